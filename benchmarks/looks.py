@@ -16,7 +16,7 @@ from benchmarks.drawing.problem import Problem
 from benchmarks.process import call
 from benchmarks.race import Progress
 from benchmarks.whole_run import SCENE, command
-from taichi_msm.model.surface import rods
+from taichi_msm.model.surface import place_capsules
 from taichi_msm.render.camera import view
 from taichi_msm.render.rasterizer import Drawing, drawing_config
 from taichi_msm.render.tracking import find_flow
@@ -67,7 +67,7 @@ def variants(problem: Problem) -> dict[str, Callable[[], Any]]:
 
     def picture(made: Scene, *, picture: bool = True, labels: bool = False) -> Callable[[], Any]:
         drawing = Drawing(made, problem.texture, drawing_config(made, picture=picture, labels=labels))
-        return lambda: drawing.look(position, None, rods(made, position, 0.2))
+        return lambda: drawing.look(position, None, place_capsules(made, position, 0.2))
 
     def pinhole(lens: dict[str, Any]) -> Scene:
         focal, middle = 1.2 * problem.pixels, (problem.pixels - 1) / 2

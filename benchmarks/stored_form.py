@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm import load_scene
-from taichi_msm.model.loads import Schedule, decay, schedule
+from taichi_msm.model.loads import Schedule, average_loads, decay
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.scene.scene import Scene
@@ -57,7 +57,7 @@ def displacements(plan: Plan, real: type[np.floating[Any]], form: str) -> Array:
     rest = rest64.astype(real)
     moves = ~plan.fixed[..., None]
     share = [decay(probe, scene.sheet).astype(real)[..., None] for probe in scene.probes]
-    loads: Schedule = schedule(plan, 0, grid.steps)
+    loads: Schedule = average_loads(plan, 0, grid.steps)
     now = rest.copy() if form == "positions" else np.zeros_like(rest)
     # The one before, or the difference from it.
     other = now.copy()

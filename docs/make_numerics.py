@@ -23,14 +23,14 @@ from scipy.special import k0, k1
 
 from taichi_msm import Scene, load_scene
 from taichi_msm.accuracy.time_step import estimate_error, longest
-from taichi_msm.model.loads import decay, loads_at
+from taichi_msm.model.loads import decay, evaluate_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import fixed_points, rest_positions, spacing
 from taichi_msm.model.time_grid import Precision
 from taichi_msm.plot_style import BLUE, DPI, GREY, STYLE, VERMILION, WIDE
 from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.solver.planning import make_plan
-from taichi_msm.solver.rest import Rest
+from taichi_msm.solver.rest import QuasiStatics
 from taichi_msm.solver.state import State
 from taichi_msm.study.format import markdown
 from taichi_msm.system import runtime
@@ -150,7 +150,7 @@ def forces(scene: Scene, displacement: Array, t: float) -> Array:
         pull = k * (1 - math.hypot(right * dx, down * dy) / length) * along
         total[here] += pull
         total[there] -= pull
-    loads = loads_at(make_plan(scene), np.array([t]))
+    loads = evaluate_loads(make_plan(scene), np.array([t]))
     total -= loads.active[0] * make_plan(scene).material.virtual * displacement
     for n, probe in enumerate(scene.probes):
         total += decay(probe, scene.sheet)[..., None] * loads.strength[0, n]
@@ -176,7 +176,7 @@ def buckling() -> dict[str, Any]:
         if frame:
             dynamics.advance(grid.steps_per_frame)
         t = frame / scene.time.frames_per_second
-        active = float(loads_at(make_plan(scene), np.array([t])).active[0])
+        active = float(evaluate_loads(make_plan(scene), np.array([t])).active[0])
         value, vector = lowest(stiffness(scene, dynamics.displacement(), active), below=-6.0)
         mode = np.zeros((*scene.sheet.points, 3))
         mode[moves] = vector[:, 0].reshape(-1, 3)
@@ -306,7 +306,7 @@ def at_rest() -> dict[str, Any]:
         for side in sides:
             points = f"sheet.points=[{side}, {side}]"
             found = load_scene(ROOT / press, [*held, *change, points, "time.motion=quasistatic"])
-            still = Rest(make_plan(found), runtime.started())
+            still = QuasiStatics(make_plan(found), runtime.started())
             still.advance(0)
             counts.append(f"{still.evaluations}")
             if not change:
@@ -342,7 +342,7 @@ def indentation() -> dict[str, Any]:
             time={"motion": "quasistatic", "duration": count, "frames_per_second": 1},
             output=[],
         )
-        rest = Rest(make_plan(scene), runtime.started())
+        rest = QuasiStatics(make_plan(scene), runtime.started())
         for row, depth in zip(rows, depths, strict=True):
             rest.advance(1)
             error = -rest.tool_forces()[0, 2] / resistance(depth, radius, tension, foundation) - 1

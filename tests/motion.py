@@ -13,7 +13,7 @@ from taichi_msm.model.plan import Plan
 from taichi_msm.model.tool_force import probe_records
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.arrays import SheetLayout
-from taichi_msm.solver.dynamics import Dynamics, layout_of
+from taichi_msm.solver.dynamics import Dynamics, choose_layout
 from taichi_msm.solver.state import RunProgress
 from taichi_msm.system.runtime import Device
 from tests.scenes import plan_of
@@ -21,7 +21,7 @@ from tests.scenes import plan_of
 
 def structure_of(made: Scene, device: Device, cores: int | None = None) -> SheetLayout:
     """What the kernel of a scene's own steps is compiled for."""
-    return layout_of(plan_of(made), device, cores)
+    return choose_layout(plan_of(made), device, cores)
 
 
 def dynamics_of(made: Scene, device: Device, layout: SheetLayout | None = None) -> Dynamics:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.integrate import solve_ivp
 
-from taichi_msm.model.loads import loads_at
+from taichi_msm.model.loads import evaluate_loads
 from taichi_msm.model.sheet import fixed_points, rest_positions
 from taichi_msm.scene.scene import Scene
 from taichi_msm.terms.elasticity import energy_density
@@ -112,7 +112,7 @@ def without_bending(scene: Scene) -> Scene:
 def test_agrees_with_dop853() -> None:
     made = scene(probes=[{"force": [0, 300, -1000], "load": [[0, 0], [0.4, 100]], "falloff": 20}])
     rest, moves = rest_positions(made.sheet), ~fixed_points(made.sheet)[..., None]
-    full = loads_at(plan_of(made), np.array([0.4]))
+    full = evaluate_loads(plan_of(made), np.array([0.4]))
 
     def motion(t: float, y: NDArray[np.float64]) -> NDArray[np.float64]:
         u, v = y.reshape(2, *rest.shape)

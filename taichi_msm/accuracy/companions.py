@@ -10,7 +10,7 @@ import math
 from typing import NamedTuple
 
 from taichi_msm.model.plan import Plan
-from taichi_msm.solver.planning import affords_pilots, stable_steps
+from taichi_msm.solver.planning import affords_companions, stable_steps
 
 # An error below this needs no finer pilot: nobody sees it, and twice as much or half of it would mean the same.
 ENOUGH = 1e-3
@@ -48,7 +48,7 @@ class Pilots(NamedTuple):
 def choose_pilots(plan: Plan, *, asked: bool = False) -> Pilots:
     """Choose the pilots of a run; asked: whatever they cost. At rest there are none for a step."""
     if plan.scene.time.at_rest:
-        tells = plan.scene.tissue is not None and (asked or affords_pilots(plan, POINTS))
+        tells = plan.scene.tissue is not None and (asked or affords_companions(plan, POINTS))
         return Pilots(points=tells, cost=POINTS if tells else 0.0, reason=AT_REST)
     own, coarse, fine = plan.grid.steps_per_frame, coarse_steps(plan), fine_steps(plan)
     points = (POINTS_IN_CONTACT if plan.tools else POINTS) if plan.scene.tissue is not None else 0.0
@@ -57,13 +57,13 @@ def choose_pilots(plan: Plan, *, asked: bool = False) -> Pilots:
     first = (1 + points) * coarse / own if coarse else fine_cost + points
     if coarse and plan.tools:
         first = coarse / own + points  # Those for the points are compared with the run, not with the coarse pilot.
-    if not asked and not affords_pilots(plan, first):
+    if not asked and not affords_companions(plan, first):
         return Pilots(reason="it would take more than two fifths of the run; to have it anyway, pass --estimate-error")
     if not coarse:
         return Pilots(fine, 0, points > 0, first)
     # Where no positions are kept, the run is repeated beside the pilot that follows.
     again = 0.0 if plan.scene.output else 1.0
-    follows = asked or affords_pilots(plan, first + fine_cost + again)
+    follows = asked or affords_companions(plan, first + fine_cost + again)
     return Pilots(coarse, fine if follows else 0, points > 0, first)
 
 

@@ -64,7 +64,7 @@ def _pierces(tool: Tool, position: NDArray[np.floating], time: float) -> bool:
     """Return whether the middle line of a tool meets a triangle of the sheet."""
     frame = np.linalg.svd(tool.axis[None])[2]  # first the axis, or its opposite, then two directions across it
     frame[0] = tool.axis
-    place = (position - tool.middle(np.array([time]))[0]) @ frame.T
+    place = (position - tool.tip_centre(np.array([time]))[0]) @ frame.T
     # The cells around the line: of the four corners some are on either side in both directions.
     around = np.ones([count - 1 for count in position.shape[:2]], dtype=bool)
     for value in (place[..., 1], place[..., 2]):

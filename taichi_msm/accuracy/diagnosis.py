@@ -15,8 +15,8 @@ from taichi_msm.model.sheet import axes
 from taichi_msm.model.surface import to_positions
 from taichi_msm.model.tool_force import control_points, probe_force
 from taichi_msm.scene.scene import Scene
-from taichi_msm.solver.dynamics import Dynamics, Gauge
-from taichi_msm.solver.state import RunProgress, Saved, farthest
+from taichi_msm.solver.dynamics import Dynamics, ForceRecorder
+from taichi_msm.solver.state import RunProgress, Snapshot, largest_displacement
 
 # How many times finer the steps are that are tried, and how many steps of a point all trials together may take: some
 # ten seconds. Counted, so that the message is the same on every machine.
@@ -29,16 +29,16 @@ class Diagnosis:
     """What was found out about a divergence."""
 
     message: str  # the time, the step, the point, the key that is the most likely cause, and the remedy
-    good: Saved | None  # the last sound state of the run; None: only the start is known to be sound
+    good: Snapshot | None  # the last sound state of the run; None: only the start is known to be sound
 
 
-def diagnose(dynamics: Dynamics, start: Saved | None, pause: Pause) -> Diagnosis:
+def diagnose(dynamics: Dynamics, start: Snapshot | None, pause: Pause) -> Diagnosis:
     """Find out how a run diverged within the current frame, from a sound state on; None: from rest.
 
     The state of the dynamics afterwards is arbitrary.
     """
     plan, grid, bad = dynamics.plan, dynamics.plan.grid, dynamics.steps_done
-    gauge = Gauge(plan)
+    gauge = ForceRecorder(plan)
     state, progress, felt = (None, RunProgress(), gauge.at_rest()) if start is None else start[:3]
     watch = Watch(plan, progress)
     dynamics.restart(plan, state)
@@ -67,9 +67,9 @@ def diagnose(dynamics: Dynamics, start: Saved | None, pause: Pause) -> Diagnosis
     dynamics.restart(plan, low)
     dynamics.advance(1)
     reading = dynamics.read()
-    cause = _cause(dynamics, high, farthest(reading.displacement)[:2], pause)
+    cause = _cause(dynamics, high, largest_displacement(reading.displacement)[:2], pause)
     said = f"{watch.judge(reading)}; {cause}"
-    good = Saved(low, watch.progress, felt, plan.scene.probes)
+    good = Snapshot(low, watch.progress, felt, plan.scene.probes)
     return Diagnosis(divergence.message(grid.time(high), high, said, exact=True), good)
 
 
@@ -86,7 +86,7 @@ def _cause(dynamics: Dynamics, bad: int, point: tuple[int, int], pause: Pause) -
             return f"likely cause: time.step, {grid.step:.6g} s; with {finer.grid.step:.9g} s it does not diverge here"
         tried = finer.grid.step
     if not plan.slots:
-        speeds = [tool.stride(grid.step)[0] / grid.step for tool in plan.tools]
+        speeds = [tool.max_stride(grid.step)[0] / grid.step for tool in plan.tools]
         tool, speed = max(zip(plan.tools, speeds, strict=True), key=lambda pair: pair[1])
         said = f"likely cause: probes.{tool.probe}.path, at up to {speed:.3g} m/s"
         return f"{said}; move the tool more slowly, or less far"

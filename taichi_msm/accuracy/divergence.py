@@ -8,13 +8,13 @@ import numpy as np
 
 from taichi_msm.accuracy.contact_warnings import piercing
 from taichi_msm.accuracy.energy_growth import EnergyGrowth
-from taichi_msm.model.loads import Envelope
+from taichi_msm.model.loads import LoadBounds
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import spacing
-from taichi_msm.solver.state import Farthest, Reading, RunProgress, farthest
+from taichi_msm.solver.state import LargestDisplacement, Reading, RunProgress, largest_displacement
 from taichi_msm.terms import TERMS
 from taichi_msm.terms.foundation import FoundationTerm
-from taichi_msm.terms.loads import free_acceleration, norm
+from taichi_msm.terms.loads import force_norm, max_free_acceleration
 
 # No deformation displaces a point by more than this many sheet sizes; a sheet that nothing holds may also fly away.
 MOST_SHEET_SIZES = 10.0
@@ -36,18 +36,18 @@ def farthest_displacement(
         points [J]; None: most that the scene's can.
     """
     # A tool takes along what it holds.
-    most = MOST_SHEET_SIZES * max(plan.scene.sheet.size) + sum(tool.way + tool.radius for tool in plan.tools)
+    most = MOST_SHEET_SIZES * max(plan.scene.sheet.size) + sum(tool.path_length + tool.radius for tool in plan.tools)
     # Springs then connect every point to a fixed one; shear springs alone may skip every other point.
     if plan.scene.sheet.fixed not in ("none", ()) and min(plan.material.across, plan.material.down) > 0:
         return most
-    if plan.material.virtual > 0 and not plan.material.always:
+    if plan.material.virtual > 0 and not plan.material.always_active:
         # The virtual springs may accelerate a point from far away, and let go of it when it is fast.
         return math.inf
     if plan.tools:
         # No point is faster than if it had its share of all energy that the tools may have given.
         given = _most_moved(plan) if moved is None else moved
         most += math.sqrt(2 * given / plan.fixed.size / plan.material.mass) * time
-    return most + (free_acceleration(plan) if acceleration is None else acceleration) * time * time / 2
+    return most + (max_free_acceleration(plan) if acceleration is None else acceleration) * time * time / 2
 
 
 class Watch:
@@ -70,23 +70,23 @@ class Watch:
     def __init__(self, plan: Plan, progress: RunProgress | None = None) -> None:
         self.progress = progress or RunProgress()
         self._plan, self._grid = plan, plan.grid
-        self._loads = Envelope(plan)
-        self._acceleration = free_acceleration(plan)
+        self._loads = LoadBounds(plan)
+        self._acceleration = max_free_acceleration(plan)
         self._moved = _most_moved(plan)
-        self._shares = np.array([norm(slot, plan.scene) for slot in plan.slots])
+        self._shares = np.array([force_norm(slot, plan.scene) for slot in plan.slots])
         self._swing = SWING / max(1e-9, 1 - (plan.grid.step / plan.stable_step) ** 2)
         self._least, self._growth = _underflow(plan), EnergyGrowth(plan)
 
     def steer(self, plan: Plan) -> None:
         """Expect other loads from now on; control points move if they did before."""
         self._plan, self._growth = plan, EnergyGrowth(plan)
-        self._loads = Envelope(plan)
-        self._acceleration = max(self._acceleration, free_acceleration(plan))
+        self._loads = LoadBounds(plan)
+        self._acceleration = max(self._acceleration, max_free_acceleration(plan))
         self._moved = max(self._moved, _most_moved(plan))
 
     def follow(self, reading: Reading) -> str:
         """Judge the next frame, as `judge` does, and record its progress if it is sound."""
-        where, progress = farthest(reading.displacement), self.progress
+        where, progress = largest_displacement(reading.displacement), self.progress
         frame, wrong = reading.steps // self._grid.steps_per_frame, self._fault(reading, where)
         if not wrong:
             least, growth = self._growth.follow(progress, reading, frame)
@@ -114,9 +114,9 @@ class Watch:
 
     def judge(self, reading: Reading) -> str:
         """Say what is wrong at a step since the last recorded frame; an empty text if it is sound."""
-        return self._fault(reading, farthest(reading.displacement))
+        return self._fault(reading, largest_displacement(reading.displacement))
 
-    def _fault(self, reading: Reading, where: Farthest) -> str:
+    def _fault(self, reading: Reading, where: LargestDisplacement) -> str:
         if self._plan.scene.time.at_rest:
             return ""  # Where the forces balance, nothing has grown without bound.
         begin, end = self.progress.frame / self._grid.frames_per_second, self._grid.time(reading.steps)
@@ -136,7 +136,7 @@ class Watch:
     def _most_energy(self, begin: float, end: float) -> float:
         """Bound the energy at the end of an interval that begins at the last recorded frame [J]."""
         progress, material = self.progress, self._plan.material
-        mass, virtual = material.mass, FoundationTerm.bound(material, self._plan.scene.sheet) / 2
+        mass, virtual = material.mass, FoundationTerm.stiffness_bound(material, self._plan.scene.sheet) / 2
         forces, active, activations = self._loads.between(begin, end)
         push = float((forces * self._shares).sum())
         # Products instead of powers: these raise OverflowError where a product is infinite.
@@ -157,9 +157,9 @@ def message(time: float, step: int, wrong: str, *, exact: bool) -> str:
 def _most_moved(plan: Plan) -> float:
     """Bound the energy that the tools which are moved can have given to the points [J]."""
     material, step, most = plan.material, plan.grid.step, 0.0
-    stiffness = sum(term.bound(material, plan.scene.sheet) for term in TERMS)
+    stiffness = sum(term.stiffness_bound(material, plan.scene.sheet) for term in TERMS)
     for tool in plan.tools:
-        far, speed = tool.way + tool.radius, tool.stride(step)[0] / step
+        far, speed = tool.path_length + tool.radius, tool.max_stride(step)[0] / step
         most += (stiffness * far * far + material.mass * speed * speed) / 2
     return plan.fixed.size * most
 
@@ -170,5 +170,5 @@ def _underflow(plan: Plan) -> float:
     (dx, dy), material = spacing(plan.scene.sheet), plan.material
     inertia = material.mass / plan.grid.step**2
     # Squares are summed, and squares times a stiffness.
-    springs = max(1.0, sum(term.bound(material, plan.scene.sheet) for term in TERMS)) * (dx**2 + dy**2)
+    springs = max(1.0, sum(term.stiffness_bound(material, plan.scene.sheet) for term in TERMS)) * (dx**2 + dy**2)
     return math.prod(plan.scene.sheet.points) * tiny * (inertia + springs)

@@ -27,7 +27,7 @@ class EnergyGrowth:
     def __init__(self, plan: Plan) -> None:
         self._released = release_time(plan) + plan.grid.step
         self._rate, self._stiffness = plan.grid.frames_per_second, np.zeros(())
-        if plan.material.always and plan.material.virtual > 0:
+        if plan.material.always_active and plan.material.virtual > 0:
             self._stiffness = plan.material.virtual * point_shares(plan)
 
     def follow(self, before: RunProgress, reading: Reading, frame: int) -> tuple[float, float]:

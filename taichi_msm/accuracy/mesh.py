@@ -41,14 +41,14 @@ from numpy.typing import NDArray
 from taichi_msm.accuracy.time_step import longest
 from taichi_msm.errors import Count, DivergedError, Pause, SceneError
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.sheet import LONGEST_CELL, Maps, cell_ratio, spacing
-from taichi_msm.model.tool_force import sums
+from taichi_msm.model.sheet import MAX_CELL_ASPECT, Maps, cell_aspect_ratio, spacing
+from taichi_msm.model.tool_force import sum_probe_forces
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_POINTS
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Probe
-from taichi_msm.solver.planning import on, stable_steps, variant
-from taichi_msm.solver.rest import sheet_of
+from taichi_msm.solver.planning import choose_precision, plan_variant, stable_steps
+from taichi_msm.solver.rest import build_dynamics
 from taichi_msm.system.runtime import Device
 
 # Orders between which the three runs are taken to converge.
@@ -121,7 +121,7 @@ def coarser(plan: Plan, share: float = 0.5) -> Plan | None:
         ]
     ways = product(*({math.ceil(count) + 1, math.floor(count) + 1} for count in cells))
     halves = [with_points(scene, (rows, cols)) for rows, cols in ways]
-    possible = [halved for halved in halves if cell_ratio(halved.sheet) <= LONGEST_CELL]
+    possible = [halved for halved in halves if cell_aspect_ratio(halved.sheet) <= MAX_CELL_ASPECT]
     if not possible:
         return None
 
@@ -130,7 +130,7 @@ def coarser(plan: Plan, share: float = 0.5) -> Plan | None:
 
     coarse = min(possible, key=lambda halved: (off(halved), halved.sheet.points))
     probes = tuple(_pressing_alike(probe, scene.sheet, coarse.sheet) for probe in scene.probes)
-    return variant(plan, coarse.model_copy(update={"probes": probes}))
+    return plan_variant(plan, coarse.model_copy(update={"probes": probes}))
 
 
 def companion(plan: Plan) -> Plan | None:
@@ -142,7 +142,7 @@ def _pressing_alike(probe: Probe, sheet: Sheet, other: Sheet) -> Probe:
     """Scale the total of a probe, by less than 2, so that its force on another sheet is that on this one."""
     if probe.total is None:
         return probe
-    own, there = sums(probe, sheet)[0], sums(probe, other)[0]
+    own, there = sum_probe_forces(probe, sheet)[0], sum_probe_forces(probe, other)[0]
     if not 0.5 * there < own < 2 * there:
         return probe
     return probe.model_copy(update={"total": tuple(own / there * part for part in probe.total)})
@@ -154,7 +154,9 @@ def missing_force(scene: Scene) -> float:
     if finer < 2:
         return 0.0  # With so many points no tool is as narrow as a cell.
     probes = [probe for probe in scene.probes if probe.total is not None]
-    pairs = [(sums(probe, scene.sheet)[0], sums(probe, scene.sheet, finer)[0]) for probe in probes]
+    pairs = [
+        (sum_probe_forces(probe, scene.sheet)[0], sum_probe_forces(probe, scene.sheet, finer)[0]) for probe in probes
+    ]
     return max((abs(own / exact - 1) for own, exact in pairs if exact > 0), default=0.0)
 
 
@@ -179,7 +181,7 @@ class MeshPilot:
             least = math.ceil(plan.grid.steps_per_frame / 2) if plan.tools else 1
             steps = 1 if plan.scene.time.at_rest else max(math.ceil(steps / 2), stable_steps(sheet), least)
             exact = sheet.with_grid(precision="f64", steps_per_frame=steps)
-            self._sheets.append(sheet_of(exact, device, cores=cores))
+            self._sheets.append(build_dynamics(exact, device, cores=cores))
         points = [sheet.scene.sheet.points for sheet in (plan, *plans)]
         self._samplings = [CubicSampling(after, before) for before, after in pairwise(points)]
         self._ratio = min((own - 1) / (other - 1) for own, other in zip(*points[:2], strict=True))
@@ -296,7 +298,7 @@ def choose_points(
     for _ in range(MOST_TRIALS):
         rows, cols = (round((count - 1) * times) + 1 for count in given)
         try:
-            tried = on(check(with_points(plan.scene, (rows, cols)), plan.maps), device.arch)
+            tried = choose_precision(check(with_points(plan.scene, (rows, cols)), plan.maps), device.arch)
         except SceneError as error:
             asked = f"with the {rows} x {cols} points that sheet.tolerance: {tolerance:g} asks for"
             raise SceneError([f"{line} ({asked})" for line in error.lines]) from None
@@ -327,7 +329,7 @@ def estimate_points(plan: Plan, device: Device, progress: Count) -> MeshEstimate
     pilot = MeshPilot(exact, coarse, device)
     each: MeshPilot | None = pilot
     while each is not None:
-        own = sheet_of(exact, device)
+        own = build_dynamics(exact, device)
         for frame in range(grid.frames):
             pause = partial(progress, frame, grid.frames)
             pause()

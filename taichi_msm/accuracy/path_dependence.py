@@ -22,8 +22,8 @@ from taichi_msm.model.loads import FrameLoad
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.tools import grip_frames
 from taichi_msm.scene.tools import Probe
-from taichi_msm.solver.planning import affords_pilots, variant
-from taichi_msm.solver.rest import sheet_of
+from taichi_msm.solver.planning import affords_companions, plan_variant
+from taichi_msm.solver.rest import build_dynamics
 from taichi_msm.system.runtime import Device
 
 # Shapes that differ by more than this share of the largest displacement are different equilibria.
@@ -84,7 +84,7 @@ class PathDependence:
 
     def affords(self, pilots: float) -> bool:
         """Return whether second solutions, in addition to pilots of this cost, are a small part of the run."""
-        return affords_pilots(self._plan, pilots + SECOND_SOLUTIONS * COST / (self._plan.grid.frames + 1))
+        return affords_companions(self._plan, pilots + SECOND_SOLUTIONS * COST / (self._plan.grid.frames + 1))
 
     def finish(self, device: Device, cores: int | None, pause: Pause) -> None:
         """Solve the last frame, the one with the largest displacement and one after it a second time, from rest."""
@@ -137,7 +137,9 @@ def second_solution(plan: Plan, frame: int, device: Device, cores: int | None, p
         return None
     probes = tuple(_at_once(plan, probe, frame) for probe in scene.probes)
     time = scene.time.model_copy(update={"duration": 1.0, "frames_per_second": 1})
-    sheet = sheet_of(variant(plan, scene.model_copy(update={"probes": probes, "time": time})), device, cores=cores)
+    sheet = build_dynamics(
+        plan_variant(plan, scene.model_copy(update={"probes": probes, "time": time})), device, cores=cores
+    )
     try:
         sheet.advance(1, pause)
         return sheet.displacement()
@@ -185,7 +187,7 @@ class _Loads:
         ]
         for tool in self._tools:
             pressing = tool.times[0] <= frame / rate <= tool.times[-1]
-            shares += [pressing, *tool.middle(np.array([frame / rate]))[0] / self._size]
+            shares += [pressing, *tool.tip_centre(np.array([frame / rate]))[0] / self._size]
         return tuple(np.rint(np.array(shares) / SAME_LOAD).astype(np.int64).tolist())
 
     def change(self, frame: int) -> float:
@@ -198,6 +200,6 @@ class _Loads:
             frames = [grip_frames(grip, self._rate) for grip in tool.grips]
             if any((frame in held) != (frame - 1 in held) for held in frames):
                 return 0.0
-            before, after = tool.middle(np.array([frame - 1, frame]) / self._rate)
-            change += math.dist(before, after) / max(tool.way, 1e-300)
+            before, after = tool.tip_centre(np.array([frame - 1, frame]) / self._rate)
+            change += math.dist(before, after) / max(tool.path_length, 1e-300)
         return change

@@ -33,11 +33,11 @@ from taichi_msm.model import tool_force
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import has_fixed_border
 from taichi_msm.model.tool_force import ProbeRecord
-from taichi_msm.model.tools import MOST_FINER, TOO_FEW, path_notes
+from taichi_msm.model.tools import COARSE_TIP_PHRASE, MAX_REFINEMENT, path_warnings
 from taichi_msm.scene.section import MAX_POINTS
 from taichi_msm.scene.sheet import Foundation
 from taichi_msm.solver.dynamics import Dynamics
-from taichi_msm.solver.planning import variant
+from taichi_msm.solver.planning import plan_variant
 from taichi_msm.solver.state import RunProgress
 from taichi_msm.system.runtime import Device
 
@@ -181,7 +181,7 @@ class RunError:
 pass  # REMOVED
 
 # The stability limit holds while no spring is compressed below this share of its rest length (see
-# `SpringTerm.bound`).
+# `SpringTerm.stiffness_bound`).
 SHORTEST = 0.5
 
 # Tissue that is compressed by more than this share of its depth gets much stiffer, which the foundation does not.
@@ -236,15 +236,15 @@ def run_notes(
             yield f"force error not known: {force.doubt}"
         else:
             yield f"force error at most about {_percent(force.error, 2)} % of the greatest force"
-    yield from tool_force.force_notes(scene, probes)
-    paths = list(path_notes(scene, plan.tools))
+    yield from tool_force.force_warnings(scene, probes)
+    paths = list(path_warnings(scene, plan.tools))
     yield from paths
     yield from contact_notes(plan, progress)
     yield from growth_notes(plan, progress)
     if mesh is not None and mesh.doubt and mesh.error < math.inf:
         yield f"the error due to the number of points may be larger: {mesh.doubt}"
     # Where points are too far apart for a tool, it is said already what would help.
-    if mesh is not None and WRONG < mesh.error < math.inf and not any(TOO_FEW in note for note in paths):
+    if mesh is not None and WRONG < mesh.error < math.inf and not any(COARSE_TIP_PHRASE in note for note in paths):
         yield f"for a smaller error of the mesh, {_finer(plan, mesh, affords)}"
     if progress.max_displacement == 0 and progress.frame > 0:
         yield "nothing moved: does a probe press where and when it should?"
@@ -312,8 +312,8 @@ def _finer(plan: Plan, mesh: MeshEstimate, affords: Callable[[Plan], bool]) -> s
     """Say what would reduce the error that the number of points makes: no more than four times as many."""
     scene, cut = plan.scene, math.sqrt(mesh.error / (WRONG / 2))
     rows, cols = (math.ceil((count - 1) * cut) + 1 for count in scene.sheet.points)
-    few = rows * cols <= MOST_FINER * math.prod(scene.sheet.points) and max(rows, cols) < MAX_POINTS
-    if few and affords(variant(plan, with_points(scene, (rows, cols)))):
+    few = rows * cols <= MAX_REFINEMENT * math.prod(scene.sheet.points) and max(rows, cols) < MAX_POINTS
+    if few and affords(plan_variant(plan, with_points(scene, (rows, cols)))):
         return f"try sheet.points: {[rows, cols]}"
     return "more than points, tissue.bending, tissue.pretension or a wider tip help"
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from taichi_msm.errors import printable
 from taichi_msm.load.cost import rough_time
-from taichi_msm.model.tool_force import in_words
+from taichi_msm.model.tool_force import describe_forces
 from taichi_msm.system.process import tell
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def summary(record: Mapping[str, Any], directory: Path) -> str:
         f"{printable(str(directory))}: {record['frames']} frames, {steps}, {rows} x {cols} points, "
         f"largest displacement {record['max_displacement']:.4g} m",
         *([f"the first {record['resumed']} frames were simulated by an earlier run"] if record["resumed"] else []),
-        *(f"probes.{index}: {in_words(probe)}" for index, probe in enumerate(record["probes"])),
+        *(f"probes.{index}: {describe_forces(probe)}" for index, probe in enumerate(record["probes"])),
         *record["notes"],
         f"{times['total']:.2f} s: {stages}{' (encoding runs in parallel)' if beside else ''}",
     ]

@@ -140,8 +140,8 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     from taichi_msm.load import cost as cost_module
     from taichi_msm.load.scene_file import load_plan
     from taichi_msm.model import tool_force
-    from taichi_msm.model.tool_force import in_words, probe_records
-    from taichi_msm.model.tools import path_notes
+    from taichi_msm.model.tool_force import describe_forces, probe_records
+    from taichi_msm.model.tools import path_warnings
     from taichi_msm.render.notes import drawing_notes
     from taichi_msm.render.texture import load_texture
 
@@ -170,7 +170,11 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         "disk": need.disk_bytes,
         "disk_while_running": need.disk_bytes + need.working_bytes,
         "probes": (records := probe_records(loaded)),
-        "notes": [*tool_force.force_notes(loaded, records), *path_notes(loaded, plan.tools), *drawing_notes(loaded)],
+        "notes": [
+            *tool_force.force_warnings(loaded, records),
+            *path_warnings(loaded, plan.tools),
+            *drawing_notes(loaded),
+        ],
     }
     if as_json:
         print_json(facts)
@@ -195,7 +199,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         f"{need.working_bytes / 2**20:.1f} MiB more while it runs"
     )
     for index, probe in enumerate(facts["probes"]):
-        if said := in_words(probe):
+        if said := describe_forces(probe):
             click.echo(f"probes.{index}: {said}")
     for note in facts["notes"]:
         click.echo(note)

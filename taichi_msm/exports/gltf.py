@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from taichi_msm.errors import Count
 from taichi_msm.exports.formats import in_folders
 from taichi_msm.exports.inputs import REFINE, picture_png, unit_normals
-from taichi_msm.model.surface import surface
+from taichi_msm.model.surface import refine_surface
 from taichi_msm.runs.directory import create
 from taichi_msm.runs.finished import FinishedRun
 from taichi_msm.version import __version__
@@ -94,7 +94,7 @@ def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
 
 def _surface(position: NDArray[np.floating], has_picture: bool, binary: Binary) -> dict[str, Any]:
     """Make the triangles of the first frame, with the place of each vertex in the picture if there is one."""
-    first = surface(position, REFINE)
+    first = refine_surface(position, REFINE)
     attributes = {
         "POSITION": binary.accessor(first.vertices.astype(np.float32), VERTICES, bounds=True),
         "NORMAL": binary.accessor(unit_normals(position).astype(np.float32), VERTICES),

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from taichi_msm.errors import Count
 from taichi_msm.exports.formats import in_folders
 from taichi_msm.exports.inputs import PICTURE, REFINE, picture_png, unit_normals
-from taichi_msm.model.surface import surface
+from taichi_msm.model.surface import refine_surface
 from taichi_msm.runs.directory import add, create
 from taichi_msm.runs.finished import FinishedRun
 
@@ -35,7 +35,7 @@ def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
     if picture is not None:
         add(folder / PICTURE, picture)
     add(folder / MATERIAL, "".join(f"{line}\n" for line in _material(picture is not None)).encode())
-    first = surface(positions[0], REFINE)
+    first = refine_surface(positions[0], REFINE)
     from_below = first.texture_coordinates * (1, -1) + (0, 1)
     coordinates = _lines("vt", from_below)
     corners = np.repeat(first.triangles + 1, 3, axis=1)

@@ -25,7 +25,7 @@ from taichi_msm.errors import Count, NotInstalledError
 from taichi_msm.exports.formats import in_folders
 from taichi_msm.exports.inputs import PICTURE, REFINE, picture_png
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.model.surface import surface
+from taichi_msm.model.surface import refine_surface
 from taichi_msm.runs.directory import add
 from taichi_msm.runs.finished import FinishedRun
 from taichi_msm.solver.planning import make_plan
@@ -101,7 +101,7 @@ def _grid(position: Array, values: dict[str, Array]) -> bytes:
             array.GetInformation().Set(vtkDataArray.UNITS_LABEL(), UNITS[name])
         return array
 
-    shown = surface(position, REFINE)
+    shown = refine_surface(position, REFINE)
     points, cells, grid = vtkPoints(), vtkCellArray(), vtkUnstructuredGrid()
     points.SetData(named("points", shown.vertices))
     starts = np.arange(0, shown.triangles.size + 1, 3)

@@ -23,9 +23,9 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import Section
 from taichi_msm.scene.sheet import Foundation
 from taichi_msm.scene.tools import Probe
-from taichi_msm.terms import material_of
+from taichi_msm.terms import derive_material
 from taichi_msm.terms.damping import coefficients
-from taichi_msm.terms.springs import stiffness
+from taichi_msm.terms.springs import spring_stiffness
 
 Array = NDArray[np.float64]
 
@@ -51,7 +51,7 @@ class Slopes:
         factors, material = plan.material.factors, plan.material
         assert factors is not None
         total = float(self.tensions @ material.tensions) + float(self.held.sum()) + self.bent
-        for slope, k, tension in zip(self.springs, stiffness(material, factors), material.tensions, strict=True):
+        for slope, k, tension in zip(self.springs, spring_stiffness(material, factors), material.tensions, strict=True):
             total += float((slope * (k - tension)).sum())
         return total
 
@@ -92,7 +92,7 @@ def derivatives(plan: Plan, slopes: Slopes, loads: LoadSlopes) -> Derivatives:
 
 def _numbers(plan: Plan, scene: Scene) -> NDArray[Any]:
     """List the numbers of a sheet of which `_by_numbers` gives the derivatives; they may be complex."""
-    one = material_of(scene, {})
+    one = derive_material(scene, {})
     springs = [one.across, one.down, one.shear, one.tension]
     steps = () if scene.time.at_rest else coefficients(replace(plan, scene=scene, material=one))
     return np.array([*springs, one.virtual, one.bending, *steps])
@@ -102,7 +102,7 @@ def _by_numbers(plan: Plan, slopes: Slopes) -> Array:
     """List the derivatives by across, down, shear, tension, virtual, bending, keep, gain and the first gain."""
     material = plan.material
     assert material.factors is not None
-    unit = stiffness(replace(material, across=1.0, down=1.0, shear=1.0), material.factors)
+    unit = spring_stiffness(replace(material, across=1.0, down=1.0, shear=1.0), material.factors)
     # tau is a stiffness times the tension, and k - tau falls as it grows.
     tensions = slopes.tensions - [float(slope.sum()) for slope in slopes.springs]
     springs = [

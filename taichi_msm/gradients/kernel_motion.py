@@ -21,12 +21,12 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
 
-from taichi_msm.solver.arrays import point_step
-from taichi_msm.solver.bands import MOMENTS, joining
-from taichi_msm.solver.row import row_passing
+from taichi_msm.solver.arrays import build_point_step
+from taichi_msm.solver.bands import MOMENT_ROWS, build_join_strips
+from taichi_msm.solver.row import build_pass_row
 from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, ti
-from taichi_msm.terms.base import AREA, DX, DY, GAIN, MOVES, Entry, KernelRow, KernelSheet, StepCode
-from taichi_msm.terms.bending import BendingTerm, five_point
+from taichi_msm.terms.base import AREA_SHARE, DX, DY, GAIN, MOBILITY, Entry, KernelConfig, KernelRow, KernelSheet
+from taichi_msm.terms.bending import BendingTerm, build_laplacian
 from taichi_msm.terms.foundation import FoundationTerm
 from taichi_msm.terms.loads import ProbeTerm
 from taichi_msm.terms.springs import ALONG_COLUMN, ALONG_ROW, DIAGONAL, SpringTerm
@@ -60,7 +60,7 @@ class AdjointSheet(NamedTuple):
     by_column: Any
     stiffness: Any
     fields: Any
-    numbers: Any
+    constants: Any
     rows: Any
     width: Any
     shapes: Any  # displacements of the steps of a segment, three arrays
@@ -90,7 +90,7 @@ class Tables(NamedTuple):
 
 
 @cache
-def kernels(code: StepCode, *, parallel: bool) -> tuple[Callable[..., None], Callable[..., None]]:
+def kernels(code: KernelConfig, *, parallel: bool) -> tuple[Callable[..., None], Callable[..., None]]:
     """Make the kernels that step forward and keep every shape, and that sweep backward."""
     return _recording(code, parallel=parallel), _sweeping(code, parallel=parallel)
 
@@ -133,12 +133,12 @@ def _banded(take: Callable[..., None], *, parallel: bool) -> Callable[..., None]
     return work
 
 
-def _storing(code: StepCode) -> list[Callable[..., None]]:
+def _storing(code: KernelConfig) -> list[Callable[..., None]]:
     """Make the function that stores the moments that row i of a band needs, if any: at first of three, then of one."""
-    bending, join_strips = code.get(BendingTerm), joining(code)
+    bending, join_strips = code.get(BendingTerm), build_join_strips(code)
     if bending is None:
         return []
-    store_moment = bending.storing(code)
+    store_moment = bending.build_store_moment(code)
 
     @ti.func
     def store_moments(sheet: ti.template(), band: ti.template(), i):
@@ -146,7 +146,7 @@ def _storing(code: StepCode) -> list[Callable[..., None]]:
             last = sheet.rows - 1
             before = band.before + ti.max(0, ti.min(ahead - 1, last))
             here, after = band.before + ti.max(0, ti.min(ahead, last)), band.before + ti.min(ahead + 1, last)
-            target = band.moments + (ahead + MOMENTS) % MOMENTS
+            target = band.moments + (ahead + MOMENT_ROWS) % MOMENT_ROWS
             for b in range(1, sheet.width - 1):
                 store_moment(sheet, ahead, before, here, after, b, target)
             join_strips(sheet.u, target, sheet.width)
@@ -154,7 +154,7 @@ def _storing(code: StepCode) -> list[Callable[..., None]]:
     return [store_moments]
 
 
-def _clearing(code: StepCode) -> Callable[..., None]:
+def _clearing(code: KernelConfig) -> Callable[..., None]:
     """Make Taichi's function clear(sheet, row), for a row of u."""
     vector = code.vector
 
@@ -167,17 +167,17 @@ def _clearing(code: StepCode) -> Callable[..., None]:
     return clear
 
 
-def _recording(code: StepCode, *, parallel: bool) -> Callable[..., None]:
+def _recording(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
     """Make the kernel that takes steps, each from one shape to the next."""
     real, vector, vectors = code.real, code.vector, code.vectors
-    count_of_numbers, join_strips, step = code.first_number(None), joining(code), point_step(code)
+    count_of_numbers, join_strips, step = code.first_constant(None), build_join_strips(code), build_point_step(code)
     clear, storing = _clearing(code), _storing(code)
 
     @ti.func
     def move(sheet: ti.template(), entry: ti.template(), target, force: ti.template(), now: ti.template()):
         step(sheet, entry, target + sheet.rows, force, now)
 
-    pass_row = row_passing(code, move)
+    pass_row = build_pass_row(code, move)
 
     @ti.func
     def take(sheet: ti.template(), loads: ti.template(), sizes: ti.template(), worker, k):
@@ -186,7 +186,7 @@ def _recording(code: StepCode, *, parallel: bool) -> Callable[..., None]:
         low, high = sheet.rows * worker // workers, sheet.rows * (worker + 1) // workers
         shape = (ti.cast(sizes[SHAPE], ti.i32) + k) * sheet.rows
         carry = ti.cast(sizes[CARRY] + sizes[CARRIED_ROWS] * worker, ti.i32)
-        moments = ti.cast(sizes[MOMENT_ROW], ti.i32) + MOMENTS * worker
+        moments = ti.cast(sizes[MOMENT_ROW], ti.i32) + MOMENT_ROWS * worker
         band = ti.static(Strip(low, high, shape, shape, shape, carry, moments, k, 0))
         if low == 0:
             clear(sheet, carry)
@@ -197,9 +197,9 @@ def _recording(code: StepCode, *, parallel: bool) -> Callable[..., None]:
             kind = ti.select(i == sheet.rows - 1, 2, ti.select(i == 0, 0, 1))
             exists = ti.cast(i + 1 < sheet.rows, real)
             below = shape + ti.min(i + 1, sheet.rows - 1)
-            before, at = moments + (i + 2) % MOMENTS, moments + i % MOMENTS
-            line = ti.static(KernelRow(i, kind, before, at, moments + (i + 1) % MOMENTS))
-            up = 0 - sheet.numbers[DY]
+            before, at = moments + (i + 2) % MOMENT_ROWS, moments + i % MOMENT_ROWS
+            line = ti.static(KernelRow(i, kind, before, at, moments + (i + 1) % MOMENT_ROWS))
+            up = 0 - sheet.constants[DY]
             pass_row(sheet, sheet.u, carry, line, shape + i, below, exists, up, loads, k, i >= low)
             if i >= low:
                 join_strips(sheet.u, shape + sheet.rows + i, sheet.width)
@@ -213,39 +213,42 @@ def _recording(code: StepCode, *, parallel: bool) -> Callable[..., None]:
         loads: ti.types.ndarray(dtype=real, ndim=2),
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
-        numbers_of: ti.types.ndarray(dtype=vector, ndim=1),
+        constants_of: ti.types.ndarray(dtype=vector, ndim=1),
         by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
         ti.loop_config(serialize=not parallel)
         for index in range(ti.cast(sizes[WORKERS], ti.i32) * ITERATIONS_PER_THREAD):
             if index % ITERATIONS_PER_THREAD == 0:
                 rows, width = ti.cast(sizes[ROWS], ti.i32), ti.cast(sizes[STRIP], ti.i32) + 2
-                numbers = [numbers_of[n][0] for n in ti.static(range(count_of_numbers))]
+                constants = [constants_of[n][0] for n in ti.static(range(count_of_numbers))]
                 u, d = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z))
-                sheet = ti.static(KernelSheet(u, d, by_column, stiffness, fields, numbers, rows, width))
+                sheet = ti.static(KernelSheet(u, d, by_column, stiffness, fields, constants, rows, width))
                 work(sheet, loads, sizes, progress, index // ITERATIONS_PER_THREAD)
 
     return record
 
 
-def _row_sweeping(code: StepCode) -> Callable[..., None]:
+def _row_sweeping(code: KernelConfig) -> Callable[..., None]:
     """Make the function that takes a row of the adjoint a step backward."""
     vector, columns, springs = code.vector, code.first_column(None), code.require(SpringTerm)
     structural, shear, tense = springs.structural, springs.shear, springs.tense
-    differentiate, (*_, of_row, of_column, of_diagonal) = springs.tangent(code), springs.between(code)
-    tangents = [add for term in code.terms for add in term.tangents(code)]
-    reducing = [reduce for term in code.terms for reduce in term.reducing(code)]
+    differentiate, (*_, of_row, of_column, of_diagonal) = (
+        springs.build_spring_tangent(code),
+        springs.build_spring_forces(code),
+    )
+    tangents = [add for term in code.terms for add in term.build_tangents(code)]
+    reducing = [reduce for term in code.terms for reduce in term.build_damping(code)]
     probes, holds = code.require(ProbeTerm), code.get(FoundationTerm) is not None
-    curving = [] if code.get(BendingTerm) is None else [five_point(code)]
-    sense, slots, standing = probes.sensing(code, SUM_PARTS), len(probes.moves), probes.moves.count(False)
-    first_tension, held = code.first_number(SpringTerm) + 3, code.first_column(FoundationTerm) if holds else 0
+    curving = [] if code.get(BendingTerm) is None else [build_laplacian(code)]
+    sense, slots, standing = probes.build_load_adjoint(code, SUM_PARTS), len(probes.moves), probes.moves.count(False)
+    first_tension, held = code.first_constant(SpringTerm) + 3, code.first_column(FoundationTerm) if holds else 0
 
     @ti.func
     def of_spring(sheet: ti.template(), ahead, p, q, x0, y0, length, k, family: ti.template()):
         """Differentiate the force of entry p on entry q; entries of p and q, of which shapes are `ahead`."""
         change = [sheet.u[c][p] - sheet.u[c][q] for c in ti.static(range(3))]
         apart = [sheet.shapes[c][p + ahead] - sheet.shapes[c][q + ahead] for c in ti.static(range(3))]
-        tension = sheet.numbers[first_tension + family]
+        tension = sheet.constants[first_tension + family]
         return differentiate(apart, change, x0, y0, length, k, tension)
 
     @ti.func
@@ -256,7 +259,7 @@ def _row_sweeping(code: StepCode) -> Callable[..., None]:
     @ti.func
     def sweep_row(sheet: ti.template(), band: ti.template(), i, loads: ti.template(), pushes: ti.template()):
         """Sweep row i of a band; row low - 1 only for what it carries to the next."""
-        width, dx, dy, owned = sheet.width, sheet.numbers[DX], sheet.numbers[DY], i >= band.low
+        width, dx, dy, owned = sheet.width, sheet.constants[DX], sheet.constants[DY], i >= band.low
         diagonal, kind = ti.sqrt(dx * dx + dy * dy), ti.select(i == sheet.rows - 1, 2, ti.select(i == 0, 0, 1))
         here, below = (band.before + i) * width, (band.before + ti.min(i + 1, sheet.rows - 1)) * width
         ahead, carry = (band.shape - band.before) * width, band.carry * width
@@ -265,8 +268,8 @@ def _row_sweeping(code: StepCode) -> Callable[..., None]:
         now = [loads[band.n, c] for c in ti.static(range(columns))]
         # What the cell before an entry adds to it, and to the entry below it.
         beside, under = [vector(0) for _ in ti.static(range(3))], [vector(0) for _ in ti.static(range(3))]
-        before, at = band.moments + (i + 2) % MOMENTS, band.moments + i % MOMENTS
-        line = ti.static(KernelRow(i, kind, before, at, band.moments + (i + 1) % MOMENTS))
+        before, at = band.moments + (i + 2) % MOMENT_ROWS, band.moments + i % MOMENT_ROWS
+        line = ti.static(KernelRow(i, kind, before, at, band.moments + (i + 1) % MOMENT_ROWS))
         for b in range(width - 1):
             # The cell to the right of the entry: the spring along its upper edge, and its diagonals.
             right = [vector(0) for _ in ti.static(range(5))]
@@ -300,7 +303,7 @@ def _row_sweeping(code: StepCode) -> Callable[..., None]:
                     entry = ti.static(Entry(line, b, p))
                     for add_change in ti.static(tangents):
                         add_change(force, sheet, entry, now)
-                    gain = now[GAIN] * sheet.by_column[(MOVES + kind) * width + b]
+                    gain = now[GAIN] * sheet.by_column[(MOBILITY + kind) * width + b]
                     q = [sheet.u[c][(LAST * sheet.rows + i) * width + b] for c in ti.static(range(3))]
                     # The sum of p_{n+1} (u_n - u_{n-1}) over all n, added up in another order: of u_n q_{n+1}.
                     kept = q[0] * u[0] + q[1] * u[1] + q[2] * u[2]
@@ -328,7 +331,7 @@ def _row_sweeping(code: StepCode) -> Callable[..., None]:
                         sums[TENSE + ALONG_COLUMN] = sums[TENSE + ALONG_COLUMN] - down[4]
                         sums[TENSE + DIAGONAL] = sums[TENSE + DIAGONAL] - (to_right[4] + to_left[4])
                     if ti.static(code.by_area):
-                        kept *= sheet.by_column[(AREA + kind) * width + b]
+                        kept *= sheet.by_column[(AREA_SHARE + kind) * width + b]
                     sums[KEPT] += kept
                     sense(pushed, sheet, entry, now)
                     for laplacian in ti.static(curving):
@@ -354,10 +357,10 @@ def _row_sweeping(code: StepCode) -> Callable[..., None]:
     return sweep_row
 
 
-def _sweeping(code: StepCode, *, parallel: bool) -> Callable[..., None]:
+def _sweeping(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
     """Make the kernel that takes steps of the adjoint, from the last to the first."""
     real, vector, vectors = code.real, code.vector, code.vectors
-    count_of_numbers, join_strips, storing = code.first_number(None), joining(code), _storing(code)
+    count_of_numbers, join_strips, storing = code.first_constant(None), build_join_strips(code), _storing(code)
     clear, sweep_row = _clearing(code), _row_sweeping(code)
 
     @ti.func
@@ -369,7 +372,7 @@ def _sweeping(code: StepCode, *, parallel: bool) -> Callable[..., None]:
         shape = (ti.cast(sizes[SHAPE], ti.i32) - k) * sheet.rows
         buffer = (ti.cast(sizes[BUFFER], ti.i32) + k) % 2
         carry = ti.cast(sizes[CARRY] + sizes[CARRIED_ROWS] * worker, ti.i32)
-        moments = ti.cast(sizes[MOMENT_ROW], ti.i32) + MOMENTS * worker
+        moments = ti.cast(sizes[MOMENT_ROW], ti.i32) + MOMENT_ROWS * worker
         with_loss = n == 0 and sizes[WITH_LOSS] != 0
         before, after = buffer * sheet.rows, (1 - buffer) * sheet.rows
         band = ti.static(Strip(low, high, before, after, shape, carry, moments, n, with_loss))
@@ -393,16 +396,16 @@ def _sweeping(code: StepCode, *, parallel: bool) -> Callable[..., None]:
         pushes: ti.types.ndarray(dtype=real, ndim=3),
         p_x: vectors, p_y: vectors, p_z: vectors,
         u_x: vectors, u_y: vectors, u_z: vectors,
-        numbers_of: ti.types.ndarray(dtype=vector, ndim=1),
+        constants_of: ti.types.ndarray(dtype=vector, ndim=1),
         by_column: vectors, stiffness: vectors, fields: vectors, found: vectors,
     ):  # fmt: skip
         ti.loop_config(serialize=not parallel)
         for index in range(ti.cast(sizes[WORKERS], ti.i32) * ITERATIONS_PER_THREAD):
             if index % ITERATIONS_PER_THREAD == 0:
                 rows, width = ti.cast(sizes[ROWS], ti.i32), ti.cast(sizes[STRIP], ti.i32) + 2
-                numbers = [numbers_of[n][0] for n in ti.static(range(count_of_numbers))]
+                constants = [constants_of[n][0] for n in ti.static(range(count_of_numbers))]
                 p, u = ti.static((p_x, p_y, p_z), (u_x, u_y, u_z))
-                sheet = ti.static(AdjointSheet(p, by_column, stiffness, fields, numbers, rows, width, u, found))
+                sheet = ti.static(AdjointSheet(p, by_column, stiffness, fields, constants, rows, width, u, found))
                 tables = ti.static(Tables(loads, pushes))
                 work(sheet, tables, sizes, progress, index // ITERATIONS_PER_THREAD)
 
@@ -410,7 +413,7 @@ def _sweeping(code: StepCode, *, parallel: bool) -> Callable[..., None]:
 
 
 @cache
-def copying(code: StepCode) -> Callable[..., None]:
+def copying(code: KernelConfig) -> Callable[..., None]:
     """Make the kernel that copies so many entries, from one entry of some arrays to one of others."""
     vectors = code.vectors
 

@@ -33,14 +33,14 @@ from taichi_msm.gradients.kernel_motion import (
     copying,
     kernels,
 )
-from taichi_msm.model.loads import schedule
+from taichi_msm.model.loads import average_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import area_shares
-from taichi_msm.solver.arrays import in_lanes, out_of_lanes
-from taichi_msm.solver.bands import MOMENTS
+from taichi_msm.solver.arrays import from_lanes, to_lanes
+from taichi_msm.solver.bands import MOMENT_ROWS
 from taichi_msm.solver.dynamics import STEPS_PER_TABLE, Dynamics
 from taichi_msm.solver.kernel_cpu import PAGE, PATIENCE
-from taichi_msm.solver.state import State, farthest
+from taichi_msm.solver.state import State, largest_displacement
 from taichi_msm.system.runtime import Memory, our_compilation, write
 from taichi_msm.terms.base import GAIN
 from taichi_msm.terms.damping import coefficients
@@ -95,8 +95,8 @@ class MotionAdjoint(Dynamics):
     def restart(self, plan: Plan, state: State | None = None) -> None:
         """Begin again with the same scene or another, as `Dynamics` does."""
         super().restart(plan, state)
-        self._slopes = self.structure.code.require(ProbeTerm).slopes(plan)
-        key = self.structure, plan.grid.steps, len(self._slopes)
+        self._slopes = self.layout.config.require(ProbeTerm).decay_gradients(plan)
+        key = self.layout, plan.grid.steps, len(self._slopes)
         if key != self._allocated:
             self._allocate()
             self._allocated = key
@@ -104,16 +104,16 @@ class MotionAdjoint(Dynamics):
     def _allocate(self) -> None:
         """Take memory for a layout, a number of steps and of standing slots."""
         plan = self.plan
-        layout, memory = self.structure, Memory()
-        row_bytes = layout.width * layout.code.lanes * 8
+        layout, memory = self.layout, Memory()
+        row_bytes = layout.width * layout.config.lanes * 8
         self._segment = segment_steps(plan.grid.steps, 3 * layout.rows * row_bytes)
         # No two workers write to one page of what they carry.
         self._carried_rows = 1 - (-PAGE // row_bytes)
-        self._extra = (MOMENTS + self._carried_rows) * layout.workers
+        self._extra = (MOMENT_ROWS + self._carried_rows) * layout.workers
         sums = -(-ROW_SUMS * layout.rows // layout.width)
 
         def rows(count: int) -> Any:
-            return memory.array("f64", layout.code.lanes, count * layout.width)
+            return memory.array("f64", layout.config.lanes, count * layout.width)
 
         def three(count: int) -> list[Any]:
             return [rows(count) for _ in range(3)]
@@ -145,23 +145,23 @@ class MotionAdjoint(Dynamics):
                 fault = watch.follow(reading)
                 if fault:
                     said = divergence.message(grid.time(n), n, fault, exact=False)
-                    raise DivergedError(said, n, grid.time(n), farthest(reading.displacement)[:2])
+                    raise DivergedError(said, n, grid.time(n), largest_displacement(reading.displacement)[:2])
                 frames[n // grid.steps_per_frame] = reading.displacement
         return frames
 
     def backward(self, by_frame: Array, pause: Pause = lambda: None) -> tuple[Slopes, LoadSlopes]:
         """Sweep the adjoint of the last `run`; by_frame: derivative of the loss by what that returned."""
-        grid, layout, arrays = self.plan.grid, self.structure, self._arrays
+        grid, layout, arrays = self.plan.grid, self.layout, self._arrays
         _, gain, _ = coefficients(self.plan)
-        shares = area_shares(self.plan.scene.sheet) if layout.code.by_area else np.ones((layout.rows, layout.cols))
+        shares = area_shares(self.plan.scene.sheet) if layout.config.by_area else np.ones((layout.rows, layout.cols))
         start = gain * (~self.plan.fixed / shares)[..., None] * by_frame[-1]
         for c in range(3):
             # p, an empty buffer, and q.
             parts = start[..., c], 0 * start[..., c], start[..., c]
-            write(arrays.adjoint[c], in_lanes(layout, np.concatenate(parts)))
+            write(arrays.adjoint[c], to_lanes(layout, np.concatenate(parts)))
         none = np.zeros((SUM_PARTS * layout.rows, layout.cols))
         slopes = self._slopes.reshape(-1, layout.cols)
-        write(arrays.found, in_lanes(layout, np.concatenate([none, slopes])))
+        write(arrays.found, to_lanes(layout, np.concatenate([none, slopes])))
         loads, self._buffer, totals = LoadSlopes(self.plan), BUFFERS, np.zeros(2)
         block = max(1, STEPS_PER_TABLE // self._segment) * self._segment
         for first in reversed(range(0, grid.steps, block)):
@@ -186,8 +186,8 @@ class MotionAdjoint(Dynamics):
             by_slot[0] *= table[0, GAIN] / coefficients(self.plan)[1]
         if not self.plan.slots:
             return np.zeros(2)
-        loads.add(lambda plan: schedule(plan, first, end - first), by_slot, (first * h - h, end * h))
-        work = (by_slot[..., :3] * schedule(self.plan, first, end - first).strength).sum(axis=(1, 2))
+        loads.add(lambda plan: average_loads(plan, first, end - first), by_slot, (first * h - h, end * h))
+        work = (by_slot[..., :3] * average_loads(self.plan, first, end - first).strength).sum(axis=(1, 2))
         return np.array([work[int(first == 0) :].sum(), work[: int(first == 0)].sum()])
 
     def _keep(self, segment: int) -> None:
@@ -199,16 +199,16 @@ class MotionAdjoint(Dynamics):
     @property
     def _entries(self) -> int:
         """Entries of a shape."""
-        return self.structure.rows * self.structure.width
+        return self.layout.rows * self.layout.width
 
     def _copy_entries(self, source: int, target: int, of: list[Any], to: list[Any]) -> None:
         """Copy a shape from one entry of three arrays to one of others."""
         with our_compilation():
-            copying(self.structure.code)(self._entries, source, target, *of, *to)
+            copying(self.layout.config)(self._entries, source, target, *of, *to)
 
     def _record(self, first: int, table: Array, pause: Pause) -> None:
         """Take the steps of a segment, from its first one on, and keep every shape; table: of its loads."""
-        layout, arrays, count = self.structure, self._arrays, len(table) - 1
+        layout, arrays, count = self.layout, self._arrays, len(table) - 1
         begins = first // self._segment * self._entries
         self._copy_entries(begins, 0, arrays.kept, arrays.shapes)
         self._copy_entries(begins, 0, arrays.last, arrays.moving)
@@ -230,7 +230,7 @@ class MotionAdjoint(Dynamics):
         Returns:
             Derivatives by the force and the control point of every slot in every step, shape (steps, slots, 5).
         """
-        layout, arrays, grid, count = self.structure, self._arrays, self.plan.grid, len(table)
+        layout, arrays, grid, count = self.layout, self._arrays, self.plan.grid, len(table)
         frame, beyond = divmod(end - count, grid.steps_per_frame)
         if not beyond:
             self._put(by_frame[frame])
@@ -243,14 +243,14 @@ class MotionAdjoint(Dynamics):
     def _put(self, slopes: Array) -> None:
         """Put the derivative by the shape of a frame where the kernel adds it."""
         for c in range(3):
-            write(self._arrays.loss[c], in_lanes(self.structure, slopes[..., c]))
+            write(self._arrays.loss[c], to_lanes(self.layout, slopes[..., c]))
         self._copy_entries(0, LOSS * self._entries, self._arrays.loss, self._arrays.adjoint)
 
     def _collect(self, gain: float, totals: Array) -> Slopes:
         """Add up what was found."""
-        layout = self.structure
+        layout = self.layout
         rows, cols, found = layout.rows, layout.cols, self._arrays.found.to_numpy()
-        every = out_of_lanes(layout, found, SUM_PARTS * rows).reshape(SUM_PARTS, rows, cols)
+        every = from_lanes(layout, found, SUM_PARTS * rows).reshape(SUM_PARTS, rows, cols)
         first = (SUM_PARTS + 2 * len(self._slopes)) * rows * layout.width
         # Row by row, each in the order of its lanes.
         sums = found[first : first + ROW_SUMS * rows].reshape(rows, ROW_SUMS, -1).sum(axis=2).sum(axis=0)
@@ -265,15 +265,15 @@ class MotionAdjoint(Dynamics):
     def _sheet_arrays(self) -> tuple[Any, ...]:
         """The arrays of the sheet that the kernels only read."""
         arrays = self._moving.arrays
-        return arrays.numbers, arrays.by_column, arrays.stiffness, arrays.fields
+        return arrays.constants, arrays.by_column, arrays.stiffness, arrays.fields
 
     def _most_steps(self) -> int:
-        return max(1, POINT_STEPS_PER_LAUNCH // (self.structure.rows * self.structure.cols))
+        return max(1, POINT_STEPS_PER_LAUNCH // (self.layout.rows * self.layout.cols))
 
     def _sizes(self, count: int, shape: int, extra: int, with_loss: bool = False) -> NDArray[np.int64]:
         """List the sizes of a launch, in the order that `kernel_adjoint` gives; extra: rows before moments."""
-        layout = self.structure
-        carry = extra + MOMENTS * layout.workers
+        layout = self.layout
+        carry = extra + MOMENT_ROWS * layout.workers
         return np.array([
             count, layout.workers, layout.rows, layout.strip, shape, extra, carry, self._carried_rows, LONG_PATIENCE,
             self._buffer if extra == ADJOINT_PARTS * layout.rows else 0, with_loss,
@@ -281,7 +281,7 @@ class MotionAdjoint(Dynamics):
 
     def _launch(self, which: int, sizes: NDArray[np.int64], *arguments: Any) -> None:
         """Launch the kernel that records, or the one that sweeps; if a worker gives up, one goes on alone."""
-        code, workers = self.structure.code, self.structure.workers
+        code, workers = self.layout.config, self.layout.workers
         progress = np.zeros(STRIDE * workers, np.int64)
         for parallel in (True, False) if workers > 1 else (False,):
             if (progress[::STRIDE] < sizes[0]).any():

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import MsmError, Pause
 from taichi_msm.gradients.chain_rule import LoadSlopes, Slopes
-from taichi_msm.model.loads import Schedule, decay, decay_slope, frame_loads
+from taichi_msm.model.loads import Schedule, decay, decay_gradient, evaluate_frame_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import spacing
-from taichi_msm.solver.rest import Rest
+from taichi_msm.solver.rest import QuasiStatics
 from taichi_msm.system.runtime import Device
 from taichi_msm.terms.elasticity import SpringFamily, spring_families
 from taichi_msm.terms.foundation import point_shares
@@ -42,7 +42,7 @@ class RestAdjoint:
 
     def __init__(self, plan: Plan, device: Device) -> None:
         self.plan = plan
-        self._sheet = Rest(plan, device)
+        self._sheet = QuasiStatics(plan, device)
         self._displacements = np.empty(0)
 
     def restart(self, plan: Plan) -> None:
@@ -82,7 +82,7 @@ class RestAdjoint:
             u: Array = self._displacements[n]
             if not slope[~plan.fixed].any():
                 continue
-            at_frame = frame_loads(plan, n)
+            at_frame = evaluate_frame_loads(plan, n)
             held = plan.material.virtual * at_frame.active[0] * point_shares(plan)
             p = _waited(partial(_solved, plan, _stiffness(plan, families, held, curvature, u), slope), pause)
             if p is None and u.any():
@@ -105,17 +105,19 @@ class RestAdjoint:
         for n, slot in enumerate(at_frame.slots):
             probe, at = scene.probes[slot.probe], at_frame.point[0, n]
             pushes[0, n, :3] = np.einsum("ij,ijc->c", decay(probe, scene.sheet, at), p)
-            pushes[0, n, 3:] = np.einsum("aij,ij->a", decay_slope(probe, scene.sheet, at), p @ at_frame.strength[0, n])
+            pushes[0, n, 3:] = np.einsum(
+                "aij,ij->a", decay_gradient(probe, scene.sheet, at), p @ at_frame.strength[0, n]
+            )
         time = frame / self.plan.grid.frames_per_second
         nearly = 1e-3 / self.plan.grid.frames_per_second
-        loads.add(lambda plan: frame_loads(plan, frame), pushes, (time - nearly, time + nearly))
+        loads.add(lambda plan: evaluate_frame_loads(plan, frame), pushes, (time - nearly, time + nearly))
 
 
 def _add_springs(slopes: Slopes, families: Sequence[SpringFamily], u: Array, p: Array) -> None:
     """Add the derivatives by the springs."""
     for number, family in enumerate(families):
-        between, length = family.apart(u)
-        change, apart = p[family.here] - p[family.there], u[family.there] - u[family.here]
+        between, length = family.edge_vectors(u)
+        change, apart = p[family.start] - p[family.end], u[family.end] - u[family.start]
         kind = min(number, 2)  # The two diagonals are one.
         slopes.springs[kind][...] += (1 - family.length / length) * (change * between).sum(axis=-1)
         slopes.tensions[kind] += (change * apart).sum()
@@ -132,7 +134,7 @@ def _stiffness(plan: Plan, families: Sequence[SpringFamily], held: Array, curvat
     )
     for family in families:
         blocks = family.tangent(u).reshape(-1, 3, 3)
-        p, q = (3 * number[end].reshape(-1, 1, 1) for end in (family.here, family.there))
+        p, q = (3 * number[end].reshape(-1, 1, 1) for end in (family.start, family.end))
         for row, column, sign in ((p, p, 1), (q, q, 1), (p, q, -1), (q, p, -1)):
             places = np.broadcast_arrays(row + axis[:, None], column + axis)
             entries = sign * blocks.ravel(), (places[0].ravel(), places[1].ravel())

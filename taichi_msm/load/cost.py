@@ -26,7 +26,7 @@ from taichi_msm.render import texture
 from taichi_msm.scene.camera import Camera
 from taichi_msm.scene.outputs import OUTPUTS
 from taichi_msm.scene.scene import Scene
-from taichi_msm.solver.planning import work
+from taichi_msm.solver.planning import count_work
 from taichi_msm.system.process import available_memory
 from taichi_msm.terms.contact import contact_fields
 
@@ -240,7 +240,7 @@ class Duration(NamedTuple):
 
 def estimate_duration(plan: Plan) -> Duration:
     """Estimate how long a run takes on a CPU, with every core; computing it takes milliseconds."""
-    parts = work(plan, choose_pilots(plan).cost)
+    parts = count_work(plan, choose_pilots(plan).cost)
     unit = UNIT * _calibrate() / CALIBRATION
     return Duration(unit * sum(parts), unit * parts.start)
 

@@ -10,7 +10,7 @@ from taichi_msm.errors import Count
 from taichi_msm.load.check import checked
 from taichi_msm.model.plan import Plan
 from taichi_msm.solver import planning
-from taichi_msm.solver.planning import with_chosen_grid
+from taichi_msm.solver.planning import freeze_grid
 from taichi_msm.system.runtime import Device
 
 
@@ -25,9 +25,9 @@ class Resolved(NamedTuple):
 def resolve(plan: Plan, device: Device, progress: Count = lambda done, total: None) -> Resolved:
     """Choose what a checked scene leaves open, by pilot runs where it has tolerances; SceneError: none meet them."""
     estimate = mesh = None
-    plan = planning.on(plan, device.arch)
+    plan = planning.choose_precision(plan, device.arch)
     if plan.scene.sheet.tolerance is not None:
         plan, mesh = choose_points(plan, device, checked, progress)
     if plan.scene.time.tolerance is not None:
         plan, estimate = choose_step(plan, device, progress)
-    return Resolved(with_chosen_grid(plan), estimate, mesh)
+    return Resolved(freeze_grid(plan), estimate, mesh)

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.model.plan import EDGE, Plan, ProbeSegment, ProbeSlot, probe_slots
+from taichi_msm.model.plan import HAT_TOLERANCE, Plan, ProbeSegment, ProbeSlot, probe_slots
 from taichi_msm.model.sheet import area_shares, axes
 from taichi_msm.model.tool_force import control_points, point_at, probe_force
 from taichi_msm.scene.scene import Scene
@@ -52,7 +52,7 @@ def decay(probe: Probe, sheet: Sheet, at: Array | None = None) -> Array:
     return shares * area_shares(sheet) if acts.by_area else shares
 
 
-def decay_slope(probe: Probe, sheet: Sheet, at: Array | None = None) -> Array:
+def decay_gradient(probe: Probe, sheet: Sheet, at: Array | None = None) -> Array:
     """Differentiate `decay` by x and y of the control point [1/m], shape (2, rows, cols); at its tip, 0."""
     acts, (at_x, at_y) = probe_force(probe, sheet), control_points(probe, sheet)[1][0] if at is None else at
     x, y = axes(sheet)
@@ -62,7 +62,7 @@ def decay_slope(probe: Probe, sheet: Sheet, at: Array | None = None) -> Array:
     return decay(probe, sheet, at) * acts.falloff * outside * off / np.where(outside, distance, 1)
 
 
-def schedule(plan: Plan, first: int, count: int) -> Schedule:
+def average_loads(plan: Plan, first: int, count: int) -> Schedule:
     """Average the loads over the steps first, ..., first + count - 1 of a plan."""
     scene, parts = plan.scene, plan.slots
     t, h = np.arange(first, first + count) / plan.grid.steps_per_second, plan.grid.step
@@ -74,7 +74,7 @@ def schedule(plan: Plan, first: int, count: int) -> Schedule:
         if turns == 1:
             shares, places = line.averages(t, h)[:, None], np.zeros((count, 1), np.intp)
         else:
-            shares, places = _by_turns(line, jumps, turns, t, h)
+            shares, places = _distribute_over_slots(line, jumps, turns, t, h)
         strength[:, own] = np.multiply.outer(shares / 100, probe_force(probe, scene.sheet).force)
         for n, place in zip(own, places.T, strict=True):
             for number in np.unique(place):
@@ -83,7 +83,7 @@ def schedule(plan: Plan, first: int, count: int) -> Schedule:
     return Schedule(parts, strength, point, _activity(plan).averages(t, h))
 
 
-def loads_at(plan: Plan, t: Array) -> Schedule:
+def evaluate_loads(plan: Plan, t: Array) -> Schedule:
     """Evaluate the loads themselves, not their averages, with one slot a probe, at times that are no keys [s]."""
     scene = plan.scene
     parts = plan.slots if scene.time.at_rest else probe_slots(scene.probes, scene.sheet, 0.0)
@@ -118,30 +118,30 @@ class FrameLoad:
         return float(self._line.values(np.array([time]))[0]), point_at(self._times, self._points, time)
 
 
-def frame_loads(plan: Plan, frame: int) -> Schedule:
+def evaluate_frame_loads(plan: Plan, frame: int) -> Schedule:
     """Evaluate the loads at a frame; at a jump the later value counts, and a key within WHOLE of a frame is at it.
 
     Foundations that are `loaded` act where the percent of any probe is not 0, and from a path's first key to its last.
     """
     scene, rate = plan.scene, plan.grid.frames_per_second
     time = frame / rate
-    near = [key for key in _every_key(scene) if abs(key - time) <= WHOLE / rate]
+    near = [key for key in _all_key_times(scene) if abs(key - time) <= WHOLE / rate]
     t = np.array([max(near, default=time)])
-    loads = loads_at(plan, t)
+    loads = evaluate_loads(plan, t)
     pressed = any(
         _load(probe).values(t)[0] != 0 if probe.path is None else probe.path[0][0] <= t[0] <= probe.path[-1][0]
         for probe in scene.probes
     )
-    return loads._replace(active=np.array([float(plan.material.always or pressed)]))
+    return loads._replace(active=np.array([float(plan.material.always_active or pressed)]))
 
 
-def key_times(scene: Scene) -> Array:
+def keyframe_times(scene: Scene) -> Array:
     """List the times of all keys between 0 and the end [s]: only there the loads are not smooth."""
-    times = _every_key(scene)
+    times = _all_key_times(scene)
     return times[(times > 0) & (times < scene.time.duration)]
 
 
-def _every_key(scene: Scene) -> Array:
+def _all_key_times(scene: Scene) -> Array:
     """List the times of all keys [s]."""
     keys: list[Any] = [[]]
     for probe in scene.probes:
@@ -152,7 +152,7 @@ def _every_key(scene: Scene) -> Array:
     return np.unique(np.concatenate(keys))
 
 
-class Envelope:
+class LoadBounds:
     """Bounds of the loads from one time to another."""
 
     def __init__(self, plan: Plan) -> None:
@@ -177,7 +177,7 @@ class Envelope:
         return np.array(most), self._activity.largest(begin, end) > 0, int(begun)
 
 
-class _Line:
+class _PiecewiseLinear:
     """A piecewise linear function of time [s] that jumps where two keys have one time; 0 before the first key.
 
     After the last key it is constant.
@@ -208,7 +208,8 @@ class _Line:
         bounds = np.union1d(self.times, edges)
         # At t = 0 there is only half a hat, so that even the average of a line is not its value at t.
         uneven = (t <= 0) | (
-            bounds.searchsorted(t + h * (1 - EDGE), "left") > bounds.searchsorted(t - h * (1 - EDGE), "right")
+            bounds.searchsorted(t + h * (1 - HAT_TOLERANCE), "left")
+            > bounds.searchsorted(t - h * (1 - HAT_TOLERANCE), "right")
         )
         for n in np.flatnonzero(uneven):
             averages[n] = self._average(float(t[n]), h, begin, end)
@@ -244,11 +245,13 @@ class _Line:
         return 2 * total if t <= 0 else total
 
 
-def _by_turns(line: _Line, jumps: Array, turns: int, t: Array, h: float) -> tuple[Array, NDArray[np.intp]]:
+def _distribute_over_slots(
+    line: _PiecewiseLinear, jumps: Array, turns: int, t: Array, h: float
+) -> tuple[Array, NDArray[np.intp]]:
     """Share the load of a probe that jumps out among its slots: percent and index of the segment, (steps, slots)."""
     bounds = np.concatenate([[-math.inf], jumps, [math.inf]])
-    first = jumps.searchsorted(t - h * (1 - EDGE), "right")
-    last = jumps.searchsorted(t + h * (1 - EDGE), "left")
+    first = jumps.searchsorted(t - h * (1 - HAT_TOLERANCE), "right")
+    last = jumps.searchsorted(t + h * (1 - HAT_TOLERANCE), "left")
     shares, places = np.zeros((len(t), turns)), np.empty((len(t), turns), np.intp)
     for turn in range(turns):
         place = first + (turn - first) % turns
@@ -265,9 +268,9 @@ def _held(segment: ProbeSegment, t: Array) -> Array:
     return np.stack([np.interp(t, segment.times, segment.points[:, axis]) for axis in range(2)], axis=-1)
 
 
-def _load(probe: Probe) -> _Line:
+def _load(probe: Probe) -> _PiecewiseLinear:
     """Give the percent of a probe's force as a function of time."""
-    return _Line(*np.array(probe.load, dtype=float).T)
+    return _PiecewiseLinear(*np.array(probe.load, dtype=float).T)
 
 
 def _presses(probe: Probe) -> Sequence[tuple[float, float]]:
@@ -278,22 +281,22 @@ def _presses(probe: Probe) -> Sequence[tuple[float, float]]:
     return (begin, 1.0), (end, 1.0), (end, 0.0)
 
 
-def _activity(plan: Plan) -> _Line:
+def _activity(plan: Plan) -> _PiecewiseLinear:
     """Tell when the virtual springs act: 1 always or while any probe presses, else 0."""
     scene = plan.scene
-    if plan.material.always:
-        return _Line(np.array([LONG_AGO]), np.array([1.0]))
+    if plan.material.always_active:
+        return _PiecewiseLinear(np.array([LONG_AGO]), np.array([1.0]))
     presses = [_presses(probe) for probe in scene.probes]
     times = np.unique([time for keys in presses for time, _ in keys])
     if not times.size:
-        return _Line(np.zeros(1), np.zeros(1))
+        return _PiecewiseLinear(np.zeros(1), np.zeros(1))
     # A time between each two keys, and one after the last.
     middles = np.append((times[:-1] + times[1:]) / 2, times[-1] + 1)
     active = np.zeros(len(times))
     for keys in presses:
-        line = _Line(*np.array(keys, dtype=float).T)
+        line = _PiecewiseLinear(*np.array(keys, dtype=float).T)
         after = line.times.searchsorted(middles, "right")
         following = np.minimum(after, len(line.times) - 1)
         pressed = (line.after[after - 1] != 0) | ((line.before[following] != 0) & (after < len(line.times)))
         active[(after > 0) & pressed] = 1.0
-    return _Line(np.repeat(times, 2)[1:], np.repeat(active, 2)[:-1])
+    return _PiecewiseLinear(np.repeat(times, 2)[1:], np.repeat(active, 2)[:-1])

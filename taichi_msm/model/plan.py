@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from taichi_msm.model.sheet import Maps, Material, has_fixed_border
 from taichi_msm.model.time_grid import TimeGrid
 from taichi_msm.model.tool_force import control_points
-from taichi_msm.model.tools import Tool, tools_of
+from taichi_msm.model.tools import Tool, build_tools
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Probe
 
 # A key closer than this to an end of the hat, as a fraction of its half-width, counts as outside: it would contribute
 # less than rounding does.
-EDGE = 1e-9
+HAT_TOLERANCE = 1e-9
 
 Array = NDArray[np.float64]
 
@@ -71,13 +71,13 @@ def probe_slots(probes: Sequence[Probe], sheet: Sheet, h: float) -> tuple[ProbeS
         segments = tuple(ProbeSegment(*part) for part in parts)
         # One more than the largest number of jumps in any hat.
         jumped = times[jumps]
-        within = np.searchsorted(jumped, jumped + 2 * h * (1 - EDGE), "left") - np.arange(len(jumped))
+        within = np.searchsorted(jumped, jumped + 2 * h * (1 - HAT_TOLERANCE), "left") - np.arange(len(jumped))
         turns = 1 + int(within.max(initial=0))
         slots += [ProbeSlot(index, segments, turn, turns) for turn in range(turns)]
     return tuple(slots)
 
 
-def slots_of(scene: Scene, grid: TimeGrid) -> tuple[ProbeSlot, ...]:
+def build_slots(scene: Scene, grid: TimeGrid) -> tuple[ProbeSlot, ...]:
     """List the slots of a scene's probes; at rest loads are not averaged."""
     return probe_slots(scene.probes, scene.sheet, 0.0 if scene.time.at_rest else grid.step)
 
@@ -106,10 +106,10 @@ class Plan:
         grid = replace(self.grid, **changes)
         if grid.step == self.grid.step:
             return replace(self, grid=grid)
-        return replace(self, grid=grid, slots=slots_of(self.scene, grid))
+        return replace(self, grid=grid, slots=build_slots(self.scene, grid))
 
     def with_probes(self, probes: Sequence[Probe | Mapping[str, Any]]) -> Plan:
         """Replace the probes; SceneError: one of them is not a probe."""
         scene = self.scene.model_copy(update={"probes": tuple(probes)})
-        tools = tools_of(scene.probes, scene.sheet)
-        return replace(self, scene=scene, slots=slots_of(scene, self.grid), tools=tools)
+        tools = build_tools(scene.probes, scene.sheet)
+        return replace(self, scene=scene, slots=build_slots(scene, self.grid), tools=tools)

@@ -62,10 +62,8 @@ def fixed_points(sheet: Sheet) -> NDArray[np.bool_]:
     return fixed
 
 
-pass  # REMOVED
-
 # Cells longer than this many times their width would need springs of negative stiffness.
-LONGEST_CELL = math.sqrt(3)
+MAX_CELL_ASPECT = math.sqrt(3)
 
 Array = NDArray[np.float64]
 
@@ -93,7 +91,7 @@ class Material:
     shear: float
     tension: float  # e; a spring pulls at rest with this share of its stiffness times its length
     virtual: float  # stiffness K of the virtual springs [N/m]; 0 if they never act
-    always: bool  # whether the virtual springs always act; else only under a load
+    always_active: bool  # whether the virtual springs always act; else only under a load
     bending: float  # D dx dy [N m3]
     by_area: bool  # whether points and springs at an edge get less than others, as in tissue
     factors: Array | None  # of the stiffness of every cell, shape (rows - 1, cols - 1); None without a map
@@ -158,7 +156,7 @@ def area_shares(sheet: Sheet) -> Array:
     return np.outer(rows, cols)
 
 
-def cell_ratio(sheet: Sheet) -> float:
+def cell_aspect_ratio(sheet: Sheet) -> float:
     """Give the ratio of the longer to the shorter side of a cell."""
     dx, dy = spacing(sheet)
     return max(dx, dy) / min(dx, dy)
@@ -169,7 +167,7 @@ def has_fixed_border(fixed: NDArray[np.bool_]) -> bool:
     return bool(fixed[[0, -1]].all() and fixed[:, [0, -1]].all())
 
 
-def kind_problems(scene: Scene) -> Iterator[Problem]:
+def material_key_problems(scene: Scene) -> Iterator[Problem]:
     """Find missing and superfluous keys of springs and of tissue."""
     sheet = scene.sheet
     if scene.tissue is None:
@@ -197,20 +195,23 @@ def kind_problems(scene: Scene) -> Iterator[Problem]:
 
 
 def tissue_problems(scene: Scene, fixed: NDArray[np.bool_], factors: Array | None) -> Iterator[Problem]:
-    """Find tissue that is impossible, where `kind_problems` finds nothing; factors None: not known, or no map."""
+    """Find tissue that is impossible."""
     tissue, sheet = scene.tissue, scene.sheet
     if tissue is None:
         return
-    longest = cell_ratio(sheet)
-    if longest > LONGEST_CELL * (1 + 1e-9):
+    longest = cell_aspect_ratio(sheet)
+    if longest > MAX_CELL_ASPECT * (1 + 1e-9):
         (dx, dy), (rows, cols), (height, width) = spacing(sheet), sheet.points, sheet.size
-        enough = (rows, math.ceil(width / dy / LONGEST_CELL) + 1), (math.ceil(height / dx / LONGEST_CELL) + 1, cols)
+        enough = (
+            (rows, math.ceil(width / dy / MAX_CELL_ASPECT) + 1),
+            (math.ceil(height / dx / MAX_CELL_ASPECT) + 1, cols),
+        )
         more = enough[0] if dx > dy else enough[1]
         remedy = f"try {list(more)}" if max(more) <= MAX_POINTS else "take another sheet.size"
         yield Problem(
             ("sheet", "points"),
             f"{list(sheet.points)} make cells {longest:.3g} times as long as wide, and tissue allows "
-            f"{LONGEST_CELL:.3g} times; {remedy}",
+            f"{MAX_CELL_ASPECT:.3g} times; {remedy}",
         )
     if tissue.foundation_map is not None and tissue.foundation_stiffness == 0:
         said = "needs a foundation; set tissue.foundation, such as {young: 15e3, depth: 0.05}, or remove foundation_map"

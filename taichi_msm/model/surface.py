@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.model.sheet import axes
 from taichi_msm.model.tool_force import control_point
-from taichi_msm.model.tools import tools_of, unit
+from taichi_msm.model.tools import build_tools, unit_vector
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Instrument
@@ -30,7 +30,7 @@ def to_positions(displacement: NDArray[Any], sheet: Sheet) -> NDArray[Any]:
     return position
 
 
-def touched(position: NDArray[np.floating], refine: int, sheet: Sheet, rest: Array) -> tuple[Array, Array]:
+def surface_point(position: NDArray[np.floating], refine: int, sheet: Sheet, rest: Array) -> tuple[Array, Array]:
     """Find the point of the refined surface whose rest position, x and y [m], is `rest`.
 
     A point outside the sheet moves with the nearest point of its edge. The mass points are at `position` [m], shape
@@ -47,11 +47,11 @@ def touched(position: NDArray[np.floating], refine: int, sheet: Sheet, rest: Arr
     return point + beside, normal / max(float(np.linalg.norm(normal)), 1e-300)
 
 
-def on_surface(position: NDArray[np.floating], refine: int, coordinates: NDArray[np.floating]) -> Array:
+def surface_positions(position: NDArray[np.floating], refine: int, coordinates: NDArray[np.floating]) -> Array:
     """Place material points on the refined surface [m], shape (n, 3).
 
     `coordinates` are fractions of the sheet's width from its left and of its height from its top, shape (n, 2);
-    `position` and `refine` as for `touched`.
+    `position` and `refine` as for `surface_point`.
     """
     return _on_cells(position, refine, coordinates.astype(np.float64))[0]
 
@@ -60,7 +60,7 @@ def surface_weights(coordinates: Array, sheet: Sheet, refine: int) -> tuple[NDAr
     """Give the four mass points around each point of the surface that is drawn, and their weights, shapes (N, 4).
 
     coordinates: across and down, shape (N, 2). The points are numbered row after row; the same place on the surface as
-    that of `on_surface`.
+    that of `surface_positions`.
     """
     cols = sheet.points[1]
     i, j, s, t, twist = _in_cells(coordinates, sheet.points, refine)
@@ -93,9 +93,6 @@ def _in_cells(coordinates: Array, points: tuple[int, int], refine: int) -> tuple
     return i, j, s, t, s0 * t0 + s1 * t0 + s0 * t1 + np.minimum(s1, t1) / parts
 
 
-pass  # REMOVED
-
-
 class Surface(NamedTuple):
     """Textured triangles.
 
@@ -111,7 +108,7 @@ class Surface(NamedTuple):
     texture_coordinates: NDArray[np.float64]
 
 
-class Rod(NamedTuple):
+class Capsule(NamedTuple):
     """The shape and place of an instrument at one time: a rod with rounded ends."""
 
     tip: Array  # middle of its rounded tip [m], shape (3,)
@@ -120,7 +117,7 @@ class Rod(NamedTuple):
     radius: float  # of the rod and its ends [m]
 
 
-def surface(position: NDArray[np.floating], refine: int) -> Surface:
+def refine_surface(position: NDArray[np.floating], refine: int) -> Surface:
     """Refine the sheet bilinearly (section 2 of the paper); every small quad is cut from top left to bottom right.
 
     The mass points are at `position` [m], shape (rows, cols, 3); `refine` vertices are inserted between neighbours.
@@ -140,25 +137,25 @@ def surface(position: NDArray[np.floating], refine: int) -> Surface:
     )
 
 
-def rods(scene: Scene, position: NDArray[np.floating], time: float) -> list[Rod]:
+def place_capsules(scene: Scene, position: NDArray[np.floating], time: float) -> list[Capsule]:
     """Place the instruments of a scene at a time [s]; the mass points are at `position` [m], shape (rows, cols, 3)."""
-    moved = {tool.probe: tool for tool in tools_of(scene.probes, scene.sheet)}
+    moved = {tool.probe: tool for tool in build_tools(scene.probes, scene.sheet)}
     placed = []
     for index, probe in enumerate(scene.probes):
         if index in moved:
             tool = moved[index]
-            placed.append(Rod(tool.middle(np.array([time]))[0], tool.axis, tool.length, tool.radius))
+            placed.append(Capsule(tool.tip_centre(np.array([time]))[0], tool.axis, tool.length, tool.radius))
         elif probe.instrument is not None:
-            placed.append(rod(probe.instrument, scene, position, control_point(probe, scene.sheet, time)))
+            placed.append(place_capsule(probe.instrument, scene, position, control_point(probe, scene.sheet, time)))
     return placed
 
 
-def rod(instrument: Instrument, scene: Scene, position: NDArray[np.floating], rest: Array) -> Rod:
+def place_capsule(instrument: Instrument, scene: Scene, position: NDArray[np.floating], rest: Array) -> Capsule:
     """Place an instrument; `rest` is the rest position of the point that it touches, x and y [m], shape (2,)."""
-    axis = unit(instrument.shaft)
-    point, normal = touched(position, scene.render.refine, scene.sheet, rest)
+    axis = unit_vector(instrument.shaft)
+    point, normal = surface_point(position, scene.render.refine, scene.sheet, rest)
     outward = normal if normal @ axis >= 0 else -normal
-    return Rod(point + instrument.radius * outward, axis, instrument.length, instrument.radius)
+    return Capsule(point + instrument.radius * outward, axis, instrument.length, instrument.radius)
 
 
 def _between(values: NDArray[np.floating], refine: int, axis: int) -> NDArray[np.floating]:

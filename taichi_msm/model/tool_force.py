@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 BLOCK = 1 << 20
 
 # A note is made if the force on the sheet is below this share of a tool's total, or above its inverse.
-LEAST_REACHING = 0.8
+MIN_FORCE_RATIO = 0.8
 
 
 class ProbeForce(NamedTuple):
@@ -64,7 +64,7 @@ def probe_force(probe: Probe, sheet: Sheet) -> ProbeForce:
         assert probe.force is not None
         return ProbeForce(probe.force, probe.falloff, probe.offset - flat, probe.offset, by_area=False)
     dx, dy = spacing(sheet)
-    share = dx * dy / spread(probe)
+    share = dx * dy / decay_integral(probe)
     x, y, z = probe.total
     return ProbeForce((x * share, y * share, z * share), probe.falloff, 0.0 - flat, 0.0, by_area=True)
 
@@ -93,14 +93,14 @@ def point_at(times: Array, points: Array, time: float) -> Array:
     return points[after - 1] + share * (points[after] - points[after - 1])
 
 
-def spread(probe: Probe) -> float:
+def decay_integral(probe: Probe) -> float:
     """Integrate the decay of a probe with `total` over an infinite sheet: W [m2]."""
     reach = 1 / probe.falloff
     # Products instead of powers: these raise OverflowError where a product is infinite.
     return math.pi * (probe.radius * probe.radius + 2 * (probe.radius * reach + reach * reach))
 
 
-def sums(probe: Probe, sheet: Sheet, finer: int = 1) -> tuple[float, float]:
+def sum_probe_forces(probe: Probe, sheet: Sheet, finer: int = 1) -> tuple[float, float]:
     """Sum the forces of a probe at 100 % and at its first place on the points of a sheet.
 
     finer: how many times shorter the cells are.
@@ -145,14 +145,14 @@ def probe_records(scene: Scene) -> list[ProbeRecord]:
         if probe.moved:
             records.append(ProbeRecord())
             continue
-        flat, (total, pressure) = 0.0, sums(probe, scene.sheet)
+        flat, (total, pressure) = 0.0, sum_probe_forces(probe, scene.sheet)
         if probe.total is not None:
-            flat = math.hypot(*probe.total) * math.pi * probe.radius * probe.radius / spread(probe)
+            flat = math.hypot(*probe.total) * math.pi * probe.radius * probe.radius / decay_integral(probe)
         records.append(ProbeRecord(total_force=total, flat_end_force=flat, largest_pressure=pressure))
     return records
 
 
-def in_words(record: ProbeRecord) -> str:
+def describe_forces(record: ProbeRecord) -> str:
     """Describe the forces of a probe in a line; empty if nothing is known of them."""
     if "total_force" not in record:
         known = "greatest_force" in record
@@ -161,7 +161,7 @@ def in_words(record: ProbeRecord) -> str:
     return f"{record['total_force']:.3g} N in all{flat}, at most {record['largest_pressure'] / 1000:.3g} kPa"
 
 
-def force_notes(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str]:
+def force_warnings(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str]:
     """Note the probes of a checked scene whose forces do not add up to their total on this sheet."""
     across, down = spacing(scene.sheet)
     cell = f"a cell of {across:.3g} x {down:.3g} m"
@@ -169,10 +169,10 @@ def force_notes(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str]:
         if probe.moved:
             continue
         asked, reaching = math.hypot(*probe.total) if probe.total is not None else 0.0, record["total_force"]
-        if asked > 0 and reaching <= LEAST_REACHING * asked:
+        if asked > 0 and reaching <= MIN_FORCE_RATIO * asked:
             yield (
                 f"probes.{index}: {reaching:.3g} N of its {asked:.3g} N reach the sheet; is the tool beside the sheet, "
                 f"wider than the sheet, or narrower than {cell}?"
             )
-        elif asked > 0 and reaching * LEAST_REACHING >= asked:
+        elif asked > 0 and reaching * MIN_FORCE_RATIO >= asked:
             yield f"probes.{index}: {reaching:.3g} N instead of its {asked:.3g} N, as the tool is narrower than {cell}"

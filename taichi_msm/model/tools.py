@@ -24,17 +24,17 @@ from taichi_msm.scene.tools import Probe
 
 # A tool may move by this share of its radius in a step, and be this much larger than the distance between points
 # before a note is made.
-LARGEST_STRIDE = WIDEST_CELL = 0.5
-TOO_FEW = "which touches few of them"
+MAX_STRIDE_RADII = MAX_SPACING_RADII = 0.5
+COARSE_TIP_PHRASE = "which touches few of them"
 
 # Advice is at most this many times as many points.
-MOST_FINER = 4
+MAX_REFINEMENT = 4
 
 # At how many moments it is looked whether two tools are in one place.
 MOMENTS = 1024
 
 # A tip holds the points within this many times its radius of its middle.
-GRASP = 1.5
+GRIP_RADII = 1.5
 
 Array = NDArray[np.float64]
 
@@ -45,7 +45,7 @@ class Tool:
 
     probe: int  # index of the probe in the scene
     times: Array  # of the keys [s], shape (n,)
-    middles: Array  # of the round tip at those times, c [m], shape (n, 3)
+    tip_centres: Array  # of the round tip at those times, c [m], shape (n, 3)
     heights: Array  # of the lowest point of the round tip [m], shape (n,)
     axis: Array  # a, shape (3,)
     length: float  # of the middle line [m]
@@ -54,11 +54,11 @@ class Tool:
     grips: tuple[tuple[float, float], ...]  # from, to [s]
 
     @property
-    def way(self) -> float:
+    def path_length(self) -> float:
         """How far the tool goes in all [m]."""
-        return float(np.linalg.norm(np.diff(self.middles, axis=0), axis=1).sum())
+        return float(np.linalg.norm(np.diff(self.tip_centres, axis=0), axis=1).sum())
 
-    def stride(self, step: float, first: int = 0) -> tuple[float, int]:
+    def max_stride(self, step: float, first: int = 0) -> tuple[float, int]:
         """Give how far the tool comes at most in a step from 0 s on [m], and the key that it goes to then.
 
         Between the times where a key enters or leaves the step, how far it comes is a convex function.
@@ -66,37 +66,37 @@ class Tool:
         first: the key from which on its way counts.
         """
         begin = np.maximum([0.0, *self.times, *(self.times - step)], max(0.0, self.times[first] if first else 0.0))
-        far = np.linalg.norm(self.middle(begin + step) - self.middle(begin), axis=1)
+        far = np.linalg.norm(self.tip_centre(begin + step) - self.tip_centre(begin), axis=1)
         most = int(far.argmax())
         return float(far[most]), min(int(self.times.searchsorted(begin[most], "right")), len(self.times) - 1)
 
-    def middle(self, t: Array) -> Array:
+    def tip_centre(self, t: Array) -> Array:
         """Give the middle of the tip at times [s], linear between the keys and held outside, shape (times, 3)."""
-        return np.stack([np.interp(t, self.times, self.middles[:, axis]) for axis in range(3)], axis=-1)
+        return np.stack([np.interp(t, self.times, self.tip_centres[:, axis]) for axis in range(3)], axis=-1)
 
-    def lowest(self, t: float) -> tuple[float, float, float]:
+    def lowest_point(self, t: float) -> tuple[float, float, float]:
         """Give the lowest point of the round tip at a time [s]; x, y and z [m]."""
-        x, y, z = (float(np.interp(t, self.times, each)) for each in (*self.middles.T[:2], self.heights))
+        x, y, z = (float(np.interp(t, self.times, each)) for each in (*self.tip_centres.T[:2], self.heights))
         return x, y, z
 
     def touches(self, places: Array, t: float) -> bool:
         """Tell whether any of these places [m], shape (n, 3), is in or, but for rounding, on the rod at a time [s]."""
-        r = places - self.middle(np.array([t]))[0]
+        r = places - self.tip_centre(np.array([t]))[0]
         s = np.clip(r @ self.axis, 0, self.length)
         return bool((np.linalg.norm(r - s[:, None] * self.axis, axis=1) < self.radius * (1 + 1e-6)).any())
 
-    def strides(self, begin: float, end: float) -> Array:
+    def substep_times(self, begin: float, end: float) -> Array:
         """Cut the way from one time to another into parts of at most LARGEST_STRIDE radii; the ends of these [s]."""
-        parts, most = 1, LARGEST_STRIDE * self.radius * (1 + 1e-9)
+        parts, most = 1, MAX_STRIDE_RADII * self.radius * (1 + 1e-9)
         while True:
             times = np.linspace(begin, end, parts + 1)
-            longest = float(np.linalg.norm(np.diff(self.middle(times), axis=0), axis=1).max())
+            longest = float(np.linalg.norm(np.diff(self.tip_centre(times), axis=0), axis=1).max())
             if longest <= most:
                 return times[1:]
             parts = max(parts + 1, int(parts * longest / most))
 
 
-def tools_of(probes: Sequence[Probe], sheet: Sheet) -> tuple[Tool, ...]:
+def build_tools(probes: Sequence[Probe], sheet: Sheet) -> tuple[Tool, ...]:
     """List the probes that have a path."""
     height, width = sheet.size
     tools = []
@@ -105,13 +105,13 @@ def tools_of(probes: Sequence[Probe], sheet: Sheet) -> tuple[Tool, ...]:
             continue
         assert probe.instrument is not None
         rod, (time, across, down, lowest) = probe.instrument, np.array(probe.path, dtype=float).T
-        middles = np.stack([(across - 0.5) * width, (0.5 - down) * height, lowest + rod.radius], axis=1)
-        shape = unit(rod.shaft), rod.length, rod.radius
-        tools.append(Tool(index, time, middles, lowest, *shape, probe.friction, probe.grip))
+        tip_centres = np.stack([(across - 0.5) * width, (0.5 - down) * height, lowest + rod.radius], axis=1)
+        shape = unit_vector(rod.shaft), rod.length, rod.radius
+        tools.append(Tool(index, time, tip_centres, lowest, *shape, probe.friction, probe.grip))
     return tuple(tools)
 
 
-def unit(shaft: Sequence[float]) -> Array:
+def unit_vector(shaft: Sequence[float]) -> Array:
     """Give a direction the length 1; the largest number is divided by first, so that no square overflows."""
     axis = np.array(shaft) / max(map(abs, shaft))
     return np.asarray(axis / np.linalg.norm(axis))
@@ -142,20 +142,20 @@ def path_problems(scene: Scene, tools: Sequence[Tool], grid: TimeGrid) -> Iterat
 
 def too_fast(tool: Tool, grid: TimeGrid, first: int = 0) -> tuple[int, str] | None:
     """Find the key after the `first` to which a tool moves too far in a step, and say so; None: there is none."""
-    stride, key = tool.stride(grid.step, first)
-    if stride <= LARGEST_STRIDE * tool.radius * (1 + 1e-9):
+    stride, key = tool.max_stride(grid.step, first)
+    if stride <= MAX_STRIDE_RADII * tool.radius * (1 + 1e-9):
         return None
     return key, (
         f"moves {stride:.3g} m in a step of {grid.step:.3g} s, over half the radius of its "
-        f"instrument; move at most {LARGEST_STRIDE * tool.radius / grid.step:.3g} m/s, or take a smaller step"
+        f"instrument; move at most {MAX_STRIDE_RADII * tool.radius / grid.step:.3g} m/s, or take a smaller step"
     )
 
 
-def fewest_steps(tools: Sequence[Tool], grid: TimeGrid, least: int) -> int:
+def min_steps_per_frame(tools: Sequence[Tool], grid: TimeGrid, least: int) -> int:
     """Count the fewest steps of a frame, `least` or more, in which no tool moves too far."""
 
     def times_too_far(tool: Tool) -> float:
-        return tool.stride(1 / grid.frames_per_second / least)[0] / (LARGEST_STRIDE * tool.radius)
+        return tool.max_stride(1 / grid.frames_per_second / least)[0] / (MAX_STRIDE_RADII * tool.radius)
 
     # In a step of 1 / n it moves at least 1 / n as far.
     while (most := max(map(times_too_far, tools), default=0.0)) > 1 + 1e-9:
@@ -163,7 +163,7 @@ def fewest_steps(tools: Sequence[Tool], grid: TimeGrid, least: int) -> int:
     return least
 
 
-def path_notes(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:
+def path_warnings(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:
     """Note the tools that are too thin for the points, and two that are in one place."""
     apart, side, end = max(spacing(scene.sheet)), max(scene.sheet.size), scene.time.duration
     for tool in tools:
@@ -176,14 +176,14 @@ def path_notes(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:
                 yield f"probes.{tool.probe}.grip begins at {begin:g} s, not before the end of the scene at {end:g} s"
             elif scene.time.at_rest and not grip_frames((begin, until), scene.time.frames_per_second):
                 yield f"probes.{tool.probe}.grip from {begin:g} to {until:g} s holds nothing: no frame is between them"
-        if apart > WIDEST_CELL * tool.radius:
-            (height, width), most = scene.sheet.size, WIDEST_CELL * tool.radius
+        if apart > MAX_SPACING_RADII * tool.radius:
+            (height, width), most = scene.sheet.size, MAX_SPACING_RADII * tool.radius
             points = [int(np.ceil(side / most)) + 1 for side in (height, width)]
-            few = math.prod(points) <= MOST_FINER * math.prod(scene.sheet.points)
+            few = math.prod(points) <= MAX_REFINEMENT * math.prod(scene.sheet.points)
             remedy = f"try sheet.points: {points}" if few else "take a wider tip"
             yield (
                 f"probes.{tool.probe}: the points are {apart:.3g} m apart, more than half the radius of the "
-                f"instrument, {tool.radius:.3g} m, {TOO_FEW}; {remedy}"
+                f"instrument, {tool.radius:.3g} m, {COARSE_TIP_PHRASE}; {remedy}"
             )
 
     if (where := overlap(tools, scene.time.duration)) is not None:
@@ -198,7 +198,7 @@ def overlap(tools: Sequence[Tool], duration: float) -> tuple[int, int, float] | 
     """Find two tools that run through each other: the indices of their probes, and when first [s]."""
     times = np.linspace(0, duration, MOMENTS + 1)
     for one, other in combinations(tools, 2):
-        apart = _apart(one, other, one.middle(times) - other.middle(times))
+        apart = _apart(one, other, one.tip_centre(times) - other.tip_centre(times))
         within = np.flatnonzero(apart < (1 - 1e-9) * (one.radius + other.radius))
         if within.size:
             return one.probe, other.probe, float(times[within[0]])
@@ -228,7 +228,7 @@ def _apart(one: Tool, other: Tool, between: Array) -> Array:
 
 def _distance(tool: Tool, sheet: Sheet) -> float:
     """Give the distance of the middle line at 0 s from the sheet at rest [m]."""
-    start, half = tool.middle(np.zeros(1))[0], np.array([sheet.size[1] / 2, sheet.size[0] / 2, 0.0])
+    start, half = tool.tip_centre(np.zeros(1))[0], np.array([sheet.size[1] / 2, sheet.size[0] / 2, 0.0])
 
     def distance(s: float) -> float:
         place = start + s * tool.axis

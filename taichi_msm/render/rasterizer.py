@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.model.surface import Rod
+from taichi_msm.model.surface import Capsule
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.camera import View, view, view_at
 from taichi_msm.render.config import DrawingConfig
@@ -75,13 +75,15 @@ class Drawing:
         form = Threads if self.config.lanes == 1 else Bands
         self._form: Bands | Threads = form(self.config, scene.sheet.points, scene.render.size, texels)
 
-    def draw(self, position: NDArray[Any], camera: View | None = None, rods: Sequence[Rod] = ()) -> NDArray[np.uint8]:
+    def draw(
+        self, position: NDArray[Any], camera: View | None = None, rods: Sequence[Capsule] = ()
+    ) -> NDArray[np.uint8]:
         """Draw the picture alone, shape (height, width, 3); arguments as for `look`."""
         picture = self.look(position, camera, rods).picture
         assert picture is not None
         return picture
 
-    def look(self, position: NDArray[Any], camera: View | None = None, rods: Sequence[Rod] = ()) -> Observed:
+    def look(self, position: NDArray[Any], camera: View | None = None, rods: Sequence[Capsule] = ()) -> Observed:
         """Draw the picture, the labels or both, as the config says, of points [m] at `position`, shape (rows, cols, 3).
 
         The scene's own camera is taken if none is given.
@@ -104,7 +106,7 @@ class Drawing:
             self._optics = camera.optics
             self._form.place(sample_places(camera, self.config.supersample, steps=self.config.place_steps))
 
-    def _numbers(self, camera: View, rods: Sequence[Rod]) -> NDArray[np.float32]:
+    def _numbers(self, camera: View, rods: Sequence[Capsule]) -> NDArray[np.float32]:
         """Give the numbers of a view; without instruments they are computed again only when the camera changes."""
         if rods or self._known is None or self._known[0] is not camera:
             render, size = self.scene.render, self.scene.sheet.size

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError, are_numbers, as_array, did_you_mean
-from taichi_msm.model.surface import Rod
+from taichi_msm.model.surface import Capsule
 from taichi_msm.render.camera import View, moves, view, view_at
 from taichi_msm.render.labels import Flow, Labels, Observed, Sight, Stereo, track_grid
 from taichi_msm.render.texture import load_texture
@@ -33,7 +33,7 @@ class Shot(NamedTuple):
 
     positions: Array  # of the mass points [m], shape (rows, cols, 3)
     view: View
-    rods: Sequence[Rod] = ()
+    rods: Sequence[Capsule] = ()
 
 
 class Renderer:

@@ -11,7 +11,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.model.surface import Rod
+from taichi_msm.model.surface import Capsule
 from taichi_msm.render import geometry, lens_kernels
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.bins import BOUNDS, binned, store_bounds
@@ -44,7 +44,7 @@ AROUND = 4
 NOWHERE = math.nan
 
 
-def find(scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Rod] = ()) -> Sight:
+def find(scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Capsule] = ()) -> Sight:
     """Find material points by their coordinates on the sheet, as in `Labels`, shape (n, 2).
 
     The mass points are at `position` [m], shape (rows, cols, 3). Raises a DeviceError when threads were cut short.
@@ -53,7 +53,7 @@ def find(scene: Scene, coordinates: Array, position: Array, view: View, rods: Se
     return Sight(pixels, hidden.view(np.bool_))
 
 
-def find_flow(scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Rod] = ()) -> Flow:
+def find_flow(scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Capsule] = ()) -> Flow:
     """Find how far the points that the pixels of another frame show have moved in the picture; else as `find`.
 
     `coordinates` are those in the labels of the other frame, shape (height, width, 2); NaN where no sheet is seen.
@@ -64,7 +64,7 @@ def find_flow(scene: Scene, coordinates: Array, position: Array, view: View, rod
 
 
 def _search(
-    scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Rod], *, moved: bool
+    scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Capsule], *, moved: bool
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Find material points, or how far they are from the centres of all pixels, row by row; and which are hidden."""
     total = len(coordinates)

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.model.surface import Rod
+from taichi_msm.model.surface import Capsule
 from taichi_msm.render.camera import View
 from taichi_msm.render.lens_table import visible
 from taichi_msm.scene.render import Render
@@ -101,7 +101,12 @@ def sizes_of(scene: Scene, levels: NDArray[np.int32]) -> NDArray[np.int32]:
 
 
 def view_numbers(
-    view: View, render: Render, factor: int, sheet: tuple[float, float], texture: tuple[int, int], rods: Sequence[Rod]
+    view: View,
+    render: Render,
+    factor: int,
+    sheet: tuple[float, float],
+    texture: tuple[int, int],
+    rods: Sequence[Capsule],
 ) -> Array:
     """Put the numbers together, for `factor` samples per pixel along each axis.
 
@@ -144,7 +149,7 @@ def tell_lens(numbers: Array, view: View, factor: int, radius: float) -> None:
     numbers[PICTURE_X:FOCAL_X], numbers[FOCAL_X:VISIBLE] = view.centre * factor, view.scale * factor
 
 
-def _rod_numbers(rod: Rod, view: View, factor: int) -> Array:
+def _rod_numbers(rod: Capsule, view: View, factor: int) -> Array:
     numbers = np.empty(ROD_NUMBERS)
     numbers[TIP:AXIS] = view.axes @ (rod.tip - view.eye)
     numbers[AXIS:LENGTH] = view.axes @ rod.axis

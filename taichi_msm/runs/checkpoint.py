@@ -30,7 +30,7 @@ from taichi_msm.model.time_grid import TimeGrid
 from taichi_msm.runs.arrays import read_array, write_arrays
 from taichi_msm.runs.directory import DRAFT, FILE, FOLDER, HIDDEN, LOCK, STAGING, clear, create, replacing, require
 from taichi_msm.scene.scene import Scene
-from taichi_msm.solver.state import Felt, PeakForce, RunProgress, Saved, State, TipForce
+from taichi_msm.solver.state import PeakForce, ProbeForces, RunProgress, Snapshot, State, TipForce
 from taichi_msm.terms.contact import contact_fields
 
 pass  # REMOVED
@@ -98,7 +98,7 @@ class Checkpoint:
         """Remove the manifest: without it, what is left, even if it is only half removed, is no checkpoint."""
         (self._folder / MANIFEST).unlink(missing_ok=True)
 
-    def reopen(self) -> Saved | None:
+    def reopen(self) -> Snapshot | None:
         """Continue an earlier run; returns the state that it saved last, or None to continue from rest."""
         self.close()
         try:
@@ -129,7 +129,7 @@ class Checkpoint:
         """Read the forces of a frame, where they were asked for."""
         return _as_forces(self._forces.read(frame))
 
-    def save(self, saved: Saved) -> str:
+    def save(self, saved: Snapshot) -> str:
         """Save a state of the run, replacing the one saved before; the frames up to it must have been added.
 
         Gives the path of the file, which has the arrays of `State` and the numbers of `RunProgress` by name.
@@ -142,9 +142,9 @@ class Checkpoint:
         self._due = now + (now - start) / SHARE
         return str(path)
 
-    def load(self) -> Saved | None:
+    def load(self) -> Snapshot | None:
         """Read the state that was saved last; None: none was."""
-        like = self._arrays(Saved(State(0, np.empty(0), np.empty(0)), RunProgress(), Felt((), ())))
+        like = self._arrays(Snapshot(State(0, np.empty(0), np.empty(0)), RunProgress(), ProbeForces((), ())))
         kinds = {name: (array.dtype, array.shape) for name, array in like.items()}
         kinds["forces"] = kinds["forces"][0], (self._probes, FORCE_NUMBERS)
         kinds["greatest"] = kinds["greatest"][0], (self._probes, PEAK_NUMBERS)
@@ -161,7 +161,7 @@ class Checkpoint:
         progress = RunProgress(**{field.name: arrays[field.name].item() for field in fields(RunProgress)})
         state = State(int(arrays["steps"]), arrays["displacement"], arrays["difference"], arrays["contact"])
         greatest = tuple(PeakForce(time, (x, y, z)) for time, x, y, z in arrays["greatest"].tolist())
-        saved = Saved(state, progress, Felt(_as_forces(arrays["forces"]), greatest))
+        saved = Snapshot(state, progress, ProbeForces(_as_forces(arrays["forces"]), greatest))
         every = self._grid.steps_per_frame
         if not (
             progress.frame <= self._grid.frames
@@ -178,7 +178,7 @@ class Checkpoint:
         for records in self._kept:
             records.close()
 
-    def _arrays(self, saved: Saved) -> dict[str, NDArray[Any]]:
+    def _arrays(self, saved: Snapshot) -> dict[str, NDArray[Any]]:
         """Give the arrays of a state, the numbers of its progress and the digest of the manifest, all by name."""
         greatest = np.array([(peak.time, *peak.force) for peak in saved.felt.greatest]).reshape(-1, PEAK_NUMBERS)
         forces = {"forces": _tips(saved.felt.forces), "greatest": greatest}

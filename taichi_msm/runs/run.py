@@ -43,7 +43,7 @@ from taichi_msm.runs.simulation import Simulation
 from taichi_msm.runs.writer import ResultWriter, RunRecord
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.planning import ENCODING
-from taichi_msm.solver.state import Felt, RunProgress
+from taichi_msm.solver.state import ProbeForces, RunProgress
 from taichi_msm.system import process, runtime
 from taichi_msm.system.compiler import versions
 from taichi_msm.system.runtime import Device
@@ -337,7 +337,7 @@ class _Run:
         """Save what an interrupted run has; KeyboardInterrupt: no new frame."""
         writer, simulation = self._writer, self._simulation
         # An interruption outside `progress` may come before the last frame is stored.
-        if simulation.steps > 0 and simulation.frame < writer.stored and not simulation.torn:
+        if simulation.steps > 0 and simulation.frame < writer.stored and not simulation.inconsistent:
             # If the simulation diverges within this frame, the resumed run will find it.
             with suppress(DivergedError):
                 writer.save(simulation.save())
@@ -406,7 +406,7 @@ def _pilots(task: _Task, *, resumed: bool) -> Pilots:
 
 
 def _facts(
-    task: _Task, progress: RunProgress, felt: Felt, known: Known, path_dependence: Iterable[str]
+    task: _Task, progress: RunProgress, felt: ProbeForces, known: Known, path_dependence: Iterable[str]
 ) -> dict[str, Any]:
     """Say what was run, and what is known of its last frame, for run.json."""
     manifest, plan = task.manifest, task.plan

@@ -25,17 +25,17 @@ from taichi_msm.errors import ArgumentError, DivergedError, MsmError, Pause, are
 from taichi_msm.load.check import checked
 from taichi_msm.load.resolve import resolve
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.surface import Surface, rods, surface, to_positions
+from taichi_msm.model.surface import Surface, place_capsules, refine_surface, to_positions
 from taichi_msm.render.labels import Flow, Labels, Observed, Sight
 from taichi_msm.render.picking import pick
 from taichi_msm.render.renderer import Array, CameraLike, Renderer, Shot
 from taichi_msm.render.texture import require_texture
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.tools import Probe
-from taichi_msm.solver.dynamics import Gauge
-from taichi_msm.solver.planning import steered, with_paths_of
-from taichi_msm.solver.rest import sheet_of
-from taichi_msm.solver.state import Felt, Reading, RunProgress, Saved, TipForce, farthest
+from taichi_msm.solver.dynamics import ForceRecorder
+from taichi_msm.solver.planning import steer_plan, with_current_paths
+from taichi_msm.solver.rest import build_dynamics
+from taichi_msm.solver.state import ProbeForces, Reading, RunProgress, Snapshot, TipForce, largest_displacement
 from taichi_msm.system import runtime
 
 if TYPE_CHECKING:
@@ -92,12 +92,12 @@ class Simulation:
         # As they are before they are steered.
         self._probes = self.scene.probes
         self._watch: Watch
-        self._gauge: Gauge
-        self._felt: Felt
+        self._gauge: ForceRecorder
+        self._felt: ProbeForces
         self._placed: Array | None
         self._divergence: DivergedError | None
         self._closed, self._cores = False, cores
-        self._dynamics = sheet_of(self._plan, self.device, cores=cores)
+        self._dynamics = build_dynamics(self._plan, self.device, cores=cores)
         self._begin()
         self.renderer = Renderer(self.scene, texture)
 
@@ -122,19 +122,19 @@ class Simulation:
         return self._dynamics.steps_done
 
     @property
-    def torn(self) -> bool:
+    def inconsistent(self) -> bool:
         """Whether it was interrupted while steps were taken, so that only `restore` or `restart` make it whole."""
-        return self._dynamics.torn
+        return self._dynamics.inconsistent
 
     @property
     def lanes(self) -> int:
         """Lanes of the vectors that the steps are computed in; 1 on a GPU."""
-        return self._dynamics.structure.code.lanes
+        return self._dynamics.layout.config.lanes
 
     @property
     def workers(self) -> int:
         """Number of threads that share the steps while the cores are free; 0 on a GPU."""
-        return self._dynamics.structure.workers
+        return self._dynamics.layout.workers
 
     @property
     def progress(self) -> RunProgress:
@@ -177,10 +177,10 @@ class Simulation:
         if not isinstance(probes, Sequence):
             raise ArgumentError(f"probes: {probes!r}; take a list of them")
         self._find_first()
-        plan = steered(self._plan, probes, self._plan.grid.time(self.steps))
+        plan = steer_plan(self._plan, probes, self._plan.grid.time(self.steps))
         self._dynamics.steer(plan)
         self._watch.steer(plan)
-        self._gauge = Gauge(plan)
+        self._gauge = ForceRecorder(plan)
         self._plan, self.renderer.scene = plan, plan.scene
 
     def restart(self, scene: Plan | Scene | Mapping[str, Any] | None = None) -> None:
@@ -204,10 +204,10 @@ class Simulation:
             self._dynamics.restart(self._plan)
         else:
             self._dynamics.close()
-            self._dynamics = sheet_of(self._plan, self.device, cores=self._cores)
+            self._dynamics = build_dynamics(self._plan, self.device, cores=self._cores)
         self._begin()
 
-    def save(self) -> Saved:
+    def save(self) -> Snapshot:
         """Save all that another simulation needs to continue from here.
 
         Raises:
@@ -217,16 +217,16 @@ class Simulation:
         self._find_first()
         reading = self._dynamics.read()
         self._require_good(reading, self._watch.judge(reading))
-        return Saved(self._dynamics.state(), self.progress, self._felt, self.scene.probes)
+        return Snapshot(self._dynamics.state(), self.progress, self._felt, self.scene.probes)
 
-    def restore(self, saved: Saved) -> None:
+    def restore(self, saved: Snapshot) -> None:
         """Continue from where a simulation of the same scene was saved, also between two frames; to the same bits.
 
         Raises:
             ArgumentError: when it was saved with other points or probes, another precision or another step.
         """
         self._require_open()
-        if not isinstance(saved, Saved):
+        if not isinstance(saved, Snapshot):
             raise ArgumentError(f"{type(saved).__name__} is not what `save` returns")
         state, per_frame = saved.state, self._plan.grid.steps_per_frame
         since = state.steps - saved.progress.frame * per_frame
@@ -258,7 +258,7 @@ class Simulation:
         return list(self._felt.forces)
 
     @property
-    def felt(self) -> Felt:
+    def felt(self) -> ProbeForces:
         """The forces at the last frame that was found, and the greatest so far, as in `progress`."""
         return self._felt
 
@@ -273,9 +273,9 @@ class Simulation:
 
     def surface(self) -> Surface:
         """Give the refined surface as textured triangles: vertices, triangles, texture coordinates."""
-        return surface(self._position, self.scene.render.refine)
+        return refine_surface(self._position, self.scene.render.refine)
 
-    def diagnose(self, start: Saved | None = None, pause: Pause = lambda: None) -> Diagnosis:
+    def diagnose(self, start: Snapshot | None = None, pause: Pause = lambda: None) -> Diagnosis:
         """Find out why the simulation diverged in `advance`. Afterwards it can advance only after `restore`.
 
         Args:
@@ -292,7 +292,7 @@ class Simulation:
             good = (
                 None
                 if self._placed is None
-                else Saved(self._dynamics.state(), self.progress, self._felt, self.scene.probes)
+                else Snapshot(self._dynamics.state(), self.progress, self._felt, self.scene.probes)
             )
             return Diagnosis(str(self._divergence), good)
         return diagnose(self._dynamics, start, pause)
@@ -469,28 +469,28 @@ class Simulation:
             time = self.time
         elif not (are_numbers(as_array(time, "time"), ()) and math.isfinite(time)):
             raise ArgumentError(f"time: {time!r}; take a number, in seconds, or None for now")
-        return Shot(positions, self.renderer.set_up(camera, time), rods(self.scene, positions, time))
+        return Shot(positions, self.renderer.set_up(camera, time), place_capsules(self.scene, positions, time))
 
     def _require_good(self, reading: Reading, fault: str) -> None:
         """Raise the error of a divergence, if there is a fault."""
         if fault:
             steps, time = reading.steps, self._plan.grid.time(reading.steps)
-            point = farthest(reading.displacement)[:2]
+            point = largest_displacement(reading.displacement)[:2]
             self._divergence = DivergedError(divergence.message(time, steps, fault, exact=False), steps, time, point)
             raise self._divergence
 
     def _begin(self) -> None:
         """Begin with the flat sheet; at rest, the first frame is yet to be found."""
         self._divergence = None
-        self._watch, self._gauge = Watch(self._plan), Gauge(self._plan)
+        self._watch, self._gauge = Watch(self._plan), ForceRecorder(self._plan)
         self._felt = self._gauge.at_rest()
         flat = to_positions(self._dynamics.displacement(), self.scene.sheet)
         self._placed = None if self.scene.time.at_rest else flat
 
     def _follow_paths(self, probes: Sequence[Probe]) -> None:
         """Move tools along the paths that these probes have, in place of those that they were steered along."""
-        self._plan = with_paths_of(self._plan, probes)
-        self._gauge, self.renderer.scene = Gauge(self._plan), self.scene
+        self._plan = with_current_paths(self._plan, probes)
+        self._gauge, self.renderer.scene = ForceRecorder(self._plan), self.scene
 
 
 # The quality of JPEGs: some hundred frames fit into a notebook, and no difference from the picture is visible.

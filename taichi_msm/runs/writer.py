@@ -22,7 +22,7 @@ from PIL import Image
 from typing_extensions import NotRequired
 
 from taichi_msm.errors import Pause, writing
-from taichi_msm.model.surface import on_surface
+from taichi_msm.model.surface import surface_positions
 from taichi_msm.model.time_grid import TimeGrid
 from taichi_msm.model.tool_force import ProbeRecord
 from taichi_msm.render.camera import calibration, moves, pose, view_at
@@ -35,7 +35,7 @@ from taichi_msm.runs.media import Job, PictureWriter
 from taichi_msm.scene import outputs
 from taichi_msm.scene.outputs import CAMERA, OUTPUTS
 from taichi_msm.scene.scene import Scene
-from taichi_msm.solver.state import Saved, TipForce
+from taichi_msm.solver.state import Snapshot, TipForce
 
 pass  # REMOVED
 
@@ -77,7 +77,7 @@ class ResultWriter:
         resumes: bool = False,
         beside: bool = True,
     ) -> None:
-        self.saved: Saved | None = None
+        self.saved: Snapshot | None = None
         self.frames = 0
         self.encode_seconds = 0.0
         self._directory = directory
@@ -140,12 +140,12 @@ class ResultWriter:
         """Whether it is time to save the state of the run."""
         return self.stored > 0 and self._checkpoint.due
 
-    def save(self, saved: Saved) -> str:
+    def save(self, saved: Snapshot) -> str:
         """Save the state of the run, in case it ends here; returns the file."""
         with writing(self._directory):
             return self._checkpoint.save(saved)
 
-    def load(self) -> Saved | None:
+    def load(self) -> Snapshot | None:
         """Give the state that was saved last; None: none was."""
         with writing(self._directory):
             return self._checkpoint.load()
@@ -269,7 +269,7 @@ class LabelWriter:
                     _WRITERS[path.suffix](file, getattr(getattr(observed, output.source), output.name))
         if observed.tracks is not None:
             self._points[:, frame], self._occluded[:, frame] = observed.tracks
-            self._position[:, frame] = on_surface(position, self._scene.render.refine, self._grid)
+            self._position[:, frame] = surface_positions(position, self._scene.render.refine, self._grid)
 
     def finish(self, frames: int) -> None:
         """Keep the files of the first frames only, this many, and write those that belong to all frames together."""

@@ -9,7 +9,7 @@ both ends. The arrays are one-dimensional, which saves a few instructions for ev
                  and their share of a cell's area. For all rows: x at rest [m]; whether there is a left neighbour;
                  whether there is a right one
     fields       a number for every point each, as many rows as the sheet has; those of its terms follow each other
-    stiffness    with a map, of every spring: see `SpringTerm.laid_out`
+    stiffness    with a map, of every spring: see `SpringTerm.stiffness_array`
     numbers      of the sheet and its terms, in the first lane of an entry each
 
 With bending, u also has rows of moments. The numbers of a step are in the table of loads, a row for every step.
@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.solver.state import State
 from taichi_msm.system.runtime import Memory, ti, write
-from taichi_msm.terms.base import AREA, GAIN, MOTION, MOVES, KernelSheet, StepCode
+from taichi_msm.terms.base import AREA_SHARE, GAIN, MOBILITY, SQUARED_MOTION, KernelConfig, KernelSheet
 
 # Bytes of a number.
 BYTES = {"f32": 4, "f64": 8}
@@ -45,12 +45,12 @@ class SheetLayout:
     workers: int  # number of bands of rows that are stepped in parallel; 0 on a GPU, where all points are
     depth: int  # number of steps that a band takes in one pass
     fixed_rows: tuple[bool, bool]  # whether all points of the first row are fixed, and all of the last
-    code: StepCode  # what the kernels are compiled for
+    config: KernelConfig  # what the kernels are compiled for
 
     @property
     def strip(self) -> int:
         """Number of columns of a strip."""
-        return -(-self.cols // self.code.lanes)
+        return -(-self.cols // self.config.lanes)
 
     @property
     def width(self) -> int:
@@ -58,32 +58,32 @@ class SheetLayout:
         return self.strip + 2
 
 
-class Start(NamedTuple):
+class InitialData(NamedTuple):
     """What the arrays of a sheet hold at the start."""
 
-    numbers: NDArray[Any]  # of the sheet and its terms
+    constants: NDArray[Any]  # of the sheet and its terms
     by_column: NDArray[Any]  # shape (COLUMN_ROWS, cols)
     fields: NDArray[Any]  # of the terms, shape (fields, rows, cols)
     stiffness: NDArray[Any] | None  # as many rows as it takes; None without a map
     state: State | None  # to continue from; None: at rest
 
 
-def in_lanes(layout: SheetLayout, values: NDArray[Any]) -> NDArray[Any]:
+def to_lanes(layout: SheetLayout, values: NDArray[Any]) -> NDArray[Any]:
     """Lay columns of values, shape (..., cols), out in strips with their halo, shape (entries, lanes).
 
     In the precision of the code: values too large for it become infinite. Entries without a column are 0.
     """
-    column = np.arange(layout.code.lanes) * layout.strip + np.arange(-1, layout.strip + 1)[:, None]
+    column = np.arange(layout.config.lanes) * layout.strip + np.arange(-1, layout.strip + 1)[:, None]
     inside = (column >= 0) & (column < layout.cols)
-    real = np.float32 if layout.code.precision == "f32" else np.float64
+    real = np.float32 if layout.config.precision == "f32" else np.float64
     with np.errstate(over="ignore"):
         laid = np.take(values.astype(real), column * inside, axis=-1) * inside.astype(real)
-    return laid.reshape(-1, layout.code.lanes)
+    return laid.reshape(-1, layout.config.lanes)
 
 
-def out_of_lanes(layout: SheetLayout, entries: NDArray[Any], rows: int) -> NDArray[Any]:
-    """Give the columns of the first rows of what `in_lanes` has laid out, shape (rows, cols)."""
-    laid = entries[: rows * layout.width].reshape(rows, layout.width, layout.code.lanes)
+def from_lanes(layout: SheetLayout, entries: NDArray[Any], rows: int) -> NDArray[Any]:
+    """Give the columns of the first rows of what `to_lanes` has laid out, shape (rows, cols)."""
+    laid = entries[: rows * layout.width].reshape(rows, layout.width, layout.config.lanes)
     return laid[:, 1:-1].transpose(0, 2, 1).reshape(rows, -1)[:, : layout.cols]
 
 
@@ -96,19 +96,19 @@ class SheetArrays:
         start: what the arrays hold at the start.
     """
 
-    def __init__(self, layout: SheetLayout, stored: NDArray[np.int32], start: Start) -> None:
-        lanes, none = layout.code.lanes, np.zeros((0, layout.cols))
+    def __init__(self, layout: SheetLayout, stored: NDArray[np.int32], start: InitialData) -> None:
+        lanes, none = layout.config.lanes, np.zeros((0, layout.cols))
         self._layout = layout
         self._memory = Memory()
         self.u = [self.rows(len(stored)) for _ in range(3)]
         self.d = [self.rows(layout.rows) for _ in range(3)]
-        self.numbers = self._memory.array(layout.code.precision, lanes, len(start.numbers))
+        self.constants = self._memory.array(layout.config.precision, lanes, len(start.constants))
         self.by_column = self.rows(len(start.by_column))
         self.fields = self.rows(max(1, len(start.fields)) * layout.rows)
         self.stiffness = self.rows(1 if start.stiffness is None else len(start.stiffness))
-        real = np.float32 if layout.code.precision == "f32" else np.float64
+        real = np.float32 if layout.config.precision == "f32" else np.float64
         with np.errstate(over="ignore"):
-            write(self.numbers, np.repeat(start.numbers[:, None].astype(real), lanes, axis=1))
+            write(self.constants, np.repeat(start.constants[:, None].astype(real), lanes, axis=1))
         self._set(self.by_column, start.by_column)
         if start.stiffness is not None:
             self._set(self.stiffness, start.stiffness)
@@ -121,29 +121,29 @@ class SheetArrays:
     @property
     def all(self) -> tuple[Any, ...]:
         """All arrays, in the order in which kernels take them."""
-        return *self.u, *self.d, self.numbers, self.by_column, self.stiffness, self.fields
+        return *self.u, *self.d, self.constants, self.by_column, self.stiffness, self.fields
 
     def get_fields(self, first: int, count: int) -> NDArray[Any]:
         """Read so many fields from the first one on, shape (count, rows, cols)."""
         layout = self._layout
         entries = self.fields.to_numpy()[first * layout.rows * layout.width :]
-        values = out_of_lanes(layout, entries, count * layout.rows)
+        values = from_lanes(layout, entries, count * layout.rows)
         return np.ascontiguousarray(values.reshape(count, layout.rows, layout.cols))
 
     def set_fields(self, first: int, values: NDArray[Any]) -> None:
         """Replace fields from the first one on, shape (fields, rows, cols); the others stay."""
-        entries, laid = self.fields.to_numpy(), in_lanes(self._layout, values)
+        entries, laid = self.fields.to_numpy(), to_lanes(self._layout, values)
         at = first * self._layout.rows * self._layout.width
         entries[at : at + len(laid)] = laid
         self.fields.from_numpy(entries)
 
     def _set(self, array: Any, values: NDArray[Any]) -> None:
         """Set the first rows of an array to values, shape (..., cols), and the others to zero."""
-        write(array, in_lanes(self._layout, values))
+        write(array, to_lanes(self._layout, values))
 
     def rows(self, count: int) -> Any:
         """Allocate an array of `count` rows; its content is arbitrary."""
-        return self._memory.array(self._layout.code.precision, self._layout.code.lanes, count * self._layout.width)
+        return self._memory.array(self._layout.config.precision, self._layout.config.lanes, count * self._layout.width)
 
 
 class StepKernel(Protocol):
@@ -151,7 +151,7 @@ class StepKernel(Protocol):
 
     arrays: SheetArrays
 
-    def __init__(self, layout: SheetLayout, start: Start) -> None: ...
+    def __init__(self, layout: SheetLayout, start: InitialData) -> None: ...
 
     def advance(self, count: int, table: NDArray[Any]) -> None:
         """Take a number of steps; table: of the loads, shape (count, columns)."""
@@ -163,27 +163,27 @@ class StepKernel(Protocol):
         """Copy displacements or differences into values, shape (rows, cols, 3), and the measures of every row."""
 
 
-def point_forces(code: StepCode) -> list[Callable[..., Any]]:
+def point_forces(config: KernelConfig) -> list[Callable[..., Any]]:
     """List the functions that add the forces of terms on points to those of springs."""
     # Terms that reach far come first. The last bits depend on the order.
-    ordered = sorted(code.terms, key=lambda term: -term.reach)
-    return [force for term in ordered for force in term.forces(code)]
+    ordered = sorted(config.terms, key=lambda term: -term.reach)
+    return [force for term in ordered for force in term.build_forces(config)]
 
 
-def point_step(code: StepCode) -> Callable[..., None]:
+def build_point_step(config: KernelConfig) -> Callable[..., None]:
     """Make the function that adds the forces of terms on points to those of springs, and steps.
 
     d_{n+1} = keep d_n + gain F_n,    u_{n+1} = u_n + d_{n+1}                                  (eq. 6 to 9)
     """
-    forces = point_forces(code)
-    reducing = [reduce for term in code.terms for reduce in term.reducing(code)]
+    forces = point_forces(config)
+    reducing = [reduce for term in config.terms for reduce in term.build_damping(config)]
 
     @ti.func
     def move(sheet: ti.template(), entry: ti.template(), target, force: ti.template(), now: ti.template()):
         """Step an entry, and store it in row `target` of u; force: of springs; now: its row of the table of loads."""
         for add in ti.static(forces):
             add(force, sheet, entry, now)
-        gain = now[GAIN] * sheet.by_column[(MOVES + entry.row.kind) * sheet.width + entry.b]
+        gain = now[GAIN] * sheet.by_column[(MOBILITY + entry.row.kind) * sheet.width + entry.b]
         at = entry.row.i * sheet.width + entry.b
         d = [sheet.d[c][at] for c in ti.static(range(3))]
         for reduce in ti.static(reducing):
@@ -197,9 +197,12 @@ def point_step(code: StepCode) -> Callable[..., None]:
     return move
 
 
-def measuring(code: StepCode) -> Callable[..., Any]:
+def build_measure(config: KernelConfig) -> Callable[..., Any]:
     """Make the function that measures an entry: it adds motion, and what the terms measure, to a list of vectors."""
-    vector, measuring_terms = code.vector, [measure for term in code.terms for measure in term.measuring(code)]
+    vector, measuring_terms = (
+        config.vector,
+        [measure for term in config.terms for measure in term.build_measures(config)],
+    )
 
     @ti.func
     def measure(measures: ti.template(), sheet: ti.template(), p, i, b):
@@ -209,19 +212,25 @@ def measuring(code: StepCode) -> Callable[..., Any]:
         for c in ti.static(range(3)):
             change = sheet.d[c][i * sheet.width + b]
             motion += change * change
-        if ti.static(code.by_area):
-            motion *= sheet.by_column[(AREA + kind) * sheet.width + b]
-        measures[MOTION] += motion
+        if ti.static(config.by_area):
+            motion *= sheet.by_column[(AREA_SHARE + kind) * sheet.width + b]
+        measures[SQUARED_MOTION] += motion
         for measure_term in ti.static(measuring_terms):
             measure_term(measures, sheet, p, i, kind, b)
 
     return measure
 
 
-def reading(code: StepCode, *, parallel: bool, iterations: int) -> Callable[..., None]:
+def build_read(config: KernelConfig, *, parallel: bool, iterations: int) -> Callable[..., None]:
     """Make the kernel that reads and measures a sheet, in a loop with so many iterations for each row."""
-    real, vector, vectors, lanes, count = code.real, code.vector, code.vectors, code.lanes, code.first_number(None)
-    measure, reductions = measuring(code), ["sum", *(how for term in code.terms for how in term.reductions)]
+    real, vector, vectors, lanes, count = (
+        config.real,
+        config.vector,
+        config.vectors,
+        config.lanes,
+        config.first_constant(None),
+    )
+    measure, reductions = build_measure(config), ["sum", *(how for term in config.terms for how in term.reductions)]
 
     @ti.kernel
     def read(
@@ -233,7 +242,7 @@ def reading(code: StepCode, *, parallel: bool, iterations: int) -> Callable[...,
         measures: ti.types.ndarray(dtype=real, ndim=2),
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
-        numbers_of: ti.types.ndarray(dtype=vector, ndim=1),
+        constants_of: ti.types.ndarray(dtype=vector, ndim=1),
         by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
         ti.loop_config(serialize=not parallel)
@@ -242,9 +251,9 @@ def reading(code: StepCode, *, parallel: bool, iterations: int) -> Callable[...,
                 i, strip = index // iterations, (cols + lanes - 1) // lanes
                 # Entries of a row, and where u has it.
                 width, p = strip + 2, first + i
-                numbers = [numbers_of[n][0] for n in ti.static(range(count))]
+                constants = [constants_of[n][0] for n in ti.static(range(count))]
                 u, d = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z))
-                sheet = ti.static(KernelSheet(u, d, by_column, stiffness, fields, numbers, rows, width))
+                sheet = ti.static(KernelSheet(u, d, by_column, stiffness, fields, constants, rows, width))
                 sums = [vector(0) for _ in ti.static(reductions)]
                 for b in range(1, strip + 1):
                     measure(sums, sheet, p, i, b)

@@ -22,10 +22,10 @@ records its place and ends, which frees its own core. Further launches continue 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from taichi_msm.solver.arrays import point_step
-from taichi_msm.solver.row import row_passing, row_touching
+from taichi_msm.solver.arrays import build_point_step
+from taichi_msm.solver.row import build_pass_row, build_touch_row
 from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, ti
-from taichi_msm.terms.base import DY, KernelRow, KernelSheet, StepCode
+from taichi_msm.terms.base import DY, KernelConfig, KernelRow, KernelSheet
 from taichi_msm.terms.bending import BendingTerm
 from taichi_msm.terms.contact import ContactTerm
 
@@ -44,7 +44,7 @@ WORKER_STRIDE = 2 * COUNTER_STRIDE
 TURN, ROUND, STEP, PLACE_END = 1, 2, 3, 4
 
 # Number of rows of moments that a worker needs at a time.
-MOMENTS = 3
+MOMENT_ROWS = 3
 
 
 class RowBand(NamedTuple):
@@ -62,9 +62,9 @@ class RowBand(NamedTuple):
     progress: Any  # of all workers
 
 
-def joining(code: StepCode) -> Callable[..., None]:
+def build_join_strips(config: KernelConfig) -> Callable[..., None]:
     """Make the function that fills the halo of a row."""
-    vector, lanes = code.vector, code.lanes
+    vector, lanes = config.vector, config.lanes
 
     @ti.func
     def join_strips(u: ti.template(), p, width):
@@ -78,19 +78,26 @@ def joining(code: StepCode) -> Callable[..., None]:
     return join_strips
 
 
-def stepping_row(code: StepCode, move: Callable[..., None], *, touches: bool, parallel: bool) -> Callable[..., Any]:
+def build_step_row(
+    config: KernelConfig, move: Callable[..., None], *, touches: bool, parallel: bool
+) -> Callable[..., Any]:
     """Make the function that takes a step of a row of a band, as soon as the neighbours' rows allow it.
 
     Args:
-        code: of the sheet.
-        move: what it does with an entry, as for `row_passing`.
+        config: of the sheet.
+        move: what it does with an entry, as for `build_pass_row`.
         touches: whether tools then push the points of the row out.
         parallel: whether there are neighbours.
     """
-    vector, bending, copied, join_strips = code.vector, code.get(BendingTerm), code.reach, joining(code)
-    pass_row, storing = row_passing(code, move), [bending.storing(code)] if bending else []
-    contact = code.get(ContactTerm) if touches else None
-    touching = [row_touching(code, contact)] if contact else []
+    vector, bending, copied, join_strips = (
+        config.vector,
+        config.get(BendingTerm),
+        config.reach,
+        build_join_strips(config),
+    )
+    pass_row, storing = build_pass_row(config, move), [bending.build_store_moment(config)] if bending else []
+    contact = config.get(ContactTerm) if touches else None
+    touching = [build_touch_row(config, contact)] if contact else []
 
     @ti.func
     def copy_row(rows, worker, border, n, behind):
@@ -135,7 +142,7 @@ def stepping_row(code: StepCode, move: Callable[..., None], *, touches: bool, pa
         begin = ti.select(band.way > 0, band.low, band.high - 1)
         for ahead in range(ti.select(row < 0, -1, row + 1), row + 2):
             before, here = row_at(band, ahead - 1, n), row_at(band, ahead, n)
-            after, target = row_at(band, ahead + 1, n), moments + (ahead + MOMENTS) % MOMENTS
+            after, target = row_at(band, ahead + 1, n), moments + (ahead + MOMENT_ROWS) % MOMENT_ROWS
             for b in range(1, sheet.width - 1):
                 for store_moment in ti.static(storing):
                     store_moment(sheet, begin + ahead * band.way, before, here, after, b, target)
@@ -155,7 +162,7 @@ def stepping_row(code: StepCode, move: Callable[..., None], *, touches: bool, pa
         i = begin + row * band.way
         here = i
         other = i + band.way
-        exists = ti.cast(0 <= other < band.rows, code.real)
+        exists = ti.cast(0 <= other < band.rows, config.real)
         goes = True
         if ti.static(parallel):
             if row == -1 and 0 <= near < band.workers:
@@ -172,9 +179,9 @@ def stepping_row(code: StepCode, move: Callable[..., None], *, touches: bool, pa
             other = ti.select(exists > 0, other, i)
             if 0 <= i < band.rows:
                 kind = ti.select(i == band.rows - 1, 2, ti.select(i == 0, 0, 1))
-                up = -band.way * sheet.numbers[DY]
-                before, middle = moments + (row + 2) % MOMENTS, moments + row % MOMENTS
-                after = moments + (row + 1) % MOMENTS
+                up = -band.way * sheet.constants[DY]
+                before, middle = moments + (row + 2) % MOMENT_ROWS, moments + row % MOMENT_ROWS
+                after = moments + (row + 1) % MOMENT_ROWS
                 line = ti.static(KernelRow(i, kind, before, middle, after))
                 pass_row(sheet, carried, carry, line, here, other, exists, up, loads, n, row >= 0)
                 if row >= 0:
@@ -197,12 +204,12 @@ def stepping_row(code: StepCode, move: Callable[..., None], *, touches: bool, pa
     return step_row
 
 
-def advancing(code: StepCode, *, parallel: bool) -> Callable[..., None]:
+def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None]:
     """Make the kernel that takes steps, with one worker or several."""
-    real, vector, vectors, lanes = code.real, code.vector, code.vectors, code.lanes
-    count_of_numbers, step_row = (
-        code.first_number(None),
-        stepping_row(code, point_step(code), touches=True, parallel=parallel),
+    real, vector, vectors, lanes = config.real, config.vector, config.vectors, config.lanes
+    constant_count, step_row = (
+        config.first_constant(None),
+        build_step_row(config, build_point_step(config), touches=True, parallel=parallel),
     )
 
     @ti.func
@@ -213,7 +220,7 @@ def advancing(code: StepCode, *, parallel: bool) -> Callable[..., None]:
         first, place = sizes[FIRST], WORKER_STRIDE * band.worker
         count, depth = ti.cast(sizes[COUNT], ti.i32), ti.cast(sizes[DEPTH], ti.i32)
         carried_rows = ti.cast(sizes[CARRIED_ROWS], ti.i32)
-        moments = ti.cast(sizes[MOMENT_ROW], ti.i32) + MOMENTS * band.worker
+        moments = ti.cast(sizes[MOMENT_ROW], ti.i32) + MOMENT_ROWS * band.worker
         turn = ti.cast(band.progress[place + TURN], ti.i32)
         k = ti.cast(band.progress[place + ROUND], ti.i32)
         step = ti.cast(band.progress[place + STEP], ti.i32)
@@ -250,7 +257,7 @@ def advancing(code: StepCode, *, parallel: bool) -> Callable[..., None]:
         carried_x: vectors, carried_y: vectors, carried_z: vectors,
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
-        numbers_of: ti.types.ndarray(dtype=vector, ndim=1),
+        constants_of: ti.types.ndarray(dtype=vector, ndim=1),
         by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
         ti.loop_config(serialize=not parallel)
@@ -258,9 +265,9 @@ def advancing(code: StepCode, *, parallel: bool) -> Callable[..., None]:
             # One worker a thread.
             if index % ITERATIONS_PER_THREAD == 0:
                 rows, width = ti.cast(sizes[ROWS], ti.i32), ti.cast(sizes[STRIP], ti.i32) + 2
-                numbers = [numbers_of[n][0] for n in ti.static(range(count_of_numbers))]
+                constants = [constants_of[n][0] for n in ti.static(range(constant_count))]
                 sheet = ti.static(
-                    KernelSheet((u_x, u_y, u_z), (d_x, d_y, d_z), by_column, stiffness, fields, numbers, rows, width)
+                    KernelSheet((u_x, u_y, u_z), (d_x, d_y, d_z), by_column, stiffness, fields, constants, rows, width)
                 )
                 worker, workers = index // ITERATIONS_PER_THREAD, ti.cast(sizes[WORKERS], ti.i32)
                 first_row, end_row = ti.cast(sizes[FIRST_ROW], ti.i32), ti.cast(sizes[END_ROW], ti.i32)

@@ -19,24 +19,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError, DeviceError, MsmError, Pause
-from taichi_msm.model.loads import FrameLoad, Schedule, decay, schedule
+from taichi_msm.model.loads import FrameLoad, Schedule, average_loads, decay
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import area_shares, axes, rest_positions, spacing
-from taichi_msm.model.surface import touched
+from taichi_msm.model.surface import surface_point
 from taichi_msm.model.tool_force import probe_force
-from taichi_msm.solver.arrays import BYTES, SheetLayout, Start, StepKernel
-from taichi_msm.solver.kernel_cpu import Scatter
-from taichi_msm.solver.kernel_gpu import STEPS_PER_LAUNCH, Gather
-from taichi_msm.solver.pushes import sum_pushes
-from taichi_msm.solver.state import Felt, PeakForce, Reading, State, TipForce
+from taichi_msm.solver.arrays import BYTES, InitialData, SheetLayout, StepKernel
+from taichi_msm.solver.kernel_cpu import ScatterKernel
+from taichi_msm.solver.kernel_gpu import STEPS_PER_LAUNCH, GatherKernel
+from taichi_msm.solver.pushes import sum_corrections
+from taichi_msm.solver.state import PeakForce, ProbeForces, Reading, State, TipForce
 from taichi_msm.system.process import available_threads
 from taichi_msm.system.runtime import Device, lanes
-from taichi_msm.terms import terms_of
-from taichi_msm.terms.base import ACROSS, AREA, COLUMN_ROWS, GAIN, HAS_LEFT, HAS_RIGHT, MOTION, MOVES, StepCode
+from taichi_msm.terms import build_terms
+from taichi_msm.terms.base import (
+    AREA_SHARE,
+    COLUMN_ROWS,
+    GAIN,
+    HAS_LEFT,
+    HAS_RIGHT,
+    MOBILITY,
+    REST_X,
+    SQUARED_MOTION,
+    KernelConfig,
+)
 from taichi_msm.terms.contact import ContactTerm
 from taichi_msm.terms.damping import coefficients
-from taichi_msm.terms.loads import ProbeTerm, standing
-from taichi_msm.terms.springs import LEAST, MOST, SpringTerm
+from taichi_msm.terms.loads import ProbeTerm, decay_parameters
+from taichi_msm.terms.springs import MAX_STRAIN, MIN_STRAIN, SpringTerm
 
 # With fewer points per worker, one worker more costs more time in waiting than it saves in work.
 POINTS_PER_WORKER = 450
@@ -57,7 +67,7 @@ MAX_STEPS_PER_LAUNCH = 8192
 STEPS_PER_TABLE = 4096
 
 
-def layout_of(plan: Plan, device: Device, cores: int | None = None) -> SheetLayout:
+def choose_layout(plan: Plan, device: Device, cores: int | None = None) -> SheetLayout:
     """Choose how a sheet is laid out and shared out among cores, None: all, and what is compiled for it.
 
     Raises:
@@ -75,15 +85,15 @@ def layout_of(plan: Plan, device: Device, cores: int | None = None) -> SheetLayo
         workers = max(1, min(cores, rows * cols // POINTS_PER_WORKER, (rows - sum(fixed_rows)) // 2))
     else:
         workers = 0
-    code = StepCode(precision, lanes(precision), plan.open_edges and plan.material.by_area, terms_of(plan))
+    config = KernelConfig(precision, lanes(precision), plan.open_edges and plan.material.by_area, build_terms(plan))
     if device.arch == "vulkan" and precision == "f64" and any(slot.moves for slot in plan.slots):
         raise DeviceError(
             "--arch vulkan: has no exp in f64, which control points that move need; take time.precision: f32 without a "
             "tolerance or an estimate of the error, or --arch cpu"
         )
     fits = workers == 0 or rows // workers * cols * NUMBERS_PER_POINT * BYTES[precision] <= CACHE
-    depth = 1 if fits or code.reach > 1 else DEPTH
-    return SheetLayout(rows, cols, workers, depth, fixed_rows, code)
+    depth = 1 if fits or config.reach > 1 else DEPTH
+    return SheetLayout(rows, cols, workers, depth, fixed_rows, config)
 
 
 class Dynamics:
@@ -114,12 +124,12 @@ class Dynamics:
         state: what `state` returned for the same points and steps, to continue from; None: at rest.
         """
         self.plan = plan
-        self.structure = self._layout or layout_of(plan, self._device, self._cores)
-        self._real = np.dtype(np.float32 if self.structure.code.precision == "f32" else np.float64)
-        self.steps_done, self.torn = 0 if state is None else state.steps, True
+        self.layout = self._layout or choose_layout(plan, self._device, self._cores)
+        self._real = np.dtype(np.float32 if self.layout.config.precision == "f32" else np.float64)
+        self.steps_done, self.inconsistent = 0 if state is None else state.steps, True
         self._tabulate(STEPS_PER_TABLE)
         self._place(state)
-        self.torn = False
+        self.inconsistent = False
 
     def steer(self, plan: Plan) -> None:
         """Continue with other probes, each of which moves, jumps or stands as its predecessor did, and the same steps.
@@ -127,8 +137,8 @@ class Dynamics:
         Raises:
             ArgumentError: when the new probes need another kernel.
         """
-        probes, before = ProbeTerm.of(plan), self.structure.code.require(ProbeTerm)
-        tools, compiled = ContactTerm.of(plan), self.structure.code.get(ContactTerm)
+        probes, before = ProbeTerm.from_plan(plan), self.layout.config.require(ProbeTerm)
+        tools, compiled = ContactTerm.from_plan(plan), self.layout.config.get(ContactTerm)
         if [tool.probe for tool in plan.tools] != [tool.probe for tool in self.plan.tools]:
             raise ArgumentError("probes: which of them have a path cannot change; restart with the new scene")
         if probes.moves != before.moves:
@@ -143,8 +153,8 @@ class Dynamics:
                 "probes: friction and grips cannot be added where there were none; restart with the new scene, such as "
                 "with a friction of 1e-9, or with a grip that ends before the start"
             )
-        if standing(plan) != standing(self.plan):
-            self._moving.arrays.set_fields(self.structure.code.first_field(ProbeTerm), probes.fields(plan))
+        if decay_parameters(plan) != decay_parameters(self.plan):
+            self._moving.arrays.set_fields(self.layout.config.first_field(ProbeTerm), probes.fields(plan))
         self.plan = plan
         # A caller that steers will steer again in a frame, so no more loads than those of a frame are tabulated.
         self._tabulate(plan.grid.steps_per_frame)
@@ -157,22 +167,22 @@ class Dynamics:
         Raises:
             MsmError: when the sheet is torn; so do `state` and `read`.
         """
-        points = self.structure.rows * self.structure.cols
-        most, depth = max(1, min(MAX_STEPS_PER_LAUNCH, POINT_STEPS_PER_LAUNCH // points)), self.structure.depth
+        points = self.layout.rows * self.layout.cols
+        most, depth = max(1, min(MAX_STEPS_PER_LAUNCH, POINT_STEPS_PER_LAUNCH // points)), self.layout.depth
         # A launch takes whole passes. If not even one is within the limit, it takes up to four times the limit.
         most = most // depth * depth or min(depth, 4 * most)
-        if self.structure.workers == 0:
+        if self.layout.workers == 0:
             most = STEPS_PER_LAUNCH
-        self._require_whole()
+        self._require_consistent()
         if steps and self.steps_done % self.plan.grid.steps_per_frame == 0:
-            sum_pushes(self.structure, self._moving.arrays, clear=True)
+            sum_corrections(self.layout, self._moving.arrays, clear=True)
         end = self.steps_done + steps
         while self.steps_done < end:
             count = min(most, end - self.steps_done)
-            self.torn = True
+            self.inconsistent = True
             self._moving.advance(count, self._next_loads(count))
             self.steps_done += count
-            self.torn = False
+            self.inconsistent = False
             self.launches += 1
             pause()
 
@@ -188,35 +198,39 @@ class Dynamics:
 
     def state(self) -> State:
         """Read everything that the next steps depend on."""
-        self._require_whole()
+        self._require_consistent()
         u, d = self._copy(differences=False)[0], self._copy(differences=True)[0]
         return State(self.steps_done, u, d, self._contact())
 
     def read(self) -> Reading:
         """Read the displacements and measure the sheet, in the scene's precision."""
-        self._require_whole()
+        self._require_consistent()
         displacement, measures = self._copy(differences=False)
-        code, plan = self.structure.code, self.plan
-        springs = measures[:, code.first_measure(SpringTerm) :]
+        config, plan = self.layout.config, self.plan
+        springs = measures[:, config.first_measure(SpringTerm) :]
         # The measures are (L^2 - L0^2) / L0^2.
         shortest, longest = (
-            math.sqrt(max(0.0, 1.0 + float(extreme))) for extreme in (springs[:, LEAST].min(), springs[:, MOST].max())
+            math.sqrt(max(0.0, 1.0 + float(extreme)))
+            for extreme in (springs[:, MIN_STRAIN].min(), springs[:, MAX_STRAIN].max())
         )
         sums = measures.sum(axis=0, dtype=np.float64)
         energy = self._of_motion(sums)
-        for term in code.terms:
-            first = code.first_measure(type(term))
+        for term in config.terms:
+            first = config.first_measure(type(term))
             energy += term.energy(sums[first : first + len(term.reductions)], plan)
         return Reading(self.steps_done, displacement, shortest, longest, energy / 2)
 
     def _of_motion(self, sums: NDArray[Any]) -> float:
         """Give twice the energy of motion [J], from the measures summed up."""
-        return self.plan.material.mass * float(sums[MOTION]) / self.plan.grid.step**2
+        return self.plan.material.mass * float(sums[SQUARED_MOTION]) / self.plan.grid.step**2
 
     def _copy(self, *, differences: bool) -> tuple[NDArray[Any], NDArray[Any]]:
         """Copy the displacements or the differences, and the measures of every row."""
-        rows, cols, code = self.structure.rows, self.structure.cols, self.structure.code
-        values, measures = np.empty((rows, cols, 3), self._real), np.empty((rows, code.first_measure(None)), self._real)
+        rows, cols, config = self.layout.rows, self.layout.cols, self.layout.config
+        values, measures = (
+            np.empty((rows, cols, 3), self._real),
+            np.empty((rows, config.first_measure(None)), self._real),
+        )
         self._moving.read(differences, values, measures)
         return values, measures
 
@@ -227,19 +241,19 @@ class Dynamics:
         differences, by the number of steps; m is the mass of a point.
         """
         _, gain, _ = coefficients(self.plan)
-        sums = sum_pushes(self.structure, self._moving.arrays, clear=False)
+        sums = sum_corrections(self.layout, self._moving.arrays, clear=False)
         return sums / (gain * self.plan.grid.steps_per_frame)
 
     def _contact(self) -> NDArray[Any]:
         """Read the fields of contact, shape (fields, rows, cols)."""
-        code = self.structure.code
-        contact = code.get(ContactTerm)
+        config = self.layout.config
+        contact = config.get(ContactTerm)
         if contact is None:
-            return np.empty((0, self.structure.rows, self.structure.cols), self._real)
-        return self._moving.arrays.get_fields(code.first_field(ContactTerm), contact.field_count)
+            return np.empty((0, self.layout.rows, self.layout.cols), self._real)
+        return self._moving.arrays.get_fields(config.first_field(ContactTerm), contact.field_count)
 
-    def _require_whole(self) -> None:
-        if self.torn:
+    def _require_consistent(self) -> None:
+        if self.inconsistent:
             raise MsmError("interrupted while steps were taken; restore what was saved before, or restart the scene")
 
     def close(self) -> None:
@@ -266,7 +280,7 @@ class Dynamics:
     def _table(self, first: int, count: int) -> NDArray[Any]:
         """Tabulate the loads of steps first, ..., first + count - 1, shape (count, columns)."""
         _, gain, first_gain = coefficients(self.plan)
-        table = self._columns(schedule(self.plan, first, count), first)
+        table = self._columns(average_loads(self.plan, first, count), first)
         table[:, GAIN] = gain
         if first == 0:
             table[0, GAIN] = first_gain
@@ -274,10 +288,10 @@ class Dynamics:
 
     def _columns(self, loads: Schedule, first: int) -> NDArray[Any]:
         """Tabulate the loads from step `first` on, shape (their number, columns), without a gain."""
-        code = self.structure.code
-        table = np.zeros((len(loads.active), code.first_column(None)))
-        for term in code.terms:
-            first_column = code.first_column(type(term))
+        config = self.layout.config
+        table = np.zeros((len(loads.active), config.first_column(None)))
+        for term in config.terms:
+            first_column = config.first_column(type(term))
             table[:, first_column : first_column + term.column_count] = term.columns(self.plan, loads, first)
         # Loads too large for f32 become infinite; the next reading of the sheet shows it.
         with np.errstate(over="ignore"):
@@ -285,31 +299,35 @@ class Dynamics:
 
     def _place(self, state: State | None) -> None:
         """Fill the arrays of the sheet."""
-        layout, plan, sheet = self.structure, self.plan, self.plan.scene.sheet
+        layout, plan, sheet = self.layout, self.plan, self.plan.scene.sheet
         moves, column, areas = ~plan.fixed, np.arange(layout.cols), area_shares(sheet)
         # Rows are of three kinds: the first, any in between, the last.
         kinds = [0, layout.rows // 2, -1]
-        shares = areas[kinds] if layout.code.by_area else np.ones((3, layout.cols))
+        shares = areas[kinds] if layout.config.by_area else np.ones((3, layout.cols))
         by_column = np.empty((COLUMN_ROWS, layout.cols))
-        by_column[MOVES : MOVES + 3] = moves[kinds] / shares
+        by_column[MOBILITY : MOBILITY + 3] = moves[kinds] / shares
         # Springs along columns ask for the shares of a row in between even where there is none.
-        by_column[AREA : AREA + 3] = areas[0], 2 * areas[0], areas[-1]
-        by_column[ACROSS] = axes(sheet)[0]
+        by_column[AREA_SHARE : AREA_SHARE + 3] = areas[0], 2 * areas[0], areas[-1]
+        by_column[REST_X] = axes(sheet)[0]
         by_column[HAS_LEFT] = column > 0
         by_column[HAS_RIGHT] = column < layout.cols - 1
-        numbers = *spacing(sheet), sheet.size[0] / 2, *(n for term in layout.code.terms for n in term.numbers(plan))
-        fields = np.concatenate([term.fields(plan) for term in layout.code.terms])
+        constants = (
+            *spacing(sheet),
+            sheet.size[0] / 2,
+            *(n for term in layout.config.terms for n in term.constants(plan)),
+        )
+        fields = np.concatenate([term.fields(plan) for term in layout.config.terms])
         if state is not None and len(state.contact):
-            first = layout.code.first_field(ContactTerm)
+            first = layout.config.first_field(ContactTerm)
             fields[first : first + len(state.contact)] = state.contact
-        stiffness = layout.code.require(SpringTerm).laid_out(plan)
+        stiffness = layout.config.require(SpringTerm).stiffness_array(plan)
         self._sheet = None  # Frees its memory before another sheet takes some.
-        self._sheet = self._started(Start(np.array(numbers), by_column, fields, stiffness, state))
+        self._sheet = self._started(InitialData(np.array(constants), by_column, fields, stiffness, state))
 
-    def _started(self, start: Start) -> StepKernel:
+    def _started(self, start: InitialData) -> StepKernel:
         """Make the form of the kernel that the device takes."""
-        kind: type[StepKernel] = Scatter if self.structure.workers else Gather
-        return kind(self.structure, start)
+        kind: type[StepKernel] = ScatterKernel if self.layout.workers else GatherKernel
+        return kind(self.layout, start)
 
 
 def _in_words(moves: tuple[bool, ...]) -> str:
@@ -319,7 +337,7 @@ def _in_words(moves: tuple[bool, ...]) -> str:
 Array = NDArray[np.float64]
 
 
-class Gauge:
+class ForceRecorder:
     """Tells the forces of a plan's probes at its frames."""
 
     def __init__(self, plan: Plan) -> None:
@@ -329,13 +347,13 @@ class Gauge:
         # The sums of decays that stay the same, by probe.
         self._standing: dict[int, float] = {}
 
-    def at_rest(self) -> Felt:
+    def at_rest(self) -> ProbeForces:
         """Give the forces at the first frame."""
         plan, real = self._plan, np.float32 if self._plan.grid.precision == "f32" else np.float64
         forces = self._forces(0, rest_positions(plan.scene.sheet).astype(real), np.zeros((len(plan.tools), 3)))
-        return Felt(forces, tuple(PeakForce(0.0, one.force) for one in forces))
+        return ProbeForces(forces, tuple(PeakForce(0.0, one.force) for one in forces))
 
-    def follow(self, before: Felt, frame: int, position: NDArray[Any], tools: Array) -> Felt:
+    def follow(self, before: ProbeForces, frame: int, position: NDArray[Any], tools: Array) -> ProbeForces:
         """Give the forces at a frame, and the greatest up to it.
 
         Args:
@@ -346,7 +364,7 @@ class Gauge:
         """
         forces, time = self._forces(frame, position, tools), frame / self._plan.grid.frames_per_second
         peaks = zip(before.greatest, (PeakForce(time, one.force) for one in forces), strict=True)
-        return Felt(forces, tuple(max(pair, key=lambda peak: math.hypot(*peak.force)) for pair in peaks))
+        return ProbeForces(forces, tuple(max(pair, key=lambda peak: math.hypot(*peak.force)) for pair in peaks))
 
     def _forces(self, frame: int, position: NDArray[Any], tools: Array) -> tuple[TipForce, ...]:
         plan, moved = self._plan, iter(zip(self._plan.tools, tools.tolist(), strict=True))
@@ -354,12 +372,12 @@ class Gauge:
         for index, probe in enumerate(plan.scene.probes):
             if probe.moved:
                 tool, (x, y, z) = next(moved)
-                forces.append(TipForce(index, tool.lowest(frame / rate), (x, y, z)))
+                forces.append(TipForce(index, tool.lowest_point(frame / rate), (x, y, z)))
                 continue
             percent, at = self._loads[index].at(frame, rate)
             share = percent / 100 * self._decays(index, at) if percent else 0.0
             x, y, z = probe_force(probe, sheet).force
-            tip, _ = touched(position, plan.scene.render.refine, sheet, at)
+            tip, _ = surface_point(position, plan.scene.render.refine, sheet, at)
             # Not -0.
             forces.append(TipForce(index, tuple(tip.tolist()), (share * x + 0.0, share * y + 0.0, share * z + 0.0)))
         return tuple(forces)

@@ -14,12 +14,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.solver.arrays import BYTES, SheetArrays, SheetLayout, Start, reading
-from taichi_msm.solver.bands import COUNTER_STRIDE, MOMENTS, PLACE_END, ROUND, STEP, TURN, WORKER_STRIDE, advancing
+from taichi_msm.solver.arrays import BYTES, InitialData, SheetArrays, SheetLayout, build_read
+from taichi_msm.solver.bands import (
+    COUNTER_STRIDE,
+    MOMENT_ROWS,
+    PLACE_END,
+    ROUND,
+    STEP,
+    TURN,
+    WORKER_STRIDE,
+    build_advance,
+)
 from taichi_msm.system import process
 from taichi_msm.system.compiler import chosen
 from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, our_compilation, ti
-from taichi_msm.terms.base import StepCode
+from taichi_msm.terms.base import KernelConfig
 from taichi_msm.terms.bending import BendingTerm
 
 # Bytes of a page.
@@ -37,13 +46,13 @@ SHORTEST_REST, LONGEST_REST, HALF_LIFE = 0.002, 0.2, 0.02
 CROWDED = 0.2
 
 
-class Scatter:
+class ScatterKernel:
     """The state of a sheet in the memory of a CPU, and its kernels: a `StepKernel`."""
 
-    def __init__(self, layout: SheetLayout, start: Start) -> None:
+    def __init__(self, layout: SheetLayout, start: InitialData) -> None:
         self._layout = layout
-        self._advance, self._read = _kernels(layout.code, parallel=layout.workers > 1)
-        self._alone, _ = _kernels(layout.code, parallel=False)
+        self._advance, self._read = _kernels(layout.config, parallel=layout.workers > 1)
+        self._alone, _ = _kernels(layout.config, parallel=False)
         self._steps = 0
         self._rest = self._rests_until = 0.0
         # Time that all workers have stepped undisturbed since the last rest [s].
@@ -53,11 +62,11 @@ class Scatter:
         self._first_row, self._end_row = int(layout.fixed_rows[0]), layout.rows - int(layout.fixed_rows[1])
         # Stored after the sheet's own rows: two copies for every border of every worker; then moments.
         self._borders = self._border_rows()
-        moments = 0 if layout.code.get(BendingTerm) is None else MOMENTS * layout.workers
+        moments = 0 if layout.config.get(BendingTerm) is None else MOMENT_ROWS * layout.workers
         sheet_rows = np.arange(layout.rows, dtype=np.int32), self._borders, np.full(moments, -1, np.int32)
         self.arrays = SheetArrays(layout, np.concatenate(sheet_rows), start)
         # Rows of `carried` per worker: one for each step of a pass, and then a page, which no prefetcher crosses.
-        row_bytes = layout.width * layout.code.lanes * BYTES[layout.code.precision]
+        row_bytes = layout.width * layout.config.lanes * BYTES[layout.config.precision]
         self._carried_rows = layout.depth - (-PAGE // row_bytes)
         # Forces carried to the next row, for every worker and step of a pass.
         self._carried = [self.arrays.rows(layout.workers * self._carried_rows) for _ in range(3)]
@@ -144,7 +153,7 @@ class Scatter:
     def _copy_borders(self) -> None:
         """Bring the copies of the rows at the borders of bands up to date, after steps of a single worker."""
         with our_compilation():
-            _copying(self._layout.code)(*self.arrays.u, self._borders, self._layout.rows, self._layout.width)
+            _build_copy(self._layout.config)(*self.arrays.u, self._borders, self._layout.rows, self._layout.width)
         self._progress[::COUNTER_STRIDE] = self._steps
 
     def _start_pass(self) -> None:
@@ -173,21 +182,21 @@ class Scatter:
             # The row at the border and, with bending, the one behind it; each after even and after odd steps.
             inward = 1 if worker % 2 else -1
             for border in ((near, near + inward), (far, far - inward)):
-                rows += [*border[: self._layout.code.reach]] * 2
+                rows += [*border[: self._layout.config.reach]] * 2
         return np.array(rows, np.int32)
 
 
 @cache
-def _kernels(code: StepCode, *, parallel: bool) -> tuple[Callable[..., None], Callable[..., None]]:
+def _kernels(config: KernelConfig, *, parallel: bool) -> tuple[Callable[..., None], Callable[..., None]]:
     """Make the kernels of one code that step and read; each is compiled when it is first launched."""
     iterations = ITERATIONS_PER_THREAD if parallel else 1
-    return advancing(code, parallel=parallel), reading(code, parallel=parallel, iterations=iterations)
+    return build_advance(config, parallel=parallel), build_read(config, parallel=parallel, iterations=iterations)
 
 
 @cache
-def _copying(code: StepCode) -> Callable[..., None]:
+def _build_copy(config: KernelConfig) -> Callable[..., None]:
     """Make the kernel that updates the copies of the rows at the borders of bands."""
-    vectors = code.vectors
+    vectors = config.vectors
 
     @ti.kernel
     def copy(

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.solver.arrays import SheetArrays, SheetLayout, Start, point_step, reading
+from taichi_msm.solver.arrays import InitialData, SheetArrays, SheetLayout, build_point_step, build_read
 from taichi_msm.system.runtime import our_compilation, ti
-from taichi_msm.terms.base import DX, DY, HAS_LEFT, HAS_RIGHT, Entry, KernelRow, KernelSheet, StepCode
+from taichi_msm.terms.base import DX, DY, HAS_LEFT, HAS_RIGHT, Entry, KernelConfig, KernelRow, KernelSheet
 from taichi_msm.terms.bending import BendingTerm
 from taichi_msm.terms.contact import ContactTerm
 from taichi_msm.terms.springs import SpringTerm
@@ -24,16 +24,16 @@ from taichi_msm.terms.springs import SpringTerm
 STEPS_PER_LAUNCH = 8
 
 
-class Gather:
+class GatherKernel:
     """The state of a sheet in the memory of a GPU, and its kernels: a `StepKernel`."""
 
-    def __init__(self, layout: SheetLayout, start: Start) -> None:
+    def __init__(self, layout: SheetLayout, start: InitialData) -> None:
         self._layout = layout
-        self._advance, self._read = _kernels(layout.code)
+        self._advance, self._read = _kernels(layout.config)
         # Which of the two buffers holds u_n. Each has a halo of one row above and below.
         self._now = 0
         buffer = np.pad(np.arange(layout.rows, dtype=np.int32), 1, constant_values=-1)
-        moments = np.full(0 if layout.code.get(BendingTerm) is None else layout.rows + 2, -1, np.int32)
+        moments = np.full(0 if layout.config.get(BendingTerm) is None else layout.rows + 2, -1, np.int32)
         self.arrays = SheetArrays(layout, np.concatenate([buffer, buffer, moments]), start)
 
     def advance(self, count: int, table: NDArray[Any]) -> None:
@@ -54,24 +54,24 @@ class Gather:
 
 
 @cache
-def _kernels(code: StepCode) -> tuple[Callable[..., None], Callable[..., None]]:
+def _kernels(config: KernelConfig) -> tuple[Callable[..., None], Callable[..., None]]:
     """Make the kernels of one code; each is compiled when it is first launched."""
-    return _advancing(code), reading(code, parallel=True, iterations=1)
+    return _build_advance(config), build_read(config, parallel=True, iterations=1)
 
 
-def _gathering(code: StepCode) -> Callable[..., None]:
+def _build_step(config: KernelConfig) -> Callable[..., None]:
     """Make the function that steps a point."""
-    real, vector, columns, springs = code.real, code.vector, code.first_column(None), code.require(SpringTerm)
+    real, vector, columns, springs = config.real, config.vector, config.first_column(None), config.require(SpringTerm)
     structural, shear = springs.structural, springs.shear
     leaves_out = springs.open_edges and not springs.mapped
-    along, to_other_row, of_row, of_column, of_diagonal = springs.between(code)
-    move, contact = point_step(code), code.get(ContactTerm)
-    resolving = [contact.resolving(code)] if contact else []
+    along, to_other_row, of_row, of_column, of_diagonal = springs.build_spring_forces(config)
+    move, contact = build_point_step(config), config.get(ContactTerm)
+    build_resolve = [contact.build_resolve(config)] if contact else []
 
     @ti.func
     def by_row(sheet: ti.template(), p, q, lower, b, row_exists, up):
         """Force of entry b of row p on row q, which is `up` above; summed in the order of a pass on a CPU."""
-        u, dx = [sheet.u[c][p * sheet.width + b] for c in ti.static(range(3))], sheet.numbers[DX]
+        u, dx = [sheet.u[c][p * sheet.width + b] for c in ti.static(range(3))], sheet.constants[DX]
         force = [vector(0) for _ in ti.static(range(3))]
         for right in ti.static((-1, 0, 1)):
             if ti.static(structural if right == 0 else shear):
@@ -104,7 +104,7 @@ def _gathering(code: StepCode) -> Callable[..., None]:
         p = now * (rows + 2) + i + 1
         kind = ti.select(i == rows - 1, 2, ti.select(i == 0, 0, 1))
         below, above = ti.cast(i < rows - 1, real), ti.cast(i > 0, real)
-        dy = sheet.numbers[DY]
+        dy = sheet.constants[DY]
         on_below = by_row(sheet, p, p + 1, i + 1, b, below, 0 - dy)
         on_above = by_row(sheet, p, p - 1, i, b, above, dy)
         force = [0 - (on_below[c] + on_above[c]) for c in ti.static(range(3))]
@@ -120,17 +120,17 @@ def _gathering(code: StepCode) -> Callable[..., None]:
         entry = ti.static(Entry(line, b, u))
         target = (1 - now) * (rows + 2) + i + 1
         move(sheet, entry, target, force, row)
-        for resolve in ti.static(resolving):
+        for resolve in ti.static(build_resolve):
             resolve(sheet, i, kind, target, b, row)
 
     return step
 
 
-def _advancing(code: StepCode) -> Callable[..., None]:
+def _build_advance(config: KernelConfig) -> Callable[..., None]:
     """Make the kernel that takes steps."""
-    real, vector, vectors, count_of_numbers = code.real, code.vector, code.vectors, code.first_number(None)
-    step, bending = _gathering(code), code.get(BendingTerm)
-    storing = [bending.storing(code)] if bending else []
+    real, vector, vectors, constant_count = config.real, config.vector, config.vectors, config.first_constant(None)
+    step, bending = _build_step(config), config.get(BendingTerm)
+    storing = [bending.build_store_moment(config)] if bending else []
 
     @ti.kernel
     def advance(
@@ -141,23 +141,23 @@ def _advancing(code: StepCode) -> Callable[..., None]:
         loads: ti.types.ndarray(dtype=real, ndim=2),
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
-        numbers_of: ti.types.ndarray(dtype=vector, ndim=1),
+        constants_of: ti.types.ndarray(dtype=vector, ndim=1),
         by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
         for n in ti.static(range(STEPS_PER_LAUNCH)):
             for store_moment in ti.static(storing):
                 for i, b in ti.ndrange((-1, rows + 1), cols + 2):
                     if n < count:
-                        numbers = [numbers_of[m][0] for m in ti.static(range(count_of_numbers))]
+                        constants = [constants_of[m][0] for m in ti.static(range(constant_count))]
                         u, d = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z))
-                        sheet = ti.static(KernelSheet(u, d, by_column, stiffness, fields, numbers, rows, cols + 2))
+                        sheet = ti.static(KernelSheet(u, d, by_column, stiffness, fields, constants, rows, cols + 2))
                         p = (now + n) % 2 * (rows + 2) + i + 1
                         store_moment(sheet, i, p - 1, p, p + 1, b, 2 * (rows + 2) + i + 1)
             for i, b in ti.ndrange(rows, (1, cols + 1)):
                 if n < count:
-                    numbers = [numbers_of[m][0] for m in ti.static(range(count_of_numbers))]
+                    constants = [constants_of[m][0] for m in ti.static(range(constant_count))]
                     u, d = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z))
-                    sheet = ti.static(KernelSheet(u, d, by_column, stiffness, fields, numbers, rows, cols + 2))
+                    sheet = ti.static(KernelSheet(u, d, by_column, stiffness, fields, constants, rows, cols + 2))
                     step(sheet, loads, (now + n) % 2, i, b, n)
 
     return advance

@@ -26,13 +26,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.solver.arrays import SheetArrays, SheetLayout, Start, in_lanes, point_forces, reading
-from taichi_msm.solver.bands import MOMENTS, RowBand, joining, stepping_row
+from taichi_msm.solver.arrays import InitialData, SheetArrays, SheetLayout, build_read, point_forces, to_lanes
+from taichi_msm.solver.bands import MOMENT_ROWS, RowBand, build_join_strips, build_step_row
 from taichi_msm.system.runtime import our_compilation, ti, write
-from taichi_msm.terms.base import MOVES, Entry, KernelRow, KernelSheet, StepCode
+from taichi_msm.terms.base import MOBILITY, Entry, KernelConfig, KernelRow, KernelSheet
 from taichi_msm.terms.bending import BendingTerm
 from taichi_msm.terms.contact import ContactTerm
-from taichi_msm.terms.contact_rest import bearing, keeping_out
+from taichi_msm.terms.contact_rest import build_bear, build_keep_out
 from taichi_msm.terms.springs import SpringTerm
 
 # The numbers of a launch. It is given: rows of the sheet; columns of a strip; the first row that moves, and the row
@@ -63,7 +63,7 @@ class RestSheet(NamedTuple):
     by_column: Any
     stiffness: Any
     fields: Any
-    numbers: Any
+    constants: Any
     rows: Any
     width: Any
     q: Any  # momenta, three arrays
@@ -77,15 +77,15 @@ class Relaxation:
         masses: M of every point [N/m], shape (rows, cols).
     """
 
-    def __init__(self, layout: SheetLayout, start: Start, masses: NDArray[Any]) -> None:
+    def __init__(self, layout: SheetLayout, start: InitialData, masses: NDArray[Any]) -> None:
         self._layout = layout
-        self._relax, self._compare, self._read = _kernels(layout.code)
-        moments = 0 if layout.code.get(BendingTerm) is None else MOMENTS
+        self._relax, self._compare, self._read = _kernels(layout.config)
+        moments = 0 if layout.config.get(BendingTerm) is None else MOMENT_ROWS
         # Stored after the sheet's own rows: moments, and then the forces carried to the next row.
         self._stored = np.concatenate([np.arange(layout.rows, dtype=np.int32), np.full(moments + 1, -1, np.int32)])
         self.arrays = arrays = SheetArrays(layout, self._stored, start)
         self._q, self._work = [arrays.rows(layout.rows) for _ in range(3)], arrays.rows(layout.rows + SUMS)
-        write(self._work, in_lanes(layout, 1 / masses))
+        write(self._work, to_lanes(layout, 1 / masses))
         first_fixed, last_fixed = layout.fixed_rows
         self._fire = np.zeros(NUMBERS)
         self._fire[:COUNT] = layout.rows, layout.strip, int(first_fixed), layout.rows - int(last_fixed)
@@ -94,7 +94,7 @@ class Relaxation:
     def stop(self) -> None:
         """Let the points stand still, and begin again with FIRE's first step."""
         for q in self._q:
-            write(q, np.zeros((0, self._layout.code.lanes)))
+            write(q, np.zeros((0, self._layout.config.lanes)))
         self._fire[[STEP, SHARE, WORKED, PLACED]] = LARGEST_STEP, FIRST_SHARE, 0, 1
 
     def place(self, displacement: NDArray[Any]) -> None:
@@ -102,7 +102,7 @@ class Relaxation:
         held = (self._stored >= 0)[:, None]
         self._fire[PLACED] = 1
         for c in range(3):
-            write(self.arrays.u[c], in_lanes(self._layout, np.where(held, displacement[self._stored, :, c], 0)))
+            write(self.arrays.u[c], to_lanes(self._layout, np.where(held, displacement[self._stored, :, c], 0)))
 
     def relax(self, count: int, enough: float, row: NDArray[Any]) -> tuple[int, float]:
         """Evaluate the forces up to `count` times, and move the points after each; until all forces are small.
@@ -137,22 +137,22 @@ class Relaxation:
 
 
 @cache
-def _kernels(code: StepCode) -> tuple[Callable[..., None], Callable[..., None], Callable[..., None]]:
+def _kernels(config: KernelConfig) -> tuple[Callable[..., None], Callable[..., None], Callable[..., None]]:
     """Make the kernels of one code; each is compiled when it is first launched."""
-    return _relaxing(code), _comparing(code), reading(code, parallel=False, iterations=1)
+    return _build_relax(config), _build_compare(config), build_read(config, parallel=False, iterations=1)
 
 
-def _storing(code: StepCode) -> Callable[..., None]:
+def _build_store(config: KernelConfig) -> Callable[..., None]:
     """Make the function that stores the force on an entry, and adds what FIRE needs of it to the sums."""
-    vector, forces, contact = code.vector, point_forces(code), code.get(ContactTerm)
-    bearings = [bearing(code, contact)] if contact else []
+    vector, forces, contact = config.vector, point_forces(config), config.get(ContactTerm)
+    bearings = [build_bear(config, contact)] if contact else []
 
     @ti.func
     def store(sheet: ti.template(), entry: ti.template(), _target, force: ti.template(), now: ti.template()):
         for add in ti.static(forces):
             add(force, sheet, entry, now)
         width, at = sheet.width, entry.row.i * sheet.width + entry.b
-        moves = sheet.by_column[(MOVES + entry.row.kind) * width + entry.b] > 0
+        moves = sheet.by_column[(MOBILITY + entry.row.kind) * width + entry.b] > 0
         inverse = sheet.work[at]
         power, square, motion = vector(0), vector(0), vector(0)
         for c in ti.static(range(3)):
@@ -175,14 +175,14 @@ def _storing(code: StepCode) -> Callable[..., None]:
     return store
 
 
-def _relaxing(code: StepCode) -> Callable[..., None]:
+def _build_relax(config: KernelConfig) -> Callable[..., None]:
     """Make the kernel that moves the points."""
-    real, vector, vectors, lanes = code.real, code.vector, code.vectors, code.lanes
-    count_of_numbers, join_strips = code.first_number(None), joining(code)
-    pass_row = stepping_row(code, _storing(code), touches=False, parallel=False)
-    moments = 0 if code.get(BendingTerm) is None else MOMENTS
-    columns, contact = code.first_column(None), code.get(ContactTerm)
-    bearings, keepings = ([bearing(code, contact)], [keeping_out(code, contact)]) if contact else ([], [])
+    real, vector, vectors, lanes = config.real, config.vector, config.vectors, config.lanes
+    constant_count, join_strips = config.first_constant(None), build_join_strips(config)
+    pass_row = build_step_row(config, _build_store(config), touches=False, parallel=False)
+    moments = 0 if config.get(BendingTerm) is None else MOMENT_ROWS
+    columns, contact = config.first_column(None), config.get(ContactTerm)
+    bearings, keepings = ([build_bear(config, contact)], [build_keep_out(config, contact)]) if contact else ([], [])
 
     @ti.func
     def add_up(sheet: ti.template(), n: ti.template()):
@@ -240,7 +240,7 @@ def _relaxing(code: StepCode) -> Callable[..., None]:
         work: vectors,
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
-        numbers_of: ti.types.ndarray(dtype=vector, ndim=1),
+        constants_of: ti.types.ndarray(dtype=vector, ndim=1),
         by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
         ti.loop_config(serialize=True)
@@ -248,9 +248,9 @@ def _relaxing(code: StepCode) -> Callable[..., None]:
             rows, width = ti.cast(fire[ROWS], ti.i32), ti.cast(fire[STRIP], ti.i32) + 2
             low, high = ti.cast(fire[FIRST_ROW], ti.i32), ti.cast(fire[END_ROW], ti.i32)
             count = ti.cast(fire[COUNT], ti.i32)
-            numbers = [numbers_of[n][0] for n in ti.static(range(count_of_numbers))]
+            constants = [constants_of[n][0] for n in ti.static(range(constant_count))]
             u, forces, q = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z), (q_x, q_y, q_z))
-            sheet = ti.static(RestSheet(u, forces, by_column, stiffness, fields, numbers, rows, width, q, work))
+            sheet = ti.static(RestSheet(u, forces, by_column, stiffness, fields, constants, rows, width, q, work))
             band = ti.static(RowBand(0, 1, low, high, 1, rows, 0, fire))
             if fire[PLACED] > 0:
                 for i in range(low, high):
@@ -295,11 +295,13 @@ def _relaxing(code: StepCode) -> Callable[..., None]:
     return relax
 
 
-def _comparing(code: StepCode) -> Callable[..., None]:
+def _build_compare(config: KernelConfig) -> Callable[..., None]:
     """Make the kernel that finds the square of the largest force of a spring, a load or the foundation."""
-    real, vector, vectors, columns = code.real, code.vector, code.vectors, code.first_column(None)
-    count_of_numbers, pull = code.first_number(None), code.require(SpringTerm).pulling(code)
-    forces = [force for term in code.terms if not isinstance(term, BendingTerm) for force in term.forces(code)]
+    real, vector, vectors, columns = config.real, config.vector, config.vectors, config.first_column(None)
+    constant_count, pull = config.first_constant(None), config.require(SpringTerm).build_max_spring_force(config)
+    forces = [
+        force for term in config.terms if not isinstance(term, BendingTerm) for force in term.build_forces(config)
+    ]
 
     @ti.kernel
     def compare(
@@ -309,14 +311,14 @@ def _comparing(code: StepCode) -> Callable[..., None]:
         row: ti.types.ndarray(dtype=real, ndim=2),
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
-        numbers_of: ti.types.ndarray(dtype=vector, ndim=1),
+        constants_of: ti.types.ndarray(dtype=vector, ndim=1),
         by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
         ti.loop_config(serialize=True)
         for _ in range(1):
-            numbers = [numbers_of[n][0] for n in ti.static(range(count_of_numbers))]
+            constants = [constants_of[n][0] for n in ti.static(range(constant_count))]
             u, d = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z))
-            sheet = ti.static(KernelSheet(u, d, by_column, stiffness, fields, numbers, rows, width))
+            sheet = ti.static(KernelSheet(u, d, by_column, stiffness, fields, constants, rows, width))
             now = [row[0, c] for c in ti.static(range(columns))]
             largest = vector(0)
             for i in range(rows):
@@ -326,7 +328,7 @@ def _comparing(code: StepCode) -> Callable[..., None]:
                     here = [u[c][i * width + b] for c in ti.static(range(3))]
                     entry = ti.static(Entry(line, b, here))
                     largest = ti.max(largest, pull(sheet, entry))
-                    moves = sheet.by_column[(MOVES + kind) * width + b] > 0
+                    moves = sheet.by_column[(MOBILITY + kind) * width + b] > 0
                     for add in ti.static(forces):
                         force = [vector(0) for _ in ti.static(range(3))]
                         add(force, sheet, entry, now)

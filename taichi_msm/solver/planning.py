@@ -23,24 +23,24 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError, Problem, SceneError
 from taichi_msm.images import PictureError
-from taichi_msm.model.plan import Plan, slots_of
+from taichi_msm.model.plan import Plan, build_slots
 from taichi_msm.model.sheet import (
     MapImage,
     Maps,
     Material,
     fixed_points,
-    kind_problems,
+    material_key_problems,
     read_map,
     spacing,
     tissue_problems,
 )
 from taichi_msm.model.time_grid import TimeGrid
-from taichi_msm.model.tools import LARGEST_STRIDE, Tool, path_problems, too_fast, tools_of
+from taichi_msm.model.tools import MAX_STRIDE_RADII, Tool, build_tools, path_problems, too_fast
 from taichi_msm.scene.scene import Scene, Time
 from taichi_msm.scene.section import WHOLE
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Probe
-from taichi_msm.terms import highest_frequency, material_of
+from taichi_msm.terms import derive_material, highest_frequency
 
 # Work of starting Python and Taichi and of compiling the kernels.
 START = 4e8
@@ -63,7 +63,7 @@ EVALUATIONS = 2.0
 SMALL = 0.25
 
 # Unless they are asked for, pilots are run only if they take at most this share of the run.
-MOST_FOR_PILOTS = 2 / 5
+MAX_COMPANION_SHARE = 2 / 5
 
 
 class Work(NamedTuple):
@@ -75,22 +75,22 @@ class Work(NamedTuple):
     pictures: float  # drawing and encoding
 
 
-def work(plan: Plan, pilots: float) -> Work:
+def count_work(plan: Plan, pilots: float) -> Work:
     """Count the work of a run; pilots: their steps in f64 for each step of it, counted in steps of the whole sheet."""
     steps = _steps(plan)
     stepping = DOUBLE * steps if plan.grid.precision == "f64" else steps
     return Work(START, stepping, DOUBLE * pilots * steps, _other(plan.scene) - START)
 
 
-def is_small_in_f64(plan: Plan) -> bool:
+def is_f64_cheap(plan: Plan) -> bool:
     """Tell whether stepping in f64 is a small part of a run, so that `auto` chooses it."""
     return DOUBLE * _steps(plan) <= SMALL * _other(plan.scene)
 
 
-def affords_pilots(plan: Plan, pilots: float) -> bool:
+def affords_companions(plan: Plan, pilots: float) -> bool:
     """Tell whether pilots take at most two fifths of a run; arguments as for `work`."""
-    parts = work(plan, pilots)
-    return parts.pilots <= MOST_FOR_PILOTS * sum(parts)
+    parts = count_work(plan, pilots)
+    return parts.pilots <= MAX_COMPANION_SHARE * sum(parts)
 
 
 def _steps(plan: Plan) -> float:
@@ -108,8 +108,6 @@ def _other(scene: Scene) -> float:
     pixels = (scene.time.frames + 1) * math.prod(scene.render.size) * len(scene.render.all_cameras) * scene.renders
     return START + pixels * (ENCODING + SAMPLE * scene.render.supersample**2)
 
-
-pass  # REMOVED
 
 # Lengths [m] whose squares, and a few of their products, f32 holds.
 SMALLEST_SINGLE, LARGEST_SINGLE = 1e-15, 1e17
@@ -133,13 +131,13 @@ def try_plan(scene: Scene, maps: Maps | None = None) -> tuple[Plan | None, list[
         scene: whose keys are valid each by itself.
         maps: from the plan of a scene with the same maps; None: they are read.
     """
-    problems = list(kind_problems(scene))
+    problems = list(material_key_problems(scene))
     if problems:
         return None, problems
     if maps is None:
         maps, unreadable = _read_maps(scene)
         problems += unreadable
-    fixed, material = fixed_points(scene.sheet), material_of(scene, maps)
+    fixed, material = fixed_points(scene.sheet), derive_material(scene, maps)
     problems += tissue_problems(scene, fixed, material.factors)
     if problems:
         return None, problems
@@ -147,9 +145,9 @@ def try_plan(scene: Scene, maps: Maps | None = None) -> tuple[Plan | None, list[
     return plan, [*_step_problems(plan), *path_problems(scene, plan.tools, plan.grid)]
 
 
-def variant(plan: Plan, scene: Scene) -> Plan:
+def plan_variant(plan: Plan, scene: Scene) -> Plan:
     """Plan a scene that a valid one was turned into, with its maps, without looking for what is wrong with it."""
-    return _plan(scene, plan.maps, fixed_points(scene.sheet), material_of(scene, plan.maps))
+    return _plan(scene, plan.maps, fixed_points(scene.sheet), derive_material(scene, plan.maps))
 
 
 def _read_maps(scene: Scene) -> tuple[dict[str, MapImage], list[Problem]]:
@@ -166,11 +164,11 @@ def _read_maps(scene: Scene) -> tuple[dict[str, MapImage], list[Problem]]:
 def _plan(scene: Scene, maps: Maps, fixed: NDArray[np.bool_], material: Material) -> Plan:
     limit = stable_step(material, scene.sheet, scene.time.damping_difference)
     grid = TimeGrid(scene.time.frames_per_second, scene.time.frames, steps_per_frame(scene.time, limit), "f64")
-    tools = tools_of(scene.probes, scene.sheet)
-    return on(Plan(scene, maps, fixed, material, limit, grid, slots_of(scene, grid), tools), "cpu")
+    tools = build_tools(scene.probes, scene.sheet)
+    return choose_precision(Plan(scene, maps, fixed, material, limit, grid, build_slots(scene, grid), tools), "cpu")
 
 
-def on(plan: Plan, arch: str) -> Plan:
+def choose_precision(plan: Plan, arch: str) -> Plan:
     """Choose the precision for an arch, unless the scene gives it.
 
     A tolerance asks for f64; so does `auto` where it is a small part of the run. On a GPU f64 is slow or missing. At
@@ -181,7 +179,7 @@ def on(plan: Plan, arch: str) -> Plan:
         return plan.with_grid(precision="f64")
     if time.precision != "auto":
         return plan.with_grid(precision=time.precision)
-    in_f64 = arch == "cpu" and (time.tolerance is not None or is_small_in_f64(plan))
+    in_f64 = arch == "cpu" and (time.tolerance is not None or is_f64_cheap(plan))
     return plan.with_grid(precision="f64" if in_f64 else "f32")
 
 
@@ -220,7 +218,7 @@ def with_time(scene: Scene, **changes: Any) -> Scene:
     return scene.model_copy(update={"time": scene.time.model_copy(update=changes)})
 
 
-def with_chosen_grid(plan: Plan) -> Plan:
+def freeze_grid(plan: Plan) -> Plan:
     """Write the grid into the scene, so that every plan of it has the same grid, on any arch.
 
     The precision is written, and a step in the place of a tolerance; a step that follows from the scene stays "auto".
@@ -266,7 +264,7 @@ def _step_problems(plan: Plan) -> Iterator[Problem]:
 Key = tuple[float, float, float, float]
 
 
-def steered(plan: Plan, probes: Sequence[Probe | Mapping[str, Any] | None], now: float) -> Plan:
+def steer_plan(plan: Plan, probes: Sequence[Probe | Mapping[str, Any] | None], now: float) -> Plan:
     """Replace the probes of a plan from a time on [s].
 
     A tool that stays as it is, also on its path, is None or given as it is. Any other with a path gets the keys of its
@@ -283,7 +281,7 @@ def steered(plan: Plan, probes: Sequence[Probe | Mapping[str, Any] | None], now:
     given = [_completed(*pair) for pair in zip(before, probes, strict=True)]
     after = plan.with_probes(given)
     steering = [
-        _Steering(plan, index, *pair, now)
+        _PathChange(plan, index, *pair, now)
         for index, pair in enumerate(zip(before, after.scene.probes, strict=True))
         if pair[0].moved and pair[1].moved and pair[0] != pair[1]
     ]
@@ -295,7 +293,7 @@ def steered(plan: Plan, probes: Sequence[Probe | Mapping[str, Any] | None], now:
     return after.with_probes([going_on.get(index, probe) for index, probe in enumerate(after.scene.probes)])
 
 
-def with_paths_of(plan: Plan, probes: Sequence[Probe]) -> Plan:
+def with_current_paths(plan: Plan, probes: Sequence[Probe]) -> Plan:
     """Give the tools that are moved the paths, and all else, that they have among these probes."""
     if not plan.tools:
         return plan
@@ -311,7 +309,7 @@ def _completed(before: Probe, given: Probe | Mapping[str, Any] | None) -> Probe 
     return {"instrument": before.instrument, "friction": before.friction, "grip": before.grip, **given}
 
 
-class _Steering:
+class _PathChange:
     """A tool that gets another path.
 
     Attributes:
@@ -343,12 +341,12 @@ class _Steering:
             yield Problem((*where, "path", 0), said)
             return
         grid, sheet = self._plan.grid, self._plan.scene.sheet
-        (was,), (tool,) = tools_of((self._before,), sheet), tools_of((self.probe,), sheet)
+        (was,), (tool,) = build_tools((self._before,), sheet), build_tools((self.probe,), sheet)
         first = len(self._past) - 1
         if not self._plan.scene.time.at_rest and (fault := too_fast(tool, grid, first)):
             yield Problem((*where, "path", fault[0] - first - 1), fault[1])
         turned = _change(was, tool)
-        if turned > LARGEST_STRIDE * tool.radius:
+        if turned > MAX_STRIDE_RADII * tool.radius:
             yield Problem(
                 (*where, "instrument"),
                 f"changes its shape by {turned:.3g} m in a step, over half its radius; change it little by little",

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from taichi_msm.solver.arrays import SheetArrays, SheetLayout
 from taichi_msm.system.runtime import our_compilation, ti
-from taichi_msm.terms.base import AREA, StepCode
-from taichi_msm.terms.contact import PUSHES, ContactTerm
+from taichi_msm.terms.base import AREA_SHARE, KernelConfig
+from taichi_msm.terms.contact import CORRECTIONS, ContactTerm
 
 
-def sum_pushes(layout: SheetLayout, arrays: SheetArrays, *, clear: bool) -> NDArray[np.float64]:
+def sum_corrections(layout: SheetLayout, arrays: SheetArrays, *, clear: bool) -> NDArray[np.float64]:
     """Add up the pushes [m] that the fields of contact hold, each times its point's share of a cell's mass.
 
     clear: set them to 0 then.
@@ -22,20 +22,24 @@ def sum_pushes(layout: SheetLayout, arrays: SheetArrays, *, clear: bool) -> NDAr
     Returns:
         Sums [m], shape (tools, 3); the order of adding depends neither on lanes nor on workers.
     """
-    contact = layout.code.get(ContactTerm)
+    contact = layout.config.get(ContactTerm)
     if contact is None:
         return np.zeros((0, 3))
-    sums = np.empty((PUSHES * contact.tools, layout.rows))
+    sums = np.empty((CORRECTIONS * contact.tools, layout.rows))
     with our_compilation():
-        _summing(layout.code)(layout.rows, layout.cols, clear, arrays.by_column, arrays.fields, sums)
-    return sums.sum(axis=1).reshape(-1, PUSHES)
+        _build_sum(layout.config)(layout.rows, layout.cols, clear, arrays.by_column, arrays.fields, sums)
+    return sums.sum(axis=1).reshape(-1, CORRECTIONS)
 
 
 @cache
-def _summing(code: StepCode) -> Callable[..., None]:
+def _build_sum(config: KernelConfig) -> Callable[..., None]:
     """Make the kernel that adds up every component of the pushes of every tool in every row, from left to right."""
-    vector, vectors, lanes, serial = code.vector, code.vectors, code.lanes, code.lanes > 1
-    first, count, by_area = code.first_field(ContactTerm), PUSHES * code.require(ContactTerm).tools, code.by_area
+    vector, vectors, lanes, serial = config.vector, config.vectors, config.lanes, config.lanes > 1
+    first, count, by_area = (
+        config.first_field(ContactTerm),
+        CORRECTIONS * config.require(ContactTerm).tools,
+        config.by_area,
+    )
 
     @ti.kernel
     def add_up(
@@ -61,7 +65,7 @@ def _summing(code: StepCode) -> Callable[..., None]:
                         for b in range(1, strip + 1):
                             share = ti.cast(1, ti.f64)
                             if ti.static(by_area):
-                                share = ti.cast(share_of[(AREA + kind) * (strip + 2) + b][lane], ti.f64)
+                                share = ti.cast(share_of[(AREA_SHARE + kind) * (strip + 2) + b][lane], ti.f64)
                             total += share * ti.cast(pushes[row + b][lane], ti.f64)
                     if clear:
                         for b in range(1, strip + 1):

@@ -27,18 +27,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import DivergedError, Pause
-from taichi_msm.model.loads import frame_loads
+from taichi_msm.model.loads import evaluate_frame_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.model.tools import GRASP, Tool, grip_frames
+from taichi_msm.model.tools import GRIP_RADII, Tool, grip_frames
 from taichi_msm.scene.section import SMALLEST
-from taichi_msm.solver.arrays import SheetLayout, Start
+from taichi_msm.solver.arrays import InitialData, SheetLayout
 from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.solver.kernel_rest import Relaxation
-from taichi_msm.solver.state import Reading, State, farthest
+from taichi_msm.solver.state import Reading, State, largest_displacement
 from taichi_msm.system.runtime import Device
-from taichi_msm.terms import inertia
-from taichi_msm.terms.contact import AFTER, COLUMNS, HELD, PUSHES, SINCE, TAKEN, TOOL_COLUMNS, ContactTerm
+from taichi_msm.terms import fictitious_masses
+from taichi_msm.terms.contact import (
+    COLUMNS,
+    CORRECTIONS,
+    GRIP_SHIFT,
+    HOLD_DISPLACEMENT,
+    HOLDER,
+    TIP_AFTER,
+    TOOL_COLUMNS,
+    ContactTerm,
+)
 
 # A frame is done when the forces left are this share of the largest; it is disturbed when they are that share. Where
 # the balance may not be stable, the search goes on to a smaller share.
@@ -59,7 +68,7 @@ PER_LAUNCH, POINTS_PER_LAUNCH = 64, 40_000_000
 Array = NDArray[np.float64]
 
 
-class Rest(Dynamics):
+class QuasiStatics(Dynamics):
     """The sheet at rest, in the place of the sheet in motion: a frame is a step.
 
     Attributes:
@@ -81,7 +90,7 @@ class Rest(Dynamics):
         Raises:
             DivergedError: when no shape was found in which the forces balance.
         """
-        self._require_whole()
+        self._require_consistent()
         end = self.steps_done + steps
         while self._settled is None or self.steps_done < end:
             frame = self.steps_done + (self._settled is not None)
@@ -92,7 +101,7 @@ class Rest(Dynamics):
 
     def compile(self) -> None:
         """Compile everything without moving anything."""
-        row = self._columns(frame_loads(self.plan, 0), 0)
+        row = self._columns(evaluate_frame_loads(self.plan, 0), 0)
         self._relaxation.relax(0, 0.0, row)
         self._relaxation.scale(row)
         self.displacement()
@@ -117,17 +126,17 @@ class Rest(Dynamics):
     def _touched(self) -> NDArray[np.bool_]:
         """Tell which points each tool touches or holds, shape (tools, rows, cols)."""
         tools, contact = len(self.plan.tools), self._contact()
-        normals = contact[: PUSHES * tools].reshape(tools, PUSHES, self.structure.rows, self.structure.cols)
+        normals = contact[: CORRECTIONS * tools].reshape(tools, CORRECTIONS, self.layout.rows, self.layout.cols)
         touched = (normals != 0).any(axis=1)
-        if len(contact) > PUSHES * tools:
-            touched |= contact[PUSHES * tools + HELD] == np.arange(1, tools + 1)[:, None, None]
+        if len(contact) > CORRECTIONS * tools:
+            touched |= contact[CORRECTIONS * tools + HOLDER] == np.arange(1, tools + 1)[:, None, None]
         return np.asarray(touched)
 
-    def _started(self, start: Start) -> Any:
+    def _started(self, start: InitialData) -> Any:
         self._astray = False
         # A point without any stiffness has no place to rest either.
-        self._masses = np.maximum(inertia(self.plan), SMALLEST)
-        return Relaxation(self.structure, start, self._masses)
+        self._masses = np.maximum(fictitious_masses(self.plan), SMALLEST)
+        return Relaxation(self.layout, start, self._masses)
 
     @property
     def _relaxation(self) -> Relaxation:
@@ -139,7 +148,7 @@ class Rest(Dynamics):
         """The last frame that was found; before the first one, the flat sheet."""
         if self._settled is not None:
             return self._settled
-        shape, contact = (self.structure.rows, self.structure.cols), self.structure.code.get(ContactTerm)
+        shape, contact = (self.layout.rows, self.layout.cols), self.layout.config.get(ContactTerm)
         none = np.zeros((0 if contact is None else contact.field_count, *shape))
         return State(0, np.zeros((*shape, 3)), np.zeros((*shape, 3)), none)
 
@@ -152,12 +161,12 @@ class Rest(Dynamics):
     def _settle(self, frame: int, pause: Pause) -> None:
         """Find the shape of a frame."""
         self.evaluations = 0
-        relaxation, before, loads = self._relaxation, self._before, frame_loads(self.plan, frame)
+        relaxation, before, loads = self._relaxation, self._before, evaluate_frame_loads(self.plan, frame)
         contact = self._gripping(frame, before)
-        held = PUSHES * len(self.plan.tools) + HELD
+        held = CORRECTIONS * len(self.plan.tools) + HOLDER
         held_before, holds = (len(fields) > held and bool(fields[held].any()) for fields in (before.contact, contact))
         if len(contact):
-            relaxation.arrays.set_fields(self.structure.code.first_field(ContactTerm), contact)
+            relaxation.arrays.set_fields(self.layout.config.first_field(ContactTerm), contact)
         if self._astray:
             relaxation.place(before.displacement)
         self._astray, left = True, 0.0
@@ -191,16 +200,16 @@ class Rest(Dynamics):
         """List the times of the shapes on the way to a frame, and that of the frame itself."""
         rate = self.plan.grid.frames_per_second
         begin, end = max(0, frame - 1) / rate, frame / rate
-        return sorted({end, *(float(time) for tool in self.plan.tools for time in tool.strides(begin, end))})
+        return sorted({end, *(float(time) for tool in self.plan.tools for time in tool.substep_times(begin, end))})
 
     def _at(self, time: float, frame: int, row: NDArray[Any]) -> NDArray[Any]:
         """Put the tools in a row of the table of loads where they are at a time on the way to a frame."""
         for n, tool in enumerate(self.plan.tools):
-            own = self.structure.code.first_column(ContactTerm) + COLUMNS + TOOL_COLUMNS * n
-            middle = tool.middle(np.array([time]))[0]
-            row[0, own + AFTER : own + AFTER + 3] = middle
+            own = self.layout.config.first_column(ContactTerm) + COLUMNS + TOOL_COLUMNS * n
+            middle = tool.tip_centre(np.array([time]))[0]
+            row[0, own + TIP_AFTER : own + TIP_AFTER + 3] = middle
             for taken in self._held(tool, frame):
-                row[0, own + SINCE : own + SINCE + 3] = middle - self._taken_at(tool, taken)
+                row[0, own + GRIP_SHIFT : own + GRIP_SHIFT + 3] = middle - self._taken_at(tool, taken)
         return row
 
     def _held(self, tool: Tool, frame: int) -> Iterator[int]:
@@ -212,14 +221,17 @@ class Rest(Dynamics):
 
     def _taken_at(self, tool: Tool, frame: int) -> Array:
         """Tell where a tool was when it took hold at a frame: with the points as they were the frame before."""
-        return tool.middle(np.array([max(0, frame - 1) / self.plan.grid.frames_per_second]))[0]
+        return tool.tip_centre(np.array([max(0, frame - 1) / self.plan.grid.frames_per_second]))[0]
 
     def _gripping(self, frame: int, before: State) -> NDArray[Any]:
         """Give the fields of contact at the start of a frame: grips that end let go, and others take hold."""
         tools, contact = self.plan.tools, before.contact.copy()
-        if len(contact) == PUSHES * len(tools):
+        if len(contact) == CORRECTIONS * len(tools):
             return contact
-        held, taken = contact[PUSHES * len(tools) + HELD], contact[PUSHES * len(tools) + TAKEN :]
+        held, taken = (
+            contact[CORRECTIONS * len(tools) + HOLDER],
+            contact[CORRECTIONS * len(tools) + HOLD_DISPLACEMENT :],
+        )
         place = rest_positions(self.plan.scene.sheet) + before.displacement
         begun = [frame in self._held(tool, frame) for tool in tools]
         for n, tool in enumerate(tools):
@@ -227,7 +239,7 @@ class Rest(Dynamics):
                 held[held == n + 1] = 0
         for n, tool in enumerate(tools):
             if begun[n]:
-                near = np.linalg.norm(place - self._taken_at(tool, frame), axis=-1) <= GRASP * tool.radius
+                near = np.linalg.norm(place - self._taken_at(tool, frame), axis=-1) <= GRIP_RADII * tool.radius
                 takes = near & ~self.plan.fixed & (held == 0)
                 held[takes] = n + 1
                 taken[:, takes] = before.displacement[takes].T
@@ -235,9 +247,9 @@ class Rest(Dynamics):
 
     def _relax(self, frame: int, row: NDArray[Any], wanted: float, pause: Pause) -> float:
         """Let the points go to where at most a share of the forces is left; returns that share."""
-        relaxation, longer = self._relaxation, max(self.structure.rows, self.structure.cols)
+        relaxation, longer = self._relaxation, max(self.layout.rows, self.layout.cols)
         relaxation.stop()
-        per_launch = max(1, min(PER_LAUNCH, POINTS_PER_LAUNCH // (self.structure.rows * self.structure.cols)))
+        per_launch = max(1, min(PER_LAUNCH, POINTS_PER_LAUNCH // (self.layout.rows * self.layout.cols)))
         most, evaluations, disturbed = MOST_EVALUATIONS * longer, 0, wanted >= DISTURBED
         scale, last = max(NOTHING, relaxation.scale(row)), math.inf
         while True:
@@ -272,7 +284,7 @@ class Rest(Dynamics):
 
     def _disturb(self, force: float) -> None:
         """Move every point at random, by at most what a force [N] moves it; always in the same way."""
-        rows, cols = self.structure.rows, self.structure.cols
+        rows, cols = self.layout.rows, self.layout.cols
         # This generator gives the same numbers with every version of NumPy.
         noise = 2 * np.random.RandomState(0).random_sample((rows, cols, 3)) - 1
         moves = (~self.plan.fixed / self._masses)[..., None]
@@ -281,7 +293,7 @@ class Rest(Dynamics):
     def _diverged(self, frame: int, left: float, evaluations: int) -> DivergedError:
         """Say that no shape was found, how far the forces were from balance, and what may help."""
         plan, time = self.plan, frame / self.plan.grid.frames_per_second
-        row, column, *_ = farthest(self._copy(differences=True)[0])
+        row, column, *_ = largest_displacement(self._copy(differences=True)[0])
         remedy = (
             "the sheet may hang slack, fold or wrinkle; give it a foundation, pretension or bending, or take less load"
         )
@@ -297,6 +309,6 @@ class Rest(Dynamics):
         return DivergedError(said, frame, time, (row, column))
 
 
-def sheet_of(plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> Dynamics:
+def build_dynamics(plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> Dynamics:
     """Make the sheet of a plan, in motion or at rest; arguments as for `Dynamics`."""
-    return (Rest if plan.scene.time.at_rest else Dynamics)(plan, device, layout, cores)
+    return (QuasiStatics if plan.scene.time.at_rest else Dynamics)(plan, device, layout, cores)

@@ -14,20 +14,20 @@ Tools that are moved then push the points out of their rods, in the rows that th
 from collections.abc import Callable
 
 from taichi_msm.system.runtime import ti
-from taichi_msm.terms.base import DX, DY, HAS_LEFT, HAS_RIGHT, Entry, StepCode
-from taichi_msm.terms.contact import ContactTerm, greatest_lane
+from taichi_msm.terms.base import DX, DY, HAS_LEFT, HAS_RIGHT, Entry, KernelConfig
+from taichi_msm.terms.contact import ContactTerm, build_max_lane
 from taichi_msm.terms.springs import SpringTerm
 
 
-def row_passing(code: StepCode, move: Callable[..., None]) -> Callable[..., None]:
+def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[..., None]:
     """Make the function that goes through a row and moves it.
 
-    move(sheet, entry, target, force, now) does so with an entry, given the force of its springs: see `point_step`.
+    move
     """
-    vector, columns, springs = code.vector, code.first_column(None), code.require(SpringTerm)
+    vector, columns, springs = config.vector, config.first_column(None), config.require(SpringTerm)
     structural, shear = springs.structural, springs.shear
     leaves_out = springs.open_edges and not springs.mapped
-    along, to_other_row, of_row, of_column, of_diagonal = springs.between(code)
+    along, to_other_row, of_row, of_column, of_diagonal = springs.build_spring_forces(config)
 
     @ti.func
     def pass_row(
@@ -40,7 +40,7 @@ def row_passing(code: StepCode, move: Callable[..., None]) -> Callable[..., None
         the row of the forces carried from row to row, and n that of the table of loads.
         """
         width, strip, i, kind = sheet.width, sheet.width - 2, line.i, line.kind
-        diagonal = ti.sqrt(sheet.numbers[DX] * sheet.numbers[DX] + sheet.numbers[DY] * sheet.numbers[DY])
+        diagonal = ti.sqrt(sheet.constants[DX] * sheet.constants[DX] + sheet.constants[DY] * sheet.constants[DY])
         # The lower one of the two rows.
         lower = i + ti.select(up < 0, 1, 0)
         # Where u has this row and the other one, and where the forces between them are carried; all from entry 0 on.
@@ -123,10 +123,10 @@ def row_passing(code: StepCode, move: Callable[..., None]) -> Callable[..., None
     return pass_row
 
 
-def row_touching(code: StepCode, contact: ContactTerm) -> Callable[..., None]:
+def build_touch_row(config: KernelConfig, contact: ContactTerm) -> Callable[..., None]:
     """Make the function that resolves the contact of a row with all tools, if one reaches it."""
-    columns, resolve, reaches = code.first_column(None), contact.resolving(code), contact.reaching(code)
-    greatest = greatest_lane(code)
+    columns, resolve, reaches = config.first_column(None), contact.build_resolve(config), contact.build_reaches(config)
+    greatest = build_max_lane(config)
 
     @ti.func
     def touch_row(sheet: ti.template(), i, kind, loads: ti.template(), n):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from taichi_msm.scene.tools import Probe
 
 
-class Farthest(NamedTuple):
+class LargestDisplacement(NamedTuple):
     """The point that is farthest from its rest position, or not finite."""
 
     # row, column: of the point
@@ -22,14 +22,14 @@ class Farthest(NamedTuple):
     reach: float  # root of the sum of the squared displacements of all points [m]
 
 
-def farthest(displacement: NDArray[np.floating]) -> Farthest:
+def largest_displacement(displacement: NDArray[np.floating]) -> LargestDisplacement:
     """Find the point that is farthest from rest; displacement [m] of shape (rows, cols, 3)."""
     with np.errstate(over="ignore", invalid="ignore"):
         square = np.einsum("ijk,ijk->ij", displacement, displacement, dtype=np.float64)
         # Where there is a NaN, argmax gives its index.
         row, column = (int(index) for index in np.unravel_index(square.argmax(), square.shape))
         distance = float(np.linalg.norm(displacement[row, column].astype(float)))
-        return Farthest(row, column, distance, math.sqrt(square.sum()))
+        return LargestDisplacement(row, column, distance, math.sqrt(square.sum()))
 
 
 class State(NamedTuple):
@@ -105,18 +105,18 @@ class PeakForce(NamedTuple):
     force: Numbers  # as in a `TipForce` [N]
 
 
-class Felt(NamedTuple):
+class ProbeForces(NamedTuple):
     """What is known of the forces at a frame, for every probe."""
 
     forces: tuple[TipForce, ...]  # at this frame
     greatest: tuple[PeakForce, ...]  # at any frame so far
 
 
-class Saved(NamedTuple):
+class Snapshot(NamedTuple):
     """A point of a run from which it can continue."""
 
     state: State  # at a step, which may lie between two frames
     # progress, felt: at the last frame up to that step
     progress: RunProgress
-    felt: Felt
+    felt: ProbeForces
     probes: tuple[Probe, ...] = ()  # with the paths that the tools followed; none: those of the scene

@@ -28,17 +28,17 @@ from taichi_msm.accuracy.mesh import FEWEST, CubicSampling, MeshPilot, companion
 from taichi_msm.accuracy.time_step import longest
 from taichi_msm.errors import Count
 from taichi_msm.load import cost
-from taichi_msm.model.loads import Schedule, key_times, loads_at
+from taichi_msm.model.loads import Schedule, evaluate_loads, keyframe_times
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import area_shares, axes, spacing
 from taichi_msm.model.time_grid import Precision
 from taichi_msm.model.tool_force import probe_force
-from taichi_msm.model.tools import fewest_steps
+from taichi_msm.model.tools import min_steps_per_frame
 from taichi_msm.render.rasterizer import Drawing
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_POINTS
 from taichi_msm.solver.dynamics import Dynamics
-from taichi_msm.solver.planning import stable_steps, try_plan, variant, with_time
+from taichi_msm.solver.planning import plan_variant, stable_steps, try_plan, with_time
 from taichi_msm.study.result import Drawn, Points, Reference, Stepping, Study, TimedTerm
 from taichi_msm.system import process
 from taichi_msm.system.runtime import Device
@@ -71,7 +71,7 @@ class SteppingStudy:
     def __init__(self, plan: Plan, device: Device, longest_run: float, study: Study, progress: Count) -> None:
         self.plan = plan
         self._plans = {
-            difference: variant(plan, with_time(plan.scene, damping_difference=difference, step="auto"))
+            difference: plan_variant(plan, with_time(plan.scene, damping_difference=difference, step="auto"))
             for difference in DIFFERENCES
         }
         self.frames: Frames | None = None
@@ -119,7 +119,7 @@ class SteppingStudy:
 
     def _series(self, difference: str) -> Iterator[int]:
         """Give the steps per frame of a series: of the largest valid step, doubled until a run would take too long."""
-        steps = fewest_steps(self.plan.tools, self.plan.grid, stable_steps(self._plans[difference]))
+        steps = min_steps_per_frame(self.plan.tools, self.plan.grid, stable_steps(self._plans[difference]))
         samples: list[float] = []
         self._run("f64", difference, steps, samples)
         yield steps
@@ -217,7 +217,7 @@ class PointStudy:
 
     def __init__(self, plan: Plan, device: Device, longest_run: float, study: Study, progress: Count) -> None:
         scene = with_time(plan.scene, step="auto", tolerance=None, precision="f64")
-        self._plan = variant(plan, with_points(scene, scene.sheet.points))
+        self._plan = plan_variant(plan, with_points(scene, scene.sheet.points))
         self._device, self._longest_run, self._study, self._progress = device, longest_run, study, progress
         self._sheets: list[_Sheet] = []
         self._done = 0
@@ -279,7 +279,7 @@ class PointStudy:
         points = _scaled(plan, FINER)
         if max(points) > MAX_POINTS:
             return None
-        finer = variant(plan, with_points(plan.scene, points))
+        finer = plan_variant(plan, with_points(plan.scene, points))
         work = [math.prod(one.scene.sheet.points) * one.grid.steps_per_frame for one in (plan, finer)]
         return None if seconds * work[1] / work[0] > longest_run or any(cost.size_problems(finer)) else finer
 
@@ -474,7 +474,7 @@ def measure_terms(plan: Plan, device: Device, sample: float, study: Study, progr
     """Measure the time of a step with each term left out in turn, in samples of about so many seconds."""
     # All variants have the steps of the whole scene: without a spring the automatic step would be another.
     grid = {"steps_per_frame": plan.grid.steps_per_frame, "precision": plan.grid.precision}
-    plans = {without: variant(plan, scene).with_grid(**grid) for without, scene in variants(plan.scene)}
+    plans = {without: plan_variant(plan, scene).with_grid(**grid) for without, scene in variants(plan.scene)}
     study.terms += map(TimedTerm, plans)
     with ExitStack() as opened:
         sheets: list[Dynamics] = []
@@ -552,7 +552,7 @@ def solve(plan: Plan, rtol: float, atol: float, deadline: float, tick: Callable[
     displacements = []
     for start, end, frames in _pieces(scene):
         margin = INSIDE * (end - start)
-        first = loads_at(plan, np.array([start + margin, end - margin]))
+        first = evaluate_loads(plan, np.array([start + margin, end - margin]))
 
         def motion(t: float, y: Array, start: float = start, end: float = end, ends: Schedule = first) -> Array:
             if time.perf_counter() > deadline:
@@ -609,7 +609,7 @@ def acceleration(plan: Plan) -> Callable[[Array, Array, Schedule], Array]:
 def _pieces(scene: Scene) -> Iterator[tuple[float, float, Array]]:
     """Split the time at the keys: start, end, and the times t of frames with start < t <= end."""
     frames = np.arange(1, scene.time.frames + 1) / scene.time.frames_per_second
-    bounds = [0.0, *key_times(scene), float(frames[-1])]
+    bounds = [0.0, *keyframe_times(scene), float(frames[-1])]
     for start, end in pairwise(bounds):
         # A key that differs from the time of a frame only by rounding is at that frame.
         near = frames[(frames > start * (1 + INSIDE)) & (frames <= end * (1 + INSIDE))]

@@ -14,7 +14,7 @@ from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.render.texture import load_texture
 from taichi_msm.scene.scene import Scene
-from taichi_msm.solver.planning import on, variant, with_time
+from taichi_msm.solver.planning import choose_precision, plan_variant, with_time
 from taichi_msm.study.measurements import (
     FailedError,
     PointStudy,
@@ -87,7 +87,7 @@ def study(
     )
     effort = QUICK if quick else FULL
     # The study itself varies the step.
-    plan = on(variant(given, with_time(scene, tolerance=None)), device.arch)
+    plan = choose_precision(plan_variant(given, with_time(scene, tolerance=None)), device.arch)
     scene = plan.scene
     try:
         stepping = SteppingStudy(plan, device, effort.longest_run, results, partial(progress, "stepping"))

@@ -27,8 +27,8 @@ from taichi_msm.terms.springs import SpringTerm
 TERMS: tuple[type[Term], ...] = (SpringTerm, FoundationTerm, DampingTerm, BendingTerm, ProbeTerm, ContactTerm)
 
 
-def material_of(scene: Scene, maps: Maps) -> Material:
-    """Find the numbers of the sheet of a scene in which `kind_problems` finds nothing; maps: those that can be read."""
+def derive_material(scene: Scene, maps: Maps) -> Material:
+    """Derive the material."""
     (dx, dy), mass = spacing(scene.sheet), scene.sheet.mass
     there = {name: (one, maps[name], scene.sheet) for name, one in scene.maps.items() if name in maps}
     if scene.tissue is not None:
@@ -46,16 +46,16 @@ def material_of(scene: Scene, maps: Maps) -> Material:
     )
 
 
-def terms_of(plan: Plan) -> tuple[Term, ...]:
+def build_terms(plan: Plan) -> tuple[Term, ...]:
     """List the terms that a scene has."""
-    return tuple(term for kind in TERMS if (term := kind.of(plan)) is not None)
+    return tuple(term for kind in TERMS if (term := kind.from_plan(plan)) is not None)
 
 
-def inertia(plan: Plan) -> NDArray[np.float64]:
+def fictitious_masses(plan: Plan) -> NDArray[np.float64]:
     """Give every point a mass with which no frequency is above 1 [N/m]: so much stiffness it feels, (rows, cols)."""
-    return np.sum([np.broadcast_to(term.bounds(plan), plan.fixed.shape) for term in TERMS], axis=0)
+    return np.sum([np.broadcast_to(term.node_stiffness_bounds(plan), plan.fixed.shape) for term in TERMS], axis=0)
 
 
 def highest_frequency(material: Material, sheet: Sheet) -> float:
     """Bound the highest angular frequency of the sheet [rad/s] in any shape without springs below half their length."""
-    return math.sqrt(sum(term.bound(material, sheet) for term in TERMS) / material.mass)
+    return math.sqrt(sum(term.stiffness_bound(material, sheet) for term in TERMS) / material.mass)

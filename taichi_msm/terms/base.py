@@ -18,16 +18,16 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 
 # Rows of the array by_column. MOVES and AREA have three each, for a first, a middle and a last row of the sheet.
-MOVES, AREA, ACROSS, HAS_LEFT, HAS_RIGHT, COLUMN_ROWS = 0, 3, 6, 7, 8, 9
+MOBILITY, AREA_SHARE, REST_X, HAS_LEFT, HAS_RIGHT, COLUMN_ROWS = 0, 3, 6, 7, 8, 9
 
 # The first numbers of a sheet: dx, dy, and y of the first row. Those of its terms follow.
-DX, DY, TOP, GEOMETRY = range(4)
+DX, DY, TOP_Y, GEOMETRY = range(4)
 
 # The first column of the table of loads: what a force of 1 N adds to the last difference [m]. Those of terms follow.
 GAIN, STEP_COLUMNS = 0, 1
 
 # The first measure of a row: the sum of |d|^2 times the share of mass. Those of terms follow.
-MOTION, STEP_MEASURES = 0, 1
+SQUARED_MOTION, STEP_MEASURES = 0, 1
 
 
 class Term(ABC):
@@ -38,12 +38,12 @@ class Term(ABC):
     """
 
     reach: ClassVar[int] = 0  # how many rows away a point may be that the force depends on
-    numbers_count: ClassVar[int] = 0  # how many of the sheet's numbers belong to the term
+    constant_count: ClassVar[int] = 0  # how many of the sheet's numbers belong to the term
     reductions: ClassVar[tuple[str, ...]] = ()  # how each of its measures becomes one of a row: "min", "max" or "sum"
 
     @classmethod
     @abstractmethod
-    def of(cls, plan: Plan) -> Self | None:
+    def from_plan(cls, plan: Plan) -> Self | None:
         """Choose what is compiled for a scene; None if it does not have the term."""
 
     @staticmethod
@@ -52,16 +52,16 @@ class Term(ABC):
         return {}
 
     @staticmethod
-    def bound(material: Material, sheet: Sheet) -> float:
+    def stiffness_bound(material: Material, sheet: Sheet) -> float:
         """Bound the part of m w^2 that the term has in any motion [N/m]."""
         return 0.0
 
     @classmethod
-    def bounds(cls, plan: Plan) -> NDArray[Any] | float:
+    def node_stiffness_bounds(cls, plan: Plan) -> NDArray[Any] | float:
         """Bound the stiffness that each point feels, as `bound` does; shape (rows, cols), or one for all [N/m]."""
-        return cls.bound(plan.material, plan.scene.sheet)
+        return cls.stiffness_bound(plan.material, plan.scene.sheet)
 
-    def numbers(self, plan: Plan) -> tuple[float, ...]:
+    def constants(self, plan: Plan) -> tuple[float, ...]:
         """Give its numbers."""
         return ()
 
@@ -87,25 +87,25 @@ class Term(ABC):
         """Give twice its energy [J], from its measures summed up."""
         return 0.0
 
-    def forces(self, code: StepCode) -> Sequence[Callable[..., Any]]:
+    def build_forces(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
         """Make Taichi's functions add(force, sheet, entry, now) that add to the force on a point, a list of x, y and z.
 
         `now` is the row of the table of loads, a list of variables.
         """
         return ()
 
-    def tangents(self, code: StepCode) -> Sequence[Callable[..., Any]]:
+    def build_tangents(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
         """Make Taichi's functions add(force, sheet, entry, now) that add the change of the force on a point.
 
         Entry and sheet hold the change of the displacements in the place of displacements.
         """
         return ()
 
-    def reducing(self, code: StepCode) -> Sequence[Callable[..., Any]]:
+    def build_damping(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
         """Make Taichi's functions reduce(d, sheet) that change the last difference of a point, a list of x, y and z."""
         return ()
 
-    def measuring(self, code: StepCode) -> Sequence[Callable[..., None]]:
+    def build_measures(self, config: KernelConfig) -> Sequence[Callable[..., None]]:
         """Make Taichi's functions measure(measures, sheet, p, i, kind, b) for entry b of row i, which is row p of u."""
         return ()
 
@@ -114,7 +114,7 @@ AnyTerm = TypeVar("AnyTerm", bound=Term)
 
 
 @dataclass(frozen=True)
-class StepCode:
+class KernelConfig:
     """What the kernels of a sheet are compiled for; everything else is an argument."""
 
     precision: str  # f32 or f64
@@ -159,9 +159,9 @@ class StepCode:
         assert term is not None, kind
         return term
 
-    def first_number(self, kind: type[Term] | None) -> int:
+    def first_constant(self, kind: type[Term] | None) -> int:
         """Give the index of the first number of a term; None: how many numbers there are."""
-        return GEOMETRY + sum(term.numbers_count for term in self._before(kind))
+        return GEOMETRY + sum(term.constant_count for term in self._before(kind))
 
     def first_column(self, kind: type[Term] | None) -> int:
         """Give the first column of a term in the table of loads; None: how many columns there are."""
@@ -190,7 +190,7 @@ class KernelSheet(NamedTuple):
     by_column: Any
     stiffness: Any
     fields: Any
-    numbers: Any  # of the sheet and of its terms, a list of variables
+    constants: Any  # of the sheet and of its terms, a list of variables
     rows: Any  # of points
     width: Any  # entries of a row
 

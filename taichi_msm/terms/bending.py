@@ -17,7 +17,7 @@ from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import Material, spacing
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
-from taichi_msm.terms.base import DX, DY, HAS_LEFT, HAS_RIGHT, StepCode, Term
+from taichi_msm.terms.base import DX, DY, HAS_LEFT, HAS_RIGHT, KernelConfig, Term
 
 # Poisson's ratio of a lattice of springs between nearest and diagonal neighbours.
 POISSON = 1 / 3
@@ -29,7 +29,7 @@ class BendingTerm(Term):
 
     # The moments of the neighbours, and what these depend on.
     reach: ClassVar[int] = 2
-    numbers_count: ClassVar[int] = 1
+    constant_count: ClassVar[int] = 1
     # The sum of the squares of the Laplacian.
     reductions: ClassVar[tuple[str, ...]] = ("sum",)
 
@@ -43,17 +43,17 @@ class BendingTerm(Term):
         return {"bending": (plate if tissue.bending == "plate" else tissue.bending) * (dx * dy)}
 
     @classmethod
-    def of(cls, plan: Plan) -> Self | None:
+    def from_plan(cls, plan: Plan) -> Self | None:
         """Leave it out if it is 0."""
         return cls() if plan.material.bending > 0 else None
 
     @staticmethod
-    def bound(material: Material, sheet: Sheet) -> float:
+    def stiffness_bound(material: Material, sheet: Sheet) -> float:
         """Bound the part of m w^2 by the square of the largest Laplacian, (4 / dx^2 + 4 / dy^2)^2 D dx dy [N/m]."""
         dx, dy = spacing(sheet)
         return material.bending * (4 / dx**2 + 4 / dy**2) ** 2
 
-    def numbers(self, plan: Plan) -> tuple[float, ...]:
+    def constants(self, plan: Plan) -> tuple[float, ...]:
         """Give D dx dy [N m3]."""
         return (plan.material.bending,)
 
@@ -61,15 +61,15 @@ class BendingTerm(Term):
         """Give twice the energy [J]."""
         return plan.material.bending * float(sums[0])
 
-    def storing(self, code: StepCode) -> Callable[..., None]:
+    def build_store_moment(self, config: KernelConfig) -> Callable[..., None]:
         """Make the function that stores the moment of an entry."""
-        ti = code.ti
-        vector, number, laplacian = code.vector, code.first_number(BendingTerm), five_point(code)
+        ti = config.ti
+        vector, number, laplacian = config.vector, config.first_constant(BendingTerm), build_laplacian(config)
 
         @ti.func
         def store_moment(sheet: ti.template(), i, before, row, after, b, target):
             """Store the moment of entry b of row i, whose displacement is in `row`, in row `target` of u."""
-            dx, dy, stiffness = sheet.numbers[DX], sheet.numbers[DY], sheet.numbers[number]
+            dx, dy, stiffness = sheet.constants[DX], sheet.constants[DY], sheet.constants[number]
             across, down = stiffness / (dx * dx), stiffness / (dy * dy)
             for c in ti.static(range(3)):
                 sheet.u[c][target * sheet.width + b] = vector(0)
@@ -81,29 +81,37 @@ class BendingTerm(Term):
 
         return store_moment
 
-    def forces(self, code: StepCode) -> Sequence[Callable[..., Any]]:
+    def build_forces(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
         """Make the function that adds the force on an entry."""
-        ti = code.ti
-        laplacian = five_point(code)
+        ti = config.ti
+        laplacian = build_laplacian(config)
 
         @ti.func
         def add(force: ti.template(), sheet: ti.template(), entry: ti.template(), _now: ti.template()):
             row = ti.static(entry.row)
-            across, down = 1 / (sheet.numbers[DX] * sheet.numbers[DX]), 1 / (sheet.numbers[DY] * sheet.numbers[DY])
+            across, down = (
+                1 / (sheet.constants[DX] * sheet.constants[DX]),
+                1 / (sheet.constants[DY] * sheet.constants[DY]),
+            )
             for c in ti.static(range(3)):
                 bent = laplacian(sheet.u[c], sheet.width, row.before, row.at, row.after, entry.b, across, down)
                 force[c] = force[c] - bent
 
         return (add,)
 
-    def tangents(self, code: StepCode) -> Sequence[Callable[..., Any]]:
+    def build_tangents(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
         """Make the function that adds the change of the force, which is linear in the displacements."""
-        return self.forces(code)
+        return self.build_forces(config)
 
-    def measuring(self, code: StepCode) -> Sequence[Callable[..., None]]:
+    def build_measures(self, config: KernelConfig) -> Sequence[Callable[..., None]]:
         """Make the function that adds up the square of the Laplacian, which is 0 at edges."""
-        ti = code.ti
-        real, vector, first, laplacian = code.real, code.vector, code.first_measure(BendingTerm), five_point(code)
+        ti = config.ti
+        real, vector, first, laplacian = (
+            config.real,
+            config.vector,
+            config.first_measure(BendingTerm),
+            build_laplacian(config),
+        )
 
         @ti.func
         def measure(measures: ti.template(), sheet: ti.template(), p, _i, kind, b):
@@ -111,7 +119,10 @@ class BendingTerm(Term):
             inside *= ti.cast(kind == 1, real)
             # Only an inner row has both a row before it and one after it.
             before, after = p - ti.cast(kind == 1, ti.i32), p + ti.cast(kind == 1, ti.i32)
-            across, down = 1 / (sheet.numbers[DX] * sheet.numbers[DX]), 1 / (sheet.numbers[DY] * sheet.numbers[DY])
+            across, down = (
+                1 / (sheet.constants[DX] * sheet.constants[DX]),
+                1 / (sheet.constants[DY] * sheet.constants[DY]),
+            )
             bent = vector(0)
             for c in ti.static(range(3)):
                 curved = inside * laplacian(sheet.u[c], sheet.width, before, p, after, b, across, down)
@@ -121,9 +132,9 @@ class BendingTerm(Term):
         return (measure,)
 
 
-def five_point(code: StepCode) -> Callable[..., Any]:
+def build_laplacian(config: KernelConfig) -> Callable[..., Any]:
     """Make the function that gives the five-point Laplacian of an array."""
-    ti = code.ti
+    ti = config.ti
 
     @ti.func
     def laplacian(field: ti.template(), width, before, row, after, b, across, down):

@@ -25,26 +25,27 @@ from typing_extensions import Self
 
 from taichi_msm.model.loads import Schedule
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.tools import GRASP
+from taichi_msm.model.tools import GRIP_RADII
 from taichi_msm.scene.section import WHOLE
 from taichi_msm.scene.tools import Probe
-from taichi_msm.terms.base import ACROSS, DY, MOVES, TOP, StepCode, Term
+from taichi_msm.terms.base import DY, MOBILITY, REST_X, TOP_Y, KernelConfig, Term
 from taichi_msm.terms.damping import coefficients
 
 # Columns of the table of loads. For all tools: the weight of a step's pushes. For each tool: the middle of its tip
 # after the step and before it; what its grip does, and how far it has come since that began; its shape and friction;
 # 1 / the y and the z of its axis.
 WEIGHT, COLUMNS = 0, 1
-AFTER, BEFORE, GRIP, SINCE, AXIS, LENGTH, RADIUS, FRICTION, INVERSE, TOOL_COLUMNS = 0, 3, 6, 7, 10, 13, 14, 15, 16, 18
+TIP_AFTER, TIP_BEFORE, GRIP_STATE, GRIP_SHIFT, AXIS = 0, 3, 6, 7, 10
+LENGTH, RADIUS, FRICTION, INVERSE_AXIS, TOOL_COLUMNS = 13, 14, 15, 16, 18
 
 # What a grip does in a step: nothing, begin, or go on.
-IDLE, BEGINS, GOES_ON = 0.0, 1.0, 2.0
+GRIP_IDLE, GRIP_BEGINS, GRIP_CONTINUES = 0.0, 1.0, 2.0
 
 # Fields: for every tool the sum of the pushes; with grips, which tool holds a point, plus 1, and u when it was taken.
-PUSHES, HELD, TAKEN, GRIP_FIELDS = 3, 0, 1, 4
+CORRECTIONS, HOLDER, HOLD_DISPLACEMENT, GRIP_FIELDS = 3, 0, 1, 4
 
 # A distance [m] that counts as none: its square is a number in f32 too.
-NONE = 1e-18
+MIN_DISTANCE_M = 1e-18
 
 
 @dataclass(frozen=True)
@@ -52,11 +53,11 @@ class ContactTerm(Term):
     """The tools that are moved."""
 
     tools: int  # how many there are
-    rubs: tuple[bool, ...]  # for each, whether it has friction
+    has_friction: tuple[bool, ...]  # for each, whether it has friction
     grips: bool  # whether any can hold tissue
 
     @classmethod
-    def of(cls, plan: Plan) -> Self | None:
+    def from_plan(cls, plan: Plan) -> Self | None:
         """Leave it out without tools that are moved."""
         tools = plan.tools
         grips = any(tool.grips for tool in tools)
@@ -86,32 +87,34 @@ class ContactTerm(Term):
         columns[:, WEIGHT] = np.where(steps[:-1] == 0, gain / first_gain, 1.0)
         for n, tool in enumerate(plan.tools):
             own = columns[:, COLUMNS + TOOL_COLUMNS * n : COLUMNS + TOOL_COLUMNS * (n + 1)]
-            places = tool.middle(t)
-            own[:, AFTER:BEFORE], own[:, BEFORE:GRIP] = places[1:], places[:-1]
-            inverse = [1 / slope if abs(slope) > NONE else 1 / NONE for slope in tool.axis[1:]]
+            places = tool.tip_centre(t)
+            own[:, TIP_AFTER:TIP_BEFORE], own[:, TIP_BEFORE:GRIP_STATE] = places[1:], places[:-1]
+            inverse = [1 / slope if abs(slope) > MIN_DISTANCE_M else 1 / MIN_DISTANCE_M for slope in tool.axis[1:]]
             own[:, AXIS:] = *tool.axis, tool.length, tool.radius, tool.friction, *inverse
             for begin, end in tool.grips:
                 # The first steps at or after these times, but for rounding.
                 taken, left = (max(0, math.ceil((at - WHOLE * frame) * grid.steps_per_second)) for at in (begin, end))
                 held = (steps[:-1] >= taken) & (steps[:-1] < left)
-                own[held, GRIP] = np.where(steps[:-1] == taken, BEGINS, GOES_ON)[held]
-                own[held, SINCE:AXIS] = (places[1:] - tool.middle(np.array([taken / grid.steps_per_second])))[held]
+                own[held, GRIP_STATE] = np.where(steps[:-1] == taken, GRIP_BEGINS, GRIP_CONTINUES)[held]
+                own[held, GRIP_SHIFT:AXIS] = (places[1:] - tool.tip_centre(np.array([taken / grid.steps_per_second])))[
+                    held
+                ]
         return columns
 
     def is_compiled_in(self, compiled: Self) -> bool:
         """Tell whether a kernel that was compiled for `compiled` does all that these tools need."""
-        rubs = all(rubs <= able for rubs, able in zip(self.rubs, compiled.rubs, strict=True))
-        return rubs and self.grips <= compiled.grips
+        friction = zip(self.has_friction, compiled.has_friction, strict=True)
+        return all(needed <= available for needed, available in friction) and self.grips <= compiled.grips
 
-    def reaching(self, code: StepCode) -> Callable[..., Any]:
+    def build_reaches(self, config: KernelConfig) -> Callable[..., Any]:
         """Make Taichi's function reaches(sheet, i, low, high, now): whether a tool may touch or hold a point of row i.
 
         The displacements of the row along y and z are between `low` and `high`, two numbers each.
         """
-        ti, real, vector, tools, grips = code.ti, code.real, code.vector, self.tools, self.grips
-        greatest = greatest_lane(code)
-        first = code.first_column(ContactTerm) + COLUMNS
-        holding = (code.first_field(ContactTerm) + PUSHES * tools + HELD) if grips else 0
+        ti, real, vector, tools, grips = config.ti, config.real, config.vector, self.tools, self.grips
+        greatest = build_max_lane(config)
+        first = config.first_column(ContactTerm) + COLUMNS
+        holding = (config.first_field(ContactTerm) + CORRECTIONS * tools + HOLDER) if grips else 0
 
         @ti.func
         def cut(low, high, begin, end, start, inverse):
@@ -121,21 +124,21 @@ class ContactTerm(Term):
 
         @ti.func
         def reaches(sheet: ti.template(), i, low: ti.template(), high: ti.template(), now: ti.template()):
-            y, reached = sheet.numbers[TOP] - i * sheet.numbers[DY], False
+            y, reached = sheet.constants[TOP_Y] - i * sheet.constants[DY], False
             for tool in ti.static(range(tools)):
                 own = ti.static(first + TOOL_COLUMNS * tool)
                 # A little more than the radius, because of rounding.
                 near = 1.001 * now[own + RADIUS]
                 begin, end = cut(
-                    y + low[0] - near, y + high[0] + near, ti.cast(0, real), now[own + LENGTH], now[own + AFTER + 1],
-                    now[own + INVERSE],
+                    y + low[0] - near, y + high[0] + near, ti.cast(0, real), now[own + LENGTH],
+                    now[own + TIP_AFTER + 1], now[own + INVERSE_AXIS],
                 )  # fmt: skip
                 begin, end = cut(
-                    low[1] - near, high[1] + near, begin, end, now[own + AFTER + 2], now[own + INVERSE + 1]
+                    low[1] - near, high[1] + near, begin, end, now[own + TIP_AFTER + 2], now[own + INVERSE_AXIS + 1]
                 )
                 reached = reached or begin <= end
                 if ti.static(grips):
-                    reached = reached or now[own + GRIP] == BEGINS
+                    reached = reached or now[own + GRIP_STATE] == GRIP_BEGINS
             if ti.static(grips):
                 held = vector(0)
                 for b in range(1, sheet.width - 1):
@@ -145,49 +148,49 @@ class ContactTerm(Term):
 
         return reaches
 
-    def resolving(self, code: StepCode) -> Callable[..., None]:
+    def build_resolve(self, config: KernelConfig) -> Callable[..., None]:
         """Make Taichi's function resolve(sheet, i, kind, at, b, now), which changes entry b of row i after its step.
 
         `at` is the row of u.
         """
-        ti, vector, tools, rubs, grips = code.ti, code.vector, self.tools, self.rubs, self.grips
-        first_field, first = code.first_field(ContactTerm), code.first_column(ContactTerm)
-        grip_field = first_field + PUSHES * tools
-        own, part = [first + COLUMNS + TOOL_COLUMNS * tool for tool in range(tools)], parting(code)
-        greatest = greatest_lane(code)
+        ti, vector, tools, has_friction, grips = config.ti, config.vector, self.tools, self.has_friction, self.grips
+        first_field, first = config.first_field(ContactTerm), config.first_column(ContactTerm)
+        grip_field = first_field + CORRECTIONS * tools
+        own, part = [first + COLUMNS + TOOL_COLUMNS * tool for tool in range(tools)], build_penetration(config)
+        greatest = build_max_lane(config)
 
         @ti.func
         def resolve(sheet: ti.template(), i, kind, at, b, now: ti.template()):
             row, entry, here = sheet.rows, at * sheet.width + b, i * sheet.width + b
             rest = [
-                sheet.by_column[ACROSS * sheet.width + b],
-                vector(sheet.numbers[TOP] - i * sheet.numbers[DY]),
+                sheet.by_column[REST_X * sheet.width + b],
+                vector(sheet.constants[TOP_Y] - i * sheet.constants[DY]),
                 vector(0),
             ]
             u, d = [sheet.u[c][entry] for c in ti.static(range(3))], [sheet.d[c][here] for c in ti.static(range(3))]
-            free = ti.select(sheet.by_column[(MOVES + kind) * sheet.width + b] > 0, vector(1), vector(0))
+            free = ti.select(sheet.by_column[(MOBILITY + kind) * sheet.width + b] > 0, vector(1), vector(0))
             held = vector(0)
             if ti.static(grips):
-                held = sheet.fields[(grip_field + HELD) * row * sheet.width + here]
+                held = sheet.fields[(grip_field + HOLDER) * row * sheet.width + here]
                 # All grips let go before any takes hold.
                 for tool in ti.static(range(tools)):
-                    if now[own[tool] + GRIP] != GOES_ON:
+                    if now[own[tool] + GRIP_STATE] != GRIP_CONTINUES:
                         held = ti.select(held == tool + 1, vector(0), held)
                 for tool in ti.static(range(tools)):
-                    if now[own[tool] + GRIP] == BEGINS:
+                    if now[own[tool] + GRIP_STATE] == GRIP_BEGINS:
                         away = vector(0)
                         for c in ti.static(range(3)):
-                            off = rest[c] + (u[c] - d[c]) - now[own[tool] + BEFORE + c]
+                            off = rest[c] + (u[c] - d[c]) - now[own[tool] + TIP_BEFORE + c]
                             away += off * off
-                        reach = GRASP * now[own[tool] + RADIUS]
+                        reach = GRIP_RADII * now[own[tool] + RADIUS]
                         takes = ti.select(away <= reach * reach, free, vector(0)) * ti.select(
                             held == 0, vector(1), vector(0)
                         )
                         held += takes * (tool + 1)
                         for c in ti.static(range(3)):
-                            taken = (grip_field + TAKEN + c) * row * sheet.width + here
+                            taken = (grip_field + HOLD_DISPLACEMENT + c) * row * sheet.width + here
                             sheet.fields[taken] = ti.select(takes > 0, u[c] - d[c], sheet.fields[taken])
-                sheet.fields[(grip_field + HELD) * row * sheet.width + here] = held
+                sheet.fields[(grip_field + HOLDER) * row * sheet.width + here] = held
                 free = ti.select(held == 0, free, vector(0))
             for tool in ti.static(range(tools)):
                 inside, normal_x, normal_y, normal_z = part(rest, u, now, own[tool])
@@ -198,9 +201,9 @@ class ContactTerm(Term):
                 if greatest(pushed) > 0:
                     normal = [normal_x, normal_y, normal_z]
                     push = [depth * normal[c] for c in ti.static(range(3))]
-                    if ti.static(rubs[tool]):
+                    if ti.static(has_friction[tool]):
                         slip = [
-                            d[c] + push[c] - (now[own[tool] + AFTER + c] - now[own[tool] + BEFORE + c])
+                            d[c] + push[c] - (now[own[tool] + TIP_AFTER + c] - now[own[tool] + TIP_BEFORE + c])
                             for c in ti.static(range(3))
                         ]
                         along = vector(0)
@@ -210,30 +213,30 @@ class ContactTerm(Term):
                         for c in ti.static(range(3)):
                             slip[c] = slip[c] - along * normal[c]
                             speed += slip[c] * slip[c]
-                        stopped = now[own[tool] + FRICTION] * depth / ti.max(ti.sqrt(speed), NONE)
+                        stopped = now[own[tool] + FRICTION] * depth / ti.max(ti.sqrt(speed), MIN_DISTANCE_M)
                         stopped = ti.min(stopped, 1)
                         for c in ti.static(range(3)):
                             push[c] = push[c] - slip[c] * stopped
                     if ti.static(grips):
                         for c in ti.static(range(3)):
-                            target = sheet.fields[(grip_field + TAKEN + c) * row * sheet.width + here]
-                            target += now[own[tool] + SINCE + c]
+                            target = sheet.fields[(grip_field + HOLD_DISPLACEMENT + c) * row * sheet.width + here]
+                            target += now[own[tool] + GRIP_SHIFT + c]
                             push[c] = ti.select(held == tool + 1, target - u[c], push[c])
                     for c in ti.static(range(3)):
                         # A lane that is not pushed keeps its bits, the sign of a zero too.
                         u[c] = ti.select(pushed > 0, u[c] + push[c], u[c])
                         d[c] = ti.select(pushed > 0, d[c] + push[c], d[c])
                         sheet.u[c][entry], sheet.d[c][here] = u[c], d[c]
-                        pushes = (first_field + PUSHES * tool + c) * row * sheet.width + here
+                        pushes = (first_field + CORRECTIONS * tool + c) * row * sheet.width + here
                         # Not `+=`, which would be atomic, and of vectors that does not compile.
                         sheet.fields[pushes] = sheet.fields[pushes] + push[c] * now[first + WEIGHT]
 
         return resolve
 
 
-def greatest_lane(code: StepCode) -> Callable[..., Any]:
+def build_max_lane(config: KernelConfig) -> Callable[..., Any]:
     """Make Taichi's function greatest(values), the greatest lane, by shuffles: Taichi's own takes lane after lane."""
-    ti, vector, lanes = code.ti, code.vector, code.lanes
+    ti, vector, lanes = config.ti, config.vector, config.lanes
     halves = [lanes >> n for n in range(1, lanes.bit_length())]
 
     @ti.func
@@ -246,16 +249,16 @@ def greatest_lane(code: StepCode) -> Callable[..., Any]:
     return greatest
 
 
-def parting(code: StepCode) -> Callable[..., Any]:
+def build_penetration(config: KernelConfig) -> Callable[..., Any]:
     """Make Taichi's function part(rest, u, now, own), which tells how deep a point is in a tool, and the way out.
 
     `own` is the first column of the tool. It gives radius - |r'|, and then n.
     """
-    ti, vector = code.ti, code.vector
+    ti, vector = config.ti, config.vector
 
     @ti.func
     def part(rest: ti.template(), u: ti.template(), now: ti.template(), own: ti.template()):
-        r = [rest[c] - now[own + AFTER + c] + u[c] for c in ti.static(range(3))]
+        r = [rest[c] - now[own + TIP_AFTER + c] + u[c] for c in ti.static(range(3))]
         s = vector(0)
         for c in ti.static(range(3)):
             s += r[c] * now[own + AXIS + c]
@@ -265,7 +268,7 @@ def parting(code: StepCode) -> Callable[..., Any]:
             r[c] = r[c] - s * now[own + AXIS + c]
             square += r[c] * r[c]
         distance = ti.sqrt(square)
-        normal = [r[c] / ti.max(distance, NONE) for c in ti.static(range(3))]
+        normal = [r[c] / ti.max(distance, MIN_DISTANCE_M) for c in ti.static(range(3))]
         normal[2] = ti.select(distance > 0, normal[2], vector(1))
         return now[own + RADIUS] - distance, normal[0], normal[1], normal[2]
 
@@ -278,4 +281,4 @@ def contact_fields(probes: Sequence[Probe]) -> int:
 
 
 def _field_count(tools: int, grips: bool) -> int:
-    return PUSHES * tools + (GRIP_FIELDS if grips else 0)
+    return CORRECTIONS * tools + (GRIP_FIELDS if grips else 0)

@@ -12,18 +12,27 @@ Gauss-Seidel).
 
 from collections.abc import Callable
 
-from taichi_msm.terms.base import ACROSS, DY, MOVES, TOP, StepCode
-from taichi_msm.terms.contact import COLUMNS, HELD, PUSHES, SINCE, TAKEN, TOOL_COLUMNS, ContactTerm, parting
+from taichi_msm.terms.base import DY, MOBILITY, REST_X, TOP_Y, KernelConfig
+from taichi_msm.terms.contact import (
+    COLUMNS,
+    CORRECTIONS,
+    GRIP_SHIFT,
+    HOLD_DISPLACEMENT,
+    HOLDER,
+    TOOL_COLUMNS,
+    ContactTerm,
+    build_penetration,
+)
 
 # How many turns tools take at a point, if there are several.
 TURNS = 8
 
 
-def bearing(code: StepCode, contact: ContactTerm) -> Callable[..., None]:
+def build_bear(config: KernelConfig, contact: ContactTerm) -> Callable[..., None]:
     """Make Taichi's function bear(force, sheet, at), which takes off what the tools bear at an entry of the sheet."""
-    ti, vector, tools, grips = code.ti, code.vector, contact.tools, contact.grips
-    first_field = code.first_field(ContactTerm)
-    holding, turns = first_field + PUSHES * tools + HELD, _turns(contact)
+    ti, vector, tools, grips = config.ti, config.vector, contact.tools, contact.grips
+    first_field = config.first_field(ContactTerm)
+    holding, turns = first_field + CORRECTIONS * tools + HOLDER, _turns(contact)
 
     @ti.func
     def bear(force: ti.template(), sheet: ti.template(), at):
@@ -31,7 +40,9 @@ def bearing(code: StepCode, contact: ContactTerm) -> Callable[..., None]:
         borne = [vector(0) for _ in ti.static(range(tools))]
         for _ in range(turns):
             for tool in ti.static(range(tools)):
-                normal = [sheet.fields[(first_field + PUSHES * tool + c) * field + at] for c in ti.static(range(3))]
+                normal = [
+                    sheet.fields[(first_field + CORRECTIONS * tool + c) * field + at] for c in ti.static(range(3))
+                ]
                 along = force[0] * normal[0] + force[1] * normal[1] + force[2] * normal[2]
                 all_of_it = ti.max(borne[tool] - along, 0)
                 change = all_of_it - borne[tool]
@@ -45,38 +56,41 @@ def bearing(code: StepCode, contact: ContactTerm) -> Callable[..., None]:
     return bear
 
 
-def keeping_out(code: StepCode, contact: ContactTerm) -> Callable[..., None]:
+def build_keep_out(config: KernelConfig, contact: ContactTerm) -> Callable[..., None]:
     """Make Taichi's function keep_out(sheet, i, kind, b, now), for entry b of row i of a `RestSheet` that has moved.
 
     It pushes the points out of the tools, stops them there, and puts what is held where its tool is.
     """
-    ti, vector, tools, grips = code.ti, code.vector, contact.tools, contact.grips
-    first_field, first = code.first_field(ContactTerm), code.first_column(ContactTerm)
-    grip_field = first_field + PUSHES * tools
-    own, part = [first + COLUMNS + TOOL_COLUMNS * tool for tool in range(tools)], parting(code)
+    ti, vector, tools, grips = config.ti, config.vector, contact.tools, contact.grips
+    first_field, first = config.first_field(ContactTerm), config.first_column(ContactTerm)
+    grip_field = first_field + CORRECTIONS * tools
+    own, part = [first + COLUMNS + TOOL_COLUMNS * tool for tool in range(tools)], build_penetration(config)
     turns = _turns(contact)
 
     @ti.func
     def keep_out(sheet: ti.template(), i, kind, b, now: ti.template()):
         field, at = sheet.rows * sheet.width, i * sheet.width + b
         rest = [
-            sheet.by_column[ACROSS * sheet.width + b],
-            vector(sheet.numbers[TOP] - i * sheet.numbers[DY]),
+            sheet.by_column[REST_X * sheet.width + b],
+            vector(sheet.constants[TOP_Y] - i * sheet.constants[DY]),
             vector(0),
         ]
         u, q = [sheet.u[c][at] for c in ti.static(range(3))], [sheet.q[c][at] for c in ti.static(range(3))]
-        free = ti.select(sheet.by_column[(MOVES + kind) * sheet.width + b] > 0, vector(1), vector(0))
+        free = ti.select(sheet.by_column[(MOBILITY + kind) * sheet.width + b] > 0, vector(1), vector(0))
         if ti.static(grips):
-            held = sheet.fields[(grip_field + HELD) * field + at]
+            held = sheet.fields[(grip_field + HOLDER) * field + at]
             for tool in ti.static(range(tools)):
                 for c in ti.static(range(3)):
-                    place = sheet.fields[(grip_field + TAKEN + c) * field + at] + now[own[tool] + SINCE + c]
+                    place = (
+                        sheet.fields[(grip_field + HOLD_DISPLACEMENT + c) * field + at]
+                        + now[own[tool] + GRIP_SHIFT + c]
+                    )
                     u[c] = ti.select(held == tool + 1, place, u[c])
                     q[c] = ti.select(held == tool + 1, vector(0), q[c])
             free = ti.select(held > 0, vector(0), free)
         for tool in ti.static(range(tools)):
             for c in ti.static(range(3)):
-                sheet.fields[(first_field + PUSHES * tool + c) * field + at] = vector(0)
+                sheet.fields[(first_field + CORRECTIONS * tool + c) * field + at] = vector(0)
         for _ in range(turns):
             for tool in ti.static(range(tools)):
                 depth, x, y, z = part(rest, u, now, own[tool])
@@ -86,7 +100,7 @@ def keeping_out(code: StepCode, contact: ContactTerm) -> Callable[..., None]:
                 for c in ti.static(range(3)):
                     u[c] += touches * depth * normal[c]
                     q[c] = q[c] - inward * normal[c]
-                    place = (first_field + PUSHES * tool + c) * field + at
+                    place = (first_field + CORRECTIONS * tool + c) * field + at
                     sheet.fields[place] = ti.select(touches > 0, normal[c], sheet.fields[place])
         for c in ti.static(range(3)):
             sheet.u[c][at] = u[c]

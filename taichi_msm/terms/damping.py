@@ -17,7 +17,7 @@ from typing_extensions import Self
 
 from taichi_msm.model.plan import Plan
 from taichi_msm.scene.scene import Scene
-from taichi_msm.terms.base import StepCode, Term
+from taichi_msm.terms.base import KernelConfig, Term
 
 
 def coefficients(plan: Plan) -> tuple[float, float, float]:
@@ -33,7 +33,7 @@ def coefficients(plan: Plan) -> tuple[float, float, float]:
 class DampingTerm(Term):
     """Damping of every point. It adds no energy, and its limit on the step is in `planning.stable_step`."""
 
-    numbers_count: ClassVar[int] = 1
+    constant_count: ClassVar[int] = 1
 
     @staticmethod
     def derive(scene: Scene) -> dict[str, Any]:
@@ -46,21 +46,21 @@ class DampingTerm(Term):
         return {"drag": scene.damping / scene.sheet.mass}
 
     @classmethod
-    def of(cls, plan: Plan) -> Self | None:
+    def from_plan(cls, plan: Plan) -> Self | None:
         """Leave it out if it is 0."""
         return cls() if plan.material.drag > 0 else None
 
-    def numbers(self, plan: Plan) -> tuple[float, ...]:
+    def constants(self, plan: Plan) -> tuple[float, ...]:
         """Give the factor `keep`."""
         return coefficients(plan)[:1]
 
-    def reducing(self, code: StepCode) -> Sequence[Callable[..., Any]]:
+    def build_damping(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
         """Make the function that reduces the last difference."""
-        ti, keep = code.ti, code.first_number(DampingTerm)
+        ti, keep = config.ti, config.first_constant(DampingTerm)
 
         @ti.func
         def reduce(d: ti.template(), sheet: ti.template()):
             for c in ti.static(range(3)):
-                d[c] *= sheet.numbers[keep]
+                d[c] *= sheet.constants[keep]
 
         return (reduce,)

@@ -20,7 +20,7 @@ from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import Material, area_shares, spacing
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
-from taichi_msm.terms.base import AREA, StepCode, Term
+from taichi_msm.terms.base import AREA_SHARE, KernelConfig, Term
 
 
 @dataclass(frozen=True)
@@ -40,23 +40,23 @@ class FoundationTerm(Term):
             assert scene.springs is not None
             k, active = scene.springs.virtual, scene.springs.virtual_active
         always = active == "always"
-        return {"virtual": k if always or scene.probes else 0.0, "always": always}
+        return {"virtual": k if always or scene.probes else 0.0, "always_active": always}
 
     @classmethod
-    def of(cls, plan: Plan) -> Self | None:
+    def from_plan(cls, plan: Plan) -> Self | None:
         """Leave them out if they never act."""
         material = plan.material
         mapped = material.virtual_factors is not None
         return cls(plan.open_edges and material.by_area and not mapped, mapped) if material.virtual > 0 else None
 
     @staticmethod
-    def bound(material: Material, sheet: Sheet) -> float:
+    def stiffness_bound(material: Material, sheet: Sheet) -> float:
         """Give the part of m w^2, which is the largest K [N/m]."""
         factors = material.virtual_factors
         return material.virtual if factors is None else material.virtual * float(factors.max())
 
     @classmethod
-    def bounds(cls, plan: Plan) -> NDArray[Any] | float:
+    def node_stiffness_bounds(cls, plan: Plan) -> NDArray[Any] | float:
         """Give K of each point, as if none had less of the sheet's area."""
         factors = plan.material.virtual_factors
         return plan.material.virtual * (1.0 if factors is None else factors)
@@ -79,11 +79,11 @@ class FoundationTerm(Term):
         """Give each point's share of K: its factor times its share of a cell's area."""
         return point_shares(plan)[None] if self.mapped else super().fields(plan)
 
-    def forces(self, code: StepCode) -> Sequence[Callable[..., Any]]:
+    def build_forces(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
         """Make the function that adds -K u."""
-        ti = code.ti
-        by_area, mapped, column = self.by_area, self.mapped, code.first_column(FoundationTerm)
-        field = code.first_field(FoundationTerm)
+        ti = config.ti
+        by_area, mapped, column = self.by_area, self.mapped, config.first_column(FoundationTerm)
+        field = config.first_field(FoundationTerm)
 
         @ti.func
         def add(force: ti.template(), sheet: ti.template(), entry: ti.template(), now: ti.template()):
@@ -92,7 +92,7 @@ class FoundationTerm(Term):
                 for c in ti.static(range(3)):
                     force[c] = force[c] - held * entry.u[c]
             elif ti.static(by_area):
-                held = now[column] * sheet.by_column[(AREA + entry.row.kind) * sheet.width + entry.b]
+                held = now[column] * sheet.by_column[(AREA_SHARE + entry.row.kind) * sheet.width + entry.b]
                 for c in ti.static(range(3)):
                     force[c] = force[c] - held * entry.u[c]
             else:
@@ -101,9 +101,9 @@ class FoundationTerm(Term):
 
         return (add,)
 
-    def tangents(self, code: StepCode) -> Sequence[Callable[..., Any]]:
+    def build_tangents(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
         """Make the function that adds the change of the force, which is linear in the displacements."""
-        return self.forces(code)
+        return self.build_forces(config)
 
 
 def point_shares(plan: Plan) -> NDArray[Any]:

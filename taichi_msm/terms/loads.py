@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
-from taichi_msm.model.loads import Schedule, decay, decay_slope
+from taichi_msm.model.loads import Schedule, decay, decay_gradient
 from taichi_msm.model.plan import Plan, ProbeSlot
 from taichi_msm.model.sheet import axes, spacing
 from taichi_msm.model.tool_force import probe_force
 from taichi_msm.scene.scene import Scene
-from taichi_msm.terms.base import ACROSS, AREA, DY, TOP, StepCode, Term
+from taichi_msm.terms.base import AREA_SHARE, DY, REST_X, TOP_Y, KernelConfig, Term
 
 # Columns of a slot: force (3), control point (2), falloff, shift and offset.
 FORCE, POINT, FALLOFF, SHIFT, OFFSET, SLOT_COLUMNS = 0, 3, 5, 6, 7, 8
@@ -34,7 +34,7 @@ class ProbeTerm(Term):
     by_area: tuple[bool, ...]  # for every slot, whether points at an open edge get less of its force
 
     @classmethod
-    def of(cls, plan: Plan) -> Self:
+    def from_plan(cls, plan: Plan) -> Self:
         """Tell which slots stand."""
         probes = plan.scene.probes
         by_area = tuple(plan.open_edges and probes[slot.probe].total is not None for slot in plan.slots)
@@ -66,12 +66,12 @@ class ProbeTerm(Term):
         decays = [decay(scene.probes[slot.probe], scene.sheet) for slot in plan.slots if not slot.moves]
         return np.array(decays).reshape(-1, *scene.sheet.points)
 
-    def forces(self, code: StepCode) -> Sequence[Callable[..., Any]]:
+    def build_forces(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
         """Make the function that adds the forces of all slots."""
-        ti = code.ti
-        moves, by_area, first = self.moves, self.by_area, code.first_column(ProbeTerm)
-        vector, lanes = code.vector, code.lanes
-        first_field = code.first_field(ProbeTerm)
+        ti = config.ti
+        moves, by_area, first = self.moves, self.by_area, config.first_column(ProbeTerm)
+        vector, lanes = config.vector, config.lanes
+        first_field = config.first_field(ProbeTerm)
         standing = [first_field + moves[:n].count(False) for n in range(len(moves))]
 
         @ti.func
@@ -80,13 +80,13 @@ class ProbeTerm(Term):
                 column = ti.static(first + SLOT_COLUMNS * n)
                 share = vector(0)
                 if ti.static(moves[n]):
-                    off_x = sheet.by_column[ACROSS * sheet.width + entry.b] - now[column + POINT]
-                    off_y = sheet.numbers[TOP] - entry.row.i * sheet.numbers[DY] - now[column + POINT + 1]
+                    off_x = sheet.by_column[REST_X * sheet.width + entry.b] - now[column + POINT]
+                    off_y = sheet.constants[TOP_Y] - entry.row.i * sheet.constants[DY] - now[column + POINT + 1]
                     exponent = now[column + FALLOFF] * ti.sqrt(off_x * off_x + off_y * off_y) + now[column + SHIFT]
                     exponent = ti.max(exponent, now[column + OFFSET])
                     share = vector([ti.exp(-exponent[lane]) for lane in ti.static(range(lanes))])
                     if ti.static(by_area[n]):
-                        share *= sheet.by_column[(AREA + entry.row.kind) * sheet.width + entry.b]
+                        share *= sheet.by_column[(AREA_SHARE + entry.row.kind) * sheet.width + entry.b]
                 else:
                     share = sheet.fields[(standing[n] * sheet.rows + entry.row.i) * sheet.width + entry.b]
                 for c in ti.static(range(3)):
@@ -94,22 +94,22 @@ class ProbeTerm(Term):
 
         return (add,)
 
-    def slopes(self, plan: Plan) -> NDArray[Any]:
+    def decay_gradients(self, plan: Plan) -> NDArray[Any]:
         """Give the derivatives of the decays of the standing slots by x and y of the control point, (slots, 2, ...)."""
         scene = plan.scene
-        slopes = [decay_slope(scene.probes[slot.probe], scene.sheet) for slot in plan.slots if not slot.moves]
+        slopes = [decay_gradient(scene.probes[slot.probe], scene.sheet) for slot in plan.slots if not slot.moves]
         return np.array(slopes).reshape(-1, 2, *scene.sheet.points)
 
-    def sensing(self, code: StepCode, first_slope: int) -> Callable[..., None]:
+    def build_load_adjoint(self, config: KernelConfig, first_slope: int) -> Callable[..., None]:
         """Make the function that differentiates the work of all slots by their forces and their control points.
 
         An entry's work on it is the product of the force and `entry.u`; of a slot, three derivatives by the force and
         two by the control point are added to a list. `slopes` are in `sheet.found`, from `first_slope` times the
         sheet's rows on.
         """
-        ti = code.ti
-        moves, by_area, first = self.moves, self.by_area, code.first_column(ProbeTerm)
-        vector, lanes, first_field = code.vector, code.lanes, code.first_field(ProbeTerm)
+        ti = config.ti
+        moves, by_area, first = self.moves, self.by_area, config.first_column(ProbeTerm)
+        vector, lanes, first_field = config.vector, config.lanes, config.first_field(ProbeTerm)
         standing = [moves[:n].count(False) for n in range(len(moves))]
 
         @ti.func
@@ -119,8 +119,8 @@ class ProbeTerm(Term):
                 column = ti.static(first + SLOT_COLUMNS * n)
                 share, slope = vector(0), [vector(0), vector(0)]
                 if ti.static(moves[n]):
-                    off_x = sheet.by_column[ACROSS * sheet.width + b] - now[column + POINT]
-                    off_y = sheet.numbers[TOP] - i * sheet.numbers[DY] - now[column + POINT + 1]
+                    off_x = sheet.by_column[REST_X * sheet.width + b] - now[column + POINT]
+                    off_y = sheet.constants[TOP_Y] - i * sheet.constants[DY] - now[column + POINT + 1]
                     distance = ti.sqrt(off_x * off_x + off_y * off_y)
                     exponent = now[column + FALLOFF] * distance + now[column + SHIFT]
                     # 0 on the flat end, and where the point is the control point.
@@ -129,7 +129,7 @@ class ProbeTerm(Term):
                     exponent = ti.max(exponent, now[column + OFFSET])
                     share = vector([ti.exp(-exponent[lane]) for lane in ti.static(range(lanes))])
                     if ti.static(by_area[n]):
-                        share *= sheet.by_column[(AREA + entry.row.kind) * sheet.width + b]
+                        share *= sheet.by_column[(AREA_SHARE + entry.row.kind) * sheet.width + b]
                     slope[0], slope[1] = share * turned * off_x, share * turned * off_y
                 else:
                     share = sheet.fields[((first_field + standing[n]) * sheet.rows + i) * sheet.width + b]
@@ -146,13 +146,13 @@ class ProbeTerm(Term):
         return sense
 
 
-def standing(plan: Plan) -> list[tuple[object, ...]]:
+def decay_parameters(plan: Plan) -> list[tuple[object, ...]]:
     """List everything that the decays of the standing slots depend on."""
     probes = [plan.scene.probes[slot.probe] for slot in plan.slots if not slot.moves]
     return [(probe.at, probe_force(probe, plan.scene.sheet)[1:]) for probe in probes]
 
 
-def free_acceleration(plan: Plan) -> float:
+def max_free_acceleration(plan: Plan) -> float:
     """Bound the acceleration that the probes give to a free point [m/s^2]."""
     forces = (
         probe_force(probe, plan.scene.sheet).size * max(abs(percent) for _, percent in probe.load) / 100
@@ -162,7 +162,7 @@ def free_acceleration(plan: Plan) -> float:
     return sum(forces) / plan.material.mass
 
 
-def norm(slot: ProbeSlot, scene: Scene) -> float:
+def force_norm(slot: ProbeSlot, scene: Scene) -> float:
     """Bound |F| over all points for a force of 1 N at the control point."""
     if not slot.moves:
         return float(np.linalg.norm(decay(scene.probes[slot.probe], scene.sheet)))

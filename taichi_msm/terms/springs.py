@@ -38,17 +38,17 @@ from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import Material, largest_mean, spacing
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
-from taichi_msm.terms.base import AREA, DX, DY, HAS_LEFT, HAS_RIGHT, StepCode, Term
+from taichi_msm.terms.base import AREA_SHARE, DX, DY, HAS_LEFT, HAS_RIGHT, KernelConfig, Term
 
 # Families of springs.
 ALONG_ROW, ALONG_COLUMN, DIAGONAL = range(3)
 
 # Measures: the smallest and the largest (L^2 - L0^2) / L0^2; for every family the sum of (k - tau) (L / L0 - 1)^2;
 # and then, under tension, the sum of |q|^2 / L0^2.
-LEAST, MOST, STRETCHED, TENSE = 0, 1, 2, 5
+MIN_STRAIN, MAX_STRAIN, STRETCH_SUMS, TENSION_SUMS = 0, 1, 2, 5
 
 # Prevents a division by 0 at L = 0, where the force is then 0, as P - Q is. A literal in a kernel is always f32.
-TINY = 1e-36
+MIN_SQUARED_LENGTH = 1e-36
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class SpringTerm(Term):
 
     reach: ClassVar[int] = 1
     # k - tau, and then tau, of each family.
-    numbers_count: ClassVar[int] = 6
+    constant_count: ClassVar[int] = 6
     reductions: ClassVar[tuple[str, ...]] = ("min", "max", "sum", "sum", "sum", "sum", "sum", "sum")
 
     @staticmethod
@@ -85,7 +85,7 @@ class SpringTerm(Term):
         }
 
     @classmethod
-    def of(cls, plan: Plan) -> Self:
+    def from_plan(cls, plan: Plan) -> Self:
         """Leave out the families that have no stiffness."""
         material, open_edges = plan.material, plan.open_edges
         return cls(
@@ -98,7 +98,7 @@ class SpringTerm(Term):
         )
 
     @staticmethod
-    def bound(material: Material, sheet: Sheet) -> float:
+    def stiffness_bound(material: Material, sheet: Sheet) -> float:
         """Bound the part of m w^2 of the springs, as long as none is shorter than half its length [N/m].
 
         The energy is a sum over cells. The springs of a cell have at most the energy k / 2 |q|^2, so that no mode of a
@@ -115,7 +115,7 @@ class SpringTerm(Term):
         return _unmapped_bound(material) * largest
 
     @classmethod
-    def bounds(cls, plan: Plan) -> NDArray[Any] | float:
+    def node_stiffness_bounds(cls, plan: Plan) -> NDArray[Any] | float:
         """Bound it point by point: with a map, each cell gives its corners a quarter of its own bound.
 
         Tissue has fewer cells at a point at an edge. Springs along an edge are whole: the largest factor.
@@ -128,7 +128,7 @@ class SpringTerm(Term):
         shares = cells.mean(axis=0) if material.by_area else cells.max(axis=0)
         return _unmapped_bound(material) * shares
 
-    def numbers(self, plan: Plan) -> tuple[float, ...]:
+    def constants(self, plan: Plan) -> tuple[float, ...]:
         """Give k - tau and tau of every family [N/m]."""
         material = plan.material
         less = 1 - material.tension
@@ -138,13 +138,13 @@ class SpringTerm(Term):
         """Give twice the energy [J]."""
         dx, dy = spacing(plan.scene.sheet)
         squares = np.array([dx**2, dy**2, dx**2 + dy**2])
-        return float((sums[STRETCHED:TENSE] + plan.material.tensions * sums[TENSE:]) @ squares)
+        return float((sums[STRETCH_SUMS:TENSION_SUMS] + plan.material.tensions * sums[TENSION_SUMS:]) @ squares)
 
-    def between(self, code: StepCode) -> tuple[Callable[..., Any], ...]:
+    def build_spring_forces(self, config: KernelConfig) -> tuple[Callable[..., Any], ...]:
         """Make the functions for the forces of springs along a row and to another one, and for their stiffness."""
-        ti = code.ti
+        ti = config.ti
         tense, mapped, by_area = self.tense, self.mapped, self.by_area and not self.mapped
-        leaves_out, real, first = self.open_edges and not self.mapped, code.real, code.first_number(SpringTerm)
+        leaves_out, real, first = self.open_edges and not self.mapped, config.real, config.first_constant(SpringTerm)
         first_tension = first + 3
 
         @ti.func
@@ -160,15 +160,15 @@ class SpringTerm(Term):
         @ti.func
         def along(sheet: ti.template(), right, here: ti.template(), k, exists):
             """Force of a point displaced by `here` on its right neighbour, in entry `right` of u; exists: 0 if none."""
-            dx = sheet.numbers[DX]
+            dx = sheet.constants[DX]
             x, y, z = here[0] - sheet.u[0][right], here[1] - sheet.u[1][right], here[2] - sheet.u[2][right]
             to_x = x - dx
             rest = y * y + z * z
             weighted = k * (x * (to_x - dx) + rest)
             if ti.static(leaves_out):
                 weighted *= exists
-            tension = sheet.numbers[first_tension + ALONG_ROW]
-            return pull(weighted, to_x * to_x + (rest + TINY), dx, [to_x, y, z], tension, [x, y, z])
+            tension = sheet.constants[first_tension + ALONG_ROW]
+            return pull(weighted, to_x * to_x + (rest + MIN_SQUARED_LENGTH), dx, [to_x, y, z], tension, [x, y, z])
 
         @ti.func
         def to_other_row(sheet: ti.template(), entry, right: ti.template(), here: ti.template(), up, length, k, exists):
@@ -179,13 +179,13 @@ class SpringTerm(Term):
             rest = z * z
             longer = x * x + (y * (to_y - up) + rest)
             if ti.static(right != 0):
-                to_x = x - right * sheet.numbers[DX]
-                longer = x * (to_x - right * sheet.numbers[DX]) + (y * (to_y - up) + rest)
+                to_x = x - right * sheet.constants[DX]
+                longer = x * (to_x - right * sheet.constants[DX]) + (y * (to_y - up) + rest)
             weighted = k * longer
             if ti.static(leaves_out):
                 weighted *= exists
-            tension = sheet.numbers[first_tension + ti.static(DIAGONAL if right else ALONG_COLUMN)]
-            square = to_x * to_x + to_y * to_y + (rest + TINY)
+            tension = sheet.constants[first_tension + ti.static(DIAGONAL if right else ALONG_COLUMN)]
+            square = to_x * to_x + to_y * to_y + (rest + MIN_SQUARED_LENGTH)
             return pull(weighted, square, length, [to_x, to_y, z], tension, [x, y, z])
 
         @ti.func
@@ -194,9 +194,9 @@ class SpringTerm(Term):
             if ti.static(mapped):
                 return sheet.stiffness[i * sheet.width + b]
             elif ti.static(by_area):  # noqa: RET505  # Taichi would compile the rest as well.
-                return sheet.numbers[first + ALONG_ROW] * ti.select(kind == 1, ti.cast(1, real), ti.cast(0.5, real))
+                return sheet.constants[first + ALONG_ROW] * ti.select(kind == 1, ti.cast(1, real), ti.cast(0.5, real))
             else:
-                return sheet.numbers[first + ALONG_ROW]
+                return sheet.constants[first + ALONG_ROW]
 
         @ti.func
         def of_column(sheet: ti.template(), lower, b):
@@ -204,9 +204,9 @@ class SpringTerm(Term):
             if ti.static(mapped):
                 return sheet.stiffness[(sheet.rows + lower) * sheet.width + b]
             elif ti.static(by_area):  # noqa: RET505
-                return sheet.numbers[first + ALONG_COLUMN] * sheet.by_column[(AREA + 1) * sheet.width + b]
+                return sheet.constants[first + ALONG_COLUMN] * sheet.by_column[(AREA_SHARE + 1) * sheet.width + b]
             else:
-                return sheet.numbers[first + ALONG_COLUMN]
+                return sheet.constants[first + ALONG_COLUMN]
 
         @ti.func
         def of_diagonal(sheet: ti.template(), lower, b):
@@ -214,11 +214,11 @@ class SpringTerm(Term):
             if ti.static(mapped):
                 return sheet.stiffness[(2 * sheet.rows + 1 + lower) * sheet.width + b]
             else:  # noqa: RET505
-                return sheet.numbers[first + DIAGONAL]
+                return sheet.constants[first + DIAGONAL]
 
         return along, to_other_row, of_row, of_column, of_diagonal
 
-    def tangent(self, code: StepCode) -> Callable[..., Any]:
+    def build_spring_tangent(self, config: KernelConfig) -> Callable[..., Any]:
         """Make the function that differentiates the force of a point P on its neighbour Q.
 
         As u_P - u_Q changes from q by p, the force of k - tau and tau changes by
@@ -227,13 +227,13 @@ class SpringTerm(Term):
 
         which is symmetric. The product of the force with p changes with k - tau by s (o + q) . p, with tau by q . p.
         """
-        ti, tense = code.ti, self.tense
+        ti, tense = config.ti, self.tense
 
         @ti.func
         def differentiate(q: ti.template(), p: ti.template(), x0, y0, length, k, tension):
             """Give the change of the force, x, y and z; and of its product with p by k - tau and by tau."""
             to = [q[0] + x0, q[1] + y0, q[2]]
-            square = to[0] * to[0] + to[1] * to[1] + (to[2] * to[2] + TINY)
+            square = to[0] * to[0] + to[1] * to[1] + (to[2] * to[2] + MIN_SQUARED_LENGTH)
             longer = q[0] * (to[0] + x0) + (q[1] * (to[1] + y0) + q[2] * q[2])
             both = square + length * ti.sqrt(square)
             # One division in the place of two.
@@ -249,11 +249,11 @@ class SpringTerm(Term):
 
         return differentiate
 
-    def pulling(self, code: StepCode) -> Callable[..., Any]:
+    def build_max_spring_force(self, config: KernelConfig) -> Callable[..., Any]:
         """Make the function that gives the square of the largest force of the springs to the right and below."""
-        ti = code.ti
-        structural, shear, vector = self.structural, self.shear, code.vector
-        along, to_other_row, of_row, of_column, of_diagonal = self.between(code)
+        ti = config.ti
+        structural, shear, vector = self.structural, self.shear, config.vector
+        along, to_other_row, of_row, of_column, of_diagonal = self.build_spring_forces(config)
 
         @ti.func
         def stronger(largest, force: ti.template()):
@@ -270,7 +270,7 @@ class SpringTerm(Term):
                 sheet.by_column[HAS_LEFT * sheet.width + b],
                 sheet.by_column[HAS_RIGHT * sheet.width + b],
             )
-            dx, dy = sheet.numbers[DX], sheet.numbers[DY]
+            dx, dy = sheet.constants[DX], sheet.constants[DY]
             here, below, lower = row.i * sheet.width + b, (row.i + 1) * sheet.width + b, row.i + 1
             if ti.static(structural):
                 k = vector(0) + of_row(sheet, row.i, row.kind, b)
@@ -289,11 +289,11 @@ class SpringTerm(Term):
 
         return pull
 
-    def measuring(self, code: StepCode) -> Sequence[Callable[..., None]]:
+    def build_measures(self, config: KernelConfig) -> Sequence[Callable[..., None]]:
         """Make the function that measures the springs to the right of an entry and to the row below it."""
-        ti = code.ti
-        tense, open_edges, vector, first = self.tense, self.open_edges, code.vector, code.first_measure(SpringTerm)
-        _, _, of_row, of_column, of_diagonal = self.between(code)
+        ti = config.ti
+        tense, open_edges, vector, first = self.tense, self.open_edges, config.vector, config.first_measure(SpringTerm)
+        _, _, of_row, of_column, of_diagonal = self.build_spring_forces(config)
         # Of every family that there is: rows and columns from one end to the other, for each of its springs.
         structural = ((ALONG_ROW, 0, (1,)), (ALONG_COLUMN, 1, (0,))) if self.structural else ()
         families = structural + (((DIAGONAL, 1, (-1, 1)),) if self.shear else ())
@@ -316,7 +316,7 @@ class SpringTerm(Term):
 
         @ti.func
         def measure(measures: ti.template(), sheet: ti.template(), p, i, kind, b):
-            dx, dy = sheet.numbers[DX], sheet.numbers[DY]
+            dx, dy = sheet.constants[DX], sheet.constants[DY]
             for family, down, rights in ti.static(families):
                 if i + down < sheet.rows:
                     stretched, tense_part = vector(0), vector(0)
@@ -329,19 +329,19 @@ class SpringTerm(Term):
                         else:
                             k += of_diagonal(sheet, i + 1, b + ti.static(min(right, 0)))
                         share, apart = longer(sheet, p, p + down, b, right, right * dx, -down * dy)
-                        measures[first + LEAST] = ti.min(measures[first + LEAST], share)
-                        measures[first + MOST] = ti.max(measures[first + MOST], share)
+                        measures[first + MIN_STRAIN] = ti.min(measures[first + MIN_STRAIN], share)
+                        measures[first + MAX_STRAIN] = ti.max(measures[first + MAX_STRAIN], share)
                         # L / L0 - 1; rounding may put the share below -1.
                         stretch = share / (1 + ti.sqrt(ti.max(share + 1, vector(0))))
                         stretched += stretch * stretch * k
                         tense_part += apart
-                    measures[first + STRETCHED + family] += stretched
+                    measures[first + STRETCH_SUMS + family] += stretched
                     if ti.static(tense):
-                        measures[first + TENSE + family] += tense_part
+                        measures[first + TENSION_SUMS + family] += tense_part
 
         return (measure,)
 
-    def laid_out(self, plan: Plan) -> NDArray[Any] | None:
+    def stiffness_array(self, plan: Plan) -> NDArray[Any] | None:
         """Give the array of stiffness: k - tau of every spring [N/m], shape (stiffness_rows, cols); None without a map.
 
         Along rows come as many rows as the sheet has; along columns and diagonals one more, of which the first and the
@@ -351,17 +351,17 @@ class SpringTerm(Term):
         if material.factors is None:
             return None
         pads = ((0, 0), (0, 1)), ((1, 1), (0, 0)), ((1, 1), (0, 1))
-        families = zip(stiffness(material, material.factors), material.tensions, pads, strict=True)
+        families = zip(spring_stiffness(material, material.factors), material.tensions, pads, strict=True)
         return np.concatenate([np.pad(np.maximum(k - tension, 0), pad) for k, tension, pad in families])
 
 
 def _unmapped_bound(material: Material) -> float:
-    """Bound m w^2 where the factor of the map is 1: see `SpringTerm.bound` [N/m]."""
+    """Bound m w^2 where the factor of the map is 1: see `SpringTerm.stiffness_bound` [N/m]."""
     across, down, shear = material.across, material.down, material.shear
     return 4 * max(across + down, across + 2 * shear, down + 2 * shear)
 
 
-def stiffness(material: Material, factors: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+def spring_stiffness(material: Material, factors: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Assemble the stiffness k of every spring from the factors of its cells, shape (rows - 1, cols - 1) [N/m].
 
     Along rows, shape (rows, cols - 1); along columns, shape (rows - 1, cols); along both diagonals of a cell.

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.model.surface import Rod
+from taichi_msm.model.surface import Capsule
 from taichi_msm.render.camera import View, held, pinhole, turned, view
 from taichi_msm.render.picking import on_rest_plane
 from taichi_msm.render.renderer import Renderer, Shot
@@ -167,7 +167,7 @@ class Viewport:
         """Show the mesh, or hide it."""
         self._change(wireframe=not self.render.wireframe)
 
-    def draw(self, positions: NDArray[Any], rods: Sequence[Rod] = ()) -> Picture:
+    def draw(self, positions: NDArray[Any], rods: Sequence[Capsule] = ()) -> Picture:
         """Draw the sheet with some instruments; positions and picture as those of `Simulation`."""
         return self._renderer.draw(Shot(positions, self.view, rods), self.render)
 

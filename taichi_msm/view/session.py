@@ -14,15 +14,15 @@ from taichi_msm.load.check import checked
 from taichi_msm.load.resolve import resolve
 from taichi_msm.load.yaml_reader import MAX_NODES
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.surface import rod, rods, touched
+from taichi_msm.model.surface import place_capsule, place_capsules, surface_point
 from taichi_msm.model.tool_force import probe_force
-from taichi_msm.model.tools import path_notes, path_problems
+from taichi_msm.model.tools import path_problems, path_warnings
 from taichi_msm.render.texture import load_texture
 from taichi_msm.runs.media import Picture
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_PROBES
-from taichi_msm.solver.planning import variant, with_time
+from taichi_msm.solver.planning import plan_variant, with_time
 from taichi_msm.system import runtime
 from taichi_msm.view import events, overlay
 from taichi_msm.view.controller import Controller, Viewport
@@ -57,7 +57,7 @@ def with_live_frames(plan: Plan) -> tuple[Plan, int]:
         steps = plan.grid.steps_per_frame
         while steps % parts:
             parts -= 1
-    return variant(plan, with_time(scene, frames_per_second=scene.time.frames_per_second * parts)), parts
+    return plan_variant(plan, with_time(scene, frames_per_second=scene.time.frames_per_second * parts)), parts
 
 
 class Session:
@@ -256,10 +256,10 @@ class Session:
     def _draw(self) -> Picture:
         """Draw the tissue and the instruments; the tool's is where the tool acts, or would if it were pressed."""
         positions, scene = self.positions(), self._simulation.scene
-        instruments = rods(scene, positions, self._simulation.time)
+        instruments = place_capsules(scene, positions, self._simulation.time)
         instrument = scene.probes[-1].instrument
         if instrument is not None and (place := self._controller.over()):
-            instruments[-1] = rod(instrument, scene, positions, self._rest_point(place))
+            instruments[-1] = place_capsule(instrument, scene, positions, self._rest_point(place))
         return self.viewport.draw(positions, instruments)
 
     def _rest_point(self, place: Place) -> NDArray[np.float64]:
@@ -270,7 +270,7 @@ class Session:
     def _touched(self) -> NDArray[np.float64]:
         """Find the point of the sheet at which the tool acts [m]."""
         rest = self._rest_point(self.tool.place)
-        return touched(self.positions(), self.scene.render.refine, self.scene.sheet, rest)[0]
+        return surface_point(self.positions(), self.scene.render.refine, self.scene.sheet, rest)[0]
 
     def _do(self, key: str) -> None:
         match key:
@@ -342,7 +342,7 @@ class Session:
         self.seconds_a_frame = 0.0
         self._begin()
         mine = [own for own in plan.tools if own.probe == len(self._others)]
-        self.say("; ".join(path_notes(plan.scene, mine)))
+        self.say("; ".join(path_warnings(plan.scene, mine)))
 
     def _begin(self) -> None:
         """Forget what was said and felt of the session so far."""

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.tools import LARGEST_STRIDE
+from taichi_msm.model.tools import MAX_STRIDE_RADII
 from taichi_msm.scene.tools import Probe
 
 # How long a hand takes from no force to the full force [s]. It lets go at once.
@@ -300,7 +300,7 @@ class MovedTool:
         goal = self._wanted if abs(up) <= most else self.height + math.copysign(most, up)
         (across, down), (to_across, to_down), (height, width) = self.place, self.goal, self._sheet.size
         way = math.hypot((to_across - across) * width, (to_down - down) * height, goal - self.height)
-        longest = MARGIN * LARGEST_STRIDE * self._radius * self._grid.steps_per_frame
+        longest = MARGIN * MAX_STRIDE_RADII * self._radius * self._grid.steps_per_frame
         share = min(1.0, longest / way) if way > 0 else 1.0
         if share < 1:
             self.place = on_sheet((across + share * (to_across - across), down + share * (to_down - down)))

@@ -19,11 +19,11 @@ from taichi_msm.accuracy.mesh import MeshEstimate, companion, estimate_points, w
 from taichi_msm.accuracy.report import Known, RunError
 from taichi_msm.accuracy.time_step import Estimate, choose_step, estimate_error, longest, order, reconcile
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.tools import overlap, path_notes
+from taichi_msm.model.tools import overlap, path_warnings
 from taichi_msm.runs.run import run
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.dynamics import Dynamics
-from taichi_msm.solver.planning import variant
+from taichi_msm.solver.planning import plan_variant
 from taichi_msm.system.runtime import Device
 from tests.accuracy.test_accuracy import MOVED, Falling
 from tests.motion import frames_on, notes_of, true_error
@@ -81,7 +81,7 @@ def test_the_error_of_the_points_is_hardly_above_what_is_told(
     assert mesh.at_most
     exact = plan.with_grid(precision="f64")
     rows, cols = plan.scene.sheet.points
-    finer = variant(exact, with_points(plan.scene, (4 * rows - 3, 4 * cols - 3))).with_grid(precision="f64")
+    finer = plan_variant(exact, with_points(plan.scene, (4 * rows - 3, 4 * cols - 3))).with_grid(precision="f64")
     reference = frames_on(finer, device)[:, ::4, ::4]
     own = frames_on(exact.with_grid(steps_per_frame=8 * plan.grid.steps_per_frame), device)
     error = longest(own - reference) / longest(reference)
@@ -108,7 +108,9 @@ def test_the_errors_of_a_drag_are_about_what_is_told(
     assert known.mesh is not None
     assert known.force is not None
     assert known.force.error is not None
-    finer = variant(plan, with_points(plan.scene, (61, 61))).with_grid(steps_per_frame=2 * plan.grid.steps_per_frame)
+    finer = plan_variant(plan, with_points(plan.scene, (61, 61))).with_grid(
+        steps_per_frame=2 * plan.grid.steps_per_frame
+    )
     own, reference = Dynamics(plan, device), Dynamics(finer, device)
     apart = most = forces_apart = greatest = 0.0
     for _ in range(plan.grid.frames):
@@ -219,7 +221,7 @@ def test_the_error_with_tools_in_one_place_may_be_larger(device: Device) -> None
     assert where is not None
     one, other, time = where
     assert (one, other) == (0, 1)
-    (note,) = (note for note in path_notes(plan.scene, plan.tools) if "through each other" in note)
+    (note,) = (note for note in path_warnings(plan.scene, plan.tools) if "through each other" in note)
     assert note.startswith(f"probes.0 and probes.1: their instruments run through each other at {time:.3g} s")
     estimate = told(plan, device).estimate
     assert estimate is not None
@@ -284,7 +286,7 @@ def test_where_a_tip_is_as_narrow_as_a_cell_a_nearer_run_follows(radius: float, 
     plan = plan_of(Scene.model_validate(made))
     mesh = told(plan, device).mesh
     assert mesh is not None
-    finer = variant(plan, with_points(plan.scene, (91, 91))).with_grid(precision="f64")
+    finer = plan_variant(plan, with_points(plan.scene, (91, 91))).with_grid(precision="f64")
     reference = frames_on(finer, device)[:, ::3, ::3]
     error = longest(frames_on(plan, device) - reference) / longest(reference)
     assert 0.67 <= mesh.error / error <= 4

@@ -14,8 +14,8 @@ from taichi_msm import DivergedError, Simulation
 from taichi_msm.accuracy.diagnosis import Diagnosis
 from taichi_msm.accuracy.divergence import farthest_displacement
 from taichi_msm.scene.scene import Scene
-from taichi_msm.solver.dynamics import Gauge
-from taichi_msm.solver.state import RunProgress, Saved, State
+from taichi_msm.solver.dynamics import ForceRecorder
+from taichi_msm.solver.state import RunProgress, Snapshot, State
 from taichi_msm.system.runtime import Device
 from tests.motion import notes_of
 from tests.scenes import SHEET, plan_of, scene, with_steps
@@ -42,12 +42,12 @@ def pressed(precision: str = "f32", **sections: object) -> Scene:
     return scene(**{"probes": [PRESS], "time": {"precision": precision}, **sections})
 
 
-def rest(made: Scene) -> Saved:
+def rest(made: Scene) -> Snapshot:
     nothing = np.zeros((*made.sheet.points, 3), made.time.precision.replace("f", "float"))
-    return Saved(State(0, nothing, nothing), RunProgress(), Gauge(plan_of(made)).at_rest())
+    return Snapshot(State(0, nothing, nothing), RunProgress(), ForceRecorder(plan_of(made)).at_rest())
 
 
-def with_fault(saved: Saved, part: str, change: float, random: np.random.Generator) -> Saved:
+def with_fault(saved: Snapshot, part: str, change: float, random: np.random.Generator) -> Snapshot:
     """Add to one number of a point that moves."""
     wrong = getattr(saved.state, part).copy()
     rows, cols, _ = wrong.shape
@@ -210,8 +210,8 @@ def diagnosed(made: Scene, device: Device, fault: Callable[[Simulation], None] =
 
 def test_a_force_that_is_too_strong_is_named(device: Device) -> None:
     weak = {"force": [0, 0, 1], "at": [0.2, 0.2]}
-    torn = {"force": [0, 0, -1], "load": [[0, 0], [0.1, 100], [0.1, 1e9]], "falloff": 20}
-    made = pressed(probes=[weak, torn])
+    inconsistent = {"force": [0, 0, -1], "load": [[0, 0], [0.1, 100], [0.1, 1e9]], "falloff": 20}
+    made = pressed(probes=[weak, inconsistent])
     found = diagnosed(made, device)
     assert re.fullmatch(
         r"diverged at 0\.1\d* s, step \d+: point \(4, 5\) is [.\d]+ m from its rest position, and the sheet is 0\.4 m "
@@ -231,8 +231,8 @@ def test_a_force_that_is_too_strong_is_named(device: Device) -> None:
 
 
 def test_a_tool_that_does_no_harm_is_not_named(device: Device) -> None:
-    torn = {"force": [0, 0, -1], "load": [[0, 0], [0.1, 100], [0.1, 1e9]], "falloff": 20}
-    made = pressed(probes=[moved([0, 0.2, 0.2, 0.0], [0.2, 0.2, 0.2, -0.02]), torn])
+    inconsistent = {"force": [0, 0, -1], "load": [[0, 0], [0.1, 100], [0.1, 1e9]], "falloff": 20}
+    made = pressed(probes=[moved([0, 0.2, 0.2, 0.0], [0.2, 0.2, 0.2, -0.02]), inconsistent])
     assert "likely cause: probes.1.force, which reaches 454 N" in diagnosed(made, device).message
 
 

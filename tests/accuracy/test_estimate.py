@@ -18,7 +18,7 @@ from taichi_msm.runs.writer import RunRecord
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver import planning
 from taichi_msm.solver.dynamics import Dynamics
-from taichi_msm.solver.planning import affords_pilots, on, with_time
+from taichi_msm.solver.planning import affords_companions, choose_precision, with_time
 from taichi_msm.solver.state import RunProgress
 from taichi_msm.system.runtime import Device
 from tests.motion import notes_of, true_error
@@ -68,7 +68,7 @@ def test_an_estimate_can_be_left_out_or_asked_for(small: Path, device: Device, m
     record = run(made, "out", threads=device.threads, estimate_error=False)
     assert (record["error_estimate"], record["error_estimate_reason"]) == (None, "not asked for")
     assert "pilot" not in record["timings"]
-    monkeypatch.setattr(companions, "affords_pilots", lambda plan, steps: False)
+    monkeypatch.setattr(companions, "affords_companions", lambda plan, steps: False)
     record = run(made, "out", threads=device.threads)
     assert record["error_estimate"] is None
     assert record["error_estimate_reason"].startswith("it would take more than two fifths of the run")
@@ -120,7 +120,7 @@ def test_a_small_run_is_in_f64_and_a_large_one_in_f32() -> None:
         return scene(sheet={"points": [points, points], "size": [0.3, 0.3], "mass": 1e-3}, time=time, **keys)
 
     def precision(scene: Scene, arch: str = "cpu") -> str:
-        return on(plan_of(scene), arch).grid.precision
+        return choose_precision(plan_of(scene), arch).grid.precision
 
     assert precision(made(61, 30)) == "f64"
     assert precision(made(61, 30), "cuda") == "f32"
@@ -138,14 +138,14 @@ def test_a_small_run_is_in_f64_and_a_large_one_in_f32() -> None:
 
 def test_pilots_are_taken_while_they_are_two_fifths_of_the_run() -> None:
     small = scene(probes=[PRESS], time={"precision": "auto"})
-    assert affords_pilots(plan_of(small), 2)
+    assert affords_companions(plan_of(small), 2)
     time = {"precision": "auto", "duration": 40.0}
     large = scene(sheet={"points": [2000, 2000], "size": [0.3, 0.3], "mass": 1e-3}, time=time)
     single, double = plan_of(large), plan_of(large).with_grid(precision="f64")
     assert single.grid.precision == "f32"
     # Of a run that is nearly all stepping, two thirds of the run's own steps are two fifths of the whole.
-    assert [affords_pilots(double, steps) for steps in (0.66, 0.67)] == [True, False]
-    assert [affords_pilots(single, steps) for steps in (0.33, 0.34)] == [True, False]
+    assert [affords_companions(double, steps) for steps in (0.66, 0.67)] == [True, False]
+    assert [affords_companions(single, steps) for steps in (0.33, 0.34)] == [True, False]
     steps = math.ceil(double.grid.steps_per_frame / 2)
     assert choose_pilots(double) == Pilots(steps, 0, False, steps / double.grid.steps_per_frame)
     assert choose_pilots(single).reason
@@ -189,7 +189,7 @@ def test_a_finer_pilot_follows_an_error_that_matters(
     error = true_error(plan_of(made), device, fine=32)
     # Twice the next power of h, as in tests/accuracy/test_accuracy.py.
     assert told(record) == pytest.approx(error, rel=1 / 12)
-    monkeypatch.setattr(companions, "affords_pilots", lambda plan, steps: steps < 1)
+    monkeypatch.setattr(companions, "affords_companions", lambda plan, steps: steps < 1)
     record = run(made, "out", threads=device.threads)
     found = record["error_estimate"]
     assert found is not None
@@ -229,7 +229,7 @@ def test_beside_f32_a_coarse_pilot_of_order_1_tells_a_bound(small: Path, device:
 def test_beside_f32_a_coarse_pilot_tells_a_bound(
     small: Path, device: Device, monkeypatch: pytest.MonkeyPatch, taken: list[int]
 ) -> None:
-    monkeypatch.setattr(companions, "affords_pilots", lambda plan, steps: steps < 1)
+    monkeypatch.setattr(companions, "affords_companions", lambda plan, steps: steps < 1)
     made = load_scene("small.yaml", [*WRONG, "time.precision=f32"])
     record = run(made, "out", threads=device.threads)
     assert record["steps"] is not None

@@ -24,7 +24,7 @@ from taichi_msm.fitting.parameters import Method, make_parameters
 from taichi_msm.fitting.predict import Job, Predicted, Predictor, Runs, runnable
 from taichi_msm.fitting.rejection import by_pattern
 from taichi_msm.fitting.result import FitResult
-from taichi_msm.model.surface import on_surface, surface_weights, touched
+from taichi_msm.model.surface import surface_point, surface_positions, surface_weights
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system import process
 from taichi_msm.system.runtime import Device
@@ -117,7 +117,7 @@ def test_points_are_on_the_surface_that_is_drawn(motion: Array) -> None:
         points = np.einsum("nk,nkc->nc", weights, position.reshape(-1, 3)[corners])
         for place, point in zip(PLACES, points, strict=True):
             rest = np.array([(place[0] - 0.5) * 0.1, (0.5 - place[1]) * 0.1])
-            np.testing.assert_allclose(point, touched(position, refine, sheet, rest)[0], atol=1e-15)
+            np.testing.assert_allclose(point, surface_point(position, refine, sheet, rest)[0], atol=1e-15)
 
 
 def test_a_camera_that_moves_and_bends_lines_sees_what_is_predicted(motion: Array, device: Device) -> None:
@@ -125,7 +125,7 @@ def test_a_camera_that_moves_and_bends_lines_sees_what_is_predicted(motion: Arra
     made = changed(render__camera={"eye": eye, "fov": 40, "distortion": {"k1": -0.3, "k2": 0.1}})
     with Simulation(made, threads=device.threads) as simulation:
         pixels = [simulation.locate(PLACES, positions=motion[n], time=n / 25).pixels for n in range(11)]
-    points = np.stack([on_surface(each, made.render.refine, PLACES) for each in motion], axis=1)
+    points = np.stack([surface_positions(each, made.render.refine, PLACES) for each in motion], axis=1)
     seen = seen_by_camera(made, points, np.arange(11) / 25)
     np.testing.assert_allclose(seen, np.stack(pixels, axis=1), atol=1e-4)
 

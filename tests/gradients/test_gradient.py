@@ -21,10 +21,10 @@ from taichi_msm.gradients import motion, rest
 from taichi_msm.gradients.chain_rule import Derivatives
 from taichi_msm.gradients.gradient import Adjoint, mapped
 from taichi_msm.gradients.motion import MotionAdjoint
-from taichi_msm.model.loads import schedule
+from taichi_msm.model.loads import average_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.solver.dynamics import layout_of
+from taichi_msm.solver.dynamics import choose_layout
 from taichi_msm.system.runtime import Device
 from tests.reference import adjoint as twin
 from tests.reference.sheet import sheet
@@ -103,7 +103,7 @@ def differentiated(made: Mapping[str, Any], device: Device) -> Derivatives:
 
 def twin_value(plan: Plan, put: Any = None, loads: Any = None) -> Any:
     """The loss by the twin, of another sheet or other loads, which may be complex."""
-    loads = schedule(plan, 0, plan.grid.steps) if loads is None else loads
+    loads = average_loads(plan, 0, plan.grid.steps) if loads is None else loads
     every = twin.displacements(plan, sheet(plan.scene) if put is None else put, loads)
     return value(rest_positions(plan.scene.sheet) + np.array(every[:: plan.grid.steps_per_frame]))
 
@@ -123,7 +123,7 @@ def material_numbers(found: Derivatives) -> list[str]:
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_adjoint_of_the_twin_is_its_complex_step(kind: str, image: str) -> None:
     plan = plan_of(Scene.model_validate(described(kind, image)))
-    put, loads, rng = sheet(plan.scene), schedule(plan, 0, plan.grid.steps), np.random.default_rng(0)
+    put, loads, rng = sheet(plan.scene), average_loads(plan, 0, plan.grid.steps), np.random.default_rng(0)
     every = twin.displacements(plan, put, loads)
     frames = range(0, plan.grid.steps + 1, plan.grid.steps_per_frame)
     slope = loss(rest_positions(plan.scene.sheet) + np.array(every)[frames])[1]
@@ -154,7 +154,7 @@ def test_the_adjoint_of_the_twin_is_its_complex_step(kind: str, image: str) -> N
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_tangent_is_symmetric_and_that_of_the_force(kind: str, image: str) -> None:
     plan = plan_of(Scene.model_validate(described(kind, image)))
-    put, loads = sheet(plan.scene), schedule(plan, 0, 1)
+    put, loads = sheet(plan.scene), average_loads(plan, 0, 1)
     u, v, w = 0.004 * np.random.default_rng(1).standard_normal((3, *plan.scene.sheet.points, 3))
     changed = [twin.tangent(plan.scene, put, loads.active[0], u, of) for of in (v, w)]
     assert (w * changed[0]).sum() == pytest.approx((v * changed[1]).sum(), rel=1e-13)
@@ -299,7 +299,7 @@ def test_the_bits_depend_neither_on_workers_nor_on_segments(
     plan = mapped(plan_of(Scene.model_validate(made)))
 
     def bits(workers: int) -> bytes:
-        sheet = MotionAdjoint(plan, device, layout=replace(layout_of(plan, device), workers=workers))
+        sheet = MotionAdjoint(plan, device, layout=replace(choose_layout(plan, device), workers=workers))
         slopes, loads = sheet.backward(loss(sheet.run())[1])
         arrays = [*slopes.springs, slopes.tensions, slopes.held, *loads.by_key.values()]
         arrays += [slopes.bent, slopes.keep, slopes.gain, slopes.first_gain]

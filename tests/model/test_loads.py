@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from taichi_msm.model.loads import Envelope, key_times, loads_at, schedule
+from taichi_msm.model.loads import LoadBounds, average_loads, evaluate_loads, keyframe_times
 from taichi_msm.model.plan import probe_slots
 from taichi_msm.scene.scene import Scene
 from tests.scenes import PRESS, SPRINGS, plan_of, scene
@@ -20,7 +20,7 @@ SOFT = {**SPRINGS, "structural": 0.1, "shear": 0.1, "virtual": 0.1}
 def percent(load: list[list[float]], **changes: Any) -> list[float]:
     """Percent at the steps 0 to 5, that is at 0 s to 0.05 s."""
     made = scene(springs=SOFT, probes=[{"force": [100, 0, 0], "load": load}], time=STEPS, **changes)
-    return [round(float(value), 5) for value in schedule(plan_of(made), 0, 6).strength[:, 0, 0]]
+    return [round(float(value), 5) for value in average_loads(plan_of(made), 0, 6).strength[:, 0, 0]]
 
 
 @pytest.mark.parametrize(
@@ -50,7 +50,7 @@ def test_percent(load: list[list[float]], expected: list[float]) -> None:
 def test_what_no_key_is_near_is_the_value_itself() -> None:
     load = [[0, 0], [0.1, 33.3], [0.3, 33.3], [0.7, 80], [2, 81]]
     made = scene(springs=SOFT, probes=[{"force": [100, 0, 0], "load": load}], time=STEPS)
-    found = schedule(plan_of(made), 0, 100).strength[:, 0, 0]
+    found = average_loads(plan_of(made), 0, 100).strength[:, 0, 0]
     t = np.arange(100) / 100
     expected = np.interp(t, *np.array(load).T)
     near = np.isin(np.arange(100), [0, 10, 30, 70])
@@ -72,7 +72,7 @@ def test_the_average_is_the_integral_with_the_hat(seed: int) -> None:
     load = random_load(seed)
     at = [[0, 0, 0], [0.011, 1, 0], [0.011, 0, 1], [0.043, 0.5, 0.5], [0.043, 0.25, 0]]
     made = scene(springs=SOFT, probes=[{"force": [100, 0, 0], "load": load, "at": at}], time=STEPS)
-    found, h = schedule(plan_of(made), 0, 7), plan_of(made).grid.step
+    found, h = average_loads(plan_of(made), 0, 7), plan_of(made).grid.step
     keys = sorted({time for time, _ in load} | {0.011, 0.043})
 
     def integral(of: Any, n: int) -> float:
@@ -87,13 +87,13 @@ def test_the_average_is_the_integral_with_the_hat(seed: int) -> None:
     def of_slot(slot: int, t: float) -> float:
         """The two slots act by turns: the first until the first jump, and from the second one on."""
         acts = ((t >= 0.011) + (t >= 0.043)) % 2 == slot
-        return float(loads_at(plan_of(made), np.array([t])).strength[0, 0, 0]) if acts else 0.0
+        return float(evaluate_loads(plan_of(made), np.array([t])).strength[0, 0, 0]) if acts else 0.0
 
     for n in range(7):
         for slot in range(2):
             strength = integral(lambda t, slot=slot: of_slot(slot, t), n)
             assert found.strength[n, slot, 0] == pytest.approx(strength, abs=1e-9), (n, slot)
-        active = integral(lambda t: loads_at(plan_of(made), np.array([t])).active[0], n)
+        active = integral(lambda t: evaluate_loads(plan_of(made), np.array([t])).active[0], n)
         assert found.active[n] == pytest.approx(active, abs=1e-9), n
 
 
@@ -101,7 +101,7 @@ def test_a_free_point_goes_where_the_load_takes_it() -> None:
     """Verlet's u_{n+1} = 2 u_n - u_{n-1} + h^2 a_n is then exact, whatever the load."""
     load = random_load(5)
     made = scene(springs={}, probes=[{"force": [1, 0, 0], "load": load}], time=STEPS)
-    a, h = schedule(plan_of(made), 0, 8).strength[:, 0, 0], plan_of(made).grid.step
+    a, h = average_loads(plan_of(made), 0, 8).strength[:, 0, 0], plan_of(made).grid.step
     u = [0.0, h**2 / 2 * a[0]]
     for n in range(1, 8):
         u.append(2 * u[-1] - u[-2] + h**2 * a[n])
@@ -110,7 +110,9 @@ def test_a_free_point_goes_where_the_load_takes_it() -> None:
     def double_integral(end: float) -> float:
         cuts = [0.0, *(time for time in keys if time < end), end]
         return sum(
-            quad(lambda t: (end - t) * loads_at(plan_of(made), np.array([t])).strength[0, 0, 0], a, b, epsabs=1e-14)[0]
+            quad(
+                lambda t: (end - t) * evaluate_loads(plan_of(made), np.array([t])).strength[0, 0, 0], a, b, epsabs=1e-14
+            )[0]
             for a, b in pairwise(cuts)
         )
 
@@ -125,7 +127,7 @@ def test_a_step_meets_a_key_in_spite_of_rounding() -> None:
         time={"duration": 20, "frames_per_second": 0.1, "step": 10 / 3},
     )
     assert 3 / (3 * 0.1) < 10
-    found = schedule(plan_of(made), 0, 6)
+    found = average_loads(plan_of(made), 0, 6)
     np.testing.assert_allclose(found.strength[:, 0, 0], [0, 0, 0, 50, 100, 100], atol=1e-12)
 
 
@@ -147,19 +149,19 @@ def test_a_step_meets_a_key_in_spite_of_rounding() -> None:
 def test_virtual_springs_while_loaded(loads: list[list[list[float]]], expected: list[float]) -> None:
     probes = [{"force": [0, 0, 1], "load": load} for load in loads]
     made = scene(springs=SOFT, probes=probes, time=STEPS)
-    assert schedule(plan_of(made), 0, 6).active.tolist() == pytest.approx(expected, abs=1e-12)
+    assert average_loads(plan_of(made), 0, 6).active.tolist() == pytest.approx(expected, abs=1e-12)
 
 
 def test_virtual_springs_always() -> None:
     made = scene(springs={**SOFT, "virtual_active": "always"}, probes=[], time=STEPS)
-    assert schedule(plan_of(made), 0, 3).active.tolist() == [1, 1, 1]
+    assert average_loads(plan_of(made), 0, 3).active.tolist() == [1, 1, 1]
 
 
 def test_a_schedule_does_not_depend_on_where_it_is_cut() -> None:
     made = scene(springs=SOFT, time=STEPS)
-    whole = schedule(plan_of(made), 0, 40)
+    whole = average_loads(plan_of(made), 0, 40)
     for cut in (1, 17, 20, 21):
-        halves = schedule(plan_of(made), 0, cut), schedule(plan_of(made), cut, 40 - cut)
+        halves = average_loads(plan_of(made), 0, cut), average_loads(plan_of(made), cut, 40 - cut)
         for n in range(1, 4):
             np.testing.assert_array_equal(np.concatenate([half[n] for half in halves]), whole[n])
 
@@ -169,7 +171,7 @@ def test_keys_that_change_nothing_change_no_bit() -> None:
 
     def bits(load: list[list[float]], steps: int) -> bytes:
         made = scene(springs=SOFT, probes=[{"force": [0, 0, 8], "load": load}], time=STEPS)
-        return b"".join(part.tobytes() for part in schedule(plan_of(made), 0, steps)[1:])
+        return b"".join(part.tobytes() for part in average_loads(plan_of(made), 0, steps)[1:])
 
     load: list[list[float]] = [[0, 0], [0.013, 70], [0.031, 70]]
     assert bits(load, 9) == bits([*load[:2], [0.017, 70], [0.02, 70], *load[2:], [0.05, 70], [0.06, 70]], 9)
@@ -180,7 +182,7 @@ def test_keys_that_change_nothing_change_no_bit() -> None:
 def test_a_control_point_moves_between_its_keys_and_is_held_outside() -> None:
     keys = [[0.01, 0, 0], [0.03, 1, 0.5]]
     made = scene(springs=SOFT, probes=[{"force": [0, 0, 1], "at": keys}], time=STEPS)
-    point = schedule(plan_of(made), 0, 6).point[:, 0]
+    point = average_loads(plan_of(made), 0, 6).point[:, 0]
     # The sheet is 0.4 m wide and 0.3 m high, its centre the origin, y up.
     expected = [[-0.2, 0.15], [-0.2, 0.15], [0, 0.075], [0.2, 0], [0.2, 0], [0.2, 0]]
     np.testing.assert_allclose(point, expected, atol=1e-15)
@@ -190,7 +192,7 @@ def test_a_control_point_moves_between_its_keys_and_is_held_outside() -> None:
 def test_a_jump_of_the_control_point_shares_the_force_between_both_places(keys: list[list[float]]) -> None:
     probe = {"force": [0, 0, 8], "at": keys, "load": [[0, 100], [0.02, 100], [0.02, 50]]}
     made = scene(springs=SOFT, probes=[probe], time=STEPS)
-    found = schedule(plan_of(made), 0, 5)
+    found = average_loads(plan_of(made), 0, 5)
     assert [(slot.turn, slot.turns, slot.moves) for slot in found.slots] == [(0, 2, True), (1, 2, True)]
     np.testing.assert_allclose(found.strength[..., 2].T, [[8, 8, 4, 0, 0], [0, 0, 2, 4, 4]], atol=1e-12)
     np.testing.assert_allclose(found.point[2], [[-0.2, 0.15], [0.2, -0.15]])
@@ -202,7 +204,7 @@ def test_before_and_after_a_jump_the_control_point_is_where_its_keys_have_it() -
     # The jump is between two steps; before it the control point moves, and after it too.
     at = [[0, 0, 0], [0.024, 0.6, 0], [0.024, 1, 1], [0.044, 0.5, 1]]
     made = scene(springs=SOFT, probes=[{"force": [0, 0, 8], "at": at}], time=STEPS)
-    x = schedule(plan_of(made), 0, 5).point[..., 0] / 0.4 + 0.5
+    x = average_loads(plan_of(made), 0, 5).point[..., 0] / 0.4 + 0.5
     np.testing.assert_allclose(x[[0, 1, 2, 3], 0], [0, 0.25, 0.5, 0.6], atol=1e-12)
     np.testing.assert_allclose(x[[2, 3, 4], 1], [1, 0.85, 0.6], atol=1e-12)
 
@@ -212,11 +214,11 @@ def test_a_control_point_that_jumps_a_thousand_times_has_few_places() -> None:
     at = [[n / 100, *place] for n in range(1000) for place in ([n % 7 / 7, 0.5], [n % 5 / 5, 0.25])]
     probes = [{"force": [0, 0, 8], "at": at}, PRESS]
     made = scene(springs=SOFT, probes=probes, time={"duration": 10.0, "step": 0.005})
-    between = schedule(plan_of(made), 2, 1)
+    between = average_loads(plan_of(made), 2, 1)
     found = [(slot.probe, slot.turn, slot.turns, slot.moves) for slot in between.slots]
     assert found == [(0, 0, 2, True), (0, 1, 2, True), (1, 0, 1, False)]
     assert len(probe_slots(made.probes, made.sheet, 0.01)) == 1 + 3, "steps of 0.01 s see two jumps"
-    loads = loads_at(plan_of(made), np.array([0.0104, 0.0204]))
+    loads = evaluate_loads(plan_of(made), np.array([0.0104, 0.0204]))
     assert [(slot.probe, slot.turns) for slot in loads.slots] == [(0, 1), (1, 1)], "at one time it is at one place"
     np.testing.assert_allclose(loads.strength[:, 0, 2], [8, 8])
     across = [n / 5 + 0.04 * ((n + 1) / 7 - n / 5) for n in (1, 2)]
@@ -228,12 +230,12 @@ def test_keys() -> None:
     load = [[-1, 0], [0, 0], [0.1, 50], [0.1, 100], [0.3, 100], [0.5, 0], [0.7, 0], [2, 1]]
     at = [[0, 0, 0], [0.25, 0, 1], [0.25, 1, 1], [0.6, 1, 0]]
     made = scene(springs=SOFT, probes=[{"force": [0, 0, 8], "load": load, "at": at}], time=STEPS)
-    np.testing.assert_allclose(key_times(made), [0.1, 0.25, 0.3, 0.5, 0.6, 0.7])
-    assert key_times(scene(probes=[])).size == 0
+    np.testing.assert_allclose(keyframe_times(made), [0.1, 0.25, 0.3, 0.5, 0.6, 0.7])
+    assert keyframe_times(scene(probes=[])).size == 0
 
 
 def within(made: Scene, begin: float, end: float) -> tuple[float, bool, int]:
-    forces, active, begins = Envelope(plan_of(made)).between(begin, end)
+    forces, active, begins = LoadBounds(plan_of(made)).between(begin, end)
     return round(float(forces.max()), 12), active, begins
 
 
@@ -246,7 +248,7 @@ def test_the_envelope_holds_what_steps_see() -> None:
     assert within(made, 0.15, 0.19) == (5, True, 0), "the step at 0.19 s sees as far as 0.2 s"
     assert within(made, 0.3, 0.4) == (0.0, False, 0)
     assert within(made, 0.3, 0.55) == (5 * 0.2, True, 1)
-    found = schedule(plan_of(made), 0, 100)
+    found = average_loads(plan_of(made), 0, 100)
     for first in range(0, 96, 4):
         most = np.linalg.norm(found.strength[first : first + 5, 0], axis=-1).max()
         assert most <= within(made, first / 100, (first + 4) / 100)[0] * (1 + 1e-12)

@@ -16,13 +16,13 @@ from taichi_msm import load_scene, terms
 from taichi_msm.cli.main import main
 from taichi_msm.model import plan, sheet
 from taichi_msm.solver import planning
-from taichi_msm.solver.planning import make_plan, variant
+from taichi_msm.solver.planning import make_plan, plan_variant
 
 # Gives a scene a map.
 MAP = "tissue.map={image: textures/tumour.png, range: [1, 13]}"
 
 DERIVED = [
-    (terms, "material_of"),
+    (terms, "derive_material"),
     (terms, "highest_frequency"),
     (plan, "probe_slots"),
     (sheet, "fixed_points"),
@@ -64,7 +64,7 @@ def test_pilots_with_fewer_points_derive_their_own_sheets_once(root: Path, tmp_p
     short = ["--set", "time.duration=0.08", "--set", "output=[]", "--estimate-error", "--quiet"]
     assert main(["run", str(root / "scenes/press.yaml"), "--set", MAP, "--out", str(tmp_path / "out"), *short]) == 0
     # The run, the two companions, and the finer sheet that is advised.
-    assert {calls[name] for name in ("material_of", "fixed_points", "map_factors", "stable_step")} == {4}
+    assert {calls[name] for name in ("derive_material", "fixed_points", "map_factors", "stable_step")} == {4}
     assert calls["read_map"] == 1, "the map's file"
 
 
@@ -78,5 +78,5 @@ def test_a_scene_without_the_map_of_another_one_has_none(root: Path) -> None:
     mapped = make_plan(load_scene(root / "scenes/press.yaml", [MAP]))
     assert mapped.scene.tissue is not None
     tissue = mapped.scene.tissue.model_copy(update={"map": None})
-    plain = variant(mapped, mapped.scene.model_copy(update={"tissue": tissue}))
+    plain = plan_variant(mapped, mapped.scene.model_copy(update={"tissue": tissue}))
     assert plain.material.factors is None

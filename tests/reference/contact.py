@@ -41,7 +41,7 @@ class Contact:
             held = self.holder[i, j]
             for tool in plan.tools:
                 index = tool.probe
-                before, after = (tool.middle(np.array([step / grid.steps_per_second]))[0] for step in (n, n + 1))
+                before, after = (tool.tip_centre(np.array([step / grid.steps_per_second]))[0] for step in (n, n + 1))
                 push = np.zeros(3)
                 if held == index:
                     push = self._taken[i, j] + after - self._since[index] - following[i, j]
@@ -79,7 +79,7 @@ class Contact:
                 self.holder[self.holder == probe] = -1
         for tool in plan.tools:
             if tool.probe in begun:
-                middle = tool.middle(np.array([t]))[0]
+                middle = tool.tip_centre(np.array([t]))[0]
                 near = np.linalg.norm(self._rest + u - middle, axis=-1) <= 1.5 * tool.radius
                 taken = near & ~plan.fixed & (self.holder < 0)
                 self.holder[taken] = tool.probe

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.model.loads import Schedule, schedule
+from taichi_msm.model.loads import Schedule, average_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions, spacing
 from taichi_msm.scene.scene import Scene
@@ -168,7 +168,7 @@ def steps(plan: Plan) -> Iterator[tuple[Array, Contact]]:
     h, made = plan.grid.step, sheet(scene)
     m, g = made.mass[..., None], (made.drag / made.mass)[..., None]
     moves, contact = ~plan.fixed[..., None], Contact(plan)
-    loads = schedule(plan, 0, plan.grid.steps)
+    loads = average_loads(plan, 0, plan.grid.steps)
 
     previous = np.zeros((*scene.sheet.points, 3))
     yield previous, contact

@@ -42,7 +42,7 @@ def away(plan: Plan, displacement: Array, time: float) -> Array:
 def _from_axes(plan: Plan, displacement: Array, time: float) -> Array:
     every = np.empty((len(plan.tools), *displacement.shape))
     for n, tool in enumerate(plan.tools):
-        r = place(plan, displacement) - tool.middle(np.array([time]))[0]
+        r = place(plan, displacement) - tool.tip_centre(np.array([time]))[0]
         every[n] = r - np.clip(r @ tool.axis, 0, tool.length)[..., None] * tool.axis
     return every
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.model.surface import Rod
+from taichi_msm.model.surface import Capsule
 from taichi_msm.render import uniforms
 from taichi_msm.render.camera import View
 from taichi_msm.scene.scene import Scene
@@ -202,7 +202,7 @@ def tissue(
     normal: Array,
     depth: Array,
     place: tuple[Array, Array, Array],
-    rods: Sequence[Rod],
+    rods: Sequence[Capsule],
 ) -> Array:
     """Shade wet tissue; see `render/shading.py`.
 
@@ -257,7 +257,7 @@ def metal(camera: View, factor: int, depth: Array, normal: Array) -> Array:
     return np.asarray(np.minimum(share[..., None] * np.array(uniforms.METAL) + gloss[..., None], 255))
 
 
-def meet(rods: Sequence[Rod], camera: View, size: tuple[int, int], factor: int) -> tuple[Array, Array]:
+def meet(rods: Sequence[Capsule], camera: View, size: tuple[int, int], factor: int) -> tuple[Array, Array]:
     """Find the instruments that samples show, by search: the distance to a rod is convex along a line of sight.
 
     Args:
@@ -284,7 +284,7 @@ def meet(rods: Sequence[Rod], camera: View, size: tuple[int, int], factor: int) 
 
     for rod in rods:
 
-        def outward(depth: Array, rod: Rod = rod) -> Array:
+        def outward(depth: Array, rod: Capsule = rod) -> Array:
             point = sight(depth) - rod.tip
             foot = np.clip(point @ rod.axis, 0, rod.length)
             return np.asarray(point - foot[..., None] * rod.axis)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import SceneError
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.model.surface import rods
+from taichi_msm.model.surface import place_capsules
 from taichi_msm.render import tracking
 from taichi_msm.render.camera import Lens, calibration, view
 from taichi_msm.render.labels import track_grid
@@ -60,7 +60,7 @@ def opencv(made: Scene, points: Array) -> Array:
     return np.asarray(project(points.reshape(-1, 1, 3), axis, turn[:, 3], matrix, distortion)[0][:, 0])
 
 
-def on_surface(made: Scene, coordinates: Array, position: Array) -> Array:
+def surface_positions(made: Scene, coordinates: Array, position: Array) -> Array:
     """The points of the drawn surface at coordinates, shape (n, 3)."""
     surface = reference.refine(position, made.render.refine)
     rows, cols = surface.shape[:2]
@@ -157,7 +157,7 @@ def test_pictures_are_like_the_twins(lens: str, render: dict[str, Any], device: 
     made, texture = seen_through(lens, **render), speckle(13, 17)
     for shape in (dented, folded):
         position = shape(made)
-        placed = rods(made, position, 0)
+        placed = place_capsules(made, position, 0)
         drawn = Drawing(made, texture).draw(position, rods=placed)
         apart = difference(drawn, reference.draw(made, position, texture, placed))
         # As without a lens (test_drawing.py).
@@ -200,7 +200,7 @@ def test_the_shape_of_a_tile_does_not_change_the_bits(lens: str, lanes: int, dev
 def test_labels_are_on_the_ray_of_each_pixel(lens: str, shape: Any, device: Device) -> None:
     made = seen_through(lens)
     position = shape(made)
-    placed = rods(made, position, 0)
+    placed = place_capsules(made, position, 0)
     found, (coordinates, depth, instrument) = look(made, position), twin.labels(made, position, placed)
     alike = (np.isnan(found.coordinates[..., 0]) == np.isnan(coordinates[..., 0])) & (
         np.abs(found.depth - depth) < 1e-4 * depth.max()
@@ -209,7 +209,7 @@ def test_labels_are_on_the_ray_of_each_pixel(lens: str, shape: Any, device: Devi
     assert ((found.instrument == 255) == instrument)[alike].all()
     sheet = alike & ~np.isnan(coordinates[..., 0])
     assert sheet.mean() > 0.2
-    points = on_surface(made, found.coordinates[sheet].astype(float), position)
+    points = surface_positions(made, found.coordinates[sheet].astype(float), position)
     assert np.abs(opencv(made, points) - np.argwhere(sheet)[:, ::-1]).max() < 0.01
     pose = np.array(calibration(view(made))["pose"])
     np.testing.assert_allclose(found.depth[sheet], points @ pose[2, :3] + pose[2, 3], rtol=1e-5)

@@ -17,7 +17,7 @@ from PIL import Image
 from taichi_msm import run
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.model.surface import rods
+from taichi_msm.model.surface import place_capsules
 from taichi_msm.render.camera import view
 from taichi_msm.render.labels import track_grid
 from taichi_msm.render.rasterizer import Drawing, drawing_config
@@ -182,13 +182,15 @@ def looks() -> dict[str, NDArray[Any]]:
         )
     )  # fmt: skip
     position, view_now = draped(made), view(made)
-    placed, texture = rods(made, position, 0), speckle(300, 400)
+    placed, texture = place_capsules(made, position, 0), speckle(300, 400)
     seen["picture"] = Drawing(made, texture).draw(position, rods=placed)
     labels = Drawing(made, texture, drawing_config(made, picture=False, labels=True)).look(position, rods=placed).labels
     assert labels is not None
     seen |= {f"label_{name}": value for name, value in labels._asdict().items()}
     moved = position + np.array([0.002, 0.001, 0])
-    seen["flow"], seen["occlusion"] = find_flow(made, labels.coordinates, moved, view_now, rods(made, moved, 0))
+    seen["flow"], seen["occlusion"] = find_flow(
+        made, labels.coordinates, moved, view_now, place_capsules(made, moved, 0)
+    )
     rough = position + np.random.default_rng(5).normal(0, 0.004, position.shape)
     seen["pixels"], seen["hidden"] = find(made, track_grid(60), rough, view_now, placed)
     # One cell, larger than the picture, which is a single row.
@@ -209,13 +211,13 @@ def bent_looks() -> dict[str, NDArray[Any]]:
         camera["distortion"] = {"model": model, "k1": k1, "k2": 0.01}
         made = with_instruments(drawable((41, 41), size=[320, 240], camera=camera, shading="tissue", wireframe=True))
         position, view_now, texture = draped(made), view(made), speckle(300, 400)
-        placed = rods(made, position, 0)
+        placed = place_capsules(made, position, 0)
         drawn = Drawing(made, texture, drawing_config(made, labels=True)).look(position, rods=placed)
         assert drawn.labels is not None
         seen[f"{model}_picture"] = np.asarray(drawn.picture)
         seen |= {f"{model}_{name}": value for name, value in drawn.labels._asdict().items()}
         moved = position + np.array([0.002, 0.001, 0])
-        placed_then = rods(made, moved, 0)
+        placed_then = place_capsules(made, moved, 0)
         flow = find_flow(made, drawn.labels.coordinates, moved, view_now, placed_then)
         seen[f"{model}_flow"], seen[f"{model}_occlusion"] = flow
         seen[f"{model}_pixels"], seen[f"{model}_hidden"] = find(made, track_grid(60), position, view_now, placed)

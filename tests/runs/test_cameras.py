@@ -15,7 +15,7 @@ from taichi_msm import ArgumentError, Playback, Simulation, resume, run
 from taichi_msm.errors import ForeignError, SceneError
 from taichi_msm.load import cost
 from taichi_msm.load.scene_file import load_plan, load_scene
-from taichi_msm.model.surface import rods
+from taichi_msm.model.surface import place_capsules
 from taichi_msm.render import rasterizer
 from taichi_msm.render.camera import View, view, view_at
 from taichi_msm.render.lens_table import sample_places
@@ -117,7 +117,7 @@ def test_the_light_is_that_of_the_main_camera(shading: str, device: Device) -> N
     del render["camera"]
     made = made.model_copy(update={"render": render})
     position, texture = dented(made), np.full((9, 9, 3), 120, np.uint8)
-    placed, config = rods(made, position, 0), rasterizer.drawing_config(made)
+    placed, config = place_capsules(made, position, 0), rasterizer.drawing_config(made)
     drawing, of_gpu = (Drawing(made, texture, config._replace(lanes=lanes)) for lanes in (config.lanes, 1))
     for name in made.render.all_cameras:
         seen = view_at(made, 0.0, name)

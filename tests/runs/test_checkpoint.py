@@ -16,7 +16,7 @@ from taichi_msm.errors import DamagedError
 from taichi_msm.runs.checkpoint import FORCES, MANIFEST, POSITIONS, STATE, Checkpoint, seal, unseal
 from taichi_msm.runs.manifest import Manifest, read_manifest
 from taichi_msm.scene.scene import Scene
-from taichi_msm.solver.state import Felt, PeakForce, RunProgress, Saved, State, TipForce
+from taichi_msm.solver.state import PeakForce, ProbeForces, RunProgress, Snapshot, State, TipForce
 from tests.scenes import scene, scene_and_grid
 
 FRAMES = 3
@@ -45,14 +45,14 @@ def manifest() -> Manifest:
     return Manifest(made, made, (), None, None, None, "/", "cpu", {}, {"taichi": "1.7"})
 
 
-def state(**changes: Any) -> Saved:
+def state(**changes: Any) -> Snapshot:
     """The state of a run at its third frame."""
     steps: dict[str, Any] = {"steps": EVERY * (FRAMES - 1), "displacement": position(8), "difference": position(9)}
     steps["contact"] = np.empty((0, 2, 3))
     progress = RunProgress(frame=FRAMES - 1, energy=1.0, peak=2.0, reach=3.0)
     kept = {key: changes.pop(key) for key in list(changes) if key in steps}
-    felt = Felt(forces(8), (PeakForce(0.1, (7.0, 8.0, 9.0)),))
-    return Saved(State(**{**steps, **kept}), RunProgress(**{**vars(progress), **changes}), felt)
+    felt = ProbeForces(forces(8), (PeakForce(0.1, (7.0, 8.0, 9.0)),))
+    return Snapshot(State(**{**steps, **kept}), RunProgress(**{**vars(progress), **changes}), felt)
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from taichi_msm import DivergedError, Simulation, run
 from taichi_msm.cli.console import summary
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.model.surface import touched
+from taichi_msm.model.surface import surface_point
 from taichi_msm.model.tool_force import control_point, probe_records
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.process import available_threads
@@ -51,7 +51,7 @@ def test_the_force_of_a_tool_is_that_of_the_twin(precision: str, error: float, d
         for frame, each in enumerate(expected):
             simulation.advance()
             forces.append([one.force for one in simulation.forces()])
-            lowest = [tool.lowest((frame + 1) / 25) for tool in plan_of(made).tools]
+            lowest = [tool.lowest_point((frame + 1) / 25) for tool in plan_of(made).tools]
             assert [one.tip for one in simulation.forces()] == lowest
             assert np.abs(np.array(forces[-1]) - each).max() < error * np.abs(expected).max()
         norms = np.linalg.norm(forces, axis=2)
@@ -92,7 +92,7 @@ def test_the_force_of_a_load_is_that_at_the_frame(device: Device) -> None:
             distance = np.hypot(*(rest[..., :2] - at).T).T
             total = np.exp(-40 * distance)[free].sum() * percent / 100
             np.testing.assert_allclose(felt.force, np.array([1, 0, -3]) * total, rtol=1e-13, atol=0)
-            assert felt.tip == tuple(touched(simulation.positions(), made.render.refine, made.sheet, at)[0])
+            assert felt.tip == tuple(surface_point(simulation.positions(), made.render.refine, made.sheet, at)[0])
             assert felt.tip[2] < 0 or frame == 0
             simulation.advance()
 

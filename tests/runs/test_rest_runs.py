@@ -20,8 +20,8 @@ from taichi_msm.runs.finished import read_run
 from taichi_msm.runs.run import resume, run
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
-from taichi_msm.solver.dynamics import layout_of
-from taichi_msm.solver.rest import ENOUGH, sheet_of
+from taichi_msm.solver.dynamics import choose_layout
+from taichi_msm.solver.rest import ENOUGH, build_dynamics
 from taichi_msm.study.study import study
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
@@ -219,7 +219,7 @@ def test_friction_and_gpus_and_studies_are_refused(device: Device) -> None:
     with pytest.raises(
         DeviceError, match=r"--arch vulkan: time.motion: quasistatic runs on a CPU only; take --arch cp"
     ):
-        layout_of(plan_of(at_rest([PUSH])), Device("vulkan", 1))
+        choose_layout(plan_of(at_rest([PUSH])), Device("vulkan", 1))
     with pytest.raises(SceneError, match=r"time.motion: quasistatic takes no steps, which a study compares; set time"):
         study(at_rest([PUSH]), "rest", threads=device.threads)
 
@@ -233,11 +233,11 @@ def test_a_pilot_that_never_rests_leaves_the_error_unknown(
     made = at_rest([PUSH])
 
     def failing(*arguments: Any, **keys: Any) -> Any:
-        pilot = sheet_of(*arguments, **keys)
+        pilot = build_dynamics(*arguments, **keys)
         monkeypatch.setattr(pilot, "advance", diverges)
         return pilot
 
-    monkeypatch.setattr("taichi_msm.accuracy.mesh.sheet_of", failing)
+    monkeypatch.setattr("taichi_msm.accuracy.mesh.build_dynamics", failing)
     record = run(made, tmp_path / "out", threads=device.threads)
     assert record["error_estimate"] is not None
     assert record["error_estimate"]["mesh_error"] is None

@@ -211,7 +211,7 @@ def test_a_run_that_kept_no_positions_goes_on_where_no_pilot_needs_them(
     asked: bool | None, small: Path, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Else it begins anew, so that what is known of its error does not depend on the interruption."""
-    monkeypatch.setattr(planning, "MOST_FOR_PILOTS", 0.0)
+    monkeypatch.setattr(planning, "MAX_COMPANION_SHARE", 0.0)
     made = dragged("time.duration=0.2", "output=[]")
     whole = run(made, "whole", threads=device.threads, estimate_error=asked)
     assert (whole["error_estimate"] is None) == (not asked)

@@ -78,7 +78,7 @@ def test_random_scene_is_like_the_twin(seed: int, precision: str, device: Device
 
 def with_lanes(layout: SheetLayout, lanes: int) -> SheetLayout:
     """The same sheet in other vectors."""
-    return replace(layout, code=replace(layout.code, lanes=lanes))
+    return replace(layout, config=replace(layout.config, lanes=lanes))
 
 
 def as_on_a_gpu(layout: SheetLayout) -> SheetLayout:
@@ -216,11 +216,11 @@ def test_a_frame_of_a_small_sheet_is_one_launch(device: Device) -> None:
 
 
 def test_absent_terms_are_left_out(device: Device) -> None:
-    bare = structure_of(scene(springs={"structural": 1}, probes=[], damping=0), device).code
+    bare = structure_of(scene(springs={"structural": 1}, probes=[], damping=0), device).config
     assert bare.terms == (SpringTerm(True, False, False, False, False, False), ProbeTerm((), ()))
-    assert not structure_of(scene(probes=[]), device).code.get(FoundationTerm), "loaded, but nothing ever loads"
-    assert structure_of(scene(), device).code.get(FoundationTerm)
-    assert structure_of(scene(), device).code.lanes == lanes("f64")
+    assert not structure_of(scene(probes=[]), device).config.get(FoundationTerm), "loaded, but nothing ever loads"
+    assert structure_of(scene(), device).config.get(FoundationTerm)
+    assert structure_of(scene(), device).config.lanes == lanes("f64")
 
 
 @pytest.mark.parametrize(
@@ -493,7 +493,7 @@ def test_rests_grow_while_workers_give_up_and_are_forgotten_when_they_do_not(
 ) -> None:
     made = scene(sheet={**SHEET, "points": [21, 19]}, time={"precision": "f32"})
     scatter = dynamics_of(made, device, replace(structure_of(made, device), workers=2))._moving
-    assert isinstance(scatter, kernel_cpu.Scatter)
+    assert isinstance(scatter, kernel_cpu.ScatterKernel)
     now, taken, patient = 0.0, [0, 0], False
 
     def alone(done: int, end: int, *_: object) -> None:
@@ -547,7 +547,7 @@ def test_giving_up_in_the_last_pass_of_a_launch_counts(device: Device, monkeypat
     monkeypatch.setattr(kernel_cpu, "PATIENCE", 0)
     dynamics = dynamics_of(made, device, replace(structure_of(made, device), workers=2, depth=8))
     scatter = dynamics._moving
-    assert isinstance(scatter, kernel_cpu.Scatter)
+    assert isinstance(scatter, kernel_cpu.ScatterKernel)
     for _ in range(200):
         dynamics.advance(8)
     assert scatter._rests_until > 0
@@ -596,6 +596,6 @@ def test_a_second_sheet_of_the_same_terms_compiles_nothing(device: Device, monke
 
 def test_damping_of_0_is_left_out(device: Device) -> None:
     # Not multiplied by 1: what a scene does not use is not in its kernel.
-    assert not structure_of(scene(damping=0), device).code.get(DampingTerm)
-    assert structure_of(scene(), device).code.get(DampingTerm)
+    assert not structure_of(scene(damping=0), device).config.get(DampingTerm)
+    assert structure_of(scene(), device).config.get(DampingTerm)
     assert_like_twin(scene(damping=0, time={"duration": 0.08}), device)

@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 from scipy.special import k0, k1
 
 from taichi_msm import Simulation
-from taichi_msm.model.loads import loads_at
+from taichi_msm.model.loads import evaluate_loads
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests import reference
@@ -63,7 +63,7 @@ def test_at_rest_a_tool_bears_what_springs_and_foundation_would_do_without_it(
         simulation.advance(75)
         (felt,), u = simulation.forces(), simulation.positions() - rest
         assert np.abs(simulation.velocities()).max() < 1e-12
-    fixed, force = plan_of(made).fixed, reference.force(made, u, loads_at(plan_of(made), np.array([3.0])), 0)
+    fixed, force = plan_of(made).fixed, reference.force(made, u, evaluate_loads(plan_of(made), np.array([3.0])), 0)
     touched = np.linalg.norm(force, axis=-1) > 1e-9
     assert 5 < (touched & ~fixed).sum() < 60
     size = np.linalg.norm(felt.force)

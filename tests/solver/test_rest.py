@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm.errors import DivergedError
-from taichi_msm.model.loads import frame_loads
+from taichi_msm.model.loads import evaluate_frame_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.model.tools import path_notes
+from taichi_msm.model.tools import path_warnings
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.arrays import SheetLayout
-from taichi_msm.solver.dynamics import Dynamics, layout_of
-from taichi_msm.solver.rest import ENOUGH, Rest
+from taichi_msm.solver.dynamics import Dynamics, choose_layout
+from taichi_msm.solver.rest import ENOUGH, QuasiStatics
 from taichi_msm.system.runtime import Device
 from tests import reference
 from tests.scenes import plan_of, scene, speckle
@@ -91,7 +91,7 @@ QUICK = ("springs, one side", "plate, map", "moving")
 
 def shape_of(plan: Plan, device: Device, frames: int = 1, layout: SheetLayout | None = None) -> Array:
     """Displacements of the last of some frames [m]."""
-    rest = Rest(plan, device, layout)
+    rest = QuasiStatics(plan, device, layout)
     rest.advance(frames)
     assert rest.residual <= ENOUGH
     u = rest.displacement()
@@ -114,7 +114,7 @@ def assert_close(u: Array, twin: Array) -> None:
 def test_like_scipy(name: str, grey: str, device: Device) -> None:
     plan = plan_of(case(name, grey))
     u = shape_of(plan, device)
-    twin = reference.equilibrium(plan, frame_loads(plan, 1), nearly_flat(plan))
+    twin = reference.equilibrium(plan, evaluate_frame_loads(plan, 1), nearly_flat(plan))
     assert np.abs(twin).max() > 0.003
     assert_close(u, twin)
 
@@ -124,9 +124,9 @@ PRESSED = moved([0, 0.5, 0.5, 0.001], [1, 0.52, 0.45, -0.03])
 
 def test_a_tool_like_scipy_with_constraints(device: Device) -> None:
     plan = plan_of(at_rest([PRESSED], tissue={**TISSUE, "pretension": 2}))
-    rest = Rest(plan, device)
+    rest = QuasiStatics(plan, device)
     rest.advance(1)
-    u, loads = rest.displacement(), frame_loads(plan, 1)
+    u, loads = rest.displacement(), evaluate_frame_loads(plan, 1)
     twin = reference.equilibrium_outside_tool(plan, loads, 1.0, 0.01)
     assert (reference.clearance(plan, twin, 1.0) < 1e-9).sum() >= 3
     assert_close(u, twin)
@@ -138,19 +138,22 @@ def test_a_tool_like_scipy_with_constraints(device: Device) -> None:
 def test_a_grip_holds_the_points_of_the_frame_before(device: Device) -> None:
     tool = moved([0, 0.5, 0.4, 0.0], [1, 0.5, 0.4, -0.02], [2, 0.45, 0.6, 0.04], grip=[[1.5, 2.5]])
     plan = plan_of(at_rest([tool], time={"duration": 3}))
-    rest = Rest(plan, device)
+    rest = QuasiStatics(plan, device)
     rest.advance(1)
     before, tip = rest.displacement(), plan.tools[0]
     rest.advance(1)
-    u, middle = rest.displacement(), tip.middle(np.array([1.0, 2.0]))
+    u, middle = rest.displacement(), tip.tip_centre(np.array([1.0, 2.0]))
     held = np.linalg.norm(reference.place(plan, before) - middle[0], axis=-1) <= 1.5 * tip.radius
     assert held.sum() > 4
     moved_by = np.where(held[..., None], before + middle[1] - middle[0], 0)
     np.testing.assert_allclose(u[held], moved_by[held], rtol=0, atol=1e-15)
     assert_close(
-        u, reference.equilibrium(plan, frame_loads(plan, 2), moved_by + nearly_flat(plan) * ~held[..., None], held)
+        u,
+        reference.equilibrium(
+            plan, evaluate_frame_loads(plan, 2), moved_by + nearly_flat(plan) * ~held[..., None], held
+        ),
     )
-    others = reference.force(plan.scene, u, frame_loads(plan, 2), 0)[~plan.fixed].sum(axis=0)
+    others = reference.force(plan.scene, u, evaluate_frame_loads(plan, 2), 0)[~plan.fixed].sum(axis=0)
     np.testing.assert_allclose(rest.tool_forces()[0], -others, rtol=0, atol=1e-6 * np.abs(others).max())
     # Let go, at the first frame after the end of the grip, it is flat: the tip is above it.
     rest.advance(1)
@@ -200,7 +203,7 @@ def test_a_stepped_sheet_comes_to_the_same_rest(device: Device) -> None:
 )
 def test_lanes_do_not_change_the_bits(made: Scene, device: Device) -> None:
     plan = plan_of(made)
-    layout = layout_of(plan, device)
+    layout = choose_layout(plan, device)
     plain = shape_of(plan, device).tobytes()
     for lanes in (1, 4):
         assert shape_of(plan, device, layout=with_lanes(layout, lanes)).tobytes() == plain
@@ -212,7 +215,7 @@ LIFT = {"total": [0, 0, 0.05], "radius": 0.03, "falloff": 30, "at": [0.6, 0.5], 
 
 def test_a_flat_sheet_that_is_pressed_together_buckles(device: Device) -> None:
     plan = plan_of(tissue(SQUEEZE, foundation=100))
-    u, loads = shape_of(plan, device), frame_loads(plan, 1)
+    u, loads = shape_of(plan, device), evaluate_frame_loads(plan, 1)
     flat = np.zeros_like(u)
     in_plane = reference.equilibrium(plan, loads, flat)
     assert not in_plane[..., 2].any(), "the forces balance in the plane, too"
@@ -237,7 +240,7 @@ def test_it_buckles_near_the_critical_load(keys: dict[str, Any], critical: float
 
 def softest(plan: Plan, u: Array, frame: int) -> float:
     """The smallest eigenvalue of the stiffness of the points that move [N/m]."""
-    free, loads = ~plan.fixed, frame_loads(plan, frame)
+    free, loads = ~plan.fixed, evaluate_frame_loads(plan, frame)
 
     def slope(x: Array) -> Array:
         placed = u.copy()
@@ -264,19 +267,19 @@ def test_what_has_buckled_goes_on_as_it_began(side: int, device: Device) -> None
 def test_loads_at_a_frame(device: Device) -> None:
     jump = {**PUSH, "load": [[0, 50], [1, 100], [1, -20], [2, 0], [2.0000005, 70], [3, 0]]}
     plan = plan_of(at_rest([jump], time={"duration": 4}))
-    percents = [frame_loads(plan, frame).strength[0, 0, 2] for frame in range(5)]
-    whole = frame_loads(plan_of(at_rest([PUSH])), 1).strength[0, 0, 2]
+    percents = [evaluate_frame_loads(plan, frame).strength[0, 0, 2] for frame in range(5)]
+    whole = evaluate_frame_loads(plan_of(at_rest([PUSH])), 1).strength[0, 0, 2]
     # A key within a millionth of a frame is at it; and what comes later counts.
     np.testing.assert_allclose(percents, whole * np.array([0.5, -0.2, 0.7, 0, 0]), rtol=1e-12)
-    assert [frame_loads(plan, frame).active[0] for frame in range(5)] == [1, 1, 1, 0, 0]
+    assert [evaluate_frame_loads(plan, frame).active[0] for frame in range(5)] == [1, 1, 1, 0, 0]
     path = plan_of(at_rest([moved([1, 0.5, 0.5, 0.001], [2, 0.5, 0.5, 0.1])], time={"duration": 3}))
-    assert [frame_loads(path, frame).active[0] for frame in range(4)] == [0, 1, 1, 0]
+    assert [evaluate_frame_loads(path, frame).active[0] for frame in range(4)] == [0, 1, 1, 0]
 
 
 def test_without_a_load_it_is_flat_and_a_held_load_costs_nothing(device: Device) -> None:
     # Neither tension nor a foundation would bring it back.
     made = tissue({**PUSH, "load": [[0, 0], [1, 100], [2, 100], [2.5, 0]]}, foundation=0)
-    rest, shapes, evaluations = Rest(plan_of(made), device), [], []
+    rest, shapes, evaluations = QuasiStatics(plan_of(made), device), [], []
     for frame in range(5):
         rest.advance(min(frame, 1))
         shapes.append(rest.displacement())
@@ -309,5 +312,5 @@ def test_a_sheet_that_nothing_holds_never_rests(device: Device) -> None:
 
 def test_a_grip_between_two_frames_is_noted() -> None:
     plan = plan_of(at_rest([moved([0, 0.5, 0.5, 0.001], grip=[[0.2, 0.8], [0.9, 1.5]])]))
-    (note,) = (note for note in path_notes(plan.scene, plan.tools) if "grip" in note)
+    (note,) = (note for note in path_warnings(plan.scene, plan.tools) if "grip" in note)
     assert note == "probes.0.grip from 0.2 to 0.8 s holds nothing: no frame is between them"

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import root
 
-from taichi_msm.model.loads import loads_at
+from taichi_msm.model.loads import evaluate_loads
 from taichi_msm.model.sheet import fixed_points
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.state import State
@@ -25,7 +25,7 @@ def residual(made: Scene, moving: NDArray[np.float64]) -> NDArray[np.float64]:
     free = ~fixed_points(made.sheet)
     u = np.zeros((*made.sheet.points, 3))
     u[free] = moving.reshape(-1, 3)
-    return reference.force(made, u, loads_at(plan_of(made), np.array([made.time.duration])), 0)[free].ravel()
+    return reference.force(made, u, evaluate_loads(plan_of(made), np.array([made.time.duration])), 0)[free].ravel()
 
 
 def test_a_sheet_comes_to_rest_where_the_forces_balance(device: Device) -> None:

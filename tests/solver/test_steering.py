@@ -21,7 +21,7 @@ def guided(probe: dict[str, Any], frames: int = 10, **changes: Any) -> Scene:
     ((tool,),) = [plan_of(touching([probe])).tools]
     path = []
     for frame in range(frames + 1):
-        x, y, z = tool.lowest(frame / RATE)
+        x, y, z = tool.lowest_point(frame / RATE)
         path.append([frame / RATE, x / 0.4 + 0.5, 0.5 - y / 0.3, z])
     return touching([{**probe, "path": path, **changes}], time={"duration": frames / RATE})
 
@@ -55,7 +55,7 @@ def test_between_its_keys_a_tool_goes_straight_on_from_where_it_is(device: Devic
     there = [0.4, 0.7, 0.6, 0.01]
     made = touching([HELD])
     (tool,) = plan_of(made).tools
-    x, y, z = tool.lowest(0.2)
+    x, y, z = tool.lowest_point(0.2)
     through = [0.2, x / 0.4 + 0.5, 0.5 - y / 0.3, z]
     whole = touching([{**HELD, "path": [*HELD["path"][:2], through, there]}])
     with Simulation(made, threads=device.threads) as steered, Simulation(whole, threads=device.threads) as expected:

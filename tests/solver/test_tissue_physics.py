@@ -21,9 +21,9 @@ from skfem import Basis, BilinearForm, ElementQuad2, ElementVector, LinearForm, 
 from skfem.helpers import dot
 from skfem.models.elasticity import linear_elasticity, plane_stress
 
-from taichi_msm.model.loads import loads_at
+from taichi_msm.model.loads import evaluate_loads
 from taichi_msm.model.sheet import fixed_points, rest_positions, spacing
-from taichi_msm.model.tool_force import spread
+from taichi_msm.model.tool_force import decay_integral
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.tools import Probe
 from taichi_msm.solver.state import State
@@ -120,7 +120,7 @@ def moving(made: Scene, directions: tuple[int, ...] = (0, 1, 2)) -> NDArray[np.i
 
 
 def tool_forces(made: Scene, time: float = 0.01) -> Array:
-    return reference.surgical_force(made, loads_at(plan_of(made), np.array([time])), 0)
+    return reference.surgical_force(made, evaluate_loads(plan_of(made), np.array([time])), 0)
 
 
 def at_rest(made: Scene, directions: tuple[int, ...]) -> Array:
@@ -179,7 +179,7 @@ def test_the_linear_stiffness_is_that_of_the_forces(seed: int, tmp_path: Path) -
     rng, shape = np.random.default_rng(seed), (*made.sheet.points, 3)
     here, way, small = 1e-3 * rng.normal(size=shape), rng.normal(size=shape), 3e-8
     # At the end, when all tools press and so the foundation acts.
-    loads = loads_at(plan_of(made), np.array([made.time.duration]))
+    loads = evaluate_loads(plan_of(made), np.array([made.time.duration]))
     ends = [reference.force(made, here + sign * small * way, loads, 0) for sign in (1, -1)]
     found = (ends[1] - ends[0]).ravel() / (2 * small)
     expected = stiffness(made, here) @ way.ravel()
@@ -453,7 +453,7 @@ def test_just_under_the_limit_tissue_stays_bounded(name: str, device: Device, tm
 @pytest.mark.parametrize("tool", [{"falloff": 300}, {"falloff": 300, "radius": 0.004}, {"falloff": 40, "radius": 0.05}])
 def test_the_weight_of_a_tool_is_its_integral_over_the_plane(tool: dict[str, Any]) -> None:
     probe = Probe(total=[0, 0, 1], **tool)
-    assert spread(probe) == pytest.approx(weight(probe), rel=1e-7)
+    assert decay_integral(probe) == pytest.approx(weight(probe), rel=1e-7)
 
 
 @pytest.mark.parametrize("fixed", ["border", "none"])

@@ -246,7 +246,7 @@ def test_why_dop853_is_left_out_is_told(
 
 def test_terms_are_left_out_of_the_kernel(device: Device) -> None:
     made = scene(probes=[PRESS, PRESS])
-    shapes = {name: structure_of(variant, device).code for name, variant in variants(made)}
+    shapes = {name: structure_of(variant, device).config for name, variant in variants(made)}
     assert list(shapes) == [
         "",
         "springs.structural",

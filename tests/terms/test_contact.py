@@ -11,7 +11,7 @@ import pytest
 from taichi_msm import Simulation
 from taichi_msm.errors import SceneError
 from taichi_msm.load.check import checked
-from taichi_msm.model.tools import fewest_steps, path_notes, tools_of
+from taichi_msm.model.tools import build_tools, min_steps_per_frame, path_warnings
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.arrays import SheetLayout
 from taichi_msm.solver.dynamics import Dynamics
@@ -233,15 +233,15 @@ def test_how_far_a_tool_comes_in_a_step() -> None:
 
 def test_the_fewest_steps_in_which_no_tool_moves_too_far() -> None:
     plan = plan_of(touching([moved([0, 0.5, 0.5, 0.1], [0.1, 1.5, 0.5, 0.1])]))
-    assert fewest_steps(plan.tools, plan.grid, 1) == 7  # 0.16 m in a frame, in parts of 0.025 m
-    assert fewest_steps(plan.tools, plan.grid, 9) == 9
-    assert fewest_steps((), plan.grid, 1) == 1
+    assert min_steps_per_frame(plan.tools, plan.grid, 1) == 7  # 0.16 m in a frame, in parts of 0.025 m
+    assert min_steps_per_frame(plan.tools, plan.grid, 9) == 9
+    assert min_steps_per_frame((), plan.grid, 1) == 1
 
 
 def test_units_and_times_that_cannot_be_meant_are_noted() -> None:
     late = {**PRESSED, "path": [[0, 0.5, 0.5, 1], [300, 0.5, 0.5, -5]], "grip": [[2, 3]]}
     made = touching([late])
-    height, path, grip, *_ = path_notes(made, tools_of(made.probes, made.sheet))
+    height, path, grip, *_ = path_warnings(made, build_tools(made.probes, made.sheet))
     assert height == "probes.0.path: a height of 5 m beside a sheet of 0.4 m; heights are in metres"
     assert path == "probes.0.path ends at 300 s, after the end of the scene at 0.4 s"
     assert grip == "probes.0.grip begins at 2 s, not before the end of the scene at 0.4 s"

@@ -14,15 +14,15 @@ from PIL import Image
 from taichi_msm.accuracy.mesh import coarser
 from taichi_msm.errors import SceneError
 from taichi_msm.load.scene_file import load_plan, load_scene
-from taichi_msm.model.loads import schedule
+from taichi_msm.model.loads import average_loads
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.runs.run import run
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Foundation
 from taichi_msm.solver.arrays import SheetLayout
-from taichi_msm.solver.planning import variant
-from taichi_msm.solver.state import RunProgress, farthest
+from taichi_msm.solver.planning import plan_variant
+from taichi_msm.solver.state import RunProgress, largest_displacement
 from taichi_msm.study.measurements import acceleration, variants
 from taichi_msm.sweeps.spec import load_sweep
 from taichi_msm.system.runtime import Device
@@ -81,7 +81,7 @@ def test_both_forms_bands_and_lanes_give_the_same_bits(precision: str, image: st
 
 def test_it_is_compiled_in_only_with_a_map(image: str, device: Device) -> None:
     def term(made: Scene) -> FoundationTerm | None:
-        return structure_of(made, device).code.get(FoundationTerm)
+        return structure_of(made, device).config.get(FoundationTerm)
 
     assert term(mapped(image)) == FoundationTerm(by_area=False, mapped=True)
     assert term(tissue((13, 15), foundation=2e6, fixed="none", probes=[TOOL])) == FoundationTerm(True, False)
@@ -141,7 +141,7 @@ def test_the_energy_that_it_gives_is_explained(tmp_path: Path, device: Device) -
         away = np.full((*made.sheet.points, 3), [0, 0, 0.02])
         saved = simulation.save()
         state = saved.state._replace(displacement=away)
-        simulation.restore(saved._replace(state=state, progress=RunProgress(reach=farthest(away).reach)))
+        simulation.restore(saved._replace(state=state, progress=RunProgress(reach=largest_displacement(away).reach)))
         simulation.advance(2)
         held = 400 * 1e4 / 2 * 0.1**2 * 0.02**2
         # With the factor 1, and a swing of 4, a hundredth would be explained.
@@ -152,7 +152,7 @@ def test_the_peer_and_the_terms_of_a_study_know_it(image: str, device: Device) -
     made = mapped(image, "none", damping=0, map={"image": image, "range": [1, 2]})
     plan = plan_of(made)
     u = 1e-3 * np.random.default_rng(0).normal(size=(*made.sheet.points, 3))
-    loads = schedule(plan, plan.grid.steps, 1)
+    loads = average_loads(plan, plan.grid.steps, 1)
     force = reference.force(made, u, loads, 0)
     expected = force / reference.sheet(made).mass[..., None]
     np.testing.assert_allclose(
@@ -161,9 +161,9 @@ def test_the_peer_and_the_terms_of_a_study_know_it(image: str, device: Device) -
 
     without = dict(variants(made))
     assert list(without) == ["", "tissue.foundation", "tissue.map", "tissue.foundation_map", "probes.0"]
-    unmapped, unheld = (variant(plan, without[f"tissue.{name}"]) for name in ("foundation_map", "foundation"))
-    assert FoundationTerm.of(unmapped) == FoundationTerm(by_area=True, mapped=False)
-    assert FoundationTerm.of(unheld) is None
+    unmapped, unheld = (plan_variant(plan, without[f"tissue.{name}"]) for name in ("foundation_map", "foundation"))
+    assert FoundationTerm.from_plan(unmapped) == FoundationTerm(by_area=True, mapped=False)
+    assert FoundationTerm.from_plan(unheld) is None
 
 
 SCENE = """\

@@ -30,7 +30,7 @@ from taichi_msm.terms.bending import BendingTerm
 from taichi_msm.terms.damping import DampingTerm
 from taichi_msm.terms.foundation import FoundationTerm
 from taichi_msm.terms.loads import ProbeTerm
-from taichi_msm.terms.springs import SpringTerm, stiffness
+from taichi_msm.terms.springs import SpringTerm, spring_stiffness
 from tests import reference
 from tests.motion import dynamics_of, frames, structure_of
 from tests.outputs import results
@@ -106,7 +106,7 @@ def test_in_f32_it_is_like_the_twin_but_for_rounding(seed: int, image: str, devi
 
 
 def test_the_random_tissues_have_every_term(image: str, device: Device) -> None:
-    codes = [structure_of(random_tissue(seed, image), device).code for seed in SEEDS]
+    codes = [structure_of(random_tissue(seed, image), device).config for seed in SEEDS]
     for kind in (FoundationTerm, DampingTerm, BendingTerm):
         assert {code.get(kind) is None for code in codes} == {False, True}, kind
     assert {term.mapped for code in codes if (term := code.get(FoundationTerm))} == {False, True}
@@ -123,7 +123,7 @@ def test_the_random_tissues_have_every_term(image: str, device: Device) -> None:
 def test_bands_do_not_change_the_bits(seed: int, image: str, device: Device) -> None:
     made = random_tissue(seed, image)
     layout = structure_of(made, device)
-    assert layout.code.require(SpringTerm).mapped or layout.code.get(BendingTerm)
+    assert layout.config.require(SpringTerm).mapped or layout.config.get(BendingTerm)
     plain = simulate(made, device)
     assert simulate(made, device, replace(layout, workers=2)).tobytes() == plain.tobytes()
     dynamics = dynamics_of(made, device, replace(layout, workers=3))
@@ -176,7 +176,7 @@ def test_a_map_of_springs_is_like_the_twin(load: Any, device: Device) -> None:
     material = plan_of(made).material
     factor = material.factors
     assert factor is not None
-    across, down, diagonal = stiffness(material, factor)
+    across, down, diagonal = spring_stiffness(material, factor)
     np.testing.assert_allclose(across[[0, -1]], 20 * factor[[0, -1]], rtol=1e-15)
     np.testing.assert_allclose(across[1:-1], 10 * (factor[1:] + factor[:-1]), rtol=1e-15)
     np.testing.assert_allclose(down[:, 1:-1], 10 * (factor[:, 1:] + factor[:, :-1]), rtol=1e-15)
@@ -346,7 +346,7 @@ def test_the_numbers_of_the_sheet(load: Any) -> None:
     assert made.virtual == pytest.approx(2e6 * dx * dy)
     assert made.bending == pytest.approx(3e4 * 2e-3**3 / (12 * (1 - 1 / 9)) * dx * dy)
     assert (made.drag, made.tension) == pytest.approx((40, 0.1))
-    assert sum(SpringTerm.of(plan).numbers(plan)) == pytest.approx(made.across + made.down + made.shear)
+    assert sum(SpringTerm.from_plan(plan).constants(plan)) == pytest.approx(made.across + made.down + made.shear)
 
 
 def test_a_tool_with_a_total_is_steered_like_another(load: Any) -> None:
@@ -552,7 +552,7 @@ def test_points_for_which_a_given_step_is_too_long_are_refused(load: Any, device
 )
 def test_a_tool_that_does_not_act_as_a_whole_is_told_of(setting: str, told: str, load: Any) -> None:
     def notes(made: Scene) -> list[str]:
-        return list(tool_force.force_notes(made, tool_force.probe_records(made)))
+        return list(tool_force.force_warnings(made, tool_force.probe_records(made)))
 
     assert not notes(load())
     (said,) = notes(load(setting))

@@ -16,7 +16,7 @@ from PIL import Image
 
 from taichi_msm import load_scene, run
 from taichi_msm.errors import FilesError, SceneError
-from taichi_msm.model.loads import schedule
+from taichi_msm.model.loads import average_loads
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.system.runtime import Device
 from taichi_msm.view import overlay, recording
@@ -203,7 +203,7 @@ def test_virtual_springs_vanish_when_the_tool_is_released(begin: Begin) -> None:
     advance(session, 1)
     recorded = session.recorded()
     count = plan_of(recorded).grid.steps_per_frame
-    active = schedule(plan_of(recorded), 0, 16 * count).active
+    active = average_loads(plan_of(recorded), 0, 16 * count).active
     assert (active[: 15 * count] == 1).all()
     assert active[15 * count] == 0.5, "the mean at the instant of the release"
     assert (active[15 * count + 1 :] == 0).all()

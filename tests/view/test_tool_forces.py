@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from taichi_msm.model.loads import schedule
+from taichi_msm.model.loads import average_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.tools import path_problems
 from taichi_msm.scene.tools import Probe
-from taichi_msm.solver.planning import steered
+from taichi_msm.solver.planning import steer_plan
 from taichi_msm.terms.contact import ContactTerm
 from taichi_msm.view.tools import DEEPEST, FRICTION, HOVER, RISE, MovedTool
 from tests.scenes import plan_of, scene
@@ -48,7 +48,7 @@ def follow(hand: MovedTool, first: int, count: int) -> list[float]:
 def tables(held: Plan, frame: int) -> tuple[bytes, ...]:
     """All that the steps of a frame are told of a tool."""
     count = held.grid.steps_per_frame
-    contact, loads = ContactTerm.of(held), schedule(held, frame * count, count)
+    contact, loads = ContactTerm.from_plan(held), average_loads(held, frame * count, count)
     assert contact is not None
     assert contact == ContactTerm(1, (True,), True), "one kernel, whatever is done"
     return contact.columns(held, loads, frame * count).tobytes(), loads.active.tobytes()
@@ -72,7 +72,7 @@ def test_every_frame_is_what_the_record_says(seed: int, rate: float) -> None:
                     hand.ask(hand.strength + float(rng.integers(-40, 41)))
                 case _:
                     hand.move(place)
-        live = steered(live, [hand.follow(frame)], made.grid.time(frame * made.grid.steps_per_frame))
+        live = steer_plan(live, [hand.follow(frame)], made.grid.time(frame * made.grid.steps_per_frame))
         seen.append(tables(live, frame))
         gripped += hand.grips
     record = made.with_probes((hand.recorded(frames),))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from taichi_msm.model.loads import Schedule, schedule
+from taichi_msm.model.loads import Schedule, average_loads
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.tools import Probe
 from taichi_msm.view.tools import RISE, HeldTool
@@ -27,7 +27,7 @@ def loads(probe: Probe, frame: int) -> Schedule:
     """The loads at the steps of a frame."""
     plan = plan_of(with_probe(probe, 1))
     count = plan.grid.steps_per_frame
-    return schedule(plan, frame * count, count)
+    return average_loads(plan, frame * count, count)
 
 
 def percents(hand: HeldTool, first: int, count: int) -> list[float]:
