@@ -1,1 +1,1 @@
-"""The sheet in NumPy: mass points, loads, tools, plan."""
+"""The sheet as NumPy arrays: mass points, loads, tools and the plan of a run."""

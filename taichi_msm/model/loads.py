@@ -1,12 +1,12 @@
-"""The probes in time: how hard and where each presses, and whether the virtual springs act, step by step.
+"""Loads in time: the force and control point of each probe, and the activity of the virtual springs, per step.
 
-Step n takes the load averaged with the hat function of half-width h about t_n,
+Step n uses the load averaged with the hat function of half-width h about t_n,
 
     percent_n = integral of percent(t) (1 - |t - t_n| / h) dt / h,    at n = 0 twice that over [0, h].
 
-It moves a free point exactly as far as the load itself does, so the method keeps its order 2 for every load, wherever
-it jumps. If no key lies within the hat, the average is the value at t_n. The activity of the virtual springs is
-averaged in the same way.
+The averaged load displaces a free mass point by exactly the same distance as the load itself. The method therefore
+keeps order 2 for every load, including one that jumps between steps. If no keyframe lies within the hat, the average is
+the value at t_n. The activity of the virtual springs is averaged in the same way.
 """
 
 from __future__ import annotations
@@ -26,79 +26,113 @@ from taichi_msm.scene.section import WHOLE
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Probe
 
-# A time before all others [s].
-LONG_AGO = -1e300
-
 Array = NDArray[np.float64]
 
 
 class Schedule(NamedTuple):
-    """The loads at consecutive steps."""
+    """Loads at consecutive steps or given times."""
 
-    slots: tuple[ProbeSlot, ...]  # where the probes act; the columns of the arrays
+    slots: tuple[ProbeSlot, ...]  # the second axis of `strength` and `point`
     strength: Array  # force at the control point before the decay [N], shape (steps, slots, 3)
     point: Array  # control point, x and y at rest [m], shape (steps, slots, 2)
-    active: Array  # share of their stiffness with which the virtual springs act, 0 to 1; shape (steps,)
+    active: Array  # active share of the virtual springs' stiffness, 0 to 1, shape (steps,)
 
 
 def decay(probe: Probe, sheet: Sheet, at: Array | None = None) -> Array:
-    """Give the share of a probe's force that each point feels, shape (rows, cols).
+    """Compute the factor by which a probe's force decays at each mass point.
 
-    at: the control point, x and y at rest [m]; None: its first place.
+    Args:
+        probe: the probe.
+        sheet: the sheet.
+        at: control point, x and y at rest [m], shape (2,); by default the first keyframe of `probe.at`.
+
+    Returns:
+        Decay factors, of a probe with `total` times the mass point's share of a cell's area, shape (rows, cols).
     """
-    acts, (at_x, at_y) = probe_force(probe, sheet), control_points(probe, sheet)[1][0] if at is None else at
+    law, (at_x, at_y) = probe_force(probe, sheet), control_points(probe, sheet)[1][0] if at is None else at
     x, y = axes(sheet)
-    shares = acts.decay(np.hypot(x - at_x, y - at_y))
-    return shares * area_shares(sheet) if acts.by_area else shares
+    factors = law.decay(np.hypot(x - at_x, y - at_y))
+    return factors * area_shares(sheet) if law.by_area else factors
 
 
 def decay_gradient(probe: Probe, sheet: Sheet, at: Array | None = None) -> Array:
-    """Differentiate `decay` by x and y of the control point [1/m], shape (2, rows, cols); at its tip, 0."""
-    acts, (at_x, at_y) = probe_force(probe, sheet), control_points(probe, sheet)[1][0] if at is None else at
+    """Differentiate `decay` with respect to the control point.
+
+    Args:
+        probe: the probe.
+        sheet: the sheet.
+        at: control point, as in `decay`.
+
+    Returns:
+        Derivatives by x and y [1/m], shape (2, rows, cols); 0 at the control point itself.
+    """
+    law, (at_x, at_y) = probe_force(probe, sheet), control_points(probe, sheet)[1][0] if at is None else at
     x, y = axes(sheet)
     off = np.stack(np.broadcast_arrays(x - at_x, y - at_y))
     distance = np.hypot(*off)
-    outside = (acts.falloff * distance + acts.shift > acts.offset) & (distance > 0)
-    return decay(probe, sheet, at) * acts.falloff * outside * off / np.where(outside, distance, 1)
+    outside = (law.falloff * distance + law.shift > law.offset) & (distance > 0)
+    return decay(probe, sheet, at) * law.falloff * outside * off / np.where(outside, distance, 1)
 
 
 def average_loads(plan: Plan, first: int, count: int) -> Schedule:
-    """Average the loads over the steps first, ..., first + count - 1 of a plan."""
-    scene, parts = plan.scene, plan.slots
+    """Average the loads of a plan over its steps.
+
+    Args:
+        plan: the plan.
+        first: number of the first step.
+        count: number of steps.
+
+    Returns:
+        Averaged loads of the steps first, ..., first + count - 1.
+    """
+    scene, slots = plan.scene, plan.slots
     t, h = np.arange(first, first + count) / plan.grid.steps_per_second, plan.grid.step
-    strength, point = np.zeros((count, len(parts), 3)), np.zeros((count, len(parts), 2))
-    for index in sorted({part.probe for part in parts}):
-        probe, own = scene.probes[index], [n for n, part in enumerate(parts) if part.probe == index]
-        turns, segments, jumps = len(own), parts[own[0]].segments, parts[own[0]].jumps
-        line = _load(probe)
-        if turns == 1:
-            shares, places = line.averages(t, h)[:, None], np.zeros((count, 1), np.intp)
+    strength, point = np.zeros((count, len(slots), 3)), np.zeros((count, len(slots), 2))
+    for index in sorted({slot.probe for slot in slots}):
+        probe, columns = scene.probes[index], [n for n, slot in enumerate(slots) if slot.probe == index]
+        slot_count, segments, jumps = len(columns), slots[columns[0]].segments, slots[columns[0]].jumps
+        load = _load(probe)
+        if slot_count == 1:
+            percents, numbers = load.averages(t, h)[:, None], np.zeros((count, 1), np.intp)
         else:
-            shares, places = _distribute_over_slots(line, jumps, turns, t, h)
-        strength[:, own] = np.multiply.outer(shares / 100, probe_force(probe, scene.sheet).force)
-        for n, place in zip(own, places.T, strict=True):
-            for number in np.unique(place):
-                chosen = place == number
-                point[chosen, n] = _held(segments[number], t[chosen])
-    return Schedule(parts, strength, point, _activity(plan).averages(t, h))
+            percents, numbers = _distribute_over_slots(load, jumps, slot_count, t, h)
+        strength[:, columns] = np.multiply.outer(percents / 100, probe_force(probe, scene.sheet).force)
+        for n, segment_numbers in zip(columns, numbers.T, strict=True):
+            for number in np.unique(segment_numbers):
+                steps = segment_numbers == number
+                point[steps, n] = _control_point(segments[number], t[steps])
+    return Schedule(slots, strength, point, _activity(plan).averages(t, h))
 
 
 def evaluate_loads(plan: Plan, t: Array) -> Schedule:
-    """Evaluate the loads themselves, not their averages, with one slot a probe, at times that are no keys [s]."""
+    """Evaluate the loads without averaging, with one slot per probe.
+
+    Args:
+        plan: the plan.
+        t: times that differ from all keyframes [s], shape (n,).
+
+    Returns:
+        Loads at these times; each time takes the place of a step.
+    """
     scene = plan.scene
-    parts = plan.slots if scene.time.at_rest else probe_slots(scene.probes, scene.sheet, 0.0)
-    strength, point = np.zeros((len(t), len(parts), 3)), np.zeros((len(t), len(parts), 2))
-    for n, part in enumerate(parts):
-        probe = scene.probes[part.probe]
+    slots = plan.slots if scene.time.at_rest else probe_slots(scene.probes, scene.sheet, 0.0)
+    strength, point = np.zeros((len(t), len(slots), 3)), np.zeros((len(t), len(slots), 2))
+    for n, slot in enumerate(slots):
+        probe = scene.probes[slot.probe]
         strength[:, n] = np.multiply.outer(_load(probe).values(t) / 100, probe_force(probe, scene.sheet).force)
-        number = part.jumps.searchsorted(t, "right")
-        for segment in np.unique(number):
-            point[number == segment, n] = _held(part.segments[segment], t[number == segment])
-    return Schedule(parts, strength, point, _activity(plan).values(t))
+        segment_numbers = slot.jumps.searchsorted(t, "right")
+        for number in np.unique(segment_numbers):
+            steps = segment_numbers == number
+            point[steps, n] = _control_point(slot.segments[number], t[steps])
+    return Schedule(slots, strength, point, _activity(plan).values(t))
 
 
 class FrameLoad:
-    """The load of a probe at frames: the load itself, not its average.
+    """The load of a force-controlled probe at frames, without averaging.
+
+    Args:
+        probe: the probe.
+        sheet: the sheet.
 
     Attributes:
         moves: whether the control point moves.
@@ -110,23 +144,40 @@ class FrameLoad:
         self._keys = np.unique(np.concatenate([self._line.times, self._times]))
 
     def at(self, frame: int, rate: float) -> tuple[float, Array]:
-        """Give the percent, and the control point, x and y at rest [m], at a frame; at a jump, those after it."""
+        """Evaluate the load at a frame; at a jump, the value after the jump counts.
+
+        Args:
+            frame: number of the frame.
+            rate: frames per second [1/s].
+
+        Returns:
+            The load [%], and the control point, x and y at rest [m], shape (2,).
+        """
         time = frame / rate
-        # A key that is as good as at the frame counts as at it.
+        # Frame times are rounded, so a keyframe very close to the frame counts as at the frame.
         key = float(self._keys[max(0, self._keys.searchsorted(time + WHOLE / rate, "right") - 1)])
         time = key if abs(time - key) <= WHOLE / rate else time
         return float(self._line.values(np.array([time]))[0]), point_at(self._times, self._points, time)
 
 
 def evaluate_frame_loads(plan: Plan, frame: int) -> Schedule:
-    """Evaluate the loads at a frame; at a jump the later value counts, and a key within WHOLE of a frame is at it.
+    """Evaluate the loads at a frame.
 
-    Foundations that are `loaded` act where the percent of any probe is not 0, and from a path's first key to its last.
+    At a jump the later value counts, and a keyframe within WHOLE frames of the frame counts as at the frame. A
+    foundation that is active only under load is active while the percent of any probe differs from 0, and from the
+    first to the last keyframe of any path.
+
+    Args:
+        plan: the plan.
+        frame: number of the frame.
+
+    Returns:
+        Loads of one step.
     """
     scene, rate = plan.scene, plan.grid.frames_per_second
     time = frame / rate
-    near = [key for key in _all_key_times(scene) if abs(key - time) <= WHOLE / rate]
-    t = np.array([max(near, default=time)])
+    keys_at_frame = [key for key in _all_key_times(scene) if abs(key - time) <= WHOLE / rate]
+    t = np.array([max(keys_at_frame, default=time)])
     loads = evaluate_loads(plan, t)
     pressed = any(
         _load(probe).values(t)[0] != 0 if probe.path is None else probe.path[0][0] <= t[0] <= probe.path[-1][0]
@@ -136,13 +187,12 @@ def evaluate_frame_loads(plan: Plan, frame: int) -> Schedule:
 
 
 def keyframe_times(scene: Scene) -> Array:
-    """List the times of all keys between 0 and the end [s]: only there the loads are not smooth."""
+    """List the keyframes of all loads between 0 and the end [s]; the loads are smooth everywhere else."""
     times = _all_key_times(scene)
     return times[(times > 0) & (times < scene.time.duration)]
 
 
 def _all_key_times(scene: Scene) -> Array:
-    """List the times of all keys [s]."""
     keys: list[Any] = [[]]
     for probe in scene.probes:
         if probe.path is None:
@@ -153,7 +203,11 @@ def _all_key_times(scene: Scene) -> Array:
 
 
 class LoadBounds:
-    """Bounds of the loads from one time to another."""
+    """Bounds of the loads over time intervals.
+
+    Args:
+        plan: the plan.
+    """
 
     def __init__(self, plan: Plan) -> None:
         scene, self._h = plan.scene, plan.grid.step
@@ -164,49 +218,60 @@ class LoadBounds:
         self._begins = self._activity.times[self._activity.before < self._activity.after]
 
     def between(self, begin: float, end: float) -> tuple[Array, bool, int]:
-        """Bound what the loads do in the steps from one time to another, both included.
+        """Bound the loads of all steps in a closed time interval.
+
+        Args:
+            begin: start of the interval [s].
+            end: end of the interval [s].
 
         Returns:
-            The largest force at the control point of each slot [N], shape (slots,); whether the virtual springs act at
-            any time; and how many times they begin to act.
+            The largest force at the control point of each slot [N], shape (slots,); whether the virtual springs are
+            active at any time; and the number of their activations.
         """
-        # A step depends on everything within its hat.
+        # The averaged load of a step depends on the whole hat.
         begin, end = begin - self._h, end + self._h
-        most = [force * line.largest(begin, end) for force, line in zip(self._forces, self._lines, strict=True)]
-        begun = self._begins.searchsorted(end, "right") - self._begins.searchsorted(begin, "left")
-        return np.array(most), self._activity.largest(begin, end) > 0, int(begun)
+        forces = [force * load.max_abs(begin, end) for force, load in zip(self._forces, self._lines, strict=True)]
+        activations = self._begins.searchsorted(end, "right") - self._begins.searchsorted(begin, "left")
+        return np.array(forces), self._activity.max_abs(begin, end) > 0, int(activations)
 
 
 class _PiecewiseLinear:
-    """A piecewise linear function of time [s] that jumps where two keys have one time; 0 before the first key.
+    """A piecewise linear function of time [s], 0 before the first keyframe and constant after the last.
 
-    After the last key it is constant.
+    It jumps where two keyframes have the same time.
     """
 
     def __init__(self, times: Array, values: Array) -> None:
         keys = np.unique(times)
-        # The limits from the left and from the right at every key.
+        # Limits from the left and from the right at every keyframe.
         before, after = values[times.searchsorted(keys, "left")], values[times.searchsorted(keys, "right") - 1]
         before[0] = 0.0
-        # Keys that change nothing are dropped, so that they do not change the rounding either.
+        # Redundant keyframes are dropped, because they would change the rounding.
         last, following = np.append(0.0, after[:-1]), np.append(before[1:], after[-1])
-        told = (last != before) | (before != after) | (after != following)
-        told[0] = True
-        self.times, self.before, self.after = keys[told], before[told], after[told]
+        needed = (last != before) | (before != after) | (after != following)
+        needed[0] = True
+        self.times, self.before, self.after = keys[needed], before[needed], after[needed]
 
     def values(self, t: Array) -> Array:
-        """Evaluate the function; at a key, its limit from the right."""
+        """Evaluate the function; at a keyframe, its limit from the right."""
         return self._values(t, self.times.searchsorted(t, "right"))
 
     def averages(self, t: Array, h: float, begin: float = -math.inf, end: float = math.inf) -> Array:
-        """Average the function with the hat of half-width h about times t >= 0; it counts as 0 outside [begin, end].
+        """Average the function with the hat function.
 
-        If neither a key nor begin nor end lies within the hat, the average is the value itself.
+        Args:
+            t: centres of the hat, 0 or later [s], shape (n,).
+            h: half-width of the hat [s].
+            begin: time before which the function counts as 0 [s].
+            end: time after which the function counts as 0 [s].
+
+        Returns:
+            Averages, shape (n,); the value at t where neither a keyframe nor begin nor end lies within the hat.
         """
         edges = [edge for edge in (begin, end) if math.isfinite(edge)]
         averages = self.values(t) * ((begin <= t) & (t < end))
         bounds = np.union1d(self.times, edges)
-        # At t = 0 there is only half a hat, so that even the average of a line is not its value at t.
+        # At t = 0 only half a hat exists, and the average of even a straight line differs from its value.
         uneven = (t <= 0) | (
             bounds.searchsorted(t + h * (1 - HAT_TOLERANCE), "left")
             > bounds.searchsorted(t - h * (1 - HAT_TOLERANCE), "right")
@@ -215,14 +280,19 @@ class _PiecewiseLinear:
             averages[n] = self._average(float(t[n]), h, begin, end)
         return averages
 
-    def largest(self, begin: float, end: float) -> float:
-        """Find the largest absolute value from one time to another."""
+    def max_abs(self, begin: float, end: float) -> float:
+        """Find the largest absolute value in a closed time interval.
+
+        Args:
+            begin: start of the interval [s].
+            end: end of the interval [s].
+        """
         first, last = self.times.searchsorted(begin, "left"), self.times.searchsorted(end, "right")
         ends = np.array([begin, end])
         return float(np.abs(np.concatenate([self.values(ends), self.before[first:last], self.after[first:last]])).max())
 
     def _values(self, t: Array, after: NDArray[np.intp]) -> Array:
-        """Evaluate the function between the keys after[n] - 1 and after[n]."""
+        """Evaluate the function between the keyframes after[n] - 1 and after[n]."""
         low, high = np.maximum(after - 1, 0), np.minimum(after, len(self.times) - 1)
         span = self.times[high] - self.times[low]
         share = np.divide(t - self.times[low], span, out=np.zeros_like(t), where=span > 0)
@@ -230,7 +300,7 @@ class _PiecewiseLinear:
         return np.where(after == 0, 0.0, self.after[low] + share * slope)
 
     def _average(self, t: float, h: float, begin: float, end: float) -> float:
-        """Integrate piece by piece: on each piece hat and function are linear, so that Simpson's rule is exact."""
+        """Integrate piece by piece, by Simpson's rule, which is exact for a product of linear functions."""
         low, high = max(t - h, 0.0 if t <= 0 else -math.inf, begin), min(t + h, end)
         inner = self.times[(self.times > low) & (self.times < high)]
         cuts = np.unique(np.concatenate([[low, high], inner, [t] if low < t < high else []]))
@@ -246,35 +316,35 @@ class _PiecewiseLinear:
 
 
 def _distribute_over_slots(
-    line: _PiecewiseLinear, jumps: Array, turns: int, t: Array, h: float
+    load: _PiecewiseLinear, jumps: Array, slot_count: int, t: Array, h: float
 ) -> tuple[Array, NDArray[np.intp]]:
-    """Share the load of a probe that jumps out among its slots: percent and index of the segment, (steps, slots)."""
+    """Distribute the load of a probe that jumps over its slots: percent and number of the segment, (steps, slots)."""
     bounds = np.concatenate([[-math.inf], jumps, [math.inf]])
     first = jumps.searchsorted(t - h * (1 - HAT_TOLERANCE), "right")
     last = jumps.searchsorted(t + h * (1 - HAT_TOLERANCE), "left")
-    shares, places = np.zeros((len(t), turns)), np.empty((len(t), turns), np.intp)
-    for turn in range(turns):
-        place = first + (turn - first) % turns
-        acts = place <= last
-        places[:, turn] = np.where(acts, place, first)
-        for number in np.unique(place[acts]):
-            chosen = acts & (place == number)
-            shares[chosen, turn] = line.averages(t[chosen], h, bounds[number], bounds[number + 1])
-    return shares, places
+    percents, numbers = np.zeros((len(t), slot_count)), np.empty((len(t), slot_count), np.intp)
+    for slot in range(slot_count):
+        candidates = first + (slot - first) % slot_count
+        acts = candidates <= last
+        numbers[:, slot] = np.where(acts, candidates, first)
+        for number in np.unique(candidates[acts]):
+            steps = acts & (candidates == number)
+            percents[steps, slot] = load.averages(t[steps], h, bounds[number], bounds[number + 1])
+    return percents, numbers
 
 
-def _held(segment: ProbeSegment, t: Array) -> Array:
-    """Interpolate a control point, constant before and after its keys; shape (times, 2)."""
+def _control_point(segment: ProbeSegment, t: Array) -> Array:
+    """Interpolate a control point, constant before and after its keyframes; shape (times, 2)."""
     return np.stack([np.interp(t, segment.times, segment.points[:, axis]) for axis in range(2)], axis=-1)
 
 
 def _load(probe: Probe) -> _PiecewiseLinear:
-    """Give the percent of a probe's force as a function of time."""
+    """Return the percent of a probe's force as a function of time."""
     return _PiecewiseLinear(*np.array(probe.load, dtype=float).T)
 
 
-def _presses(probe: Probe) -> Sequence[tuple[float, float]]:
-    """Give keys of a function that is not 0 while a probe presses; a path does so from its first key to its last."""
+def _pressing_keys(probe: Probe) -> Sequence[tuple[float, float]]:
+    """Return keyframes of a function that differs from 0 while a probe presses, or from first to last key of a path."""
     if probe.path is None:
         return probe.load
     begin, end = probe.path[0][0], probe.path[-1][0]
@@ -282,18 +352,19 @@ def _presses(probe: Probe) -> Sequence[tuple[float, float]]:
 
 
 def _activity(plan: Plan) -> _PiecewiseLinear:
-    """Tell when the virtual springs act: 1 always or while any probe presses, else 0."""
+    """Return the activity of the virtual springs: 1 if always active or while any probe presses, else 0."""
     scene = plan.scene
     if plan.material.always_active:
-        return _PiecewiseLinear(np.array([LONG_AGO]), np.array([1.0]))
-    presses = [_presses(probe) for probe in scene.probes]
-    times = np.unique([time for keys in presses for time, _ in keys])
+        # A keyframe before every time [s].
+        return _PiecewiseLinear(np.array([-1e300]), np.array([1.0]))
+    probe_keys = [_pressing_keys(probe) for probe in scene.probes]
+    times = np.unique([time for keys in probe_keys for time, _ in keys])
     if not times.size:
         return _PiecewiseLinear(np.zeros(1), np.zeros(1))
-    # A time between each two keys, and one after the last.
+    # A time within each interval between keyframes, and one after the last.
     middles = np.append((times[:-1] + times[1:]) / 2, times[-1] + 1)
     active = np.zeros(len(times))
-    for keys in presses:
+    for keys in probe_keys:
         line = _PiecewiseLinear(*np.array(keys, dtype=float).T)
         after = line.times.searchsorted(middles, "right")
         following = np.minimum(after, len(line.times) - 1)

@@ -1,4 +1,4 @@
-"""A scene resolved: what is decided before the first step, once, and then handed on."""
+"""The plan of a run: a scene resolved into arrays and a time grid, once, before the first step."""
 
 from __future__ import annotations
 
@@ -17,33 +17,34 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Probe
 
-# A key closer than this to an end of the hat, as a fraction of its half-width, counts as outside: it would contribute
-# less than rounding does.
+# Keyframes closer to an end of the hat than this fraction of its half-width count as outside, because their
+# contribution is below rounding.
 HAT_TOLERANCE = 1e-9
 
 Array = NDArray[np.float64]
 
 
 class ProbeSegment(NamedTuple):
-    """A control point between two jumps."""
+    """The path of a control point between two jumps, constant before its first and after its last keyframe."""
 
-    times: Array  # of the keys [s], shape (n,)
-    points: Array  # control point at those times, x and y at rest [m], shape (n, 2); constant before and after them
+    times: Array  # of the keyframes [s], shape (n,)
+    points: Array  # control point at the keyframes, x and y at rest [m], shape (n, 2)
 
 
 @dataclass(frozen=True)
 class ProbeSlot:
-    """A place where a probe acts; a probe whose control point jumps has several slots and uses them by turns.
+    """One of the control points at which a probe can act in the same step.
 
-    If a jump falls within the hat, the probe acts in that step at the places before and after the jump. So the segments
-    of the control point are dealt out to two slots: the first, third, ... to one, the second, fourth, ... to the other.
-    If several jumps can fall within one hat, there are as many slots as it takes.
+    If the control point jumps within the hat, the probe acts in that step both at the point before the jump and at the
+    point after it. The segments of the control point are therefore distributed over two slots: the first, third, ... to
+    one, the second, fourth, ... to the other. If several jumps can fall within one hat, the probe has one slot more
+    than the largest number of jumps within a hat.
     """
 
     probe: int  # index of the probe in the scene
-    segments: tuple[ProbeSegment, ...]  # all segments of the control point, also those of the other slots
+    segments: tuple[ProbeSegment, ...]  # all segments of the control point, including those of other slots
     turn: int  # index of the slot's first segment
-    turns: int  # number of slots that the probe has; every `turns`-th segment from `turn` on is the slot's
+    turns: int  # number of slots of the probe; the slot has every `turns`-th segment from `turn` on
 
     @property
     def moves(self) -> bool:
@@ -52,14 +53,17 @@ class ProbeSlot:
 
     @property
     def jumps(self) -> Array:
-        """Times at which the control point jumps [s]: the first key of every segment but the first."""
+        """Times at which the control point jumps [s], shape (segments - 1,)."""
         return np.array([segment.times[0] for segment in self.segments[1:]])
 
 
 def probe_slots(probes: Sequence[Probe], sheet: Sheet, h: float) -> tuple[ProbeSlot, ...]:
-    """List the slots of all probes that exert a force.
+    """Build the slots of all force-controlled probes.
 
-    h: half-width of the hat, which is the step [s]; 0 if loads are not averaged: every probe then has one slot.
+    Args:
+        probes: probes of a scene.
+        sheet: the sheet.
+        h: half-width of the hat, equal to the step [s]; with 0, loads are not averaged and every probe has one slot.
     """
     slots = []
     for index, probe in enumerate(probes):
@@ -67,49 +71,64 @@ def probe_slots(probes: Sequence[Probe], sheet: Sheet, h: float) -> tuple[ProbeS
             continue
         times, points = control_points(probe, sheet)
         jumps = np.flatnonzero((times[1:] == times[:-1]) & (points[1:] != points[:-1]).any(axis=1)) + 1
-        parts = zip(np.split(times, jumps), np.split(points, jumps), strict=True)
-        segments = tuple(ProbeSegment(*part) for part in parts)
-        # One more than the largest number of jumps in any hat.
-        jumped = times[jumps]
-        within = np.searchsorted(jumped, jumped + 2 * h * (1 - HAT_TOLERANCE), "left") - np.arange(len(jumped))
+        segments = tuple(map(ProbeSegment, np.split(times, jumps), np.split(points, jumps)))
+        jump_times = times[jumps]
+        hat_ends = jump_times + 2 * h * (1 - HAT_TOLERANCE)
+        within = np.searchsorted(jump_times, hat_ends, "left") - np.arange(len(jump_times))
         turns = 1 + int(within.max(initial=0))
         slots += [ProbeSlot(index, segments, turn, turns) for turn in range(turns)]
     return tuple(slots)
 
 
 def build_slots(scene: Scene, grid: TimeGrid) -> tuple[ProbeSlot, ...]:
-    """List the slots of a scene's probes; at rest loads are not averaged."""
+    """Build the slots of a scene's probes.
+
+    Args:
+        scene: the scene; in a quasi-static scene loads are not averaged.
+        grid: its time grid.
+    """
     return probe_slots(scene.probes, scene.sheet, 0.0 if scene.time.at_rest else grid.step)
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What a scene comes to; `planning.make_plan` makes it."""
+    """A scene with its material, time grid and tools, built by `planning.make_plan`."""
 
-    scene: Scene  # as it was given
-    maps: Maps  # the files of its maps
-    fixed: NDArray[np.bool_]  # which points are fixed, shape (rows, cols)
-    material: Material  # what the sheet is made of, with its maps as arrays
-    stable_step: float  # the largest stable step [s]; infinite where nothing oscillates
-    grid: TimeGrid  # the steps
-    slots: tuple[ProbeSlot, ...]  # the places where probes act with a force
-    tools: tuple[Tool, ...]  # the probes that are moved
-    sha256: Mapping[str, str] = field(default_factory=dict)  # of the files of its cameras, by the keys that name them
+    scene: Scene  # as read or built by the user
+    maps: Maps  # image files of its stiffness maps
+    fixed: NDArray[np.bool_]  # whether each mass point is fixed, shape (rows, cols)
+    material: Material  # coefficients of the sheet, with its maps as arrays
+    stable_step: float  # largest stable step [s]; infinite for a sheet without stiffness
+    grid: TimeGrid  # frames, steps and precision
+    slots: tuple[ProbeSlot, ...]  # control points of the force-controlled probes
+    tools: tuple[Tool, ...]  # position-controlled tools
+    sha256: Mapping[str, str] = field(default_factory=dict)  # checksums of camera files, by the scene's keys
 
     @property
     def open_edges(self) -> bool:
-        """Whether a point at an edge moves."""
+        """Whether any mass point at an edge can move."""
         return not has_fixed_border(self.fixed)
 
     def with_grid(self, **changes: Any) -> Plan:
-        """Change attributes of the time grid: steps_per_frame, precision."""
+        """Return a copy with another time grid.
+
+        Args:
+            changes: attributes of `TimeGrid`, such as `steps_per_frame` or `precision`.
+        """
         grid = replace(self.grid, **changes)
         if grid.step == self.grid.step:
             return replace(self, grid=grid)
         return replace(self, grid=grid, slots=build_slots(self.scene, grid))
 
     def with_probes(self, probes: Sequence[Probe | Mapping[str, Any]]) -> Plan:
-        """Replace the probes; SceneError: one of them is not a probe."""
+        """Return a copy with other probes.
+
+        Args:
+            probes: all probes, each a `Probe` or a mapping of its keys.
+
+        Raises:
+            SceneError: when a mapping is not a valid probe.
+        """
         scene = self.scene.model_copy(update={"probes": tuple(probes)})
         tools = build_tools(scene.probes, scene.sheet)
         return replace(self, scene=scene, slots=build_slots(scene, self.grid), tools=tools)

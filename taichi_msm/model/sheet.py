@@ -1,10 +1,9 @@
-"""The sheet at rest: where its points are, which of them are fixed.
+"""The sheet at rest and its material: rest positions, fixed mass points, stiffness maps and checks of the scene.
 
-What a sheet is made of, whichever way a scene describes it, and what is wrong with a description.
-
-With `springs`, the scene has the numbers of the model. With `tissue`, they are derived from it cell by cell: a cell
-adds to the springs along its edges and diagonals and to the points at its corners. So points and springs at an edge,
-which belong to fewer cells, get less. Each term of the model derives its own numbers (see `terms`).
+With `springs`, the scene contains the coefficients of the model. With `tissue`, they are assembled cell by cell: each
+cell contributes to the springs along its edges and diagonals and to the mass points at its corners. Springs and mass
+points at an edge belong to fewer cells and are therefore softer and lighter. Each term of the model derives its own
+coefficients (see `terms`).
 """
 
 from __future__ import annotations
@@ -23,17 +22,15 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_POINTS
 from taichi_msm.scene.sheet import Sheet, StiffnessMap
 
-SIDES = ("top", "bottom", "left", "right")
-
 
 def spacing(sheet: Sheet) -> tuple[float, float]:
-    """Give the distance between neighbouring columns and between neighbouring rows [m]."""
+    """Return the distances between neighbouring columns and between neighbouring rows at rest, dx and dy [m]."""
     (rows, cols), (height, width) = sheet.points, sheet.size
     return width / (cols - 1), height / (rows - 1)
 
 
 def axes(sheet: Sheet) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Give x of the columns, shape (cols,), and y of the rows, shape (rows, 1), at rest [m].
+    """Return x of the columns, shape (cols,), and y of the rows, shape (rows, 1), at rest [m].
 
     x_j = (j / (cols - 1) - 1/2) width, y_i = (1/2 - i / (rows - 1)) height.
     """
@@ -42,19 +39,20 @@ def axes(sheet: Sheet) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def rest_positions(sheet: Sheet) -> NDArray[np.float64]:
-    """Give the rest positions of the points, X_ij = (x_j, y_i, 0) [m], shape (rows, cols, 3)."""
+    """Return the rest positions of the mass points, X_ij = (x_j, y_i, 0) [m], shape (rows, cols, 3)."""
     position = np.zeros((*sheet.points, 3))
     position[..., 0], position[..., 1] = axes(sheet)
     return position
 
 
 def fixed_points(sheet: Sheet) -> NDArray[np.bool_]:
-    """Mark the points that never move, shape (rows, cols)."""
+    """Return whether each mass point is fixed, shape (rows, cols)."""
     fixed = np.zeros(sheet.points, dtype=bool)
     if sheet.fixed == "corners":
         fixed[np.ix_((0, -1), (0, -1))] = True
         return fixed
-    sides = {"border": SIDES, "none": ()}.get(sheet.fixed, sheet.fixed) if isinstance(sheet.fixed, str) else sheet.fixed
+    named = {"border": ("top", "bottom", "left", "right"), "none": ()}
+    sides = named[sheet.fixed] if isinstance(sheet.fixed, str) else sheet.fixed
     fixed[0] |= "top" in sides
     fixed[-1] |= "bottom" in sides
     fixed[:, 0] |= "left" in sides
@@ -62,69 +60,98 @@ def fixed_points(sheet: Sheet) -> NDArray[np.bool_]:
     return fixed
 
 
-# Cells longer than this many times their width would need springs of negative stiffness.
+# A larger ratio of the sides of a cell would require springs of negative stiffness.
 MAX_CELL_ASPECT = math.sqrt(3)
 
 Array = NDArray[np.float64]
 
 
 class MapImage(NamedTuple):
-    """The file of a map. It is read once, so that a whole run has one map even if the file changes meanwhile."""
+    """The image of a stiffness map, read once, so that a file changed during a run has no effect."""
 
-    grey: NDArray[Any]  # 0 to 255, of 16-bit pictures 0 to 65535; shape (height, width)
+    grey: NDArray[Any]  # 0 to 255, in 16-bit images 0 to 65535, shape (height, width)
     sha256: str  # of the file
 
 
-# The files of a scene's maps, by the keys that name them, such as map and foundation_map.
+# Images of a scene's stiffness maps, by their keys, such as map and foundation_map.
 Maps = Mapping[str, MapImage]
 
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """The numbers of a sheet; with maps, those for a factor of 1."""
+    """The coefficients of a sheet; where a map applies, those for a factor of 1."""
 
-    mass: float  # of a point [kg]
+    mass: float  # of a mass point [kg]
     drag: float  # C / m [1/s]
-    # across, down, shear: stiffness k of springs along a row, along a column and along diagonals [N/m]
+    # across, down, shear: stiffness k of springs along rows, along columns and along diagonals [N/m]
     across: float
     down: float
     shear: float
-    tension: float  # e; a spring pulls at rest with this share of its stiffness times its length
-    virtual: float  # stiffness K of the virtual springs [N/m]; 0 if they never act
-    always_active: bool  # whether the virtual springs always act; else only under a load
+    tension: float  # e; the tension of a spring at rest, relative to its stiffness times its length
+    virtual: float  # stiffness K of the virtual springs [N/m]; 0 if they are never active
+    always_active: bool  # whether the virtual springs are always active; else only under load
     bending: float  # D dx dy [N m3]
-    by_area: bool  # whether points and springs at an edge get less than others, as in tissue
-    factors: Array | None  # of the stiffness of every cell, shape (rows - 1, cols - 1); None without a map
-    virtual_factors: Array | None  # of K at every point, shape (rows, cols); None without a map
+    by_area: bool  # whether mass points and springs at an edge are lighter and softer, as in tissue
+    factors: Array | None  # of the stiffness, for every cell, shape (rows - 1, cols - 1); None without a map
+    virtual_factors: Array | None  # of K, for every mass point, shape (rows, cols); None without a map
 
     @property
     def tensions(self) -> tuple[float, float, float]:
-        """Tension per length, tau, of springs along rows, along columns and of diagonals [N/m]."""
+        """Tension per length, tau, of springs along rows, along columns and along diagonals [N/m]."""
         return self.across * self.tension, self.down * self.tension, self.shear * self.tension
 
 
 def read_map(stiffness_map: StiffnessMap) -> MapImage:
-    """Read the file of a map; PictureError: it cannot be used."""
+    """Read the image of a stiffness map.
+
+    Raises:
+        PictureError: when the file is missing, unreadable or not a grey image.
+    """
     sha256 = file_sha256(stiffness_map.image)
     return MapImage(read_grey(stiffness_map.image, sha256), sha256)
 
 
 def cell_factors(stiffness_map: StiffnessMap, image: MapImage, sheet: Sheet) -> Array:
-    """Give the factors at the centres of the cells, shape (rows - 1, cols - 1)."""
+    """Interpolate the factors of a stiffness map at the centres of the cells.
+
+    Args:
+        stiffness_map: its keys in the scene.
+        image: its image.
+        sheet: the sheet.
+
+    Returns:
+        Factors, shape (rows - 1, cols - 1).
+    """
     rows, cols = (count - 1 for count in sheet.points)
     return map_factors(stiffness_map, image, (np.arange(rows) + 0.5) / rows, (np.arange(cols) + 0.5) / cols)
 
 
 def point_factors(stiffness_map: StiffnessMap, image: MapImage, sheet: Sheet) -> Array:
-    """Give the factors at the mass points, shape (rows, cols)."""
+    """Interpolate the factors of a stiffness map at the mass points.
+
+    Args:
+        stiffness_map: its keys in the scene.
+        image: its image.
+        sheet: the sheet.
+
+    Returns:
+        Factors, shape (rows, cols).
+    """
     rows, cols = (np.arange(count) / (count - 1) for count in sheet.points)
     return map_factors(stiffness_map, image, rows, cols)
 
 
 def map_factors(stiffness_map: StiffnessMap, image: MapImage, rows: Array, cols: Array) -> Array:
-    """Interpolate the factors bilinearly between texels, constant beyond them.
+    """Interpolate the factors of a stiffness map bilinearly between pixel centres, constant beyond the outermost.
 
-    rows, cols: places of the rows from the top, of the columns from the left, as fractions of the sheet.
+    Args:
+        stiffness_map: its keys in the scene.
+        image: its image.
+        rows: distances of the sampled rows from the top, as fractions of the height, shape (m,).
+        cols: distances of the sampled columns from the left, as fractions of the width, shape (n,).
+
+    Returns:
+        Factors, shape (m, n).
     """
     grey = image.grey.astype(float)
     height, width = grey.shape
@@ -140,45 +167,45 @@ def map_factors(stiffness_map: StiffnessMap, image: MapImage, rows: Array, cols:
 
 
 def largest_mean(factors: Array) -> float:
-    """Find the largest mean of the factors of the cells around a point."""
-    around, cells = np.pad(factors, 1), np.pad(np.ones_like(factors), 1)
+    """Return the largest mean of the factors of the cells around a mass point."""
+    factor_sums, cell_counts = np.pad(factors, 1), np.pad(np.ones_like(factors), 1)
 
     def at_points(values: Array) -> Array:
         return values[:-1, :-1] + values[:-1, 1:] + values[1:, :-1] + values[1:, 1:]
 
-    return float((at_points(around) / at_points(cells)).max())
+    return float((at_points(factor_sums) / at_points(cell_counts)).max())
 
 
 def area_shares(sheet: Sheet) -> Array:
-    """Tell which share of a cell's area belongs to each point: 1, at edges 1/2, at corners 1/4; shape (rows, cols)."""
+    """Return the share of a cell's area at each mass point: 1, at edges 1/2, at corners 1/4; shape (rows, cols)."""
     rows, cols = np.ones(sheet.points[0]), np.ones(sheet.points[1])
     rows[[0, -1]], cols[[0, -1]] = 0.5, 0.5
     return np.outer(rows, cols)
 
 
 def cell_aspect_ratio(sheet: Sheet) -> float:
-    """Give the ratio of the longer to the shorter side of a cell."""
+    """Return the ratio of the longer to the shorter side of a cell."""
     dx, dy = spacing(sheet)
     return max(dx, dy) / min(dx, dy)
 
 
 def has_fixed_border(fixed: NDArray[np.bool_]) -> bool:
-    """Tell whether every point at an edge is fixed."""
+    """Return whether every mass point at an edge is fixed."""
     return bool(fixed[[0, -1]].all() and fixed[:, [0, -1]].all())
 
 
 def material_key_problems(scene: Scene) -> Iterator[Problem]:
-    """Find missing and superfluous keys of springs and of tissue."""
+    """Check a scene for missing and superfluous keys of springs and tissue."""
     sheet = scene.sheet
     if scene.tissue is None:
         if scene.springs is None:
-            said = "missing; expected a mapping with young, thickness and density, or springs in its place"
-            yield Problem(("tissue",), said)
+            text = "missing; expected a mapping with young, thickness and density, or springs in its place"
+            yield Problem(("tissue",), text)
         elif sheet.mass is None and not scene.time.at_rest:
             yield Problem(("sheet", "mass"), "missing; with springs expected a number above 0, in kg")
         if sheet.tolerance is not None:
-            said = f"{sheet.tolerance:g} needs tissue: with springs other points make another sheet; remove tolerance"
-            yield Problem(("sheet", "tolerance"), said)
+            text = f"{sheet.tolerance:g} needs tissue: with springs other points make another sheet; remove tolerance"
+            yield Problem(("sheet", "tolerance"), text)
         return
     if scene.tissue.density is None and not scene.time.at_rest:
         yield Problem(("tissue", "density"), "missing; expected a number above 0, in kg/m3")
@@ -190,12 +217,18 @@ def material_key_problems(scene: Scene) -> Iterator[Problem]:
         yield Problem(("damping",), f"{scene.damping:g} N s/m is per point; with tissue set tissue.damping, in 1/s")
     for index, probe in enumerate(scene.probes):
         if probe.force is not None:
-            said = "is per point, so that more points would be pressed deeper; set total, of the whole tool, in newtons"
-            yield Problem(("probes", index, "force"), said)
+            text = "is per point, so that more points would be pressed deeper; set total, of the whole tool, in newtons"
+            yield Problem(("probes", index, "force"), text)
 
 
 def tissue_problems(scene: Scene, fixed: NDArray[np.bool_], factors: Array | None) -> Iterator[Problem]:
-    """Find tissue that is impossible."""
+    """Check the keys of tissue for impossible values.
+
+    Args:
+        scene: a scene without `material_key_problems`.
+        fixed: whether each mass point is fixed, shape (rows, cols).
+        factors: of the stiffness, for every cell; None if the scene has no map or its image is unreadable.
+    """
     tissue, sheet = scene.tissue, scene.sheet
     if tissue is None:
         return
@@ -214,14 +247,14 @@ def tissue_problems(scene: Scene, fixed: NDArray[np.bool_], factors: Array | Non
             f"{MAX_CELL_ASPECT:.3g} times; {remedy}",
         )
     if tissue.foundation_map is not None and tissue.foundation_stiffness == 0:
-        said = "needs a foundation; set tissue.foundation, such as {young: 15e3, depth: 0.05}, or remove foundation_map"
-        yield Problem(("tissue", "foundation_map"), said)
+        text = "needs a foundation; set tissue.foundation, such as {young: 15e3, depth: 0.05}, or remove foundation_map"
+        yield Problem(("tissue", "foundation_map"), text)
     if not has_fixed_border(fixed):
         bending = "plate" if tissue.bending == "plate" else f"{tissue.bending:g} N m"
         for name, value in (("pretension", f"{tissue.pretension:g} N/m"), ("bending", bending)):
             if getattr(tissue, name) != 0:
-                said = f"{value} needs every side fixed; set sheet.fixed: border, or {name}: 0"
-                yield Problem(("tissue", name), said)
+                text = f"{value} needs every side fixed; set sheet.fixed: border, or {name}: 0"
+                yield Problem(("tissue", name), text)
     if tissue.pretension > 0:
         softest = 1.0 if factors is None else float(factors.min())
         most = 1.5 * tissue.young * tissue.thickness * softest

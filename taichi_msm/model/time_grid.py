@@ -1,4 +1,4 @@
-"""The times at which a scene is stepped and drawn, and the precision of the steps: decided once and passed on."""
+"""The time grid of a run: frames, steps and precision."""
 
 from __future__ import annotations
 
@@ -10,31 +10,31 @@ Precision = Literal["f32", "f64"]
 
 @dataclass(frozen=True)
 class TimeGrid:
-    """The steps of a run; `physics.planning` decides them for a scene.
+    """The steps of a run, chosen for a scene by `solver.planning`.
 
-    Times are quotients of whole numbers of steps, never sums of steps.
+    Times are quotients of numbers of steps, never sums of steps, so that rounding does not accumulate.
     """
 
     frames_per_second: float  # [1/s]
-    frames: int  # F, the number of frame intervals; F + 1 frames are drawn
-    steps_per_frame: int  # from one frame to the next, 1 or more
-    precision: Precision  # of the steps
+    frames: int  # number of intervals between frames; a run has one frame more
+    steps_per_frame: int  # 1 or more
+    precision: Precision  # of the positions and forces
 
     @property
     def steps(self) -> int:
-        """Number of steps in all."""
+        """Number of steps of the run."""
         return self.frames * self.steps_per_frame
 
     @property
     def steps_per_second(self) -> float:
-        """Number of steps per simulated second [1/s]."""
+        """Number of steps per second of simulated time [1/s]."""
         return self.frames_per_second * self.steps_per_frame
 
     @property
     def step(self) -> float:
-        """The step h [s]."""
+        """The time step h [s]."""
         return 1 / self.steps_per_second
 
     def time(self, steps: int) -> float:
-        """Tell the time after a number of steps from rest [s]."""
+        """Return the time after a number of steps [s]."""
         return steps / self.steps_per_second
