@@ -1,7 +1,4 @@
-"""The deformed sheet: its points, and any place on the surface that is drawn between them.
-
-The refined surface as arrays that other programs can draw; and instruments, whose tips touch it.
-"""
+"""The deformed sheet: positions of mass points, the refined surface between them, and the tools that touch it."""
 
 from __future__ import annotations
 
@@ -21,7 +18,15 @@ Array = NDArray[np.float64]
 
 
 def to_positions(displacement: NDArray[Any], sheet: Sheet) -> NDArray[Any]:
-    """Turn displacements [m], shape (rows, cols, 3), into positions, which are not to be written to."""
+    """Convert displacements to positions, in place.
+
+    Args:
+        displacement: x - X [m], shape (rows, cols, 3); overwritten.
+        sheet: the sheet.
+
+    Returns:
+        Positions x [m], a read-only view of the same array.
+    """
     position, (x, y) = displacement, axes(sheet)
     # The sum is computed in float64 and rounded once, without a float64 copy of the sheet.
     np.add(position[..., 0], x, out=position[..., 0], casting="same_kind")
@@ -31,75 +36,92 @@ def to_positions(displacement: NDArray[Any], sheet: Sheet) -> NDArray[Any]:
 
 
 def surface_point(position: NDArray[np.floating], refine: int, sheet: Sheet, rest: Array) -> tuple[Array, Array]:
-    """Find the point of the refined surface whose rest position, x and y [m], is `rest`.
+    """Find the point of the refined surface with a given rest position.
 
-    A point outside the sheet moves with the nearest point of its edge. The mass points are at `position` [m], shape
-    (rows, cols, 3), and `refine` vertices are inserted between neighbours.
+    A point outside the sheet moves with the nearest point of the sheet's edge.
+
+    Args:
+        position: of the mass points [m], shape (rows, cols, 3).
+        refine: number of vertices inserted between neighbouring mass points.
+        sheet: the sheet.
+        rest: rest position, x and y [m], shape (2,).
 
     Returns:
-        The point [m], and the unit normal of its cell there, upward at rest; both of shape (3,).
+        The point [m], shape (3,), and the unit normal of its cell at this point, upward at rest, shape (3,).
     """
     height, width = sheet.size
     across = min(1.0, max(0.0, rest[0] / width + 0.5))
     down = min(1.0, max(0.0, 0.5 - rest[1] / height))
-    point, normal = (each[0] for each in _on_cells(position, refine, np.array([[across, down]])))
-    beside = np.array([rest[0] - (across - 0.5) * width, rest[1] - (0.5 - down) * height, 0.0])
-    return point + beside, normal / max(float(np.linalg.norm(normal)), 1e-300)
+    point, normal = (values[0] for values in _interpolate(position, refine, np.array([[across, down]])))
+    outside = np.array([rest[0] - (across - 0.5) * width, rest[1] - (0.5 - down) * height, 0.0])
+    return point + outside, normal / max(float(np.linalg.norm(normal)), 1e-300)
 
 
 def surface_positions(position: NDArray[np.floating], refine: int, coordinates: NDArray[np.floating]) -> Array:
-    """Place material points on the refined surface [m], shape (n, 3).
+    """Compute the positions of material points on the refined surface.
 
-    `coordinates` are fractions of the sheet's width from its left and of its height from its top, shape (n, 2);
-    `position` and `refine` as for `surface_point`.
+    Args:
+        position: of the mass points [m], shape (rows, cols, 3).
+        refine: number of vertices inserted between neighbouring mass points.
+        coordinates: fractions of the sheet's width from its left and of its height from its top, shape (n, 2).
+
+    Returns:
+        Positions [m], shape (n, 3).
     """
-    return _on_cells(position, refine, coordinates.astype(np.float64))[0]
+    return _interpolate(position, refine, coordinates.astype(np.float64))[0]
 
 
 def surface_weights(coordinates: Array, sheet: Sheet, refine: int) -> tuple[NDArray[np.intp], Array]:
-    """Give the four mass points around each point of the surface that is drawn, and their weights, shapes (N, 4).
+    """Compute the interpolation weights with which mass points define points of the refined surface.
 
-    coordinates: across and down, shape (N, 2). The points are numbered row after row; the same place on the surface as
-    that of `surface_positions`.
+    The weighted sums of positions are the results of `surface_positions`.
+
+    Args:
+        coordinates: fractions of the sheet's width from its left and of its height from its top, shape (n, 2).
+        sheet: the sheet.
+        refine: number of vertices inserted between neighbouring mass points.
+
+    Returns:
+        Indices of the four mass points around each point, numbered row by row, and their weights, both of shape (n, 4).
     """
     cols = sheet.points[1]
-    i, j, s, t, twist = _in_cells(coordinates, sheet.points, refine)
+    i, j, s, t, twist = _cell_coordinates(coordinates, sheet.points, refine)
     first = i * cols + j
     corners = np.stack([first, first + 1, first + cols, first + cols + 1], axis=1)
     return corners, np.stack([1 - s - t + twist, s - twist, t - twist, twist], axis=1)
 
 
-def _on_cells(position: NDArray[np.floating], refine: int, coordinates: Array) -> tuple[Array, Array]:
-    """Give the points at some coordinates, and normals of their cells there, of any length; both of shape (n, 3)."""
+def _interpolate(position: NDArray[np.floating], refine: int, coordinates: Array) -> tuple[Array, Array]:
+    """Return points of the surface and normals of their cells, not normalised, both of shape (n, 3)."""
     rows, cols = position.shape[:2]
-    i, j, *shares = _in_cells(coordinates, (rows, cols), refine)
+    i, j, *shares = _cell_coordinates(coordinates, (rows, cols), refine)
     s, t, twist = (share[:, None] for share in shares)
-    a, right, below, far = (position[i + n // 2, j + n % 2].astype(np.float64) for n in range(4))
-    b, c, d = right - a, below - a, far - right - below + a
+    a, right, below, opposite = (position[i + n // 2, j + n % 2].astype(np.float64) for n in range(4))
+    b, c, d = right - a, below - a, opposite - right - below + a
     return a + b * s + c * t + d * twist, np.cross(b + d * t, -(c + d * s))
 
 
-def _in_cells(coordinates: Array, points: tuple[int, int], refine: int) -> tuple[NDArray[Any], ...]:
-    """Give the row i and the column j of each coordinate's cell, s and t across and down in it, and a twist.
+def _cell_coordinates(coordinates: Array, points: tuple[int, int], refine: int) -> tuple[NDArray[Any], ...]:
+    """Return row i and column j of each coordinate's cell, s and t across and down in it, and a twist.
 
-    That takes the place of s t: in a small quad of the refined surface it is linear on either side of the diagonal.
+    The twist replaces s t of bilinear interpolation; in each small quad it is linear on either side of the diagonal.
     """
-    (rows, cols), parts = points, refine + 1
+    (rows, cols), quads = points, refine + 1
     s, t = (coordinates * (cols - 1, rows - 1)).T
     j, i = np.minimum(s.astype(int), cols - 2), np.minimum(t.astype(int), rows - 2)
     s, t = s - j, t - i
-    s0, t0 = (np.minimum((each * parts).astype(int), parts - 1) / parts for each in (s, t))
+    s0, t0 = (np.minimum((share * quads).astype(int), quads - 1) / quads for share in (s, t))
     s1, t1 = s - s0, t - t0
-    return i, j, s, t, s0 * t0 + s1 * t0 + s0 * t1 + np.minimum(s1, t1) / parts
+    return i, j, s, t, s0 * t0 + s1 * t0 + s0 * t1 + np.minimum(s1, t1) / quads
 
 
 class Surface(NamedTuple):
     """Textured triangles.
 
     Attributes:
-        vertices: positions [m], shape (vertices, 3), row after row from the top left.
+        vertices: positions [m], shape (vertices, 3), row by row from the top left.
         triangles: indices of vertices, shape (triangles, 3), counter-clockwise as seen from above.
-        texture_coordinates: fractions of the picture's width from its left and of its height from its top, shape
+        texture_coordinates: fractions of the texture's width from its left and of its height from its top, shape
             (vertices, 2).
     """
 
@@ -109,20 +131,25 @@ class Surface(NamedTuple):
 
 
 class Capsule(NamedTuple):
-    """The shape and place of an instrument at one time: a rod with rounded ends."""
+    """The shape and position of an instrument at a time: a cylinder with hemispherical ends."""
 
-    tip: Array  # middle of its rounded tip [m], shape (3,)
-    axis: Array  # unit vector from there along the rod, shape (3,)
-    length: float  # between the middles of its ends [m]
-    radius: float  # of the rod and its ends [m]
+    tip: Array  # centre of the hemisphere that touches the sheet [m], shape (3,)
+    axis: Array  # unit vector from the tip along the cylinder, shape (3,)
+    length: float  # of the cylinder [m]
+    radius: float  # of cylinder and ends [m]
 
 
 def refine_surface(position: NDArray[np.floating], refine: int) -> Surface:
-    """Refine the sheet bilinearly (section 2 of the paper); every small quad is cut from top left to bottom right.
+    """Refine the sheet bilinearly (section 2 of the paper) and triangulate it.
 
-    The mass points are at `position` [m], shape (rows, cols, 3); `refine` vertices are inserted between neighbours.
+    Args:
+        position: of the mass points [m], shape (rows, cols, 3).
+        refine: number of vertices inserted between neighbouring mass points.
+
+    Returns:
+        The surface; every small quad is divided by the diagonal from top left to bottom right.
     """
-    vertices = _between(_between(position, refine, 0), refine, 1)
+    vertices = _insert(_insert(position, refine, 0), refine, 1)
     rows, cols = vertices.shape[:2]
     corner = np.arange(rows * cols, dtype=np.int32).reshape(rows, cols)
     upper_left, upper_right = corner[:-1, :-1], corner[:-1, 1:]
@@ -138,7 +165,16 @@ def refine_surface(position: NDArray[np.floating], refine: int) -> Surface:
 
 
 def place_capsules(scene: Scene, position: NDArray[np.floating], time: float) -> list[Capsule]:
-    """Place the instruments of a scene at a time [s]; the mass points are at `position` [m], shape (rows, cols, 3)."""
+    """Place all instruments of a scene.
+
+    Args:
+        scene: the scene.
+        position: of the mass points [m], shape (rows, cols, 3).
+        time: the time [s].
+
+    Returns:
+        A capsule for every probe with an instrument, in the order of the probes.
+    """
     moved = {tool.probe: tool for tool in build_tools(scene.probes, scene.sheet)}
     placed = []
     for index, probe in enumerate(scene.probes):
@@ -151,17 +187,24 @@ def place_capsules(scene: Scene, position: NDArray[np.floating], time: float) ->
 
 
 def place_capsule(instrument: Instrument, scene: Scene, position: NDArray[np.floating], rest: Array) -> Capsule:
-    """Place an instrument; `rest` is the rest position of the point that it touches, x and y [m], shape (2,)."""
+    """Place the instrument of a force-controlled probe on the surface.
+
+    Args:
+        instrument: the instrument.
+        scene: the scene.
+        position: of the mass points [m], shape (rows, cols, 3).
+        rest: rest position of the point that the tip touches, x and y [m], shape (2,).
+    """
     axis = unit_vector(instrument.shaft)
     point, normal = surface_point(position, scene.render.refine, scene.sheet, rest)
     outward = normal if normal @ axis >= 0 else -normal
     return Capsule(point + instrument.radius * outward, axis, instrument.length, instrument.radius)
 
 
-def _between(values: NDArray[np.floating], refine: int, axis: int) -> NDArray[np.floating]:
-    """Insert values between neighbours along an axis; the given values keep their bits."""
-    parts = refine + 1
+def _insert(values: NDArray[np.floating], refine: int, axis: int) -> NDArray[np.floating]:
+    """Insert interpolated values between neighbours along an axis, without changing a bit of the given values."""
+    intervals = refine + 1
     along = np.moveaxis(values, axis, 0)
-    share = np.arange(parts, dtype=values.dtype).reshape(-1, *(1,) * (along.ndim - 1)) / parts
+    share = np.arange(intervals, dtype=values.dtype).reshape(-1, *(1,) * (along.ndim - 1)) / intervals
     filled = along[:-1, None] + share * (along[1:] - along[:-1])[:, None]
     return np.moveaxis(np.concatenate([filled.reshape(-1, *along.shape[1:]), along[-1:]]), 0, axis)

@@ -1,14 +1,14 @@
-"""The force of a probe on the points around its control point.
+"""The force of a force-controlled probe on the mass points around its control point.
 
-A probe with `force` exerts on a point at the distance d from its control point (eq. 5)
+A probe with `force` exerts on a mass point at the distance d from its control point (eq. 5)
 
     F = force exp(-falloff max(d - radius, 0) - offset)
 
-and one with `total`, for any number of points, the area that belongs to the point times
+A probe with `total` exerts, per area that belongs to a mass point, for any number of mass points
 
     F = total w(d) / W,    w = exp(-falloff max(d - radius, 0)),    W = pi R^2 + 2 pi (R / falloff + 1 / falloff^2)
 
-where W is the integral of w over an infinite sheet, and R the radius of the tool's flat end.
+where W is the integral of w over an infinite sheet and R the radius of the tool's flat end.
 """
 
 from __future__ import annotations
@@ -26,51 +26,58 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Probe
 
-# Times that differ by less are one [s, or of the time].
-SAME_TIME = 1e-12
-
 Array = NDArray[np.float64]
 
-# Forces are summed for this many points at a time.
-BLOCK = 1 << 20
-
-# A note is made if the force on the sheet is below this share of a tool's total, or above its inverse.
+# A warning is issued if the ratio of the force on the sheet to `total` is below this value or above its inverse.
 MIN_FORCE_RATIO = 0.8
 
 
 class ProbeForce(NamedTuple):
-    """How a probe acts: force exp(-max(falloff d + shift, offset)) on a point at the distance d."""
+    """The force law of a probe: force exp(-max(falloff d + shift, offset)) on a mass point at the distance d."""
 
     force: tuple[float, float, float]  # [N] at 100 %, before the decay
     falloff: float  # [1/m]
-    shift: float  # offset - falloff radius, so that the exponent is that of the flat end up to its rim
-    offset: float  # exponent on the flat end
-    by_area: bool  # whether the force on a point is multiplied by its share of a cell's area
+    shift: float  # offset - falloff radius; the exponent is constant under the flat end and continuous at its rim
+    offset: float  # exponent under the flat end
+    by_area: bool  # whether the force on a mass point is multiplied by its share of a cell's area
 
     @property
-    def size(self) -> float:
-        """Largest force on a point at 100 % [N]."""
+    def max_force(self) -> float:
+        """Largest force on a mass point at 100 % [N]."""
         return math.hypot(*self.force) * math.exp(-self.offset)
 
     def decay(self, distance: Array) -> Array:
-        """Give the share of the force that acts at a distance from the control point [m]."""
+        """Return the decay factors at distances from the control point [m]."""
         return np.exp(-np.maximum(self.falloff * distance + self.shift, self.offset))
 
 
 def probe_force(probe: Probe, sheet: Sheet) -> ProbeForce:
-    """Compute how a probe acts on a sheet."""
-    flat = probe.falloff * probe.radius
+    """Compute the force law of a probe.
+
+    Args:
+        probe: a force-controlled probe, with `force` or `total`.
+        sheet: the sheet; its cell size scales a `total`.
+    """
+    rim = probe.falloff * probe.radius
     if probe.total is None:
         assert probe.force is not None
-        return ProbeForce(probe.force, probe.falloff, probe.offset - flat, probe.offset, by_area=False)
+        return ProbeForce(probe.force, probe.falloff, probe.offset - rim, probe.offset, by_area=False)
     dx, dy = spacing(sheet)
     share = dx * dy / decay_integral(probe)
     x, y, z = probe.total
-    return ProbeForce((x * share, y * share, z * share), probe.falloff, 0.0 - flat, 0.0, by_area=True)
+    return ProbeForce((x * share, y * share, z * share), probe.falloff, 0.0 - rim, 0.0, by_area=True)
 
 
 def control_points(probe: Probe, sheet: Sheet) -> tuple[Array, Array]:
-    """Give the keys of a probe's control point: times [s], shape (n,), and points [m], shape (n, 2)."""
+    """Return the keyframes of a probe's control point.
+
+    Args:
+        probe: the probe.
+        sheet: the sheet.
+
+    Returns:
+        Times [s], shape (n,), and control points, x and y at rest [m], shape (n, 2).
+    """
     first = probe.at[0]
     keys = probe.at if isinstance(first, tuple) else ((0.0, *probe.at),)
     time, across, down = np.array(keys, dtype=float).T
@@ -79,14 +86,32 @@ def control_points(probe: Probe, sheet: Sheet) -> tuple[Array, Array]:
 
 
 def control_point(probe: Probe, sheet: Sheet, time: float) -> Array:
-    """Give a probe's control point at a time, x and y at rest [m], shape (2,); where it jumps, the one it jumps to."""
+    """Return the control point of a probe at a time; at a jump, the point after the jump.
+
+    Args:
+        probe: the probe.
+        sheet: the sheet.
+        time: the time [s].
+
+    Returns:
+        x and y at rest [m], shape (2,).
+    """
     return point_at(*control_points(probe, sheet), time)
 
 
 def point_at(times: Array, points: Array, time: float) -> Array:
-    """Give the control point with these keys at a time [s], as `control_point` does."""
-    # Times of frames are rounded.
-    after = int(np.searchsorted(times, time + SAME_TIME * max(1.0, abs(time)), side="right"))
+    """Interpolate a control point between keyframes; at a jump, the point after the jump.
+
+    Args:
+        times: of the keyframes [s], shape (n,).
+        points: control points at the keyframes [m], shape (n, 2).
+        time: the time [s].
+
+    Returns:
+        The control point [m], shape (2,).
+    """
+    # Frame times are rounded, so a keyframe very close to the time counts as reached.
+    after = int(np.searchsorted(times, time + 1e-12 * max(1.0, abs(time)), side="right"))
     if after in (0, len(times)):
         return points[min(after, len(times) - 1)]
     share = min(1.0, (time - times[after - 1]) / (times[after] - times[after - 1]))
@@ -94,52 +119,56 @@ def point_at(times: Array, points: Array, time: float) -> Array:
 
 
 def decay_integral(probe: Probe) -> float:
-    """Integrate the decay of a probe with `total` over an infinite sheet: W [m2]."""
+    """Return the integral W of the decay of a probe with `total` over an infinite sheet [m2]."""
     reach = 1 / probe.falloff
-    # Products instead of powers: these raise OverflowError where a product is infinite.
+    # Powers would raise OverflowError where products become infinite.
     return math.pi * (probe.radius * probe.radius + 2 * (probe.radius * reach + reach * reach))
 
 
-def sum_probe_forces(probe: Probe, sheet: Sheet, finer: int = 1) -> tuple[float, float]:
-    """Sum the forces of a probe at 100 % and at its first place on the points of a sheet.
+def sum_probe_forces(probe: Probe, sheet: Sheet, refinement: int = 1) -> tuple[float, float]:
+    """Sum the forces of a probe over all mass points, at 100 % and at its first control point.
 
-    finer: how many times shorter the cells are.
+    Args:
+        probe: a force-controlled probe.
+        sheet: the sheet.
+        refinement: factor by which the cells are divided along both axes.
 
     Returns:
-        The sum [N], and the largest force on a point per area that belongs to it [Pa].
+        The sum [N], and the largest force on a mass point per area that belongs to it [Pa].
     """
-    acts, (at_x, at_y) = probe_force(probe, sheet), control_points(probe, sheet)[1][0]
-    (rows, cols), (height, width) = ((count - 1) * finer for count in sheet.points), sheet.size
+    law, (at_x, at_y) = probe_force(probe, sheet), control_points(probe, sheet)[1][0]
+    (rows, cols), (height, width) = ((count - 1) * refinement for count in sheet.points), sheet.size
     x, y = (np.arange(cols + 1) / cols - 0.5) * width, (0.5 - np.arange(rows + 1) / rows) * height
     along, down = np.ones(cols + 1), np.ones(rows + 1)
     along[[0, -1]], down[[0, -1]] = 0.5, 0.5
     total, largest = 0.0, 0.0
-    # A block of rows at a time, which takes little memory.
-    block = max(1, BLOCK // (cols + 1))
+    # Blocks of rows limit the memory to about a million mass points.
+    block = max(1, (1 << 20) // (cols + 1))
     for first in range(0, rows + 1, block):
-        part = slice(first, first + block)
-        decay, share = acts.decay(np.hypot(x - at_x, y[part, None] - at_y)), down[part, None] * along
-        total += float((decay * share if acts.by_area else decay).sum())
-        largest = max(largest, float((decay if acts.by_area else decay / share).max()))
-    force, (dx, dy) = math.hypot(*acts.force), spacing(sheet)
-    return force * total / finer**2, force * largest / (dx * dy)
+        rows_of_block = slice(first, first + block)
+        decay = law.decay(np.hypot(x - at_x, y[rows_of_block, None] - at_y))
+        share = down[rows_of_block, None] * along
+        total += float((decay * share if law.by_area else decay).sum())
+        largest = max(largest, float((decay if law.by_area else decay / share).max()))
+    force, (dx, dy) = math.hypot(*law.force), spacing(sheet)
+    return force * total / refinement**2, force * largest / (dx * dy)
 
 
 class ProbeRecord(TypedDict, total=False):
-    """The forces of a probe."""
+    """The forces of a probe, as written to run.json."""
 
-    # Those of a load at 100 %, at the first place of the control point; a tool that is moved has none.
-    total_force: float  # sum over all points [N]
-    flat_end_force: float  # the part of a `total` that acts under the tool's flat end, on a wide sheet [N]
-    largest_pressure: float  # largest force on a point per area that belongs to it [Pa]
-    # Of a run, the force on the points that are not fixed at the frame at which it is greatest.
+    # At 100 % and at the first control point; missing for position-controlled tools.
+    total_force: float  # sum over all mass points [N]
+    flat_end_force: float  # part of a `total` that acts under the tool's flat end, on a wide sheet [N]
+    largest_pressure: float  # largest force on a mass point per area that belongs to it [Pa]
+    # Of a run, at the frame with the largest force on the mass points that are not fixed.
     greatest_force: float  # [N]
     greatest_force_vector: Sequence[float]  # x, y and z [N]
     greatest_force_time: float  # [s]
 
 
 def probe_records(scene: Scene) -> list[ProbeRecord]:
-    """Sum the forces of every probe of a scene; nothing of one that is moved."""
+    """Compute the forces of every probe of a scene; the record of a position-controlled tool is empty."""
     records: list[ProbeRecord] = []
     for probe in scene.probes:
         if probe.moved:
@@ -153,7 +182,7 @@ def probe_records(scene: Scene) -> list[ProbeRecord]:
 
 
 def describe_forces(record: ProbeRecord) -> str:
-    """Describe the forces of a probe in a line; empty if nothing is known of them."""
+    """Format the forces of a probe as one line, which is empty for an empty record."""
     if "total_force" not in record:
         known = "greatest_force" in record
         return f"at most {record['greatest_force']:.3g} N, at {record['greatest_force_time']:.3g} s" if known else ""
@@ -162,17 +191,24 @@ def describe_forces(record: ProbeRecord) -> str:
 
 
 def force_warnings(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str]:
-    """Note the probes of a checked scene whose forces do not add up to their total on this sheet."""
+    """Warn of probes whose forces on this sheet do not add up to their `total`.
+
+    Args:
+        scene: a valid scene.
+        records: the forces of its probes, from `probe_records`.
+    """
     across, down = spacing(scene.sheet)
     cell = f"a cell of {across:.3g} x {down:.3g} m"
     for index, (probe, record) in enumerate(zip(scene.probes, records, strict=True)):
         if probe.moved:
             continue
-        asked, reaching = math.hypot(*probe.total) if probe.total is not None else 0.0, record["total_force"]
-        if asked > 0 and reaching <= MIN_FORCE_RATIO * asked:
+        requested, applied = math.hypot(*probe.total) if probe.total is not None else 0.0, record["total_force"]
+        if requested > 0 and applied <= MIN_FORCE_RATIO * requested:
             yield (
-                f"probes.{index}: {reaching:.3g} N of its {asked:.3g} N reach the sheet; is the tool beside the sheet, "
-                f"wider than the sheet, or narrower than {cell}?"
+                f"probes.{index}: {applied:.3g} N of its {requested:.3g} N reach the sheet; is the tool beside "
+                f"the sheet, wider than the sheet, or narrower than {cell}?"
             )
-        elif asked > 0 and reaching * MIN_FORCE_RATIO >= asked:
-            yield f"probes.{index}: {reaching:.3g} N instead of its {asked:.3g} N, as the tool is narrower than {cell}"
+        elif requested > 0 and applied * MIN_FORCE_RATIO >= requested:
+            yield (
+                f"probes.{index}: {applied:.3g} N instead of its {requested:.3g} N, as the tool is narrower than {cell}"
+            )

@@ -1,7 +1,7 @@
-"""Tools that are moved: the rods that touch the sheet, where they are, and when they hold it. Scene: `probes`, `path`.
+"""Position-controlled tools: capsules that touch the sheet along paths, and their grips. Scene: `probes` with `path`.
 
-A rod is all that is within `radius` of its middle line, c(t) + s a with 0 <= s <= length, where c is the middle of its
-round tip and a the unit vector along its shaft.
+A capsule consists of all points within `radius` of its axis, c(t) + s a with 0 <= s <= length, where c is the centre of
+its round tip and a the unit vector along its shaft.
 """
 
 from __future__ import annotations
@@ -22,18 +22,17 @@ from taichi_msm.scene.section import WHOLE
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Probe
 
-# A tool may move by this share of its radius in a step, and be this much larger than the distance between points
-# before a note is made.
-MAX_STRIDE_RADII = MAX_SPACING_RADII = 0.5
+# Largest displacement of a tool in a step, in radii of the tool.
+MAX_STRIDE_RADII = 0.5
+
+# A larger spacing of the mass points, in radii of the tool, makes the contact force rough and issues a warning.
+MAX_SPACING_RADII = 0.5
 COARSE_TIP_PHRASE = "which touches few of them"
 
-# Advice is at most this many times as many points.
+# Remedies suggest at most this multiple of the number of mass points.
 MAX_REFINEMENT = 4
 
-# At how many moments it is looked whether two tools are in one place.
-MOMENTS = 1024
-
-# A tip holds the points within this many times its radius of its middle.
+# A grip holds the mass points within this distance of the tip's centre, in radii of the tip.
 GRIP_RADII = 1.5
 
 Array = NDArray[np.float64]
@@ -41,107 +40,155 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Tool:
-    """A probe with a path."""
+    """A position-controlled tool: a probe with a path."""
 
     probe: int  # index of the probe in the scene
-    times: Array  # of the keys [s], shape (n,)
-    tip_centres: Array  # of the round tip at those times, c [m], shape (n, 3)
-    heights: Array  # of the lowest point of the round tip [m], shape (n,)
-    axis: Array  # a, shape (3,)
-    length: float  # of the middle line [m]
-    radius: float  # [m]
+    times: Array  # of the keyframes [s], shape (n,)
+    tip_centres: Array  # c at the keyframes [m], shape (n, 3)
+    heights: Array  # z of the lowest point of the tip at the keyframes [m], shape (n,)
+    axis: Array  # unit vector a from the tip along the shaft, shape (3,)
+    length: float  # of the axis [m]
+    radius: float  # of tip and shaft [m]
     friction: float  # Coulomb's coefficient
-    grips: tuple[tuple[float, float], ...]  # from, to [s]
+    grips: tuple[tuple[float, float], ...]  # start and end of every grip [s]
 
     @property
     def path_length(self) -> float:
-        """How far the tool goes in all [m]."""
+        """Length of the whole path [m]."""
         return float(np.linalg.norm(np.diff(self.tip_centres, axis=0), axis=1).sum())
 
     def max_stride(self, step: float, first: int = 0) -> tuple[float, int]:
-        """Give how far the tool comes at most in a step from 0 s on [m], and the key that it goes to then.
+        """Find the largest displacement of the tool in a step.
 
-        Between the times where a key enters or leaves the step, how far it comes is a convex function.
+        The displacement is a convex function of the start of the step, as long as no keyframe enters or leaves the
+        step. It is therefore evaluated only where one does.
 
-        first: the key from which on its way counts.
+        Args:
+            step: duration of the step [s].
+            first: index of the keyframe from which on the path is considered.
+
+        Returns:
+            The displacement [m], and the index of the keyframe that ends its path segment.
         """
         begin = np.maximum([0.0, *self.times, *(self.times - step)], max(0.0, self.times[first] if first else 0.0))
-        far = np.linalg.norm(self.tip_centre(begin + step) - self.tip_centre(begin), axis=1)
-        most = int(far.argmax())
-        return float(far[most]), min(int(self.times.searchsorted(begin[most], "right")), len(self.times) - 1)
+        strides = np.linalg.norm(self.tip_centre(begin + step) - self.tip_centre(begin), axis=1)
+        longest = int(strides.argmax())
+        key = min(int(self.times.searchsorted(begin[longest], "right")), len(self.times) - 1)
+        return float(strides[longest]), key
 
     def tip_centre(self, t: Array) -> Array:
-        """Give the middle of the tip at times [s], linear between the keys and held outside, shape (times, 3)."""
+        """Return the tip's centre c [m] at times t [s], constant before the first and after the last key, (n, 3)."""
         return np.stack([np.interp(t, self.times, self.tip_centres[:, axis]) for axis in range(3)], axis=-1)
 
     def lowest_point(self, t: float) -> tuple[float, float, float]:
-        """Give the lowest point of the round tip at a time [s]; x, y and z [m]."""
+        """Return x, y and z of the lowest point of the tip at a time t [s], in metres."""
         x, y, z = (float(np.interp(t, self.times, each)) for each in (*self.tip_centres.T[:2], self.heights))
         return x, y, z
 
-    def touches(self, places: Array, t: float) -> bool:
-        """Tell whether any of these places [m], shape (n, 3), is in or, but for rounding, on the rod at a time [s]."""
-        r = places - self.tip_centre(np.array([t]))[0]
+    def touches(self, positions: Array, t: float) -> bool:
+        """Return whether any point lies inside the capsule or, up to rounding, on its surface.
+
+        Args:
+            positions: points [m], shape (n, 3).
+            t: the time [s].
+        """
+        r = positions - self.tip_centre(np.array([t]))[0]
         s = np.clip(r @ self.axis, 0, self.length)
         return bool((np.linalg.norm(r - s[:, None] * self.axis, axis=1) < self.radius * (1 + 1e-6)).any())
 
     def substep_times(self, begin: float, end: float) -> Array:
-        """Cut the way from one time to another into parts of at most LARGEST_STRIDE radii; the ends of these [s]."""
-        parts, most = 1, MAX_STRIDE_RADII * self.radius * (1 + 1e-9)
+        """Divide a time interval so that the tool moves by at most MAX_STRIDE_RADII radii in each subinterval.
+
+        Args:
+            begin: start of the interval [s].
+            end: end of the interval [s].
+
+        Returns:
+            Ends of the subintervals [s].
+        """
+        count, max_stride = 1, MAX_STRIDE_RADII * self.radius * (1 + 1e-9)
         while True:
-            times = np.linspace(begin, end, parts + 1)
+            times = np.linspace(begin, end, count + 1)
             longest = float(np.linalg.norm(np.diff(self.tip_centre(times), axis=0), axis=1).max())
-            if longest <= most:
+            if longest <= max_stride:
                 return times[1:]
-            parts = max(parts + 1, int(parts * longest / most))
+            count = max(count + 1, int(count * longest / max_stride))
 
 
 def build_tools(probes: Sequence[Probe], sheet: Sheet) -> tuple[Tool, ...]:
-    """List the probes that have a path."""
+    """Build the position-controlled tools of a scene.
+
+    Args:
+        probes: all probes of the scene.
+        sheet: the sheet; paths are fractions of its size.
+    """
     height, width = sheet.size
     tools = []
     for index, probe in enumerate(probes):
         if probe.path is None:
             continue
         assert probe.instrument is not None
-        rod, (time, across, down, lowest) = probe.instrument, np.array(probe.path, dtype=float).T
-        tip_centres = np.stack([(across - 0.5) * width, (0.5 - down) * height, lowest + rod.radius], axis=1)
-        shape = unit_vector(rod.shaft), rod.length, rod.radius
-        tools.append(Tool(index, time, tip_centres, lowest, *shape, probe.friction, probe.grip))
+        instrument, (time, across, down, heights) = probe.instrument, np.array(probe.path, dtype=float).T
+        tip_centres = np.stack([(across - 0.5) * width, (0.5 - down) * height, heights + instrument.radius], axis=1)
+        shape = unit_vector(instrument.shaft), instrument.length, instrument.radius
+        tools.append(Tool(index, time, tip_centres, heights, *shape, probe.friction, probe.grip))
     return tuple(tools)
 
 
 def unit_vector(shaft: Sequence[float]) -> Array:
-    """Give a direction the length 1; the largest number is divided by first, so that no square overflows."""
+    """Normalise a vector."""
+    # Division by the largest component first, so that no square overflows.
     axis = np.array(shaft) / max(map(abs, shaft))
     return np.asarray(axis / np.linalg.norm(axis))
 
 
 def grip_frames(grip: tuple[float, float], rate: float) -> range:
-    """List the frames at rest that a grip holds: from the first at or after its begin to before that of its end."""
-    # But for rounding.
+    """Return the frames of a quasi-static scene at which a grip holds.
+
+    Args:
+        grip: its start and end [s].
+        rate: frames per second [1/s].
+
+    Returns:
+        The frames at or after the start, up to rounding, and before the end.
+    """
     begin, end = (max(0, math.ceil(time * rate - WHOLE)) for time in grip)
     return range(begin, end)
 
 
 def path_problems(scene: Scene, tools: Sequence[Tool], grid: TimeGrid) -> Iterator[Problem]:
-    """Find tools that are in the sheet from the start, and such that move too far in a step."""
+    """Check for tools inside the sheet at the start, for tools too fast for the step, and for quasi-static friction.
+
+    Args:
+        scene: the scene.
+        tools: its position-controlled tools.
+        grid: its time grid.
+    """
     for tool in tools:
-        where = ("probes", tool.probe, "path")
-        depth = tool.radius - _distance(tool, scene.sheet)
+        key = ("probes", tool.probe, "path")
+        depth = tool.radius - _distance_to_sheet(tool, scene.sheet)
         if depth > 1e-9 * tool.radius:
-            said = f"the instrument is {depth:.3g} m in the sheet at rest at 0 s; begin above it, at a greater height"
-            yield Problem(where, said)
+            text = f"the instrument is {depth:.3g} m in the sheet at rest at 0 s; begin above it, at a greater height"
+            yield Problem(key, text)
         if scene.time.at_rest:
             if tool.friction > 0:
-                said = f"{tool.friction:g} needs time.motion: dynamic, as at rest nothing slides; remove friction"
-                yield Problem(("probes", tool.probe, "friction"), said)
+                text = f"{tool.friction:g} needs time.motion: dynamic, as at rest nothing slides; remove friction"
+                yield Problem(("probes", tool.probe, "friction"), text)
         elif fault := too_fast(tool, grid):
-            yield Problem((*where, fault[0]), fault[1])
+            yield Problem((*key, fault[0]), fault[1])
 
 
 def too_fast(tool: Tool, grid: TimeGrid, first: int = 0) -> tuple[int, str] | None:
-    """Find the key after the `first` to which a tool moves too far in a step, and say so; None: there is none."""
+    """Check the speed of a tool against the time step.
+
+    Args:
+        tool: the tool.
+        grid: the time grid.
+        first: index of the keyframe from which on the path is considered.
+
+    Returns:
+        The index of the keyframe that ends the fastest path segment, and a message; None if the tool is slow enough.
+    """
     stride, key = tool.max_stride(grid.step, first)
     if stride <= MAX_STRIDE_RADII * tool.radius * (1 + 1e-9):
         return None
@@ -152,23 +199,37 @@ def too_fast(tool: Tool, grid: TimeGrid, first: int = 0) -> tuple[int, str] | No
 
 
 def min_steps_per_frame(tools: Sequence[Tool], grid: TimeGrid, least: int) -> int:
-    """Count the fewest steps of a frame, `least` or more, in which no tool moves too far."""
+    """Compute the fewest steps of a frame with which no tool is too fast.
 
-    def times_too_far(tool: Tool) -> float:
+    Args:
+        tools: the position-controlled tools.
+        grid: the time grid; only its frame rate counts.
+        least: lower bound of the result.
+    """
+
+    def speed_ratio(tool: Tool) -> float:
         return tool.max_stride(1 / grid.frames_per_second / least)[0] / (MAX_STRIDE_RADII * tool.radius)
 
-    # In a step of 1 / n it moves at least 1 / n as far.
-    while (most := max(map(times_too_far, tools), default=0.0)) > 1 + 1e-9:
-        least = max(least + 1, math.ceil(least * most * (1 - 1e-9)))
+    # With n times as many steps, the largest displacement in a step is at least 1 / n of the former one.
+    while (ratio := max(map(speed_ratio, tools), default=0.0)) > 1 + 1e-9:
+        least = max(least + 1, math.ceil(least * ratio * (1 - 1e-9)))
     return least
 
 
 def path_warnings(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:
-    """Note the tools that are too thin for the points, and two that are in one place."""
-    apart, side, end = max(spacing(scene.sheet)), max(scene.sheet.size), scene.time.duration
+    """Warn of implausible paths and grips, of tools too thin for the mesh, and of tools that intersect.
+
+    Args:
+        scene: the scene.
+        tools: its position-controlled tools.
+    """
+    spacing_max, side, end = max(spacing(scene.sheet)), max(scene.sheet.size), scene.time.duration
     for tool in tools:
-        if (far := float(np.abs(tool.heights).max())) > side:
-            yield f"probes.{tool.probe}.path: a height of {far:g} m beside a sheet of {side:g} m; heights are in metres"
+        if (height_max := float(np.abs(tool.heights).max())) > side:
+            yield (
+                f"probes.{tool.probe}.path: a height of {height_max:g} m beside a sheet of {side:g} m; "
+                "heights are in metres"
+            )
         if tool.times[-1] > end * (1 + 1e-9):
             yield f"probes.{tool.probe}.path ends at {tool.times[-1]:g} s, after the end of the scene at {end:g} s"
         for begin, until in tool.grips:
@@ -176,65 +237,72 @@ def path_warnings(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:
                 yield f"probes.{tool.probe}.grip begins at {begin:g} s, not before the end of the scene at {end:g} s"
             elif scene.time.at_rest and not grip_frames((begin, until), scene.time.frames_per_second):
                 yield f"probes.{tool.probe}.grip from {begin:g} to {until:g} s holds nothing: no frame is between them"
-        if apart > MAX_SPACING_RADII * tool.radius:
-            (height, width), most = scene.sheet.size, MAX_SPACING_RADII * tool.radius
-            points = [int(np.ceil(side / most)) + 1 for side in (height, width)]
-            few = math.prod(points) <= MAX_REFINEMENT * math.prod(scene.sheet.points)
-            remedy = f"try sheet.points: {points}" if few else "take a wider tip"
+        if spacing_max > MAX_SPACING_RADII * tool.radius:
+            points = [int(np.ceil(length / (MAX_SPACING_RADII * tool.radius))) + 1 for length in scene.sheet.size]
+            affordable = math.prod(points) <= MAX_REFINEMENT * math.prod(scene.sheet.points)
+            remedy = f"try sheet.points: {points}" if affordable else "take a wider tip"
             yield (
-                f"probes.{tool.probe}: the points are {apart:.3g} m apart, more than half the radius of the "
+                f"probes.{tool.probe}: the points are {spacing_max:.3g} m apart, more than half the radius of the "
                 f"instrument, {tool.radius:.3g} m, {COARSE_TIP_PHRASE}; {remedy}"
             )
 
-    if (where := overlap(tools, scene.time.duration)) is not None:
-        one, other, time = where
+    if (intersection := overlap(tools, scene.time.duration)) is not None:
+        first, second, time = intersection
         yield (
-            f"probes.{one} and probes.{other}: their instruments run through each other at {time:.3g} s, so that the "
-            "sheet cannot be outside both; keep them apart"
+            f"probes.{first} and probes.{second}: their instruments run through each other at {time:.3g} s, so that "
+            "the sheet cannot be outside both; keep them apart"
         )
 
 
 def overlap(tools: Sequence[Tool], duration: float) -> tuple[int, int, float] | None:
-    """Find two tools that run through each other: the indices of their probes, and when first [s]."""
-    times = np.linspace(0, duration, MOMENTS + 1)
-    for one, other in combinations(tools, 2):
-        apart = _apart(one, other, one.tip_centre(times) - other.tip_centre(times))
-        within = np.flatnonzero(apart < (1 - 1e-9) * (one.radius + other.radius))
-        if within.size:
-            return one.probe, other.probe, float(times[within[0]])
+    """Find two tools that intersect, at 1025 equidistant times.
+
+    Args:
+        tools: the position-controlled tools.
+        duration: of the scene [s].
+
+    Returns:
+        The indices of their probes, and the first time [s]; None if no tools intersect.
+    """
+    times = np.linspace(0, duration, 1025)
+    for a, b in combinations(tools, 2):
+        distance = _axis_distance(a, b, a.tip_centre(times) - b.tip_centre(times))
+        intersecting = np.flatnonzero(distance < (1 - 1e-9) * (a.radius + b.radius))
+        if intersecting.size:
+            return a.probe, b.probe, float(times[intersecting[0]])
     return None
 
 
-def _apart(one: Tool, other: Tool, between: Array) -> Array:
-    """Give the distance of two middle lines [m], shape (n,); between: the one's tip minus the other's, shape (n, 3)."""
+def _axis_distance(a: Tool, b: Tool, offset: Array) -> Array:
+    """Return the distance of the axes of two tools [m], shape (n,); offset: tip of a minus tip of b, shape (n, 3)."""
 
-    def from_end(way: Array, axis: Array, length: float) -> Array:
-        return np.asarray(np.linalg.norm(way - np.clip(way @ axis, 0, length)[:, None] * axis, axis=1))
+    def from_end(offset: Array, axis: Array, length: float) -> Array:
+        return np.asarray(np.linalg.norm(offset - np.clip(offset @ axis, 0, length)[:, None] * axis, axis=1))
 
-    # From an end of either to anywhere on the other.
-    apart = np.minimum(
-        np.minimum(*(from_end(between + s * one.axis, other.axis, other.length) for s in (0, one.length))),
-        np.minimum(*(from_end(s * other.axis - between, one.axis, one.length) for s in (0, other.length))),
+    # From an end of either axis to any point of the other.
+    distance = np.minimum(
+        np.minimum(*(from_end(offset + s * a.axis, b.axis, b.length) for s in (0, a.length))),
+        np.minimum(*(from_end(s * b.axis - offset, a.axis, a.length) for s in (0, b.length))),
     )
-    # Or where both are nearest if they had no ends, |between + s a - t b| least.
-    across = np.cross(one.axis, other.axis)
-    if (square := float(across @ across)) > 1e-12:
-        cosine, along, there = one.axis @ other.axis, between @ one.axis, between @ other.axis
-        s, t = (cosine * there - along) / square, (there - cosine * along) / square
-        inside = (s >= 0) & (s <= one.length) & (t >= 0) & (t <= other.length)
-        apart = np.where(inside, np.minimum(apart, abs(between @ across) / math.sqrt(square)), apart)
-    return apart
+    # Between the nearest points of both infinite lines, which minimise |offset + s a - t b|, if the axes contain them.
+    normal = np.cross(a.axis, b.axis)
+    if (square := float(normal @ normal)) > 1e-12:
+        cosine, along_a, along_b = a.axis @ b.axis, offset @ a.axis, offset @ b.axis
+        s, t = (cosine * along_b - along_a) / square, (along_b - cosine * along_a) / square
+        inside = (s >= 0) & (s <= a.length) & (t >= 0) & (t <= b.length)
+        distance = np.where(inside, np.minimum(distance, abs(offset @ normal) / math.sqrt(square)), distance)
+    return distance
 
 
-def _distance(tool: Tool, sheet: Sheet) -> float:
-    """Give the distance of the middle line at 0 s from the sheet at rest [m]."""
+def _distance_to_sheet(tool: Tool, sheet: Sheet) -> float:
+    """Return the distance of a tool's axis at 0 s from the sheet at rest [m]."""
     start, half = tool.tip_centre(np.zeros(1))[0], np.array([sheet.size[1] / 2, sheet.size[0] / 2, 0.0])
 
     def distance(s: float) -> float:
-        place = start + s * tool.axis
-        return float(np.linalg.norm(place - np.clip(place, -half, half)))
+        point = start + s * tool.axis
+        return float(np.linalg.norm(point - np.clip(point, -half, half)))
 
-    # It is a convex function of s.
+    # Ternary search, because the distance is a convex function of s.
     low, high = 0.0, tool.length
     for _ in range(200):
         left, right = low + (high - low) / 3, high - (high - low) / 3

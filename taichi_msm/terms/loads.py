@@ -155,7 +155,7 @@ def decay_parameters(plan: Plan) -> list[tuple[object, ...]]:
 def max_free_acceleration(plan: Plan) -> float:
     """Bound the acceleration that the probes give to a free point [m/s^2]."""
     forces = (
-        probe_force(probe, plan.scene.sheet).size * max(abs(percent) for _, percent in probe.load) / 100
+        probe_force(probe, plan.scene.sheet).max_force * max(abs(percent) for _, percent in probe.load) / 100
         for probe in plan.scene.probes
         if not probe.moved
     )
