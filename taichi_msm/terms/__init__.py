@@ -1,6 +1,6 @@
-"""The terms of the model, a file each: what its keys mean, its force, its energy and its bound of the step.
+"""The terms of the model, one per file: coefficients, force, energy, tangent and bound of the stable step.
 
-docs/architecture.md tells how to add one.
+docs/architecture.md describes how to add a term.
 """
 
 from __future__ import annotations
@@ -23,39 +23,52 @@ from taichi_msm.terms.foundation import FoundationTerm
 from taichi_msm.terms.loads import ProbeTerm
 from taichi_msm.terms.springs import SpringTerm
 
-# All terms. What they contribute is added up in this order, on which the last bits depend.
+# All terms, in the order of summation, on which the last bits of results depend.
 TERMS: tuple[type[Term], ...] = (SpringTerm, FoundationTerm, DampingTerm, BendingTerm, ProbeTerm, ContactTerm)
 
 
 def derive_material(scene: Scene, maps: Maps) -> Material:
-    """Derive the material."""
+    """Derive the coefficients of the sheet of a scene.
+
+    Args:
+        scene: a scene without `material_key_problems`.
+        maps: images of its readable stiffness maps, by key.
+    """
     (dx, dy), mass = spacing(scene.sheet), scene.sheet.mass
-    there = {name: (one, maps[name], scene.sheet) for name, one in scene.maps.items() if name in maps}
+    readable = {key: (keys, maps[key], scene.sheet) for key, keys in scene.maps.items() if key in maps}
     if scene.tissue is not None:
         mass = (scene.tissue.density or 0.0) * scene.tissue.thickness * (dx * dy)
     if scene.time.at_rest:
-        mass = 1.0  # Any will do.
+        mass = 1.0  # Static equilibrium does not depend on it.
     assert mass is not None
     derived: dict[str, Any] = {name: value for term in TERMS for name, value in term.derive(scene).items()}
     return Material(
         mass=mass,
         by_area=scene.tissue is not None,
-        factors=cell_factors(*there["map"]) if "map" in there else None,
-        virtual_factors=point_factors(*there["foundation_map"]) if "foundation_map" in there else None,
+        factors=cell_factors(*readable["map"]) if "map" in readable else None,
+        virtual_factors=point_factors(*readable["foundation_map"]) if "foundation_map" in readable else None,
         **derived,
     )
 
 
 def build_terms(plan: Plan) -> tuple[Term, ...]:
-    """List the terms that a scene has."""
+    """Build the terms of a scene."""
     return tuple(term for kind in TERMS if (term := kind.from_plan(plan)) is not None)
 
 
 def fictitious_masses(plan: Plan) -> NDArray[np.float64]:
-    """Give every point a mass with which no frequency is above 1 [N/m]: so much stiffness it feels, (rows, cols)."""
+    """Compute masses with which no angular frequency of the sheet exceeds 1 [N/m], shape (rows, cols)."""
     return np.sum([np.broadcast_to(term.node_stiffness_bounds(plan), plan.fixed.shape) for term in TERMS], axis=0)
 
 
 def highest_frequency(material: Material, sheet: Sheet) -> float:
-    """Bound the highest angular frequency of the sheet [rad/s] in any shape without springs below half their length."""
+    """Bound the highest angular frequency of the sheet, as long as no spring is shorter than half its rest length.
+
+    Args:
+        material: coefficients of the sheet.
+        sheet: the sheet.
+
+    Returns:
+        The bound [rad/s].
+    """
     return math.sqrt(sum(term.stiffness_bound(material, sheet) for term in TERMS) / material.mass)

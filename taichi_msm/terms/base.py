@@ -1,4 +1,4 @@
-"""What a term of the model is, and what a kernel tells a term's functions about a sheet."""
+"""The interface of a term of the model, the compile-time configuration of kernels, and their views of a sheet."""
 
 from __future__ import annotations
 
@@ -17,96 +17,122 @@ from taichi_msm.model.sheet import Material
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 
-# Rows of the array by_column. MOVES and AREA have three each, for a first, a middle and a last row of the sheet.
+# Rows of the array by_column. MOBILITY and AREA_SHARE have three each: for the first, a middle and the last row.
 MOBILITY, AREA_SHARE, REST_X, HAS_LEFT, HAS_RIGHT, COLUMN_ROWS = 0, 3, 6, 7, 8, 9
 
-# The first numbers of a sheet: dx, dy, and y of the first row. Those of its terms follow.
+# Constants of a sheet: dx, dy and y of the first row [m], followed by those of its terms.
 DX, DY, TOP_Y, GEOMETRY = range(4)
 
-# The first column of the table of loads: what a force of 1 N adds to the last difference [m]. Those of terms follow.
+# The first column of the load table, the gain: change of the last difference per force [m/N]; those of terms follow.
 GAIN, STEP_COLUMNS = 0, 1
 
-# The first measure of a row: the sum of |d|^2 times the share of mass. Those of terms follow.
+# The first measure of a row: the sum of |d|^2 times the share of mass, followed by those of its terms.
 SQUARED_MOTION, STEP_MEASURES = 0, 1
 
 
 class Term(ABC):
-    """A term of the model as kernels are compiled for it: a frozen dataclass, without the numbers of a sheet.
+    """A term of the model, as a frozen dataclass of its compile-time configuration, without coefficients.
 
-    The kernels know by name the terms that act between points, springs and bending; others need only the functions
-    here.
+    The kernels refer by name to the terms that act between mass points, springs and bending. All other terms are used
+    through this interface only.
     """
 
-    reach: ClassVar[int] = 0  # how many rows away a point may be that the force depends on
-    constant_count: ClassVar[int] = 0  # how many of the sheet's numbers belong to the term
-    reductions: ClassVar[tuple[str, ...]] = ()  # how each of its measures becomes one of a row: "min", "max" or "sum"
+    reach: ClassVar[int] = 0  # number of neighbouring rows on either side on which the force depends
+    constant_count: ClassVar[int] = 0  # number of the sheet's constants that belong to the term
+    reductions: ClassVar[tuple[str, ...]] = ()  # reduction of each measure over a row: "min", "max" or "sum"
 
     @classmethod
     @abstractmethod
     def from_plan(cls, plan: Plan) -> Self | None:
-        """Choose what is compiled for a scene; None if it does not have the term."""
+        """Return the configuration of the term for a plan; None if the scene does not have the term."""
 
     @staticmethod
     def derive(scene: Scene) -> dict[str, Any]:
-        """Derive the attributes of `Material` that the term's keys of a scene stand for."""
+        """Derive the term's attributes of `Material`, by name, from its keys of a scene."""
         return {}
 
     @staticmethod
     def stiffness_bound(material: Material, sheet: Sheet) -> float:
-        """Bound the part of m w^2 that the term has in any motion [N/m]."""
+        """Bound the term's contribution to m w^2, for the angular frequency w of any mode.
+
+        Args:
+            material: coefficients of the sheet.
+            sheet: the sheet.
+
+        Returns:
+            The bound [N/m].
+        """
         return 0.0
 
     @classmethod
     def node_stiffness_bounds(cls, plan: Plan) -> NDArray[Any] | float:
-        """Bound the stiffness that each point feels, as `bound` does; shape (rows, cols), or one for all [N/m]."""
+        """Bound the term's stiffness at each mass point [N/m], shape (rows, cols), or by one number for all."""
         return cls.stiffness_bound(plan.material, plan.scene.sheet)
 
     def constants(self, plan: Plan) -> tuple[float, ...]:
-        """Give its numbers."""
+        """Return the term's constants, `constant_count` numbers."""
         return ()
 
     @property
     def column_count(self) -> int:
-        """How many columns of the table of loads belong to the term."""
+        """Number of columns of the load table that belong to the term."""
         return 0
 
     @property
     def field_count(self) -> int:
-        """How many fields belong to the term."""
+        """Number of fields that belong to the term."""
         return 0
 
     def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
-        """Give its columns of the table of loads, from step `first` on, shape (steps, column_count)."""
+        """Compute the term's columns of the load table.
+
+        Args:
+            plan: the plan.
+            loads: loads of consecutive steps.
+            first: number of the first step.
+
+        Returns:
+            Columns, shape (steps, column_count).
+        """
         return np.empty((len(loads.active), 0))
 
     def fields(self, plan: Plan) -> NDArray[Any]:
-        """Give its fields at the start, a number for every point each, shape (field_count, rows, cols)."""
+        """Return the initial values of the term's fields, shape (field_count, rows, cols)."""
         return np.empty((0, *plan.scene.sheet.points))
 
     def energy(self, sums: NDArray[Any], plan: Plan) -> float:
-        """Give twice its energy [J], from its measures summed up."""
+        """Compute twice the term's energy.
+
+        Args:
+            sums: the term's measures, reduced over the sheet, shape (measures,).
+            plan: the plan.
+
+        Returns:
+            Twice the energy [J].
+        """
         return 0.0
 
     def build_forces(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
-        """Make Taichi's functions add(force, sheet, entry, now) that add to the force on a point, a list of x, y and z.
+        """Build Taichi functions add(force, sheet, entry, now), which add the term's force on an entry.
 
-        `now` is the row of the table of loads, a list of variables.
+        In them `force` is a list of x, y and z, `sheet` a `KernelSheet`, `entry` an `Entry` and `now` a row of the load
+        table as a list of variables.
         """
         return ()
 
     def build_tangents(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
-        """Make Taichi's functions add(force, sheet, entry, now) that add the change of the force on a point.
+        """Build Taichi functions add(force, sheet, entry, now), which add the linearised change of the force.
 
-        Entry and sheet hold the change of the displacements in the place of displacements.
+        In them `entry` and `sheet` contain changes of displacements instead of displacements.
         """
         return ()
 
     def build_damping(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
-        """Make Taichi's functions reduce(d, sheet) that change the last difference of a point, a list of x, y and z."""
+        """Build Taichi functions reduce(d, sheet), which scale the last difference d of an entry, a list of 3."""
         return ()
 
     def build_measures(self, config: KernelConfig) -> Sequence[Callable[..., None]]:
-        """Make Taichi's functions measure(measures, sheet, p, i, kind, b) for entry b of row i, which is row p of u."""
+        """Build Taichi functions measure(measures, sheet, p, i, kind, b) for entry b of row i, stored in row p of u."""
         return ()
 
 
@@ -115,64 +141,64 @@ AnyTerm = TypeVar("AnyTerm", bound=Term)
 
 @dataclass(frozen=True)
 class KernelConfig:
-    """What the kernels of a sheet are compiled for; everything else is an argument."""
+    """Compile-time configuration of the kernels of a sheet; everything else is an argument of a kernel."""
 
     precision: str  # f32 or f64
-    lanes: int  # of a vector; columns are cut into as many strips
-    by_area: bool  # whether points at an open edge have less mass than others, because they belong to fewer cells
-    terms: tuple[Term, ...]  # those that the scene has, always with springs and probes; in the order of `terms.TERMS`
+    lanes: int  # of a vector, equal to the number of strips of columns
+    by_area: bool  # whether mass points at an open edge are lighter, because they belong to fewer cells
+    terms: tuple[Term, ...]  # terms of the scene in the order of `terms.TERMS`, always with springs and probes
 
     @property
     def reach(self) -> int:
-        """How many rows on either side of a band its steps depend on."""
+        """Number of rows on either side of a band on which its steps depend."""
         return max(term.reach for term in self.terms)
 
     @property
     def ti(self) -> Any:
-        """Taichi; terms import it only here, because `check` needs their bounds without a compiler."""
+        """The module of Taichi, imported lazily, because `check` needs the terms without a compiler."""
         from taichi_msm.system.runtime import ti
 
         return ti
 
     @property
     def real(self) -> Any:
-        """Taichi's type of a number."""
+        """Taichi type of a number."""
         return getattr(self.ti, self.precision)
 
     @property
     def vector(self) -> Any:
-        """Taichi's type of a vector of lanes."""
+        """Taichi type of a vector of lanes."""
         return self.ti.types.vector(self.lanes, self.real)
 
     @property
     def vectors(self) -> Any:
-        """Taichi's type of an array of vectors."""
+        """Taichi type of an array of vectors."""
         return self.ti.types.ndarray(dtype=self.vector, ndim=1)
 
     def get(self, kind: type[AnyTerm]) -> AnyTerm | None:
-        """Give the term of a kind; None if there is none."""
+        """Return the term of a class; None if the scene does not have it."""
         return next((term for term in self.terms if isinstance(term, kind)), None)
 
     def require(self, kind: type[AnyTerm]) -> AnyTerm:
-        """Give the term of a kind that every scene has."""
+        """Return the term of a class that every scene has."""
         term = self.get(kind)
         assert term is not None, kind
         return term
 
     def first_constant(self, kind: type[Term] | None) -> int:
-        """Give the index of the first number of a term; None: how many numbers there are."""
+        """Return the index of a term's first constant; with None, the number of constants."""
         return GEOMETRY + sum(term.constant_count for term in self._before(kind))
 
     def first_column(self, kind: type[Term] | None) -> int:
-        """Give the first column of a term in the table of loads; None: how many columns there are."""
+        """Return the index of a term's first column of the load table; with None, the number of columns."""
         return STEP_COLUMNS + sum(term.column_count for term in self._before(kind))
 
     def first_field(self, kind: type[Term] | None) -> int:
-        """Give the index of the first field of a term; None: how many fields there are."""
+        """Return the index of a term's first field; with None, the number of fields."""
         return sum(term.field_count for term in self._before(kind))
 
     def first_measure(self, kind: type[Term] | None) -> int:
-        """Give the index of the first measure of a term; None: how many measures there are."""
+        """Return the index of a term's first measure; with None, the number of measures."""
         return STEP_MEASURES + sum(len(term.reductions) for term in self._before(kind))
 
     def _before(self, kind: type[Term] | None) -> tuple[Term, ...]:
@@ -181,34 +207,33 @@ class KernelConfig:
 
 
 class KernelSheet(NamedTuple):
-    """A sheet within a kernel; its arrays are those of `kernel`."""
+    """A sheet within a kernel; `solver.arrays` describes the arrays."""
 
-    # u, d: displacements, with bending also moments, and last differences; three arrays each, for x, y and z
+    # u, d: displacements, with bending also moments, and last differences, each as three arrays for x, y and z
     u: Any
     d: Any
-    # by_column, stiffness, fields: one array each
     by_column: Any
     stiffness: Any
     fields: Any
-    constants: Any  # of the sheet and of its terms, a list of variables
-    rows: Any  # of points
-    width: Any  # entries of a row
+    constants: Any  # of the sheet and its terms, as a list of variables
+    rows: Any  # number of rows of mass points
+    width: Any  # number of entries of a row
 
 
 class KernelRow(NamedTuple):
     """A row of the sheet within a kernel."""
 
-    i: Any  # its number
-    kind: Any  # 0 for the first row of the sheet, 2 for the last, else 1
-    # before, at, after: with bending, rows of u with the moments of the row before, of row i and of the row after
+    i: Any  # index of the row
+    kind: Any  # 0 for the first row of the sheet, 2 for the last, 1 for all others
+    # before, at, after: with bending, rows of u with the moments of the previous row, of row i and of the next row
     before: Any
     at: Any
     after: Any
 
 
 class Entry(NamedTuple):
-    """An entry b of a row within a kernel, which is a point in each lane; u: its displacement, a list of x, y and z."""
+    """An entry of a row within a kernel: one mass point in each lane."""
 
     row: KernelRow
-    b: Any
-    u: Any
+    b: Any  # index of the entry in its row
+    u: Any  # displacement, a list of x, y and z

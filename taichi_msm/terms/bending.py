@@ -1,7 +1,7 @@
-"""Bending: the resistance of a plate, which keeps the sheet smooth. Scene: `tissue.bending`.
+"""Bending: the stiffness of a plate. Scene: `tissue.bending`.
 
-The energy is D / 2 times the integral of the Laplacian of u squared. With the moment M = D dx dy Laplacian(u), which is
-0 at edges, where the sheet may turn, the force on a point is -Laplacian(M).
+The energy is D / 2 times the integral of the squared Laplacian of u. With the moment M = D dx dy Laplacian(u), which is
+0 at the simply supported edges, the force on a mass point is -Laplacian(M).
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -19,56 +19,53 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.terms.base import DX, DY, HAS_LEFT, HAS_RIGHT, KernelConfig, Term
 
-# Poisson's ratio of a lattice of springs between nearest and diagonal neighbours.
-POISSON = 1 / 3
-
 
 @dataclass(frozen=True)
 class BendingTerm(Term):
-    """Bending. Moments are stored a row ahead of the points that are stepped, in rows of u."""
+    """Bending. Moments are stored in rows of u, one row ahead of the row that is stepped."""
 
-    # The moments of the neighbours, and what these depend on.
+    # The force depends on the moments of neighbours, which depend on one row more.
     reach: ClassVar[int] = 2
     constant_count: ClassVar[int] = 1
-    # The sum of the squares of the Laplacian.
+    # The sum of the squared Laplacian.
     reductions: ClassVar[tuple[str, ...]] = ("sum",)
 
     @staticmethod
     def derive(scene: Scene) -> dict[str, Any]:
-        """Give D dx dy; `plate` is E t^3 / 12 (1 - nu^2)."""
+        """Derive D dx dy [N m3]; for `plate`, D = E t^3 / (12 (1 - nu^2)) with nu = 1/3, as in `terms.springs`."""
         tissue, (dx, dy) = scene.tissue, spacing(scene.sheet)
         if tissue is None:
             return {"bending": 0.0}
-        plate = tissue.young * tissue.thickness**3 / (12 * (1 - POISSON**2))
+        plate = tissue.young * tissue.thickness**3 / (12 * (1 - (1 / 3) ** 2))
         return {"bending": (plate if tissue.bending == "plate" else tissue.bending) * (dx * dy)}
 
     @classmethod
     def from_plan(cls, plan: Plan) -> Self | None:
-        """Leave it out if it is 0."""
+        """Return the term's configuration; None without bending stiffness."""
         return cls() if plan.material.bending > 0 else None
 
     @staticmethod
     def stiffness_bound(material: Material, sheet: Sheet) -> float:
-        """Bound the part of m w^2 by the square of the largest Laplacian, (4 / dx^2 + 4 / dy^2)^2 D dx dy [N/m]."""
+        """Return (4 / dx^2 + 4 / dy^2)^2 D dx dy [N/m], from the largest eigenvalue of the discrete Laplacian."""
         dx, dy = spacing(sheet)
         return material.bending * (4 / dx**2 + 4 / dy**2) ** 2
 
     def constants(self, plan: Plan) -> tuple[float, ...]:
-        """Give D dx dy [N m3]."""
+        """Return D dx dy [N m3]."""
         return (plan.material.bending,)
 
     def energy(self, sums: NDArray[Any], plan: Plan) -> float:
-        """Give twice the energy [J]."""
+        """Compute twice the energy [J]."""
         return plan.material.bending * float(sums[0])
 
     def build_store_moment(self, config: KernelConfig) -> Callable[..., None]:
-        """Make the function that stores the moment of an entry."""
+        """Build the function that stores the moment of an entry."""
         ti = config.ti
         vector, number, laplacian = config.vector, config.first_constant(BendingTerm), build_laplacian(config)
 
         @ti.func
         def store_moment(sheet: ti.template(), i, before, row, after, b, target):
-            """Store the moment of entry b of row i, whose displacement is in `row`, in row `target` of u."""
+            """Store the moment of entry b of row i in row `target` of u; `row` is the row of its displacement."""
             dx, dy, stiffness = sheet.constants[DX], sheet.constants[DY], sheet.constants[number]
             across, down = stiffness / (dx * dx), stiffness / (dy * dy)
             for c in ti.static(range(3)):
@@ -82,7 +79,7 @@ class BendingTerm(Term):
         return store_moment
 
     def build_forces(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
-        """Make the function that adds the force on an entry."""
+        """Build the function that adds -Laplacian(M)."""
         ti = config.ti
         laplacian = build_laplacian(config)
 
@@ -100,11 +97,11 @@ class BendingTerm(Term):
         return (add,)
 
     def build_tangents(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
-        """Make the function that adds the change of the force, which is linear in the displacements."""
+        """Return `build_forces`, because the force is linear in the displacements."""
         return self.build_forces(config)
 
     def build_measures(self, config: KernelConfig) -> Sequence[Callable[..., None]]:
-        """Make the function that adds up the square of the Laplacian, which is 0 at edges."""
+        """Build the function that sums the squared Laplacian, which is 0 at edges."""
         ti = config.ti
         real, vector, first, laplacian = (
             config.real,
@@ -117,7 +114,7 @@ class BendingTerm(Term):
         def measure(measures: ti.template(), sheet: ti.template(), p, _i, kind, b):
             inside = sheet.by_column[HAS_LEFT * sheet.width + b] * sheet.by_column[HAS_RIGHT * sheet.width + b]
             inside *= ti.cast(kind == 1, real)
-            # Only an inner row has both a row before it and one after it.
+            # The first and the last row have no neighbour on one side.
             before, after = p - ti.cast(kind == 1, ti.i32), p + ti.cast(kind == 1, ti.i32)
             across, down = (
                 1 / (sheet.constants[DX] * sheet.constants[DX]),
@@ -133,15 +130,15 @@ class BendingTerm(Term):
 
 
 def build_laplacian(config: KernelConfig) -> Callable[..., Any]:
-    """Make the function that gives the five-point Laplacian of an array."""
+    """Build the function that computes the five-point Laplacian of an array."""
     ti = config.ti
 
     @ti.func
     def laplacian(field: ti.template(), width, before, row, after, b, across, down):
-        """Laplacian at entry b of a row, between rows before and after; across: 1/dx^2, down: 1/dy^2."""
-        here = field[row * width + b]
-        beside = (field[row * width + b - 1] - here) + (field[row * width + b + 1] - here)
-        over = (field[before * width + b] - here) + (field[after * width + b] - here)
-        return across * beside + down * over
+        """Return the Laplacian at entry b of a row, between rows before and after; across: 1/dx^2, down: 1/dy^2."""
+        centre = field[row * width + b]
+        horizontal = (field[row * width + b - 1] - centre) + (field[row * width + b + 1] - centre)
+        vertical = (field[before * width + b] - centre) + (field[after * width + b] - centre)
+        return across * horizontal + down * vertical
 
     return laplacian

@@ -1,15 +1,16 @@
-"""Contact, friction and grips: the tools that are moved, which no point may be in. Scene: `probes` with `path`.
+"""Contact, friction and grips of position-controlled tools. Scene: `probes` with `path`.
 
-After each step, the points that neither are fixed nor are held are pushed out of the rods, in the order of the probes.
-u is what the step gives, c the middle of a rod's tip and a its axis:
+After each step, mass points that are neither fixed nor held are projected out of the tools' capsules, in the order of
+the probes. With the displacement u after the step, the centre c of a capsule's tip and its axis a, the correction is
 
     r = X + u - c,   s = clamp(r . a, 0, length),   r' = r - s a,   n = r' / |r'|  (+z if r' = 0)
-    where |r'| < radius:   push = (radius - |r'|) n
-    with friction mu:      w = the part of (u + push - u_before) - (c - c_before) that is perpendicular to n
-                           push = push - w min(1, mu (radius - |r'|) / |w|)
+    where |r'| < radius:   correction = (radius - |r'|) n
+    with friction mu:      w = the part of (u + correction - u_before) - (c - c_before) perpendicular to n
+                           correction -= w min(1, mu (radius - |r'|) / |w|)
 
-A grip holds the points that are within 1.5 radius of the tip when it begins: u = u_then + c - c_then. A push is what a
-force of push m (1 + g h / 2) / h^2 would do in a step (see `damping`), so the pushes add up to the force of the tool.
+A grip holds the mass points that are within 1.5 radii of the tip's centre when it begins: u = u_then + c - c_then. A
+correction equals the displacement by a force correction m (1 + g h / 2) / h^2 in a step (see `damping`), so the sum of
+corrections yields the force of the tool.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -31,85 +32,97 @@ from taichi_msm.scene.tools import Probe
 from taichi_msm.terms.base import DY, MOBILITY, REST_X, TOP_Y, KernelConfig, Term
 from taichi_msm.terms.damping import coefficients
 
-# Columns of the table of loads. For all tools: the weight of a step's pushes. For each tool: the middle of its tip
-# after the step and before it; what its grip does, and how far it has come since that began; its shape and friction;
-# 1 / the y and the z of its axis.
+# Columns of the load table. For all tools: the weight of the step's corrections. For each tool: the tip's centre after
+# and before the step; the state of its grip, and the tool's displacement since the grip began; axis, length, radius and
+# friction; the inverse y and z components of the axis.
 WEIGHT, COLUMNS = 0, 1
 TIP_AFTER, TIP_BEFORE, GRIP_STATE, GRIP_SHIFT, AXIS = 0, 3, 6, 7, 10
 LENGTH, RADIUS, FRICTION, INVERSE_AXIS, TOOL_COLUMNS = 13, 14, 15, 16, 18
 
-# What a grip does in a step: nothing, begin, or go on.
+# States of a grip in a step.
 GRIP_IDLE, GRIP_BEGINS, GRIP_CONTINUES = 0.0, 1.0, 2.0
 
-# Fields: for every tool the sum of the pushes; with grips, which tool holds a point, plus 1, and u when it was taken.
+# Fields: for every tool the three components of the summed corrections; with grips, the index of the tool that holds a
+# mass point plus 1, and the displacement of the mass point when the grip began.
 CORRECTIONS, HOLDER, HOLD_DISPLACEMENT, GRIP_FIELDS = 3, 0, 1, 4
 
-# A distance [m] that counts as none: its square is a number in f32 too.
+# Distances below this count as 0; the square is representable in f32.
 MIN_DISTANCE_M = 1e-18
 
 
 @dataclass(frozen=True)
 class ContactTerm(Term):
-    """The tools that are moved."""
+    """Position-controlled tools."""
 
-    tools: int  # how many there are
-    has_friction: tuple[bool, ...]  # for each, whether it has friction
-    grips: bool  # whether any can hold tissue
+    tools: int  # number of tools
+    has_friction: tuple[bool, ...]  # of each tool
+    grips: bool  # whether any tool can hold tissue
 
     @classmethod
     def from_plan(cls, plan: Plan) -> Self | None:
-        """Leave it out without tools that are moved."""
+        """Return the term's configuration; None without position-controlled tools."""
         tools = plan.tools
         grips = any(tool.grips for tool in tools)
         return cls(len(tools), tuple(tool.friction > 0 for tool in tools), grips) if tools else None
 
     @property
     def field_count(self) -> int:
-        """The pushes of every tool, and with grips what they hold."""
+        """The corrections of every tool, and with grips the held mass points."""
         return _field_count(self.tools, self.grips)
 
     def fields(self, plan: Plan) -> NDArray[Any]:
-        """Give no pushes, and nothing held."""
+        """Return zeros: no corrections and no held mass points."""
         return np.zeros((self.field_count, *plan.scene.sheet.points))
 
     @property
     def column_count(self) -> int:
-        """A few columns for each tool."""
+        """The weight, and the columns of each tool."""
         return COLUMNS + TOOL_COLUMNS * self.tools
 
     def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
-        """Give the places of the tools before and after every step, and what their grips do in it."""
+        """Compute the positions of the tools before and after every step and the states of their grips.
+
+        Args:
+            plan: the plan.
+            loads: loads of consecutive steps.
+            first: number of the first step.
+
+        Returns:
+            Columns, shape (steps, column_count).
+        """
         grid, steps = plan.grid, first + np.arange(len(loads.active) + 1)
         t, frame = steps / grid.steps_per_second, 1 / grid.frames_per_second
         _, gain, first_gain = coefficients(plan)
         columns = np.zeros((len(loads.active), self.column_count))
-        # A push of the first step takes another force, as its gain is another.
+        # The first step has another gain, so the force of its corrections differs.
         columns[:, WEIGHT] = np.where(steps[:-1] == 0, gain / first_gain, 1.0)
         for n, tool in enumerate(plan.tools):
-            own = columns[:, COLUMNS + TOOL_COLUMNS * n : COLUMNS + TOOL_COLUMNS * (n + 1)]
-            places = tool.tip_centre(t)
-            own[:, TIP_AFTER:TIP_BEFORE], own[:, TIP_BEFORE:GRIP_STATE] = places[1:], places[:-1]
+            of_tool = columns[:, COLUMNS + TOOL_COLUMNS * n : COLUMNS + TOOL_COLUMNS * (n + 1)]
+            centres = tool.tip_centre(t)
+            of_tool[:, TIP_AFTER:TIP_BEFORE], of_tool[:, TIP_BEFORE:GRIP_STATE] = centres[1:], centres[:-1]
             inverse = [1 / slope if abs(slope) > MIN_DISTANCE_M else 1 / MIN_DISTANCE_M for slope in tool.axis[1:]]
-            own[:, AXIS:] = *tool.axis, tool.length, tool.radius, tool.friction, *inverse
+            of_tool[:, AXIS:] = *tool.axis, tool.length, tool.radius, tool.friction, *inverse
             for begin, end in tool.grips:
-                # The first steps at or after these times, but for rounding.
-                taken, left = (max(0, math.ceil((at - WHOLE * frame) * grid.steps_per_second)) for at in (begin, end))
-                held = (steps[:-1] >= taken) & (steps[:-1] < left)
-                own[held, GRIP_STATE] = np.where(steps[:-1] == taken, GRIP_BEGINS, GRIP_CONTINUES)[held]
-                own[held, GRIP_SHIFT:AXIS] = (places[1:] - tool.tip_centre(np.array([taken / grid.steps_per_second])))[
-                    held
-                ]
+                # The first steps at or after these times, up to rounding.
+                start, stop = (
+                    max(0, math.ceil((time - WHOLE * frame) * grid.steps_per_second)) for time in (begin, end)
+                )
+                held = (steps[:-1] >= start) & (steps[:-1] < stop)
+                of_tool[held, GRIP_STATE] = np.where(steps[:-1] == start, GRIP_BEGINS, GRIP_CONTINUES)[held]
+                centre_at_start = tool.tip_centre(np.array([start / grid.steps_per_second]))
+                of_tool[held, GRIP_SHIFT:AXIS] = (centres[1:] - centre_at_start)[held]
         return columns
 
     def is_compiled_in(self, compiled: Self) -> bool:
-        """Tell whether a kernel that was compiled for `compiled` does all that these tools need."""
+        """Return whether a kernel compiled for another configuration supports these tools."""
         friction = zip(self.has_friction, compiled.has_friction, strict=True)
         return all(needed <= available for needed, available in friction) and self.grips <= compiled.grips
 
     def build_reaches(self, config: KernelConfig) -> Callable[..., Any]:
-        """Make Taichi's function reaches(sheet, i, low, high, now): whether a tool may touch or hold a point of row i.
+        """Build the Taichi function reaches(sheet, i, low, high, now): whether a tool may touch or hold mass points.
 
-        The displacements of the row along y and z are between `low` and `high`, two numbers each.
+        In it `i` is the row, `low` and `high` bound its displacements along y and z, two numbers each, and `now` is a
+        row of the load table.
         """
         ti, real, vector, tools, grips = config.ti, config.real, config.vector, self.tools, self.grips
         greatest = build_max_lane(config)
@@ -118,16 +131,16 @@ class ContactTerm(Term):
 
         @ti.func
         def cut(low, high, begin, end, start, inverse):
-            """Cut the part of a line, from `begin` to `end`, where start + s / inverse is between two numbers."""
-            one, other = (low - start) * inverse, (high - start) * inverse
-            return ti.max(begin, ti.min(one, other)), ti.min(end, ti.max(one, other))
+            """Clip the interval of s from `begin` to `end` to where start + s / inverse is between low and high."""
+            at_low, at_high = (low - start) * inverse, (high - start) * inverse
+            return ti.max(begin, ti.min(at_low, at_high)), ti.min(end, ti.max(at_low, at_high))
 
         @ti.func
         def reaches(sheet: ti.template(), i, low: ti.template(), high: ti.template(), now: ti.template()):
             y, reached = sheet.constants[TOP_Y] - i * sheet.constants[DY], False
             for tool in ti.static(range(tools)):
                 own = ti.static(first + TOOL_COLUMNS * tool)
-                # A little more than the radius, because of rounding.
+                # Slightly more than the radius, because of rounding.
                 near = 1.001 * now[own + RADIUS]
                 begin, end = cut(
                     y + low[0] - near, y + high[0] + near, ti.cast(0, real), now[own + LENGTH],
@@ -149,9 +162,10 @@ class ContactTerm(Term):
         return reaches
 
     def build_resolve(self, config: KernelConfig) -> Callable[..., None]:
-        """Make Taichi's function resolve(sheet, i, kind, at, b, now), which changes entry b of row i after its step.
+        """Build the Taichi function resolve(sheet, i, kind, at, b, now), which corrects entry b of row i.
 
-        `at` is the row of u.
+        It is called after the step of the row. In it `kind` is that of a `KernelRow`, `at` the row of u, and `now` a
+        row of the load table.
         """
         ti, vector, tools, has_friction, grips = config.ti, config.vector, self.tools, self.has_friction, self.grips
         first_field, first = config.first_field(ContactTerm), config.first_column(ContactTerm)
@@ -172,7 +186,7 @@ class ContactTerm(Term):
             held = vector(0)
             if ti.static(grips):
                 held = sheet.fields[(grip_field + HOLDER) * row * sheet.width + here]
-                # All grips let go before any takes hold.
+                # All grips that end release their mass points before any other grip begins.
                 for tool in ti.static(range(tools)):
                     if now[own[tool] + GRIP_STATE] != GRIP_CONTINUES:
                         held = ti.select(held == tool + 1, vector(0), held)
@@ -223,19 +237,19 @@ class ContactTerm(Term):
                             target += now[own[tool] + GRIP_SHIFT + c]
                             push[c] = ti.select(held == tool + 1, target - u[c], push[c])
                     for c in ti.static(range(3)):
-                        # A lane that is not pushed keeps its bits, the sign of a zero too.
+                        # Lanes without a correction keep their bits, including the sign of zero.
                         u[c] = ti.select(pushed > 0, u[c] + push[c], u[c])
                         d[c] = ti.select(pushed > 0, d[c] + push[c], d[c])
                         sheet.u[c][entry], sheet.d[c][here] = u[c], d[c]
                         pushes = (first_field + CORRECTIONS * tool + c) * row * sheet.width + here
-                        # Not `+=`, which would be atomic, and of vectors that does not compile.
+                        # `+=` would be atomic, which does not compile for vectors.
                         sheet.fields[pushes] = sheet.fields[pushes] + push[c] * now[first + WEIGHT]
 
         return resolve
 
 
 def build_max_lane(config: KernelConfig) -> Callable[..., Any]:
-    """Make Taichi's function greatest(values), the greatest lane, by shuffles: Taichi's own takes lane after lane."""
+    """Build the Taichi function greatest(values), the maximum over lanes, by shuffles, unlike Taichi's `max()`."""
     ti, vector, lanes = config.ti, config.vector, config.lanes
     halves = [lanes >> n for n in range(1, lanes.bit_length())]
 
@@ -250,9 +264,9 @@ def build_max_lane(config: KernelConfig) -> Callable[..., Any]:
 
 
 def build_penetration(config: KernelConfig) -> Callable[..., Any]:
-    """Make Taichi's function part(rest, u, now, own), which tells how deep a point is in a tool, and the way out.
+    """Build the Taichi function part(rest, u, now, own), the penetration depth of mass points in a tool.
 
-    `own` is the first column of the tool. It gives radius - |r'|, and then n.
+    In it `own` is the first column of the tool. It returns radius - |r'| and the three components of n.
     """
     ti, vector = config.ti, config.vector
 
@@ -276,7 +290,7 @@ def build_penetration(config: KernelConfig) -> Callable[..., Any]:
 
 
 def contact_fields(probes: Sequence[Probe]) -> int:
-    """Count the fields that the contact with these probes needs."""
+    """Return the number of contact fields that these probes require."""
     return _field_count(sum(probe.moved for probe in probes), any(probe.grip for probe in probes))
 
 

@@ -1,11 +1,12 @@
-"""Contact at rest: the forces that tools take off the points, and how these are kept out of the rods.
+"""Contact in quasi-static equilibrium: contact forces of tools, and projection of mass points out of their capsules.
 
-A tool pushes a point that touches it, and never pulls it: of the force F on the point it bears the part into the rod,
-min(F . n, 0) n. What is left, along the rod or away from it, must vanish. Each n is kept in the fields where steps keep
-pushes, and is 0 where a point does not touch. What is held goes with its tool, which bears all of its force.
+A tool can push a mass point that touches it but cannot pull it. Of the force F on the mass point, the tool therefore
+carries the part into the capsule, min(F . n, 0) n; the remainder, tangential or outward, must vanish in equilibrium.
+The normals n are stored in the fields of corrections and are 0 where a mass point touches no tool. Held mass points
+move with their tool, which carries their whole force.
 
-A point between tools may touch several: then what they bear, and how far they push, is found in turns (by projected
-Gauss-Seidel).
+A mass point may touch several tools. Their contact forces and corrections are then found by projected Gauss-Seidel
+iteration.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -24,29 +25,31 @@ from taichi_msm.terms.contact import (
     build_penetration,
 )
 
-# How many turns tools take at a point, if there are several.
-TURNS = 8
-
 
 def build_bear(config: KernelConfig, contact: ContactTerm) -> Callable[..., None]:
-    """Make Taichi's function bear(force, sheet, at), which takes off what the tools bear at an entry of the sheet."""
+    """Build the Taichi function bear(force, sheet, at), which removes contact forces from the force on entry `at`.
+
+    Args:
+        config: compile-time configuration.
+        contact: its contact term.
+    """
     ti, vector, tools, grips = config.ti, config.vector, contact.tools, contact.grips
     first_field = config.first_field(ContactTerm)
-    holding, turns = first_field + CORRECTIONS * tools + HOLDER, _turns(contact)
+    holding, iterations = first_field + CORRECTIONS * tools + HOLDER, _iterations(contact)
 
     @ti.func
     def bear(force: ti.template(), sheet: ti.template(), at):
         field = sheet.rows * sheet.width
         borne = [vector(0) for _ in ti.static(range(tools))]
-        for _ in range(turns):
+        for _ in range(iterations):
             for tool in ti.static(range(tools)):
                 normal = [
                     sheet.fields[(first_field + CORRECTIONS * tool + c) * field + at] for c in ti.static(range(3))
                 ]
                 along = force[0] * normal[0] + force[1] * normal[1] + force[2] * normal[2]
-                all_of_it = ti.max(borne[tool] - along, 0)
-                change = all_of_it - borne[tool]
-                borne[tool] = all_of_it
+                total = ti.max(borne[tool] - along, 0)
+                change = total - borne[tool]
+                borne[tool] = total
                 for c in ti.static(range(3)):
                     force[c] += change * normal[c]
         if ti.static(grips):
@@ -57,15 +60,20 @@ def build_bear(config: KernelConfig, contact: ContactTerm) -> Callable[..., None
 
 
 def build_keep_out(config: KernelConfig, contact: ContactTerm) -> Callable[..., None]:
-    """Make Taichi's function keep_out(sheet, i, kind, b, now), for entry b of row i of a `RestSheet` that has moved.
+    """Build the Taichi function keep_out(sheet, i, kind, b, now) for entry b of row i of a `RestSheet` that has moved.
 
-    It pushes the points out of the tools, stops them there, and puts what is held where its tool is.
+    It projects mass points out of the tools, removes their momentum into the tools, and moves held mass points with
+    their tool.
+
+    Args:
+        config: compile-time configuration.
+        contact: its contact term.
     """
     ti, vector, tools, grips = config.ti, config.vector, contact.tools, contact.grips
     first_field, first = config.first_field(ContactTerm), config.first_column(ContactTerm)
     grip_field = first_field + CORRECTIONS * tools
     own, part = [first + COLUMNS + TOOL_COLUMNS * tool for tool in range(tools)], build_penetration(config)
-    turns = _turns(contact)
+    iterations = _iterations(contact)
 
     @ti.func
     def keep_out(sheet: ti.template(), i, kind, b, now: ti.template()):
@@ -91,7 +99,7 @@ def build_keep_out(config: KernelConfig, contact: ContactTerm) -> Callable[..., 
         for tool in ti.static(range(tools)):
             for c in ti.static(range(3)):
                 sheet.fields[(first_field + CORRECTIONS * tool + c) * field + at] = vector(0)
-        for _ in range(turns):
+        for _ in range(iterations):
             for tool in ti.static(range(tools)):
                 depth, x, y, z = part(rest, u, now, own[tool])
                 normal = [x, y, z]
@@ -109,5 +117,5 @@ def build_keep_out(config: KernelConfig, contact: ContactTerm) -> Callable[..., 
     return keep_out
 
 
-def _turns(contact: ContactTerm) -> int:
-    return TURNS if contact.tools > 1 else 1
+def _iterations(contact: ContactTerm) -> int:
+    return 8 if contact.tools > 1 else 1

@@ -1,4 +1,4 @@
-"""Damping: a force against the velocity, C v on every point. Scene: `damping`, or `tissue.damping`.
+"""Damping: the force -C v on every mass point. Scene: `damping`, or `tissue.damping`.
 
 In a Verlet step, d_{n+1} = keep d_n + gain F_n and u_{n+1} = u_n + d_{n+1} (eq. 6 to 9), with g = C / m and the step h,
 
@@ -21,23 +21,23 @@ from taichi_msm.terms.base import KernelConfig, Term
 
 
 def coefficients(plan: Plan) -> tuple[float, float, float]:
-    """Compute keep, gain and the gain of step 0 [m/N], for central or backward differences."""
+    """Return keep, the gain [m/N] and the gain of step 0 [m/N], for central or backward differences."""
     material, h = plan.material, plan.grid.step
-    g, whole = material.drag, h * h / material.mass
+    g, undamped = material.drag, h * h / material.mass
     if plan.scene.time.damping_difference == "central":
-        return (1 - g * h / 2) / (1 + g * h / 2), whole / (1 + g * h / 2), whole / 2
-    return 1 - g * h, whole, whole / 2
+        return (1 - g * h / 2) / (1 + g * h / 2), undamped / (1 + g * h / 2), undamped / 2
+    return 1 - g * h, undamped, undamped / 2
 
 
 @dataclass(frozen=True)
 class DampingTerm(Term):
-    """Damping of every point. It adds no energy, and its limit on the step is in `planning.stable_step`."""
+    """Damping. It stores no energy; `planning.stable_step` includes its effect on the stable step."""
 
     constant_count: ClassVar[int] = 1
 
     @staticmethod
     def derive(scene: Scene) -> dict[str, Any]:
-        """Give C / m [1/s]; at rest nothing moves."""
+        """Derive C / m [1/s], 0 in quasi-static scenes."""
         if scene.time.at_rest:
             return {"drag": 0.0}
         if scene.tissue is not None:
@@ -47,15 +47,15 @@ class DampingTerm(Term):
 
     @classmethod
     def from_plan(cls, plan: Plan) -> Self | None:
-        """Leave it out if it is 0."""
+        """Return the term's configuration; None without damping."""
         return cls() if plan.material.drag > 0 else None
 
     def constants(self, plan: Plan) -> tuple[float, ...]:
-        """Give the factor `keep`."""
+        """Return the factor `keep`."""
         return coefficients(plan)[:1]
 
     def build_damping(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
-        """Make the function that reduces the last difference."""
+        """Build the function that multiplies the last difference by `keep`."""
         ti, keep = config.ti, config.first_constant(DampingTerm)
 
         @ti.func

@@ -1,4 +1,4 @@
-"""The springs of a sheet as arrays in float64, with their forces and energies: for SciPy and for exports."""
+"""The springs of a sheet as float64 arrays with their forces, energies and tangents, for SciPy and exports."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ Window = tuple[slice, slice]
 
 
 class SpringFamily(NamedTuple):
-    """All springs with the same number of points down and to the right between their ends."""
+    """All springs with the same offset between their ends."""
 
-    # here, there: select the points at their ends; `there` is down or to the right of `here`
+    # start, end: slices of the mass points at the springs' ends; `end` is below or to the right of `start`
     start: Window
     end: Window
-    offset: Array  # vector from here to there at rest [m], x right, y up, z
+    offset: Array  # vector from start to end at rest [m], shape (3,)
     length: float  # at rest [m]
-    stiffness: Array  # k of each [N/m], shape as selected by `here`
-    unstretched_length: Array  # length at which each has no force [m]; shorter than `length` under tension
+    stiffness: Array  # k of each spring [N/m], shape as selected by `start`
+    unstretched_length: Array  # length without force [m], as selected by `start`; below `length` under tension
 
     def edge_vectors(self, displacement: Array) -> tuple[Array, Array]:
-        """Give the vectors from one end of each spring to the other, and their lengths [m]."""
-        between = displacement[self.end] - displacement[self.start] + self.offset
-        return between, np.linalg.norm(between, axis=-1)
+        """Return the vectors from start to end of each spring and their lengths [m]."""
+        edges = displacement[self.end] - displacement[self.start] + self.offset
+        return edges, np.linalg.norm(edges, axis=-1)
 
     def tangent(self, displacement: Array) -> Array:
-        """Give how the forces change as an end moves [N/m], symmetric, shape (..., 3, 3): see `terms.springs`."""
-        between, length = self.edge_vectors(displacement)
-        unit, slack = between / length[..., None], self.unstretched_length / length
+        """Return the symmetric derivative of each spring's force by the position of an end [N/m], shape (..., 3, 3)."""
+        edges, length = self.edge_vectors(displacement)
+        unit, slack = edges / length[..., None], self.unstretched_length / length
         straight = self.stiffness * (1 - slack)
         return straight[..., None, None] * np.eye(3) + (self.stiffness * slack)[..., None, None] * (
             unit[..., :, None] * unit[..., None, :]
@@ -44,58 +44,68 @@ class SpringFamily(NamedTuple):
 
 
 def spring_families(plan: Plan) -> Iterator[SpringFamily]:
-    """List the springs along rows, along columns and along both diagonals, each spring once."""
-    (rows, cols), (dx, dy), sheet = plan.scene.sheet.points, spacing(plan.scene.sheet), plan.material
-    factors = np.ones((rows - 1, cols - 1)) if sheet.factors is None else sheet.factors
-    across, down_columns, shear = spring_stiffness(sheet, factors)
-    # Under tension a spring pulls at rest as if there were no map; at edges half as strongly, like its stiffness.
+    """Build the families of springs along rows, along columns and along both diagonals."""
+    (rows, cols), (dx, dy), material = plan.scene.sheet.points, spacing(plan.scene.sheet), plan.material
+    factors = np.ones((rows - 1, cols - 1)) if material.factors is None else material.factors
+    across, down_columns, shear = spring_stiffness(material, factors)
+    # The tension of a spring at rest does not depend on the map; at edges it is half, like the stiffness.
     shares = (np.where(np.isin(np.arange(count), (0, count - 1)), 0.5, 1.0) for count in (rows, cols))
-    of_rows, of_columns = np.ix_(*shares) if sheet.by_area else (1.0, 1.0)
-    for down, right, own, unmapped in (
-        (0, 1, across, sheet.across * of_rows),
-        (1, 0, down_columns, sheet.down * of_columns),
-        (1, 1, shear, sheet.shear),
-        (1, -1, shear, sheet.shear),
+    of_rows, of_columns = np.ix_(*shares) if material.by_area else (1.0, 1.0)
+    for down, right, stiffness, unmapped in (
+        (0, 1, across, material.across * of_rows),
+        (1, 0, down_columns, material.down * of_columns),
+        (1, 1, shear, material.shear),
+        (1, -1, shear, material.shear),
     ):
-        here = slice(0, rows - down), slice(max(0, -right), cols - max(0, right))
-        there = slice(down, rows), slice(max(0, right), cols - max(0, -right))
+        start = slice(0, rows - down), slice(max(0, -right), cols - max(0, right))
+        end = slice(down, rows), slice(max(0, right), cols - max(0, -right))
         length = math.hypot(right * dx, down * dy)
-        pull = np.broadcast_to(sheet.tension * unmapped * length, own.shape)
-        shorter = np.divide(pull, own, out=np.zeros_like(own), where=own > 0)
-        yield SpringFamily(here, there, np.array([right * dx, -down * dy, 0.0]), length, own, length - shorter)
+        tension = np.broadcast_to(material.tension * unmapped * length, stiffness.shape)
+        stretch = np.divide(tension, stiffness, out=np.zeros_like(stiffness), where=stiffness > 0)
+        offset = np.array([right * dx, -down * dy, 0.0])
+        yield SpringFamily(start, end, offset, length, stiffness, length - stretch)
 
 
-def elastic_force(every: Sequence[SpringFamily], displacement: Array) -> Array:
-    """Sum k (L - L0) (Q - P) / L over the neighbours Q of every point P (eq. 2), without the part that cancels at rest.
+def elastic_force(families: Sequence[SpringFamily], displacement: Array) -> Array:
+    """Sum k (L - L0) (Q - P) / L over the neighbours Q of every mass point P (eq. 2), without the tension at rest.
 
-    Displacement x - X [m] and force [N] have shape (rows, cols, 3).
+    Args:
+        families: of springs, from `spring_families`.
+        displacement: x - X [m], shape (rows, cols, 3).
+
+    Returns:
+        Force on every mass point [N], shape (rows, cols, 3).
     """
     force = np.zeros_like(displacement)
-    for family in every:
-        between, length = family.edge_vectors(displacement)
+    for family in families:
+        edges, length = family.edge_vectors(displacement)
         pull = np.divide(length - family.unstretched_length, length, out=np.zeros_like(length), where=length > 0)
         at_rest = family.stiffness * (family.length - family.unstretched_length) / family.length
-        forward = (family.stiffness * pull)[..., None] * between - at_rest[..., None] * family.offset
+        forward = (family.stiffness * pull)[..., None] * edges - at_rest[..., None] * family.offset
         force[family.start] += forward
         force[family.end] -= forward
     return force
 
 
 def energy_density(plan: Plan, displacement: Array) -> Array:
-    """Give the elastic energy of springs above that at rest, per area, without bending and the virtual springs.
+    """Compute the elastic energy of the springs above that at rest, per area, without bending and foundation.
 
-    Each end of a spring gets half of its energy, and a point has the share of the sheet's area at rest that
-    `area_shares` gives it, so that the sum of density times area is the energy of all springs.
+    Each end of a spring is assigned half of the spring's energy. The sum of density times `area_shares` times the area
+    of a cell is therefore the energy of all springs.
+
+    Args:
+        plan: the plan.
+        displacement: x - X [m], shape (rows, cols, 3).
 
     Returns:
-        Energy per area at rest [J/m2], shape (rows, cols), for displacements x - X [m], shape (rows, cols, 3).
+        Energy per area at rest [J/m2], shape (rows, cols).
     """
     at_points, (dx, dy) = np.zeros(displacement.shape[:2]), spacing(plan.scene.sheet)
     for family in spring_families(plan):
-        between, length = family.edge_vectors(displacement)
+        edges, length = family.edge_vectors(displacement)
         rest = family.length - family.unstretched_length
-        # The part that is linear in the displacements cancels in the sum, as the sheet is in equilibrium at rest.
-        linear = (between - family.offset) @ family.offset * rest / family.length
+        # The linear part cancels in the sum over all springs, because the sheet is in equilibrium at rest.
+        linear = (edges - family.offset) @ family.offset * rest / family.length
         energy = family.stiffness * ((length - family.unstretched_length) ** 2 / 2 - rest**2 / 2 - linear)
         at_points[family.start] += energy / 2
         at_points[family.end] += energy / 2

@@ -1,7 +1,6 @@
-"""The foundation, or virtual springs: each pulls a point back to its rest position.
+"""The elastic (Winkler) foundation, or virtual springs: the force -K u pulls each mass point to its rest position.
 
-Scene: `springs.virtual` and `virtual_active`, or `tissue.foundation`, `foundation_active` and `foundation_map`. The
-force is -K u.
+Scene: `springs.virtual` and `virtual_active`, or `tissue.foundation`, `foundation_active` and `foundation_map`.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -25,14 +24,14 @@ from taichi_msm.terms.base import AREA_SHARE, KernelConfig, Term
 
 @dataclass(frozen=True)
 class FoundationTerm(Term):
-    """Virtual springs. Their energy is not measured: `divergence` bounds it."""
+    """Virtual springs. Their energy is not measured; `accuracy.divergence` bounds it."""
 
-    by_area: bool  # whether they are softer at an open edge, where less of the sheet's area belongs to a point
-    mapped: bool  # whether the share of K that each point has is read from a field
+    by_area: bool  # whether K is smaller at an open edge, where less area belongs to a mass point
+    mapped: bool  # whether the factor of K at each mass point is read from a field
 
     @staticmethod
     def derive(scene: Scene) -> dict[str, Any]:
-        """Give K, of a tissue foundation dx dy, or 0 if it never acts; and whether it acts without a load."""
+        """Derive K [N/m], 0 if the foundation is never active, and whether it is always active."""
         if scene.tissue is not None:
             k = scene.tissue.foundation_stiffness * math.prod(spacing(scene.sheet))
             active = scene.tissue.foundation_active
@@ -44,43 +43,43 @@ class FoundationTerm(Term):
 
     @classmethod
     def from_plan(cls, plan: Plan) -> Self | None:
-        """Leave them out if they never act."""
+        """Return the term's configuration; None if the foundation is never active."""
         material = plan.material
         mapped = material.virtual_factors is not None
         return cls(plan.open_edges and material.by_area and not mapped, mapped) if material.virtual > 0 else None
 
     @staticmethod
     def stiffness_bound(material: Material, sheet: Sheet) -> float:
-        """Give the part of m w^2, which is the largest K [N/m]."""
+        """Return the largest K [N/m]."""
         factors = material.virtual_factors
         return material.virtual if factors is None else material.virtual * float(factors.max())
 
     @classmethod
     def node_stiffness_bounds(cls, plan: Plan) -> NDArray[Any] | float:
-        """Give K of each point, as if none had less of the sheet's area."""
+        """Return K at each mass point without the reduction at edges [N/m]."""
         factors = plan.material.virtual_factors
         return plan.material.virtual * (1.0 if factors is None else factors)
 
     @property
     def column_count(self) -> int:
-        """One column: K, times the share of it that acts."""
+        """One column: the active share of K."""
         return 1
 
     def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
-        """Give K at every step [N/m]."""
+        """Return the active share of K at every step [N/m], shape (steps, 1)."""
         return plan.material.virtual * loads.active[:, None]
 
     @property
     def field_count(self) -> int:
-        """One field with a map."""
+        """One field if the foundation has a map."""
         return int(self.mapped)
 
     def fields(self, plan: Plan) -> NDArray[Any]:
-        """Give each point's share of K: its factor times its share of a cell's area."""
+        """Return the factors of K at the mass points, shape (1, rows, cols)."""
         return point_shares(plan)[None] if self.mapped else super().fields(plan)
 
     def build_forces(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
-        """Make the function that adds -K u."""
+        """Build the function that adds -K u."""
         ti = config.ti
         by_area, mapped, column = self.by_area, self.mapped, config.first_column(FoundationTerm)
         field = config.first_field(FoundationTerm)
@@ -102,12 +101,12 @@ class FoundationTerm(Term):
         return (add,)
 
     def build_tangents(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
-        """Make the function that adds the change of the force, which is linear in the displacements."""
+        """Return `build_forces`, because the force is linear in the displacements."""
         return self.build_forces(config)
 
 
 def point_shares(plan: Plan) -> NDArray[Any]:
-    """Give each point's share of K: its factor times its share of a cell's area; shape (rows, cols)."""
+    """Return the factor of K at each mass point: that of the map times the share of a cell's area, (rows, cols)."""
     material = plan.material
     shares = area_shares(plan.scene.sheet) if material.by_area else np.ones(plan.fixed.shape)
     return shares if material.virtual_factors is None else material.virtual_factors * shares

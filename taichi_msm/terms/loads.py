@@ -1,7 +1,8 @@
-"""The loads: what probes exert on the points around their control points. Scene: `probes`.
+"""Loads: the forces of force-controlled probes on the mass points around their control points. Scene: `probes`.
 
-The force on a point at the distance d is F exp(-max(falloff d + shift, offset)) (see `probe_force`), tabulated for
-every step in a few columns for each `ProbeSlot`. Where a control point stands, its decay is a field.
+The force on a mass point at the distance d is F exp(-max(falloff d + shift, offset)) (see `probe_force`). The load
+table contains its parameters for every step and `ProbeSlot`. For a stationary control point the decay factors are a
+field.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -28,51 +29,60 @@ FORCE, POINT, FALLOFF, SHIFT, OFFSET, SLOT_COLUMNS = 0, 3, 5, 6, 7, 8
 
 @dataclass(frozen=True)
 class ProbeTerm(Term):
-    """The loads."""
+    """Loads of force-controlled probes."""
 
-    moves: tuple[bool, ...]  # for every slot, whether its control point moves
-    by_area: tuple[bool, ...]  # for every slot, whether points at an open edge get less of its force
+    moves: tuple[bool, ...]  # whether the control point moves, for each slot
+    by_area: tuple[bool, ...]  # whether forces are smaller at an open edge, for each slot
 
     @classmethod
     def from_plan(cls, plan: Plan) -> Self:
-        """Tell which slots stand."""
+        """Return the term's configuration."""
         probes = plan.scene.probes
         by_area = tuple(plan.open_edges and probes[slot.probe].total is not None for slot in plan.slots)
         return cls(tuple(slot.moves for slot in plan.slots), by_area)
 
     @property
     def column_count(self) -> int:
-        """A few columns for each slot."""
+        """The columns of all slots."""
         return SLOT_COLUMNS * len(self.moves)
 
     def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
-        """Give forces and places of every slot."""
+        """Compute the columns of all slots.
+
+        Args:
+            plan: the plan.
+            loads: loads of consecutive steps.
+            first: number of the first step.
+
+        Returns:
+            Columns, shape (steps, column_count).
+        """
         slots = np.empty((len(loads.active), len(self.moves), SLOT_COLUMNS))
         slots[..., FORCE:POINT] = loads.strength
         slots[..., POINT:FALLOFF] = loads.point
         for n, slot in enumerate(plan.slots):
-            acts = probe_force(plan.scene.probes[slot.probe], plan.scene.sheet)
-            slots[:, n, FALLOFF:] = acts.falloff, acts.shift, acts.offset
+            law = probe_force(plan.scene.probes[slot.probe], plan.scene.sheet)
+            slots[:, n, FALLOFF:] = law.falloff, law.shift, law.offset
         return slots.reshape(len(slots), self.column_count)
 
     @property
     def field_count(self) -> int:
-        """One field for each slot that stands."""
+        """One field for each slot with a stationary control point."""
         return self.moves.count(False)
 
     def fields(self, plan: Plan) -> NDArray[Any]:
-        """Give the decays of the standing slots."""
+        """Compute the decay factors of the stationary slots, shape (field_count, rows, cols)."""
         scene = plan.scene
         decays = [decay(scene.probes[slot.probe], scene.sheet) for slot in plan.slots if not slot.moves]
         return np.array(decays).reshape(-1, *scene.sheet.points)
 
     def build_forces(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
-        """Make the function that adds the forces of all slots."""
+        """Build the function that adds the forces of all slots."""
         ti = config.ti
         moves, by_area, first = self.moves, self.by_area, config.first_column(ProbeTerm)
         vector, lanes = config.vector, config.lanes
         first_field = config.first_field(ProbeTerm)
-        standing = [first_field + moves[:n].count(False) for n in range(len(moves))]
+        stationary = [first_field + moves[:n].count(False) for n in range(len(moves))]
 
         @ti.func
         def add(force: ti.template(), sheet: ti.template(), entry: ti.template(), now: ti.template()):
@@ -88,29 +98,37 @@ class ProbeTerm(Term):
                     if ti.static(by_area[n]):
                         share *= sheet.by_column[(AREA_SHARE + entry.row.kind) * sheet.width + entry.b]
                 else:
-                    share = sheet.fields[(standing[n] * sheet.rows + entry.row.i) * sheet.width + entry.b]
+                    share = sheet.fields[(stationary[n] * sheet.rows + entry.row.i) * sheet.width + entry.b]
                 for c in ti.static(range(3)):
                     force[c] += now[column + c] * share
 
         return (add,)
 
     def decay_gradients(self, plan: Plan) -> NDArray[Any]:
-        """Give the derivatives of the decays of the standing slots by x and y of the control point, (slots, 2, ...)."""
+        """Differentiate the decay factors of the stationary slots by x and y of the control point.
+
+        Returns:
+            Derivatives [1/m], shape (field_count, 2, rows, cols).
+        """
         scene = plan.scene
-        slopes = [decay_gradient(scene.probes[slot.probe], scene.sheet) for slot in plan.slots if not slot.moves]
-        return np.array(slopes).reshape(-1, 2, *scene.sheet.points)
+        gradients = [decay_gradient(scene.probes[slot.probe], scene.sheet) for slot in plan.slots if not slot.moves]
+        return np.array(gradients).reshape(-1, 2, *scene.sheet.points)
 
     def build_load_adjoint(self, config: KernelConfig, first_slope: int) -> Callable[..., None]:
-        """Make the function that differentiates the work of all slots by their forces and their control points.
+        """Build the function sense(sums, sheet, entry, now), the adjoint of the loads.
 
-        An entry's work on it is the product of the force and `entry.u`; of a slot, three derivatives by the force and
-        two by the control point are added to a list. `slopes` are in `sheet.found`, from `first_slope` times the
-        sheet's rows on.
+        It differentiates the work of all slots, the product of force and `entry.u`. For each slot it adds three
+        derivatives by the force and two by the control point to the list `sums`.
+
+        Args:
+            config: compile-time configuration.
+            first_slope: index of the first array of `decay_gradients` in `sheet.found`, in multiples of the sheet's
+                rows.
         """
         ti = config.ti
         moves, by_area, first = self.moves, self.by_area, config.first_column(ProbeTerm)
         vector, lanes, first_field = config.vector, config.lanes, config.first_field(ProbeTerm)
-        standing = [moves[:n].count(False) for n in range(len(moves))]
+        stationary = [moves[:n].count(False) for n in range(len(moves))]
 
         @ti.func
         def sense(sums: ti.template(), sheet: ti.template(), entry: ti.template(), now: ti.template()):
@@ -123,7 +141,7 @@ class ProbeTerm(Term):
                     off_y = sheet.constants[TOP_Y] - i * sheet.constants[DY] - now[column + POINT + 1]
                     distance = ti.sqrt(off_x * off_x + off_y * off_y)
                     exponent = now[column + FALLOFF] * distance + now[column + SHIFT]
-                    # 0 on the flat end, and where the point is the control point.
+                    # 0 under the flat end and at the control point.
                     turned = now[column + FALLOFF] / ti.select(distance > 0, distance, vector(1))
                     turned = ti.select(exponent > now[column + OFFSET], turned, vector(0))
                     exponent = ti.max(exponent, now[column + OFFSET])
@@ -132,9 +150,9 @@ class ProbeTerm(Term):
                         share *= sheet.by_column[(AREA_SHARE + entry.row.kind) * sheet.width + b]
                     slope[0], slope[1] = share * turned * off_x, share * turned * off_y
                 else:
-                    share = sheet.fields[((first_field + standing[n]) * sheet.rows + i) * sheet.width + b]
+                    share = sheet.fields[((first_field + stationary[n]) * sheet.rows + i) * sheet.width + b]
                     for axis in ti.static(range(2)):
-                        row = (first_slope + 2 * standing[n] + axis) * sheet.rows + i
+                        row = (first_slope + 2 * stationary[n] + axis) * sheet.rows + i
                         slope[axis] = sheet.found[row * sheet.width + b]
                 work = vector(0)
                 for c in ti.static(range(3)):
@@ -147,13 +165,13 @@ class ProbeTerm(Term):
 
 
 def decay_parameters(plan: Plan) -> list[tuple[object, ...]]:
-    """List everything that the decays of the standing slots depend on."""
+    """Return all parameters on which the decay factors of the stationary slots depend."""
     probes = [plan.scene.probes[slot.probe] for slot in plan.slots if not slot.moves]
     return [(probe.at, probe_force(probe, plan.scene.sheet)[1:]) for probe in probes]
 
 
 def max_free_acceleration(plan: Plan) -> float:
-    """Bound the acceleration that the probes give to a free point [m/s^2]."""
+    """Bound the acceleration of a free mass point by all probes [m/s^2]."""
     forces = (
         probe_force(probe, plan.scene.sheet).max_force * max(abs(percent) for _, percent in probe.load) / 100
         for probe in plan.scene.probes
@@ -163,11 +181,16 @@ def max_free_acceleration(plan: Plan) -> float:
 
 
 def force_norm(slot: ProbeSlot, scene: Scene) -> float:
-    """Bound |F| over all points for a force of 1 N at the control point."""
+    """Bound the Euclidean norm of the forces on all mass points for a force of 1 N at the control point.
+
+    Args:
+        slot: slot of a probe.
+        scene: its scene.
+    """
     if not slot.moves:
         return float(np.linalg.norm(decay(scene.probes[slot.probe], scene.sheet)))
-    # The moving control point is within half a cell's diagonal of some lattice point. The sheet around that point lies
-    # within four sheets that meet there, and their norm is twice that of one.
+    # The moving control point is within half a cell's diagonal of some mass point. Four sheets that meet at that mass
+    # point cover the sheet, and their norm is twice that of one of them with the mass point at its corner.
     x, y = axes(scene.sheet)
     nearest = np.maximum(np.hypot(x - x[0], y - y[0]) - math.hypot(*spacing(scene.sheet)) / 2, 0)
     return 2 * float(np.linalg.norm(probe_force(scene.probes[slot.probe], scene.sheet).decay(nearest)))

@@ -1,27 +1,27 @@
-"""Springs between neighbours: along rows, along columns and along both diagonals of a cell.
+"""Springs between neighbouring mass points: along rows, along columns and along both diagonals of a cell.
 
 Scene: `springs.structural`, `springs.shear` and `springs.map`, or `tissue.young`, `thickness`, `pretension` and `map`.
 
-The force of P on its neighbour Q is, with q = u_P - u_Q and the rest vector o from Q to P,
+With q = u_P - u_Q and the vector o from Q to P at rest, the force of P on its neighbour Q is
 
     k (L - L0) (P - Q) / L = k (L^2 - L0^2) / (L^2 + L0 L) (o + q),    L^2 - L0^2 = q (q + 2 o)         (eq. 2)
 
-which keeps the digits of a small motion on a large sheet. The force of Q on P is the opposite, to the bit.
+This form avoids cancellation for small displacements of a large sheet. The force of Q on P is exactly the opposite.
 
-Of a tissue each cell, dx by dy, adds to the springs along its edges and diagonals (f: the factor of the map there)
+In tissue each cell of size dx by dy contributes to the springs along its edges and diagonals, with the map's factor f,
 
     along x     f E t (9/8 dy/dx - 3/8 dx/dy) / 2        along y: the same with x and y exchanged
     diagonals   f 3/16 E t (dx^2 + dy^2) / (dx dy)
 
-so that the lattice is an isotropic sheet in plane stress. Springs impose its Poisson's ratio of 1/3; docs/model.md has
-the derivation.
+so that the lattice approximates an isotropic sheet in plane stress. Springs imply Poisson's ratio 1/3; docs/model.md
+contains the derivation.
 
-Under a tension S each spring pulls at rest with tau L. Here tau = k1 e, where k1 is its stiffness for f = 1 and
-e = S / (3/2 E t). Its force, less that at rest, which cancels, is
+Under a pretension S each spring has the tension tau L at rest, with tau = k1 e, its stiffness k1 for f = 1 and
+e = S / (3/2 E t). The tensions at rest cancel at every mass point. Without them, the force of a spring is
 
     (k - tau) (1 - L0 / L) (o + q) + tau q
 
-and its energy ((k - tau) (L - L0)^2 + tau q^2) / 2.
+and its energy is ((k - tau) (L - L0)^2 + tau q^2) / 2.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -43,34 +43,33 @@ from taichi_msm.terms.base import AREA_SHARE, DX, DY, HAS_LEFT, HAS_RIGHT, Kerne
 # Families of springs.
 ALONG_ROW, ALONG_COLUMN, DIAGONAL = range(3)
 
-# Measures: the smallest and the largest (L^2 - L0^2) / L0^2; for every family the sum of (k - tau) (L / L0 - 1)^2;
-# and then, under tension, the sum of |q|^2 / L0^2.
+# Measures: the smallest and the largest (L^2 - L0^2) / L0^2; for each family the sum of (k - tau) (L / L0 - 1)^2; under
+# tension, for each family the sum of |q|^2 / L0^2.
 MIN_STRAIN, MAX_STRAIN, STRETCH_SUMS, TENSION_SUMS = 0, 1, 2, 5
 
-# Prevents a division by 0 at L = 0, where the force is then 0, as P - Q is. A literal in a kernel is always f32.
+# Prevents a division by 0 at L = 0, where the force then is 0. Literals in kernels are f32, which can represent it.
 MIN_SQUARED_LENGTH = 1e-36
 
 
 @dataclass(frozen=True)
 class SpringTerm(Term):
-    """Springs between neighbours."""
+    """Springs between neighbouring mass points."""
 
-    # structural, shear: whether there are springs along rows and columns, and along diagonals
-    structural: bool
-    shear: bool
-    open_edges: bool  # whether a point at an edge moves, so that springs beyond the edge must be left out
-    by_area: bool  # whether springs along such an edge are softer than others, because they belong to one cell
-    mapped: bool  # whether the stiffness of every spring is read from an array; it is 0 where there is no spring
+    structural: bool  # whether the sheet has springs along rows and columns
+    shear: bool  # whether the sheet has springs along diagonals
+    open_edges: bool  # whether mass points at an edge can move; springs beyond the edge are then excluded
+    by_area: bool  # whether springs along an open edge are softer, because they belong to one cell
+    mapped: bool  # whether each stiffness is read from an array, with 0 for springs beyond an edge
     tense: bool  # whether the sheet is under tension at rest
 
     reach: ClassVar[int] = 1
-    # k - tau, and then tau, of each family.
+    # k - tau of each family, followed by tau of each family.
     constant_count: ClassVar[int] = 6
     reductions: ClassVar[tuple[str, ...]] = ("min", "max", "sum", "sum", "sum", "sum", "sum", "sum")
 
     @staticmethod
     def derive(scene: Scene) -> dict[str, Any]:
-        """Take over the springs, or make a sheet of a tissue: see the module."""
+        """Return the coefficients of `springs`, or assemble those of `tissue` as described above."""
         tissue, springs = scene.tissue, scene.springs
         if tissue is None:
             assert springs is not None
@@ -86,7 +85,7 @@ class SpringTerm(Term):
 
     @classmethod
     def from_plan(cls, plan: Plan) -> Self:
-        """Leave out the families that have no stiffness."""
+        """Return the term's configuration, without families of stiffness 0."""
         material, open_edges = plan.material, plan.open_edges
         return cls(
             structural=max(material.across, material.down) > 0,
@@ -99,15 +98,22 @@ class SpringTerm(Term):
 
     @staticmethod
     def stiffness_bound(material: Material, sheet: Sheet) -> float:
-        """Bound the part of m w^2 of the springs, as long as none is shorter than half its length [N/m].
+        """Bound m w^2 of the springs, as long as no spring is shorter than half its rest length.
 
-        The energy is a sum over cells. The springs of a cell have at most the energy k / 2 |q|^2, so that no mode of a
-        cell with a quarter of the points' mass at its corners has more than
+        The energy is a sum over cells. A spring of a cell has at most the energy k / 2 |q|^2. With a quarter of the
+        mass of a mass point at each corner, every mode of a cell, and hence every mode of the sheet, satisfies
 
-            m w^2 = 4 max(across + down, across + 2 shear, down + 2 shear)
+            m w^2 <= 4 max(across + down, across + 2 shear, down + 2 shear)
 
-        and hence no mode of the sheet. If factors differ, each cell takes the share of a point's mass that it has of
-        the point's stiffness; the maximum is then multiplied by the largest mean of the factors around a point.
+        With a map, the mass of each mass point is distributed over its cells in proportion to their stiffness. The
+        bound is then multiplied by the largest mean of the factors around a mass point.
+
+        Args:
+            material: coefficients of the sheet.
+            sheet: the sheet.
+
+        Returns:
+            The bound [N/m].
         """
         largest = 1.0
         if material.factors is not None:
@@ -116,32 +122,37 @@ class SpringTerm(Term):
 
     @classmethod
     def node_stiffness_bounds(cls, plan: Plan) -> NDArray[Any] | float:
-        """Bound it point by point: with a map, each cell gives its corners a quarter of its own bound.
+        """Bound the stiffness at each mass point [N/m], shape (rows, cols).
 
-        Tissue has fewer cells at a point at an edge. Springs along an edge are whole: the largest factor.
+        Each cell contributes a quarter of its bound to each corner. Mass points at an edge of tissue have fewer cells;
+        `springs` are not softer at an edge, so their bound uses the largest factor around the mass point.
         """
         material, factors = plan.material, plan.material.factors
         if factors is None:
             factors = np.ones([count - 1 for count in plan.scene.sheet.points])
-        around = np.pad(factors, 1)
-        cells = np.stack([around[:-1, :-1], around[:-1, 1:], around[1:, :-1], around[1:, 1:]])
+        padded = np.pad(factors, 1)
+        cells = np.stack([padded[:-1, :-1], padded[:-1, 1:], padded[1:, :-1], padded[1:, 1:]])
         shares = cells.mean(axis=0) if material.by_area else cells.max(axis=0)
         return _unmapped_bound(material) * shares
 
     def constants(self, plan: Plan) -> tuple[float, ...]:
-        """Give k - tau and tau of every family [N/m]."""
+        """Return k - tau and tau of each family [N/m], for a factor of 1."""
         material = plan.material
-        less = 1 - material.tension
-        return material.across * less, material.down * less, material.shear * less, *material.tensions
+        rest = 1 - material.tension
+        return material.across * rest, material.down * rest, material.shear * rest, *material.tensions
 
     def energy(self, sums: NDArray[Any], plan: Plan) -> float:
-        """Give twice the energy [J]."""
+        """Compute twice the energy [J]."""
         dx, dy = spacing(plan.scene.sheet)
         squares = np.array([dx**2, dy**2, dx**2 + dy**2])
         return float((sums[STRETCH_SUMS:TENSION_SUMS] + plan.material.tensions * sums[TENSION_SUMS:]) @ squares)
 
     def build_spring_forces(self, config: KernelConfig) -> tuple[Callable[..., Any], ...]:
-        """Make the functions for the forces of springs along a row and to another one, and for their stiffness."""
+        """Build the functions for the forces of springs within a row and between two rows, and for their stiffness.
+
+        Returns:
+            Taichi functions along, to_other_row, of_row, of_column and of_diagonal.
+        """
         ti = config.ti
         tense, mapped, by_area = self.tense, self.mapped, self.by_area and not self.mapped
         leaves_out, real, first = self.open_edges and not self.mapped, config.real, config.first_constant(SpringTerm)
@@ -149,7 +160,7 @@ class SpringTerm(Term):
 
         @ti.func
         def pull(weighted, square, length, to: ti.template(), tension, q: ti.template()):
-            """Force along the deformed spring, from k (L^2 - L0^2) and L^2, plus tension times the difference q."""
+            """Return the force, from weighted = k (L^2 - L0^2), square = L^2 and length = L0."""
             share = weighted / (square + length * ti.sqrt(square))
             force = [share * to[c] for c in ti.static(range(3))]
             if ti.static(tense):
@@ -159,7 +170,7 @@ class SpringTerm(Term):
 
         @ti.func
         def along(sheet: ti.template(), right, here: ti.template(), k, exists):
-            """Force of a point displaced by `here` on its right neighbour, in entry `right` of u; exists: 0 if none."""
+            """Return the force of a mass point displaced by `here` on its right neighbour, entry `right` of u."""
             dx = sheet.constants[DX]
             x, y, z = here[0] - sheet.u[0][right], here[1] - sheet.u[1][right], here[2] - sheet.u[2][right]
             to_x = x - dx
@@ -172,7 +183,7 @@ class SpringTerm(Term):
 
         @ti.func
         def to_other_row(sheet: ti.template(), entry, right: ti.template(), here: ti.template(), up, length, k, exists):
-            """Force of a point displaced by `here` on that in `entry`, `right` columns on in the row above."""
+            """Return the force of a mass point displaced by `here` on `entry`, `up` above and `right` columns on."""
             x, y, z = here[0] - sheet.u[0][entry], here[1] - sheet.u[1][entry], here[2] - sheet.u[2][entry]
             to_x = x
             to_y = y - up
@@ -190,7 +201,7 @@ class SpringTerm(Term):
 
         @ti.func
         def of_row(sheet: ti.template(), i, kind, b):
-            """Stiffness of the spring to the right of entry b of row i; one along an edge belongs to one cell."""
+            """Return the stiffness of the spring to the right of entry b of row i, which along an edge is half."""
             if ti.static(mapped):
                 return sheet.stiffness[i * sheet.width + b]
             elif ti.static(by_area):  # noqa: RET505  # Taichi would compile the rest as well.
@@ -200,7 +211,7 @@ class SpringTerm(Term):
 
         @ti.func
         def of_column(sheet: ti.template(), lower, b):
-            """Stiffness of the spring between entry b of row `lower` and the row before."""
+            """Return the stiffness of the spring between entry b of row `lower` and the row before."""
             if ti.static(mapped):
                 return sheet.stiffness[(sheet.rows + lower) * sheet.width + b]
             elif ti.static(by_area):  # noqa: RET505
@@ -210,7 +221,7 @@ class SpringTerm(Term):
 
         @ti.func
         def of_diagonal(sheet: ti.template(), lower, b):
-            """Stiffness of the diagonals of the cell right of entry b, between row `lower` and the row before."""
+            """Return the stiffness of the diagonals of the cell right of entry b, above row `lower`."""
             if ti.static(mapped):
                 return sheet.stiffness[(2 * sheet.rows + 1 + lower) * sheet.width + b]
             else:  # noqa: RET505
@@ -219,24 +230,25 @@ class SpringTerm(Term):
         return along, to_other_row, of_row, of_column, of_diagonal
 
     def build_spring_tangent(self, config: KernelConfig) -> Callable[..., Any]:
-        """Make the function that differentiates the force of a point P on its neighbour Q.
+        """Build the function that differentiates the force of a mass point P on its neighbour Q.
 
-        As u_P - u_Q changes from q by p, the force of k - tau and tau changes by
+        If u_P - u_Q changes from q by p, the force changes by
 
             (k - tau) (s p + (1 - s) ((o + q) . p) (o + q) / L^2) + tau p,    s = 1 - L0 / L
 
-        which is symmetric. The product of the force with p changes with k - tau by s (o + q) . p, with tau by q . p.
+        The map from p to this change is symmetric. The product of the force with p has the derivative s (o + q) . p by
+        k - tau and q . p by tau.
         """
         ti, tense = config.ti, self.tense
 
         @ti.func
         def differentiate(q: ti.template(), p: ti.template(), x0, y0, length, k, tension):
-            """Give the change of the force, x, y and z; and of its product with p by k - tau and by tau."""
+            """Return the change of the force, x, y and z, and the derivatives of its product with p."""
             to = [q[0] + x0, q[1] + y0, q[2]]
             square = to[0] * to[0] + to[1] * to[1] + (to[2] * to[2] + MIN_SQUARED_LENGTH)
             longer = q[0] * (to[0] + x0) + (q[1] * (to[1] + y0) + q[2] * q[2])
             both = square + length * ti.sqrt(square)
-            # One division in the place of two.
+            # One division instead of two.
             inverse = 1 / (square * both)
             share = longer * square * inverse
             along = to[0] * p[0] + to[1] * p[1] + to[2] * p[2]
@@ -250,14 +262,13 @@ class SpringTerm(Term):
         return differentiate
 
     def build_max_spring_force(self, config: KernelConfig) -> Callable[..., Any]:
-        """Make the function that gives the square of the largest force of the springs to the right and below."""
+        """Build the function that computes the squared largest force of the springs to the right and below."""
         ti = config.ti
         structural, shear, vector = self.structural, self.shear, config.vector
         along, to_other_row, of_row, of_column, of_diagonal = self.build_spring_forces(config)
 
         @ti.func
         def stronger(largest, force: ti.template()):
-            """Give the larger of a square and that of a force."""
             return ti.max(largest, force[0] * force[0] + force[1] * force[1] + force[2] * force[2])
 
         @ti.func
@@ -265,7 +276,7 @@ class SpringTerm(Term):
             row = ti.static(entry.row)
             u = ti.static(entry.u)
             b, largest = entry.b, vector(0)
-            # Beyond an edge there is no spring.
+            # Springs beyond an edge do not exist.
             has_left, has_right = (
                 sheet.by_column[HAS_LEFT * sheet.width + b],
                 sheet.by_column[HAS_RIGHT * sheet.width + b],
@@ -290,17 +301,17 @@ class SpringTerm(Term):
         return pull
 
     def build_measures(self, config: KernelConfig) -> Sequence[Callable[..., None]]:
-        """Make the function that measures the springs to the right of an entry and to the row below it."""
+        """Build the function that measures the springs to the right of an entry and to the row below it."""
         ti = config.ti
         tense, open_edges, vector, first = self.tense, self.open_edges, config.vector, config.first_measure(SpringTerm)
         _, _, of_row, of_column, of_diagonal = self.build_spring_forces(config)
-        # Of every family that there is: rows and columns from one end to the other, for each of its springs.
+        # For each family: its index, the rows and the columns from one end to the other.
         structural = ((ALONG_ROW, 0, (1,)), (ALONG_COLUMN, 1, (0,))) if self.structural else ()
         families = structural + (((DIAGONAL, 1, (-1, 1)),) if self.shear else ())
 
         @ti.func
         def longer(sheet: ti.template(), p, q, b, right: ti.template(), x0, y0):
-            """(L^2 - L0^2) / L0^2 and |q|^2 / L0^2 of the spring from entry b of row p to entry b + right of row q."""
+            """Return (L^2 - L0^2) / L0^2 and |q|^2 / L0^2 of the spring from entry b of row p to b + right of row q."""
             here, there = p * sheet.width + b, q * sheet.width + b + right
             x = sheet.u[0][there] - sheet.u[0][here]
             y = sheet.u[1][there] - sheet.u[1][here]
@@ -308,7 +319,7 @@ class SpringTerm(Term):
             square = x0 * x0 + y0 * y0
             share = (x * (x + 2 * x0) + (y * (y + 2 * y0) + z * z)) / square
             apart = (x * x + y * y + z * z) / square
-            # Beyond the edge there is no spring.
+            # Springs beyond the edge do not exist.
             if ti.static(open_edges and right != 0):
                 side = ti.static(HAS_LEFT if right < 0 else HAS_RIGHT)
                 share = ti.select(sheet.by_column[side * sheet.width + b] > 0, share, vector(0))
@@ -331,7 +342,7 @@ class SpringTerm(Term):
                         share, apart = longer(sheet, p, p + down, b, right, right * dx, -down * dy)
                         measures[first + MIN_STRAIN] = ti.min(measures[first + MIN_STRAIN], share)
                         measures[first + MAX_STRAIN] = ti.max(measures[first + MAX_STRAIN], share)
-                        # L / L0 - 1; rounding may put the share below -1.
+                        # L / L0 - 1; rounding can make the share smaller than -1.
                         stretch = share / (1 + ti.sqrt(ti.max(share + 1, vector(0))))
                         stretched += stretch * stretch * k
                         tense_part += apart
@@ -342,10 +353,10 @@ class SpringTerm(Term):
         return (measure,)
 
     def stiffness_array(self, plan: Plan) -> NDArray[Any] | None:
-        """Give the array of stiffness: k - tau of every spring [N/m], shape (stiffness_rows, cols); None without a map.
+        """Return the kernels' array of stiffnesses k - tau [N/m], shape (3 rows + 2, cols); None without a map.
 
-        Along rows come as many rows as the sheet has; along columns and diagonals one more, of which the first and the
-        last are zeros, as are the entries of springs beyond the last column.
+        It contains the springs along rows, one row per row of the sheet, followed by those along columns and by the
+        diagonals, with one row more each. Their first and last rows and the entries beyond the last column are 0.
         """
         material = plan.material
         if material.factors is None:
@@ -356,21 +367,27 @@ class SpringTerm(Term):
 
 
 def _unmapped_bound(material: Material) -> float:
-    """Bound m w^2 where the factor of the map is 1: see `SpringTerm.stiffness_bound` [N/m]."""
+    """Return the bound of m w^2 for a factor of 1, see `SpringTerm.stiffness_bound` [N/m]."""
     across, down, shear = material.across, material.down, material.shear
     return 4 * max(across + down, across + 2 * shear, down + 2 * shear)
 
 
 def spring_stiffness(material: Material, factors: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Assemble the stiffness k of every spring from the factors of its cells, shape (rows - 1, cols - 1) [N/m].
+    """Assemble the stiffness k of every spring from the factors of its cells.
 
-    Along rows, shape (rows, cols - 1); along columns, shape (rows - 1, cols); along both diagonals of a cell.
+    Args:
+        material: coefficients of the sheet.
+        factors: of every cell, shape (rows - 1, cols - 1).
+
+    Returns:
+        Stiffness [N/m] of springs along rows, shape (rows, cols - 1), along columns, shape (rows - 1, cols), and along
+        both diagonals of a cell, shape (rows - 1, cols - 1).
     """
-    above_and_below, beside = np.pad(factors, ((1, 1), (0, 0))), np.pad(factors, ((0, 0), (1, 1)))
+    above_and_below, left_and_right = np.pad(factors, ((1, 1), (0, 0))), np.pad(factors, ((0, 0), (1, 1)))
     across = material.across / 2 * (above_and_below[:-1] + above_and_below[1:])
-    down = material.down / 2 * (beside[:, :-1] + beside[:, 1:])
+    down = material.down / 2 * (left_and_right[:, :-1] + left_and_right[:, 1:])
     if not material.by_area:
-        # A spring at an edge is as stiff as any other: with the factor of its only cell, not with half of it.
+        # The springs of `springs` at an edge have the full factor of their only cell.
         across[[0, -1]] *= 2
         down[:, [0, -1]] *= 2
     return across, down, material.shear * factors
