@@ -1,21 +1,21 @@
-"""What both forms of kernel 1 share: the layout of a sheet, the step of a point, the measures of an entry.
+"""The arrays of a sheet and the functions shared by the CPU and the GPU kernel: step, measures and read-out.
 
-The values of the sheet are vectors of lanes, each lane of another column; on a GPU a vector has one lane. They lie in
-Taichi's ndarrays row after row. A row has `width` entries: one for every column of a strip, and a halo of one entry at
-both ends. The arrays are one-dimensional, which saves a few instructions for every index:
+The values of a sheet are vectors of lanes. The columns are divided into strips, one per lane; on a GPU a vector has one
+lane. The values are stored row by row in ndarrays of Taichi. A row has `width` entries: one for every column of a strip,
+and a halo of one entry at both ends. One-dimensional arrays save a few instructions per index:
 
-    u, d         displacements and last differences; three arrays each, for x, y and z
-    by_column    for a first, a middle and a last row: 1 over the points' share of a cell's mass, 0 if they are fixed;
-                 and their share of a cell's area. For all rows: x at rest [m]; whether there is a left neighbour;
-                 whether there is a right one
-    fields       a number for every point each, as many rows as the sheet has; those of its terms follow each other
-    stiffness    with a map, of every spring: see `SpringTerm.stiffness_array`
-    numbers      of the sheet and its terms, in the first lane of an entry each
+    u, d         displacements and last differences [m], as three arrays each, for x, y and z
+    by_column    for the first, a middle and the last row: the inverse of the mass points' share of a cell's mass, 0 if
+                 fixed; and their share of a cell's area. For all rows: x at rest [m]; 1 if there is a left neighbour,
+                 else 0; 1 if there is a right neighbour, else 0
+    fields       one number per mass point, for every field of every term in turn
+    stiffness    with a map, k - tau of every spring, see `SpringTerm.stiffness_array`
+    constants    of the sheet and its terms, each in the first lane of an entry
 
-With bending, u also has rows of moments. The numbers of a step are in the table of loads, a row for every step.
+With bending, u also contains rows of moments. The load table contains the variables of the steps, one row per step.
 
-Vectors stay vectors down to the machine code (docs/decisions/0010). There, some of Taichi's operations crash or give
-wrong results; so unary minus, `-=`, abs, any and all are not used on vectors, and exp is applied lane by lane.
+The kernels use vectors down to the machine code (docs/decisions/0010). Some operations of Taichi crash or return wrong
+results for such vectors. Unary minus, `-=`, abs, any and all are therefore not used, and exp is applied lane by lane.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -31,21 +31,21 @@ from taichi_msm.solver.state import State
 from taichi_msm.system.runtime import Memory, ti, write
 from taichi_msm.terms.base import AREA_SHARE, GAIN, MOBILITY, SQUARED_MOTION, KernelConfig, KernelSheet
 
-# Bytes of a number.
+# Bytes per number.
 BYTES = {"f32": 4, "f64": 8}
 
 
 @dataclass(frozen=True)
 class SheetLayout:
-    """How a sheet is laid out in memory and shared out among workers, and the code that steps it."""
+    """The memory layout of a sheet, its division among workers, and the configuration of its kernels."""
 
-    # rows, cols: points of the sheet
+    # rows, cols: numbers of mass points
     rows: int
     cols: int
-    workers: int  # number of bands of rows that are stepped in parallel; 0 on a GPU, where all points are
+    workers: int  # number of bands of rows that are stepped in parallel; 0 on a GPU
     depth: int  # number of steps that a band takes in one pass
-    fixed_rows: tuple[bool, bool]  # whether all points of the first row are fixed, and all of the last
-    config: KernelConfig  # what the kernels are compiled for
+    fixed_rows: tuple[bool, bool]  # whether the whole first row is fixed, and the whole last row
+    config: KernelConfig
 
     @property
     def strip(self) -> int:
@@ -59,19 +59,24 @@ class SheetLayout:
 
 
 class InitialData(NamedTuple):
-    """What the arrays of a sheet hold at the start."""
+    """Initial values of the arrays of a sheet."""
 
-    constants: NDArray[Any]  # of the sheet and its terms
+    constants: NDArray[Any]  # of the sheet and its terms, shape (constants,)
     by_column: NDArray[Any]  # shape (COLUMN_ROWS, cols)
     fields: NDArray[Any]  # of the terms, shape (fields, rows, cols)
-    stiffness: NDArray[Any] | None  # as many rows as it takes; None without a map
-    state: State | None  # to continue from; None: at rest
+    stiffness: NDArray[Any] | None  # of all springs, shape (3 rows + 2, cols); None without a map
+    state: State | None  # state to continue from; None for the sheet at rest
 
 
 def to_lanes(layout: SheetLayout, values: NDArray[Any]) -> NDArray[Any]:
-    """Lay columns of values, shape (..., cols), out in strips with their halo, shape (entries, lanes).
+    """Arrange rows of values in lanes with halo, in the precision of the kernels.
 
-    In the precision of the code: values too large for it become infinite. Entries without a column are 0.
+    Args:
+        layout: of the sheet.
+        values: shape (..., cols); values too large for the precision become infinite.
+
+    Returns:
+        Entries, shape (entries, lanes); 0 where an entry has no column.
     """
     column = np.arange(layout.config.lanes) * layout.strip + np.arange(-1, layout.strip + 1)[:, None]
     inside = (column >= 0) & (column < layout.cols)
@@ -82,22 +87,31 @@ def to_lanes(layout: SheetLayout, values: NDArray[Any]) -> NDArray[Any]:
 
 
 def from_lanes(layout: SheetLayout, entries: NDArray[Any], rows: int) -> NDArray[Any]:
-    """Give the columns of the first rows of what `to_lanes` has laid out, shape (rows, cols)."""
+    """Invert `to_lanes`.
+
+    Args:
+        layout: of the sheet.
+        entries: shape (entries, lanes).
+        rows: number of rows to return.
+
+    Returns:
+        Values, shape (rows, cols).
+    """
     laid = entries[: rows * layout.width].reshape(rows, layout.width, layout.config.lanes)
     return laid[:, 1:-1].transpose(0, 2, 1).reshape(rows, -1)[:, : layout.cols]
 
 
 class SheetArrays:
-    """The arrays that both forms of kernel 1 have.
+    """The arrays of a sheet in the memory of a device.
 
     Args:
         layout: of the sheet.
-        stored: for every stored row of u, the row of the sheet that it holds, or -1 for none.
-        start: what the arrays hold at the start.
+        stored: for every stored row of u the row of the sheet that it contains, or -1, shape (stored rows,).
+        start: initial values.
     """
 
     def __init__(self, layout: SheetLayout, stored: NDArray[np.int32], start: InitialData) -> None:
-        lanes, none = layout.config.lanes, np.zeros((0, layout.cols))
+        lanes, no_values = layout.config.lanes, np.zeros((0, layout.cols))
         self._layout = layout
         self._memory = Memory()
         self.u = [self.rows(len(stored)) for _ in range(3)]
@@ -114,64 +128,88 @@ class SheetArrays:
             self._set(self.stiffness, start.stiffness)
         state, held = start.state, (stored >= 0)[:, None]
         for c in range(3):
-            self._set(self.u[c], none if state is None else np.where(held, state.displacement[stored, :, c], 0))
-            self._set(self.d[c], none if state is None else state.difference[..., c])
+            self._set(self.u[c], no_values if state is None else np.where(held, state.displacement[stored, :, c], 0))
+            self._set(self.d[c], no_values if state is None else state.difference[..., c])
         self._set(self.fields, start.fields)
 
     @property
     def all(self) -> tuple[Any, ...]:
-        """All arrays, in the order in which kernels take them."""
+        """All arrays, in the order of the kernels' arguments."""
         return *self.u, *self.d, self.constants, self.by_column, self.stiffness, self.fields
 
     def get_fields(self, first: int, count: int) -> NDArray[Any]:
-        """Read so many fields from the first one on, shape (count, rows, cols)."""
+        """Read consecutive fields.
+
+        Args:
+            first: index of the first field.
+            count: number of fields.
+
+        Returns:
+            Fields, shape (count, rows, cols).
+        """
         layout = self._layout
         entries = self.fields.to_numpy()[first * layout.rows * layout.width :]
         values = from_lanes(layout, entries, count * layout.rows)
         return np.ascontiguousarray(values.reshape(count, layout.rows, layout.cols))
 
     def set_fields(self, first: int, values: NDArray[Any]) -> None:
-        """Replace fields from the first one on, shape (fields, rows, cols); the others stay."""
+        """Replace consecutive fields.
+
+        Args:
+            first: index of the first field.
+            values: shape (fields, rows, cols).
+        """
         entries, laid = self.fields.to_numpy(), to_lanes(self._layout, values)
         at = first * self._layout.rows * self._layout.width
         entries[at : at + len(laid)] = laid
         self.fields.from_numpy(entries)
 
     def _set(self, array: Any, values: NDArray[Any]) -> None:
-        """Set the first rows of an array to values, shape (..., cols), and the others to zero."""
+        """Set the first rows of an array to values, shape (..., cols), and all others to 0."""
         write(array, to_lanes(self._layout, values))
 
     def rows(self, count: int) -> Any:
-        """Allocate an array of `count` rows; its content is arbitrary."""
+        """Allocate an array of `count` rows with arbitrary content."""
         return self._memory.array(self._layout.config.precision, self._layout.config.lanes, count * self._layout.width)
 
 
 class StepKernel(Protocol):
-    """A form of kernel 1: the state of a sheet in the memory of a device."""
+    """A sheet in the memory of a device, and its kernels."""
 
     arrays: SheetArrays
 
     def __init__(self, layout: SheetLayout, start: InitialData) -> None: ...
 
     def advance(self, count: int, table: NDArray[Any]) -> None:
-        """Take a number of steps; table: of the loads, shape (count, columns)."""
+        """Take a number of steps.
+
+        Args:
+            count: number of steps.
+            table: rows of the load table, shape (count, columns).
+        """
 
     def compile(self, table: NDArray[Any]) -> None:
-        """Compile everything that steps may need, without taking one."""
+        """Compile all kernels without taking a step."""
 
     def read(self, differences: bool, values: NDArray[Any], measures: NDArray[Any]) -> None:
-        """Copy displacements or differences into values, shape (rows, cols, 3), and the measures of every row."""
+        """Read displacements or last differences, and measure every row.
+
+        Args:
+            differences: whether to read last differences instead of displacements.
+            values: output [m], shape (rows, cols, 3).
+            measures: output, shape (rows, measures).
+        """
 
 
 def point_forces(config: KernelConfig) -> list[Callable[..., Any]]:
-    """List the functions that add the forces of terms on points to those of springs."""
-    # Terms that reach far come first. The last bits depend on the order.
+    """Build the functions that add the forces of all terms except springs."""
+    # The order of summation determines the last bits.
     ordered = sorted(config.terms, key=lambda term: -term.reach)
     return [force for term in ordered for force in term.build_forces(config)]
 
 
 def build_point_step(config: KernelConfig) -> Callable[..., None]:
-    """Make the function that adds the forces of terms on points to those of springs, and steps.
+    """Build the function that adds the forces of all other terms to those of springs, and steps an entry.
 
     d_{n+1} = keep d_n + gain F_n,    u_{n+1} = u_n + d_{n+1}                                  (eq. 6 to 9)
     """
@@ -180,7 +218,7 @@ def build_point_step(config: KernelConfig) -> Callable[..., None]:
 
     @ti.func
     def move(sheet: ti.template(), entry: ti.template(), target, force: ti.template(), now: ti.template()):
-        """Step an entry, and store it in row `target` of u; force: of springs; now: its row of the table of loads."""
+        """Step an entry and store it in row `target` of u; force: of springs; now: row of the load table."""
         for add in ti.static(forces):
             add(force, sheet, entry, now)
         gain = now[GAIN] * sheet.by_column[(MOBILITY + entry.row.kind) * sheet.width + entry.b]
@@ -198,7 +236,7 @@ def build_point_step(config: KernelConfig) -> Callable[..., None]:
 
 
 def build_measure(config: KernelConfig) -> Callable[..., Any]:
-    """Make the function that measures an entry: it adds motion, and what the terms measure, to a list of vectors."""
+    """Build the function that adds the measures of an entry, its motion and those of terms, to a list of vectors."""
     vector, measuring_terms = (
         config.vector,
         [measure for term in config.terms for measure in term.build_measures(config)],
@@ -206,7 +244,7 @@ def build_measure(config: KernelConfig) -> Callable[..., Any]:
 
     @ti.func
     def measure(measures: ti.template(), sheet: ti.template(), p, i, b):
-        """Measure entry b of row i of the sheet, stored in row p of u, and the row below it, the next one."""
+        """Measure entry b of row i of the sheet, stored in row p of u; the row below is stored in row p + 1."""
         kind = ti.select(i == sheet.rows - 1, 2, ti.select(i == 0, 0, 1))
         motion = vector(0)
         for c in ti.static(range(3)):
@@ -222,7 +260,13 @@ def build_measure(config: KernelConfig) -> Callable[..., Any]:
 
 
 def build_read(config: KernelConfig, *, parallel: bool, iterations: int) -> Callable[..., None]:
-    """Make the kernel that reads and measures a sheet, in a loop with so many iterations for each row."""
+    """Build the kernel that reads and measures a sheet.
+
+    Args:
+        config: compile-time configuration.
+        parallel: whether the rows are distributed over threads.
+        iterations: number of loop iterations per row, of which one has work.
+    """
     real, vector, vectors, lanes, count = (
         config.real,
         config.vector,
@@ -249,7 +293,6 @@ def build_read(config: KernelConfig, *, parallel: bool, iterations: int) -> Call
         for index in range(rows * iterations):
             if index % iterations == 0:
                 i, strip = index // iterations, (cols + lanes - 1) // lanes
-                # Entries of a row, and where u has it.
                 width, p = strip + 2, first + i
                 constants = [constants_of[n][0] for n in ti.static(range(count))]
                 u, d = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z))
@@ -258,10 +301,10 @@ def build_read(config: KernelConfig, *, parallel: bool, iterations: int) -> Call
                 for b in range(1, strip + 1):
                     measure(sums, sheet, p, i, b)
                     for c in ti.static(range(3)):
-                        wanted = ti.select(differences, d[c][i * width + b], u[c][p * width + b])
+                        value = ti.select(differences, d[c][i * width + b], u[c][p * width + b])
                         for lane in ti.static(range(lanes)):
                             if lane * strip + b <= cols:
-                                values[i, lane * strip + b - 1, c] = wanted[lane]
+                                values[i, lane * strip + b - 1, c] = value[lane]
                 for m, how in ti.static(enumerate(reductions)):
                     if ti.static(how == "min"):
                         measures[i, m] = sums[m].min()

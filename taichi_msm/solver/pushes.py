@@ -1,4 +1,4 @@
-"""The pushes of the tools that are moved, added up over the points."""
+"""Sums of the contact corrections over the mass points, from which the forces of tools follow."""
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
@@ -15,12 +15,15 @@ from taichi_msm.terms.contact import CORRECTIONS, ContactTerm
 
 
 def sum_corrections(layout: SheetLayout, arrays: SheetArrays, *, clear: bool) -> NDArray[np.float64]:
-    """Add up the pushes [m] that the fields of contact hold, each times its point's share of a cell's mass.
+    """Sum the contact corrections over the mass points, weighted with their shares of a cell's mass.
 
-    clear: set them to 0 then.
+    Args:
+        layout: of the sheet.
+        arrays: of the sheet.
+        clear: whether to set the fields of corrections to 0 afterwards.
 
     Returns:
-        Sums [m], shape (tools, 3); the order of adding depends neither on lanes nor on workers.
+        Sums [m], shape (tools, 3). The order of summation depends neither on lanes nor on workers.
     """
     contact = layout.config.get(ContactTerm)
     if contact is None:
@@ -33,7 +36,7 @@ def sum_corrections(layout: SheetLayout, arrays: SheetArrays, *, clear: bool) ->
 
 @cache
 def _build_sum(config: KernelConfig) -> Callable[..., None]:
-    """Make the kernel that adds up every component of the pushes of every tool in every row, from left to right."""
+    """Build the kernel that sums the corrections in every row from left to right, per tool and component."""
     vector, vectors, lanes, serial = config.vector, config.vectors, config.lanes, config.lanes > 1
     first, count, by_area = (
         config.first_field(ContactTerm),
@@ -59,7 +62,7 @@ def _build_sum(config: KernelConfig) -> Callable[..., None]:
                 for b in range(1, strip + 1):
                     push = pushes[row + b]
                     largest = ti.max(largest, ti.max(push, push * (-1)))
-                # Most rows are touched by no tool.
+                # Most rows touch no tool.
                 if largest.max() > 0:
                     for lane in ti.static(range(lanes)):
                         for b in range(1, strip + 1):

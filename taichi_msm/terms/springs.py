@@ -138,8 +138,9 @@ class SpringTerm(Term):
     def constants(self, plan: Plan) -> tuple[float, ...]:
         """Return k - tau and tau of each family [N/m], for a factor of 1."""
         material = plan.material
-        rest = 1 - material.tension
-        return material.across * rest, material.down * rest, material.shear * rest, *material.tensions
+        remainder = 1 - material.tension
+        stiffness = material.across * remainder, material.down * remainder, material.shear * remainder
+        return *stiffness, *material.tensions
 
     def energy(self, sums: NDArray[Any], plan: Plan) -> float:
         """Compute twice the energy [J]."""
