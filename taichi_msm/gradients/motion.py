@@ -39,7 +39,7 @@ from taichi_msm.model.sheet import area_shares
 from taichi_msm.solver.arrays import from_lanes, to_lanes
 from taichi_msm.solver.bands import MOMENT_ROWS
 from taichi_msm.solver.dynamics import STEPS_PER_TABLE, Dynamics
-from taichi_msm.solver.kernel_cpu import PAGE, PATIENCE
+from taichi_msm.solver.kernel_cpu import MAX_CHECKS, PAGE
 from taichi_msm.solver.state import State, largest_displacement
 from taichi_msm.system.runtime import Memory, our_compilation, write
 from taichi_msm.terms.base import GAIN
@@ -52,7 +52,7 @@ SEGMENT_BYTES = 64 * 2**20
 
 # How many times a worker looks for its neighbour before it gives up: longer than forward, as one alone takes all the
 # rest of the launch, and its kernel may have to be compiled.
-LONG_PATIENCE = 8 * PATIENCE
+LONG_PATIENCE = 8 * MAX_CHECKS
 
 # A launch of the adjoint takes no more steps times points than this, about 0.1 s of one core.
 POINT_STEPS_PER_LAUNCH = 10_000_000

@@ -1,8 +1,8 @@
 """The arrays of a sheet and the functions shared by the CPU and the GPU kernel: step, measures and read-out.
 
 The values of a sheet are vectors of lanes. The columns are divided into strips, one per lane; on a GPU a vector has one
-lane. The values are stored row by row in ndarrays of Taichi. A row has `width` entries: one for every column of a strip,
-and a halo of one entry at both ends. One-dimensional arrays save a few instructions per index:
+lane. The values are stored row by row in ndarrays of Taichi. A row has `width` entries: one for every column of a
+strip, and a halo of one entry at both ends. One-dimensional arrays save a few instructions per index:
 
     u, d         displacements and last differences [m], as three arrays each, for x, y and z
     by_column    for the first, a middle and the last row: the inverse of the mass points' share of a cell's mass, 0 if

@@ -1,20 +1,19 @@
-"""How workers share the rows of a sheet on a CPU: a band each, passes over it, and copies of the rows at its borders.
+"""Parallel stepping on a CPU: one band of rows per worker, passes over the bands, and copies of rows at their borders.
 
-Passes. The second step can follow the first with a distance of one row, the third step the second, and so on: a pass
-takes `depth` steps while the rows are in the cache. Round k of a pass takes row k from step n to n + 1, row k - 1 from
-n + 1 to n + 2, and so on.
+Passes. A step can follow the previous step at a distance of one row. A pass therefore takes `depth` steps while the
+rows are in the cache: round k takes row k from step n to n + 1, row k - 1 from n + 1 to n + 2, and so on.
 
-Bands. Neighbouring workers go away from their common border or toward it, so that they arrive there at the same
-time. Each needs the other's row at the border as it was before the step: after every step each copies its row, into one
-of two buffers by turns, and waits for the other's copy. The order in which forces are added does not depend on the
-direction of a pass, so the bits of a result do not depend on the number of workers.
+Bands. Neighbouring workers both move away from their common border or both toward it, so that they reach it at the
+same time. Each needs the neighbour's row at the border as it was before the step. After every step, a worker therefore
+copies its row, alternately into one of two buffers, and waits for the neighbour's copy. The order of summation does not
+depend on the direction of a pass, so results are independent of the number of workers, to the bit.
 
-Bending. A moment is the Laplacian of the displacements, and the force on a row is the Laplacian of the moments. So
-before a row is stepped, the moments of the row ahead are computed, which depend on one row more. A pass is then one
-step, and neighbours copy two rows.
+Bending. A moment is the Laplacian of the displacements, and the force on a row is the Laplacian of the moments. Before
+a row is stepped, the moments of the next row are computed, which depend on one row more. A pass then takes one step,
+and neighbours copy two rows.
 
-Giving up. A waiting worker spins, but not for long: another program may have taken its neighbour's core. It then
-records its place and ends, which frees its own core. Further launches continue from the recorded places.
+Timeout. A worker waits by spinning. If another program has taken the neighbour's core, spinning would waste its own, so
+after a limited number of checks the worker records its progress and ends. Further launches continue from there.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -29,46 +28,44 @@ from taichi_msm.terms.base import DY, KernelConfig, KernelRow, KernelSheet
 from taichi_msm.terms.bending import BendingTerm
 from taichi_msm.terms.contact import ContactTerm
 
-# The sizes that a launch is given: steps taken before; steps to take; workers; steps of a pass; rows of `carried` for a
-# worker; rows of the sheet; columns of a strip; the first row that moves, and the row after the last; where u has the
-# moments; how many times a worker looks for its neighbour before it gives up.
-FIRST, COUNT, WORKERS, DEPTH, CARRIED_ROWS, ROWS, STRIP, FIRST_ROW, END_ROW, MOMENT_ROW, PATIENCE, SIZES = range(12)
+# Integer arguments of a launch: steps taken before; steps to take; workers; steps of a pass; rows of `carried` per
+# worker; rows of the sheet; columns of a strip; the first row that is not fixed, and the row after the last; the first
+# row of moments in u; the number of checks after which a waiting worker ends.
+FIRST, COUNT, WORKERS, DEPTH, CARRIED_ROWS, ROWS, STRIP, FIRST_ROW, END_ROW, MOMENT_ROW, MAX_CHECKS, SIZES = range(12)
 
-# The borders of a band: where its worker begins and where it ends.
+# The borders of a band at which its worker begins and ends.
 BEGIN, END = 0, 1
 
-# Integers of a worker in the array `progress`. For each border, in a cache line of its own, the steps taken there;
-# after the first of them the place of the worker: pass, round and step of the round.
+# Integers of a worker in the array `progress`: for each border, in a separate cache line, the number of steps taken at
+# the border; after the first of them the worker's pass, round, and step of the round.
 COUNTER_STRIDE = 16
 WORKER_STRIDE = 2 * COUNTER_STRIDE
 TURN, ROUND, STEP, PLACE_END = 1, 2, 3, 4
 
-# Number of rows of moments that a worker needs at a time.
+# Rows of moments per worker.
 MOMENT_ROWS = 3
 
 
 class RowBand(NamedTuple):
-    """A worker's band of rows, within a kernel."""
+    """A worker's band of rows within a kernel."""
 
-    # worker, workers: its worker; all workers
-    worker: Any
-    workers: Any
-    # low, high: its first row, and the row after its last
-    low: Any
-    high: Any
-    way: Any  # 1 if its worker goes down, -1 if up
-    rows: Any  # of the sheet
-    patience: Any  # as in the sizes
-    progress: Any  # of all workers
+    worker: Any  # index of the worker
+    workers: Any  # number of workers
+    low: Any  # first row of the band
+    high: Any  # row after the last of the band
+    direction: Any  # 1 if the worker goes down, -1 if up
+    rows: Any  # number of rows of the sheet
+    max_checks: Any  # number of checks after which a waiting worker ends
+    progress: Any  # array of all workers
 
 
 def build_join_strips(config: KernelConfig) -> Callable[..., None]:
-    """Make the function that fills the halo of a row."""
+    """Build the function that fills the halo of a row."""
     vector, lanes = config.vector, config.lanes
 
     @ti.func
     def join_strips(u: ti.template(), p, width):
-        """Fill the halo of row p: before the first column of a strip comes the last one of the strip before."""
+        """Fill the halo of row p with the last column of the previous strip and the first one of the next strip."""
         for c in ti.static(range(3)):
             last = u[c][p * width + width - 2]
             first = u[c][p * width + 1]
@@ -81,13 +78,13 @@ def build_join_strips(config: KernelConfig) -> Callable[..., None]:
 def build_step_row(
     config: KernelConfig, move: Callable[..., None], *, touches: bool, parallel: bool
 ) -> Callable[..., Any]:
-    """Make the function that takes a step of a row of a band, as soon as the neighbours' rows allow it.
+    """Build the function that takes a step with a row of a band, as soon as the neighbours' rows are available.
 
     Args:
-        config: of the sheet.
-        move: what it does with an entry, as for `build_pass_row`.
-        touches: whether tools then push the points of the row out.
-        parallel: whether there are neighbours.
+        config: compile-time configuration.
+        move: function that steps an entry, as for `build_pass_row`.
+        touches: whether contact with tools is resolved after the step.
+        parallel: whether the band has neighbours.
     """
     vector, bending, copied, join_strips = (
         config.vector,
@@ -101,34 +98,34 @@ def build_step_row(
 
     @ti.func
     def copy_row(rows, worker, border, n, behind):
-        """Where u has a worker's copy of the row `behind` rows from a border after n steps."""
+        """Return the row of u with a worker's copy of the row `behind` rows from a border after n steps."""
         return rows + copied * (4 * worker + 2 * border + ti.cast(n % 2, ti.i32)) + behind
 
     @ti.func
     def row_at(band: ti.template(), row, n):
-        """Where u has a row of a band, or one of two beyond its ends, after n steps; any row if there is none."""
-        i = ti.select(band.way > 0, band.low, band.high - 1) + row * band.way
+        """Return the row of u with a row of a band, or one beyond its ends, after n steps; any row if none exists."""
+        i = ti.select(band.direction > 0, band.low, band.high - 1) + row * band.direction
         stored = ti.max(0, ti.min(i, band.rows - 1))
         if ti.static(parallel):
-            if row < 0 and 0 <= band.worker - band.way < band.workers:
-                stored = copy_row(band.rows, band.worker - band.way, BEGIN, n, -1 - row)
-            if row >= band.high - band.low and 0 <= band.worker + band.way < band.workers:
-                stored = copy_row(band.rows, band.worker + band.way, END, n, row - (band.high - band.low))
+            if row < 0 and 0 <= band.worker - band.direction < band.workers:
+                stored = copy_row(band.rows, band.worker - band.direction, BEGIN, n, -1 - row)
+            if row >= band.high - band.low and 0 <= band.worker + band.direction < band.workers:
+                stored = copy_row(band.rows, band.worker + band.direction, END, n, row - (band.high - band.low))
         return stored
 
     @ti.func
-    def has_come(band: ti.template(), worker, border, n):
-        """Wait until a worker has taken n steps at a border, but not for long; returns whether it has."""
+    def wait_for(band: ti.template(), worker, border, n):
+        """Wait until a worker has taken n steps at a border; return False after `max_checks` checks."""
         steps = ti.atomic_add(band.progress[WORKER_STRIDE * worker + COUNTER_STRIDE * border], 0)
-        looks = 0
-        while steps < n and looks < band.patience:
+        checks = 0
+        while steps < n and checks < band.max_checks:
             steps = ti.atomic_add(band.progress[WORKER_STRIDE * worker + COUNTER_STRIDE * border], 0)
-            looks += 1
+            checks += 1
         return steps >= n
 
     @ti.func
     def publish(sheet: ti.template(), band: ti.template(), border, i, inward, n):
-        """Copy row i, and with bending also the next one inward, for the neighbour at a border, after n steps."""
+        """Copy row i, and with bending the next row inward, for the neighbour at a border, after n steps."""
         for behind in ti.static(range(copied)):
             copy = copy_row(band.rows, band.worker, border, n, behind)
             for b in range(sheet.width):
@@ -138,14 +135,14 @@ def build_step_row(
 
     @ti.func
     def store_moments(sheet: ti.template(), band: ti.template(), row, moments, n):
-        """Store the moments of the row ahead; at the start of a band also of row 0 and of the one before it."""
-        begin = ti.select(band.way > 0, band.low, band.high - 1)
+        """Store the moments of the next row; at the start of a band also those of row 0 and of the row before it."""
+        begin = ti.select(band.direction > 0, band.low, band.high - 1)
         for ahead in range(ti.select(row < 0, -1, row + 1), row + 2):
             before, here = row_at(band, ahead - 1, n), row_at(band, ahead, n)
             after, target = row_at(band, ahead + 1, n), moments + (ahead + MOMENT_ROWS) % MOMENT_ROWS
             for b in range(1, sheet.width - 1):
                 for store_moment in ti.static(storing):
-                    store_moment(sheet, begin + ahead * band.way, before, here, after, b, target)
+                    store_moment(sheet, begin + ahead * band.direction, before, here, after, b, target)
             join_strips(sheet.u, target, sheet.width)
 
     @ti.func
@@ -153,37 +150,38 @@ def build_step_row(
         sheet: ti.template(), carried: ti.template(), loads: ti.template(), band: ti.template(),
         row, n, at, carry, moments,
     ):  # fmt: skip
-        """Take step n of the launch, after `at` steps in all, with a row of the band; returns whether it was taken.
+        """Take step n of the launch with a row of the band, after `at` steps of the run; return whether it was taken.
 
-        Row -1 is the one before the band: it is swept for its forces, but not stepped.
+        Row -1 is the row before the band. Its forces are computed, but it is not stepped.
         """
-        begin = ti.select(band.way > 0, band.low, band.high - 1)
-        near, far, last = band.worker - band.way, band.worker + band.way, band.high - band.low - 1
-        i = begin + row * band.way
+        begin = ti.select(band.direction > 0, band.low, band.high - 1)
+        begin_worker, end_worker = band.worker - band.direction, band.worker + band.direction
+        last = band.high - band.low - 1
+        i = begin + row * band.direction
         here = i
-        other = i + band.way
-        exists = ti.cast(0 <= other < band.rows, config.real)
+        next_row = i + band.direction
+        exists = ti.cast(0 <= next_row < band.rows, config.real)
         goes = True
         if ti.static(parallel):
-            if row == -1 and 0 <= near < band.workers:
-                goes = has_come(band, near, BEGIN, at)
-                here = copy_row(band.rows, near, BEGIN, at, 0)
-            # With bending, one row further ahead is needed.
-            if goes and row > last - copied and 0 <= far < band.workers:
-                goes = has_come(band, far, END, at)
-            if row == last and 0 <= far < band.workers:
-                other = copy_row(band.rows, far, END, at, 0)
+            if row == -1 and 0 <= begin_worker < band.workers:
+                goes = wait_for(band, begin_worker, BEGIN, at)
+                here = copy_row(band.rows, begin_worker, BEGIN, at, 0)
+            # With bending, the step depends on one more row.
+            if goes and row > last - copied and 0 <= end_worker < band.workers:
+                goes = wait_for(band, end_worker, END, at)
+            if row == last and 0 <= end_worker < band.workers:
+                next_row = copy_row(band.rows, end_worker, END, at, 0)
         if goes:
             if ti.static(len(storing) > 0):
                 store_moments(sheet, band, row, moments, at)
-            other = ti.select(exists > 0, other, i)
+            next_row = ti.select(exists > 0, next_row, i)
             if 0 <= i < band.rows:
                 kind = ti.select(i == band.rows - 1, 2, ti.select(i == 0, 0, 1))
-                up = -band.way * sheet.constants[DY]
+                up = -band.direction * sheet.constants[DY]
                 before, middle = moments + (row + 2) % MOMENT_ROWS, moments + row % MOMENT_ROWS
                 after = moments + (row + 1) % MOMENT_ROWS
                 line = ti.static(KernelRow(i, kind, before, middle, after))
-                pass_row(sheet, carried, carry, line, here, other, exists, up, loads, n, row >= 0)
+                pass_row(sheet, carried, carry, line, here, next_row, exists, up, loads, n, row >= 0)
                 if row >= 0:
                     for touch_row in ti.static(touching):
                         touch_row(sheet, i, kind, loads, n)
@@ -194,18 +192,23 @@ def build_step_row(
             if row >= 0:
                 join_strips(sheet.u, i, sheet.width)
             if ti.static(parallel):
-                # As soon as all rows to be copied have been stepped.
+                # Copy as soon as all rows to be copied are stepped.
                 if row == copied - 1:
-                    publish(sheet, band, BEGIN, begin, band.way, at + 1)
+                    publish(sheet, band, BEGIN, begin, band.direction, at + 1)
                 if row == last:
-                    publish(sheet, band, END, i, -band.way, at + 1)
+                    publish(sheet, band, END, i, -band.direction, at + 1)
         return goes
 
     return step_row
 
 
 def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None]:
-    """Make the kernel that takes steps, with one worker or several."""
+    """Build the kernel that takes steps.
+
+    Args:
+        config: compile-time configuration.
+        parallel: whether several workers step at the same time.
+    """
     real, vector, vectors, lanes = config.real, config.vector, config.vectors, config.lanes
     constant_count, step_row = (
         config.first_constant(None),
@@ -213,10 +216,10 @@ def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None
     )
 
     @ti.func
-    def work(
+    def step_band(
         sheet: ti.template(), carried: ti.template(), loads: ti.template(), band: ti.template(), sizes: ti.template()
     ):
-        """Take the steps of a launch with a band, from the worker's place on; record its place if it gives up."""
+        """Take the steps of a launch with a band, from the worker's recorded progress on, and record it at the end."""
         first, place = sizes[FIRST], WORKER_STRIDE * band.worker
         count, depth = ti.cast(sizes[COUNT], ti.i32), ti.cast(sizes[DEPTH], ti.i32)
         carried_rows = ti.cast(sizes[CARRIED_ROWS], ti.i32)
@@ -224,8 +227,8 @@ def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None
         turn = ti.cast(band.progress[place + TURN], ti.i32)
         k = ti.cast(band.progress[place + ROUND], ti.i32)
         step = ti.cast(band.progress[place + STEP], ti.i32)
-        # The compiler keeps a vector with a variable index on the stack, and aligns the stack for it. Then the vectors
-        # that it spills are aligned too: a step takes up to 7 % less. `goes` is always True here.
+        # A vector with a variable index makes the compiler align the stack, and with it all spilled vectors, which
+        # saves up to 7 % of a step. `goes` is always True here.
         aligned = vector(0)
         aligned[band.workers % lanes] = 1
         goes = aligned[count % lanes] >= 0
@@ -262,7 +265,7 @@ def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None
     ):  # fmt: skip
         ti.loop_config(serialize=not parallel)
         for index in range(ti.cast(sizes[WORKERS], ti.i32) * ITERATIONS_PER_THREAD):
-            # One worker a thread.
+            # One worker per thread.
             if index % ITERATIONS_PER_THREAD == 0:
                 rows, width = ti.cast(sizes[ROWS], ti.i32), ti.cast(sizes[STRIP], ti.i32) + 2
                 constants = [constants_of[n][0] for n in ti.static(range(constant_count))]
@@ -273,10 +276,10 @@ def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None
                 first_row, end_row = ti.cast(sizes[FIRST_ROW], ti.i32), ti.cast(sizes[END_ROW], ti.i32)
                 low = first_row + (end_row - first_row) * worker // workers
                 high = first_row + (end_row - first_row) * (worker + 1) // workers
-                way = 2 * (worker % 2) - 1
-                patience = ti.cast(sizes[PATIENCE], ti.i32)
-                band = ti.static(RowBand(worker, workers, low, high, way, rows, patience, progress))
+                direction = 2 * (worker % 2) - 1
+                max_checks = ti.cast(sizes[MAX_CHECKS], ti.i32)
+                band = ti.static(RowBand(worker, workers, low, high, direction, rows, max_checks, progress))
                 carried = ti.static((carried_x, carried_y, carried_z))
-                work(sheet, carried, loads, band, sizes)
+                step_band(sheet, carried, loads, band, sizes)
 
     return advance

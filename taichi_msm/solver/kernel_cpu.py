@@ -1,7 +1,7 @@
-"""Kernel 1 on a CPU: rows are swept one after another, every spring is evaluated once, and rows are stepped in place.
+"""Kernel 1 on a CPU: passes over the rows that evaluate every spring once and step the rows in place.
 
-A launch takes several steps with several workers (`bands`), or with one. If a worker gives up waiting, further launches
-continue until all workers have taken the same steps; after that a single worker takes over for some time.
+A launch takes several steps with one worker or with several (`bands`). If a worker ends before its neighbour arrives,
+further launches continue until all workers have taken the same steps. A single worker then steps for a back-off period.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -31,171 +31,187 @@ from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, our_compilation, ti
 from taichi_msm.terms.base import KernelConfig
 from taichi_msm.terms.bending import BendingTerm
 
-# Bytes of a page.
+# Bytes of a memory page.
 PAGE = 4096
 
-# How many times a worker looks for its neighbour before it gives up: for about 1.3 ms.
-PATIENCE = round(1.32e-3 / chosen().look)
+# Number of checks after which a worker stops waiting for its neighbour, after about 1.3 ms.
+MAX_CHECKS = round(1.32e-3 / chosen().look)
 
-# After a worker has given up, a single worker steps for some time [s]. Where other programs want the cores, that is
-# four times the last such rest, halved for every HALF_LIFE that all workers have stepped since then; else it is the
-# shortest.
-SHORTEST_REST, LONGEST_REST, HALF_LIFE = 0.002, 0.2, 0.02
+# Back-off period in which a single worker steps after a timeout [s]. If other programs compete for the cores, it is
+# four times the last period, halved for every BACKOFF_HALF_LIFE_S in which all workers have stepped since; otherwise it
+# is the minimum.
+MIN_BACKOFF_S, MAX_BACKOFF_S, BACKOFF_HALF_LIFE_S = 0.002, 0.2, 0.02
 
-# Other programs want the cores if threads have waited for one for this share of the time that they have had one.
-CROWDED = 0.2
+# Other programs compete for the cores if threads have waited for a core for more than this share of their CPU time.
+MAX_WAIT_SHARE = 0.2
 
 
 class ScatterKernel:
-    """The state of a sheet in the memory of a CPU, and its kernels: a `StepKernel`."""
+    """A sheet in the memory of a CPU: a `StepKernel`.
+
+    Args:
+        layout: of the sheet.
+        start: initial values.
+    """
 
     def __init__(self, layout: SheetLayout, start: InitialData) -> None:
         self._layout = layout
         self._advance, self._read = _kernels(layout.config, parallel=layout.workers > 1)
         self._alone, _ = _kernels(layout.config, parallel=False)
         self._steps = 0
-        self._rest = self._rests_until = 0.0
-        # Time that all workers have stepped undisturbed since the last rest [s].
+        self._backoff = self._backoff_until = 0.0
+        # Time in which all workers have stepped without a timeout since the last back-off [s].
         self._together = 0.0
-        # At the end of the last rest: the time that this process's threads had had a core, and had waited for one [s].
-        self._had, self._waited = 0.0, 0.0
+        # CPU time of this process, and time waited for a core, at the end of the last back-off [s].
+        self._cpu_time, self._wait_time = 0.0, 0.0
         self._first_row, self._end_row = int(layout.fixed_rows[0]), layout.rows - int(layout.fixed_rows[1])
-        # Stored after the sheet's own rows: two copies for every border of every worker; then moments.
+        # The sheet's rows, two copies for every border of every worker, and moments.
         self._borders = self._border_rows()
         moments = 0 if layout.config.get(BendingTerm) is None else MOMENT_ROWS * layout.workers
         sheet_rows = np.arange(layout.rows, dtype=np.int32), self._borders, np.full(moments, -1, np.int32)
         self.arrays = SheetArrays(layout, np.concatenate(sheet_rows), start)
-        # Rows of `carried` per worker: one for each step of a pass, and then a page, which no prefetcher crosses.
+        # Rows of `carried` per worker: one per step of a pass, and one page, which no prefetcher crosses.
         row_bytes = layout.width * layout.config.lanes * BYTES[layout.config.precision]
         self._carried_rows = layout.depth - (-PAGE // row_bytes)
-        # Forces carried to the next row, for every worker and step of a pass.
+        # Forces carried to the next row, per worker and step of a pass.
         self._carried = [self.arrays.rows(layout.workers * self._carried_rows) for _ in range(3)]
         self._progress = np.zeros(layout.workers * WORKER_STRIDE, np.int64)
 
     def advance(self, count: int, table: NDArray[Any]) -> None:
-        """Take a number of steps; table: of the loads, shape (count, columns)."""
+        """Take a number of steps.
+
+        Args:
+            count: number of steps.
+            table: rows of the load table, shape (count, columns).
+        """
         if self._layout.workers == 1:
             self._advance_alone(0, count, table)
             return
-        done = 0
-        while done < count:
-            if time.perf_counter() < self._rests_until:
-                done = self._advance_while_resting(done, count, table)
+        first = 0
+        while first < count:
+            if time.perf_counter() < self._backoff_until:
+                first = self._advance_in_backoff(first, count, table)
             else:
-                done = self._advance_together(done, count, table)
+                first = self._advance_together(first, count, table)
 
     def compile(self, table: NDArray[Any]) -> None:
-        """Compile everything that steps may need, without taking one."""
+        """Compile all kernels without taking a step."""
         self._advance_alone(0, 0, table)
         if self._layout.workers > 1:
             self._launch_together(0, 0, table)
             self._copy_borders()
 
     def read(self, differences: bool, values: NDArray[Any], measures: NDArray[Any]) -> None:
-        """Copy displacements or differences into values, shape (rows, cols, 3), and the measures of every row."""
+        """Read displacements or last differences, and measure every row.
+
+        Args:
+            differences: whether to read last differences instead of displacements.
+            values: output [m], shape (rows, cols, 3).
+            measures: output, shape (rows, measures).
+        """
         with our_compilation():
             self._read(0, self._layout.rows, self._layout.cols, differences, values, measures, *self.arrays.all)
 
-    def _advance_alone(self, done: int, end: int, table: NDArray[Any]) -> None:
-        """Take the steps from `done` to `end` with a single worker."""
+    def _advance_alone(self, first: int, end: int, table: NDArray[Any]) -> None:
+        """Take the steps from `first` to `end` with a single worker."""
         self._start_pass()
-        self._launch(self._alone, 1, end - done, table[done:])
+        self._launch(self._alone, 1, end - first, table[first:])
 
-    def _advance_while_resting(self, done: int, end: int, table: NDArray[Any]) -> int:
-        """Take steps with a single worker until it is time for all of them; returns how many are done."""
-        # How long a step takes is not known, so pieces begin small and double.
+    def _advance_in_backoff(self, first: int, end: int, table: NDArray[Any]) -> int:
+        """Take steps with a single worker until the back-off ends; return the number of the next step."""
+        # The duration of a step is unknown, so the number of steps per launch starts small and doubles.
         piece = self._layout.depth
-        while done < end and time.perf_counter() < self._rests_until:
-            until = min(done + piece, end)
-            self._advance_alone(done, until, table)
-            done, piece = until, 2 * piece
+        while first < end and time.perf_counter() < self._backoff_until:
+            until = min(first + piece, end)
+            self._advance_alone(first, until, table)
+            first, piece = until, 2 * piece
         self._copy_borders()
-        return done
+        return first
 
-    def _advance_together(self, done: int, end: int, table: NDArray[Any]) -> int:
-        """Take steps with all workers; returns how many are done, which may be fewer than `end` if a worker gave up."""
-        if self._rests_until:
-            # The rest itself tells nothing: a single worker waits for no core.
-            self._had, self._waited = time.process_time(), process.waited_for_cores() or 0.0
-            self._rests_until = 0.0
+    def _advance_together(self, first: int, end: int, table: NDArray[Any]) -> int:
+        """Take steps with all workers; return the number of the next step, below `end` after a timeout."""
+        if self._backoff_until:
+            # The back-off itself is excluded, because a single worker rarely waits for a core.
+            self._cpu_time, self._wait_time = time.process_time(), process.waited_for_cores() or 0.0
+            self._backoff_until = 0.0
         start = time.perf_counter()
-        count, gave_up = self._launch_together(done, end, table)
+        count, timed_out = self._launch_together(first, end, table)
         now = time.perf_counter()
-        if gave_up:
-            rest = 4 * self._rest * 0.5 ** (self._together / HALF_LIFE) if self._is_crowded() else 0.0
-            self._rest = min(max(rest, SHORTEST_REST), LONGEST_REST)
-            self._together, self._rests_until = 0.0, now + self._rest
+        if timed_out:
+            backoff = 4 * self._backoff * 0.5 ** (self._together / BACKOFF_HALF_LIFE_S) if self._is_crowded() else 0.0
+            self._backoff = min(max(backoff, MIN_BACKOFF_S), MAX_BACKOFF_S)
+            self._together, self._backoff_until = 0.0, now + self._backoff
         else:
             self._together += now - start
-        return done + count
+        return first + count
 
     def _is_crowded(self) -> bool:
-        """Tell whether other programs have wanted the cores since the last rest; True if it is not known."""
-        had, waited = time.process_time(), process.waited_for_cores()
-        return waited is None or waited - self._waited > CROWDED * (had - self._had)
+        """Return whether other programs compete for the cores since the last back-off; True if unknown."""
+        cpu_time, wait_time = time.process_time(), process.waited_for_cores()
+        return wait_time is None or wait_time - self._wait_time > MAX_WAIT_SHARE * (cpu_time - self._cpu_time)
 
-    def _launch_together(self, done: int, end: int, table: NDArray[Any]) -> tuple[int, bool]:
-        """Launch all workers; returns how many steps they have taken, and whether one gave up."""
-        workers, depth, count, first = self._layout.workers, self._layout.depth, end - done, self._steps
+    def _launch_together(self, first: int, end: int, table: NDArray[Any]) -> tuple[int, bool]:
+        """Launch all workers; return the number of steps taken, and whether a worker timed out."""
+        workers, depth, count, steps_before = self._layout.workers, self._layout.depth, end - first, self._steps
         self._start_pass()
-        self._launch(self._advance, workers, count, table[done:])
+        self._launch(self._advance, workers, count, table[first:])
         passes, rounds = self._progress[TURN::WORKER_STRIDE], self._progress[ROUND::WORKER_STRIDE]
-        gave_up = not (passes * depth >= count).all()
-        if gave_up:
-            # All continue to the end of the pass that the foremost of them is in.
+        timed_out = not (passes * depth >= count).all()
+        if timed_out:
+            # All continue to the end of the pass of the foremost worker.
             count = min(count, int((passes + (rounds >= 0)).max()) * depth)
             while not (passes * depth >= count).all():
-                self._steps = first
-                self._launch(self._advance, workers, count, table[done:])
-            self._steps = first + count
-        return count, gave_up
+                self._steps = steps_before
+                self._launch(self._advance, workers, count, table[first:])
+            self._steps = steps_before + count
+        return count, timed_out
 
     def _copy_borders(self) -> None:
-        """Bring the copies of the rows at the borders of bands up to date, after steps of a single worker."""
+        """Update the copies of the rows at the borders of bands after steps of a single worker."""
         with our_compilation():
             _build_copy(self._layout.config)(*self.arrays.u, self._borders, self._layout.rows, self._layout.width)
         self._progress[::COUNTER_STRIDE] = self._steps
 
     def _start_pass(self) -> None:
-        """Send all workers to the first row of the first pass."""
+        """Reset all workers to the first row of the first pass."""
         places = self._progress.reshape(-1, WORKER_STRIDE)[:, TURN:PLACE_END]
         places[:, [TURN - 1, ROUND - 1, STEP - 1]] = 0, -1, 0
 
     def _launch(self, kernel: Callable[..., None], workers: int, count: int, table: NDArray[Any]) -> None:
         layout = self._layout
-        # In the order of the sizes in `bands`.
+        # In the order of the constants in `bands`.
         sizes = np.array([
             self._steps, count, workers, layout.depth, self._carried_rows, layout.rows, layout.strip,
-            self._first_row, self._end_row, layout.rows + len(self._borders), PATIENCE,
+            self._first_row, self._end_row, layout.rows + len(self._borders), MAX_CHECKS,
         ])  # fmt: skip
         with our_compilation():
             kernel(sizes, self._progress, table, *self._carried, *self.arrays.all)
         self._steps += count
 
     def _border_rows(self) -> NDArray[np.int32]:
-        """List for every copy at a border of a band the row of the sheet that it is a copy of."""
+        """Return the row of the sheet of every copy at a border of a band."""
         rows: list[int] = []
         first, end, workers = self._first_row, self._end_row, self._layout.workers
         for worker in range(workers):
             low, high = (first + (end - first) * n // workers for n in (worker, worker + 1))
-            near, far = (low, high - 1) if worker % 2 else (high - 1, low)
-            # The row at the border and, with bending, the one behind it; each after even and after odd steps.
+            begin_row, end_row = (low, high - 1) if worker % 2 else (high - 1, low)
+            # The row at the border and, with bending, the next row inward, each after even and after odd steps.
             inward = 1 if worker % 2 else -1
-            for border in ((near, near + inward), (far, far - inward)):
+            for border in ((begin_row, begin_row + inward), (end_row, end_row - inward)):
                 rows += [*border[: self._layout.config.reach]] * 2
         return np.array(rows, np.int32)
 
 
 @cache
 def _kernels(config: KernelConfig, *, parallel: bool) -> tuple[Callable[..., None], Callable[..., None]]:
-    """Make the kernels of one code that step and read; each is compiled when it is first launched."""
+    """Build the kernels of a configuration, which are compiled at their first launch."""
     iterations = ITERATIONS_PER_THREAD if parallel else 1
     return build_advance(config, parallel=parallel), build_read(config, parallel=parallel, iterations=iterations)
 
 
 @cache
 def _build_copy(config: KernelConfig) -> Callable[..., None]:
-    """Make the kernel that updates the copies of the rows at the borders of bands."""
+    """Build the kernel that updates the copies of the rows at the borders of bands."""
     vectors = config.vectors
 
     @ti.kernel

@@ -1,7 +1,7 @@
-"""Kernel 1 on a GPU: every point is a thread that gathers the forces of its eight springs; every step is a loop.
+"""Kernel 1 on a GPU: one thread per mass point gathers the forces of its eight springs; one loop per step.
 
-The layout is the simplest: vectors of one lane, one entry per column, and a halo around the sheet. Two buffers hold u_n
-and u_{n+1} by turns; with bending, a third one holds the moments.
+Vectors have one lane, rows have one entry per column, and the sheet has a halo. Two buffers contain u_n and u_{n+1},
+alternately; with bending, a third buffer contains the moments.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -20,34 +20,50 @@ from taichi_msm.terms.bending import BendingTerm
 from taichi_msm.terms.contact import ContactTerm
 from taichi_msm.terms.springs import SpringTerm
 
-# A launch is a chain of this many kernels, one for each step.
+# A launch is a sequence of this many kernels, one per step.
 STEPS_PER_LAUNCH = 8
 
 
 class GatherKernel:
-    """The state of a sheet in the memory of a GPU, and its kernels: a `StepKernel`."""
+    """A sheet in the memory of a GPU: a `StepKernel`.
+
+    Args:
+        layout: of the sheet.
+        start: initial values.
+    """
 
     def __init__(self, layout: SheetLayout, start: InitialData) -> None:
         self._layout = layout
         self._advance, self._read = _kernels(layout.config)
-        # Which of the two buffers holds u_n. Each has a halo of one row above and below.
+        # Index of the buffer of u_n. Each buffer has a halo of one row above and below.
         self._now = 0
         buffer = np.pad(np.arange(layout.rows, dtype=np.int32), 1, constant_values=-1)
         moments = np.full(0 if layout.config.get(BendingTerm) is None else layout.rows + 2, -1, np.int32)
         self.arrays = SheetArrays(layout, np.concatenate([buffer, buffer, moments]), start)
 
     def advance(self, count: int, table: NDArray[Any]) -> None:
-        """Take at most STEPS_PER_LAUNCH steps; table: of the loads, shape (count, columns)."""
+        """Take a number of steps.
+
+        Args:
+            count: number of steps, at most STEPS_PER_LAUNCH.
+            table: rows of the load table, shape (count, columns).
+        """
         with our_compilation():
             self._advance(self._now, count, self._layout.rows, self._layout.cols, table, *self.arrays.all)
         self._now = (self._now + count) % 2
 
     def compile(self, table: NDArray[Any]) -> None:
-        """Compile the steps without taking one."""
+        """Compile all kernels without taking a step."""
         self.advance(0, table)
 
     def read(self, differences: bool, values: NDArray[Any], measures: NDArray[Any]) -> None:
-        """Copy displacements or differences into values, shape (rows, cols, 3), and the measures of every row."""
+        """Read displacements or last differences, and measure every row.
+
+        Args:
+            differences: whether to read last differences instead of displacements.
+            values: output [m], shape (rows, cols, 3).
+            measures: output, shape (rows, measures).
+        """
         first, layout = self._now * (self._layout.rows + 2) + 1, self._layout
         with our_compilation():
             self._read(first, layout.rows, layout.cols, differences, values, measures, *self.arrays.all)
@@ -55,12 +71,12 @@ class GatherKernel:
 
 @cache
 def _kernels(config: KernelConfig) -> tuple[Callable[..., None], Callable[..., None]]:
-    """Make the kernels of one code; each is compiled when it is first launched."""
+    """Build the kernels of a configuration, which are compiled at their first launch."""
     return _build_advance(config), build_read(config, parallel=True, iterations=1)
 
 
 def _build_step(config: KernelConfig) -> Callable[..., None]:
-    """Make the function that steps a point."""
+    """Build the function that steps a mass point."""
     real, vector, columns, springs = config.real, config.vector, config.first_column(None), config.require(SpringTerm)
     structural, shear = springs.structural, springs.shear
     leaves_out = springs.open_edges and not springs.mapped
@@ -70,7 +86,7 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
 
     @ti.func
     def by_row(sheet: ti.template(), p, q, lower, b, row_exists, up):
-        """Force of entry b of row p on row q, which is `up` above; summed in the order of a pass on a CPU."""
+        """Return the force of entry b of row p on row q, which is `up` above, summed in the order of the CPU kernel."""
         u, dx = [sheet.u[c][p * sheet.width + b] for c in ti.static(range(3))], sheet.constants[DX]
         force = [vector(0) for _ in ti.static(range(3))]
         for right in ti.static((-1, 0, 1)):
@@ -90,7 +106,7 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
 
     @ti.func
     def by_right(sheet: ti.template(), p, i, kind, b):
-        """Force of entry b of row p on its right neighbour."""
+        """Return the force of entry b of row p on its right neighbour."""
         exists, here = vector(1), p * sheet.width + b
         if ti.static(leaves_out):
             exists = sheet.by_column[HAS_RIGHT * sheet.width + b]
@@ -99,7 +115,7 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
 
     @ti.func
     def step(sheet: ti.template(), loads: ti.template(), now, i, b, n):
-        """Step point (i, b - 1), where `now` is the buffer of u_n, and n the row of the table of loads."""
+        """Step mass point (i, b - 1); now: index of the buffer of u_n; n: row of the load table."""
         rows, width = sheet.rows, sheet.width
         p = now * (rows + 2) + i + 1
         kind = ti.select(i == rows - 1, 2, ti.select(i == 0, 0, 1))
@@ -127,7 +143,7 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
 
 
 def _build_advance(config: KernelConfig) -> Callable[..., None]:
-    """Make the kernel that takes steps."""
+    """Build the kernel that takes steps."""
     real, vector, vectors, constant_count = config.real, config.vector, config.vectors, config.first_constant(None)
     step, bending = _build_step(config), config.get(BendingTerm)
     storing = [bending.build_store_moment(config)] if bending else []

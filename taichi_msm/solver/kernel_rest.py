@@ -1,20 +1,21 @@
-"""Kernel 1 at rest, on a CPU: it moves a sheet to where its forces balance, by FIRE, with the forces of `row`.
+"""Kernel 1 for quasi-static equilibrium, on a CPU: minimisation of the energy by FIRE, with the forces of `row`.
 
 FIRE (Bitzek et al. 2006, Physical Review Letters 97, 170201; with the half step back of Guénolé et al. 2020,
-Computational Materials Science 175, 109584) lets the points move under their forces F with masses M of its own, and
-turns their velocities v toward the forces; where these no longer do work, it stops them:
+Computational Materials Science 175, 109584) moves mass points under their forces F with fictitious masses M. It turns
+the velocities v toward the forces, and resets them if the power F v is not positive:
 
-    F v > 0:  v += dt F / M,  v = (1 - a) v + a (F / M) |v| / |F / M|,  x += dt v;  a falls, and dt grows
-    else:     x -= dt v / 2,  v = dt F / M,                             x += dt v;  a is as at first, and dt falls
+    F v > 0:  v += dt F / M,  v = (1 - a) v + a (F / M) |v| / |F / M|,  x += dt v;  a decreases, dt increases
+    else:     x -= dt v / 2,  v = dt F / M,                             x += dt v;  a is reset, dt decreases
 
-with norms over all points, weighted with M. M bounds the stiffness that a point feels, so that no frequency is above 1,
-and dt = 1 is stable and the largest step (`rest`). Stored is the momentum q = M v.
+The norms are taken over all mass points and weighted with M. M bounds the stiffness at each mass point, so no angular
+frequency exceeds 1, and the largest step dt = 1 is stable. The kernel stores the momentum q = M v.
 
-Tools that are moved take their part of the forces off, and points that have moved are pushed out of them
-(`terms.contact_rest`): each point that presses on a tool also goes by F / M into it, so that it stays in touch.
+Contact forces of position-controlled tools are removed from the forces, and mass points that have moved are projected
+out of the tools (`terms.contact_rest`). A mass point that presses on a tool also moves by F / M into the tool before the
+projection, so that it stays in contact.
 
-One evaluation of the forces goes through the rows as a step does; a second loop moves the points. Sums over points are
-taken along columns first, and then over the columns in their order, so that their bits do not depend on lanes.
+An evaluation of the forces passes over the rows like a step; a second loop moves the mass points. Sums over mass points
+are accumulated along columns first and then over the columns in their order, so their bits do not depend on lanes.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -35,53 +36,55 @@ from taichi_msm.terms.contact import ContactTerm
 from taichi_msm.terms.contact_rest import build_bear, build_keep_out
 from taichi_msm.terms.springs import SpringTerm
 
-# The numbers of a launch. It is given: rows of the sheet; columns of a strip; the first row that moves, and the row
-# after the last; how many evaluations it may take, the square of the largest force with which it ends [N^2], and
-# whether tools or points have been put elsewhere since the last launch. FIRE
-# keeps: the step, the share a, how many times in turn the forces have done work. It gives: the number of evaluations;
-# and of the last one the square of the largest force on a point [N^2], and the sum of F^2 / M, which tells NaN.
-ROWS, STRIP, FIRST_ROW, END_ROW, COUNT, ENOUGH, PLACED, STEP, SHARE, WORKED = range(10)
+# Arguments of a launch: rows of the sheet; columns of a strip; the first row that is not fixed, and the row after the
+# last; the largest number of evaluations; the squared force tolerance [N^2]; whether tools or mass points were placed
+# since the last launch. State of FIRE: the step dt; the share a; the number of consecutive evaluations with positive
+# power. Results: the number of evaluations; of the last one the squared largest force [N^2], and the sum of F^2 / M,
+# which is not finite if any force is NaN.
+ROWS, STRIP, FIRST_ROW, END_ROW, COUNT, SQUARED_TOLERANCE, PLACED, STEP, SHARE, WORKED = range(10)
 EVALUATIONS, LARGEST, SLOPE, NUMBERS = range(10, 14)
 
-# Sums over points of an evaluation: of F q / M, of F^2 / M and of q^2 / M; and the square of the largest force.
+# Reductions of an evaluation: the sums of F q / M, F^2 / M and q^2 / M; the squared largest force.
 POWER, STEEP, MOTION, SQUARE, SUMS = range(5)
 
-# The share a at first and its decay, the factors of the step, and how often the forces do work before it grows.
+# Initial share a and its decay; factors of the step; number of evaluations with positive power before the step grows.
 FIRST_SHARE, SHARE_DECAY, SHRINK, GROW, DELAY = 0.25, 0.99, 0.9, 1.1, 10
 
 INFINITE = float("inf")
 
-# The largest step and the smallest.
+# Bounds of the step.
 LARGEST_STEP, SMALLEST_STEP = 1.0, 0.02
 
 
 class RestSheet(NamedTuple):
-    """A `KernelSheet` with what FIRE needs besides."""
+    """A `KernelSheet` with the additional arrays of FIRE."""
 
     u: Any
-    d: Any  # here the forces, of all but the tools that are moved
+    d: Any  # forces without those of contact, instead of last differences
     by_column: Any
     stiffness: Any
     fields: Any
     constants: Any
     rows: Any
     width: Any
-    q: Any  # momenta, three arrays
-    work: Any  # 1 / M of every point [m/N], and after it SUMS rows of sums
+    q: Any  # momenta, as three arrays
+    work: Any  # 1 / M of every mass point [m/N], followed by SUMS rows of reductions
 
 
 class Relaxation:
-    """The state of a sheet in the memory of a CPU, and the kernels that bring it to rest.
+    """A sheet in the memory of a CPU, and the kernels that find its equilibrium.
 
     Args:
-        masses: M of every point [N/m], shape (rows, cols).
+        layout: of the sheet.
+        start: initial values.
+        masses: M of every mass point [N/m], shape (rows, cols).
     """
 
     def __init__(self, layout: SheetLayout, start: InitialData, masses: NDArray[Any]) -> None:
         self._layout = layout
         self._relax, self._compare, self._read = _kernels(layout.config)
         moments = 0 if layout.config.get(BendingTerm) is None else MOMENT_ROWS
-        # Stored after the sheet's own rows: moments, and then the forces carried to the next row.
+        # The sheet's rows, moments, and the forces carried to the next row.
         self._stored = np.concatenate([np.arange(layout.rows, dtype=np.int32), np.full(moments + 1, -1, np.int32)])
         self.arrays = arrays = SheetArrays(layout, self._stored, start)
         self._q, self._work = [arrays.rows(layout.rows) for _ in range(3)], arrays.rows(layout.rows + SUMS)
@@ -92,58 +95,63 @@ class Relaxation:
         self.stop()
 
     def stop(self) -> None:
-        """Let the points stand still, and begin again with FIRE's first step."""
+        """Set all momenta to 0 and reset the state of FIRE."""
         for q in self._q:
             write(q, np.zeros((0, self._layout.config.lanes)))
         self._fire[[STEP, SHARE, WORKED, PLACED]] = LARGEST_STEP, FIRST_SHARE, 0, 1
 
     def place(self, displacement: NDArray[Any]) -> None:
-        """Put the points where they have these displacements [m], shape (rows, cols, 3)."""
+        """Set the displacements [m], shape (rows, cols, 3)."""
         held = (self._stored >= 0)[:, None]
         self._fire[PLACED] = 1
         for c in range(3):
             write(self.arrays.u[c], to_lanes(self._layout, np.where(held, displacement[self._stored, :, c], 0)))
 
-    def relax(self, count: int, enough: float, row: NDArray[Any]) -> tuple[int, float]:
-        """Evaluate the forces up to `count` times, and move the points after each; until all forces are small.
+    def relax(self, count: int, tolerance: float, row: NDArray[Any]) -> tuple[int, float]:
+        """Evaluate the forces repeatedly and move the mass points after each evaluation, until all forces are small.
 
         Args:
-            count: how many times at most.
-            enough: the largest force on a point that ends it, at once and without a move [N].
-            row: of the table of loads, shape (1, columns).
+            count: largest number of evaluations.
+            tolerance: largest force on a mass point at convergence [N].
+            row: row of the load table, shape (1, columns).
 
         Returns:
-            How often the forces were evaluated, and the largest of the last time [N], which is infinite where any force
-            is not a number.
+            The number of evaluations, and the largest force of the last one [N], infinite if any force is NaN.
         """
         fire = self._fire
-        fire[[COUNT, ENOUGH]] = count, enough * enough
+        fire[[COUNT, SQUARED_TOLERANCE]] = count, tolerance * tolerance
         with our_compilation():
             self._relax(fire, row, *self._q, self._work, *self.arrays.all)
         largest = float(np.sqrt(fire[LARGEST])) if fire[SLOPE] < np.inf else np.inf
         return int(fire[EVALUATIONS]), largest
 
     def scale(self, row: NDArray[Any]) -> float:
-        """Give the largest force of a spring, a load or the foundation on a point [N]."""
+        """Return the largest force of a spring, a load or the foundation on a mass point [N]."""
         largest = np.zeros(1)
         with our_compilation():
             self._compare(self._layout.rows, self._layout.width, largest, row, *self.arrays.all)
         return float(np.sqrt(largest[0]))
 
     def read(self, differences: bool, values: NDArray[Any], measures: NDArray[Any]) -> None:
-        """Copy displacements or forces into values, shape (rows, cols, 3), and the measures of every row."""
+        """Read displacements or forces, and measure every row.
+
+        Args:
+            differences: whether to read forces [N] instead of displacements [m].
+            values: output, shape (rows, cols, 3).
+            measures: output, shape (rows, measures).
+        """
         with our_compilation():
             self._read(0, self._layout.rows, self._layout.cols, differences, values, measures, *self.arrays.all)
 
 
 @cache
 def _kernels(config: KernelConfig) -> tuple[Callable[..., None], Callable[..., None], Callable[..., None]]:
-    """Make the kernels of one code; each is compiled when it is first launched."""
+    """Build the kernels of a configuration, which are compiled at their first launch."""
     return _build_relax(config), _build_compare(config), build_read(config, parallel=False, iterations=1)
 
 
 def _build_store(config: KernelConfig) -> Callable[..., None]:
-    """Make the function that stores the force on an entry, and adds what FIRE needs of it to the sums."""
+    """Build the function that stores the force on an entry and adds to the reductions of FIRE."""
     vector, forces, contact = config.vector, point_forces(config), config.get(ContactTerm)
     bearings = [build_bear(config, contact)] if contact else []
 
@@ -166,7 +174,7 @@ def _build_store(config: KernelConfig) -> Callable[..., None]:
             square += force[c] * force[c]
             motion += q * q
         for n, term in ti.static(((POWER, power), (STEEP, square), (MOTION, motion))):
-            # To an array, += would be atomic.
+            # `+=` on an array would be atomic.
             place = (sheet.rows + n) * width + entry.b
             sheet.work[place] = sheet.work[place] + term * inverse
         place = (sheet.rows + SQUARE) * width + entry.b
@@ -176,7 +184,7 @@ def _build_store(config: KernelConfig) -> Callable[..., None]:
 
 
 def _build_relax(config: KernelConfig) -> Callable[..., None]:
-    """Make the kernel that moves the points."""
+    """Build the kernel that evaluates forces and moves mass points."""
     real, vector, vectors, lanes = config.real, config.vector, config.vectors, config.lanes
     constant_count, join_strips = config.first_constant(None), build_join_strips(config)
     pass_row = build_step_row(config, _build_store(config), touches=False, parallel=False)
@@ -186,7 +194,7 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
 
     @ti.func
     def add_up(sheet: ti.template(), n: ti.template()):
-        """Add up row n of the sums, column by column."""
+        """Sum row n of the reductions, column by column."""
         total = ti.cast(0, real)
         for lane in ti.static(range(lanes)):
             for b in range(1, sheet.width - 1):
@@ -195,7 +203,7 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
 
     @ti.func
     def evaluate(sheet: ti.template(), row: ti.template(), band: ti.template()):
-        """Find the forces, which leaves the displacements as they are."""
+        """Evaluate the forces at the current displacements."""
         for n in range(sheet.rows * sheet.width, (sheet.rows + SUMS) * sheet.width):
             sheet.work[n] = vector(0)
         for line in range(-1, band.high - band.low):
@@ -203,7 +211,7 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
 
     @ti.func
     def move_points(sheet: ti.template(), row: ti.template(), band: ti.template(), keep, gain, dt, back):
-        """Turn the momenta, q = keep q + gain F, and move the points by dt q / M, less `back` times their old q / M."""
+        """Update q = keep q + gain F, and move the mass points by dt q / M minus `back` times the old q / M."""
         for i in range(band.low, band.high):
             for b in range(1, sheet.width - 1):
                 at = i * sheet.width + b
@@ -223,7 +231,7 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
 
     @ti.func
     def settle_row(sheet: ti.template(), row: ti.template(), i):
-        """Keep a row that has moved out of the tools, and fill its halo."""
+        """Project a row that has moved out of the tools, and fill its halo."""
         kind = ti.select(i == sheet.rows - 1, 2, ti.select(i == 0, 0, 1))
         if ti.static(len(keepings) > 0):
             now = [row[0, c] for c in ti.static(range(columns))]
@@ -257,8 +265,8 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
                     settle_row(sheet, row, i)
                 fire[PLACED] = 0
             evaluations = 0
-            goes = True
-            while goes and evaluations < count:
+            active = True
+            while active and evaluations < count:
                 evaluate(sheet, row, band)
                 evaluations += 1
                 power, slope, motion = add_up(sheet, POWER), add_up(sheet, STEEP), add_up(sheet, MOTION)
@@ -267,9 +275,9 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
                     largest = ti.max(largest, sheet.work[(rows + SQUARE) * width + b].max())
                 fire[LARGEST] = largest
                 fire[SLOPE] = slope
-                # Written so that NaN ends it, too.
-                goes = largest > fire[ENOUGH] and slope < INFINITE
-                if goes:
+                # With NaN the comparison is False and ends the loop.
+                active = largest > fire[SQUARED_TOLERANCE] and slope < INFINITE
+                if active:
                     keep, back = ti.cast(0, real), ti.cast(0, real)
                     if power > 0:
                         fire[WORKED] = fire[WORKED] + 1
@@ -286,7 +294,7 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
                     dt = fire[STEP]
                     gain = dt
                     if power > 0:
-                        # |q + dt F| and |F|, weighted with 1 / M.
+                        # |q + dt F| / |F|, with norms weighted with 1 / M.
                         turned = ti.sqrt((motion + 2 * dt * power + dt * dt * slope) / slope)
                         gain = keep * dt + fire[SHARE] * turned
                     move_points(sheet, row, band, keep, gain, dt, back)
@@ -296,7 +304,7 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
 
 
 def _build_compare(config: KernelConfig) -> Callable[..., None]:
-    """Make the kernel that finds the square of the largest force of a spring, a load or the foundation."""
+    """Build the kernel that computes the squared largest force of a spring, a load or the foundation."""
     real, vector, vectors, columns = config.real, config.vector, config.vectors, config.first_column(None)
     constant_count, pull = config.first_constant(None), config.require(SpringTerm).build_max_spring_force(config)
     forces = [

@@ -1,12 +1,12 @@
-"""A row in a pass on a CPU: the forces of its springs, each evaluated once for both ends, and then its step.
+"""A row in a pass on a CPU: the forces of its springs, each evaluated once for both ends, and its step in place.
 
-Lane l of entry b of a row is column b - 1 of strip l, so the neighbours of an entry are the entries beside it, and
-every operation is one vector instruction. The first and the last entry of a row are a halo: the entries at the other
-end of the strips, shifted by one lane. The force of a spring between this row and the next one is added to this row at
-once and carried to the next; the force of a spring along the row is carried to the next entry. After that no other row
-depends on the old displacements of this row, so it is stepped in place.
+Lane l of entry b of a row is column b - 1 of strip l. The neighbours of an entry are therefore the adjacent entries,
+and every operation is one vector instruction. The first and the last entry of a row are a halo: the entries at the
+opposite end of the strips, shifted by one lane. The force of a spring between this row and the next is added to this
+row and carried to the next row; the force of a spring along the row is carried to the next entry. No later row depends
+on the old displacements of this row, so it is stepped in place.
 
-Tools that are moved then push the points out of their rods, in the rows that they reach.
+Contact with position-controlled tools is resolved afterwards, in the rows that the tools can reach.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -20,9 +20,12 @@ from taichi_msm.terms.springs import SpringTerm
 
 
 def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[..., None]:
-    """Make the function that goes through a row and moves it.
+    """Build the function that computes the forces on a row and steps it.
 
-    move
+    Args:
+        config: compile-time configuration.
+        move: function move(sheet, entry, target, force, now) that steps an entry with the force of its springs, as
+            built by `build_point_step`.
     """
     vector, columns, springs = config.vector, config.first_column(None), config.require(SpringTerm)
     structural, shear = springs.structural, springs.shear
@@ -34,19 +37,18 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
         sheet: ti.template(), carried: ti.template(), carried_row, line: ti.template(), here, next_row, exists, up,
         loads: ti.template(), n, moving,
     ):  # fmt: skip
-        """Go through row `line`, in row `here` of u, and move it if `moving`.
+        """Compute the forces on row `line`, which is row `here` of u, and step it if `moving`.
 
-        The other row, `next_row` of u, is `up` above this one [m]; exists: 0 if there is none, else 1. `carried_row` is
-        the row of the forces carried from row to row, and n that of the table of loads.
+        The next row of the pass, `next_row` of u, is `up` above this one [m]; exists: 1, or 0 if the sheet ends here.
+        `carried_row` is the row of `carried` with the forces from row to row, and n the row of the load table.
         """
         width, strip, i, kind = sheet.width, sheet.width - 2, line.i, line.kind
         diagonal = ti.sqrt(sheet.constants[DX] * sheet.constants[DX] + sheet.constants[DY] * sheet.constants[DY])
-        # The lower one of the two rows.
+        # The lower of the two rows.
         lower = i + ti.select(up < 0, 1, 0)
-        # Where u has this row and the other one, and where the forces between them are carried; all from entry 0 on.
+        # Entry 0 of both rows of u and of the row of carried forces.
         row, other, carry = here * width, next_row * width, carried_row * width
-        # Force of the left neighbour, and forces carried to the other row: for the entry before this one, this one and
-        # the next one.
+        # Force of the left neighbour, and forces carried to the other row for the previous, this and the next entry.
         left, last = [vector(0) for _ in ti.static(range(3))], [vector(0) for _ in ti.static(range(3))]
         this, coming = [vector(0) for _ in ti.static(range(3))], [vector(0) for _ in ti.static(range(3))]
         has_left, has_right = vector(1), vector(1)
@@ -63,13 +65,13 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
             )
             for c in ti.static(range(3)):
                 coming[c] = first_right[c]
-        # Read once, because the compiler must assume that stores to the arrays change the table.
+        # Read once, because the compiler must assume that stores to the arrays could change the table.
         now = [loads[n, c] for c in ti.static(range(columns))]
         for b in range(1, strip + 1):
-            # Sum of the forces on the neighbours in the other row.
+            # First the sum of the forces on the neighbours in the other row.
             force = [vector(0) for _ in ti.static(range(3))]
             for c in ti.static(range(3)):
-                # Neighbours are read again for every entry: there are too few registers to keep them.
+                # Neighbours are read again for every entry, because registers are too few to keep them.
                 u[c] = sheet.u[c][row + b]
                 last[c] = this[c]
                 this[c] = coming[c]
@@ -102,7 +104,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
                     force[c] += left[c] - right[c]
                     left[c] = right[c]
             for c in ti.static(range(3)):
-                # What was stored there was read for the entry before.
+                # Its old value was read with the previous entry.
                 carried[c][carry + b - 1] = last[c]
             if moving:
                 entry = ti.static(Entry(line, b, u))
@@ -124,7 +126,12 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
 
 
 def build_touch_row(config: KernelConfig, contact: ContactTerm) -> Callable[..., None]:
-    """Make the function that resolves the contact of a row with all tools, if one reaches it."""
+    """Build the function that resolves the contact of a row with all tools, if any tool can reach it.
+
+    Args:
+        config: compile-time configuration.
+        contact: its contact term.
+    """
     columns, resolve, reaches = config.first_column(None), contact.build_resolve(config), contact.build_reaches(config)
     greatest = build_max_lane(config)
 

@@ -472,9 +472,9 @@ def test_workers_that_give_up_waiting_go_on_to_the_same_bits(
     steps = (3, 200, 1, 77, 400, 5)
     for count in steps:
         alone.advance(count)
-    monkeypatch.setattr(kernel_cpu, "PATIENCE", patience)
-    monkeypatch.setattr(kernel_cpu, "SHORTEST_REST", 0.001)
-    monkeypatch.setattr(kernel_cpu, "LONGEST_REST", 0.002)
+    monkeypatch.setattr(kernel_cpu, "MAX_CHECKS", patience)
+    monkeypatch.setattr(kernel_cpu, "MIN_BACKOFF_S", 0.001)
+    monkeypatch.setattr(kernel_cpu, "MAX_BACKOFF_S", 0.002)
     for workers, depth in ((2, 1), (2, 4), (3, 2)):
         together = dynamics_of(
             made,
@@ -544,13 +544,13 @@ def test_rests_grow_while_workers_give_up_and_are_forgotten_when_they_do_not(
 
 def test_giving_up_in_the_last_pass_of_a_launch_counts(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     made = scene(sheet={**SHEET, "points": [101, 101]}, time={"precision": "f32"})
-    monkeypatch.setattr(kernel_cpu, "PATIENCE", 0)
+    monkeypatch.setattr(kernel_cpu, "MAX_CHECKS", 0)
     dynamics = dynamics_of(made, device, replace(structure_of(made, device), workers=2, depth=8))
     scatter = dynamics._moving
     assert isinstance(scatter, kernel_cpu.ScatterKernel)
     for _ in range(200):
         dynamics.advance(8)
-    assert scatter._rests_until > 0
+    assert scatter._backoff_until > 0
 
 
 def test_a_sheet_that_was_interrupted_while_stepping_is_not_used(
