@@ -1,13 +1,8 @@
-"""The interface to kernel 1, which computes the force on every point and its Verlet step, a frame in few launches.
+"""The sheet in motion: Verlet steps by kernel 1, with few launches per frame, and the forces of probes at frames.
 
-State of point P: its displacement u_n = x_n - X and the last difference d_n = u_n - u_{n-1}, which a Verlet step
-changes as `terms.damping` tells. This is the position form (eq. 6 to 9) rearranged so that nothing cancels: in f32 it
-keeps the digits of a small motion on a large sheet.
-
-The forces that the probes exert on the sheet at the frames of a run, and the greatest of them.
-
-Of a probe with a force it is that at the frame, (percent(t) / 100) force times the sum of its decay over the points
-that are not fixed. Of a tool that is moved it is the mean over the steps since the frame before (`Dynamics`).
+The state of a mass point is its displacement u_n = x_n - X and the last difference d_n = u_n - u_{n-1}; `terms.damping`
+contains their update. This is the position form (eq. 6 to 9), rearranged to avoid cancellation: in f32 it resolves
+small displacements of a large sheet.
 """
 
 from __future__ import annotations
@@ -48,30 +43,32 @@ from taichi_msm.terms.damping import coefficients
 from taichi_msm.terms.loads import ProbeTerm, decay_parameters
 from taichi_msm.terms.springs import MAX_STRAIN, MIN_STRAIN, SpringTerm
 
-# With fewer points per worker, one worker more costs more time in waiting than it saves in work.
+# With fewer mass points per worker, an additional worker costs more waiting time than it saves.
 POINTS_PER_WORKER = 450
 
-# If a band takes more than CACHE bytes, its passes take DEPTH steps each.
-CACHE = 3 << 17
+# Passes over bands that exceed this size take DEPTH steps each, so that the rows stay in the cache.
+CACHE_BYTES = 3 << 17
 DEPTH = 8
 
-# Numbers that a pass keeps per point: displacement, difference and the force carried to the next row, as vectors.
-NUMBERS_PER_POINT = 9
-
-# A launch takes no more steps than this, so that Ctrl-C is noticed soon: steps times points, about 0.1 s of one core;
+# Limits of a launch, because Ctrl-C is handled only between launches: steps times mass points, about 0.1 s of one core,
 # and steps.
 POINT_STEPS_PER_LAUNCH = 40_000_000
 MAX_STEPS_PER_LAUNCH = 8192
 
-# Loads are tabulated for this many steps at a time; NumPy takes hardly less time for the steps of a few frames.
+# Number of rows of a load table; NumPy hardly takes less time for the steps of a few frames.
 STEPS_PER_TABLE = 4096
 
 
 def choose_layout(plan: Plan, device: Device, cores: int | None = None) -> SheetLayout:
-    """Choose how a sheet is laid out and shared out among cores, None: all, and what is compiled for it.
+    """Choose the memory layout of a sheet, its division among workers, and the configuration of its kernels.
+
+    Args:
+        plan: the plan.
+        device: the device.
+        cores: largest number of CPU cores; by default all available cores.
 
     Raises:
-        DeviceError: when the device cannot do what the scene needs.
+        DeviceError: when the device does not support the scene.
     """
     (rows, cols), fixed, precision = plan.scene.sheet.points, plan.fixed, plan.grid.precision
     fixed_rows = bool(fixed[0].all()), bool(fixed[-1].all())
@@ -80,7 +77,7 @@ def choose_layout(plan: Plan, device: Device, cores: int | None = None) -> Sheet
             raise DeviceError(f"--arch {device.arch}: time.motion: quasistatic runs on a CPU only; take --arch cpu")
         workers = 1
     elif device.arch == "cpu":
-        # Workers wait by spinning, so more workers than cores would only hold each other up.
+        # Workers wait by spinning, so more workers than cores would delay each other.
         cores = min(device.threads, available_threads() if cores is None else cores)
         workers = max(1, min(cores, rows * cols // POINTS_PER_WORKER, (rows - sum(fixed_rows)) // 2))
     else:
@@ -91,7 +88,8 @@ def choose_layout(plan: Plan, device: Device, cores: int | None = None) -> Sheet
             "--arch vulkan: has no exp in f64, which control points that move need; take time.precision: f32 without a "
             "tolerance or an estimate of the error, or --arch cpu"
         )
-    fits = workers == 0 or rows // workers * cols * NUMBERS_PER_POINT * BYTES[precision] <= CACHE
+    # Per mass point a pass reads displacement, last difference and carried force, with three components each.
+    fits = workers == 0 or rows // workers * cols * 9 * BYTES[precision] <= CACHE_BYTES
     depth = 1 if fits or config.reach > 1 else DEPTH
     return SheetLayout(rows, cols, workers, depth, fixed_rows, config)
 
@@ -100,31 +98,35 @@ class Dynamics:
     """The sheet in motion.
 
     Args:
-        layout: in the place of the scene's own; for tests.
-        cores: number of cores that stepping may use; None: all.
+        plan: the plan.
+        device: the device.
+        layout: replaces the layout chosen by `choose_layout`, for tests.
+        cores: largest number of CPU cores; by default all available cores.
 
     Attributes:
-        plan: of what is stepped.
-        structure: the layout, and what the kernels are compiled for.
+        plan: the current plan.
+        layout: the memory layout, and the configuration of the kernels.
         steps_done: number of steps taken.
-        launches: number of times that a series of steps was taken, each followed by a call of `pause`.
-        torn: whether an exception, such as KeyboardInterrupt, came while steps were taken, so that it is not known how
-            many were; then only `restart` helps.
+        launches: number of launches, each followed by a call of `pause`.
+        inconsistent: whether an exception such as KeyboardInterrupt interrupted a launch. The number of steps taken is
+            then unknown, and `advance`, `state` and `read` raise MsmError until `restart` is called.
     """
 
     def __init__(self, plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> None:
-        self._device, self._layout, self._cores = device, layout, cores
+        self._device, self._given_layout, self._cores = device, layout, cores
         self.launches = 0
         self._sheet: StepKernel | None = None
         self.restart(plan)
 
     def restart(self, plan: Plan, state: State | None = None) -> None:
-        """Begin again with the same scene or another; nothing is compiled if only numbers differ.
+        """Restart with the same or another plan, without compilation if only coefficients differ.
 
-        state: what `state` returned for the same points and steps, to continue from; None: at rest.
+        Args:
+            plan: the plan.
+            state: state to continue from, of a sheet with the same mass points and steps; by default the sheet at rest.
         """
         self.plan = plan
-        self.layout = self._layout or choose_layout(plan, self._device, self._cores)
+        self.layout = self._given_layout or choose_layout(plan, self._device, self._cores)
         self._real = np.dtype(np.float32 if self.layout.config.precision == "f32" else np.float64)
         self.steps_done, self.inconsistent = 0 if state is None else state.steps, True
         self._tabulate(STEPS_PER_TABLE)
@@ -132,10 +134,13 @@ class Dynamics:
         self.inconsistent = False
 
     def steer(self, plan: Plan) -> None:
-        """Continue with other probes, each of which moves, jumps or stands as its predecessor did, and the same steps.
+        """Continue with other probes that use the same kernels and the same steps.
+
+        Args:
+            plan: a plan that differs in its probes only.
 
         Raises:
-            ArgumentError: when the new probes need another kernel.
+            ArgumentError: when the new probes require other kernels.
         """
         probes, before = ProbeTerm.from_plan(plan), self.layout.config.require(ProbeTerm)
         tools, compiled = ContactTerm.from_plan(plan), self.layout.config.get(ContactTerm)
@@ -156,20 +161,22 @@ class Dynamics:
         if decay_parameters(plan) != decay_parameters(self.plan):
             self._moving.arrays.set_fields(self.layout.config.first_field(ProbeTerm), probes.fields(plan))
         self.plan = plan
-        # A caller that steers will steer again in a frame, so no more loads than those of a frame are tabulated.
+        # A caller that steers usually steers again at the next frame, so the table has only the steps of one frame.
         self._tabulate(plan.grid.steps_per_frame)
 
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
-        """Take a number of steps, with a pause after every launch. Where it begins at a frame, forces are counted anew.
+        """Take a number of steps. If the first one starts at a frame, the sums of contact corrections are reset.
 
-        An exception from it stops the sheet there; another call continues.
+        Args:
+            steps: number of steps.
+            pause: function called after every launch. If it raises, another call of `advance` continues.
 
         Raises:
-            MsmError: when the sheet is torn; so do `state` and `read`.
+            MsmError: when the sheet is inconsistent.
         """
         points = self.layout.rows * self.layout.cols
         most, depth = max(1, min(MAX_STEPS_PER_LAUNCH, POINT_STEPS_PER_LAUNCH // points)), self.layout.depth
-        # A launch takes whole passes. If not even one is within the limit, it takes up to four times the limit.
+        # A launch takes whole passes; a single pass may exceed the limit up to four times.
         most = most // depth * depth or min(depth, 4 * most)
         if self.layout.workers == 0:
             most = STEPS_PER_LAUNCH
@@ -187,7 +194,7 @@ class Dynamics:
             pause()
 
     def compile(self) -> None:
-        """Compile the step and the read-out without moving anything."""
+        """Compile all kernels without taking a step."""
         self._moving.compile(self._loads)
         self.displacement()
         self.tool_forces()
@@ -197,7 +204,7 @@ class Dynamics:
         return self.read().displacement
 
     def state(self) -> State:
-        """Read everything that the next steps depend on."""
+        """Read the complete state on which the next steps depend."""
         self._require_consistent()
         u, d = self._copy(differences=False)[0], self._copy(differences=True)[0]
         return State(self.steps_done, u, d, self._contact())
@@ -221,11 +228,11 @@ class Dynamics:
         return Reading(self.steps_done, displacement, shortest, longest, energy / 2)
 
     def _of_motion(self, sums: NDArray[Any]) -> float:
-        """Give twice the energy of motion [J], from the measures summed up."""
+        """Compute twice the kinetic energy [J] from the reduced measures."""
         return self.plan.material.mass * float(sums[SQUARED_MOTION]) / self.plan.grid.step**2
 
     def _copy(self, *, differences: bool) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Copy the displacements or the differences, and the measures of every row."""
+        """Read displacements or last differences [m], shape (rows, cols, 3), and the measures of every row."""
         rows, cols, config = self.layout.rows, self.layout.cols, self.layout.config
         values, measures = (
             np.empty((rows, cols, 3), self._real),
@@ -235,10 +242,13 @@ class Dynamics:
         return values, measures
 
     def tool_forces(self) -> NDArray[np.float64]:
-        """Give at a frame the mean force of each tool since the frame before [N], shape (tools, 3).
+        """Compute at a frame the mean force of each position-controlled tool since the previous frame.
 
-        It is the sum of m push (1 + g h / 2) / h^2 over the points and the steps, or of m push / h^2 with backward
-        differences, by the number of steps; m is the mass of a point.
+        It is the sum of m (1 + g h / 2) / h^2 times the contact corrections over mass points and steps, or of m / h^2
+        times the corrections with backward differences, divided by the number of steps; m is the mass of a mass point.
+
+        Returns:
+            Forces on the sheet [N], shape (tools, 3).
         """
         _, gain, _ = coefficients(self.plan)
         sums = sum_corrections(self.layout, self._moving.arrays, clear=False)
@@ -257,7 +267,7 @@ class Dynamics:
             raise MsmError("interrupted while steps were taken; restore what was saved before, or restart the scene")
 
     def close(self) -> None:
-        """Free the memory."""
+        """Release the memory of the device."""
         self._sheet = None
 
     @property
@@ -266,7 +276,7 @@ class Dynamics:
         return self._sheet
 
     def _next_loads(self, count: int) -> NDArray[Any]:
-        """Give the table of the loads of the next steps, shape (count, columns)."""
+        """Return the rows of the load table for the next steps, shape (count, columns)."""
         done = self.steps_done - self._first_tabled
         if done + count > len(self._loads):
             done = 0
@@ -274,11 +284,11 @@ class Dynamics:
         return self._loads[done : done + count]
 
     def _tabulate(self, count: int) -> None:
-        """Tabulate the loads of the next steps."""
+        """Compute the load table of the next steps."""
         self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, count)
 
     def _table(self, first: int, count: int) -> NDArray[Any]:
-        """Tabulate the loads of steps first, ..., first + count - 1, shape (count, columns)."""
+        """Compute the load table of steps first, ..., first + count - 1, shape (count, columns)."""
         _, gain, first_gain = coefficients(self.plan)
         table = self._columns(average_loads(self.plan, first, count), first)
         table[:, GAIN] = gain
@@ -287,26 +297,26 @@ class Dynamics:
         return table
 
     def _columns(self, loads: Schedule, first: int) -> NDArray[Any]:
-        """Tabulate the loads from step `first` on, shape (their number, columns), without a gain."""
+        """Compute the load table from step `first` on without the gain, shape (steps, columns)."""
         config = self.layout.config
         table = np.zeros((len(loads.active), config.first_column(None)))
         for term in config.terms:
             first_column = config.first_column(type(term))
             table[:, first_column : first_column + term.column_count] = term.columns(self.plan, loads, first)
-        # Loads too large for f32 become infinite; the next reading of the sheet shows it.
+        # Loads too large for f32 become infinite; the next reading of the sheet detects it.
         with np.errstate(over="ignore"):
             return table.astype(self._real)
 
     def _place(self, state: State | None) -> None:
-        """Fill the arrays of the sheet."""
+        """Allocate and fill the arrays of the sheet."""
         layout, plan, sheet = self.layout, self.plan, self.plan.scene.sheet
         moves, column, areas = ~plan.fixed, np.arange(layout.cols), area_shares(sheet)
-        # Rows are of three kinds: the first, any in between, the last.
+        # The three kinds of rows: first, middle, last.
         kinds = [0, layout.rows // 2, -1]
         shares = areas[kinds] if layout.config.by_area else np.ones((3, layout.cols))
         by_column = np.empty((COLUMN_ROWS, layout.cols))
         by_column[MOBILITY : MOBILITY + 3] = moves[kinds] / shares
-        # Springs along columns ask for the shares of a row in between even where there is none.
+        # Springs along columns read the shares of a middle row even in a sheet of two rows.
         by_column[AREA_SHARE : AREA_SHARE + 3] = areas[0], 2 * areas[0], areas[-1]
         by_column[REST_X] = axes(sheet)[0]
         by_column[HAS_LEFT] = column > 0
@@ -325,7 +335,7 @@ class Dynamics:
         self._sheet = self._started(InitialData(np.array(constants), by_column, fields, stiffness, state))
 
     def _started(self, start: InitialData) -> StepKernel:
-        """Make the form of the kernel that the device takes."""
+        """Allocate the kernel for the device."""
         kind: type[StepKernel] = ScatterKernel if self.layout.workers else GatherKernel
         return kind(self.layout, start)
 
@@ -338,32 +348,39 @@ Array = NDArray[np.float64]
 
 
 class ForceRecorder:
-    """Tells the forces of a plan's probes at its frames."""
+    """Computes the forces of all probes on the sheet at the frames of a run, and their maxima.
+
+    The force of a force-controlled probe at a frame is (percent(t) / 100) force times the sum of its decay factors over
+    the mass points that are not fixed. That of a position-controlled tool is `Dynamics.tool_forces`.
+
+    Args:
+        plan: the plan.
+    """
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
         sheet = plan.scene.sheet
         self._loads = {n: FrameLoad(probe, sheet) for n, probe in enumerate(plan.scene.probes) if not probe.moved}
-        # The sums of decays that stay the same, by probe.
-        self._standing: dict[int, float] = {}
+        # Sums of the decay factors of stationary control points, by probe.
+        self._stationary: dict[int, float] = {}
 
     def at_rest(self) -> ProbeForces:
-        """Give the forces at the first frame."""
+        """Compute the forces at the first frame."""
         plan, real = self._plan, np.float32 if self._plan.grid.precision == "f32" else np.float64
         forces = self._forces(0, rest_positions(plan.scene.sheet).astype(real), np.zeros((len(plan.tools), 3)))
-        return ProbeForces(forces, tuple(PeakForce(0.0, one.force) for one in forces))
+        return ProbeForces(forces, tuple(PeakForce(0.0, tip.force) for tip in forces))
 
     def follow(self, before: ProbeForces, frame: int, position: NDArray[Any], tools: Array) -> ProbeForces:
-        """Give the forces at a frame, and the greatest up to it.
+        """Compute the forces at a frame and their maxima up to it.
 
         Args:
-            before: those at the frame before.
-            frame: its number.
-            position: of the points [m], shape (rows, cols, 3).
-            tools: the forces of the tools that are moved [N], shape (tools, 3).
+            before: forces at the previous frame.
+            frame: number of the frame.
+            position: of the mass points [m], shape (rows, cols, 3).
+            tools: forces of the position-controlled tools [N], shape (tools, 3).
         """
         forces, time = self._forces(frame, position, tools), frame / self._plan.grid.frames_per_second
-        peaks = zip(before.greatest, (PeakForce(time, one.force) for one in forces), strict=True)
+        peaks = zip(before.greatest, (PeakForce(time, tip.force) for tip in forces), strict=True)
         return ProbeForces(forces, tuple(max(pair, key=lambda peak: math.hypot(*peak.force)) for pair in peaks))
 
     def _forces(self, frame: int, position: NDArray[Any], tools: Array) -> tuple[TipForce, ...]:
@@ -378,15 +395,15 @@ class ForceRecorder:
             share = percent / 100 * self._decays(index, at) if percent else 0.0
             x, y, z = probe_force(probe, sheet).force
             tip, _ = surface_point(position, plan.scene.render.refine, sheet, at)
-            # Not -0.
+            # Adding 0 turns -0 into 0.
             forces.append(TipForce(index, tuple(tip.tolist()), (share * x + 0.0, share * y + 0.0, share * z + 0.0)))
         return tuple(forces)
 
     def _decays(self, index: int, at: Array) -> float:
-        """Add up the decay of a probe over the points that are not fixed."""
+        """Sum the decay factors of a probe over the mass points that are not fixed."""
         probe, sheet = self._plan.scene.probes[index], self._plan.scene.sheet
         if self._loads[index].moves:
             return float(decay(probe, sheet, at)[~self._plan.fixed].sum())
-        if index not in self._standing:
-            self._standing[index] = float(decay(probe, sheet)[~self._plan.fixed].sum())
-        return self._standing[index]
+        if index not in self._stationary:
+            self._stationary[index] = float(decay(probe, sheet)[~self._plan.fixed].sum())
+        return self._stationary[index]

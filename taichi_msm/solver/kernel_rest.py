@@ -11,8 +11,8 @@ The norms are taken over all mass points and weighted with M. M bounds the stiff
 frequency exceeds 1, and the largest step dt = 1 is stable. The kernel stores the momentum q = M v.
 
 Contact forces of position-controlled tools are removed from the forces, and mass points that have moved are projected
-out of the tools (`terms.contact_rest`). A mass point that presses on a tool also moves by F / M into the tool before the
-projection, so that it stays in contact.
+out of the tools (`terms.contact_rest`). A mass point that presses on a tool also moves by F / M into the tool before
+the projection, so that it stays in contact.
 
 An evaluation of the forces passes over the rows like a step; a second loop moves the mass points. Sums over mass points
 are accumulated along columns first and then over the columns in their order, so their bits do not depend on lanes.

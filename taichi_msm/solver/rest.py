@@ -1,20 +1,20 @@
-"""The sheet at rest: every frame is the equilibrium under its loads and tools, found from the frame before.
+"""Quasi-static motion: each frame is the static equilibrium under its loads and tools, found from the previous frame.
 
-A frame is done when the largest force that is left on a point is at most ENOUGH of the largest force of a spring, a
-load or the foundation. FIRE (`kernel_rest`) follows the forces down from the frame before, with masses of its own, so
-that a sheet that has buckled goes on as it has begun. Tools that are moved come by at most half a radius between
-shapes, of which those between two frames are found less closely.
+A frame has converged when the largest residual force on a mass point is at most FORCE_TOLERANCE of the largest force of
+a spring, a load or the foundation. FIRE (`kernel_rest`) minimises the energy from the previous frame with fictitious
+masses, so a buckled sheet stays on its branch. Between two shapes, position-controlled tools move by at most half a
+radius; intermediate shapes are computed with a larger tolerance.
 
-A balance need not be stable: a flat sheet that is pressed together in its plane stays flat as long as nothing disturbs
-it. So every frame is disturbed once, when only the share DISTURBED of the forces is left: each point is moved at
-random, by no more than these forces would move it. Where the balance is stable this dies out with the rest of the
-motion. Where it is not, the forces do not vanish, and FIRE goes on to where the sheet buckles. Only a sheet with
-springs that are pressed together, or on a rod, can give way; there the search goes on to the share SURE, for up to four
-times the evaluations. So a weak instability may go unnoticed: 1 % above a critical load, but not 3 %
+An equilibrium can be unstable: a flat sheet compressed in its plane stays flat without a perturbation. Each frame is
+therefore perturbed once, when the residual reaches PERTURBATION_TOLERANCE: every mass point is displaced at random, at
+most by the displacement that the residual force would cause. In a stable equilibrium the perturbation decays. In an
+unstable one it grows, and FIRE converges to the buckled shape. Only a sheet with compressed springs or in contact with a
+tool can be unstable. In these cases the iteration continues to STABILITY_TOLERANCE, for up to four times the
+evaluations. Weak instabilities can remain undetected, at 1 % above a critical load but not at 3 %
 (tests/solver/test_rest.py).
 
-Where nothing holds the sheet or is in its way any more, it is flat: without tension it has no stiffness out of its
-plane, so that the forces would never tell the way back.
+A sheet without load and contact is set to the flat shape. Without tension the flat sheet has no stiffness out of its
+plane, so the iteration would not converge to it.
 """
 
 from __future__ import annotations
@@ -49,66 +49,70 @@ from taichi_msm.terms.contact import (
     ContactTerm,
 )
 
-# A frame is done when the forces left are this share of the largest; it is disturbed when they are that share. Where
-# the balance may not be stable, the search goes on to a smaller share.
-ENOUGH, DISTURBED, SURE = 1e-7, 1e-3, 1e-9
+# Residual forces relative to the largest force: at convergence, at the perturbation, and at convergence of an equilibrium
+# that may be unstable.
+FORCE_TOLERANCE, PERTURBATION_TOLERANCE, STABILITY_TOLERANCE = 1e-7, 1e-3, 1e-9
 
-# Where no force is larger, there is none [N].
-NOTHING = 1e-30
+# Smaller forces count as 0 [N].
+MIN_FORCE_N = 1e-30
 
-# Springs may be this much shorter than without any force before they count as pushing.
-SLACK = 1e-9
+# Largest number of evaluations per mass point of the longer side; a sheet that buckles takes up to 200.
+MAX_EVALUATIONS = 2000
 
-# A shape takes at most so many evaluations for each point of the longer side; one that buckles takes up to 200.
-MOST_EVALUATIONS = 2000
-
-# A launch evaluates the forces at most so many times, and of so many points in all, about 0.1 s of a core.
-PER_LAUNCH, POINTS_PER_LAUNCH = 64, 40_000_000
+# Limits of a launch: evaluations, and evaluations times mass points, about 0.1 s of one core.
+EVALUATIONS_PER_LAUNCH, POINTS_PER_LAUNCH = 64, 40_000_000
 
 Array = NDArray[np.float64]
 
 
 class QuasiStatics(Dynamics):
-    """The sheet at rest, in the place of the sheet in motion: a frame is a step.
+    """The sheet in quasi-static motion, with the interface of `Dynamics`; a frame counts as a step.
 
     Attributes:
-        evaluations: how often the forces were evaluated for the last frame.
-        residual: of the last frame: the largest force left, as a share of the largest force.
+        evaluations: number of evaluations of the forces for the last frame.
+        residual: largest residual force of the last frame, relative to the largest force.
     """
 
     def restart(self, plan: Plan, state: State | None = None) -> None:
-        """Begin again, as `Dynamics` does; without a state the first frame is yet to be found."""
+        """Restart with the same or another plan.
+
+        Args:
+            plan: the plan.
+            state: state to continue from; by default the first call of `advance` also finds the first frame.
+        """
         self.evaluations, self.residual = 0, 0.0
-        self._settled = state
+        self._last_frame = state
         super().restart(plan, state)
 
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
-        """Find the shape of the first frame, if that is yet to be done, and of so many more, with pauses.
+        """Find the equilibrium of a number of frames, and of the first frame if it is still missing.
 
-        After an exception from a pause another call begins anew from the last frame that was found.
+        Args:
+            steps: number of frames.
+            pause: function called after every launch. If it raises, another call continues from the last frame found.
 
         Raises:
-            DivergedError: when no shape was found in which the forces balance.
+            DivergedError: when the iteration does not converge.
         """
         self._require_consistent()
         end = self.steps_done + steps
-        while self._settled is None or self.steps_done < end:
-            frame = self.steps_done + (self._settled is not None)
+        while self._last_frame is None or self.steps_done < end:
+            frame = self.steps_done + (self._last_frame is not None)
             self._settle(frame, pause)
             self.steps_done = frame
             displacement = self._copy(differences=False)[0]
-            self._settled = State(frame, displacement, np.zeros_like(displacement), self._contact())
+            self._last_frame = State(frame, displacement, np.zeros_like(displacement), self._contact())
 
     def compile(self) -> None:
-        """Compile everything without moving anything."""
+        """Compile all kernels without moving a mass point."""
         row = self._columns(evaluate_frame_loads(self.plan, 0), 0)
         self._relaxation.relax(0, 0.0, row)
         self._relaxation.scale(row)
         self.displacement()
 
     def state(self) -> State:
-        """Read everything that the next frames depend on: the last frame that was found."""
-        return self._before
+        """Return the state of the last frame found, on which the next frames depend."""
+        return self._last_state
 
     def read(self) -> Reading:
         """Read the displacements and measure the sheet; its energy is that of springs and bending."""
@@ -116,15 +120,15 @@ class QuasiStatics(Dynamics):
         return reading._replace(residual=self.residual, evaluations=self.evaluations)
 
     def tool_forces(self) -> Array:
-        """Give the force of each tool that is moved on the sheet [N], shape (tools, 3).
+        """Compute the force of each position-controlled tool on the sheet [N], shape (tools, 3).
 
-        It is minus the sum of all other forces on the points that the tool touches or holds.
+        It is minus the sum of all other forces on the mass points that the tool touches or holds.
         """
-        # Not -0.
+        # Subtraction from 0 avoids -0.
         return 0.0 - np.einsum("tij,ijk->tk", self._touched().astype(float), self._copy(differences=True)[0])
 
     def _touched(self) -> NDArray[np.bool_]:
-        """Tell which points each tool touches or holds, shape (tools, rows, cols)."""
+        """Return whether each tool touches or holds each mass point, shape (tools, rows, cols)."""
         tools, contact = len(self.plan.tools), self._contact()
         normals = contact[: CORRECTIONS * tools].reshape(tools, CORRECTIONS, self.layout.rows, self.layout.cols)
         touched = (normals != 0).any(axis=1)
@@ -133,8 +137,8 @@ class QuasiStatics(Dynamics):
         return np.asarray(touched)
 
     def _started(self, start: InitialData) -> Any:
-        self._astray = False
-        # A point without any stiffness has no place to rest either.
+        self._interrupted = False
+        # A mass point without stiffness would have mass 0.
         self._masses = np.maximum(fictitious_masses(self.plan), SMALLEST)
         return Relaxation(self.layout, start, self._masses)
 
@@ -144,154 +148,158 @@ class QuasiStatics(Dynamics):
         return self._sheet
 
     @property
-    def _before(self) -> State:
-        """The last frame that was found; before the first one, the flat sheet."""
-        if self._settled is not None:
-            return self._settled
+    def _last_state(self) -> State:
+        """The state of the last frame found; before the first one, the flat sheet."""
+        if self._last_frame is not None:
+            return self._last_frame
         shape, contact = (self.layout.rows, self.layout.cols), self.layout.config.get(ContactTerm)
-        none = np.zeros((0 if contact is None else contact.field_count, *shape))
-        return State(0, np.zeros((*shape, 3)), np.zeros((*shape, 3)), none)
+        fields = np.zeros((0 if contact is None else contact.field_count, *shape))
+        return State(0, np.zeros((*shape, 3)), np.zeros((*shape, 3)), fields)
 
     def _tabulate(self, count: int) -> None:
-        """Leave it: the loads of a frame are found when it is its turn."""
+        """Do nothing, because the loads of a frame are evaluated for each frame."""
 
     def _of_motion(self, _sums: NDArray[Any]) -> float:
         return 0.0
 
     def _settle(self, frame: int, pause: Pause) -> None:
-        """Find the shape of a frame."""
+        """Find the equilibrium of a frame."""
         self.evaluations = 0
-        relaxation, before, loads = self._relaxation, self._before, evaluate_frame_loads(self.plan, frame)
+        relaxation, before, loads = self._relaxation, self._last_state, evaluate_frame_loads(self.plan, frame)
         contact = self._gripping(frame, before)
         held = CORRECTIONS * len(self.plan.tools) + HOLDER
         held_before, holds = (len(fields) > held and bool(fields[held].any()) for fields in (before.contact, contact))
         if len(contact):
             relaxation.arrays.set_fields(self.layout.config.first_field(ContactTerm), contact)
-        if self._astray:
+        if self._interrupted:
             relaxation.place(before.displacement)
-        self._astray, left = True, 0.0
-        *ways, end = self._times(frame)
-        for time in (*ways, end):
+        self._interrupted, residual = True, 0.0
+        *intermediate, end = self._times(frame)
+        for time in (*intermediate, end):
             row = self._at(time, frame, self._columns(loads, frame))
-            # What is let go falls, whatever tool is in its way.
+            # After a release the flat shape is tried even if a tool is in the way.
             free = not loads.strength.any() and not holds and (held_before or not self._meets_tool(time))
-            if free and self._falls_flat(row):
-                left = 0.0
+            if free and self._try_flat(row):
+                residual = 0.0
             else:
-                left = self._relax(frame, row, ENOUGH if time == end else DISTURBED, pause)
-        self._astray, self.residual = False, left
+                tolerance = FORCE_TOLERANCE if time == end else PERTURBATION_TOLERANCE
+                residual = self._relax(frame, row, tolerance, pause)
+        self._interrupted, self.residual = False, residual
 
     def _meets_tool(self, time: float) -> bool:
-        """Tell whether a tool at that time is in the way of the sheet as it is."""
-        place = rest_positions(self.plan.scene.sheet) + self._copy(differences=False)[0]
-        return any(tool.touches(place[~self.plan.fixed], time) for tool in self.plan.tools)
+        """Return whether a tool at a time [s] touches the current sheet."""
+        position = rest_positions(self.plan.scene.sheet) + self._copy(differences=False)[0]
+        return any(tool.touches(position[~self.plan.fixed], time) for tool in self.plan.tools)
 
-    def _falls_flat(self, row: NDArray[Any]) -> bool:
-        """Lay the sheet flat, if it stays so."""
+    def _try_flat(self, row: NDArray[Any]) -> bool:
+        """Set the flat shape if it is an equilibrium; return whether it is."""
         relaxation, shape = self._relaxation, self._copy(differences=False)[0]
         relaxation.place(np.zeros_like(shape))
-        done, left = relaxation.relax(1, 0.0, row)
-        self.evaluations += done
-        if left > 0:
+        count, force = relaxation.relax(1, 0.0, row)
+        self.evaluations += count
+        if force > 0:
             relaxation.place(shape)
-        return left == 0
+        return force == 0
 
     def _times(self, frame: int) -> list[float]:
-        """List the times of the shapes on the way to a frame, and that of the frame itself."""
+        """Return the times of the intermediate shapes before a frame, and the time of the frame [s]."""
         rate = self.plan.grid.frames_per_second
         begin, end = max(0, frame - 1) / rate, frame / rate
         return sorted({end, *(float(time) for tool in self.plan.tools for time in tool.substep_times(begin, end))})
 
     def _at(self, time: float, frame: int, row: NDArray[Any]) -> NDArray[Any]:
-        """Put the tools in a row of the table of loads where they are at a time on the way to a frame."""
+        """Write the positions of the tools at a time up to a frame into a row of the load table."""
         for n, tool in enumerate(self.plan.tools):
-            own = self.layout.config.first_column(ContactTerm) + COLUMNS + TOOL_COLUMNS * n
-            middle = tool.tip_centre(np.array([time]))[0]
-            row[0, own + TIP_AFTER : own + TIP_AFTER + 3] = middle
-            for taken in self._held(tool, frame):
-                row[0, own + GRIP_SHIFT : own + GRIP_SHIFT + 3] = middle - self._taken_at(tool, taken)
+            first = self.layout.config.first_column(ContactTerm) + COLUMNS + TOOL_COLUMNS * n
+            centre = tool.tip_centre(np.array([time]))[0]
+            row[0, first + TIP_AFTER : first + TIP_AFTER + 3] = centre
+            for start in self._grip_start(tool, frame):
+                row[0, first + GRIP_SHIFT : first + GRIP_SHIFT + 3] = centre - self._centre_at_grip(tool, start)
         return row
 
-    def _held(self, tool: Tool, frame: int) -> Iterator[int]:
-        """Give the grip of a tool at a frame, if any: the frame when it began."""
+    def _grip_start(self, tool: Tool, frame: int) -> Iterator[int]:
+        """Return the first frame of the grip that is active at a frame, if any."""
         for grip in tool.grips:
             frames = grip_frames(grip, self.plan.grid.frames_per_second)
             if frame in frames:
                 yield frames.start
 
-    def _taken_at(self, tool: Tool, frame: int) -> Array:
-        """Tell where a tool was when it took hold at a frame: with the points as they were the frame before."""
+    def _centre_at_grip(self, tool: Tool, frame: int) -> Array:
+        """Return the tip's centre [m] at the frame before a grip begins, whose displacements the grip stores."""
         return tool.tip_centre(np.array([max(0, frame - 1) / self.plan.grid.frames_per_second]))[0]
 
     def _gripping(self, frame: int, before: State) -> NDArray[Any]:
-        """Give the fields of contact at the start of a frame: grips that end let go, and others take hold."""
+        """Return the contact fields at the start of a frame, after grips have ended and begun."""
         tools, contact = self.plan.tools, before.contact.copy()
         if len(contact) == CORRECTIONS * len(tools):
             return contact
-        held, taken = (
+        held, displacement = (
             contact[CORRECTIONS * len(tools) + HOLDER],
             contact[CORRECTIONS * len(tools) + HOLD_DISPLACEMENT :],
         )
-        place = rest_positions(self.plan.scene.sheet) + before.displacement
-        begun = [frame in self._held(tool, frame) for tool in tools]
+        position = rest_positions(self.plan.scene.sheet) + before.displacement
+        begins = [frame in self._grip_start(tool, frame) for tool in tools]
         for n, tool in enumerate(tools):
-            if begun[n] or not list(self._held(tool, frame)):
+            if begins[n] or not list(self._grip_start(tool, frame)):
                 held[held == n + 1] = 0
         for n, tool in enumerate(tools):
-            if begun[n]:
-                near = np.linalg.norm(place - self._taken_at(tool, frame), axis=-1) <= GRIP_RADII * tool.radius
-                takes = near & ~self.plan.fixed & (held == 0)
-                held[takes] = n + 1
-                taken[:, takes] = before.displacement[takes].T
+            if begins[n]:
+                distance = np.linalg.norm(position - self._centre_at_grip(tool, frame), axis=-1)
+                gripped = (distance <= GRIP_RADII * tool.radius) & ~self.plan.fixed & (held == 0)
+                held[gripped] = n + 1
+                displacement[:, gripped] = before.displacement[gripped].T
         return contact
 
-    def _relax(self, frame: int, row: NDArray[Any], wanted: float, pause: Pause) -> float:
-        """Let the points go to where at most a share of the forces is left; returns that share."""
+    def _relax(self, frame: int, row: NDArray[Any], tolerance: float, pause: Pause) -> float:
+        """Iterate until the residual force is below a tolerance, relative to the largest force; return the residual."""
         relaxation, longer = self._relaxation, max(self.layout.rows, self.layout.cols)
         relaxation.stop()
-        per_launch = max(1, min(PER_LAUNCH, POINTS_PER_LAUNCH // (self.layout.rows * self.layout.cols)))
-        most, evaluations, disturbed = MOST_EVALUATIONS * longer, 0, wanted >= DISTURBED
-        scale, last = max(NOTHING, relaxation.scale(row)), math.inf
+        points = self.layout.rows * self.layout.cols
+        per_launch = max(1, min(EVALUATIONS_PER_LAUNCH, POINTS_PER_LAUNCH // points))
+        limit, evaluations, perturbed = MAX_EVALUATIONS * longer, 0, tolerance >= PERTURBATION_TOLERANCE
+        scale, last = max(MIN_FORCE_N, relaxation.scale(row)), math.inf
         while True:
-            # The first evaluation tells whether there is anything to do.
+            # The first evaluation shows whether the sheet is already in equilibrium.
             first = evaluations == 0
-            enough = (wanted if first or disturbed else DISTURBED) * scale
-            done, left = relaxation.relax(1 if first else min(per_launch, most - evaluations), enough, row)
-            evaluations += done
-            scale = max(NOTHING, relaxation.scale(row))
-            if left <= min(enough, wanted * scale):
-                if wanted == ENOUGH and not first and evaluations < last and self._may_give():
-                    # A balance that is not stable shows while these evaluations last.
-                    wanted, last = SURE, 4 * evaluations
+            target = (tolerance if first or perturbed else PERTURBATION_TOLERANCE) * scale
+            count, force = relaxation.relax(1 if first else min(per_launch, limit - evaluations), target, row)
+            evaluations += count
+            scale = max(MIN_FORCE_N, relaxation.scale(row))
+            if force <= min(target, tolerance * scale):
+                converged = tolerance == FORCE_TOLERANCE
+                if converged and not first and evaluations < last and self._may_be_unstable():
+                    # An unstable equilibrium shows within these evaluations.
+                    tolerance, last = STABILITY_TOLERANCE, 4 * evaluations
                     continue
                 self.evaluations += evaluations
-                return left / scale
-            if wanted == SURE and (left > 10 * ENOUGH * scale or evaluations >= last):
-                wanted = ENOUGH
-            if not (left < np.inf and scale < np.inf) or evaluations >= most:
-                raise self._diverged(frame, left / scale, evaluations)
-            if left <= enough and not disturbed:
-                self._disturb(left)
-                disturbed = True
+                return force / scale
+            if tolerance == STABILITY_TOLERANCE and (force > 10 * FORCE_TOLERANCE * scale or evaluations >= last):
+                tolerance = FORCE_TOLERANCE
+            if not (force < np.inf and scale < np.inf) or evaluations >= limit:
+                raise self._diverged(frame, force / scale, evaluations)
+            if force <= target and not perturbed:
+                self._perturb(force)
+                perturbed = True
             pause()
 
-    def _may_give(self) -> bool:
-        """Tell whether a spring is pressed together, or a point rests on a rod; else every balance is stable."""
+    def _may_be_unstable(self) -> bool:
+        """Return whether the equilibrium can be unstable, because of compressed springs or contact with a tool."""
         material = self.plan.material
         stiffest = 1.0 if material.factors is None else float(material.factors.max())
-        pressed = super().read().shortest_spring < 1 - material.tension / stiffest - SLACK
-        return pressed or bool(self._touched().any())
+        # Rounding may shorten a spring by 1e-9.
+        compressed = super().read().shortest_spring < 1 - material.tension / stiffest - 1e-9
+        return compressed or bool(self._touched().any())
 
-    def _disturb(self, force: float) -> None:
-        """Move every point at random, by at most what a force [N] moves it; always in the same way."""
+    def _perturb(self, force: float) -> None:
+        """Displace every mass point at random but reproducibly, at most by the displacement due to a force [N]."""
         rows, cols = self.layout.rows, self.layout.cols
-        # This generator gives the same numbers with every version of NumPy.
+        # This generator returns the same numbers in every version of NumPy.
         noise = 2 * np.random.RandomState(0).random_sample((rows, cols, 3)) - 1
         moves = (~self.plan.fixed / self._masses)[..., None]
         self._relaxation.place(self._copy(differences=False)[0] + force * noise * moves)
 
-    def _diverged(self, frame: int, left: float, evaluations: int) -> DivergedError:
-        """Say that no shape was found, how far the forces were from balance, and what may help."""
+    def _diverged(self, frame: int, residual: float, evaluations: int) -> DivergedError:
+        """Build the error for an iteration that did not converge, with the residual and a remedy."""
         plan, time = self.plan, frame / self.plan.grid.frames_per_second
         row, column, *_ = largest_displacement(self._copy(differences=True)[0])
         remedy = (
@@ -301,14 +309,21 @@ class QuasiStatics(Dynamics):
             remedy = "nothing holds the sheet; fix a side, or give it a foundation"
         elif (self._touched().sum(axis=0) > 1).any():
             remedy = "two tools press on one point; keep them apart"
-        said = (
+        message = (
             f"diverged at {time:.6g} s, frame {frame}: no shape was found in which the forces balance: after "
-            f"{evaluations} evaluations, {left:.2g} of the largest force is left at point ({row}, {column}), and "
-            f"{ENOUGH:g} was wanted; {remedy}"
+            f"{evaluations} evaluations, {residual:.2g} of the largest force is left at point ({row}, {column}), and "
+            f"{FORCE_TOLERANCE:g} was wanted; {remedy}"
         )
-        return DivergedError(said, frame, time, (row, column))
+        return DivergedError(message, frame, time, (row, column))
 
 
 def build_dynamics(plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> Dynamics:
-    """Make the sheet of a plan, in motion or at rest; arguments as for `Dynamics`."""
+    """Build the dynamic or quasi-static solver of a plan.
+
+    Args:
+        plan: the plan.
+        device: the device.
+        layout: replaces the layout chosen by `choose_layout`, for tests.
+        cores: largest number of CPU cores; by default all available cores.
+    """
     return (QuasiStatics if plan.scene.time.at_rest else Dynamics)(plan, device, layout, cores)

@@ -21,7 +21,7 @@ from taichi_msm.runs.run import resume, run
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.dynamics import choose_layout
-from taichi_msm.solver.rest import ENOUGH, build_dynamics
+from taichi_msm.solver.rest import FORCE_TOLERANCE, build_dynamics
 from taichi_msm.study.study import study
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
@@ -78,7 +78,7 @@ def test_it_goes_on_from_what_was_saved_and_after_an_interruption(device: Device
         simulation.restart()
         simulation.restore(saved)
         assert shapes(simulation, 2) == rest
-        assert simulation.progress.residual <= ENOUGH
+        assert simulation.progress.residual <= FORCE_TOLERANCE
     assert evaluations > 100
 
 
@@ -106,7 +106,7 @@ def test_a_run_tells_how_well_the_forces_balance(device: Device, tmp_path: Path)
     made = loaded().model_copy(update={"output": ("trajectory",)})
     record = run(made, tmp_path / "out", threads=device.threads)
     assert record["status"] == "complete"
-    assert 0 < record["residual"] <= ENOUGH
+    assert 0 < record["residual"] <= FORCE_TOLERANCE
     assert record["evaluations"] > 100
     assert {record["step"], record["stable_step"], record["steps_per_frame"], record["steps"]} == {None}
     estimate = record["error_estimate"]
@@ -150,7 +150,7 @@ def test_an_interrupted_run_ends_with_the_same_bits(device: Device, tmp_path: Pa
 def test_what_never_rests_is_a_divergence(
     load: list[list[float]], frames: int, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("taichi_msm.solver.rest.MOST_EVALUATIONS", 20)
+    monkeypatch.setattr("taichi_msm.solver.rest.MAX_EVALUATIONS", 20)
     made = at_rest([{**PUSH, "load": load}], output=["trajectory"], **NEVER)
     record = run(made, tmp_path / "out", threads=device.threads)
     assert (record["status"], record["frames"]) == ("diverged", frames)

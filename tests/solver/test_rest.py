@@ -19,7 +19,7 @@ from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.arrays import SheetLayout
 from taichi_msm.solver.dynamics import Dynamics, choose_layout
-from taichi_msm.solver.rest import ENOUGH, QuasiStatics
+from taichi_msm.solver.rest import FORCE_TOLERANCE, QuasiStatics
 from taichi_msm.system.runtime import Device
 from tests import reference
 from tests.scenes import plan_of, scene, speckle
@@ -93,7 +93,7 @@ def shape_of(plan: Plan, device: Device, frames: int = 1, layout: SheetLayout | 
     """Displacements of the last of some frames [m]."""
     rest = QuasiStatics(plan, device, layout)
     rest.advance(frames)
-    assert rest.residual <= ENOUGH
+    assert rest.residual <= FORCE_TOLERANCE
     u = rest.displacement()
     rest.close()
     return u
