@@ -1,14 +1,11 @@
-"""How much work a run is, and what follows from it: whether f64 is cheap enough for `auto`, and whether pilots are.
+"""Planning of a run: the plan of a scene, its steps and precision, an estimate of its work, and steering.
 
-The unit of work is a step of one point in f32, which takes 1 to 2 ns on two cores of 2024. It is counted from the scene
-alone, so that the decisions are the same on every machine.
+The unit of work is a step of one mass point in f32, which takes 1 to 2 ns on two CPU cores of 2024. Work is computed
+from the scene alone, so that decisions based on it are the same on every machine.
 
-From a scene to its plan, and the choice of its steps and their precision.
-
-Other loads, and other paths of tools, from a time of a run on.
-
-A tool that is moved cannot jump: it goes straight from where it is to the first key of its new path. What it did before
-stays part of its path as far as later steps depend on it: on its place when its grip began, and on whether it pressed.
+Steering replaces loads and paths during a run. A position-controlled tool cannot jump: it moves straight from its
+current position to the first keyframe of its new path. Past keyframes remain in its path as long as later steps depend
+on them, through the position at which a grip began or through the activity of a foundation.
 """
 
 from __future__ import annotations
@@ -42,82 +39,99 @@ from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Probe
 from taichi_msm.terms import derive_material, highest_frequency
 
-# Work of starting Python and Taichi and of compiling the kernels.
+# Work of starting Python and Taichi and compiling the kernels.
 START = 4e8
 
-# Work of a step of a point in f64.
-DOUBLE = 2.0
+# Work of a step of a mass point in f64.
+F64_WORK = 2.0
 
-# Additional work of a step for a moving control point, for bending and for a tool that touches, relative to the step
-# without them.
-MOVING, BENDING, CONTACT = 1.2, 1.0, 0.5
+# Additional work of a step per moving control point, for bending, and per position-controlled tool.
+MOVING_LOAD_WORK, BENDING_WORK, CONTACT_WORK = 1.2, 1.0, 0.5
 
-# Work of encoding a pixel, and of drawing one of its samples.
+# Work of encoding a pixel, and of drawing a sample of a pixel.
 ENCODING, SAMPLE = 40.0, 6.0
 
-# Evaluations of the forces that a frame at rest takes, for each of the rows and columns together. Each is a step, and
-# as much again to move the points.
-EVALUATIONS = 2.0
+# Evaluations of the forces for a quasi-static frame, divided by the number of rows plus columns.
+EVALUATIONS_PER_LINE = 2.0
 
-# Stepping in f64 is a small part of a run if it takes at most this share of the time of everything else.
-SMALL = 0.25
+# `auto` chooses f64 if stepping takes at most this share of the work of everything else.
+MAX_F64_SHARE = 0.25
 
-# Unless they are asked for, pilots are run only if they take at most this share of the run.
+# Largest share of companion runs in the work of a run, unless the user requests them.
 MAX_COMPANION_SHARE = 2 / 5
 
 
 class Work(NamedTuple):
-    """The work of the parts of a run."""
+    """The work of a run, by stages."""
 
     start: float  # starting Python and Taichi, and compiling the kernels
     stepping: float  # all steps
-    pilots: float  # those that go with the run
+    pilots: float  # companion runs
     pictures: float  # drawing and encoding
 
 
 def count_work(plan: Plan, pilots: float) -> Work:
-    """Count the work of a run; pilots: their steps in f64 for each step of it, counted in steps of the whole sheet."""
+    """Estimate the work of a run.
+
+    Args:
+        plan: the plan.
+        pilots: f64 steps of companion runs per step of the run, in steps of the whole sheet.
+    """
     steps = _steps(plan)
-    stepping = DOUBLE * steps if plan.grid.precision == "f64" else steps
-    return Work(START, stepping, DOUBLE * pilots * steps, _other(plan.scene) - START)
+    stepping = F64_WORK * steps if plan.grid.precision == "f64" else steps
+    return Work(START, stepping, F64_WORK * pilots * steps, _other(plan.scene) - START)
 
 
 def is_f64_cheap(plan: Plan) -> bool:
-    """Tell whether stepping in f64 is a small part of a run, so that `auto` chooses it."""
-    return DOUBLE * _steps(plan) <= SMALL * _other(plan.scene)
+    """Return whether stepping in f64 is a small part of the work of a run."""
+    return F64_WORK * _steps(plan) <= MAX_F64_SHARE * _other(plan.scene)
 
 
 def affords_companions(plan: Plan, pilots: float) -> bool:
-    """Tell whether pilots take at most two fifths of a run; arguments as for `work`."""
-    parts = count_work(plan, pilots)
-    return parts.pilots <= MAX_COMPANION_SHARE * sum(parts)
+    """Return whether companion runs take at most MAX_COMPANION_SHARE of the work of a run.
+
+    Args:
+        plan: the plan.
+        pilots: f64 steps of companion runs per step of the run, in steps of the whole sheet.
+    """
+    work = count_work(plan, pilots)
+    return work.pilots <= MAX_COMPANION_SHARE * sum(work)
 
 
 def _steps(plan: Plan) -> float:
-    """Count the work of stepping in f32, or of finding the shape of every frame."""
+    """Estimate the work of stepping in f32, or of the equilibrium of every frame."""
     moving, points = sum(slot.moves for slot in plan.slots), plan.scene.sheet.points
-    cost = 1 + MOVING * moving + BENDING * (plan.material.bending > 0) + CONTACT * len(plan.tools)
+    cost = 1 + MOVING_LOAD_WORK * moving + BENDING_WORK * (plan.material.bending > 0) + CONTACT_WORK * len(plan.tools)
     steps = float(plan.grid.steps)
     if plan.scene.time.at_rest:
-        cost, steps = cost + 1, EVALUATIONS * sum(points) * (plan.grid.frames + 1)
+        # Each evaluation is followed by an update of the positions, which takes as long as a step.
+        cost, steps = cost + 1, EVALUATIONS_PER_LINE * sum(points) * (plan.grid.frames + 1)
     return cost * steps * math.prod(points)
 
 
 def _other(scene: Scene) -> float:
-    """Count the work of everything but stepping."""
+    """Estimate the work of everything except stepping."""
     pixels = (scene.time.frames + 1) * math.prod(scene.render.size) * len(scene.render.all_cameras) * scene.renders
     return START + pixels * (ENCODING + SAMPLE * scene.render.supersample**2)
 
 
-# Lengths [m] whose squares, and a few of their products, f32 holds.
-SMALLEST_SINGLE, LARGEST_SINGLE = 1e-15, 1e17
+# Range of lengths whose squares and their products f32 can represent [m].
+MIN_F32_LENGTH, MAX_F32_LENGTH = 1e-15, 1e17
 
-# Keeps a frame that is exactly n limits long from being cut into n + 1 steps by rounding.
-SLACK = 1 - 1e-12
+# Prevents n + 1 steps due to rounding in a frame of exactly n stable steps.
+ROUNDING_MARGIN = 1 - 1e-12
 
 
 def make_plan(scene: Scene, maps: Maps | None = None) -> Plan:
-    """Plan a scene for a CPU as `try_plan` does; SceneError: with all that makes its sheet or its steps impossible."""
+    """Build the plan of a scene for a CPU.
+
+    Args:
+        scene: a scene whose keys are valid individually.
+        maps: images of its stiffness maps; by default they are read.
+
+    Raises:
+        SceneError: when sheet, steps or paths are invalid; it lists all problems.
+    """
     plan, problems = try_plan(scene, maps)
     if plan is None or problems:
         raise SceneError([str(problem) for problem in problems])
@@ -125,11 +139,14 @@ def make_plan(scene: Scene, maps: Maps | None = None) -> Plan:
 
 
 def try_plan(scene: Scene, maps: Maps | None = None) -> tuple[Plan | None, list[Problem]]:
-    """Plan a scene for a CPU, None where there can be no plan, and find what is wrong with its sheet and its steps.
+    """Build the plan of a scene for a CPU and check sheet, steps and paths.
 
     Args:
-        scene: whose keys are valid each by itself.
-        maps: from the plan of a scene with the same maps; None: they are read.
+        scene: a scene whose keys are valid individually.
+        maps: images of its stiffness maps; by default they are read.
+
+    Returns:
+        The plan, None if the material is invalid; and all problems.
     """
     problems = list(material_key_problems(scene))
     if problems:
@@ -146,16 +163,21 @@ def try_plan(scene: Scene, maps: Maps | None = None) -> tuple[Plan | None, list[
 
 
 def plan_variant(plan: Plan, scene: Scene) -> Plan:
-    """Plan a scene that a valid one was turned into, with its maps, without looking for what is wrong with it."""
+    """Build the plan of a modified scene without checks.
+
+    Args:
+        plan: the plan of a valid scene with the same maps.
+        scene: the modified scene, which must be valid.
+    """
     return _plan(scene, plan.maps, fixed_points(scene.sheet), derive_material(scene, plan.maps))
 
 
 def _read_maps(scene: Scene) -> tuple[dict[str, MapImage], list[Problem]]:
-    """Read the maps of a scene, and find those that cannot be read."""
+    """Read the images of a scene's stiffness maps; unreadable ones become problems."""
     maps, problems = {}, []
-    for name, one in scene.maps.items():
+    for name, stiffness_map in scene.maps.items():
         try:
-            maps[name] = read_map(one)
+            maps[name] = read_map(stiffness_map)
         except PictureError as error:
             problems.append(Problem((scene.kind, name, "image"), str(error)))
     return maps, problems
@@ -169,10 +191,17 @@ def _plan(scene: Scene, maps: Maps, fixed: NDArray[np.bool_], material: Material
 
 
 def choose_precision(plan: Plan, arch: str) -> Plan:
-    """Choose the precision for an arch, unless the scene gives it.
+    """Choose the precision of the steps.
 
-    A tolerance asks for f64; so does `auto` where it is a small part of the run. On a GPU f64 is slow or missing. At
-    rest it is always f64.
+    Quasi-static scenes always use f64. With `auto`, a CPU uses f64 if the scene has a tolerance or if stepping is a
+    small part of the work; GPUs use f32, because f64 is slow or missing there.
+
+    Args:
+        plan: the plan.
+        arch: cpu, cuda or vulkan.
+
+    Returns:
+        The plan with the precision in its grid.
     """
     time = plan.scene.time
     if time.at_rest:
@@ -184,9 +213,18 @@ def choose_precision(plan: Plan, arch: str) -> Plan:
 
 
 def stable_step(material: Material, sheet: Sheet, difference: str) -> float:
-    """Find the largest stable step [s]; infinite where nothing oscillates.
+    """Compute the largest stable step.
 
-    central: 2 / w. backward: (sqrt(g^2 + 4 w^2) - g) / w^2, written without its cancellation; g = C / m.
+    With the highest angular frequency w and g = C / m, it is 2 / w for central differences of the damping, and
+    (sqrt(g^2 + 4 w^2) - g) / w^2 for backward differences, which the code rearranges to avoid cancellation.
+
+    Args:
+        material: coefficients of the sheet.
+        sheet: the sheet.
+        difference: "central" or "backward".
+
+    Returns:
+        The step [s]; infinite for a sheet without stiffness and damping.
     """
     w = highest_frequency(material, sheet)
     g = material.drag if difference == "backward" else 0.0
@@ -195,33 +233,45 @@ def stable_step(material: Material, sheet: Sheet, difference: str) -> float:
 
 
 def stable_steps(plan: Plan) -> int:
-    """Count the fewest stable steps of a frame."""
-    return max(1, math.ceil(1 / plan.grid.frames_per_second / plan.stable_step * SLACK))
+    """Return the fewest stable steps per frame."""
+    return max(1, math.ceil(1 / plan.grid.frames_per_second / plan.stable_step * ROUNDING_MARGIN))
 
 
 def steps_per_frame(time: Time, limit: float) -> int:
-    """Count the steps of one frame.
+    """Compute the number of steps per frame.
 
-    auto: the fewest whose step is at most half the stability limit. A given step is rounded to a fraction of a frame.
-    A tolerance may ask for more steps, which `time_step.choose_step` finds. At rest a frame counts as a step.
+    With `auto`, it is the smallest number whose step is at most half the stability limit. A given step is rounded to a
+    fraction of a frame. `accuracy.time_step` increases the number for a tolerance.
+
+    Args:
+        time: time keys of the scene.
+        limit: the largest stable step [s].
+
+    Returns:
+        The number of steps; 1 in quasi-static scenes.
     """
     if time.at_rest:
         return 1
     frame = 1 / time.frames_per_second
     if time.step == "auto":
-        return max(1, math.ceil(2 * frame / limit * SLACK))
+        return max(1, math.ceil(2 * frame / limit * ROUNDING_MARGIN))
     return max(1, round(frame / time.step))
 
 
 def with_time(scene: Scene, **changes: Any) -> Scene:
-    """Change keys of the scene's time."""
+    """Return a copy of a scene with other time keys.
+
+    Args:
+        scene: the scene.
+        changes: keys of `time` and their values.
+    """
     return scene.model_copy(update={"time": scene.time.model_copy(update=changes)})
 
 
 def freeze_grid(plan: Plan) -> Plan:
-    """Write the grid into the scene, so that every plan of it has the same grid, on any arch.
+    """Write the chosen precision, and the step chosen for a tolerance, into the scene of a plan.
 
-    The precision is written, and a step in the place of a tolerance; a step that follows from the scene stays "auto".
+    Every plan of this scene then has the same grid on any arch. A step that follows from the scene stays "auto".
     """
     changes: dict[str, Any] = {"precision": plan.grid.precision}
     if plan.scene.time.tolerance is not None:
@@ -230,7 +280,7 @@ def freeze_grid(plan: Plan) -> Plan:
 
 
 def _step_problems(plan: Plan) -> Iterator[Problem]:
-    """Find a given step that is unstable or does not divide a frame, and what would overflow or vanish in f32."""
+    """Check for a given step that is unstable or does not divide a frame, and for values outside the range of f32."""
     if plan.scene.time.at_rest:
         return
     given, limit, frame = plan.scene.time.step, plan.stable_step, 1 / plan.grid.frames_per_second
@@ -238,22 +288,22 @@ def _step_problems(plan: Plan) -> Iterator[Problem]:
         pass
     elif given > limit * (1 + 1e-12):
         below = frame / math.ceil(frame / limit)
-        said = f"{given:g} s is above the stability limit {limit:.6g} s; try {below:.9g}, or auto"
-        yield Problem(("time", "step"), said)
+        text = f"{given:g} s is above the stability limit {limit:.6g} s; try {below:.9g}, or auto"
+        yield Problem(("time", "step"), text)
     elif abs(frame / given - round(frame / given)) > WHOLE * max(1.0, frame / given):
-        said = f"{given:g} s does not divide a frame of {frame:.9g} s; try {frame / math.ceil(frame / given):.9g}"
-        yield Problem(("time", "step"), said)
+        text = f"{given:g} s does not divide a frame of {frame:.9g} s; try {frame / math.ceil(frame / given):.9g}"
+        yield Problem(("time", "step"), text)
     if plan.grid.precision == "f64":
         return
     cells, size, step, mass = spacing(plan.scene.sheet), plan.scene.sheet.size, plan.grid.step, plan.material.mass
-    if min(cells) < SMALLEST_SINGLE or max(size) > LARGEST_SINGLE:
+    if min(cells) < MIN_F32_LENGTH or max(size) > MAX_F32_LENGTH:
         yield Problem(
             ("sheet", "size"),
             f"cells of {min(cells):g} m in a sheet of {max(size):g} m leave the range of f32, "
-            f"{SMALLEST_SINGLE:g} to {LARGEST_SINGLE:g} m; take time.precision: f64",
+            f"{MIN_F32_LENGTH:g} to {MAX_F32_LENGTH:g} m; take time.precision: f64",
         )
     gain = step**2 / mass
-    if not SMALLEST_SINGLE**2 < gain < LARGEST_SINGLE**2:
+    if not MIN_F32_LENGTH**2 < gain < MAX_F32_LENGTH**2:
         yield Problem(
             ("time", "precision"),
             f"f32 cannot hold the {gain:g} m by which a step of {step:g} s moves a mass of "
@@ -265,40 +315,48 @@ Key = tuple[float, float, float, float]
 
 
 def steer_plan(plan: Plan, probes: Sequence[Probe | Mapping[str, Any] | None], now: float) -> Plan:
-    """Replace the probes of a plan from a time on [s].
+    """Replace the probes of a plan from a time on.
 
-    A tool that stays as it is, also on its path, is None or given as it is. Any other with a path gets the keys of its
-    path from `now` on; in a mapping, what is not given of its instrument, friction and grips stays.
+    Args:
+        plan: the plan.
+        probes: one item per probe of the plan. None, or the current probe, leaves the probe unchanged. The `path` of a
+            position-controlled tool contains only keyframes after `now`; a mapping may omit its instrument, friction
+            and grips, which then stay the same.
+        now: the current time [s].
 
     Raises:
-        ArgumentError: when they are more or fewer.
-        SceneError: when one of them is not a probe; or when a tool that is moved would jump, or do something before
-            `now`.
+        ArgumentError: when the number of probes differs.
+        SceneError: when a probe is invalid, or when a position-controlled tool would jump or change its past.
     """
     before = plan.scene.probes
     if len(probes) != len(before):
         raise ArgumentError(f"probes: {len(probes)} are given, and the scene has {len(before)}; give all of them")
     given = [_completed(*pair) for pair in zip(before, probes, strict=True)]
     after = plan.with_probes(given)
-    steering = [
+    changes = [
         _PathChange(plan, index, *pair, now)
         for index, pair in enumerate(zip(before, after.scene.probes, strict=True))
         if pair[0].moved and pair[1].moved and pair[0] != pair[1]
     ]
-    if lines := [str(problem) for one in steering for problem in one.problems()]:
+    if lines := [str(problem) for change in changes for problem in change.problems()]:
         raise SceneError(lines)
-    going_on = {one.index: one.probe for one in steering}
-    if not going_on:
+    changed = {change.index: change.probe for change in changes}
+    if not changed:
         return after
-    return after.with_probes([going_on.get(index, probe) for index, probe in enumerate(after.scene.probes)])
+    return after.with_probes([changed.get(index, probe) for index, probe in enumerate(after.scene.probes)])
 
 
 def with_current_paths(plan: Plan, probes: Sequence[Probe]) -> Plan:
-    """Give the tools that are moved the paths, and all else, that they have among these probes."""
+    """Replace the position-controlled tools of a plan by those of other probes.
+
+    Args:
+        plan: the plan.
+        probes: one per probe of the plan.
+    """
     if not plan.tools:
         return plan
     pairs = zip(plan.scene.probes, probes, strict=True)
-    return plan.with_probes([other if own.moved and other.moved else own for own, other in pairs])
+    return plan.with_probes([new if old.moved and new.moved else old for old, new in pairs])
 
 
 def _completed(before: Probe, given: Probe | Mapping[str, Any] | None) -> Probe | Mapping[str, Any]:
@@ -310,70 +368,72 @@ def _completed(before: Probe, given: Probe | Mapping[str, Any] | None) -> Probe 
 
 
 class _PathChange:
-    """A tool that gets another path.
+    """A new path of a position-controlled tool from the current time on.
 
     Attributes:
-        index: of its probe.
-        probe: with the path that it has from now on, and what counts of that which it had before.
+        index: index of its probe.
+        probe: the probe with the new path, including those past keyframes on which later steps depend.
     """
 
     def __init__(self, plan: Plan, index: int, before: Probe, given: Probe, now: float) -> None:
         self.index, self._plan, self._before, self._given, self._now = index, plan, before, given, now
-        # Times that are as good as now.
-        self._nearly = WHOLE / plan.grid.frames_per_second
+        # Times that differ by less are equal up to rounding [s].
+        self._time_tolerance = WHOLE / plan.grid.frames_per_second
         assert before.path is not None
         assert given.path is not None
-        self._past, h = _past(before.path, now, self._nearly), plan.grid.step
+        self._past, h = _past(before.path, now, self._time_tolerance), plan.grid.step
         begun = [begin for begin, end in given.grip if begin < now < end]
-        if before.path[-1][0] < now - self._nearly and not begun:
-            self._past = self._past[-1:]  # It has not pressed since the last key.
-        # The averages of loads reach a step back, and bounds of the energy a frame.
+        if before.path[-1][0] < now - self._time_tolerance and not begun:
+            self._past = self._past[-1:]  # The tool has not pressed since its last keyframe.
+        # Averages of loads reach one step back, and bounds of the energy one frame.
         since = min([now - 1 / plan.grid.frames_per_second, *begun]) - 2 * h
         self._past = self._past[max((n for n, key in enumerate(self._past) if key[0] <= since), default=0) :]
         self.probe = given.model_copy(update={"path": (*self._past, *given.path)}) if self._is_later() else given
 
     def problems(self) -> Iterator[Problem]:
-        """Find what a tool cannot do from one step to the next."""
-        now, nearly, where = self._now, self._nearly, ("probes", self.index)
+        """Check the change for keyframes in the past, jumps of position or shape, and grips that begin in the past."""
+        now, tolerance, key = self._now, self._time_tolerance, ("probes", self.index)
         assert self._given.path is not None
         if not self._is_later():
-            said = f"is at {self._given.path[0][0]:g} s, and it is {now:g} s; give only times after that"
-            yield Problem((*where, "path", 0), said)
+            text = f"is at {self._given.path[0][0]:g} s, and it is {now:g} s; give only times after that"
+            yield Problem((*key, "path", 0), text)
             return
         grid, sheet = self._plan.grid, self._plan.scene.sheet
-        (was,), (tool,) = build_tools((self._before,), sheet), build_tools((self.probe,), sheet)
+        (old_tool,), (tool,) = build_tools((self._before,), sheet), build_tools((self.probe,), sheet)
         first = len(self._past) - 1
         if not self._plan.scene.time.at_rest and (fault := too_fast(tool, grid, first)):
-            yield Problem((*where, "path", fault[0] - first - 1), fault[1])
-        turned = _change(was, tool)
-        if turned > MAX_STRIDE_RADII * tool.radius:
+            yield Problem((*key, "path", fault[0] - first - 1), fault[1])
+        deviation = _shape_change(old_tool, tool)
+        if deviation > MAX_STRIDE_RADII * tool.radius:
             yield Problem(
-                (*where, "instrument"),
-                f"changes its shape by {turned:.3g} m in a step, over half its radius; change it little by little",
+                (*key, "instrument"),
+                f"changes its shape by {deviation:.3g} m in a step, over half its radius; change it little by little",
             )
         for n, (begin, end) in enumerate(self._given.grip):
-            is_over = end <= now + nearly
-            goes_on = any(begin == began and ends > now + nearly for began, ends in self._before.grip)
-            if begin < now - nearly and not (is_over or goes_on):
-                said = f"begins at {begin:g} s, and it is {now:g} s; begin at that time or later"
-                yield Problem((*where, "grip", n), said)
+            has_ended = end <= now + tolerance
+            continues = any(
+                begin == old_begin and old_end > now + tolerance for old_begin, old_end in self._before.grip
+            )
+            if begin < now - tolerance and not (has_ended or continues):
+                text = f"begins at {begin:g} s, and it is {now:g} s; begin at that time or later"
+                yield Problem((*key, "grip", n), text)
 
     def _is_later(self) -> bool:
         assert self._given.path is not None
-        return self._given.path[0][0] > self._now + self._nearly
+        return self._given.path[0][0] > self._now + self._time_tolerance
 
 
-def _past(path: Sequence[Key], now: float, nearly: float) -> list[Key]:
-    """Give the keys of a path up to a time, the last one at that time."""
-    past = [key for key in path if key[0] <= now + nearly]
-    if past and past[-1][0] >= now - nearly:
+def _past(path: Sequence[Key], now: float, tolerance: float) -> list[Key]:
+    """Return the keyframes of a path up to a time, with an interpolated one at this time if necessary."""
+    past = [key for key in path if key[0] <= now + tolerance]
+    if past and past[-1][0] >= now - tolerance:
         return past
-    times, *places = np.array(path).T
-    across, down, height = (float(np.interp(now, times, place)) for place in places)
+    times, *coordinates = np.array(path).T
+    across, down, height = (float(np.interp(now, times, values)) for values in coordinates)
     return [*past, (now, across, down, height)]
 
 
-def _change(before: Tool, after: Tool) -> float:
-    """Bound how far any point of a rod moves when it becomes another one, whose lowest point is at the same place."""
+def _shape_change(before: Tool, after: Tool) -> float:
+    """Bound the displacement of any point of a capsule by a change of its shape with a fixed lowest point [m]."""
     ends = np.linalg.norm(after.length * after.axis - before.length * before.axis)
     return float(ends) + 2 * abs(after.radius - before.radius)

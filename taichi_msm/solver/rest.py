@@ -8,8 +8,8 @@ radius; intermediate shapes are computed with a larger tolerance.
 An equilibrium can be unstable: a flat sheet compressed in its plane stays flat without a perturbation. Each frame is
 therefore perturbed once, when the residual reaches PERTURBATION_TOLERANCE: every mass point is displaced at random, at
 most by the displacement that the residual force would cause. In a stable equilibrium the perturbation decays. In an
-unstable one it grows, and FIRE converges to the buckled shape. Only a sheet with compressed springs or in contact with a
-tool can be unstable. In these cases the iteration continues to STABILITY_TOLERANCE, for up to four times the
+unstable one it grows, and FIRE converges to the buckled shape. Only a sheet with compressed springs or in contact with
+a tool can be unstable. In these cases the iteration continues to STABILITY_TOLERANCE, for up to four times the
 evaluations. Weak instabilities can remain undetected, at 1 % above a critical load but not at 3 %
 (tests/solver/test_rest.py).
 
@@ -49,8 +49,8 @@ from taichi_msm.terms.contact import (
     ContactTerm,
 )
 
-# Residual forces relative to the largest force: at convergence, at the perturbation, and at convergence of an equilibrium
-# that may be unstable.
+# Residual forces relative to the largest force: at convergence, at the perturbation, and at convergence of an
+# equilibrium that may be unstable.
 FORCE_TOLERANCE, PERTURBATION_TOLERANCE, STABILITY_TOLERANCE = 1e-7, 1e-3, 1e-9
 
 # Smaller forces count as 0 [N].

@@ -133,7 +133,11 @@ def test_a_small_run_is_in_f64_and_a_large_one_in_f32() -> None:
     assert precision(drawn) == "f64"
     # The work is counted, and not timed.
     steps = 30 * plan_of(made(edge, 30)).grid.steps_per_frame * edge**2
-    assert planning.DOUBLE * steps > planning.SMALL * planning.START >= planning.DOUBLE * steps * (1 - 3 / edge)
+    assert (
+        planning.F64_WORK * steps
+        > planning.MAX_F64_SHARE * planning.START
+        >= planning.F64_WORK * steps * (1 - 3 / edge)
+    )
 
 
 def test_pilots_are_taken_while_they_are_two_fifths_of_the_run() -> None:
