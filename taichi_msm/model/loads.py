@@ -187,7 +187,7 @@ def evaluate_frame_loads(plan: Plan, frame: int) -> Schedule:
 
 
 def keyframe_times(scene: Scene) -> Array:
-    """List the keyframes of all loads between 0 and the end [s]; the loads are smooth everywhere else."""
+    """Return the keyframe times between 0 and the end of the scene [s]; the loads are smooth everywhere else."""
     times = _all_key_times(scene)
     return times[(times > 0) & (times < scene.time.duration)]
 

@@ -235,11 +235,11 @@ def tissue_problems(scene: Scene, fixed: NDArray[np.bool_], factors: Array | Non
     longest = cell_aspect_ratio(sheet)
     if longest > MAX_CELL_ASPECT * (1 + 1e-9):
         (dx, dy), (rows, cols), (height, width) = spacing(sheet), sheet.points, sheet.size
-        enough = (
+        candidates = (
             (rows, math.ceil(width / dy / MAX_CELL_ASPECT) + 1),
             (math.ceil(height / dx / MAX_CELL_ASPECT) + 1, cols),
         )
-        more = enough[0] if dx > dy else enough[1]
+        more = candidates[0] if dx > dy else candidates[1]
         remedy = f"try {list(more)}" if max(more) <= MAX_POINTS else "take another sheet.size"
         yield Problem(
             ("sheet", "points"),

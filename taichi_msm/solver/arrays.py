@@ -181,7 +181,7 @@ class StepKernel(Protocol):
     def __init__(self, layout: SheetLayout, start: InitialData) -> None: ...
 
     def advance(self, count: int, table: NDArray[Any]) -> None:
-        """Take a number of steps.
+        """Advance the sheet by a number of steps.
 
         Args:
             count: number of steps.

@@ -150,7 +150,7 @@ def build_step_row(
         sheet: ti.template(), carried: ti.template(), loads: ti.template(), band: ti.template(),
         row, n, at, carry, moments,
     ):  # fmt: skip
-        """Take step n of the launch with a row of the band, after `at` steps of the run; return whether it was taken.
+        """Perform step n of the launch, after `at` steps of the run, on a row of the band; return its success.
 
         Row -1 is the row before the band. Its forces are computed, but it is not stepped.
         """
@@ -219,7 +219,7 @@ def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None
     def step_band(
         sheet: ti.template(), carried: ti.template(), loads: ti.template(), band: ti.template(), sizes: ti.template()
     ):
-        """Take the steps of a launch with a band, from the worker's recorded progress on, and record it at the end."""
+        """Perform the steps of a launch on a band, from the worker's recorded progress on, and record it at the end."""
         first, place = sizes[FIRST], WORKER_STRIDE * band.worker
         count, depth = ti.cast(sizes[COUNT], ti.i32), ti.cast(sizes[DEPTH], ti.i32)
         carried_rows = ti.cast(sizes[CARRIED_ROWS], ti.i32)

@@ -78,7 +78,7 @@ class ScatterKernel:
         self._progress = np.zeros(layout.workers * WORKER_STRIDE, np.int64)
 
     def advance(self, count: int, table: NDArray[Any]) -> None:
-        """Take a number of steps.
+        """Advance the sheet by a number of steps.
 
         Args:
             count: number of steps.
@@ -113,12 +113,12 @@ class ScatterKernel:
             self._read(0, self._layout.rows, self._layout.cols, differences, values, measures, *self.arrays.all)
 
     def _advance_alone(self, first: int, end: int, table: NDArray[Any]) -> None:
-        """Take the steps from `first` to `end` with a single worker."""
+        """Advance with a single worker from step `first` to step `end`."""
         self._start_pass()
         self._launch(self._alone, 1, end - first, table[first:])
 
     def _advance_in_backoff(self, first: int, end: int, table: NDArray[Any]) -> int:
-        """Take steps with a single worker until the back-off ends; return the number of the next step."""
+        """Advance with a single worker until the back-off ends; return the number of the next step."""
         # The duration of a step is unknown, so the number of steps per launch starts small and doubles.
         piece = self._layout.depth
         while first < end and time.perf_counter() < self._backoff_until:
@@ -129,7 +129,7 @@ class ScatterKernel:
         return first
 
     def _advance_together(self, first: int, end: int, table: NDArray[Any]) -> int:
-        """Take steps with all workers; return the number of the next step, below `end` after a timeout."""
+        """Advance with all workers; return the number of the next step, below `end` after a timeout."""
         if self._backoff_until:
             # The back-off itself is excluded, because a single worker rarely waits for a core.
             self._cpu_time, self._wait_time = time.process_time(), process.waited_for_cores() or 0.0

@@ -42,7 +42,7 @@ class GatherKernel:
         self.arrays = SheetArrays(layout, np.concatenate([buffer, buffer, moments]), start)
 
     def advance(self, count: int, table: NDArray[Any]) -> None:
-        """Take a number of steps.
+        """Advance the sheet by a number of steps.
 
         Args:
             count: number of steps, at most STEPS_PER_LAUNCH.

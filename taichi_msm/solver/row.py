@@ -47,7 +47,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
         # The lower of the two rows.
         lower = i + ti.select(up < 0, 1, 0)
         # Entry 0 of both rows of u and of the row of carried forces.
-        row, other, carry = here * width, next_row * width, carried_row * width
+        row, next_at, carry = here * width, next_row * width, carried_row * width
         # Force of the left neighbour, and forces carried to the other row for the previous, this and the next entry.
         left, last = [vector(0) for _ in ti.static(range(3))], [vector(0) for _ in ti.static(range(3))]
         this, coming = [vector(0) for _ in ti.static(range(3))], [vector(0) for _ in ti.static(range(3))]
@@ -61,7 +61,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
                 left[c] = first[c]
         if ti.static(shear):
             first_right = to_other_row(
-                sheet, other + 1, 1, u, up, diagonal, of_diagonal(sheet, lower, 0), has_right * exists
+                sheet, next_at + 1, 1, u, up, diagonal, of_diagonal(sheet, lower, 0), has_right * exists
             )
             for c in ti.static(range(3)):
                 coming[c] = first_right[c]
@@ -79,19 +79,19 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
                 has_left, has_right = sheet.by_column[HAS_LEFT * width + b], sheet.by_column[HAS_RIGHT * width + b]
             if ti.static(shear):
                 to_left = to_other_row(
-                    sheet, other + b - 1, -1, u, up, diagonal, of_diagonal(sheet, lower, b - 1), has_left * exists
+                    sheet, next_at + b - 1, -1, u, up, diagonal, of_diagonal(sheet, lower, b - 1), has_left * exists
                 )
                 for c in ti.static(range(3)):
                     force[c] = to_left[c]
                     last[c] += to_left[c]
             if ti.static(structural):
-                straight = to_other_row(sheet, other + b, 0, u, up, ti.abs(up), of_column(sheet, lower, b), exists)
+                straight = to_other_row(sheet, next_at + b, 0, u, up, ti.abs(up), of_column(sheet, lower, b), exists)
                 for c in ti.static(range(3)):
                     force[c] += straight[c]
                     this[c] += straight[c]
             if ti.static(shear):
                 to_right = to_other_row(
-                    sheet, other + b + 1, 1, u, up, diagonal, of_diagonal(sheet, lower, b), has_right * exists
+                    sheet, next_at + b + 1, 1, u, up, diagonal, of_diagonal(sheet, lower, b), has_right * exists
                 )
                 for c in ti.static(range(3)):
                     force[c] += to_right[c]
@@ -115,7 +115,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
             for c in ti.static(range(3)):
                 u[c] = sheet.u[c][row + strip + 1]
             end = to_other_row(
-                sheet, other + strip, -1, u, up, diagonal, of_diagonal(sheet, lower, strip), has_left * exists
+                sheet, next_at + strip, -1, u, up, diagonal, of_diagonal(sheet, lower, strip), has_left * exists
             )
             for c in ti.static(range(3)):
                 this[c] += end[c]

@@ -139,19 +139,19 @@ class ContactTerm(Term):
         def reaches(sheet: ti.template(), i, low: ti.template(), high: ti.template(), now: ti.template()):
             y, reached = sheet.constants[TOP_Y] - i * sheet.constants[DY], False
             for tool in ti.static(range(tools)):
-                own = ti.static(first + TOOL_COLUMNS * tool)
+                base = ti.static(first + TOOL_COLUMNS * tool)
                 # Slightly more than the radius, because of rounding.
-                near = 1.001 * now[own + RADIUS]
+                near = 1.001 * now[base + RADIUS]
                 begin, end = cut(
-                    y + low[0] - near, y + high[0] + near, ti.cast(0, real), now[own + LENGTH],
-                    now[own + TIP_AFTER + 1], now[own + INVERSE_AXIS],
+                    y + low[0] - near, y + high[0] + near, ti.cast(0, real), now[base + LENGTH],
+                    now[base + TIP_AFTER + 1], now[base + INVERSE_AXIS],
                 )  # fmt: skip
                 begin, end = cut(
-                    low[1] - near, high[1] + near, begin, end, now[own + TIP_AFTER + 2], now[own + INVERSE_AXIS + 1]
+                    low[1] - near, high[1] + near, begin, end, now[base + TIP_AFTER + 2], now[base + INVERSE_AXIS + 1]
                 )
                 reached = reached or begin <= end
                 if ti.static(grips):
-                    reached = reached or now[own + GRIP_STATE] == GRIP_BEGINS
+                    reached = reached or now[base + GRIP_STATE] == GRIP_BEGINS
             if ti.static(grips):
                 held = vector(0)
                 for b in range(1, sheet.width - 1):
@@ -170,7 +170,7 @@ class ContactTerm(Term):
         ti, vector, tools, has_friction, grips = config.ti, config.vector, self.tools, self.has_friction, self.grips
         first_field, first = config.first_field(ContactTerm), config.first_column(ContactTerm)
         grip_field = first_field + CORRECTIONS * tools
-        own, part = [first + COLUMNS + TOOL_COLUMNS * tool for tool in range(tools)], build_penetration(config)
+        base, part = [first + COLUMNS + TOOL_COLUMNS * tool for tool in range(tools)], build_penetration(config)
         greatest = build_max_lane(config)
 
         @ti.func
@@ -188,15 +188,15 @@ class ContactTerm(Term):
                 held = sheet.fields[(grip_field + HOLDER) * row * sheet.width + here]
                 # All grips that end release their mass points before any other grip begins.
                 for tool in ti.static(range(tools)):
-                    if now[own[tool] + GRIP_STATE] != GRIP_CONTINUES:
+                    if now[base[tool] + GRIP_STATE] != GRIP_CONTINUES:
                         held = ti.select(held == tool + 1, vector(0), held)
                 for tool in ti.static(range(tools)):
-                    if now[own[tool] + GRIP_STATE] == GRIP_BEGINS:
+                    if now[base[tool] + GRIP_STATE] == GRIP_BEGINS:
                         away = vector(0)
                         for c in ti.static(range(3)):
-                            off = rest[c] + (u[c] - d[c]) - now[own[tool] + TIP_BEFORE + c]
+                            off = rest[c] + (u[c] - d[c]) - now[base[tool] + TIP_BEFORE + c]
                             away += off * off
-                        reach = GRIP_RADII * now[own[tool] + RADIUS]
+                        reach = GRIP_RADII * now[base[tool] + RADIUS]
                         takes = ti.select(away <= reach * reach, free, vector(0)) * ti.select(
                             held == 0, vector(1), vector(0)
                         )
@@ -207,7 +207,7 @@ class ContactTerm(Term):
                 sheet.fields[(grip_field + HOLDER) * row * sheet.width + here] = held
                 free = ti.select(held == 0, free, vector(0))
             for tool in ti.static(range(tools)):
-                inside, normal_x, normal_y, normal_z = part(rest, u, now, own[tool])
+                inside, normal_x, normal_y, normal_z = part(rest, u, now, base[tool])
                 depth = ti.max(inside, 0) * free
                 pushed = depth
                 if ti.static(grips):
@@ -217,7 +217,7 @@ class ContactTerm(Term):
                     push = [depth * normal[c] for c in ti.static(range(3))]
                     if ti.static(has_friction[tool]):
                         slip = [
-                            d[c] + push[c] - (now[own[tool] + TIP_AFTER + c] - now[own[tool] + TIP_BEFORE + c])
+                            d[c] + push[c] - (now[base[tool] + TIP_AFTER + c] - now[base[tool] + TIP_BEFORE + c])
                             for c in ti.static(range(3))
                         ]
                         along = vector(0)
@@ -227,14 +227,14 @@ class ContactTerm(Term):
                         for c in ti.static(range(3)):
                             slip[c] = slip[c] - along * normal[c]
                             speed += slip[c] * slip[c]
-                        stopped = now[own[tool] + FRICTION] * depth / ti.max(ti.sqrt(speed), MIN_DISTANCE_M)
+                        stopped = now[base[tool] + FRICTION] * depth / ti.max(ti.sqrt(speed), MIN_DISTANCE_M)
                         stopped = ti.min(stopped, 1)
                         for c in ti.static(range(3)):
                             push[c] = push[c] - slip[c] * stopped
                     if ti.static(grips):
                         for c in ti.static(range(3)):
                             target = sheet.fields[(grip_field + HOLD_DISPLACEMENT + c) * row * sheet.width + here]
-                            target += now[own[tool] + GRIP_SHIFT + c]
+                            target += now[base[tool] + GRIP_SHIFT + c]
                             push[c] = ti.select(held == tool + 1, target - u[c], push[c])
                     for c in ti.static(range(3)):
                         # Lanes without a correction keep their bits, including the sign of zero.
@@ -264,27 +264,27 @@ def build_max_lane(config: KernelConfig) -> Callable[..., Any]:
 
 
 def build_penetration(config: KernelConfig) -> Callable[..., Any]:
-    """Build the Taichi function part(rest, u, now, own), the penetration depth of mass points in a tool.
+    """Build the Taichi function part(rest, u, now, base), the penetration depth of mass points in a tool.
 
-    In it `own` is the first column of the tool. It returns radius - |r'| and the three components of n.
+    In it `base` is the first column of the tool. It returns radius - |r'| and the three components of n.
     """
     ti, vector = config.ti, config.vector
 
     @ti.func
-    def part(rest: ti.template(), u: ti.template(), now: ti.template(), own: ti.template()):
-        r = [rest[c] - now[own + TIP_AFTER + c] + u[c] for c in ti.static(range(3))]
+    def part(rest: ti.template(), u: ti.template(), now: ti.template(), base: ti.template()):
+        r = [rest[c] - now[base + TIP_AFTER + c] + u[c] for c in ti.static(range(3))]
         s = vector(0)
         for c in ti.static(range(3)):
-            s += r[c] * now[own + AXIS + c]
-        s = ti.max(ti.min(s, now[own + LENGTH]), 0)
+            s += r[c] * now[base + AXIS + c]
+        s = ti.max(ti.min(s, now[base + LENGTH]), 0)
         square = vector(0)
         for c in ti.static(range(3)):
-            r[c] = r[c] - s * now[own + AXIS + c]
+            r[c] = r[c] - s * now[base + AXIS + c]
             square += r[c] * r[c]
         distance = ti.sqrt(square)
         normal = [r[c] / ti.max(distance, MIN_DISTANCE_M) for c in ti.static(range(3))]
         normal[2] = ti.select(distance > 0, normal[2], vector(1))
-        return now[own + RADIUS] - distance, normal[0], normal[1], normal[2]
+        return now[base + RADIUS] - distance, normal[0], normal[1], normal[2]
 
     return part
 

@@ -72,7 +72,7 @@ def build_keep_out(config: KernelConfig, contact: ContactTerm) -> Callable[..., 
     ti, vector, tools, grips = config.ti, config.vector, contact.tools, contact.grips
     first_field, first = config.first_field(ContactTerm), config.first_column(ContactTerm)
     grip_field = first_field + CORRECTIONS * tools
-    own, part = [first + COLUMNS + TOOL_COLUMNS * tool for tool in range(tools)], build_penetration(config)
+    base, part = [first + COLUMNS + TOOL_COLUMNS * tool for tool in range(tools)], build_penetration(config)
     iterations = _iterations(contact)
 
     @ti.func
@@ -89,11 +89,11 @@ def build_keep_out(config: KernelConfig, contact: ContactTerm) -> Callable[..., 
             held = sheet.fields[(grip_field + HOLDER) * field + at]
             for tool in ti.static(range(tools)):
                 for c in ti.static(range(3)):
-                    place = (
+                    target = (
                         sheet.fields[(grip_field + HOLD_DISPLACEMENT + c) * field + at]
-                        + now[own[tool] + GRIP_SHIFT + c]
+                        + now[base[tool] + GRIP_SHIFT + c]
                     )
-                    u[c] = ti.select(held == tool + 1, place, u[c])
+                    u[c] = ti.select(held == tool + 1, target, u[c])
                     q[c] = ti.select(held == tool + 1, vector(0), q[c])
             free = ti.select(held > 0, vector(0), free)
         for tool in ti.static(range(tools)):
@@ -101,15 +101,15 @@ def build_keep_out(config: KernelConfig, contact: ContactTerm) -> Callable[..., 
                 sheet.fields[(first_field + CORRECTIONS * tool + c) * field + at] = vector(0)
         for _ in range(iterations):
             for tool in ti.static(range(tools)):
-                depth, x, y, z = part(rest, u, now, own[tool])
+                depth, x, y, z = part(rest, u, now, base[tool])
                 normal = [x, y, z]
                 touches = ti.select(depth > 0, free, vector(0))
                 inward = ti.min(q[0] * x + q[1] * y + q[2] * z, 0) * touches
                 for c in ti.static(range(3)):
                     u[c] += touches * depth * normal[c]
                     q[c] = q[c] - inward * normal[c]
-                    place = (first_field + CORRECTIONS * tool + c) * field + at
-                    sheet.fields[place] = ti.select(touches > 0, normal[c], sheet.fields[place])
+                    index = (first_field + CORRECTIONS * tool + c) * field + at
+                    sheet.fields[index] = ti.select(touches > 0, normal[c], sheet.fields[index])
         for c in ti.static(range(3)):
             sheet.u[c][at] = u[c]
             sheet.q[c][at] = q[c]

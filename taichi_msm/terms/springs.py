@@ -257,8 +257,8 @@ class SpringTerm(Term):
             if ti.static(tense):
                 straight += tension
             change = [straight * p[c] + turned * to[c] for c in ti.static(range(3))]
-            apart = q[0] * p[0] + q[1] * p[1] + q[2] * p[2]
-            return [change[0], change[1], change[2], share * along, apart]
+            product = q[0] * p[0] + q[1] * p[1] + q[2] * p[2]
+            return [change[0], change[1], change[2], share * along, product]
 
         return differentiate
 
@@ -313,18 +313,18 @@ class SpringTerm(Term):
         @ti.func
         def longer(sheet: ti.template(), p, q, b, right: ti.template(), x0, y0):
             """Return (L^2 - L0^2) / L0^2 and |q|^2 / L0^2 of the spring from entry b of row p to b + right of row q."""
-            here, there = p * sheet.width + b, q * sheet.width + b + right
-            x = sheet.u[0][there] - sheet.u[0][here]
-            y = sheet.u[1][there] - sheet.u[1][here]
-            z = sheet.u[2][there] - sheet.u[2][here]
+            start, end = p * sheet.width + b, q * sheet.width + b + right
+            x = sheet.u[0][end] - sheet.u[0][start]
+            y = sheet.u[1][end] - sheet.u[1][start]
+            z = sheet.u[2][end] - sheet.u[2][start]
             square = x0 * x0 + y0 * y0
             share = (x * (x + 2 * x0) + (y * (y + 2 * y0) + z * z)) / square
-            apart = (x * x + y * y + z * z) / square
+            squared = (x * x + y * y + z * z) / square
             # Springs beyond the edge do not exist.
             if ti.static(open_edges and right != 0):
                 side = ti.static(HAS_LEFT if right < 0 else HAS_RIGHT)
                 share = ti.select(sheet.by_column[side * sheet.width + b] > 0, share, vector(0))
-            return share, apart
+            return share, squared
 
         @ti.func
         def measure(measures: ti.template(), sheet: ti.template(), p, i, kind, b):
@@ -340,13 +340,13 @@ class SpringTerm(Term):
                             k += of_column(sheet, i + 1, b)
                         else:
                             k += of_diagonal(sheet, i + 1, b + ti.static(min(right, 0)))
-                        share, apart = longer(sheet, p, p + down, b, right, right * dx, -down * dy)
+                        share, squared = longer(sheet, p, p + down, b, right, right * dx, -down * dy)
                         measures[first + MIN_STRAIN] = ti.min(measures[first + MIN_STRAIN], share)
                         measures[first + MAX_STRAIN] = ti.max(measures[first + MAX_STRAIN], share)
                         # L / L0 - 1; rounding can make the share smaller than -1.
                         stretch = share / (1 + ti.sqrt(ti.max(share + 1, vector(0))))
                         stretched += stretch * stretch * k
-                        tense_part += apart
+                        tense_part += squared
                     measures[first + STRETCH_SUMS + family] += stretched
                     if ti.static(tense):
                         measures[first + TENSION_SUMS + family] += tense_part
