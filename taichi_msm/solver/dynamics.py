@@ -165,7 +165,7 @@ class Dynamics:
         self._tabulate(plan.grid.steps_per_frame)
 
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
-        """Advance the sheet by a number of steps; steps that start at a frame reset the sums of contact corrections.
+        """Advance the sheet by a number of steps; a call at a frame resets the sums of contact corrections.
 
         Args:
             steps: number of steps.
