@@ -237,10 +237,8 @@ def build_point_step(config: KernelConfig) -> Callable[..., None]:
 
 def build_measure(config: KernelConfig) -> Callable[..., Any]:
     """Build the function that adds the measures of an entry, its motion and those of terms, to a list of vectors."""
-    vector, measuring_terms = (
-        config.vector,
-        [measure for term in config.terms for measure in term.build_measures(config)],
-    )
+    vector = config.vector
+    measuring_terms = [measure for term in config.terms for measure in term.build_measures(config)]
 
     @ti.func
     def measure(measures: ti.template(), sheet: ti.template(), p, i, b):
@@ -267,13 +265,8 @@ def build_read(config: KernelConfig, *, parallel: bool, iterations: int) -> Call
         parallel: whether the rows are distributed over threads.
         iterations: number of loop iterations per row, of which one has work.
     """
-    real, vector, vectors, lanes, count = (
-        config.real,
-        config.vector,
-        config.vectors,
-        config.lanes,
-        config.first_constant(None),
-    )
+    real, vector, vectors, lanes = config.real, config.vector, config.vectors, config.lanes
+    count = config.first_constant(None)
     measure, reductions = build_measure(config), ["sum", *(how for term in config.terms for how in term.reductions)]
 
     @ti.kernel

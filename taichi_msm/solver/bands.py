@@ -40,7 +40,7 @@ BEGIN, END = 0, 1
 # the border; after the first of them the worker's pass, round, and step of the round.
 COUNTER_STRIDE = 16
 WORKER_STRIDE = 2 * COUNTER_STRIDE
-TURN, ROUND, STEP, PLACE_END = 1, 2, 3, 4
+PASS_INDEX, ROUND, STEP, PLACE_END = 1, 2, 3, 4
 
 # Rows of moments per worker.
 MOMENT_ROWS = 3
@@ -86,12 +86,8 @@ def build_step_row(
         touches: whether contact with tools is resolved after the step.
         parallel: whether the band has neighbours.
     """
-    vector, bending, copied, join_strips = (
-        config.vector,
-        config.get(BendingTerm),
-        config.reach,
-        build_join_strips(config),
-    )
+    vector, bending, copied = config.vector, config.get(BendingTerm), config.reach
+    join_strips = build_join_strips(config)
     pass_row, storing = build_pass_row(config, move), [bending.build_store_moment(config)] if bending else []
     contact = config.get(ContactTerm) if touches else None
     touching = [build_touch_row(config, contact)] if contact else []
@@ -210,10 +206,8 @@ def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None
         parallel: whether several workers step at the same time.
     """
     real, vector, vectors, lanes = config.real, config.vector, config.vectors, config.lanes
-    constant_count, step_row = (
-        config.first_constant(None),
-        build_step_row(config, build_point_step(config), touches=True, parallel=parallel),
-    )
+    constant_count = config.first_constant(None)
+    step_row = build_step_row(config, build_point_step(config), touches=True, parallel=parallel)
 
     @ti.func
     def step_band(
@@ -224,7 +218,7 @@ def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None
         count, depth = ti.cast(sizes[COUNT], ti.i32), ti.cast(sizes[DEPTH], ti.i32)
         carried_rows = ti.cast(sizes[CARRIED_ROWS], ti.i32)
         moments = ti.cast(sizes[MOMENT_ROW], ti.i32) + MOMENT_ROWS * band.worker
-        turn = ti.cast(band.progress[place + TURN], ti.i32)
+        pass_index = ti.cast(band.progress[place + PASS_INDEX], ti.i32)
         k = ti.cast(band.progress[place + ROUND], ti.i32)
         step = ti.cast(band.progress[place + STEP], ti.i32)
         # A vector with a variable index makes the compiler align the stack, and with it all spilled vectors, which
@@ -232,11 +226,11 @@ def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None
         aligned = vector(0)
         aligned[band.workers % lanes] = 1
         goes = aligned[count % lanes] >= 0
-        while goes and turn * depth < count:
-            steps = ti.min(depth, count - turn * depth)
+        while goes and pass_index * depth < count:
+            steps = ti.min(depth, count - pass_index * depth)
             while goes and k < band.high - band.low + steps - 1:
                 while goes and step < ti.min(steps, k + 2):
-                    n = turn * depth + step
+                    n = pass_index * depth + step
                     carry = band.worker * carried_rows + step
                     goes = step_row(sheet, carried, loads, band, k - step, n, first + n, carry, moments)
                     if goes:
@@ -245,10 +239,10 @@ def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None
                     k += 1
                     step = ti.max(0, k - (band.high - band.low) + 1)
             if goes:
-                turn += 1
+                pass_index += 1
                 k = -1
                 step = 0
-        band.progress[place + TURN] = turn
+        band.progress[place + PASS_INDEX] = pass_index
         band.progress[place + ROUND] = k
         band.progress[place + STEP] = step
 

@@ -216,10 +216,8 @@ class Dynamics:
         config, plan = self.layout.config, self.plan
         springs = measures[:, config.first_measure(SpringTerm) :]
         # The measures are (L^2 - L0^2) / L0^2.
-        shortest, longest = (
-            math.sqrt(max(0.0, 1.0 + float(extreme)))
-            for extreme in (springs[:, MIN_STRAIN].min(), springs[:, MAX_STRAIN].max())
-        )
+        extremes = springs[:, MIN_STRAIN].min(), springs[:, MAX_STRAIN].max()
+        shortest, longest = (math.sqrt(max(0.0, 1.0 + float(extreme))) for extreme in extremes)
         sums = measures.sum(axis=0, dtype=np.float64)
         energy = self._of_motion(sums)
         for term in config.terms:

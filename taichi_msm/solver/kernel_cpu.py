@@ -18,10 +18,10 @@ from taichi_msm.solver.arrays import BYTES, InitialData, SheetArrays, SheetLayou
 from taichi_msm.solver.bands import (
     COUNTER_STRIDE,
     MOMENT_ROWS,
+    PASS_INDEX,
     PLACE_END,
     ROUND,
     STEP,
-    TURN,
     WORKER_STRIDE,
     build_advance,
 )
@@ -155,7 +155,7 @@ class ScatterKernel:
         workers, depth, count, steps_before = self._layout.workers, self._layout.depth, end - first, self._steps
         self._start_pass()
         self._launch(self._advance, workers, count, table[first:])
-        passes, rounds = self._progress[TURN::WORKER_STRIDE], self._progress[ROUND::WORKER_STRIDE]
+        passes, rounds = self._progress[PASS_INDEX::WORKER_STRIDE], self._progress[ROUND::WORKER_STRIDE]
         timed_out = not (passes * depth >= count).all()
         if timed_out:
             # All continue to the end of the pass of the foremost worker.
@@ -174,8 +174,8 @@ class ScatterKernel:
 
     def _start_pass(self) -> None:
         """Reset all workers to the first row of the first pass."""
-        places = self._progress.reshape(-1, WORKER_STRIDE)[:, TURN:PLACE_END]
-        places[:, [TURN - 1, ROUND - 1, STEP - 1]] = 0, -1, 0
+        places = self._progress.reshape(-1, WORKER_STRIDE)[:, PASS_INDEX:PLACE_END]
+        places[:, [PASS_INDEX - 1, ROUND - 1, STEP - 1]] = 0, -1, 0
 
     def _launch(self, kernel: Callable[..., None], workers: int, count: int, table: NDArray[Any]) -> None:
         layout = self._layout

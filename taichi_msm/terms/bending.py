@@ -86,10 +86,8 @@ class BendingTerm(Term):
         @ti.func
         def add(force: ti.template(), sheet: ti.template(), entry: ti.template(), _now: ti.template()):
             row = ti.static(entry.row)
-            across, down = (
-                1 / (sheet.constants[DX] * sheet.constants[DX]),
-                1 / (sheet.constants[DY] * sheet.constants[DY]),
-            )
+            dx, dy = sheet.constants[DX], sheet.constants[DY]
+            across, down = 1 / (dx * dx), 1 / (dy * dy)
             for c in ti.static(range(3)):
                 bent = laplacian(sheet.u[c], sheet.width, row.before, row.at, row.after, entry.b, across, down)
                 force[c] = force[c] - bent
@@ -103,12 +101,8 @@ class BendingTerm(Term):
     def build_measures(self, config: KernelConfig) -> Sequence[Callable[..., None]]:
         """Build the function that sums the squared Laplacian, which is 0 at edges."""
         ti = config.ti
-        real, vector, first, laplacian = (
-            config.real,
-            config.vector,
-            config.first_measure(BendingTerm),
-            build_laplacian(config),
-        )
+        real, vector, first = config.real, config.vector, config.first_measure(BendingTerm)
+        laplacian = build_laplacian(config)
 
         @ti.func
         def measure(measures: ti.template(), sheet: ti.template(), p, _i, kind, b):
@@ -116,10 +110,8 @@ class BendingTerm(Term):
             inside *= ti.cast(kind == 1, real)
             # The first and the last row have no neighbour on one side.
             before, after = p - ti.cast(kind == 1, ti.i32), p + ti.cast(kind == 1, ti.i32)
-            across, down = (
-                1 / (sheet.constants[DX] * sheet.constants[DX]),
-                1 / (sheet.constants[DY] * sheet.constants[DY]),
-            )
+            dx, dy = sheet.constants[DX], sheet.constants[DY]
+            across, down = 1 / (dx * dx), 1 / (dy * dy)
             bent = vector(0)
             for c in ti.static(range(3)):
                 curved = inside * laplacian(sheet.u[c], sheet.width, before, p, after, b, across, down)

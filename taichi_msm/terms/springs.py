@@ -278,10 +278,8 @@ class SpringTerm(Term):
             u = ti.static(entry.u)
             b, largest = entry.b, vector(0)
             # Springs beyond an edge do not exist.
-            has_left, has_right = (
-                sheet.by_column[HAS_LEFT * sheet.width + b],
-                sheet.by_column[HAS_RIGHT * sheet.width + b],
-            )
+            has_left = sheet.by_column[HAS_LEFT * sheet.width + b]
+            has_right = sheet.by_column[HAS_RIGHT * sheet.width + b]
             dx, dy = sheet.constants[DX], sheet.constants[DY]
             here, below, lower = row.i * sheet.width + b, (row.i + 1) * sheet.width + b, row.i + 1
             if ti.static(structural):
