@@ -239,6 +239,10 @@ class _PiecewiseLinear:
     """A piecewise linear function of time [s], 0 before the first keyframe and constant after the last.
 
     It jumps where two keyframes have the same time.
+
+    Args:
+        times: of the keyframes, ascending [s], shape (n,).
+        values: at the keyframes, shape (n,).
     """
 
     def __init__(self, times: Array, values: Array) -> None:

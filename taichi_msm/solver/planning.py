@@ -370,6 +370,13 @@ def _completed(before: Probe, given: Probe | Mapping[str, Any] | None) -> Probe 
 class _PathChange:
     """A new path of a position-controlled tool from the current time on.
 
+    Args:
+        plan: the current plan.
+        index: index of the probe.
+        before: the current probe.
+        given: the new probe; its path contains only keyframes after `now`.
+        now: the current time [s].
+
     Attributes:
         index: index of its probe.
         probe: the probe with the new path, including those past keyframes on which later steps depend.

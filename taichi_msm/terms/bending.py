@@ -46,7 +46,12 @@ class BendingTerm(Term):
 
     @staticmethod
     def stiffness_bound(material: Material, sheet: Sheet) -> float:
-        """Return (4 / dx^2 + 4 / dy^2)^2 D dx dy [N/m], from the largest eigenvalue of the discrete Laplacian."""
+        """Return (4 / dx^2 + 4 / dy^2)^2 D dx dy [N/m], from the largest eigenvalue of the discrete Laplacian.
+
+        Args:
+            material: coefficients of the sheet.
+            sheet: the sheet.
+        """
         dx, dy = spacing(sheet)
         return material.bending * (4 / dx**2 + 4 / dy**2) ** 2
 
@@ -55,7 +60,15 @@ class BendingTerm(Term):
         return (plan.material.bending,)
 
     def energy(self, sums: NDArray[Any], plan: Plan) -> float:
-        """Compute twice the energy [J]."""
+        """Compute twice the energy.
+
+        Args:
+            sums: the term's measures, reduced over the sheet, shape (measures,).
+            plan: the plan.
+
+        Returns:
+            Twice the energy [J].
+        """
         return plan.material.bending * float(sums[0])
 
     def build_store_moment(self, config: KernelConfig) -> Callable[..., None]:

@@ -50,7 +50,12 @@ class FoundationTerm(Term):
 
     @staticmethod
     def stiffness_bound(material: Material, sheet: Sheet) -> float:
-        """Return the largest K [N/m]."""
+        """Return the largest K [N/m].
+
+        Args:
+            material: coefficients of the sheet.
+            sheet: the sheet.
+        """
         factors = material.virtual_factors
         return material.virtual if factors is None else material.virtual * float(factors.max())
 
@@ -66,7 +71,16 @@ class FoundationTerm(Term):
         return 1
 
     def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
-        """Return the active share of K at every step [N/m], shape (steps, 1)."""
+        """Return the active share of K at every step.
+
+        Args:
+            plan: the plan.
+            loads: loads of consecutive steps.
+            first: number of the first step.
+
+        Returns:
+            K times the activity [N/m], shape (steps, 1).
+        """
         return plan.material.virtual * loads.active[:, None]
 
     @property

@@ -143,7 +143,15 @@ class SpringTerm(Term):
         return *stiffness, *material.tensions
 
     def energy(self, sums: NDArray[Any], plan: Plan) -> float:
-        """Compute twice the energy [J]."""
+        """Compute twice the energy.
+
+        Args:
+            sums: the term's measures, reduced over the sheet, shape (measures,).
+            plan: the plan.
+
+        Returns:
+            Twice the energy [J].
+        """
         dx, dy = spacing(plan.scene.sheet)
         squares = np.array([dx**2, dy**2, dx**2 + dy**2])
         return float((sums[STRETCH_SUMS:TENSION_SUMS] + plan.material.tensions * sums[TENSION_SUMS:]) @ squares)
