@@ -33,7 +33,7 @@ from taichi_msm.system.runtime import our_compilation, ti, write
 from taichi_msm.terms.base import MOBILITY, Entry, KernelConfig, KernelRow, KernelSheet
 from taichi_msm.terms.bending import BendingTerm
 from taichi_msm.terms.contact import ContactTerm
-from taichi_msm.terms.contact_rest import build_bear, build_keep_out
+from taichi_msm.terms.contact_rest import build_project_out, build_remove_contact
 from taichi_msm.terms.springs import SpringTerm
 
 # Arguments of a launch: rows of the sheet; columns of a strip; the first row that is not fixed, and the row after the
@@ -41,11 +41,11 @@ from taichi_msm.terms.springs import SpringTerm
 # since the last launch. State of FIRE: the step dt; the share a; the number of consecutive evaluations with positive
 # power. Results: the number of evaluations; of the last one the squared largest force [N^2], and the sum of F^2 / M,
 # which is not finite if any force is NaN.
-ROWS, STRIP, FIRST_ROW, END_ROW, COUNT, SQUARED_TOLERANCE, PLACED, STEP, SHARE, WORKED = range(10)
-EVALUATIONS, LARGEST, SLOPE, NUMBERS = range(10, 14)
+ROWS, STRIP, FIRST_ROW, END_ROW, COUNT, SQUARED_TOLERANCE, PLACED, STEP, SHARE, POSITIVE_COUNT = range(10)
+EVALUATIONS, LARGEST, FORCE_SUM, NUMBERS = range(10, 14)
 
 # Reductions of an evaluation: the sums of F q / M, F^2 / M and q^2 / M; the squared largest force.
-POWER, STEEP, MOTION, SQUARE, SUMS = range(5)
+POWER, SQUARED_FORCE, MOTION, SQUARE, SUMS = range(5)
 
 # Initial share a and its decay; factors of the step; number of evaluations with positive power before the step grows.
 FIRST_SHARE, SHARE_DECAY, SHRINK, GROW, DELAY = 0.25, 0.99, 0.9, 1.1, 10
@@ -98,7 +98,7 @@ class Relaxation:
         """Set all momenta to 0 and reset the state of FIRE."""
         for q in self._q:
             write(q, np.zeros((0, self._layout.config.lanes)))
-        self._fire[[STEP, SHARE, WORKED, PLACED]] = LARGEST_STEP, FIRST_SHARE, 0, 1
+        self._fire[[STEP, SHARE, POSITIVE_COUNT, PLACED]] = LARGEST_STEP, FIRST_SHARE, 0, 1
 
     def place(self, displacement: NDArray[Any]) -> None:
         """Set the displacements [m], shape (rows, cols, 3)."""
@@ -122,7 +122,7 @@ class Relaxation:
         fire[[COUNT, SQUARED_TOLERANCE]] = count, tolerance * tolerance
         with our_compilation():
             self._relax(fire, row, *self._q, self._work, *self.arrays.all)
-        largest = float(np.sqrt(fire[LARGEST])) if fire[SLOPE] < np.inf else np.inf
+        largest = float(np.sqrt(fire[LARGEST])) if fire[FORCE_SUM] < np.inf else np.inf
         return int(fire[EVALUATIONS]), largest
 
     def scale(self, row: NDArray[Any]) -> float:
@@ -153,7 +153,7 @@ def _kernels(config: KernelConfig) -> tuple[Callable[..., None], Callable[..., N
 def _build_store(config: KernelConfig) -> Callable[..., None]:
     """Build the function that stores the force on an entry and adds to the reductions of FIRE."""
     vector, forces, contact = config.vector, point_forces(config), config.get(ContactTerm)
-    bearings = [build_bear(config, contact)] if contact else []
+    removals = [build_remove_contact(config, contact)] if contact else []
 
     @ti.func
     def store(sheet: ti.template(), entry: ti.template(), _target, force: ti.template(), now: ti.template()):
@@ -166,14 +166,14 @@ def _build_store(config: KernelConfig) -> Callable[..., None]:
         for c in ti.static(range(3)):
             force[c] = ti.select(moves, force[c], vector(0))
             sheet.d[c][at] = force[c]
-        for bear in ti.static(bearings):
-            bear(force, sheet, at)
+        for remove_contact in ti.static(removals):
+            remove_contact(force, sheet, at)
         for c in ti.static(range(3)):
             q = sheet.q[c][at]
             power += force[c] * q
             square += force[c] * force[c]
             motion += q * q
-        for n, term in ti.static(((POWER, power), (STEEP, square), (MOTION, motion))):
+        for n, term in ti.static(((POWER, power), (SQUARED_FORCE, square), (MOTION, motion))):
             # `+=` on an array would be atomic.
             place = (sheet.rows + n) * width + entry.b
             sheet.work[place] = sheet.work[place] + term * inverse
@@ -190,7 +190,9 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
     pass_row = build_step_row(config, _build_store(config), touches=False, parallel=False)
     moments = 0 if config.get(BendingTerm) is None else MOMENT_ROWS
     columns, contact = config.first_column(None), config.get(ContactTerm)
-    bearings, keepings = ([build_bear(config, contact)], [build_keep_out(config, contact)]) if contact else ([], [])
+    removals, projections = (
+        ([build_remove_contact(config, contact)], [build_project_out(config, contact)]) if contact else ([], [])
+    )
 
     @ti.func
     def add_up(sheet: ti.template(), n: ti.template()):
@@ -217,14 +219,14 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
                 at = i * sheet.width + b
                 every = [sheet.d[c][at] for c in ti.static(range(3))]
                 force = [every[c] for c in ti.static(range(3))]
-                for bear in ti.static(bearings):
-                    bear(force, sheet, at)
+                for remove_contact in ti.static(removals):
+                    remove_contact(force, sheet, at)
                 for c in ti.static(range(3)):
                     before = sheet.q[c][at]
                     q = keep * before + gain * force[c]
                     sheet.q[c][at] = q
                     moved = dt * q - back * before
-                    if ti.static(len(bearings) > 0):
+                    if ti.static(len(removals) > 0):
                         moved += every[c] - force[c]
                     sheet.u[c][at] = sheet.u[c][at] + moved * sheet.work[at]
             settle_row(sheet, row, i)
@@ -233,11 +235,11 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
     def settle_row(sheet: ti.template(), row: ti.template(), i):
         """Project a row that has moved out of the tools, and fill its halo."""
         kind = ti.select(i == sheet.rows - 1, 2, ti.select(i == 0, 0, 1))
-        if ti.static(len(keepings) > 0):
+        if ti.static(len(projections) > 0):
             now = [row[0, c] for c in ti.static(range(columns))]
             for b in range(1, sheet.width - 1):
-                for keep_out in ti.static(keepings):
-                    keep_out(sheet, i, kind, b, now)
+                for project_out in ti.static(projections):
+                    project_out(sheet, i, kind, b, now)
         join_strips(sheet.u, i, sheet.width)
 
     @ti.kernel
@@ -269,33 +271,33 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
             while active and evaluations < count:
                 evaluate(sheet, row, band)
                 evaluations += 1
-                power, slope, motion = add_up(sheet, POWER), add_up(sheet, STEEP), add_up(sheet, MOTION)
+                power, force_sum, motion = add_up(sheet, POWER), add_up(sheet, SQUARED_FORCE), add_up(sheet, MOTION)
                 largest = ti.cast(0, real)
                 for b in range(1, width - 1):
                     largest = ti.max(largest, sheet.work[(rows + SQUARE) * width + b].max())
                 fire[LARGEST] = largest
-                fire[SLOPE] = slope
+                fire[FORCE_SUM] = force_sum
                 # With NaN the comparison is False and ends the loop.
-                active = largest > fire[SQUARED_TOLERANCE] and slope < INFINITE
+                active = largest > fire[SQUARED_TOLERANCE] and force_sum < INFINITE
                 if active:
                     keep, back = ti.cast(0, real), ti.cast(0, real)
                     if power > 0:
-                        fire[WORKED] = fire[WORKED] + 1
-                        if fire[WORKED] > DELAY:
+                        fire[POSITIVE_COUNT] = fire[POSITIVE_COUNT] + 1
+                        if fire[POSITIVE_COUNT] > DELAY:
                             fire[STEP] = ti.min(fire[STEP] * GROW, LARGEST_STEP)
                             fire[SHARE] = fire[SHARE] * SHARE_DECAY
                         keep = 1 - fire[SHARE]
                     else:
                         if motion > 0:
                             fire[STEP] = ti.max(fire[STEP] * SHRINK, SMALLEST_STEP)
-                        fire[WORKED] = 0
+                        fire[POSITIVE_COUNT] = 0
                         fire[SHARE] = FIRST_SHARE
                         back = fire[STEP] / 2
                     dt = fire[STEP]
                     gain = dt
                     if power > 0:
                         # |q + dt F| / |F|, with norms weighted with 1 / M.
-                        turned = ti.sqrt((motion + 2 * dt * power + dt * dt * slope) / slope)
+                        turned = ti.sqrt((motion + 2 * dt * power + dt * dt * force_sum) / force_sum)
                         gain = keep * dt + fire[SHARE] * turned
                     move_points(sheet, row, band, keep, gain, dt, back)
             fire[EVALUATIONS] = evaluations

@@ -53,15 +53,15 @@ def _build_sum(config: KernelConfig) -> Callable[..., None]:
         fields: vectors,
         sums: ti.types.ndarray(dtype=ti.f64, ndim=2),
     ):
-        share_of, pushes = ti.static(by_column, fields)
+        share_of, corrections = ti.static(by_column, fields)
         ti.loop_config(serialize=serial)
         for i in range(rows):
             strip, kind = (cols + lanes - 1) // lanes, ti.select(i == rows - 1, 2, ti.select(i == 0, 0, 1))
-            for part in range(count):
-                row, largest, total = ((first + part) * rows + i) * (strip + 2), vector(0), ti.cast(0, ti.f64)
+            for component in range(count):
+                row, largest, total = ((first + component) * rows + i) * (strip + 2), vector(0), ti.cast(0, ti.f64)
                 for b in range(1, strip + 1):
-                    push = pushes[row + b]
-                    largest = ti.max(largest, ti.max(push, push * (-1)))
+                    correction = corrections[row + b]
+                    largest = ti.max(largest, ti.max(correction, correction * (-1)))
                 # Most rows touch no tool.
                 if largest.max() > 0:
                     for lane in ti.static(range(lanes)):
@@ -69,10 +69,10 @@ def _build_sum(config: KernelConfig) -> Callable[..., None]:
                             share = ti.cast(1, ti.f64)
                             if ti.static(by_area):
                                 share = ti.cast(share_of[(AREA_SHARE + kind) * (strip + 2) + b][lane], ti.f64)
-                            total += share * ti.cast(pushes[row + b][lane], ti.f64)
+                            total += share * ti.cast(corrections[row + b][lane], ti.f64)
                     if clear:
                         for b in range(1, strip + 1):
-                            pushes[row + b] = vector(0)
-                sums[part, i] = total
+                            corrections[row + b] = vector(0)
+                sums[component, i] = total
 
     return add_up

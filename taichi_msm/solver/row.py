@@ -50,7 +50,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
         row, next_at, carry = here * width, next_row * width, carried_row * width
         # Force of the left neighbour, and forces carried to the other row for the previous, this and the next entry.
         left, last = [vector(0) for _ in ti.static(range(3))], [vector(0) for _ in ti.static(range(3))]
-        this, coming = [vector(0) for _ in ti.static(range(3))], [vector(0) for _ in ti.static(range(3))]
+        this, following = [vector(0) for _ in ti.static(range(3))], [vector(0) for _ in ti.static(range(3))]
         has_left, has_right = vector(1), vector(1)
         if ti.static(leaves_out):
             has_right = sheet.by_column[HAS_RIGHT * width + 0]
@@ -64,7 +64,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
                 sheet, next_at + 1, 1, u, up, diagonal, of_diagonal(sheet, lower, 0), has_right * exists
             )
             for c in ti.static(range(3)):
-                coming[c] = first_right[c]
+                following[c] = first_right[c]
         # Read once, because the compiler must assume that stores to the arrays could change the table.
         now = [loads[n, c] for c in ti.static(range(columns))]
         for b in range(1, strip + 1):
@@ -74,7 +74,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
                 # Neighbours are read again for every entry, because registers are too few to keep them.
                 u[c] = sheet.u[c][row + b]
                 last[c] = this[c]
-                this[c] = coming[c]
+                this[c] = following[c]
             if ti.static(leaves_out):
                 has_left, has_right = sheet.by_column[HAS_LEFT * width + b], sheet.by_column[HAS_RIGHT * width + b]
             if ti.static(shear):
@@ -95,7 +95,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
                 )
                 for c in ti.static(range(3)):
                     force[c] += to_right[c]
-                    coming[c] = to_right[c]
+                    following[c] = to_right[c]
             for c in ti.static(range(3)):
                 force[c] = carried[c][carry + b] - force[c]
             if ti.static(structural):
@@ -133,7 +133,7 @@ def build_touch_row(config: KernelConfig, contact: ContactTerm) -> Callable[...,
         contact: its contact term.
     """
     columns, resolve, reaches = config.first_column(None), contact.build_resolve(config), contact.build_reaches(config)
-    greatest = build_max_lane(config)
+    max_lane = build_max_lane(config)
 
     @ti.func
     def touch_row(sheet: ti.template(), i, kind, loads: ti.template(), n):
@@ -146,8 +146,8 @@ def build_touch_row(config: KernelConfig, contact: ContactTerm) -> Callable[...,
             for n in ti.static(range(2)):
                 value = sheet.u[n + 1][at + b]
                 least[n], most[n] = ti.min(least[n], value), ti.max(most[n], value)
-        low = [0 - greatest(0.0 - least[n]) for n in ti.static(range(2))]
-        high = [greatest(most[n]) for n in ti.static(range(2))]
+        low = [0 - max_lane(0.0 - least[n]) for n in ti.static(range(2))]
+        high = [max_lane(most[n]) for n in ti.static(range(2))]
         if reaches(sheet, i, low, high, now):
             for b in range(1, sheet.width - 1):
                 resolve(sheet, i, kind, i, b, now)

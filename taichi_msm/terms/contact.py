@@ -125,7 +125,7 @@ class ContactTerm(Term):
         row of the load table.
         """
         ti, real, vector, tools, grips = config.ti, config.real, config.vector, self.tools, self.grips
-        greatest = build_max_lane(config)
+        max_lane = build_max_lane(config)
         first = config.first_column(ContactTerm) + COLUMNS
         holding = (config.first_field(ContactTerm) + CORRECTIONS * tools + HOLDER) if grips else 0
 
@@ -141,13 +141,13 @@ class ContactTerm(Term):
             for tool in ti.static(range(tools)):
                 base = ti.static(first + TOOL_COLUMNS * tool)
                 # Slightly more than the radius, because of rounding.
-                near = 1.001 * now[base + RADIUS]
+                reach = 1.001 * now[base + RADIUS]
                 begin, end = cut(
-                    y + low[0] - near, y + high[0] + near, ti.cast(0, real), now[base + LENGTH],
+                    y + low[0] - reach, y + high[0] + reach, ti.cast(0, real), now[base + LENGTH],
                     now[base + TIP_AFTER + 1], now[base + INVERSE_AXIS],
                 )  # fmt: skip
                 begin, end = cut(
-                    low[1] - near, high[1] + near, begin, end, now[base + TIP_AFTER + 2], now[base + INVERSE_AXIS + 1]
+                    low[1] - reach, high[1] + reach, begin, end, now[base + TIP_AFTER + 2], now[base + INVERSE_AXIS + 1]
                 )
                 reached = reached or begin <= end
                 if ti.static(grips):
@@ -156,7 +156,7 @@ class ContactTerm(Term):
                 held = vector(0)
                 for b in range(1, sheet.width - 1):
                     held = ti.max(held, sheet.fields[(holding * sheet.rows + i) * sheet.width + b])
-                reached = reached or greatest(held) > 0
+                reached = reached or max_lane(held) > 0
             return reached
 
         return reaches
@@ -170,8 +170,8 @@ class ContactTerm(Term):
         ti, vector, tools, has_friction, grips = config.ti, config.vector, self.tools, self.has_friction, self.grips
         first_field, first = config.first_field(ContactTerm), config.first_column(ContactTerm)
         grip_field = first_field + CORRECTIONS * tools
-        base, part = [first + COLUMNS + TOOL_COLUMNS * tool for tool in range(tools)], build_penetration(config)
-        greatest = build_max_lane(config)
+        base, penetration = [first + COLUMNS + TOOL_COLUMNS * tool for tool in range(tools)], build_penetration(config)
+        max_lane = build_max_lane(config)
 
         @ti.func
         def resolve(sheet: ti.template(), i, kind, at, b, now: ti.template()):
@@ -192,32 +192,32 @@ class ContactTerm(Term):
                         held = ti.select(held == tool + 1, vector(0), held)
                 for tool in ti.static(range(tools)):
                     if now[base[tool] + GRIP_STATE] == GRIP_BEGINS:
-                        away = vector(0)
+                        squared = vector(0)
                         for c in ti.static(range(3)):
                             off = rest[c] + (u[c] - d[c]) - now[base[tool] + TIP_BEFORE + c]
-                            away += off * off
-                        reach = GRIP_RADII * now[base[tool] + RADIUS]
-                        takes = ti.select(away <= reach * reach, free, vector(0)) * ti.select(
+                            squared += off * off
+                        radius = GRIP_RADII * now[base[tool] + RADIUS]
+                        gripped = ti.select(squared <= radius * radius, free, vector(0)) * ti.select(
                             held == 0, vector(1), vector(0)
                         )
-                        held += takes * (tool + 1)
+                        held += gripped * (tool + 1)
                         for c in ti.static(range(3)):
-                            taken = (grip_field + HOLD_DISPLACEMENT + c) * row * sheet.width + here
-                            sheet.fields[taken] = ti.select(takes > 0, u[c] - d[c], sheet.fields[taken])
+                            stored = (grip_field + HOLD_DISPLACEMENT + c) * row * sheet.width + here
+                            sheet.fields[stored] = ti.select(gripped > 0, u[c] - d[c], sheet.fields[stored])
                 sheet.fields[(grip_field + HOLDER) * row * sheet.width + here] = held
                 free = ti.select(held == 0, free, vector(0))
             for tool in ti.static(range(tools)):
-                inside, normal_x, normal_y, normal_z = part(rest, u, now, base[tool])
+                inside, normal_x, normal_y, normal_z = penetration(rest, u, now, base[tool])
                 depth = ti.max(inside, 0) * free
-                pushed = depth
+                corrected = depth
                 if ti.static(grips):
-                    pushed = ti.select(held == tool + 1, vector(1), depth)
-                if greatest(pushed) > 0:
+                    corrected = ti.select(held == tool + 1, vector(1), depth)
+                if max_lane(corrected) > 0:
                     normal = [normal_x, normal_y, normal_z]
-                    push = [depth * normal[c] for c in ti.static(range(3))]
+                    correction = [depth * normal[c] for c in ti.static(range(3))]
                     if ti.static(has_friction[tool]):
                         slip = [
-                            d[c] + push[c] - (now[base[tool] + TIP_AFTER + c] - now[base[tool] + TIP_BEFORE + c])
+                            d[c] + correction[c] - (now[base[tool] + TIP_AFTER + c] - now[base[tool] + TIP_BEFORE + c])
                             for c in ti.static(range(3))
                         ]
                         along = vector(0)
@@ -230,48 +230,48 @@ class ContactTerm(Term):
                         stopped = now[base[tool] + FRICTION] * depth / ti.max(ti.sqrt(speed), MIN_DISTANCE_M)
                         stopped = ti.min(stopped, 1)
                         for c in ti.static(range(3)):
-                            push[c] = push[c] - slip[c] * stopped
+                            correction[c] = correction[c] - slip[c] * stopped
                     if ti.static(grips):
                         for c in ti.static(range(3)):
                             target = sheet.fields[(grip_field + HOLD_DISPLACEMENT + c) * row * sheet.width + here]
                             target += now[base[tool] + GRIP_SHIFT + c]
-                            push[c] = ti.select(held == tool + 1, target - u[c], push[c])
+                            correction[c] = ti.select(held == tool + 1, target - u[c], correction[c])
                     for c in ti.static(range(3)):
                         # Lanes without a correction keep their bits, including the sign of zero.
-                        u[c] = ti.select(pushed > 0, u[c] + push[c], u[c])
-                        d[c] = ti.select(pushed > 0, d[c] + push[c], d[c])
+                        u[c] = ti.select(corrected > 0, u[c] + correction[c], u[c])
+                        d[c] = ti.select(corrected > 0, d[c] + correction[c], d[c])
                         sheet.u[c][entry], sheet.d[c][here] = u[c], d[c]
-                        pushes = (first_field + CORRECTIONS * tool + c) * row * sheet.width + here
+                        index = (first_field + CORRECTIONS * tool + c) * row * sheet.width + here
                         # `+=` would be atomic, which does not compile for vectors.
-                        sheet.fields[pushes] = sheet.fields[pushes] + push[c] * now[first + WEIGHT]
+                        sheet.fields[index] = sheet.fields[index] + correction[c] * now[first + WEIGHT]
 
         return resolve
 
 
 def build_max_lane(config: KernelConfig) -> Callable[..., Any]:
-    """Build the Taichi function greatest(values), the maximum over lanes, by shuffles, unlike Taichi's `max()`."""
+    """Build the Taichi function max_lane(values), the maximum over lanes, by shuffles, unlike Taichi's `max()`."""
     ti, vector, lanes = config.ti, config.vector, config.lanes
     halves = [lanes >> n for n in range(1, lanes.bit_length())]
 
     @ti.func
-    def greatest(values: ti.template()):
+    def max_lane(values: ti.template()):
         most = values + vector(0)
         for half in ti.static(halves):
             most = ti.max(most, vector([most[(lane + half) % lanes] for lane in ti.static(range(lanes))]))
         return most[0]
 
-    return greatest
+    return max_lane
 
 
 def build_penetration(config: KernelConfig) -> Callable[..., Any]:
-    """Build the Taichi function part(rest, u, now, base), the penetration depth of mass points in a tool.
+    """Build the Taichi function penetration(rest, u, now, base), the penetration depth of mass points in a tool.
 
     In it `base` is the first column of the tool. It returns radius - |r'| and the three components of n.
     """
     ti, vector = config.ti, config.vector
 
     @ti.func
-    def part(rest: ti.template(), u: ti.template(), now: ti.template(), base: ti.template()):
+    def penetration(rest: ti.template(), u: ti.template(), now: ti.template(), base: ti.template()):
         r = [rest[c] - now[base + TIP_AFTER + c] + u[c] for c in ti.static(range(3))]
         s = vector(0)
         for c in ti.static(range(3)):
@@ -286,7 +286,7 @@ def build_penetration(config: KernelConfig) -> Callable[..., Any]:
         normal[2] = ti.select(distance > 0, normal[2], vector(1))
         return now[base + RADIUS] - distance, normal[0], normal[1], normal[2]
 
-    return part
+    return penetration
 
 
 def contact_fields(probes: Sequence[Probe]) -> int:

@@ -26,8 +26,8 @@ from taichi_msm.terms.contact import (
 )
 
 
-def build_bear(config: KernelConfig, contact: ContactTerm) -> Callable[..., None]:
-    """Build the Taichi function bear(force, sheet, at), which removes contact forces from the force on entry `at`.
+def build_remove_contact(config: KernelConfig, contact: ContactTerm) -> Callable[..., None]:
+    """Build the Taichi function remove_contact(force, sheet, at), which removes contact forces at an entry.
 
     Args:
         config: compile-time configuration.
@@ -38,31 +38,31 @@ def build_bear(config: KernelConfig, contact: ContactTerm) -> Callable[..., None
     holding, iterations = first_field + CORRECTIONS * tools + HOLDER, _iterations(contact)
 
     @ti.func
-    def bear(force: ti.template(), sheet: ti.template(), at):
+    def remove_contact(force: ti.template(), sheet: ti.template(), at):
         field = sheet.rows * sheet.width
-        borne = [vector(0) for _ in ti.static(range(tools))]
+        carried = [vector(0) for _ in ti.static(range(tools))]
         for _ in range(iterations):
             for tool in ti.static(range(tools)):
                 normal = [
                     sheet.fields[(first_field + CORRECTIONS * tool + c) * field + at] for c in ti.static(range(3))
                 ]
                 along = force[0] * normal[0] + force[1] * normal[1] + force[2] * normal[2]
-                total = ti.max(borne[tool] - along, 0)
-                change = total - borne[tool]
-                borne[tool] = total
+                total = ti.max(carried[tool] - along, 0)
+                change = total - carried[tool]
+                carried[tool] = total
                 for c in ti.static(range(3)):
                     force[c] += change * normal[c]
         if ti.static(grips):
             for c in ti.static(range(3)):
                 force[c] = ti.select(sheet.fields[holding * field + at] > 0, vector(0), force[c])
 
-    return bear
+    return remove_contact
 
 
-def build_keep_out(config: KernelConfig, contact: ContactTerm) -> Callable[..., None]:
-    """Build the Taichi function keep_out(sheet, i, kind, b, now) for entry b of row i of a `RestSheet` that has moved.
+def build_project_out(config: KernelConfig, contact: ContactTerm) -> Callable[..., None]:
+    """Build the Taichi function project_out(sheet, i, kind, b, now) for entry b of row i of a `RestSheet`.
 
-    It projects mass points out of the tools, removes their momentum into the tools, and moves held mass points with
+    It projects mass points that have moved out of the tools, removes their momentum into the tools, and moves held mass points with
     their tool.
 
     Args:
@@ -72,11 +72,11 @@ def build_keep_out(config: KernelConfig, contact: ContactTerm) -> Callable[..., 
     ti, vector, tools, grips = config.ti, config.vector, contact.tools, contact.grips
     first_field, first = config.first_field(ContactTerm), config.first_column(ContactTerm)
     grip_field = first_field + CORRECTIONS * tools
-    base, part = [first + COLUMNS + TOOL_COLUMNS * tool for tool in range(tools)], build_penetration(config)
+    base, penetration = [first + COLUMNS + TOOL_COLUMNS * tool for tool in range(tools)], build_penetration(config)
     iterations = _iterations(contact)
 
     @ti.func
-    def keep_out(sheet: ti.template(), i, kind, b, now: ti.template()):
+    def project_out(sheet: ti.template(), i, kind, b, now: ti.template()):
         field, at = sheet.rows * sheet.width, i * sheet.width + b
         rest = [
             sheet.by_column[REST_X * sheet.width + b],
@@ -101,7 +101,7 @@ def build_keep_out(config: KernelConfig, contact: ContactTerm) -> Callable[..., 
                 sheet.fields[(first_field + CORRECTIONS * tool + c) * field + at] = vector(0)
         for _ in range(iterations):
             for tool in ti.static(range(tools)):
-                depth, x, y, z = part(rest, u, now, base[tool])
+                depth, x, y, z = penetration(rest, u, now, base[tool])
                 normal = [x, y, z]
                 touches = ti.select(depth > 0, free, vector(0))
                 inward = ti.min(q[0] * x + q[1] * y + q[2] * z, 0) * touches
@@ -114,7 +114,7 @@ def build_keep_out(config: KernelConfig, contact: ContactTerm) -> Callable[..., 
             sheet.u[c][at] = u[c]
             sheet.q[c][at] = q[c]
 
-    return keep_out
+    return project_out
 
 
 def _iterations(contact: ContactTerm) -> int:
