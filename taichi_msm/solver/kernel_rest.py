@@ -190,9 +190,8 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
     pass_row = build_step_row(config, _build_store(config), touches=False, parallel=False)
     moments = 0 if config.get(BendingTerm) is None else MOMENT_ROWS
     columns, contact = config.first_column(None), config.get(ContactTerm)
-    removals, projections = (
-        ([build_remove_contact(config, contact)], [build_project_out(config, contact)]) if contact else ([], [])
-    )
+    removals = [build_remove_contact(config, contact)] if contact else []
+    projections = [build_project_out(config, contact)] if contact else []
 
     @ti.func
     def add_up(sheet: ti.template(), n: ti.template()):

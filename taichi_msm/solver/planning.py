@@ -66,20 +66,20 @@ class Work(NamedTuple):
 
     start: float  # starting Python and Taichi, and compiling the kernels
     stepping: float  # all steps
-    pilots: float  # companion runs
+    companions: float  # companion runs
     pictures: float  # drawing and encoding
 
 
-def count_work(plan: Plan, pilots: float) -> Work:
+def count_work(plan: Plan, companions: float) -> Work:
     """Estimate the work of a run.
 
     Args:
         plan: the plan.
-        pilots: f64 steps of companion runs per step of the run, in steps of the whole sheet.
+        companions: f64 steps of companion runs per step of the run, in steps of the whole sheet.
     """
     steps = _steps(plan)
     stepping = F64_WORK * steps if plan.grid.precision == "f64" else steps
-    return Work(START, stepping, F64_WORK * pilots * steps, _other(plan.scene) - START)
+    return Work(START, stepping, F64_WORK * companions * steps, _other(plan.scene) - START)
 
 
 def is_f64_cheap(plan: Plan) -> bool:
@@ -87,15 +87,15 @@ def is_f64_cheap(plan: Plan) -> bool:
     return F64_WORK * _steps(plan) <= MAX_F64_SHARE * _other(plan.scene)
 
 
-def affords_companions(plan: Plan, pilots: float) -> bool:
+def affords_companions(plan: Plan, companions: float) -> bool:
     """Return whether companion runs take at most MAX_COMPANION_SHARE of the work of a run.
 
     Args:
         plan: the plan.
-        pilots: f64 steps of companion runs per step of the run, in steps of the whole sheet.
+        companions: f64 steps of companion runs per step of the run, in steps of the whole sheet.
     """
-    work = count_work(plan, pilots)
-    return work.pilots <= MAX_COMPANION_SHARE * sum(work)
+    work = count_work(plan, companions)
+    return work.companions <= MAX_COMPANION_SHARE * sum(work)
 
 
 def _steps(plan: Plan) -> float:

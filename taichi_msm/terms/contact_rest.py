@@ -62,8 +62,8 @@ def build_remove_contact(config: KernelConfig, contact: ContactTerm) -> Callable
 def build_project_out(config: KernelConfig, contact: ContactTerm) -> Callable[..., None]:
     """Build the Taichi function project_out(sheet, i, kind, b, now) for entry b of row i of a `RestSheet`.
 
-    It projects mass points that have moved out of the tools, removes their momentum into the tools, and moves held mass points with
-    their tool.
+    It projects mass points that have moved out of the tools, removes their momentum into the tools, and moves held mass
+    points with their tool.
 
     Args:
         config: compile-time configuration.
