@@ -8,9 +8,9 @@ the probes. With the displacement u after the step, the centre c of a capsule's 
     with friction mu:      w = the part of (u + correction - u_before) - (c - c_before) perpendicular to n
                            correction -= w min(1, mu (radius - |r'|) / |w|)
 
-A grip holds the mass points that are within 1.5 radii of the tip's centre when it begins: u = u_then + c - c_then. A
-correction equals the displacement by a force correction m (1 + g h / 2) / h^2 in a step (see `damping`), so the sum of
-corrections yields the force of the tool.
+A grip holds the mass points that are within 1.5 radii of the tip's centre when it begins: u = u_then + c - c_then. In a
+step, a correction has the effect of the force m (1 + g h / 2) / h^2 times the correction (see `damping`). The sum of
+all corrections therefore yields the force of the tool.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
