@@ -79,7 +79,7 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
     """Build the function that steps a mass point."""
     real, vector, columns, springs = config.real, config.vector, config.first_column(None), config.require(SpringTerm)
     structural, shear = springs.structural, springs.shear
-    leaves_out = springs.open_edges and not springs.mapped
+    masks_edges = springs.open_edges and not springs.mapped
     along, to_other_row, of_row, of_column, of_diagonal = springs.build_spring_forces(config)
     move, contact = build_point_step(config), config.get(ContactTerm)
     build_resolve = [contact.build_resolve(config)] if contact else []
@@ -97,7 +97,7 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
                 else:
                     k *= of_diagonal(sheet, lower, b + ti.static(min(right, 0)))
                     length = ti.sqrt(dx * dx + up * up)
-                if ti.static(right != 0 and leaves_out):
+                if ti.static(right != 0 and masks_edges):
                     exists = sheet.by_column[ti.static(HAS_LEFT if right < 0 else HAS_RIGHT) * sheet.width + b]
                 pull = to_other_row(sheet, q * sheet.width + b + right, right, u, up, length, k, exists * row_exists)
                 for c in ti.static(range(3)):
@@ -108,7 +108,7 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
     def by_right(sheet: ti.template(), p, i, kind, b):
         """Return the force of entry b of row p on its right neighbour."""
         exists, here = vector(1), p * sheet.width + b
-        if ti.static(leaves_out):
+        if ti.static(masks_edges):
             exists = sheet.by_column[HAS_RIGHT * sheet.width + b]
         k, u = of_row(sheet, i, kind, b) * vector(1), [sheet.u[c][here] for c in ti.static(range(3))]
         return along(sheet, here + 1, u, k, exists)

@@ -29,7 +29,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
     """
     vector, columns, springs = config.vector, config.first_column(None), config.require(SpringTerm)
     structural, shear = springs.structural, springs.shear
-    leaves_out = springs.open_edges and not springs.mapped
+    masks_edges = springs.open_edges and not springs.mapped
     along, to_other_row, of_row, of_column, of_diagonal = springs.build_spring_forces(config)
 
     @ti.func
@@ -52,7 +52,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
         left, last = [vector(0) for _ in ti.static(range(3))], [vector(0) for _ in ti.static(range(3))]
         this, following = [vector(0) for _ in ti.static(range(3))], [vector(0) for _ in ti.static(range(3))]
         has_left, has_right = vector(1), vector(1)
-        if ti.static(leaves_out):
+        if ti.static(masks_edges):
             has_right = sheet.by_column[HAS_RIGHT * width + 0]
         u = [sheet.u[c][row] for c in ti.static(range(3))]
         if ti.static(structural):
@@ -75,7 +75,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
                 u[c] = sheet.u[c][row + b]
                 last[c] = this[c]
                 this[c] = following[c]
-            if ti.static(leaves_out):
+            if ti.static(masks_edges):
                 has_left, has_right = sheet.by_column[HAS_LEFT * width + b], sheet.by_column[HAS_RIGHT * width + b]
             if ti.static(shear):
                 to_left = to_other_row(
@@ -110,7 +110,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
                 entry = ti.static(Entry(line, b, u))
                 move(sheet, entry, here, force, now)
         if ti.static(shear):
-            if ti.static(leaves_out):
+            if ti.static(masks_edges):
                 has_left = sheet.by_column[HAS_LEFT * width + strip + 1]
             for c in ti.static(range(3)):
                 u[c] = sheet.u[c][row + strip + 1]

@@ -164,7 +164,7 @@ class SpringTerm(Term):
         """
         ti = config.ti
         tense, mapped, by_area = self.tense, self.mapped, self.by_area and not self.mapped
-        leaves_out, real, first = self.open_edges and not self.mapped, config.real, config.first_constant(SpringTerm)
+        masks_edges, real, first = self.open_edges and not self.mapped, config.real, config.first_constant(SpringTerm)
         first_tension = first + 3
 
         @ti.func
@@ -185,7 +185,7 @@ class SpringTerm(Term):
             to_x = x - dx
             rest = y * y + z * z
             weighted = k * (x * (to_x - dx) + rest)
-            if ti.static(leaves_out):
+            if ti.static(masks_edges):
                 weighted *= exists
             tension = sheet.constants[first_tension + ALONG_ROW]
             return pull(weighted, to_x * to_x + (rest + MIN_SQUARED_LENGTH), dx, [to_x, y, z], tension, [x, y, z])
@@ -202,7 +202,7 @@ class SpringTerm(Term):
                 to_x = x - right * sheet.constants[DX]
                 longer = x * (to_x - right * sheet.constants[DX]) + (y * (to_y - up) + rest)
             weighted = k * longer
-            if ti.static(leaves_out):
+            if ti.static(masks_edges):
                 weighted *= exists
             tension = sheet.constants[first_tension + ti.static(DIAGONAL if right else ALONG_COLUMN)]
             square = to_x * to_x + to_y * to_y + (rest + MIN_SQUARED_LENGTH)
