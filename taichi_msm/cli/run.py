@@ -142,7 +142,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     from taichi_msm.model import tool_force
     from taichi_msm.model.tool_force import in_words, probe_records
     from taichi_msm.model.tools import path_notes
-    from taichi_msm.render.notes import drawing_notes
+    from taichi_msm.render.notes import drawing_warnings
     from taichi_msm.render.texture import load_texture
 
     plan = load_plan(scene, overrides, image)
@@ -170,7 +170,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         "disk": need.disk_bytes,
         "disk_while_running": need.disk_bytes + need.working_bytes,
         "probes": (records := probe_records(loaded)),
-        "notes": [*tool_force.force_notes(loaded, records), *path_notes(loaded, plan.tools), *drawing_notes(loaded)],
+        "notes": [*tool_force.force_notes(loaded, records), *path_notes(loaded, plan.tools), *drawing_warnings(loaded)],
     }
     if as_json:
         print_json(facts)

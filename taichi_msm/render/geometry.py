@@ -18,18 +18,18 @@ from taichi_msm.render.config import INFINITY
 from taichi_msm.system.runtime import ti
 
 # The numbers of a mass point: (X, Y, w, depth), its place in the picture [samples], at SEEN.
-SEEN, POINT_NUMBERS = uni.SEEN, 6
+SCREEN, NODE_STRIDE = uni.SCREEN, 6
 
 # A triangle that is drawn by itself is enlarged a little, so that no gap is left beside it: by this fraction of its
 # side, and by this fraction of the picture's, which is what f32 resolves.
-OVERSTEP = 1e-5
-OVERSTEP_OF_PICTURE = 2e-6
+ENLARGEMENT = 1e-5
+SCREEN_ENLARGEMENT = 2e-6
 
 # By this fraction of its size a triangle or a cell must be beyond an edge of the picture to be left out.
 BESIDE = 1e-3
 
 # In f32, a cell is drawn as a whole only if its outline stays within this distance [samples].
-FARTHEST = float(1 << 16)
+MAX_COORDINATE = float(1 << 16)
 
 
 class Outline(NamedTuple):
@@ -41,7 +41,7 @@ class Outline(NamedTuple):
     right: Any
     top: Any
     bottom: Any
-    side: Any  # 1 where its front is seen, -1 where its back is, 0 if it is folded
+    facing: Any  # 1 where its front is seen, -1 where its back is, 0 if it is folded
     in_front: Any  # whether all of its corners are in front of the camera
     behind: Any  # whether none is
 
@@ -53,8 +53,8 @@ class Patch(NamedTuple):
     b: Any
     c: Any
     d: Any
-    side: Any  # as in its `Outline`
-    whole: Any  # whether it is drawn as a whole, and not triangle by triangle
+    facing: Any  # as in its `Outline`
+    invertible: Any  # whether it is drawn as a whole, and not triangle by triangle
 
 
 class Triangle(NamedTuple):
@@ -67,97 +67,97 @@ class Triangle(NamedTuple):
 
 
 @ti.func
-def project(position: ti.template(), i, j, cols, numbers: ti.template(), point: ti.template(), double: ti.template()):
+def project(position: ti.template(), i, j, cols, uniforms: ti.template(), nodes: ti.template(), double: ti.template()):
     """Store the numbers of mass point (i, j); `double` tells that they are in f64, and summed in another order."""
-    here = (i * cols + j) * POINT_NUMBERS
+    here = (i * cols + j) * NODE_STRIDE
     x, y, z = position[i, j, 0], position[i, j, 1], position[i, j, 2]
     for n in ti.static(range(4)):
         row = uni.MATRIX + 4 * n
         if ti.static(double):
-            point[here + n] = numbers[row + 3] + numbers[row] * x + numbers[row + 1] * y + numbers[row + 2] * z
+            nodes[here + n] = uniforms[row + 3] + uniforms[row] * x + uniforms[row + 1] * y + uniforms[row + 2] * z
         else:
-            point[here + n] = numbers[row] * x + numbers[row + 1] * y + numbers[row + 2] * z + numbers[row + 3]
-    point[here + SEEN] = point[here] / point[here + 2]
-    point[here + SEEN + 1] = point[here + 1] / point[here + 2]
+            nodes[here + n] = uniforms[row] * x + uniforms[row + 1] * y + uniforms[row + 2] * z + uniforms[row + 3]
+    nodes[here + SCREEN] = nodes[here] / nodes[here + 2]
+    nodes[here + SCREEN + 1] = nodes[here + 1] / nodes[here + 2]
 
 
 @ti.func
-def w_at(depth, numbers: ti.template()):
+def w_at(depth, uniforms: ti.template()):
     """Give w of points at a depth."""
-    return depth * numbers[uni.PINHOLE] + (1.0 - numbers[uni.PINHOLE])
+    return depth * uniforms[uni.PINHOLE] + (1.0 - uniforms[uni.PINHOLE])
 
 
 @ti.func
-def line_of_sight(x, y, numbers: ti.template()):
+def line_of_sight(x, y, uniforms: ti.template()):
     """Give how far points that are seen at (x, y) are to the right and above the axis of view, at w = 1 [m]."""
-    return (x - numbers[uni.CENTRE_X]) * numbers[uni.SPREAD_X], (numbers[uni.CENTRE_Y] - y) * numbers[uni.SPREAD_Y]
+    return (x - uniforms[uni.CENTRE_X]) * uniforms[uni.SPREAD_X], (uniforms[uni.CENTRE_Y] - y) * uniforms[uni.SPREAD_Y]
 
 
 @ti.func
-def corner_of(cell, cols):
+def corner_entry(cell, cols):
     """Give the first number of a cell's upper left mass point."""
-    return (cell // (cols - 1) * cols + cell % (cols - 1)) * POINT_NUMBERS
+    return (cell // (cols - 1) * cols + cell % (cols - 1)) * NODE_STRIDE
 
 
 @ti.func
-def outlined(corner, cols, near, point: ti.template()):
+def cell_outline(corner, cols, near, nodes: ti.template()):
     """Find the `Outline` of the cell whose upper left mass point has its numbers from `corner` on."""
-    below = corner + cols * POINT_NUMBERS
-    corners = ti.static((corner, corner + POINT_NUMBERS, below, below + POINT_NUMBERS))
-    x = [point[at + SEEN] for at in corners]
-    y = [point[at + SEEN + 1] for at in corners]
-    w = [point[at + 2] for at in corners]
-    side = seen_side(x, y)
+    below = corner + cols * NODE_STRIDE
+    corners = ti.static((corner, corner + NODE_STRIDE, below, below + NODE_STRIDE))
+    x = [nodes[at + SCREEN] for at in corners]
+    y = [nodes[at + SCREEN + 1] for at in corners]
+    w = [nodes[at + 2] for at in corners]
+    facing = facing_of(x, y)
     in_front = w[0] > near and w[1] > near and w[2] > near and w[3] > near
     behind = w[0] <= near and w[1] <= near and w[2] <= near and w[3] <= near
     left, right = ti.min(x[0], x[1], x[2], x[3]), ti.max(x[0], x[1], x[2], x[3])
     top, bottom = ti.min(y[0], y[1], y[2], y[3]), ti.max(y[0], y[1], y[2], y[3])
-    return ti.static(Outline(x, y, left, right, top, bottom, side, in_front, behind))
+    return ti.static(Outline(x, y, left, right, top, bottom, facing, in_front, behind))
 
 
 @ti.func
-def is_whole(outline: ti.template()):
+def is_invertible(outline: ti.template()):
     """Tell whether a cell can be drawn as a whole in f32."""
     return (
         outline.in_front
-        and outline.side != 0
-        and ti.max(-outline.left, outline.right) < FARTHEST
-        and ti.max(-outline.top, outline.bottom) < FARTHEST
+        and outline.facing != 0
+        and ti.max(-outline.left, outline.right) < MAX_COORDINATE
+        and ti.max(-outline.top, outline.bottom) < MAX_COORDINATE
     )
 
 
 @ti.func
-def patch_of(corner, cols, side, whole, point: ti.template(), double: ti.template()):
+def cell_patch(corner, cols, facing, invertible, nodes: ti.template(), double: ti.template()):
     """Make the `Patch` of a cell; `double` tells that numbers are in f64, where D is summed in another order."""
-    below = corner + cols * POINT_NUMBERS
-    a = ti.Vector([point[corner + n] for n in ti.static(range(4))])
-    right = ti.Vector([point[corner + POINT_NUMBERS + n] for n in ti.static(range(4))])
-    down = ti.Vector([point[below + n] for n in ti.static(range(4))])
-    far = ti.Vector([point[below + POINT_NUMBERS + n] for n in ti.static(range(4))])
+    below = corner + cols * NODE_STRIDE
+    a = ti.Vector([nodes[corner + n] for n in ti.static(range(4))])
+    right = ti.Vector([nodes[corner + NODE_STRIDE + n] for n in ti.static(range(4))])
+    down = ti.Vector([nodes[below + n] for n in ti.static(range(4))])
+    far = ti.Vector([nodes[below + NODE_STRIDE + n] for n in ti.static(range(4))])
     b, c = right - a, down - a
     d = far - right - down + a if ti.static(double) else far - right - c
-    return ti.static(Patch(a, b, c, d, side, whole))
+    return ti.static(Patch(a, b, c, d, facing, invertible))
 
 
 @ti.func
-def edge(p_x, p_y, q_x, q_y, x, y, side):
+def edge(p_x, p_y, q_x, q_y, x, y, facing):
     """Twice the signed area of p, q and (x, y), times side, which is 1 or -1.
 
     The sign tells on which side of the line (x, y) is. Both cells of an edge get the same bits, but for the sign.
     """
-    right, down = (q_x - p_x) * side, (q_y - p_y) * side
+    right, down = (q_x - p_x) * facing, (q_y - p_y) * facing
     return right * (y - p_y) - down * (x - p_x)
 
 
 @ti.func
-def edges(x, y, side, outline: ti.template()):
+def edges(x, y, facing, outline: ti.template()):
     """Give `edge` for the left, right, upper and lower edge of a cell; none is negative where the cell is seen."""
     p, q = ti.static((outline.x, outline.y))
     return (
-        edge(p[0], q[0], p[2], q[2], x, y, -side),
-        edge(p[1], q[1], p[3], q[3], x, y, side),
-        edge(p[0], q[0], p[1], q[1], x, y, side),
-        edge(p[2], q[2], p[3], q[3], x, y, -side),
+        edge(p[0], q[0], p[2], q[2], x, y, -facing),
+        edge(p[1], q[1], p[3], q[3], x, y, facing),
+        edge(p[0], q[0], p[1], q[1], x, y, facing),
+        edge(p[2], q[2], p[3], q[3], x, y, -facing),
     )
 
 
@@ -168,7 +168,7 @@ def turn(p_x, p_y, q_x, q_y, r_x, r_y):
 
 
 @ti.func
-def seen_side(x: ti.template(), y: ti.template()):
+def facing_of(x: ti.template(), y: ti.template()):
     """Tell which side of a cell is seen, given its corners: 1: front; -1: back; 0: both, as it is folded."""
     turns = [
         turn(x[n], y[n], x[m], y[m], x[k], y[k]) for n, m, k in ti.static(((0, 1, 3), (1, 3, 2), (3, 2, 0), (2, 0, 1)))
@@ -178,7 +178,7 @@ def seen_side(x: ti.template(), y: ti.template()):
 
 
 @ti.func
-def small_quad(x, y, inside, parts, patch: ti.template()):
+def find_quads(x, y, inside, parts, patch: ti.template()):
     """Find column and line of the small quads of a patch that are seen at (x, y).
 
     `inside` are those that it covers; `parts` is the number of small quads along its side.
@@ -193,7 +193,7 @@ def small_quad(x, y, inside, parts, patch: ti.template()):
     ab = a_1 * b_2 - b_1 * a_2
     bd = b_1 * d_2 - d_1 * b_2
     linear = ad + bc
-    root = ti.sqrt(ti.max(linear * linear - 4.0 * bd * ac, 0.0)) * patch.side
+    root = ti.sqrt(ti.max(linear * linear - 4.0 * bd * ac, 0.0)) * patch.facing
     s = ti.select(inside, -2.0 * ac / (linear + root), 0.0)
     t = ti.select(inside, -2.0 * ab / (ad - bc - root), 0.0)
     return (
@@ -220,8 +220,8 @@ def triangle_at(x, y, column, line, part, lower, patch: ti.template()):
     below = (
         (p[0] - x * p[2]) * (p[1] + r[1] + q[1] + twist[1] - y * f_w)
         - (p[1] - y * p[2]) * (p[0] + r[0] + q[0] + twist[0] - x * f_w)
-    ) * patch.side >= 0.0
-    if not patch.whole:
+    ) * patch.facing >= 0.0
+    if not patch.invertible:
         below = lower
     for n in ti.static(range(4)):
         r[n] = ti.select(below, r[n] + twist[n], r[n])
@@ -240,14 +240,14 @@ def on_triangle(x, y, triangle: ti.template()):
 
 
 @ti.func
-def is_within(s, t, overstep, near, triangle: ti.template()):
+def is_within(s, t, enlargement, near, triangle: ti.template()):
     """Tell whether (s, t) is in a triangle that is enlarged by a fraction of its side, and in front of the camera."""
     larger = ti.select(triangle.below, t, s)
     smaller = ti.select(triangle.below, s, t)
     return (
-        (smaller >= -overstep)
-        & (larger <= 1.0 + overstep)
-        & (smaller <= larger + overstep)
+        (smaller >= -enlargement)
+        & (larger <= 1.0 + enlargement)
+        & (smaller <= larger + enlargement)
         & (triangle.p[2] + triangle.r[2] * s + triangle.d[2] * t > near)
     )
 
@@ -259,72 +259,72 @@ def depth_at(s, t, triangle: ti.template()):
 
 
 @ti.func
-def facet(x, y, triangle: ti.template(), numbers: ti.template()):
+def facet(x, y, triangle: ti.template(), uniforms: ti.template()):
     """Give the normal of a triangle on the side that is seen at (x, y), of any length, in OpenCV's axes, a list."""
     sides = [
         [
-            (k[0] - k[2] * numbers[uni.CENTRE_X]) * numbers[uni.SPREAD_X],
-            (k[1] - k[2] * numbers[uni.CENTRE_Y]) * numbers[uni.SPREAD_Y],
+            (k[0] - k[2] * uniforms[uni.CENTRE_X]) * uniforms[uni.SPREAD_X],
+            (k[1] - k[2] * uniforms[uni.CENTRE_Y]) * uniforms[uni.SPREAD_Y],
             k[3],
         ]
         for k in ti.static((triangle.r, triangle.d))
     ]
     r, d = ti.static(sides)
     normal = [r[1] * d[2] - r[2] * d[1], r[2] * d[0] - r[0] * d[2], r[0] * d[1] - r[1] * d[0]]
-    right, up = line_of_sight(x, y, numbers)
-    along = (normal[0] * right - normal[1] * up) * numbers[uni.PINHOLE] + normal[2]
+    right, up = line_of_sight(x, y, uniforms)
+    along = (normal[0] * right - normal[1] * up) * uniforms[uni.PINHOLE] + normal[2]
     toward = ti.select(along > 0.0, -1.0, 1.0)
     return [normal[n] * toward for n in ti.static(range(3))]
 
 
 @ti.func
-def may_reach(corner, at, cols, top, bottom, numbers: ti.template(), point: ti.template()):
-    """Tell whether a cell may be seen between two rows of a picture that a lens has bent: what saves `cell_bounds`.
+def may_cover_rows(corner, at, cols, top, bottom, uniforms: ti.template(), nodes: ti.template()):
+    """Tell whether a cell may be seen between two rows of a picture that a lens has bent: what saves `distorted_cell_bounds`.
 
-    The numbers of its upper left mass point begin at `corner`, and what `store_bent` stored of it at `at`.
+    The numbers of its upper left mass point begin at `corner`, and what `store_distorted` stored of it at `at`.
     """
-    below, under = corner + cols * POINT_NUMBERS, at + cols * lens_kernels.BENT_NUMBERS
-    bent_corners = ti.static((at, at + lens_kernels.BENT_NUMBERS, under, under + lens_kernels.BENT_NUMBERS))
-    within = [point[here + 2] for here in bent_corners]
-    seen = [point[here + 1] for here in bent_corners]
-    corners = ti.static((corner, corner + POINT_NUMBERS, below, below + POINT_NUMBERS))
-    x = [point[here + SEEN] for here in corners]
-    y = [point[here + SEEN + 1] for here in corners]
+    below, under = corner + cols * NODE_STRIDE, at + cols * lens_kernels.DISTORTED_STRIDE
+    bent_corners = ti.static((at, at + lens_kernels.DISTORTED_STRIDE, under, under + lens_kernels.DISTORTED_STRIDE))
+    within = [nodes[here + 2] for here in bent_corners]
+    seen = [nodes[here + 1] for here in bent_corners]
+    corners = ti.static((corner, corner + NODE_STRIDE, below, below + NODE_STRIDE))
+    x = [nodes[here + SCREEN] for here in corners]
+    y = [nodes[here + SCREEN + 1] for here in corners]
     longest = ti.max(
-        lens_kernels.side(x, y, 0, 1),
-        lens_kernels.side(x, y, 1, 3),
-        lens_kernels.side(x, y, 3, 2),
-        lens_kernels.side(x, y, 2, 0),
+        lens_kernels.squared_side(x, y, 0, 1),
+        lens_kernels.squared_side(x, y, 1, 3),
+        lens_kernels.squared_side(x, y, 3, 2),
+        lens_kernels.squared_side(x, y, 2, 0),
     )
-    far = numbers[uni.BEND] * longest + 2.0
+    far = uniforms[uni.SAGITTA_FACTOR] * longest + 2.0
     lowest, highest = ti.max(seen[0], seen[1], seen[2], seen[3]), ti.min(seen[0], seen[1], seen[2], seen[3])
     partly = within[0] + within[1] + within[2] + within[3] < 3.5
     return partly or (lowest + far > top and highest - far < bottom)
 
 
 @ti.func
-def cell_bounds(at, cols, outline: ti.template(), numbers: ti.template(), point: ti.template()):
+def distorted_cell_bounds(at, cols, outline: ti.template(), uniforms: ti.template(), nodes: ti.template()):
     """Find the bounds of a cell in a picture that a lens has bent.
 
-    What `store_bent` stored of its upper left mass point is at `at`, in a sheet of so many columns.
+    What `store_distorted` stored of its upper left mass point is at `at`, in a sheet of so many columns.
     """
-    below = at + cols * lens_kernels.BENT_NUMBERS
-    corners = ti.static((at, at + lens_kernels.BENT_NUMBERS, below, below + lens_kernels.BENT_NUMBERS))
+    below = at + cols * lens_kernels.DISTORTED_STRIDE
+    corners = ti.static((at, at + lens_kernels.DISTORTED_STRIDE, below, below + lens_kernels.DISTORTED_STRIDE))
     x, y = ti.static((outline.x, outline.y))
     longest = ti.max(
-        lens_kernels.side(x, y, 0, 1),
-        lens_kernels.side(x, y, 1, 3),
-        lens_kernels.side(x, y, 3, 2),
-        lens_kernels.side(x, y, 2, 0),
+        lens_kernels.squared_side(x, y, 0, 1),
+        lens_kernels.squared_side(x, y, 1, 3),
+        lens_kernels.squared_side(x, y, 3, 2),
+        lens_kernels.squared_side(x, y, 2, 0),
     )
-    within = point[corners[0] + 2] + point[corners[1] + 2] + point[corners[2] + 2] + point[corners[3] + 2] > 3.5
-    seen_x = [point[here] for here in corners]
-    seen_y = [point[here + 1] for here in corners]
-    return lens_kernels.bent_bounds(x, y, seen_x, seen_y, within, longest, numbers)
+    within = nodes[corners[0] + 2] + nodes[corners[1] + 2] + nodes[corners[2] + 2] + nodes[corners[3] + 2] > 3.5
+    seen_x = [nodes[here] for here in corners]
+    seen_y = [nodes[here + 1] for here in corners]
+    return lens_kernels.distorted_bounds(x, y, seen_x, seen_y, within, longest, uniforms)
 
 
 @ti.func
-def is_beside(corners: ti.template(), left, right, top, bottom):
+def is_off_screen(corners: ti.template(), left, right, top, bottom):
     """Tell whether all between corners, some of which may be behind the camera, is beyond an edge of the picture.
 
     X = x w is a plane for each edge x, behind the camera too; a point beyond it has a larger X, or a smaller one.
@@ -341,7 +341,7 @@ def is_beside(corners: ti.template(), left, right, top, bottom):
 @ti.func
 def triangle_bounds(
     column, line, lower, part, near, width, height,
-    patch: ti.template(), numbers: ti.template(), lens: ti.template(),
+    patch: ti.template(), uniforms: ti.template(), lens: ti.template(),
 ):  # fmt: skip
     """Find the bounds of a small triangle in a picture of this width and height; other arguments as for `triangle_at`.
 
@@ -352,7 +352,7 @@ def triangle_bounds(
     """
     a, b, c, d = ti.static((patch.a, patch.b, patch.c, patch.d))
     low_x, high_x, low_y, high_y = 0.0, ti.cast(width, ti.f32), -INFINITY, INFINITY
-    overstep = OVERSTEP
+    enlargement = ENLARGEMENT
     s0, t0 = column * part, line * part
     s1, t1 = (column + 1) * part, (line + 1) * part
     p = a + b * s0 + (c + d * s0) * t0
@@ -368,26 +368,26 @@ def triangle_bounds(
         extent = ti.max(high_x - low_x, high_y - low_y, 1e-3)
         if ti.static(lens != ""):
             box = uni.VISIBLE
-            around = numbers[box + 1] - numbers[box] + numbers[box + 3] - numbers[box + 2]
-            overstep += OVERSTEP_OF_PICTURE * around / extent
+            around = uniforms[box + 1] - uniforms[box] + uniforms[box + 3] - uniforms[box + 2]
+            enlargement += SCREEN_ENLARGEMENT * around / extent
             x = [k[0] / k[2] for k in ti.static((p, q, r))]
             y = [k[1] / k[2] for k in ti.static((p, q, r))]
             longest = ti.max(
-                lens_kernels.side(x, y, 0, 1), lens_kernels.side(x, y, 1, 2), lens_kernels.side(x, y, 2, 0)
+                lens_kernels.squared_side(x, y, 0, 1), lens_kernels.facing(x, y, 1, 2), lens_kernels.facing(x, y, 2, 0)
             )
-            seen = [lens_kernels.bent(x[n], y[n], numbers, lens) for n in ti.static(range(3))]
-            low_x, high_x, low_y, high_y = lens_kernels.bent_bounds(
+            seen = [lens_kernels.bent(x[n], y[n], uniforms, lens) for n in ti.static(range(3))]
+            low_x, high_x, low_y, high_y = lens_kernels.distorted_bounds(
                 x, y, [one[0] for one in seen], [one[1] for one in seen], seen[0][2] and seen[1][2] and seen[2][2],
-                longest, numbers,
+                longest, uniforms,
             )  # fmt: skip
         else:
-            overstep += OVERSTEP_OF_PICTURE * (width + height) / extent
+            enlargement += SCREEN_ENLARGEMENT * (width + height) / extent
     elif p[2] <= near and q[2] <= near and r[2] <= near:
         high_x = -1.0
     else:
         left, right, top, bottom = 0.0, high_x, 0.0, ti.cast(height, ti.f32)
         if ti.static(lens != ""):
-            left, right, top, bottom = [numbers[uni.VISIBLE + n] for n in ti.static(range(4))]
-        if is_beside([p, q, r], left, right, top, bottom):
+            left, right, top, bottom = [uniforms[uni.VISIBLE + n] for n in ti.static(range(4))]
+        if is_off_screen([p, q, r], left, right, top, bottom):
             high_x = -1.0
-    return low_x, high_x, low_y, high_y, overstep
+    return low_x, high_x, low_y, high_y, enlargement

@@ -13,38 +13,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.render import uniforms as uni
-from taichi_msm.render.bins import BOUNDS, ROUNDS_OF_SEARCH, binned, owner, reaches, store_bounds
-from taichi_msm.render.config import INFINITY, Band, Bytes, DrawingConfig, Floats, Integers, clear
-from taichi_msm.render.coverage import NORMAL_NUMBERS, DrawnSheet, Part, cover, cover_with_rods, store_normal
+from taichi_msm.render.bins import BOUNDS_STRIDE, SEARCH_ROUNDS, build_bins, owner_of, is_in_bounds, store_bounds
+from taichi_msm.render.config import INFINITY, Band, Bytes, DrawingConfig, Floats, Integers, clear_tile
+from taichi_msm.render.coverage import NORMAL_STRIDE, DrawnSheet, Part, cover_capsules, cover_cell, store_normal
 from taichi_msm.render.geometry import (
-    POINT_NUMBERS,
-    cell_bounds,
-    corner_of,
-    is_whole,
-    outlined,
-    patch_of,
+    NODE_STRIDE,
+    cell_outline,
+    cell_patch,
+    corner_entry,
+    distorted_cell_bounds,
+    is_invertible,
     project,
     triangle_bounds,
 )
 from taichi_msm.render.labels import label_numbers
-from taichi_msm.render.lens_kernels import BENT_NUMBERS, store_bent
+from taichi_msm.render.lens_kernels import DISTORTED_STRIDE, store_distorted
 from taichi_msm.render.shading import Appearance, PixelArrays, resolve
 from taichi_msm.system.launches import THREADS, Launches, end_thread
 from taichi_msm.system.runtime import our_compilation, ti, write
 
 # The smallest width of a bin [samples].
-SMALLEST_BIN = 8
+MIN_BIN_SIZE = 8
 
 # A part reaches at most so much farther than its corners, by rounding and to the centres of samples [samples].
 MARGIN = 1.5
 
 # The largest number of parts. If cells would have more, several of their triangles make one.
-MOST_PARTS = 1 << 22
+MAX_PARTS = 1 << 22
 
 
 # Where the numbers of bent mass points begin, per mass point, and how many numbers it has in all.
-BENT = POINT_NUMBERS + NORMAL_NUMBERS
-STORED = BENT + BENT_NUMBERS
+BENT = NODE_STRIDE + NORMAL_STRIDE
+STORED = BENT + DISTORTED_STRIDE
 
 
 class Threads:
@@ -63,42 +63,44 @@ class Threads:
         # Rows of pixels in a strip.
         self._rows = min(max(1, THREADS // (across * config.supersample)), height)
         self._texels = launches.give(texels)
-        self._point = launches.array(np.float32, rows * cols * STORED)
+        self._nodes = launches.array(np.float32, rows * cols * STORED)
         self._pieces = launches.array(np.int32, self._cells)
         strip = self._rows * config.supersample * across * config.planes
         # Before the strip are the places of all samples, if there is a lens.
-        self._samples = ti.ndarray(config.floats, height * config.supersample * across * config.place_planes + strip)
+        self._samples = ti.ndarray(
+            config.float_vector, height * config.supersample * across * config.map_planes + strip
+        )
         self._colours = launches.array(np.uint8, 3 * width * height if config.picture else 1)
-        numbers = label_numbers(normals=config.normals) if config.labels else 0
-        self._labels = launches.array(np.float32, max(numbers * width * height, 1))
+        uniforms = label_numbers(normals=config.normals) if config.labels else 0
+        self._labels = launches.array(np.float32, max(uniforms * width * height, 1))
 
     def place(self, places: NDArray[np.float32]) -> None:
         """Take the places of the samples of the pictures that follow, as `cpu.Bands.place` does."""
         write(self._samples, places.reshape(-1, 1))
 
     def draw(
-        self, position: NDArray[np.float32], numbers: NDArray[np.float32], sizes: NDArray[np.int32]
+        self, position: NDArray[np.float32], uniforms: NDArray[np.float32], sizes: NDArray[np.int32]
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """Draw as `cpu.Bands.draw` does; raises a DeviceError when the device cut threads short."""
         launches, factor = Launches(bounded=True), self._config.supersample
-        (width, height), rods = self._size, int(sizes[uni.ROD_COUNT])
+        (width, height), rods = self._size, int(sizes[uni.CAPSULE_COUNT])
         across, down = width * factor, height * factor
-        view = launches.give(numbers), launches.give(sizes)
+        view = launches.give(uniforms), launches.give(sizes)
         with our_compilation(optimised=False):
-            self._project(position, *view, self._point, self._pieces)
+            self._project(position, *view, self._nodes, self._pieces)
         pieces = launches.take(self._pieces)
-        together = max(1, min(-(-int(pieces.sum(dtype=np.int64)) // MOST_PARTS), int(pieces.max())))
+        together = max(1, min(-(-int(pieces.sum(dtype=np.int64)) // MAX_PARTS), int(pieces.max())))
         # What is behind the eye makes one empty part.
         ends = np.cumsum(np.maximum(-(-pieces // together), 1), dtype=np.int32)
         parts = int(ends[-1])
-        owners, bounds = launches.array(np.int32, 2 * parts), launches.array(np.int32, BOUNDS * parts)
+        owners, bounds = launches.array(np.int32, 2 * parts), launches.array(np.int32, BOUNDS_STRIDE * parts)
         launches.launch(
-            self._bound, parts, together, *view, launches.give(ends), self._point, self._pieces, owners, bounds,
-            rounds=ROUNDS_OF_SEARCH + together,
+            self._bound, parts, together, *view, launches.give(ends), self._nodes, self._pieces, owners, bounds,
+            rounds=SEARCH_ROUNDS + together,
         )  # fmt: skip
-        bin_size = max(SMALLEST_BIN, round((across * down / self._cells) ** 0.5))
-        bins = binned(launches, bounds, parts, (across, down), bin_size)
-        sizes[[uni.BIN_SIZE, uni.BINS_ACROSS]] = bins.size, bins.across
+        bin_size = max(MIN_BIN_SIZE, round((across * down / self._cells) ** 0.5))
+        bins = build_bins(launches, bounds, parts, (across, down), bin_size)
+        sizes[[uni.BIN_SIZE, uni.BINS_ACROSS]] = bins.size, bins.columns
         view = view[0], launches.give(sizes)
         # A sample takes one round for a part, and for each of its triangles one and one or two for tiles.
         rounds_of_part = 1 + 3 * together
@@ -111,7 +113,7 @@ class Threads:
             for listed, count in launches.parts(longest, rounds_of_part):
                 launches.launch(
                     self._cover, rows * factor * across,
-                    top, listed, count, together, *view, self._point, self._pieces, owners, bounds,
+                    top, listed, count, together, *view, self._nodes, self._pieces, owners, bounds,
                     bins.starts, bins.entries, self._samples,
                     rounds=count * rounds_of_part,
                 )  # fmt: skip
@@ -132,7 +134,7 @@ def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable
 
     @ti.kernel
     def project_points(
-        position: ti.types.ndarray(dtype=ti.f32, ndim=3), numbers: Floats, sizes: Integers, point: Floats,
+        position: ti.types.ndarray(dtype=ti.f32, ndim=3), uniforms: Floats, sizes: Integers, nodes: Floats,
         pieces: Integers,
     ):  # fmt: skip
         """Project the mass points, and tell in how many pieces each cell is drawn.
@@ -141,44 +143,44 @@ def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable
         """
         for index in range(sizes[uni.ROWS] * sizes[uni.COLS]):
             rows, cols = sizes[uni.ROWS], sizes[uni.COLS]
-            project(position, index // cols, index % cols, cols, numbers, point, False)
-            store_normal(position, index // cols, index % cols, rows, cols, config, numbers, point)
-            if ti.static(config.bends):
-                store_bent(
-                    rows * cols * BENT + index * BENT_NUMBERS, index * POINT_NUMBERS, numbers, point, config.lens
+            project(position, index // cols, index % cols, cols, uniforms, nodes, False)
+            store_normal(position, index // cols, index % cols, rows, cols, config, uniforms, nodes)
+            if ti.static(config.has_distortion):
+                store_distorted(
+                    rows * cols * BENT + index * DISTORTED_STRIDE, index * NODE_STRIDE, uniforms, nodes, config.lens
                 )
 
         for cell in range((sizes[uni.ROWS] - 1) * (sizes[uni.COLS] - 1)):
-            cols, parts = sizes[uni.COLS], ti.cast(numbers[uni.PARTS], ti.i32)
-            outline = ti.static(outlined(corner_of(cell, cols), cols, numbers[uni.NEAR], point))
-            pieces[cell] = ti.select(outline.behind, 0, ti.select(is_whole(outline), 1, 2 * parts * parts))
+            cols, parts = sizes[uni.COLS], ti.cast(uniforms[uni.SUBDIVISIONS], ti.i32)
+            outline = ti.static(cell_outline(corner_entry(cell, cols), cols, uniforms[uni.NEAR], nodes))
+            pieces[cell] = ti.select(outline.behind, 0, ti.select(is_invertible(outline), 1, 2 * parts * parts))
 
     @ti.kernel
     def bound(
-        first: ti.i32, end: ti.i32, ended: Integers, together: ti.i32, numbers: Floats, sizes: Integers,
-        ends: Integers, point: Floats, pieces: Integers, owners: Integers, bounds: Integers,
+        first: ti.i32, end: ti.i32, ended: Integers, together: ti.i32, uniforms: Floats, sizes: Integers,
+        ends: Integers, nodes: Floats, pieces: Integers, owners: Integers, bounds: Integers,
     ):  # fmt: skip
         """Find the cell and the first piece of every part, which has `together` pieces; and its bounds [samples]."""
         for item in range(first, end):
             cols, width, height = sizes[uni.COLS], sizes[uni.WIDTH] * factor, sizes[uni.HEIGHT] * factor
-            cell = owner(item, (sizes[uni.ROWS] - 1) * (cols - 1), ends)
+            cell = owner_of(item, (sizes[uni.ROWS] - 1) * (cols - 1), ends)
             parts_of_cell = ti.max((pieces[cell] + together - 1) // together, 1)
             piece = (item - ends[cell] + parts_of_cell) * together
             owners[2 * item], owners[2 * item + 1] = cell, piece
-            outline = ti.static(outlined(corner_of(cell, cols), cols, numbers[uni.NEAR], point))
+            outline = ti.static(cell_outline(corner_entry(cell, cols), cols, uniforms[uni.NEAR], nodes))
             left, right, top, bottom = outline.left, outline.right, outline.top, outline.bottom
-            if ti.static(config.bends):
-                at = sizes[uni.ROWS] * cols * BENT + corner_of(cell, cols) // POINT_NUMBERS * BENT_NUMBERS
-                left, right, top, bottom = cell_bounds(at, cols, outline, numbers, point)
+            if ti.static(config.has_distortion):
+                at = sizes[uni.ROWS] * cols * BENT + corner_entry(cell, cols) // NODE_STRIDE * DISTORTED_STRIDE
+                left, right, top, bottom = distorted_cell_bounds(at, cols, outline, uniforms, nodes)
             if pieces[cell] != 1:
                 left, right, top, bottom = INFINITY, -INFINITY, INFINITY, -INFINITY
-                patch = ti.static(patch_of(corner_of(cell, cols), cols, outline.side, False, point, False))
-                per_side = ti.cast(numbers[uni.PARTS], ti.i32)
+                patch = ti.static(cell_patch(corner_entry(cell, cols), cols, outline.side, False, nodes, False))
+                per_side = ti.cast(uniforms[uni.SUBDIVISIONS], ti.i32)
                 for n in range(piece, ti.min(piece + together, pieces[cell])):
                     s, t = ti.cast(n // 2 % per_side, ti.f32), ti.cast(n // 2 // per_side, ti.f32)
                     low_x, high_x, low_y, high_y, _ = triangle_bounds(
-                        s, t, n % 2 == 0, 1.0 / numbers[uni.PARTS], numbers[uni.NEAR], width, height,
-                        patch, numbers, config.lens,
+                        s, t, n % 2 == 0, 1.0 / uniforms[uni.SUBDIVISIONS], uniforms[uni.NEAR], width, height,
+                        patch, uniforms, config.lens,
                     )  # fmt: skip
                     if not high_x < low_x:
                         # Where it is NaN it may be anywhere.
@@ -200,56 +202,56 @@ def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callab
     @ti.kernel
     def cover_samples(
         first: ti.i32, end: ti.i32, ended: Integers, top: ti.i32, listed: ti.i32, count: ti.i32, together: ti.i32,
-        numbers: Floats, sizes: Integers, point: Floats, pieces: Integers, owners: Integers, bounds: Integers,
-        starts: Integers, entries: Integers, samples: ti.types.ndarray(dtype=config.floats, ndim=1),
+        uniforms: Floats, sizes: Integers, nodes: Floats, pieces: Integers, owners: Integers, bounds: Integers,
+        starts: Integers, entries: Integers, samples: ti.types.ndarray(dtype=config.float_vector, ndim=1),
     ):  # fmt: skip
         """Cover the samples of a strip that begins at row `top`, with `count` parts of their lists from `listed` on."""
         for index in range(first, end):
-            rows, cols, parts = sizes[uni.ROWS], sizes[uni.COLS], numbers[uni.PARTS]
+            rows, cols, parts = sizes[uni.ROWS], sizes[uni.COLS], uniforms[uni.SUBDIVISIONS]
             width, height = sizes[uni.WIDTH] * factor, sizes[uni.HEIGHT] * factor
             x, y = index % width, top + index // width
-            table = width * height * config.place_planes
-            line, near = table + index // width * width * planes, numbers[uni.NEAR]
-            placed, bent = y * width * config.place_planes, rows * cols * BENT
+            table = width * height * config.map_planes
+            line, near = table + index // width * width * planes, uniforms[uni.NEAR]
+            placed, bent = y * width * config.map_planes, rows * cols * BENT
             texture_width, texture_height = sizes[uni.LEVELS + 1], sizes[uni.LEVELS + 2]
-            sheet = ti.static(DrawnSheet(point, rows, cols, parts, texture_width, texture_height, bent))
+            sheet = ti.static(DrawnSheet(nodes, rows, cols, parts, texture_width, texture_height, bent))
             band = ti.static(
-                Band(config, samples, line, width, x, x + 1, y, y + 1, width, height, near, numbers, placed)
+                Band(config, samples, line, width, x, x + 1, y, y + 1, width, height, near, uniforms, placed)
             )
             if listed == 0:
-                clear(table + index * planes, band)
+                clear_tile(table + index * planes, band)
             square = y // sizes[uni.BIN_SIZE] * sizes[uni.BINS_ACROSS] + x // sizes[uni.BIN_SIZE]
             begin = starts[square] + listed
             for n in range(begin, ti.min(begin + count, starts[square + 1])):
-                if reaches(entries[n], x, y, bounds):
+                if is_in_bounds(entries[n], x, y, bounds):
                     cell, piece = owners[2 * entries[n]], owners[2 * entries[n] + 1]
-                    whole, last = pieces[cell] == 1, ti.min(piece + together, pieces[cell])
-                    part = ti.static(Part(whole, piece, last))
-                    cover(cell // (cols - 1), cell % (cols - 1), part, sheet, band)
+                    invertible, last = pieces[cell] == 1, ti.min(piece + together, pieces[cell])
+                    part = ti.static(Part(invertible, piece, last))
+                    cover_cell(cell // (cols - 1), cell % (cols - 1), part, sheet, band)
             end_thread(ended)
 
     @ti.kernel
     def resolve_pixels(
-        first: ti.i32, end: ti.i32, ended: Integers, row: ti.i32, numbers: Floats, sizes: Integers, texels: Floats,
-        samples: ti.types.ndarray(dtype=config.floats, ndim=1), colours: Bytes, labels: Floats,
+        first: ti.i32, end: ti.i32, ended: Integers, row: ti.i32, uniforms: Floats, sizes: Integers, texels: Floats,
+        samples: ti.types.ndarray(dtype=config.float_vector, ndim=1), colours: Bytes, labels: Floats,
     ):  # fmt: skip
         """Cover the pixels of a strip that begins at `row` with the instruments, and write them."""
         for index in range(first, end):
-            width, height, rod_count = sizes[uni.WIDTH], sizes[uni.HEIGHT], sizes[uni.ROD_COUNT]
+            width, height, capsule_count = sizes[uni.WIDTH], sizes[uni.HEIGHT], sizes[uni.CAPSULE_COUNT]
             x, y = index % width, row + index // width
             left, top, across = x * factor, y * factor, width * factor
-            table = across * height * factor * config.place_planes
-            line, placed = table + (y - row) * factor * across * planes, top * across * config.place_planes
+            table = across * height * factor * config.map_planes
+            line, placed = table + (y - row) * factor * across * planes, top * across * config.map_planes
             if ti.static(config.instruments):
                 band = ti.static(
                     Band(
                         config, samples, line, across, left, left + factor, top, top + factor,
-                        across, height * factor, numbers[uni.NEAR], numbers, placed,
+                        across, height * factor, uniforms[uni.NEAR], uniforms, placed,
                     )
                 )  # fmt: skip
-                cover_with_rods(rod_count, band)
+                cover_capsules(capsule_count, band)
             appearance = ti.static(
-                Appearance(config, texels, sizes, sizes[uni.LEVELS + 1], sizes[uni.LEVELS + 2], numbers, rod_count)
+                Appearance(config, texels, sizes, sizes[uni.LEVELS + 1], sizes[uni.LEVELS + 2], uniforms, capsule_count)
             )
             pixels = width * height
             output = ti.static(PixelArrays(colours, labels, pixels))

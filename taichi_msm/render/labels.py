@@ -127,7 +127,7 @@ class Sight(NamedTuple):
     hidden: NDArray[np.bool_]
 
 
-class Observed(NamedTuple):
+class FrameOutputs(NamedTuple):
     """The outputs of one frame; None for those that were not asked for."""
 
     picture: NDArray[np.uint8] | None = None  # colours, shape (height, width, 3)

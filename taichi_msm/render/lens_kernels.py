@@ -1,16 +1,16 @@
 """Lenses that bend lines, in kernels: where a place is seen, and the bounds of what a cell or a triangle covers.
 
-The formulas are those of camera.py, the bounds those of `lens_table.Visible`. A place is what a camera without the lens
+The formulas are those of camera.py, the bounds those of `lens_table.VisibleRegion`. A place is what a camera without the lens
 sees there, in samples of its picture.
 """
 
 from taichi_msm.render import uniforms as uni
-from taichi_msm.render.lens_table import BEYOND
+from taichi_msm.render.lens_table import INVALID_COORDINATE
 from taichi_msm.system.runtime import ti
 
 # Numbers that are stored of a mass point: where it is seen [samples], and 1 if it is in front of the camera and within
 # the radius of the lens.
-BENT_NUMBERS = 3
+DISTORTED_STRIDE = 3
 
 # An angle is found from a half of a half of half of it, by its series in the tangent: the terms' divisors, the smallest
 # term first.
@@ -19,7 +19,7 @@ SERIES = [(-1.0) ** n * (2 * n + 1) for n in reversed(range(12))]
 
 
 @ti.func
-def arc(tangent):
+def arctangent(tangent):
     """Give the angle, 0 to pi / 2, that has a tangent; GPUs have no such function in f64."""
     part = tangent
     for _ in ti.static(range(HALVINGS)):
@@ -34,23 +34,23 @@ def arc(tangent):
 
 
 @ti.func
-def bent(x, y, numbers: ti.template(), lens: ti.template()):
+def distorted_point(x, y, uniforms: ti.template(), lens: ti.template()):
     """Find where a place is seen [samples], and whether it is within the radius of the lens.
 
     Beyond it, the nearest place within it is taken.
     """
-    a = (x - numbers[uni.CENTRE_X]) * numbers[uni.SPREAD_X]
-    b = (y - numbers[uni.CENTRE_Y]) * numbers[uni.SPREAD_Y]
+    a = (x - uniforms[uni.CENTRE_X]) * uniforms[uni.SPREAD_X]
+    b = (y - uniforms[uni.CENTRE_Y]) * uniforms[uni.SPREAD_Y]
     square = a * a + b * b
-    within = square < numbers[uni.LENS_RADIUS] * numbers[uni.LENS_RADIUS]
+    within = square < uniforms[uni.LENS_RADIUS] * uniforms[uni.LENS_RADIUS]
     if not within:
-        shorter = numbers[uni.LENS_RADIUS] / ti.sqrt(square)
+        shorter = uniforms[uni.LENS_RADIUS] / ti.sqrt(square)
         a, b = a * shorter, b * shorter
-    k = [numbers[uni.LENS + n] for n in ti.static(range(8))]
+    k = [uniforms[uni.LENS + n] for n in ti.static(range(8))]
     q = a * a + b * b
     if ti.static(lens == "fisheye"):
         r = ti.max(ti.sqrt(q), 1e-8)
-        t = arc(r)
+        t = arctangent(r)
         p = t * t
         ratio = t * (1.0 + p * (k[0] + p * (k[1] + p * (k[2] + p * k[3])))) / r
         a, b = a * ratio, b * ratio
@@ -61,30 +61,30 @@ def bent(x, y, numbers: ti.template(), lens: ti.template()):
         b = b * ratio + k[2] * (q + 2.0 * b * b) + k[3] * mixed
         a = across
     return (
-        numbers[uni.PICTURE_X] + numbers[uni.FOCAL_X] * a,
-        numbers[uni.PICTURE_Y] + numbers[uni.FOCAL_Y] * b,
+        uniforms[uni.PICTURE_X] + uniforms[uni.FOCAL_X] * a,
+        uniforms[uni.PICTURE_Y] + uniforms[uni.FOCAL_Y] * b,
         within,
     )
 
 
 @ti.func
-def store_bent(at, here, numbers: ti.template(), point: ti.template(), lens: ti.template()):
+def store_distorted(at, here, uniforms: ti.template(), nodes: ti.template(), lens: ti.template()):
     """Store at `at` where the mass point is seen whose numbers begin at `here`."""
-    seen_x, seen_y, within = bent(point[here + uni.SEEN], point[here + uni.SEEN + 1], numbers, lens)
-    point[at], point[at + 1] = seen_x, seen_y
-    point[at + 2] = ti.cast(within and point[here + 2] > numbers[uni.NEAR], ti.f32)
+    seen_x, seen_y, within = distorted_point(nodes[here + uni.SCREEN], nodes[here + uni.SCREEN + 1], uniforms, lens)
+    nodes[at], nodes[at + 1] = seen_x, seen_y
+    nodes[at + 2] = ti.cast(within and nodes[here + 2] > uniforms[uni.NEAR], ti.f32)
 
 
 @ti.func
-def side(x: ti.template(), y: ti.template(), n: ti.template(), m: ti.template()):
+def squared_side(x: ti.template(), y: ti.template(), n: ti.template(), m: ti.template()):
     """Square of the distance between two corners of an outline."""
     return (x[n] - x[m]) * (x[n] - x[m]) + (y[n] - y[m]) * (y[n] - y[m])
 
 
 @ti.func
-def bent_bounds(
+def distorted_bounds(
     x: ti.template(), y: ti.template(), seen_x: ti.template(), seen_y: ti.template(), within, longest,
-    numbers: ti.template(),
+    uniforms: ti.template(),
 ):  # fmt: skip
     """Find bounds of all samples that show a convex outline, from its corners' places, and where these are seen.
 
@@ -93,9 +93,9 @@ def bent_bounds(
     Returns:
         Least and largest x, least and largest y [samples]; the largest are below the least where nothing is seen.
     """
-    far = ti.min(numbers[uni.STRETCH] * ti.sqrt(longest), 1e6)
+    far = ti.min(uniforms[uni.STRETCH_FACTOR] * ti.sqrt(longest), 1e6)
     if within:
-        far = ti.min(far, numbers[uni.BEND] * longest)
+        far = ti.min(far, uniforms[uni.SAGITTA_FACTOR] * longest)
     left, right = x[0], x[0]
     top, bottom = y[0], y[0]
     low_x, high_x = seen_x[0], seen_x[0]
@@ -107,11 +107,14 @@ def bent_bounds(
         low_y, high_y = ti.min(low_y, seen_y[n]), ti.max(high_y, seen_y[n])
     box = uni.VISIBLE
     shown = (
-        right >= numbers[box] and left <= numbers[box + 1] and bottom >= numbers[box + 2] and top <= numbers[box + 3]
+        right >= uniforms[box]
+        and left <= uniforms[box + 1]
+        and bottom >= uniforms[box + 2]
+        and top <= uniforms[box + 3]
     )
     return (
-        ti.select(shown, low_x - far, BEYOND),
-        ti.select(shown, high_x + far, -BEYOND),
-        ti.select(shown, low_y - far, BEYOND),
-        ti.select(shown, high_y + far, -BEYOND),
+        ti.select(shown, low_x - far, INVALID_COORDINATE),
+        ti.select(shown, high_x + far, -INVALID_COORDINATE),
+        ti.select(shown, low_y - far, INVALID_COORDINATE),
+        ti.select(shown, high_y + far, -INVALID_COORDINATE),
     )

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.render.camera import Lens, View, border
+from taichi_msm.render.camera import Lens, View, border_points
 
 if TYPE_CHECKING:
     from taichi_msm.render.config import DrawingConfig
@@ -20,10 +20,10 @@ Array = NDArray[np.float64]
 Pair = tuple[float, float]
 
 # The place of a sample that shows nothing, as it is beyond the limit of the lens.
-BEYOND = 1e9
+INVALID_COORDINATE = 1e9
 
 # A picture without the lens is at most so many times larger.
-LARGEST_WINDOW = 4
+MAX_VIEW_SCALE = 4
 
 # Rows of samples whose places are found at a time.
 ROWS = 64
@@ -33,7 +33,7 @@ RADII, ANGLES, ENLARGED = 256, 64, 1.25
 STEP = 1e-5
 
 
-class Visible(NamedTuple):
+class VisibleRegion(NamedTuple):
     """What a picture shows of the plane at depth 1, and how the lens bends it there.
 
     A line of length L becomes a curve, which is at most `bend` L^2 away from the straight line between its ends, as its
@@ -46,16 +46,16 @@ class Visible(NamedTuple):
     stretch: float
 
 
-def visible(view: View) -> Visible:
+def visible_region(view: View) -> VisibleRegion:
     """Find what a camera with a lens shows."""
     assert view.lens is not None
     scale, centre, size = ((float(one[0]), float(one[1])) for one in (view.scale, view.centre, view.size))
-    return _visible(view.lens, scale, centre, size)
+    return _visible_region(view.lens, scale, centre, size)
 
 
 @lru_cache(maxsize=16)
-def _visible(lens: Lens, scale: Pair, centre: Pair, size: Pair) -> Visible:
-    place = lens.undistort((border(np.array(size)) - centre) / scale)
+def _visible_region(lens: Lens, scale: Pair, centre: Pair, size: Pair) -> VisibleRegion:
+    place = lens.undistort((border_points(np.array(size)) - centre) / scale)
     radius = float(np.linalg.norm(place, axis=-1).max())
     if np.isnan(radius):
         radius = lens.limit
@@ -69,7 +69,7 @@ def _visible(lens: Lens, scale: Pair, centre: Pair, size: Pair) -> Visible:
     curving = np.sqrt((np.stack(change) ** 2).sum(axis=(0, -1))).max() / (2 * step)
     growing = np.sqrt((lens.jacobian(points) ** 2).sum(axis=-1)).max()
     high, low = max(scale), min(scale)
-    return Visible(
+    return VisibleRegion(
         radius * (1 + 1e-5),
         (float(left), float(right), float(top), float(bottom)),
         ENLARGED * float(curving) * high / low**2 / 8,
@@ -77,10 +77,10 @@ def _visible(lens: Lens, scale: Pair, centre: Pair, size: Pair) -> Visible:
     )
 
 
-def window(view: View) -> View:
+def undistorted_view(view: View) -> View:
     """Give a camera without the lens, whose picture is all that is seen through it; smaller, if the lens is wide."""
-    left, right, top, bottom = visible(view).box
-    share = min(1.0, LARGEST_WINDOW * float(view.size.max()) / max(right - left, bottom - top))
+    left, right, top, bottom = visible_region(view).box
+    share = min(1.0, MAX_VIEW_SCALE * float(view.size.max()) / max(right - left, bottom - top))
     corner, matrix = np.array([left, top]), view.matrix.copy()
     for row in (0, 1):
         matrix[row] = (matrix[row] - corner[row] * matrix[2]) * share
@@ -90,7 +90,7 @@ def window(view: View) -> View:
     )
 
 
-def sample_places(view: View, factor: int, *, steps: bool) -> NDArray[np.float32]:
+def undistortion_map(view: View, factor: int, *, steps: bool) -> NDArray[np.float32]:
     """Give the places of all samples, `factor` a pixel along each axis, without distortion.
 
     Returns:
@@ -103,9 +103,9 @@ def sample_places(view: View, factor: int, *, steps: bool) -> NDArray[np.float32
     for first in range(0, rows, ROWS):
         end = min(first + ROWS, rows)
         pixels = (np.stack(np.meshgrid(np.arange(columns), np.arange(first, end)), axis=-1) + 0.5) / factor
-        place = view.undistorted(pixels)
+        place = view.undistort(pixels)
         seen = ~np.isnan(place[..., :1])
-        table[first:end, :, :2] = np.where(seen, place * factor, BEYOND)
+        table[first:end, :, :2] = np.where(seen, place * factor, INVALID_COORDINATE)
         if steps:
             slope = view.lens.jacobian((np.where(seen, place, view.centre) - view.centre) / view.scale)
             back = np.linalg.inv(slope) * view.scale[:, None] / view.scale
@@ -115,27 +115,27 @@ def sample_places(view: View, factor: int, *, steps: bool) -> NDArray[np.float32
 
 def bounds(places: NDArray[np.float32]) -> Array:
     """Give the left, right, top and bottom of places, shape (..., 2); without any, what nothing is in."""
-    known = places[places[..., 0] < BEYOND]
+    known = places[places[..., 0] < INVALID_COORDINATE]
     if not len(known):
-        return np.array([BEYOND, -BEYOND, BEYOND, -BEYOND])
+        return np.array([INVALID_COORDINATE, -INVALID_COORDINATE, INVALID_COORDINATE, -INVALID_COORDINATE])
     (left, top), (right, bottom) = known.min(axis=0), known.max(axis=0)
     return np.array([left, right, top, bottom])
 
 
-def tiled(places: NDArray[np.float32], config: DrawingConfig) -> NDArray[np.float32]:
+def tiled_map(places: NDArray[np.float32], config: DrawingConfig) -> NDArray[np.float32]:
     """Arrange places in the bands and tiles of kernel 2, with bounds; shape (bands, vectors of each, lanes)."""
     rows, columns, planes = places.shape
     height, lines = config.band_rows * config.supersample, config.band_lines
     tile_height, tile_width = config.tile_height, config.tile_width
     bands, across = -(-rows // height), -(-columns // tile_width)
     padding = (0, bands * height - rows), (0, across * tile_width - columns), (0, 0)
-    cut = np.pad(places, padding, constant_values=BEYOND).reshape(bands, height, -1, planes)
-    cut = np.pad(cut, ((0, 0), (0, lines * tile_height - height), (0, 0), (0, 0)), constant_values=BEYOND)
+    cut = np.pad(places, padding, constant_values=INVALID_COORDINATE).reshape(bands, height, -1, planes)
+    cut = np.pad(cut, ((0, 0), (0, lines * tile_height - height), (0, 0), (0, 0)), constant_values=INVALID_COORDINATE)
     tiles = cut.reshape(bands, lines, tile_height, across, tile_width, planes).transpose(0, 1, 3, 5, 2, 4)
     tiles = tiles.reshape(bands, lines, across, planes, config.lanes)
     # Where a tile has no place, its bounds are far away too.
     least = tiles[..., :2, :].min(axis=-1)
-    most = np.where(tiles[..., :2, :] < BEYOND, tiles[..., :2, :], least[..., None]).max(axis=-1)
+    most = np.where(tiles[..., :2, :] < INVALID_COORDINATE, tiles[..., :2, :], least[..., None]).max(axis=-1)
     box = np.stack([least, most], axis=-1).reshape(bands, lines, across, 1, 4)
     box = np.pad(box, ((0, 0), (0, 0), (0, 0), (0, 0), (0, config.lanes - 4)))
     return np.concatenate([tiles, box], axis=3).reshape(bands, -1, config.lanes)

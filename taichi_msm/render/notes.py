@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.render import texture
-from taichi_msm.render.camera import View, moves, view_at
+from taichi_msm.render.camera import View, is_moving, view_at
 from taichi_msm.scene.render import Light
 from taichi_msm.scene.scene import Scene
 
 # A picture whose proportions differ from those of the sheet by this factor is visibly stretched.
-STRETCHED = 1.02
+ASPECT_TOLERANCE = 1.02
 
 # The radius of an instrument is rarely above this share of the sheet's larger side.
 WIDEST = 0.25
@@ -23,10 +23,10 @@ LARGEST_SHEET = 5.0
 
 # Whether a camera shows the sheet is found at so many places across and down. What is between them is a dot, as the
 # sheet is to a camera that is placed in millimetres.
-DOTS = 100
+SAMPLES_PER_SIDE = 100
 
 
-def drawing_notes(scene: Scene) -> Iterator[str]:
+def drawing_warnings(scene: Scene) -> Iterator[str]:
     """List warnings about how a scene is drawn, each in a line."""
     height, width = scene.sheet.size
     if max(height, width) > LARGEST_SHEET:
@@ -35,7 +35,7 @@ def drawing_notes(scene: Scene) -> Iterator[str]:
             f"[{height / 1000:g}, {width / 1000:g}]"
         )
     if scene.draws:
-        yield from _stretched(scene)
+        yield from _stretched_picture(scene)
         if texture.is_see_through(scene):
             yield (
                 f"the picture is see-through in parts, which show render.background: {list(scene.render.background)}"
@@ -43,7 +43,7 @@ def drawing_notes(scene: Scene) -> Iterator[str]:
         if scene.render.light != Light() and scene.render.shading != "tissue":
             yield f"render.light has no effect with shading: {scene.render.shading}; take render.shading: tissue"
     if scene.renders:
-        yield from _blind(scene)
+        yield from _invisible_sheet(scene)
     for index, probe in enumerate(scene.probes):
         if (instrument := probe.instrument) is None:
             continue
@@ -59,20 +59,20 @@ def drawing_notes(scene: Scene) -> Iterator[str]:
             )
 
 
-def _blind(scene: Scene) -> Iterator[str]:
+def _invisible_sheet(scene: Scene) -> Iterator[str]:
     """Warn of cameras that show nothing of the sheet at rest, or only a dot, in all frames."""
     rate = scene.time.frames_per_second
     for name in scene.render.all_cameras:
         camera = view_at(scene, 0.0, name)
-        middle = (np.arange(DOTS) + 0.5) / DOTS
-        places = camera.undistorted(np.stack(np.meshgrid(*(middle * side for side in camera.size)), axis=-1))
-        frames = range(scene.time.frames + 1 if moves(scene, name) else 1)
-        if not any(_shows(view_at(scene, frame / rate, name), places, scene.sheet.size) for frame in frames):
+        middle = (np.arange(SAMPLES_PER_SIDE) + 0.5) / SAMPLES_PER_SIDE
+        places = camera.undistort(np.stack(np.meshgrid(*(middle * side for side in camera.size)), axis=-1))
+        frames = range(scene.time.frames + 1 if is_moving(scene, name) else 1)
+        if not any(_is_visible(view_at(scene, frame / rate, name), places, scene.sheet.size) for frame in frames):
             key = f"render.cameras.{name}" if name else "render.camera"
             yield f"{key} shows nothing of the sheet at rest, or only a dot, in all frames; lengths are in metres"
 
 
-def _shows(camera: View, places: NDArray[np.float64], size: tuple[float, float]) -> bool:
+def _is_visible(camera: View, places: NDArray[np.float64], size: tuple[float, float]) -> bool:
     """Tell whether a camera shows a sheet of this height and width, at rest, at any of some places [px], (..., 2)."""
     try:
         # From the plane of the sheet to the picture, and back.
@@ -86,7 +86,7 @@ def _shows(camera: View, places: NDArray[np.float64], size: tuple[float, float])
     return bool((seen & (per_w * camera.near < 1)).any())
 
 
-def _stretched(scene: Scene) -> Iterator[str]:
+def _stretched_picture(scene: Scene) -> Iterator[str]:
     """Warn of a picture that is stretched onto the sheet, and name two remedies."""
     size = texture.image_size(scene)
     if size is None:
@@ -115,4 +115,4 @@ def _stretched(scene: Scene) -> Iterator[str]:
 
 
 def _fits(area: float, expected: float) -> bool:
-    return expected / STRETCHED < area < expected * STRETCHED
+    return expected / ASPECT_TOLERANCE < area < expected * ASPECT_TOLERANCE

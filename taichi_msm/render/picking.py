@@ -8,44 +8,44 @@ from numpy.typing import NDArray
 from taichi_msm.render.camera import View
 
 # How many cells are examined at a time.
-CELLS = 1024
+CELLS_PER_BATCH = 1024
 
 Array = NDArray[np.float64]
 Pixel = tuple[float, float]
-Place = tuple[float, float]
-Seen = tuple[float, Place]
+SheetCoordinates = tuple[float, float]
+Hit = tuple[float, SheetCoordinates]
 
 
-def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pixel) -> Place | None:
+def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pixel) -> SheetCoordinates | None:
     """Find the material point that is drawn at the centre of a pixel, on the nearest of the triangles there.
 
     The camera maps a point to (X, Y, w, depth). Then a = X - x w and b = Y - y w are linear in the point, and both are
     0 if it is seen at (x, y). This needs no division by w, which is 0 or negative behind the camera. Arguments are as
-    for `surface` and `View.sight`.
+    for `surface` and `View.centred_at`.
 
     Returns:
         Fractions of the sheet's width from its left and of its height from its top; None if no surface is there.
     """
     rows, cols = position.shape[:2]
-    sight = view.sight(pixel)
-    seen: list[Seen] = []
-    cells = np.argwhere(_may_show(position, sight))
-    for first in range(0, len(cells), CELLS):
-        i, j = cells[first : first + CELLS].T
+    centred_at = view.centred_at(pixel)
+    seen: list[Hit] = []
+    cells = np.argwhere(_cells_on_ray(position, centred_at))
+    for first in range(0, len(cells), CELLS_PER_BATCH):
+        i, j = cells[first : first + CELLS_PER_BATCH].T
         corners = np.stack([position[i + down, j + right] for down in (0, 1) for right in (0, 1)], axis=1)
-        seen += _in_cells(sight.project(corners), i, j, refine, view.near)
+        seen += _hits_in_cells(centred_at.project(corners), i, j, refine, view.near)
     if not seen:
         return None
     _, (across, down) = min(seen)
     return across / (cols - 1), down / (rows - 1)
 
 
-def on_rest_plane(view: View, pixel: Pixel) -> NDArray[np.floating] | None:
+def intersect_rest_plane(view: View, pixel: Pixel) -> NDArray[np.floating] | None:
     """Find x and y [m] where the line of sight through a pixel's centre meets the plane of the sheet at rest.
 
     None if they do not meet in front of the camera.
     """
-    matrix = view.sight(pixel).matrix
+    matrix = view.centred_at(pixel).matrix
     planar = matrix[:2, :2]
     size = np.linalg.norm(planar, axis=1).prod()
     if not abs(np.linalg.det(planar)) > 1e-9 * size:
@@ -54,11 +54,11 @@ def on_rest_plane(view: View, pixel: Pixel) -> NDArray[np.floating] | None:
     return point if matrix[2] @ [*point, 0, 1] > view.near else None
 
 
-def _may_show(position: NDArray[np.floating], sight: View) -> NDArray[np.bool_]:
+def _cells_on_ray(position: NDArray[np.floating], centred_at: View) -> NDArray[np.bool_]:
     """Mark the cells in which a and b can both be 0."""
     rows, cols = position.shape[:2]
     marked = np.ones((rows - 1, cols - 1), dtype=bool)
-    for row in sight.matrix[:2]:
+    for row in centred_at.matrix[:2]:
         # One number per point at a time: for a large sheet, all of them together do not fit into the cache.
         value = position @ row[:3] + row[3]
         for side in (value <= 0, value >= 0):
@@ -67,7 +67,7 @@ def _may_show(position: NDArray[np.floating], sight: View) -> NDArray[np.bool_]:
     return marked
 
 
-def _in_cells(corners: Array, i: NDArray[np.intp], j: NDArray[np.intp], refine: int, near: float) -> list[Seen]:
+def _hits_in_cells(corners: Array, i: NDArray[np.intp], j: NDArray[np.intp], refine: int, near: float) -> list[Hit]:
     """List what is seen of some cells at the pixel: each time the depth, and the place in cells from the top left."""
     parts = refine + 1
     share = np.arange(parts + 1) / parts
@@ -79,7 +79,7 @@ def _in_cells(corners: Array, i: NDArray[np.intp], j: NDArray[np.intp], refine: 
     least, most = quads[..., :2].min(axis=-2), quads[..., :2].max(axis=-2)
     cell, line, column = np.nonzero(((least <= 0) & (most >= 0)).all(axis=-1))
     quad = quads[cell, line, column]
-    seen: list[Seen] = []
+    seen: list[Hit] = []
     for third in (1, 2):  # the third corner, beside the two ends of the diagonal: upper right, lower left
         triangle = quad[:, [0, third, 3]]
         p, q, r = np.moveaxis(triangle[..., :2], 1, 0)

@@ -21,8 +21,8 @@ from taichi_msm.render.camera import View, view, view_at
 from taichi_msm.render.config import DrawingConfig
 from taichi_msm.render.cpu import Bands
 from taichi_msm.render.gpu import Threads
-from taichi_msm.render.labels import Observed, labels_of
-from taichi_msm.render.lens_table import sample_places
+from taichi_msm.render.labels import FrameOutputs, labels_of
+from taichi_msm.render.lens_table import undistortion_map
 from taichi_msm.render.shading import pyramid
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import lanes
@@ -60,7 +60,7 @@ def drawing_config(
     )
 
 
-class Drawing:
+class Rasterizer:
     """Draws one scene's sheet with a texture, shape (height, width, 3); call `runtime.start` first."""
 
     def __init__(self, scene: Scene, texture: NDArray[np.uint8], config: DrawingConfig | None = None) -> None:
@@ -81,17 +81,17 @@ class Drawing:
         assert picture is not None
         return picture
 
-    def look(self, position: NDArray[Any], camera: View | None = None, rods: Sequence[Rod] = ()) -> Observed:
+    def look(self, position: NDArray[Any], camera: View | None = None, rods: Sequence[Rod] = ()) -> FrameOutputs:
         """Draw the picture, the labels or both, as the config says, of points [m] at `position`, shape (rows, cols, 3).
 
         The scene's own camera is taken if none is given.
         """
-        self._sizes[uni.ROD_COUNT] = len(rods)
+        self._sizes[uni.CAPSULE_COUNT] = len(rods)
         camera = camera or self._view
-        numbers = self._numbers(camera, rods)
+        uniforms = self._numbers(camera, rods)
         self._place(camera)
-        picture, labels = self._form.draw(np.ascontiguousarray(position, np.float32), numbers, self._sizes)
-        return Observed(
+        picture, labels = self._form.draw(np.ascontiguousarray(position, np.float32), uniforms, self._sizes)
+        return FrameOutputs(
             np.ascontiguousarray(picture) if self.config.picture else None,
             labels_of(labels, self.scene.render.size) if self.config.labels else None,
         )
@@ -102,14 +102,14 @@ class Drawing:
             return
         if camera.optics != self._optics:
             self._optics = camera.optics
-            self._form.place(sample_places(camera, self.config.supersample, steps=self.config.place_steps))
+            self._form.place(undistortion_map(camera, self.config.supersample, steps=self.config.map_has_steps))
 
     def _numbers(self, camera: View, rods: Sequence[Rod]) -> NDArray[np.float32]:
         """Give the numbers of a view; without instruments they are computed again only when the camera changes."""
         if rods or self._known is None or self._known[0] is not camera:
             render, size = self.scene.render, self.scene.sheet.size
-            numbers = uni.view_numbers(camera, render, self.config.supersample, size, self._texture_size, rods)
+            uniforms = uni.view_numbers(camera, render, self.config.supersample, size, self._texture_size, rods)
             if rods:
-                return numbers.astype(np.float32)
-            self._known = camera, numbers.astype(np.float32)
+                return uniforms.astype(np.float32)
+            self._known = camera, uniforms.astype(np.float32)
         return self._known[1]

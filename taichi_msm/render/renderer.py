@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError, are_numbers, as_array, did_you_mean
 from taichi_msm.model.surface import Rod
-from taichi_msm.render.camera import View, moves, view, view_at
-from taichi_msm.render.labels import Flow, Labels, Observed, Sight, Stereo, track_grid
+from taichi_msm.render.camera import View, is_moving, view, view_at
+from taichi_msm.render.labels import Flow, FrameOutputs, Labels, Sight, Stereo, track_grid
 from taichi_msm.render.texture import load_texture
 from taichi_msm.scene.camera import Camera
 from taichi_msm.scene.render import PRESETS, Render
 from taichi_msm.scene.scene import Scene
 
 if TYPE_CHECKING:
-    from taichi_msm.render.rasterizer import Drawing
+    from taichi_msm.render.rasterizer import Rasterizer
 
 # A camera in one of the forms that a scene may have, or the name of one of its own; or a `View`, which was set up
 # already; None: the scene's main one.
@@ -50,7 +50,7 @@ class Renderer:
     def __init__(self, scene: Scene, texture: NDArray[np.uint8] | None = None) -> None:
         self._given = texture
         self._loaded: tuple[object, NDArray[np.uint8]] | None = None
-        self._drawings: dict[tuple[object, ...], Drawing] = {}
+        self._drawings: dict[tuple[object, ...], Rasterizer] = {}
         self.restart(scene)
 
     def restart(self, scene: Scene) -> None:
@@ -58,7 +58,7 @@ class Renderer:
         self._drawings.clear()
         self.scene, self.view = scene, view(scene)
         names = scene.render.all_cameras
-        self._moving = any(moves(scene, name) for name in names)
+        self._moving = any(is_moving(scene, name) for name in names)
         self._views = {name: self.view if name == scene.render.main else view_at(scene, 0.0, name) for name in names}
 
     def set_up(self, camera: CameraLike, time: float = 0.0) -> View:
@@ -105,9 +105,9 @@ class Renderer:
         on_sheet = points.dtype.kind == "f" and not ((points < 0) | (points > 1)).any()
         if points.shape != (height, width, 2) or not on_sheet:
             raise ArgumentError(f"before: take what `labels` gave for a picture of {width} x {height} pixels")
-        from taichi_msm.render.tracking import find_flow
+        from taichi_msm.render.tracking import compute_flow
 
-        return find_flow(self.scene, points, *shot)
+        return compute_flow(self.scene, points, *shot)
 
     def locate(self, coordinates: Array, shot: Shot) -> Sight:
         """Find where material points are seen, and whether anything hides them."""
@@ -120,13 +120,13 @@ class Renderer:
 
         return find(self.scene, points, *shot)
 
-    def observe(self, before: Labels | None, shot: Shot) -> Observed:
+    def observe(self, before: Labels | None, shot: Shot) -> FrameOutputs:
         """Give everything that the scene's output asks for; `before`: the labels of the frame before, if any."""
         scene = self.scene
         # Labels need one sample, at the pixel's centre; with several samples per pixel, none is there.
         together = scene.render.supersample == 1
         normals = "normals" in scene.output
-        observed = Observed()
+        observed = FrameOutputs()
         if scene.draws:
             labels = scene.labels_pixels and together
             observed = self._drawing(picture=True, labels=labels, normals=normals, camera=shot.view).look(*shot)
@@ -151,15 +151,15 @@ class Renderer:
 
     def _drawing(
         self, style: Render | None = None, *, picture: bool, labels: bool, camera: View, normals: bool = False
-    ) -> Drawing:
+    ) -> Rasterizer:
         key = self._key(style or self.scene.render, picture=picture, labels=labels, camera=camera, normals=normals)
         if key not in self._drawings:
-            from taichi_msm.render.rasterizer import Drawing, drawing_config
+            from taichi_msm.render.rasterizer import Rasterizer, drawing_config
 
             scene = self.scene if style is None else self.scene.model_copy(update={"render": style})
             texture = self._texture() if picture else np.zeros((1, 1, 3), np.uint8)
             config = drawing_config(scene, picture=picture, labels=labels, normals=normals, lens=camera.model)
-            self._drawings[key] = Drawing(scene, texture, config)
+            self._drawings[key] = Rasterizer(scene, texture, config)
         return self._drawings[key]
 
     def _key(

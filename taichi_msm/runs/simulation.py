@@ -26,7 +26,7 @@ from taichi_msm.load.check import checked
 from taichi_msm.load.resolve import resolve
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.surface import Surface, rods, surface, to_positions
-from taichi_msm.render.labels import Flow, Labels, Observed, Sight
+from taichi_msm.render.labels import Flow, FrameOutputs, Labels, Sight
 from taichi_msm.render.picking import pick
 from taichi_msm.render.renderer import Array, CameraLike, Renderer, Shot
 from taichi_msm.render.texture import require_texture
@@ -364,7 +364,7 @@ class Simulation:
         camera: CameraLike = None,
         positions: Array | None = None,
         time: float | None = None,
-    ) -> Observed:
+    ) -> FrameOutputs:
         """Give all that the scene's output asks for of a frame; `before`: the labels of the frame before, if any."""
         return self.renderer.observe(before, self._shot(camera, positions, time))
 

@@ -13,9 +13,9 @@ from taichi_msm.model.surface import rods
 from taichi_msm.render import tracking
 from taichi_msm.render.camera import view
 from taichi_msm.render.labels import Labels
-from taichi_msm.render.rasterizer import Drawing, drawing_config
+from taichi_msm.render.rasterizer import Rasterizer, drawing_config
 from taichi_msm.render.renderer import Renderer, Shot
-from taichi_msm.render.tracking import find, find_flow
+from taichi_msm.render.tracking import compute_flow, find
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system import launches
 from taichi_msm.system.runtime import Device
@@ -29,7 +29,7 @@ CAMERAS = pytest.mark.parametrize("camera", ["top", "oblique", NEAR], ids=["top"
 def look(made: Scene, position: Array) -> Labels:
     config = drawing_config(made, picture=False, labels=True)
     placed = rods(made, position, 0)
-    found = Drawing(made, np.zeros((1, 1, 3), np.uint8), config).look(position, rods=placed).labels
+    found = Rasterizer(made, np.zeros((1, 1, 3), np.uint8), config).look(position, rods=placed).labels
     assert found is not None
     return found
 
@@ -110,7 +110,7 @@ def test_what_is_seen_is_not_hidden_in_the_same_frame(device: Device) -> None:
         made = with_instruments(drawable(camera="oblique"))
         position = shape(made)
         seen = look(made, position).coordinates
-        found = find_flow(made, seen, position, view(made), rods(made, position, 0))
+        found = compute_flow(made, seen, position, view(made), rods(made, position, 0))
         sheet = ~np.isnan(seen[..., 0])
         assert np.abs(found.flow[sheet]).max() < 1e-3
         assert (found.flow[~sheet] == 1e10).all()
@@ -148,7 +148,7 @@ def test_a_sheet_that_is_shifted_flows_by_its_shift(device: Device) -> None:
     rest = rest_positions(made.sheet)
     seen = look(made, rest).coordinates
     # 200 px a metre.
-    found = find_flow(made, seen, rest + np.array([0.01, 0.02, -0.1]), view(made))
+    found = compute_flow(made, seen, rest + np.array([0.01, 0.02, -0.1]), view(made))
     np.testing.assert_allclose(found.flow, np.tile([2.0, -4.0], (60, 80, 1)), atol=1e-3)
     # The right two columns and the upper four rows leave the picture.
     gone = np.zeros((60, 80), bool)

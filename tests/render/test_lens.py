@@ -16,8 +16,8 @@ from taichi_msm.render import tracking
 from taichi_msm.render.camera import Lens, calibration, view
 from taichi_msm.render.labels import track_grid
 from taichi_msm.render.picking import pick
-from taichi_msm.render.rasterizer import Drawing, drawing_config
-from taichi_msm.render.tracking import find, find_flow
+from taichi_msm.render.rasterizer import Rasterizer, drawing_config
+from taichi_msm.render.tracking import compute_flow, find
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests import reference
@@ -158,7 +158,7 @@ def test_pictures_are_like_the_twins(lens: str, render: dict[str, Any], device: 
     for shape in (dented, folded):
         position = shape(made)
         placed = rods(made, position, 0)
-        drawn = Drawing(made, texture).draw(position, rods=placed)
+        drawn = Rasterizer(made, texture).draw(position, rods=placed)
         apart = difference(drawn, reference.draw(made, position, texture, placed))
         # As without a lens (test_drawing.py).
         assert (apart > 1).mean() < 0.005
@@ -214,7 +214,7 @@ def test_labels_are_on_the_ray_of_each_pixel(lens: str, shape: Any, device: Devi
     pose = np.array(calibration(view(made))["pose"])
     np.testing.assert_allclose(found.depth[sheet], points @ pose[2, :3] + pose[2, 3], rtol=1e-5)
     # Nothing moved: no flow, and nothing is hidden.
-    still = find_flow(made, found.coordinates, position, view(made), placed)
+    still = compute_flow(made, found.coordinates, position, view(made), placed)
     seen = ~np.isnan(found.coordinates[..., 0])
     assert np.abs(still.flow[seen]).max() < 0.01
     assert (still.occlusion > 0).sum() <= 3
@@ -249,10 +249,10 @@ def test_what_is_beyond_the_limit_is_outside_the_picture(device: Device) -> None
     assert not np.isnan(labels.coordinates[away < rim - 0.01]).any()
     assert np.isnan(labels.coordinates[away > rim]).all()
     assert (labels.depth[away > rim] == 0).all()
-    drawn = Drawing(made, speckle(9, 9)).draw(position)
+    drawn = Rasterizer(made, speckle(9, 9)).draw(position)
     assert (drawn[away > rim] == [10, 20, 30]).all()
     # Nor is there a second picture of what folds back.
-    moved = find_flow(made, labels.coordinates, position + np.array([0.05, 0, 0]), view(made))
+    moved = compute_flow(made, labels.coordinates, position + np.array([0.05, 0, 0]), view(made))
     gone: NDArray[np.bool_] = np.all(moved.flow > 1e9, axis=-1)
     assert (moved.occlusion[gone & ~np.isnan(labels.coordinates[..., 0])] == 255).all()
     assert gone[31, 68]
@@ -290,7 +290,7 @@ def test_a_lens_without_coefficients_has_the_bits_of_none(device: Device) -> Non
     plain, zero = drawable(camera=camera), drawable(camera={**camera, "distortion": {"k1": 0.0}})
     position, texture = dented(plain), speckle(13, 17)
     assert drawing_config(plain) == drawing_config(zero)
-    np.testing.assert_array_equal(Drawing(plain, texture).draw(position), Drawing(zero, texture).draw(position))
+    np.testing.assert_array_equal(Rasterizer(plain, texture).draw(position), Rasterizer(zero, texture).draw(position))
 
 
 @pytest.mark.parametrize(
