@@ -243,7 +243,7 @@ class View(NamedTuple):
         distance: from the eye to the target [m]; of a moving camera at the start.
         pinhole: whether the projection is perspective.
         lens: lens distortion; None if there is none.
-        baseline: signed distance to the reference camera of the stereo pair, along its x axis [m]; 0 without a pair.
+        baseline: distance to the companion camera of a stereo pair, along its x axis [m]; 0 without one.
         light_view: view of the camera that carries the light; None if it is this one.
     """
 
@@ -303,13 +303,13 @@ class View(NamedTuple):
         return self.centre + self.scale * self.lens.undistort((pixels - self.centre) / self.scale)
 
     def disparity(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the disparity to the reference camera of a rectified stereo pair, without lens distortion.
+        """Return the disparity between this camera and its companion of a stereo pair, both without lens distortion.
 
         Args:
             depth: depths [m], any shape; 0 where no surface is visible.
 
         Returns:
-            Displacement to the left [px], same shape; 0 where the depth is 0.
+            Displacement to the left in the companion's picture [px], same shape; 0 where the depth is 0.
         """
         w = np.where(depth == 0, np.inf, depth if self.pinhole else 1.0)
         return (self.scale[0] * self.baseline / w).astype(np.float32)

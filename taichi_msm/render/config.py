@@ -174,7 +174,7 @@ class Band(NamedTuple):
         config: compile-time configuration.
         samples: G-buffer; with lens distortion also the undistortion map.
         first: first entry of the band in `samples`, at the left edge of the picture.
-        across: tiles in a row.
+        tiles_across: number of tiles in a row.
         left, right: first column, and the column after the last one.
         top, bottom: first row, and the row after the last one.
         width, height: size of the picture.
@@ -186,7 +186,7 @@ class Band(NamedTuple):
     config: DrawingConfig
     samples: Any
     first: Any
-    across: Any
+    tiles_across: Any
     left: Any
     right: Any
     top: Any
@@ -195,7 +195,7 @@ class Band(NamedTuple):
     height: Any
     near: Any
     uniforms: Any
-    undistorted_centres: Any
+    map_start: Any
 
 
 @ti.func
@@ -283,7 +283,7 @@ def map_entry(entry, band: ti.template()):
         entry: first entry of the tile in the G-buffer.
         band: the band.
     """
-    return band.undistorted_centres + (entry - band.first) // band.config.planes * band.config.map_planes
+    return band.map_start + (entry - band.first) // band.config.planes * band.config.map_planes
 
 
 @ti.func

@@ -1,13 +1,13 @@
-"""Points and cells of the sheet as the camera sees them, for one sample or a vector of them, in f32 or f64.
+"""Projected mass points, cells and triangles, for one sample or a vector of samples, in f32 or f64.
 
-A point of the surface is represented by (X, Y, w, depth), the product of the camera's matrix and the point. That map is
-linear, so refining the projected mass points is the same as refining the surface, and perspective is no special case.
-In a cell, with s to the right and t down, the surface between the four mass points is
+A point of the surface is represented by (X, Y, w, depth), the product of the camera's matrix and the point. This map is
+linear, so subdividing the projected cells is the same as subdividing the surface, also in perspective. With s to the
+right and t down, the surface between the four mass points of a cell is
 
-    P(s, t) = A + B s + C t + D s t,    seen at sample (x, y) where    X - x w = 0,  Y - y w = 0.
+    P(s, t) = A + B s + C t + D s t,    projected to sample (x, y) where    X - x w = 0,  Y - y w = 0.
 
-It is cut into small quads, and these into triangles along the diagonal from top left to bottom right. Corners are
-listed row by row: upper left and right, lower left and right.
+A cell is divided into sub-quads, and each of these into two triangles along the diagonal from top left to bottom right.
+Corners are listed row by row: upper left and right, lower left and right.
 """
 
 from typing import Any, NamedTuple
@@ -17,96 +17,154 @@ from taichi_msm.render import uniforms as uni
 from taichi_msm.render.config import INFINITY
 from taichi_msm.system.runtime import ti
 
-# The numbers of a mass point: (X, Y, w, depth), its place in the picture [samples], at SEEN.
+# Numbers per mass point: X, Y, w, depth, and at SCREEN its x and y in the picture [samples].
 SCREEN, NODE_STRIDE = uni.SCREEN, 6
 
-# A triangle that is drawn by itself is enlarged a little, so that no gap is left beside it: by this fraction of its
-# side, and by this fraction of the picture's, which is what f32 resolves.
+# Triangles of cells that are not inverted are enlarged, to close the gaps between them: by this fraction of their side,
+# and by this fraction of the picture's side, the resolution of f32.
 ENLARGEMENT = 1e-5
 SCREEN_ENLARGEMENT = 2e-6
 
-# By this fraction of its size a triangle or a cell must be beyond an edge of the picture to be left out.
-BESIDE = 1e-3
-
-# In f32, a cell is drawn as a whole only if its outline stays within this distance [samples].
+# The bilinear map of a cell is inverted in f32 only if its outline is within this distance [samples].
 MAX_COORDINATE = float(1 << 16)
 
 
 class Outline(NamedTuple):
-    """A cell in the picture."""
+    """The projected corners of a cell, and their bounding box [samples].
 
-    x: Any  # of its corners, a list
+    Attributes:
+        x: x of the corners, a list.
+        y: y of the corners, a list.
+        left: left edge of the bounding box.
+        right: right edge of the bounding box.
+        top: top edge of the bounding box.
+        bottom: bottom edge of the bounding box.
+        facing: 1 if the front is visible, -1 for the back, 0 if the cell is folded.
+        in_front: whether all corners are in front of the near plane.
+        behind: whether all corners are behind it.
+    """
+
+    x: Any
     y: Any
-    left: Any  # its bounds
+    left: Any
     right: Any
     top: Any
     bottom: Any
-    facing: Any  # 1 where its front is seen, -1 where its back is, 0 if it is folded
-    in_front: Any  # whether all of its corners are in front of the camera
-    behind: Any  # whether none is
+    facing: Any
+    in_front: Any
+    behind: Any
 
 
 class Patch(NamedTuple):
-    """The surface between four mass points."""
+    """The bilinear surface between four mass points.
 
-    a: Any  # coefficients, each (X, Y, w, depth)
+    Attributes:
+        a: coefficient A, a vector (X, Y, w, depth).
+        b: coefficient B.
+        c: coefficient C.
+        d: coefficient D.
+        facing: as in `Outline`.
+        invertible: whether the cell is drawn by inverting the bilinear map, and not triangle by triangle.
+    """
+
+    a: Any
     b: Any
     c: Any
     d: Any
-    facing: Any  # as in its `Outline`
-    invertible: Any  # whether it is drawn as a whole, and not triangle by triangle
+    facing: Any
+    invertible: Any
 
 
 class Triangle(NamedTuple):
-    """The triangle P + R s + D t of a small quad that a sample is on; P, R and D are lists of X, Y, w and depth."""
+    """A triangle P + R s + D t of a sub-quad.
+
+    Attributes:
+        p: origin P, a list of X, Y, w and depth.
+        r: direction R, to the right.
+        d: direction D, down.
+        below: whether it is the triangle below the diagonal, where t > s.
+    """
 
     p: Any
     r: Any
     d: Any
-    below: Any  # whether it is the one below the diagonal, where t > s
+    below: Any
 
 
 @ti.func
 def project(position: ti.template(), i, j, cols, uniforms: ti.template(), nodes: ti.template(), double: ti.template()):
-    """Store the numbers of mass point (i, j); `double` tells that they are in f64, and summed in another order."""
-    here = (i * cols + j) * NODE_STRIDE
+    """Project a mass point, and store its numbers.
+
+    Args:
+        position: positions of the mass points [m], shape (rows, cols, 3).
+        i: row of the mass point.
+        j: column of the mass point.
+        cols: number of columns.
+        uniforms: numbers of the view.
+        nodes: destination, `NODE_STRIDE` numbers per mass point.
+        double: whether the numbers are f64, which are summed in a different order.
+    """
+    entry = (i * cols + j) * NODE_STRIDE
     x, y, z = position[i, j, 0], position[i, j, 1], position[i, j, 2]
     for n in ti.static(range(4)):
         row = uni.MATRIX + 4 * n
         if ti.static(double):
-            nodes[here + n] = uniforms[row + 3] + uniforms[row] * x + uniforms[row + 1] * y + uniforms[row + 2] * z
+            nodes[entry + n] = uniforms[row + 3] + uniforms[row] * x + uniforms[row + 1] * y + uniforms[row + 2] * z
         else:
-            nodes[here + n] = uniforms[row] * x + uniforms[row + 1] * y + uniforms[row + 2] * z + uniforms[row + 3]
-    nodes[here + SCREEN] = nodes[here] / nodes[here + 2]
-    nodes[here + SCREEN + 1] = nodes[here + 1] / nodes[here + 2]
+            nodes[entry + n] = uniforms[row] * x + uniforms[row + 1] * y + uniforms[row + 2] * z + uniforms[row + 3]
+    nodes[entry + SCREEN] = nodes[entry] / nodes[entry + 2]
+    nodes[entry + SCREEN + 1] = nodes[entry + 1] / nodes[entry + 2]
 
 
 @ti.func
 def w_at(depth, uniforms: ti.template()):
-    """Give w of points at a depth."""
+    """Return w at a depth.
+
+    Args:
+        depth: depth [m].
+        uniforms: numbers of the view.
+    """
     return depth * uniforms[uni.PINHOLE] + (1.0 - uniforms[uni.PINHOLE])
 
 
 @ti.func
 def line_of_sight(x, y, uniforms: ti.template()):
-    """Give how far points that are seen at (x, y) are to the right and above the axis of view, at w = 1 [m]."""
+    """Return the offsets of lines of sight from the optical axis at w = 1, to the right and up [m].
+
+    Args:
+        x: column of the undistorted samples.
+        y: row of the undistorted samples.
+        uniforms: numbers of the view.
+    """
     return (x - uniforms[uni.CENTRE_X]) * uniforms[uni.SPREAD_X], (uniforms[uni.CENTRE_Y] - y) * uniforms[uni.SPREAD_Y]
 
 
 @ti.func
 def corner_entry(cell, cols):
-    """Give the first number of a cell's upper left mass point."""
+    """Return the first entry of a cell's upper left mass point.
+
+    Args:
+        cell: index of the cell.
+        cols: number of columns of mass points.
+    """
     return (cell // (cols - 1) * cols + cell % (cols - 1)) * NODE_STRIDE
 
 
 @ti.func
 def cell_outline(corner, cols, near, nodes: ti.template()):
-    """Find the `Outline` of the cell whose upper left mass point has its numbers from `corner` on."""
+    """Return the `Outline` of a cell.
+
+    Args:
+        corner: first entry of the cell's upper left mass point.
+        cols: number of columns of mass points.
+        near: near plane [m].
+        nodes: projected mass points.
+    """
     below = corner + cols * NODE_STRIDE
     corners = ti.static((corner, corner + NODE_STRIDE, below, below + NODE_STRIDE))
-    x = [nodes[at + SCREEN] for at in corners]
-    y = [nodes[at + SCREEN + 1] for at in corners]
-    w = [nodes[at + 2] for at in corners]
+    x = [nodes[entry + SCREEN] for entry in corners]
+    y = [nodes[entry + SCREEN + 1] for entry in corners]
+    w = [nodes[entry + 2] for entry in corners]
     facing = facing_of(x, y)
     in_front = w[0] > near and w[1] > near and w[2] > near and w[3] > near
     behind = w[0] <= near and w[1] <= near and w[2] <= near and w[3] <= near
@@ -117,7 +175,7 @@ def cell_outline(corner, cols, near, nodes: ti.template()):
 
 @ti.func
 def is_invertible(outline: ti.template()):
-    """Tell whether a cell can be drawn as a whole in f32."""
+    """Return whether the bilinear map of a cell can be inverted in f32."""
     return (
         outline.in_front
         and outline.facing != 0
@@ -128,30 +186,56 @@ def is_invertible(outline: ti.template()):
 
 @ti.func
 def cell_patch(corner, cols, facing, invertible, nodes: ti.template(), double: ti.template()):
-    """Make the `Patch` of a cell; `double` tells that numbers are in f64, where D is summed in another order."""
+    """Return the `Patch` of a cell.
+
+    Args:
+        corner: first entry of the cell's upper left mass point.
+        cols: number of columns of mass points.
+        facing: as in `Outline`.
+        invertible: whether the cell is drawn by inverting its bilinear map.
+        nodes: projected mass points.
+        double: whether the numbers are f64, for which D is summed in a different order.
+    """
     below = corner + cols * NODE_STRIDE
     a = ti.Vector([nodes[corner + n] for n in ti.static(range(4))])
     right = ti.Vector([nodes[corner + NODE_STRIDE + n] for n in ti.static(range(4))])
     down = ti.Vector([nodes[below + n] for n in ti.static(range(4))])
-    far = ti.Vector([nodes[below + NODE_STRIDE + n] for n in ti.static(range(4))])
+    opposite = ti.Vector([nodes[below + NODE_STRIDE + n] for n in ti.static(range(4))])
     b, c = right - a, down - a
-    d = far - right - down + a if ti.static(double) else far - right - c
+    d = opposite - right - down + a if ti.static(double) else opposite - right - c
     return ti.static(Patch(a, b, c, d, facing, invertible))
 
 
 @ti.func
 def edge(p_x, p_y, q_x, q_y, x, y, facing):
-    """Twice the signed area of p, q and (x, y), times side, which is 1 or -1.
+    """Return twice the signed area of the triangle p, q, (x, y), times `facing`.
 
-    The sign tells on which side of the line (x, y) is. Both cells of an edge get the same bits, but for the sign.
+    Its sign is the side of the line p q on which (x, y) lies. Both cells of an edge compute the same bits up to the
+    sign.
+
+    Args:
+        p_x: x of the edge's first end [samples].
+        p_y: y of the edge's first end [samples].
+        q_x: x of the edge's second end [samples].
+        q_y: y of the edge's second end [samples].
+        x: column of the samples.
+        y: row of the samples.
+        facing: 1 or -1.
     """
-    right, down = (q_x - p_x) * facing, (q_y - p_y) * facing
-    return right * (y - p_y) - down * (x - p_x)
+    step_x, step_y = (q_x - p_x) * facing, (q_y - p_y) * facing
+    return step_x * (y - p_y) - step_y * (x - p_x)
 
 
 @ti.func
 def edges(x, y, facing, outline: ti.template()):
-    """Give `edge` for the left, right, upper and lower edge of a cell; none is negative where the cell is seen."""
+    """Return `edge` for the left, right, upper and lower edge of a cell; all are non-negative inside the cell.
+
+    Args:
+        x: column of the samples.
+        y: row of the samples.
+        facing: 1 if the front of the cell is visible, -1 for its back.
+        outline: outline of the cell.
+    """
     p, q = ti.static((outline.x, outline.y))
     return (
         edge(p[0], q[0], p[2], q[2], x, y, -facing),
@@ -163,13 +247,27 @@ def edges(x, y, facing, outline: ti.template()):
 
 @ti.func
 def turn(p_x, p_y, q_x, q_y, r_x, r_y):
-    """Twice the signed area of p, q and r: above 0 if the path from p over q to r turns right in the picture."""
+    """Return twice the signed area of a triangle: positive if the path from p over q to r turns right in the picture.
+
+    Args:
+        p_x: x of the first vertex.
+        p_y: y of the first vertex.
+        q_x: x of the second vertex.
+        q_y: y of the second vertex.
+        r_x: x of the third vertex.
+        r_y: y of the third vertex.
+    """
     return (q_x - p_x) * (r_y - q_y) - (q_y - p_y) * (r_x - q_x)
 
 
 @ti.func
 def facing_of(x: ti.template(), y: ti.template()):
-    """Tell which side of a cell is seen, given its corners: 1: front; -1: back; 0: both, as it is folded."""
+    """Return 1 if the front of a cell is visible, -1 for its back, 0 if it is folded and both are visible.
+
+    Args:
+        x: x of the corners, a list.
+        y: y of the corners, a list.
+    """
     turns = [
         turn(x[n], y[n], x[m], y[m], x[k], y[k]) for n, m, k in ti.static(((0, 1, 3), (1, 3, 2), (3, 2, 0), (2, 0, 1)))
     ]
@@ -178,10 +276,15 @@ def facing_of(x: ti.template(), y: ti.template()):
 
 
 @ti.func
-def find_quads(x, y, inside, parts, patch: ti.template()):
-    """Find column and line of the small quads of a patch that are seen at (x, y).
+def find_quads(x, y, inside, subdivisions, patch: ti.template()):
+    """Return column and row of the sub-quads of a patch at samples.
 
-    `inside` are those that it covers; `parts` is the number of small quads along its side.
+    Args:
+        x: column of the undistorted samples.
+        y: row of the undistorted samples.
+        inside: mask of the samples that the patch covers.
+        subdivisions: number of sub-quads along a side of the patch.
+        patch: the patch.
     """
     coefficients = ti.static((patch.a, patch.b, patch.c, patch.d))
     a_1, b_1, c_1, d_1 = [k[0] - x * k[2] for k in coefficients]
@@ -197,25 +300,32 @@ def find_quads(x, y, inside, parts, patch: ti.template()):
     s = ti.select(inside, -2.0 * ac / (linear + root), 0.0)
     t = ti.select(inside, -2.0 * ab / (ad - bc - root), 0.0)
     return (
-        ti.max(ti.min(ti.floor(s * parts), parts - 1.0), 0.0),
-        ti.max(ti.min(ti.floor(t * parts), parts - 1.0), 0.0),
+        ti.max(ti.min(ti.floor(s * subdivisions), subdivisions - 1.0), 0.0),
+        ti.max(ti.min(ti.floor(t * subdivisions), subdivisions - 1.0), 0.0),
     )
 
 
 @ti.func
-def triangle_at(x, y, column, line, part, lower, patch: ti.template()):
-    """Find the `Triangle` of a small quad that (x, y) is on; in a patch that is not whole, the `lower` or upper one.
+def triangle_at(x, y, quad_column, quad_row, quad_side, lower, patch: ti.template()):
+    """Return the `Triangle` of a sub-quad at samples.
 
-    The small quad is in this column and line of the cell, and `part` is its side as a fraction of the cell's.
+    Args:
+        x: column of the undistorted samples.
+        y: row of the undistorted samples.
+        quad_column: column of the sub-quad in the cell.
+        quad_row: row of the sub-quad in the cell.
+        quad_side: side of the sub-quad, as a fraction of the cell's.
+        lower: whether the triangle below the diagonal is returned, if the patch is not invertible.
+        patch: the patch.
     """
     a, b, c, d = ti.static((patch.a, patch.b, patch.c, patch.d))
-    s0 = column * part
-    t0 = line * part
+    s0 = quad_column * quad_side
+    t0 = quad_row * quad_side
     p = [a[n] + b[n] * s0 + (c[n] + d[n] * s0) * t0 for n in ti.static(range(4))]
-    # The small quad: P + R s + Q t + twist s t.
-    r = [(b[n] + d[n] * t0) * part for n in ti.static(range(4))]
-    q = [(c[n] + d[n] * s0) * part for n in ti.static(range(4))]
-    twist = d * (part * part)
+    # The sub-quad is P + R s + Q t + twist s t.
+    r = [(b[n] + d[n] * t0) * quad_side for n in ti.static(range(4))]
+    q = [(c[n] + d[n] * s0) * quad_side for n in ti.static(range(4))]
+    twist = d * (quad_side * quad_side)
     f_w = p[2] + r[2] + q[2] + twist[2]
     below = (
         (p[0] - x * p[2]) * (p[1] + r[1] + q[1] + twist[1] - y * f_w)
@@ -231,17 +341,31 @@ def triangle_at(x, y, column, line, part, lower, patch: ti.template()):
 
 @ti.func
 def on_triangle(x, y, triangle: ti.template()):
-    """Find (s, t) where the triangle is seen at (x, y)."""
+    """Return (s, t) of a triangle at samples.
+
+    Args:
+        x: column of the undistorted samples.
+        y: row of the undistorted samples.
+        triangle: the triangle.
+    """
     coefficients = ti.static((triangle.p, triangle.r, triangle.d))
     p_1, r_1, d_1 = [k[0] - x * k[2] for k in coefficients]
     p_2, r_2, d_2 = [k[1] - y * k[2] for k in coefficients]
-    share = 1.0 / (r_1 * d_2 - r_2 * d_1)
-    return (p_2 * d_1 - p_1 * d_2) * share, (p_1 * r_2 - p_2 * r_1) * share
+    inverse_determinant = 1.0 / (r_1 * d_2 - r_2 * d_1)
+    return (p_2 * d_1 - p_1 * d_2) * inverse_determinant, (p_1 * r_2 - p_2 * r_1) * inverse_determinant
 
 
 @ti.func
 def is_within(s, t, enlargement, near, triangle: ti.template()):
-    """Tell whether (s, t) is in a triangle that is enlarged by a fraction of its side, and in front of the camera."""
+    """Return whether (s, t) is in an enlarged triangle and in front of the near plane.
+
+    Args:
+        s: horizontal coordinate in the triangle.
+        t: vertical coordinate in the triangle.
+        enlargement: fraction of the side by which the triangle is enlarged.
+        near: near plane [m].
+        triangle: the triangle.
+    """
     larger = ti.select(triangle.below, t, s)
     smaller = ti.select(triangle.below, s, t)
     return (
@@ -254,13 +378,26 @@ def is_within(s, t, enlargement, near, triangle: ti.template()):
 
 @ti.func
 def depth_at(s, t, triangle: ti.template()):
-    """Give the depth of a triangle's plane at (s, t)."""
+    """Return the depth of a triangle's plane [m].
+
+    Args:
+        s: horizontal coordinate in the triangle.
+        t: vertical coordinate in the triangle.
+        triangle: the triangle.
+    """
     return triangle.p[3] + triangle.r[3] * s + triangle.d[3] * t
 
 
 @ti.func
 def facet(x, y, triangle: ti.template(), uniforms: ti.template()):
-    """Give the normal of a triangle on the side that is seen at (x, y), of any length, in OpenCV's axes, a list."""
+    """Return the normal of a triangle on its visible side, a list of three components of any length, in OpenCV's axes.
+
+    Args:
+        x: column of the undistorted samples.
+        y: row of the undistorted samples.
+        triangle: the triangle.
+        uniforms: numbers of the view.
+    """
     sides = [
         [
             (k[0] - k[2] * uniforms[uni.CENTRE_X]) * uniforms[uni.SPREAD_X],
@@ -272,44 +409,65 @@ def facet(x, y, triangle: ti.template(), uniforms: ti.template()):
     r, d = ti.static(sides)
     normal = [r[1] * d[2] - r[2] * d[1], r[2] * d[0] - r[0] * d[2], r[0] * d[1] - r[1] * d[0]]
     right, up = line_of_sight(x, y, uniforms)
-    along = (normal[0] * right - normal[1] * up) * uniforms[uni.PINHOLE] + normal[2]
-    toward = ti.select(along > 0.0, -1.0, 1.0)
-    return [normal[n] * toward for n in ti.static(range(3))]
+    cosine = (normal[0] * right - normal[1] * up) * uniforms[uni.PINHOLE] + normal[2]
+    sign = ti.select(cosine > 0.0, -1.0, 1.0)
+    return [normal[n] * sign for n in ti.static(range(3))]
 
 
 @ti.func
-def may_cover_rows(corner, at, cols, top, bottom, uniforms: ti.template(), nodes: ti.template()):
-    """Tell whether a cell may be seen between two rows of a picture that a lens has bent: what saves `distorted_cell_bounds`.
+def may_cover_rows(corner, distorted_entry, cols, top, bottom, uniforms: ti.template(), nodes: ti.template()):
+    """Return whether a cell may overlap rows of a picture with lens distortion; cheaper than `distorted_cell_bounds`.
 
-    The numbers of its upper left mass point begin at `corner`, and what `store_distorted` stored of it at `at`.
+    Args:
+        corner: first entry of the cell's upper left mass point.
+        distorted_entry: first entry of this mass point after distortion, as stored by `store_distorted`.
+        cols: number of columns of mass points.
+        top: top edge of the rows [samples].
+        bottom: bottom edge of the rows [samples].
+        uniforms: numbers of the view.
+        nodes: projected mass points.
     """
-    below, under = corner + cols * NODE_STRIDE, at + cols * lens_kernels.DISTORTED_STRIDE
-    bent_corners = ti.static((at, at + lens_kernels.DISTORTED_STRIDE, under, under + lens_kernels.DISTORTED_STRIDE))
-    within = [nodes[here + 2] for here in bent_corners]
-    seen = [nodes[here + 1] for here in bent_corners]
+    below, distorted_below = corner + cols * NODE_STRIDE, distorted_entry + cols * lens_kernels.DISTORTED_STRIDE
+    distorted_corners = ti.static(
+        (
+            distorted_entry,
+            distorted_entry + lens_kernels.DISTORTED_STRIDE,
+            distorted_below,
+            distorted_below + lens_kernels.DISTORTED_STRIDE,
+        )
+    )
+    within = [nodes[entry + 2] for entry in distorted_corners]
+    rows = [nodes[entry + 1] for entry in distorted_corners]
     corners = ti.static((corner, corner + NODE_STRIDE, below, below + NODE_STRIDE))
-    x = [nodes[here + SCREEN] for here in corners]
-    y = [nodes[here + SCREEN + 1] for here in corners]
+    x = [nodes[entry + SCREEN] for entry in corners]
+    y = [nodes[entry + SCREEN + 1] for entry in corners]
     longest = ti.max(
         lens_kernels.squared_side(x, y, 0, 1),
         lens_kernels.squared_side(x, y, 1, 3),
         lens_kernels.squared_side(x, y, 3, 2),
         lens_kernels.squared_side(x, y, 2, 0),
     )
-    far = uniforms[uni.SAGITTA_FACTOR] * longest + 2.0
-    lowest, highest = ti.max(seen[0], seen[1], seen[2], seen[3]), ti.min(seen[0], seen[1], seen[2], seen[3])
-    partly = within[0] + within[1] + within[2] + within[3] < 3.5
-    return partly or (lowest + far > top and highest - far < bottom)
+    margin = uniforms[uni.SAGITTA_FACTOR] * longest + 2.0
+    last_row, first_row = ti.max(rows[0], rows[1], rows[2], rows[3]), ti.min(rows[0], rows[1], rows[2], rows[3])
+    partly_valid = within[0] + within[1] + within[2] + within[3] < 3.5
+    return partly_valid or (last_row + margin > top and first_row - margin < bottom)
 
 
 @ti.func
-def distorted_cell_bounds(at, cols, outline: ti.template(), uniforms: ti.template(), nodes: ti.template()):
-    """Find the bounds of a cell in a picture that a lens has bent.
+def distorted_cell_bounds(distorted_entry, cols, outline: ti.template(), uniforms: ti.template(), nodes: ti.template()):
+    """Return the bounding box of a cell in a picture with lens distortion, as `lens_kernels.distorted_bounds`.
 
-    What `store_distorted` stored of its upper left mass point is at `at`, in a sheet of so many columns.
+    Args:
+        distorted_entry: first entry of the cell's upper left mass point, as stored by `store_distorted`.
+        cols: number of columns of mass points.
+        outline: outline of the cell without distortion.
+        uniforms: numbers of the view.
+        nodes: projected mass points.
     """
-    below = at + cols * lens_kernels.DISTORTED_STRIDE
-    corners = ti.static((at, at + lens_kernels.DISTORTED_STRIDE, below, below + lens_kernels.DISTORTED_STRIDE))
+    below = distorted_entry + cols * lens_kernels.DISTORTED_STRIDE
+    corners = ti.static(
+        (distorted_entry, distorted_entry + lens_kernels.DISTORTED_STRIDE, below, below + lens_kernels.DISTORTED_STRIDE)
+    )
     x, y = ti.static((outline.x, outline.y))
     longest = ti.max(
         lens_kernels.squared_side(x, y, 0, 1),
@@ -318,43 +476,61 @@ def distorted_cell_bounds(at, cols, outline: ti.template(), uniforms: ti.templat
         lens_kernels.squared_side(x, y, 2, 0),
     )
     within = nodes[corners[0] + 2] + nodes[corners[1] + 2] + nodes[corners[2] + 2] + nodes[corners[3] + 2] > 3.5
-    seen_x = [nodes[here] for here in corners]
-    seen_y = [nodes[here + 1] for here in corners]
-    return lens_kernels.distorted_bounds(x, y, seen_x, seen_y, within, longest, uniforms)
+    distorted_x = [nodes[entry] for entry in corners]
+    distorted_y = [nodes[entry + 1] for entry in corners]
+    return lens_kernels.distorted_bounds(x, y, distorted_x, distorted_y, within, longest, uniforms)
 
 
 @ti.func
 def is_off_screen(corners: ti.template(), left, right, top, bottom):
-    """Tell whether all between corners, some of which may be behind the camera, is beyond an edge of the picture.
+    """Return whether a polygon, possibly partly behind the camera, is beyond an edge of the picture.
 
-    X = x w is a plane for each edge x, behind the camera too; a point beyond it has a larger X, or a smaller one.
+    For each edge x of the picture, X = x w is a plane, also behind the camera; beyond it, X is larger or smaller.
+
+    Args:
+        corners: corners of the polygon, vectors (X, Y, w, ...).
+        left: left edge of the picture [samples].
+        right: right edge of the picture [samples].
+        top: top edge of the picture [samples].
+        bottom: bottom edge of the picture [samples].
     """
-    beside = False
-    for axis, way, edge in ti.static(((0, -1.0, left), (0, 1.0, right), (1, -1.0, top), (1, 1.0, bottom))):
-        beyond = [(k[axis] - edge * k[2]) * way for k in ti.static(corners)]
+    off_screen = False
+    for axis, sign, edge in ti.static(((0, -1.0, left), (0, 1.0, right), (1, -1.0, top), (1, 1.0, bottom))):
+        beyond = [(k[axis] - edge * k[2]) * sign for k in ti.static(corners)]
         size = ti.max(*[ti.abs(k[axis]) + ti.abs(edge * k[2]) for k in ti.static(corners)])
-        # By more than it is enlarged, and than f32 can tell.
-        beside = beside or ti.min(*beyond) > BESIDE * size
-    return beside
+        # The margin exceeds the enlargement and the resolution of f32.
+        off_screen = off_screen or ti.min(*beyond) > 1e-3 * size
+    return off_screen
 
 
 @ti.func
 def triangle_bounds(
-    column, line, lower, part, near, width, height,
+    quad_column, quad_row, lower, quad_side, near, width, height,
     patch: ti.template(), uniforms: ti.template(), lens: ti.template(),
 ):  # fmt: skip
-    """Find the bounds of a small triangle in a picture of this width and height; other arguments as for `triangle_at`.
+    """Return the bounding box of a triangle of a sub-quad in the picture.
 
-    `lens` is the model of the camera's lens, empty if it bends no lines.
+    Args:
+        quad_column: column of the sub-quad in the cell.
+        quad_row: row of the sub-quad in the cell.
+        lower: whether it is the triangle below the diagonal.
+        quad_side: side of the sub-quad, as a fraction of the cell's.
+        near: near plane [m].
+        width: width of the picture [samples].
+        height: height of the picture [samples].
+        patch: surface of the cell.
+        uniforms: numbers of the view.
+        lens: lens model; empty without lens distortion.
 
     Returns:
-        Least and largest x, least and largest y; and by what fraction of its side it is enlarged.
+        Least and largest x, least and largest y [samples]; and the fraction of its side by which the triangle is
+        enlarged.
     """
     a, b, c, d = ti.static((patch.a, patch.b, patch.c, patch.d))
     low_x, high_x, low_y, high_y = 0.0, ti.cast(width, ti.f32), -INFINITY, INFINITY
     enlargement = ENLARGEMENT
-    s0, t0 = column * part, line * part
-    s1, t1 = (column + 1) * part, (line + 1) * part
+    s0, t0 = quad_column * quad_side, quad_row * quad_side
+    s1, t1 = (quad_column + 1) * quad_side, (quad_row + 1) * quad_side
     p = a + b * s0 + (c + d * s0) * t0
     q = a + b * s1 + (c + d * s1) * t1
     r = a + b * s0 + (c + d * s0) * t1
@@ -368,16 +544,19 @@ def triangle_bounds(
         extent = ti.max(high_x - low_x, high_y - low_y, 1e-3)
         if ti.static(lens != ""):
             box = uni.VISIBLE
-            around = uniforms[box + 1] - uniforms[box] + uniforms[box + 3] - uniforms[box + 2]
-            enlargement += SCREEN_ENLARGEMENT * around / extent
+            perimeter = uniforms[box + 1] - uniforms[box] + uniforms[box + 3] - uniforms[box + 2]
+            enlargement += SCREEN_ENLARGEMENT * perimeter / extent
             x = [k[0] / k[2] for k in ti.static((p, q, r))]
             y = [k[1] / k[2] for k in ti.static((p, q, r))]
             longest = ti.max(
-                lens_kernels.squared_side(x, y, 0, 1), lens_kernels.facing(x, y, 1, 2), lens_kernels.facing(x, y, 2, 0)
+                lens_kernels.squared_side(x, y, 0, 1),
+                lens_kernels.squared_side(x, y, 1, 2),
+                lens_kernels.squared_side(x, y, 2, 0),
             )
-            seen = [lens_kernels.bent(x[n], y[n], uniforms, lens) for n in ti.static(range(3))]
+            distorted = [lens_kernels.distorted_point(x[n], y[n], uniforms, lens) for n in ti.static(range(3))]
             low_x, high_x, low_y, high_y = lens_kernels.distorted_bounds(
-                x, y, [one[0] for one in seen], [one[1] for one in seen], seen[0][2] and seen[1][2] and seen[2][2],
+                x, y, [vertex[0] for vertex in distorted], [vertex[1] for vertex in distorted],
+                distorted[0][2] and distorted[1][2] and distorted[2][2],
                 longest, uniforms,
             )  # fmt: skip
         else:

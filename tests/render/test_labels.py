@@ -15,7 +15,7 @@ from taichi_msm.render.camera import view
 from taichi_msm.render.labels import Labels
 from taichi_msm.render.rasterizer import Rasterizer, drawing_config
 from taichi_msm.render.renderer import Renderer, Shot
-from taichi_msm.render.tracking import compute_flow, find
+from taichi_msm.render.tracking import compute_flow, locate_points
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system import launches
 from taichi_msm.system.runtime import Device
@@ -76,7 +76,7 @@ def test_points_are_found_and_hidden_as_the_twin_says(shape: Any, refine: int, c
     made = drawable(camera=camera, refine=refine)
     position = shape(made)
     coordinates = np.random.default_rng(9).uniform(0, 1, (3000, 2)).astype(np.float32)
-    found = find(made, coordinates, position, view(made))
+    found = locate_points(made, coordinates, position, view(made))
     pixels, hidden = twin.find(made, coordinates.astype(float), position)
     np.testing.assert_array_equal(np.isnan(found.pixels), np.isnan(pixels))
     near = np.abs(pixels).max(axis=1) < 1e4
@@ -92,14 +92,14 @@ def test_on_a_gpu_the_same_points_are_found(shape: Any, device: Device, monkeypa
     made = with_instruments(drawable(camera="oblique", refine=2))
     position, coordinates = shape(made), np.random.default_rng(9).uniform(0, 1, (3000, 2)).astype(np.float32)
     placed = rods(made, position, 0)
-    expected = find(made, coordinates, position, view(made), placed)
+    expected = locate_points(made, coordinates, position, view(made), placed)
     monkeypatch.setattr(tracking, "lanes", lambda precision: 1)
-    assert find(made, coordinates[:0], position, view(made), placed).pixels.shape == (0, 2)
-    found = [find(made, coordinates, position, view(made), placed)]
+    assert locate_points(made, coordinates[:0], position, view(made), placed).pixels.shape == (0, 2)
+    found = [locate_points(made, coordinates, position, view(made), placed)]
     # Two cells in a launch.
     monkeypatch.setattr(launches, "MOST_ROUNDS", launches.SPARE + 2 * (1 + 2 * 3**2))
     monkeypatch.setattr(launches, "THREADS", 100)
-    found.append(find(made, coordinates, position, view(made), placed))
+    found.append(locate_points(made, coordinates, position, view(made), placed))
     for sight in found:
         np.testing.assert_array_equal(sight.pixels, expected.pixels)
         np.testing.assert_array_equal(sight.hidden, expected.hidden)
@@ -126,7 +126,7 @@ def test_an_instrument_hides_what_is_behind_it(device: Device) -> None:
     labels = look(made, position)
     down, across = np.meshgrid((np.arange(60) + 0.5) / 60, (np.arange(80) + 0.5) / 80, indexing="ij")
     points = np.stack([across, down], axis=-1).reshape(-1, 2)
-    found = find(made, points, position, view(made), placed)
+    found = locate_points(made, points, position, view(made), placed)
     # At rest, from the top, a point is seen where it is: 80 x 60 pixels of 0.4 m x 0.3 m.
     np.testing.assert_allclose(found.pixels, points * [80, 60], atol=1e-4)
     np.testing.assert_array_equal(found.hidden, (labels.instrument == 255).ravel())
@@ -170,7 +170,7 @@ def test_coordinates_at_an_edge_are_on_the_sheet(device: Device) -> None:
 
 def test_points_behind_the_eye_are_nowhere(device: Device) -> None:
     made = drawable(camera={"eye": [0, 0, 0.02], "target": [0, 1, 0.02], "up": [0, 0, 1], "fov": 90})
-    found = find(made, np.array([[0.5, 0.9], [0.5, 0.1]]), rest_positions(made.sheet), view(made))
+    found = locate_points(made, np.array([[0.5, 0.9], [0.5, 0.1]]), rest_positions(made.sheet), view(made))
     assert np.isnan(found.pixels[0]).all()
     assert np.isfinite(found.pixels[1]).all()
     assert found.hidden[0]

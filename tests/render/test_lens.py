@@ -17,7 +17,7 @@ from taichi_msm.render.camera import Lens, calibration, view
 from taichi_msm.render.labels import track_grid
 from taichi_msm.render.picking import pick
 from taichi_msm.render.rasterizer import Rasterizer, drawing_config
-from taichi_msm.render.tracking import compute_flow, find
+from taichi_msm.render.tracking import compute_flow, locate_points
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests import reference
@@ -231,7 +231,7 @@ def test_points_are_found_and_hidden_as_the_twin_says(
     coordinates = np.random.default_rng(9).uniform(0, 1, (2000, 2)).astype(np.float32)
     if lanes:
         monkeypatch.setattr(tracking, "lanes", lambda precision: lanes)
-    found = find(made, coordinates, position, view(made))
+    found = locate_points(made, coordinates, position, view(made))
     pixels, hidden = twin.find(made, coordinates.astype(float), position)
     np.testing.assert_allclose(found.pixels, pixels, atol=1e-4)
     np.testing.assert_array_equal(found.hidden, hidden)
@@ -256,7 +256,7 @@ def test_what_is_beyond_the_limit_is_outside_the_picture(device: Device) -> None
     gone: NDArray[np.bool_] = np.all(moved.flow > 1e9, axis=-1)
     assert (moved.occlusion[gone & ~np.isnan(labels.coordinates[..., 0])] == 255).all()
     assert gone[31, 68]
-    found = find(made, np.array([[0.5, 0.5], [0.99, 0.5]]), position, view(made))
+    found = locate_points(made, np.array([[0.5, 0.5], [0.99, 0.5]]), position, view(made))
     np.testing.assert_array_equal(np.isnan(found.pixels[:, 0]), [False, True])
     np.testing.assert_array_equal(found.hidden, [False, True])
 
@@ -268,7 +268,7 @@ def test_what_tangential_distortion_folds_back_is_outside_the_picture(device: De
     places, (height, width) = track_grid(100), made.sheet.size
     points = np.stack([(places[:, 0] - 0.5) * width, (0.5 - places[:, 1]) * height, np.zeros(len(places))], axis=-1)
     away = (view(made)._replace(lens=None).pixels(points) - [37.5, 31.5]) / [60, 62]
-    found = find(made, places, rest_positions(made.sheet), view(made))
+    found = locate_points(made, places, rest_positions(made.sheet), view(made))
     np.testing.assert_array_equal(np.isnan(found.pixels[:, 0]), ~(np.linalg.norm(away, axis=-1) < 1 / 0.3))
     assert 0.1 < np.isnan(found.pixels).mean() < 0.9
 

@@ -63,10 +63,10 @@ def test_nothing_is_drawn_before_every_mass_point_is_projected(device: Device) -
     made = scene(sheet={**SHEET, "points": [3, 4000]}, render={"size": [8, 32], "refine": 0})
     texture = speckle(16, 16)
     together, alone = Rasterizer(made, texture), Rasterizer(made, texture)
-    assert isinstance(together._form, Bands)
-    assert isinstance(alone._form, Bands)
-    alone._form._workers = 1
-    assert together._form._workers == 2
+    assert isinstance(together._backend, Bands)
+    assert isinstance(alone._backend, Bands)
+    alone._backend._workers = 1
+    assert together._backend._workers == 2
     position = rest_positions(made.sheet) * [1, -1, 1]
     for _ in range(40):
         together.draw(position - 1)
@@ -126,7 +126,7 @@ def test_what_passes_behind_the_camera_is_looked_for_only_where_it_may_be_seen(
         made = drawable((40, 40), camera=camera)
         position = rest_positions(made.sheet)
         Rasterizer(made, speckle(13, 17), drawing_config(made)._replace(lanes=1)).draw(position)
-        tracking.find(made, track_grid(2), position, view(made))
+        tracking.locate_points(made, track_grid(2), position, view(made))
     # The first stands over the sheet, so that a row of cells crosses the camera's plane. 2 x 3^2 triangles of each of
     # the 39 would be everywhere. All that the second could see is above the picture.
     assert max(lists) < 39

@@ -21,7 +21,7 @@ from taichi_msm.model.surface import rods
 from taichi_msm.render.camera import view
 from taichi_msm.render.labels import track_grid
 from taichi_msm.render.rasterizer import Rasterizer, drawing_config
-from taichi_msm.render.tracking import compute_flow, find
+from taichi_msm.render.tracking import compute_flow, locate_points
 from taichi_msm.runs.arrays import read_flo
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
@@ -192,7 +192,7 @@ def looks() -> dict[str, NDArray[Any]]:
     moved = position + np.array([0.002, 0.001, 0])
     seen["flow"], seen["occlusion"] = compute_flow(made, labels.coordinates, moved, view_now, rods(made, moved, 0))
     rough = position + np.random.default_rng(5).normal(0, 0.004, position.shape)
-    seen["pixels"], seen["hidden"] = find(made, track_grid(60), rough, view_now, placed)
+    seen["pixels"], seen["hidden"] = locate_points(made, track_grid(60), rough, view_now, placed)
     # One cell, larger than the picture, which is a single row.
     made = drawable((2, 2), size=[1400, 1], refine=0, supersample=4, camera={"eye": [0, 0, 1e-4]})
     seen["row"] = Rasterizer(made, texture).draw(rest_positions(made.sheet))
@@ -220,7 +220,9 @@ def bent_looks() -> dict[str, NDArray[Any]]:
         placed_then = rods(made, moved, 0)
         flow = compute_flow(made, drawn.labels.coordinates, moved, view_now, placed_then)
         seen[f"{model}_flow"], seen[f"{model}_occlusion"] = flow
-        seen[f"{model}_pixels"], seen[f"{model}_hidden"] = find(made, track_grid(60), position, view_now, placed)
+        seen[f"{model}_pixels"], seen[f"{model}_hidden"] = locate_points(
+            made, track_grid(60), position, view_now, placed
+        )
     return seen
 
 

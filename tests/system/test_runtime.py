@@ -267,7 +267,7 @@ def test_pictures_are_compiled_quickly_and_steps_are_not(monkeypatch: pytest.Mon
         seen.append(config.advanced_optimization)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(drawing._form, "_draw", draw)
+    monkeypatch.setattr(drawing._backend, "_draw", draw)
     with pytest.raises(KeyboardInterrupt):
         drawing.draw(rest_positions(made.sheet))
     assert [*seen, config.advanced_optimization] == [False, True]
