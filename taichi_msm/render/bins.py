@@ -82,25 +82,13 @@ def _build_in_parallel(launches: Launches, bounds: Any, cells: int, extent: tupl
         size *= 2
     total = int(ends[-1])
     counts, cell_ends = launches.give(np.zeros(columns * rows, np.int32)), launches.give(ends.astype(np.int32))
-    bin_of_entry, position_in_bin, entries = (launches.array(np.int32, max(1, total)) for _ in range(3))
+    bins, positions, entries = (launches.array(np.int32, max(1, total)) for _ in range(3))
     launches.launch(
-        _assign_entries,
-        total,
-        cells,
-        size,
-        columns,
-        bounds,
-        cell_ends,
-        counts,
-        bin_of_entry,
-        position_in_bin,
-        rounds=SEARCH_ROUNDS,
+        _assign_entries, total, cells, size, columns, bounds, cell_ends, counts, bins, positions, rounds=SEARCH_ROUNDS
     )
     lengths = launches.take(counts)
     starts = launches.give(np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32))
-    launches.launch(
-        _list_entries, total, cells, cell_ends, bin_of_entry, position_in_bin, starts, entries, rounds=SEARCH_ROUNDS
-    )
+    launches.launch(_list_entries, total, cells, cell_ends, bins, positions, starts, entries, rounds=SEARCH_ROUNDS)
     return Bins(size, columns, lengths.reshape(rows, columns), starts, entries)
 
 
@@ -201,7 +189,7 @@ def owner_of(item, owners, ends: ti.template()):
 @ti.kernel
 def _assign_entries(
     first: ti.i32, end: ti.i32, ended: Integers, cells: ti.i32, size: ti.i32, columns: ti.i32,
-    bounds: Integers, ends: Integers, counts: Integers, bin_of_entry: Integers, position_in_bin: Integers,
+    bounds: Integers, ends: Integers, counts: Integers, bins: Integers, positions: Integers,
 ):  # fmt: skip
     """Assign every entry to a bin and to a position in its list, and count the entries of each bin."""
     for entry in range(first, end):
@@ -209,17 +197,17 @@ def _assign_entries(
         left, right, top, bottom = _bin_range(cell, size, bounds)
         # The cell's entries are the last ones before its end.
         n = (right - left) * (bottom - top) + entry - ends[cell]
-        bin_of_entry[entry] = (top + n // (right - left)) * columns + left + n % (right - left)
-        position_in_bin[entry] = ti.atomic_add(counts[bin_of_entry[entry]], 1)
+        bins[entry] = (top + n // (right - left)) * columns + left + n % (right - left)
+        positions[entry] = ti.atomic_add(counts[bins[entry]], 1)
         end_thread(ended)
 
 
 @ti.kernel
 def _list_entries(
-    first: ti.i32, end: ti.i32, ended: Integers, cells: ti.i32, ends: Integers, bin_of_entry: Integers,
-    position_in_bin: Integers, starts: Integers, entries: Integers,
+    first: ti.i32, end: ti.i32, ended: Integers, cells: ti.i32, ends: Integers, bins: Integers,
+    positions: Integers, starts: Integers, entries: Integers,
 ):  # fmt: skip
     """Write the cell of every entry to its position."""
     for entry in range(first, end):
-        entries[starts[bin_of_entry[entry]] + position_in_bin[entry]] = owner_of(entry, cells, ends)
+        entries[starts[bins[entry]] + positions[entry]] = owner_of(entry, cells, ends)
         end_thread(ended)

@@ -48,6 +48,34 @@ FOLD_SAMPLES = 4096
 MIN_RADIUS = 1e-8
 
 
+# The oblique preset: 50 degrees above the sheet, from its lower edge, with a field of view in degrees.
+OBLIQUE_DIRECTION = np.array([0.0, -0.64, 0.77])
+OBLIQUE_FOV = 32.0
+OBLIQUE_MARGIN = 1.04
+
+# Distance of the near plane, as a fraction of the sheet's diagonal.
+NEAR = 1e-6
+
+# Kernels multiply the matrix by the samples along a pixel, in f32.
+MAX_MATRIX_ENTRY = float(np.finfo(np.float32).max) / MAX_SUPERSAMPLE
+
+# Maximum baseline of a stereo pair, in units of the sheet's larger side.
+MAX_BASELINE_RATIO = 1e6
+
+# Maximum time between the first two poses: in units of the scene's duration, if there are more than two; and always
+# [s].
+MAX_GAP_RATIO, MAX_GAP_S = 5, 1e5
+
+# Maximum deviation of a rotation matrix from orthonormality.
+ROTATION_TOLERANCE = 1e-3
+
+# The keys of a camera that do not affect its extrinsics.
+OPTICAL_KEYS = {"fov", "intrinsics", "distortion", "outside"}
+
+# Signs between the axes right, up, toward the camera and OpenCV's right, down, forward.
+OPENCV = np.array([[1.0], [-1.0], [-1.0]])
+
+
 class Lens(NamedTuple):
     """A lens distortion model and its coefficients.
 
@@ -195,31 +223,8 @@ def _positive_roots(polynomial: Polynomial) -> list[float]:
     return [float(root.real) for root in roots if root.real > 0 and abs(root.imag) <= 1e-9 * abs(root)]
 
 
-# The oblique preset: 50 degrees above the sheet, from its lower edge, with a field of view in degrees.
-OBLIQUE_DIRECTION = np.array([0.0, -0.64, 0.77])
-OBLIQUE_FOV = 32.0
-OBLIQUE_MARGIN = 1.04
-
-# Distance of the near plane, as a fraction of the sheet's diagonal.
-NEAR = 1e-6
-
-# Kernels multiply the matrix by the samples along a pixel, in f32.
-MAX_MATRIX_ENTRY = float(np.finfo(np.float32).max) / MAX_SUPERSAMPLE
-
-# Maximum baseline of a stereo pair, in units of the sheet's larger side.
-MAX_BASELINE_RATIO = 1e6
-
-# The first two of several poses are at most this many times the scene's duration apart, and of two this long [s].
-# Maximum time between the first two poses: relative to the scene's duration, and if there are only two [s].
-MAX_GAP_RATIO, MAX_GAP_S = 5, 1e5
-
-# Maximum deviation of a rotation matrix from orthonormality.
-ROTATION_TOLERANCE = 1e-3
-
+# The lens without distortion.
 IDENTITY_LENS = Lens(fisheye=False, coefficients=(0.0,) * 8)
-
-# The keys of a camera that do not affect its extrinsics.
-OPTICAL_KEYS = {"fov", "intrinsics", "distortion", "outside"}
 
 
 class View(NamedTuple):
@@ -485,12 +490,14 @@ def _place_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
     for time in [frame / rate for frame in range(scene.time.frames + 1)] if camera.moves else [0.0]:
         when = f" at {time:g} s" if camera.moves else ""
         if camera.eye is not None:
-            eye, target, up = (list(at_time(value, time)) for value in (camera.eye, camera.target, camera.up))
-            toward = unit(np.subtract(eye, target))
+            eye, target, up = (
+                list(interpolate_keyframes(value, time)) for value in (camera.eye, camera.target, camera.up)
+            )
+            toward = normalised(np.subtract(eye, target))
             if math.dist(eye, target) < SMALLEST:
                 yield Problem(("eye",), f"{eye} is also the target{when}; move one of them")
                 return
-            if not np.linalg.norm(np.cross(toward, unit(np.array(up)))) > 1e-9:
+            if not np.linalg.norm(np.cross(toward, normalised(np.array(up)))) > 1e-9:
                 message = f"{up} is zero or along the line of sight{when}; take a direction across it"
                 yield Problem(("up",), message)
                 return
@@ -651,10 +658,6 @@ def _oblique(scene: Scene) -> Camera:
     return Camera(eye=tuple(distance * toward), fov=OBLIQUE_FOV)
 
 
-# Signs between the axes right, up, toward the camera and OpenCV's right, down, forward.
-OPENCV = np.array([[1.0], [-1.0], [-1.0]])
-
-
 class Extrinsics(NamedTuple):
     """Position and orientation of a camera at a time.
 
@@ -688,11 +691,11 @@ def extrinsics(camera: Camera, time: float) -> Extrinsics:
         eye, rotation = _interpolate(camera.poses, time)
         return Extrinsics(eye, rotation.T * OPENCV, float(np.linalg.norm(eye)))
     assert camera.eye is not None
-    eye, target, up = (at_time(value, time) for value in (camera.eye, camera.target, camera.up))
-    return Extrinsics(np.array(eye), axes(eye, target, up), math.dist(eye, target))
+    eye, target, up = (interpolate_keyframes(value, time) for value in (camera.eye, camera.target, camera.up))
+    return Extrinsics(np.array(eye), look_at_axes(eye, target, up), math.dist(eye, target))
 
 
-def axes(eye: Sequence[float], target: Sequence[float], up: Sequence[float]) -> Array:
+def look_at_axes(eye: Sequence[float], target: Sequence[float], up: Sequence[float]) -> Array:
     """Return the look-at axes of a camera: unit vectors right, up and toward the eye, as rows, shape (3, 3).
 
     Args:
@@ -700,18 +703,18 @@ def axes(eye: Sequence[float], target: Sequence[float], up: Sequence[float]) -> 
         target: point in the centre of the picture [m].
         up: direction that appears vertical in the picture; any length, not along the line of sight.
     """
-    toward = unit(np.subtract(eye, target))
-    right = unit(np.cross(scaled(np.array(up)), toward))
+    toward = normalised(np.subtract(eye, target))
+    right = normalised(np.cross(rescaled(np.array(up)), toward))
     return np.stack([right, np.cross(toward, right), toward])
 
 
-def unit(vector: Array) -> Array:
+def normalised(vector: Array) -> Array:
     """Normalise a vector; the zero vector is returned unchanged."""
-    smaller = scaled(vector)
+    smaller = rescaled(vector)
     return smaller / (float(np.linalg.norm(smaller)) or 1.0)
 
 
-def scaled(vector: Array) -> Array:
+def rescaled(vector: Array) -> Array:
     """Multiply a vector by a power of 2, which is exact, so that its squares neither overflow nor vanish."""
     return np.ldexp(vector, -math.frexp(float(np.abs(vector).max()))[1])
 
@@ -722,7 +725,7 @@ def nearest_rotation(matrix: Array) -> Array:
     return np.asarray(left @ right)
 
 
-def at_time(value: Sequence[float] | Sequence[Sequence[float]], time: float) -> Sequence[float]:
+def interpolate_keyframes(value: Sequence[float] | Sequence[Sequence[float]], time: float) -> Sequence[float]:
     """Interpolate keyframes of a vector linearly; outside them it is constant.
 
     Args:

@@ -179,7 +179,7 @@ class Band(NamedTuple):
         top, bottom: first row, and the row after the last one.
         width, height: size of the picture.
         near: near plane [m]; only surfaces with a larger w are drawn.
-        uniforms: numbers of the view (uniforms.py).
+        uniforms: constants of the view (uniforms.py).
         map_start: first entry of the band's undistortion map in `samples`.
     """
 

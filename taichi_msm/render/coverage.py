@@ -33,6 +33,66 @@ from taichi_msm.render.lens_kernels import DISTORTED_STRIDE
 from taichi_msm.render.lens_table import INVALID_COORDINATE
 from taichi_msm.system.runtime import ti
 
+# Numbers per unit normal; the normals are stored after the other numbers of all mass points.
+NORMAL_STRIDE = 3
+
+# Maximum footprint: covers any texture [texels squared].
+MAX_FOOTPRINT = 1e12
+
+
+class DrawnSheet(NamedTuple):
+    """The projected mass points and the size of the sheet.
+
+    Attributes:
+        nodes: numbers of every mass point, `NODE_STRIDE` each, then the normals.
+        rows: number of rows of mass points.
+        cols: number of columns of mass points.
+        subdivisions: number of sub-quads along a side of a cell.
+        texture_width: width of the texture [texels].
+        texture_height: height of the texture [texels].
+        distorted_start: entry of `nodes` at which the distorted mass points begin, with lens distortion.
+    """
+
+    nodes: Any
+    rows: Any
+    cols: Any
+    subdivisions: Any
+    texture_width: Any
+    texture_height: Any
+    distorted_start: Any
+
+
+class Cell(NamedTuple):
+    """A cell and its position on the sheet and on the texture.
+
+    Attributes:
+        patch: surface of the cell.
+        i: row of the cell.
+        j: column of the cell.
+        rows: number of rows of cells of the sheet.
+        cols: number of columns of cells of the sheet.
+        texel_x: integer part of the texture coordinate of the upper left mass point, horizontal [texels].
+        texel_y: integer part of that coordinate, vertical [texels].
+        fraction_x: fractional part of that coordinate, horizontal.
+        fraction_y: fractional part of that coordinate, vertical.
+        texels_across: width of the cell [texels].
+        texels_down: height of the cell [texels].
+        normal: entry of the normal at the upper left mass point.
+    """
+
+    patch: Any
+    i: Any
+    j: Any
+    rows: Any
+    cols: Any
+    texel_x: Any
+    texel_y: Any
+    fraction_x: Any
+    fraction_y: Any
+    texels_across: Any
+    texels_down: Any
+    normal: Any
+
 
 class Part(NamedTuple):
     """The part of a cell that a thread of a GPU covers.
@@ -241,7 +301,7 @@ def intersect_capsule(x, y, index, uniforms: ti.template()):
         x: column of the undistorted samples.
         y: row of the undistorted samples.
         index: index of the instrument.
-        uniforms: numbers of the view.
+        uniforms: constants of the view.
 
     Returns:
         Depth of the first intersection [m], INFINITY without one; three components of the normal times the radius.
@@ -348,67 +408,6 @@ def cover_capsules(count, band: ti.template()):
                         cover_tile_with_capsule(entry, x, y, index, band)
 
 
-# Numbers per unit normal; the normals are stored after the other numbers of all mass points.
-NORMAL_STRIDE = 3
-
-# Maximum footprint: covers any texture [texels squared].
-MAX_FOOTPRINT = 1e12
-
-
-class DrawnSheet(NamedTuple):
-    """The projected mass points and the size of the sheet.
-
-    Attributes:
-        nodes: numbers of every mass point, `NODE_STRIDE` each, then the normals.
-        rows: number of rows of mass points.
-        cols: number of columns of mass points.
-        subdivisions: number of sub-quads along a side of a cell.
-        texture_width: width of the texture [texels].
-        texture_height: height of the texture [texels].
-        distorted_start: entry of `nodes` at which the distorted mass points begin, with lens distortion.
-    """
-
-    nodes: Any
-    rows: Any
-    cols: Any
-    subdivisions: Any
-    texture_width: Any
-    texture_height: Any
-    distorted_start: Any
-
-
-class Cell(NamedTuple):
-    """A cell and its position on the sheet and on the texture.
-
-    Attributes:
-        patch: surface of the cell.
-        i: row of the cell.
-        j: column of the cell.
-        rows: number of rows of cells of the sheet.
-        cols: number of columns of cells of the sheet.
-        texel_x: integer part of the texture coordinate of the upper left mass point, horizontal [texels].
-        texel_y: integer part of that coordinate, vertical [texels].
-        fraction_x: fractional part of that coordinate, horizontal.
-        fraction_y: fractional part of that coordinate, vertical.
-        texels_across: width of the cell [texels].
-        texels_down: height of the cell [texels].
-        normal: entry of the normal at the upper left mass point.
-    """
-
-    patch: Any
-    i: Any
-    j: Any
-    rows: Any
-    cols: Any
-    texel_x: Any
-    texel_y: Any
-    fraction_x: Any
-    fraction_y: Any
-    texels_across: Any
-    texels_down: Any
-    normal: Any
-
-
 @ti.func
 def cell_at(i, j, patch: ti.template(), sheet: ti.template()):
     """Return the cell with a mass point as its upper left corner.
@@ -461,7 +460,7 @@ def store_normal(
         rows: number of rows of mass points.
         cols: number of columns of mass points.
         config: compile-time configuration.
-        uniforms: numbers of the view.
+        uniforms: constants of the view.
         nodes: destination, after the numbers of all mass points.
     """
     if ti.static(config.headlit or config.tissue):
@@ -522,7 +521,7 @@ def headlight(normal: ti.template(), uniforms: ti.template()):
 
     Args:
         normal: list of three components, of any length.
-        uniforms: numbers of the view.
+        uniforms: constants of the view.
     """
     length = ti.sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2])
     light = uni.HEADLIGHT

@@ -14,7 +14,7 @@ from taichi_msm.render import uniforms as uni
 from taichi_msm.render.config import INFINITY, Band, Bytes, DrawingConfig, Floats, Integers, clear_tile
 from taichi_msm.render.coverage import NORMAL_STRIDE, DrawnSheet, cover_capsules, cover_cell, store_normal
 from taichi_msm.render.geometry import NODE_STRIDE, SCREEN, may_cover_rows, project
-from taichi_msm.render.labels import label_numbers
+from taichi_msm.render.labels import label_width
 from taichi_msm.render.lens_kernels import DISTORTED_STRIDE, store_distorted
 from taichi_msm.render.lens_table import bounds, tiled_map
 from taichi_msm.render.shading import Appearance, PixelArrays, resolve
@@ -67,7 +67,7 @@ class Bands:
 
         Args:
             position: positions of the mass points [m], shape (rows, cols, 3).
-            uniforms: numbers of the view (uniforms.py).
+            uniforms: constants of the view (uniforms.py).
             sizes: sizes and counters (uniforms.py).
 
         Returns:
@@ -81,7 +81,7 @@ class Bands:
         # Without labels the argument is unused; passing an array of Taichi takes half the time of a NumPy array.
         labels: Any = self._nodes
         if config.labels:
-            labels = np.zeros(label_numbers(normals=config.normals) * width * height, np.float32)
+            labels = np.zeros(label_width(normals=config.normals) * width * height, np.float32)
         sizes[[uni.ROWS_TAKEN, uni.ROWS_PROJECTED, uni.BANDS_TAKEN]] = 0
         with our_compilation(optimised=False):
             self._draw(
@@ -108,7 +108,7 @@ def project_row(
         rows: number of rows of mass points.
         cols: number of columns of mass points.
         config: compile-time configuration.
-        uniforms: numbers of the view.
+        uniforms: constants of the view.
         nodes: destination.
     """
     first_row, last_row = INFINITY, -INFINITY
@@ -143,7 +143,7 @@ def project_all(
         rows: number of rows of mass points.
         cols: number of columns of mass points.
         config: compile-time configuration.
-        uniforms: numbers of the view.
+        uniforms: constants of the view.
         sizes: sizes and counters.
         nodes: destination.
     """

@@ -100,7 +100,7 @@ def project(position: ti.template(), i, j, cols, uniforms: ti.template(), nodes:
         i: row of the mass point.
         j: column of the mass point.
         cols: number of columns.
-        uniforms: numbers of the view.
+        uniforms: constants of the view.
         nodes: destination, `NODE_STRIDE` numbers per mass point.
         double: whether the numbers are f64, which are summed in a different order.
     """
@@ -122,7 +122,7 @@ def w_at(depth, uniforms: ti.template()):
 
     Args:
         depth: depth [m].
-        uniforms: numbers of the view.
+        uniforms: constants of the view.
     """
     return depth * uniforms[uni.PINHOLE] + (1.0 - uniforms[uni.PINHOLE])
 
@@ -134,7 +134,7 @@ def line_of_sight(x, y, uniforms: ti.template()):
     Args:
         x: column of the undistorted samples.
         y: row of the undistorted samples.
-        uniforms: numbers of the view.
+        uniforms: constants of the view.
     """
     return (x - uniforms[uni.CENTRE_X]) * uniforms[uni.SPREAD_X], (uniforms[uni.CENTRE_Y] - y) * uniforms[uni.SPREAD_Y]
 
@@ -396,7 +396,7 @@ def facet(x, y, triangle: ti.template(), uniforms: ti.template()):
         x: column of the undistorted samples.
         y: row of the undistorted samples.
         triangle: the triangle.
-        uniforms: numbers of the view.
+        uniforms: constants of the view.
     """
     sides = [
         [
@@ -424,7 +424,7 @@ def may_cover_rows(corner, distorted_entry, cols, top, bottom, uniforms: ti.temp
         cols: number of columns of mass points.
         top: top edge of the rows [samples].
         bottom: bottom edge of the rows [samples].
-        uniforms: numbers of the view.
+        uniforms: constants of the view.
         nodes: projected mass points.
     """
     below, distorted_below = corner + cols * NODE_STRIDE, distorted_entry + cols * lens_kernels.DISTORTED_STRIDE
@@ -461,7 +461,7 @@ def distorted_cell_bounds(distorted_entry, cols, outline: ti.template(), uniform
         distorted_entry: first entry of the cell's upper left mass point, as stored by `store_distorted`.
         cols: number of columns of mass points.
         outline: outline of the cell without distortion.
-        uniforms: numbers of the view.
+        uniforms: constants of the view.
         nodes: projected mass points.
     """
     below = distorted_entry + cols * lens_kernels.DISTORTED_STRIDE
@@ -519,7 +519,7 @@ def triangle_bounds(
         width: width of the picture [samples].
         height: height of the picture [samples].
         patch: surface of the cell.
-        uniforms: numbers of the view.
+        uniforms: constants of the view.
         lens: lens model; empty without lens distortion.
 
     Returns:

@@ -26,7 +26,7 @@ from taichi_msm.render.geometry import (
     project,
     triangle_bounds,
 )
-from taichi_msm.render.labels import label_numbers
+from taichi_msm.render.labels import label_width
 from taichi_msm.render.lens_kernels import DISTORTED_STRIDE, store_distorted
 from taichi_msm.render.shading import Appearance, PixelArrays, resolve
 from taichi_msm.system.launches import THREADS, Launches, end_thread
@@ -70,7 +70,7 @@ class Threads:
             config.float_vector, height * config.supersample * samples_across * config.map_planes + strip
         )
         self._colours = launches.array(np.uint8, 3 * width * height if config.picture else 1)
-        label_count = label_numbers(normals=config.normals) if config.labels else 0
+        label_count = label_width(normals=config.normals) if config.labels else 0
         self._labels = launches.array(np.float32, max(label_count * width * height, 1))
 
     def set_undistortion_map(self, table: NDArray[np.float32]) -> None:
@@ -84,7 +84,7 @@ class Threads:
 
         Args:
             position: positions of the mass points [m], shape (rows, cols, 3).
-            uniforms: numbers of the view (uniforms.py).
+            uniforms: constants of the view (uniforms.py).
             sizes: sizes and counters (uniforms.py).
 
         Returns:
@@ -155,7 +155,7 @@ def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable
 
         Args:
             position: positions of the mass points [m], shape (rows, cols, 3).
-            uniforms: numbers of the view.
+            uniforms: constants of the view.
             sizes: sizes and counters.
             nodes: projected mass points, written.
             pieces: number of pieces of each cell, written.
@@ -192,7 +192,7 @@ def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable
             end: part after the last one.
             ended: counter of finished threads.
             pieces_per_part: maximum number of pieces in a part.
-            uniforms: numbers of the view.
+            uniforms: constants of the view.
             sizes: sizes and counters.
             ends: cumulative number of parts up to and including each cell.
             nodes: projected mass points.
@@ -258,7 +258,7 @@ def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callab
             listed: position in the lists of the first part.
             count: number of parts.
             pieces_per_part: maximum number of pieces in a part.
-            uniforms: numbers of the view.
+            uniforms: constants of the view.
             sizes: sizes and counters.
             nodes: projected mass points.
             pieces: number of pieces of each cell.
@@ -306,7 +306,7 @@ def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callab
             end: pixel after the last one.
             ended: counter of finished threads.
             row: first row of pixels of the strip.
-            uniforms: numbers of the view.
+            uniforms: constants of the view.
             sizes: sizes and counters.
             texels: levels of the texture.
             samples: undistortion map and G-buffer.

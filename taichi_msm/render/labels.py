@@ -14,18 +14,18 @@ NO_FLOW = 1e10
 
 
 class Labels(NamedTuple):
-    """What each pixel of a frame shows at its centre.
+    """Ground-truth labels of the pixels of a frame, at their centres.
 
     Attributes:
-        coordinates: of the material point, fractions of the sheet's width from its left and of its height from its top,
-            shape (height, width, 2); NaN where no sheet is seen.
-        depth: distance from the eye along the direction of view [m], shape (height, width); 0 where nothing is seen.
-            The orthographic camera's eye is as far above the sheet at rest as the sheet's larger side is long; what
-            is above the eye has a depth below 0.
-        instrument: 255 where an instrument is seen, else 0, shape (height, width).
-        normals: unit, of the drawn triangle or the instrument's surface, toward the camera, in OpenCV's axes of the
-            camera (x right, y down, z forward), shape (height, width, 3); NaN where nothing is seen. Of a frame that
-            is observed for a scene whose output has no normals: of shape (0, 0, 3).
+        coordinates: coordinates of the material point, as fractions of the sheet's width from its left and of its
+            height from its top, shape (height, width, 2); NaN where no sheet is visible.
+        depth: distance from the eye along the optical axis [m], shape (height, width); 0 where nothing is visible. The
+            orthographic camera's eye is above the sheet at rest by the length of its larger side; surfaces above the
+            eye have a negative depth.
+        instrument: 255 where an instrument is visible, else 0, shape (height, width).
+        normals: unit normals of the drawn triangle or the instrument's surface, toward the camera, in OpenCV's axes of
+            the camera (x right, y down, z forward), shape (height, width, 3); NaN where nothing is visible. Shape (0,
+            0, 3) in the outputs of a scene that does not request normals.
     """
 
     coordinates: NDArray[np.float32]
@@ -67,7 +67,7 @@ LABELS = _consecutive(
 )
 
 
-def label_numbers(*, normals: bool) -> int:
+def label_width(*, normals: bool) -> int:
     """Return the number of values per pixel, with or without normals."""
     return LABELS["normals"].offset + normals * len(LABELS["normals"].planes)
 
@@ -111,13 +111,13 @@ def labels_of(numbers: NDArray[np.float32], size: tuple[int, int]) -> Labels:
 
 
 class Flow(NamedTuple):
-    """How the material that one frame shows moves in the picture from this frame to another.
+    """Optical flow from one frame to another, in the pixels of the first one.
 
     Attributes:
-        flow: to the right and down [px], shape (height, width, 2); NO_FLOW where no sheet is seen, and where the
-            material goes behind the eye.
-        occlusion: 255 where the sheet is seen in the first frame, but in the other something is in front of it or it
-            is outside the picture; else 0; shape (height, width).
+        flow: displacement of the material to the right and down [px], shape (height, width, 2); NO_FLOW where no sheet
+            is visible, and where the material moves behind the eye.
+        occlusion: 255 where the sheet is visible in the first frame, but hidden or outside the picture in the second
+            one; else 0; shape (height, width).
     """
 
     flow: NDArray[np.float32]
@@ -136,11 +136,11 @@ class Stereo(NamedTuple):
 
 
 class Sight(NamedTuple):
-    """Where material points are seen.
+    """Pixels and occlusion of material points.
 
     Attributes:
         pixels: x to the right and y down from the picture's upper left corner [px], shape (n, 2); NaN behind the eye.
-        hidden: whether something is in front of a point, or it is outside the picture, shape (n,).
+        hidden: whether a point is occluded or outside the picture, shape (n,).
     """
 
     pixels: NDArray[np.float32]

@@ -40,7 +40,7 @@ def distorted_point(x, y, uniforms: ti.template(), lens: ti.template()):
     Args:
         x: column of the undistorted point [samples].
         y: row of the undistorted point [samples].
-        uniforms: numbers of the view.
+        uniforms: constants of the view.
         lens: lens model, "pinhole" or "fisheye".
 
     Returns:
@@ -82,7 +82,7 @@ def store_distorted(distorted_entry, entry, uniforms: ti.template(), nodes: ti.t
     Args:
         distorted_entry: destination in `nodes`, `DISTORTED_STRIDE` numbers.
         entry: first entry of the projected mass point in `nodes`.
-        uniforms: numbers of the view.
+        uniforms: constants of the view.
         nodes: projected mass points.
         lens: lens model, "pinhole" or "fisheye".
     """
@@ -118,7 +118,7 @@ def distorted_bounds(
         distorted_y: y of the distorted vertices, a list [samples].
         is_valid: whether all vertices are within the radius of the lens.
         squared_length: square of the longest side [samples^2].
-        uniforms: numbers of the view.
+        uniforms: constants of the view.
 
     Returns:
         Least and largest x, least and largest y [samples]; an empty box, with the largest below the least, if the

@@ -127,10 +127,10 @@ class Rasterizer:
             )
 
     def _uniforms(self, camera: View, rods: Sequence[Rod]) -> NDArray[np.float32]:
-        """Return the numbers of a view; without instruments they are cached until the camera changes."""
+        """Return the uniforms of a view; without instruments they are cached until the camera changes."""
         if rods or self._cached is None or self._cached[0] is not camera:
             render, size = self.scene.render, self.scene.sheet.size
-            uniforms = uni.view_numbers(camera, render, self.config.supersample, size, self._texture_size, rods)
+            uniforms = uni.view_uniforms(camera, render, self.config.supersample, size, self._texture_size, rods)
             if rods:
                 return uniforms.astype(np.float32)
             self._cached = camera, uniforms.astype(np.float32)

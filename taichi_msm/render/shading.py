@@ -31,6 +31,28 @@ from taichi_msm.render.labels import label_channels
 from taichi_msm.system.runtime import ti
 
 
+class Appearance(NamedTuple):
+    """The texture of the sheet, and the light and the instruments.
+
+    Attributes:
+        config: compile-time configuration.
+        texels: levels of the texture, as returned by `pyramid`.
+        sizes: sizes and counters.
+        width: width of the first level [texels].
+        height: height of the first level [texels].
+        uniforms: constants of the view.
+        capsule_count: number of instruments.
+    """
+
+    config: DrawingConfig
+    texels: Any
+    sizes: Any
+    width: Any
+    height: Any
+    uniforms: Any
+    capsule_count: Any
+
+
 class PixelArrays(NamedTuple):
     """The output arrays of the kernel.
 
@@ -240,7 +262,7 @@ def illuminate(x, y, depth, normal: ti.template(), uniforms: ti.template()):
         y: row of the undistorted samples.
         depth: depth [m].
         normal: list of three components.
-        uniforms: numbers of the view.
+        uniforms: constants of the view.
 
     Returns:
         N L; M V; d0 / d; the upward component of the direction of ideal reflection of V.
@@ -290,7 +312,7 @@ def light_transmission(x, y, depth, capsule_count, uniforms: ti.template(), conf
         y: row of the undistorted samples.
         depth: depth [m].
         capsule_count: number of instruments.
-        uniforms: numbers of the view.
+        uniforms: constants of the view.
         config: compile-time configuration.
     """
     offset_x, offset_y = line_of_sight(x, y, uniforms)
@@ -317,7 +339,7 @@ def apply_relief(normal: ti.template(), slope_x, slope_y, uniforms: ti.template(
         normal: list of three components.
         slope_x: rise of the grey level per texel, to the right.
         slope_y: rise of the grey level per texel, downward.
-        uniforms: numbers of the view.
+        uniforms: constants of the view.
     """
     n_x, n_y, n_z = ti.static((normal[0], normal[1], normal[2]))
     length = 1.0 / ti.max(ti.sqrt(n_x * n_x + n_y * n_y + n_z * n_z), 1e-30)
@@ -378,7 +400,7 @@ def light_metal(x, y, depth, normal: ti.template(), uniforms: ti.template()):
         y: row of the undistorted samples.
         depth: depth [m].
         normal: list of three components.
-        uniforms: numbers of the view.
+        uniforms: constants of the view.
 
     Returns:
         Red, green and blue.
@@ -390,28 +412,6 @@ def light_metal(x, y, depth, normal: ti.template(), uniforms: ti.template()):
     share = uni.METAL_AMBIENT + uni.METAL_DIFFUSE * ti.max(cosine, 0.0) + uni.METAL_MIRROR * brightness * brightness
     gloss = specular(mirror) * (255.0 * uni.METAL_GLOSS)
     return [ti.min(share * uni.METAL[n] + gloss, 255.0) for n in ti.static(range(3))]
-
-
-class Appearance(NamedTuple):
-    """The texture of the sheet, and the light and the instruments.
-
-    Attributes:
-        config: compile-time configuration.
-        texels: levels of the texture, as returned by `pyramid`.
-        sizes: sizes and counters.
-        width: width of the first level [texels].
-        height: height of the first level [texels].
-        uniforms: numbers of the view.
-        capsule_count: number of instruments.
-    """
-
-    config: DrawingConfig
-    texels: Any
-    sizes: Any
-    width: Any
-    height: Any
-    uniforms: Any
-    capsule_count: Any
 
 
 def pack_rgb(colours: NDArray[np.uint8]) -> NDArray[np.float32]:

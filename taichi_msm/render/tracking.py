@@ -100,7 +100,7 @@ def _track(
     # With bins half as wide as cells, most bins only overlap cells around one mass point.
     bin_size = max(MIN_BIN_SIZE, round((width * height / cells) ** 0.5 / 2))
     launches = Launches(bounded=lanes("f64") == 1)
-    uniform_values = uni.view_numbers(undistorted, scene.render, 1, scene.sheet.size, (1, 1), rods)
+    uniform_values = uni.view_uniforms(undistorted, scene.render, 1, scene.sheet.size, (1, 1), rods)
     if view.lens is not None:
         uni.set_lens(uniform_values, view, 1, view.lens.limit)
     uniforms = launches.give(uniform_values)
@@ -293,7 +293,7 @@ def _kernel(lens: str) -> Callable[..., None]:
             coordinates: coordinates of the points on the sheet.
             as_flow: 0 to return pixels; otherwise the points are those of the pixels of another frame, and their
                 displacements from these pixels' centres are returned.
-            uniforms: numbers of the view.
+            uniforms: constants of the view.
             sizes: sizes and counters.
             nodes: projected mass points.
             cell: outlines of the cells.

@@ -1,7 +1,7 @@
-"""Constants of the shading, and the numbers of a view that kernel 2 receives.
+"""Constants of the shading, and the per-view arguments of kernel 2.
 
-Every argument of a kernel costs time, so they are packed into two arrays: one of sizes and counters, and one of the
-numbers of the view, its light and its instruments.
+Every argument of a kernel costs time, so they are packed into two arrays: sizes and counters, and the constants of the
+view, its light and its instruments ("uniforms", as in OpenGL).
 """
 
 from __future__ import annotations
@@ -44,7 +44,6 @@ METAL_AMBIENT, METAL_DIFFUSE, METAL_MIRROR, METAL_GLOSS = 0.2, 0.35, 0.6, 0.7
 # Minimum depth at which metal is lit, in units of the distance from the light to the centre of the picture.
 METAL_NEAREST = 0.2
 
-
 Array = NDArray[np.float64]
 
 # Indices into the array of sizes: of the sheet, the picture and its bins. Three are counters: rows of mass points that
@@ -54,7 +53,7 @@ ROWS, COLS, WIDTH, HEIGHT, CAPSULE_COUNT, BIN_SIZE, BINS_ACROSS = range(7)
 ROWS_TAKEN, ROWS_PROJECTED, BANDS_TAKEN, LEVEL_COUNT, LEVELS = range(7, 12)
 LEVEL_STRIDE = 3
 
-# Indices into the array of numbers. The camera's matrix and axes, row by row, and its near plane; the number of
+# Indices into the array of uniforms. The camera's matrix and axes, row by row, and its near plane; the number of
 # sub-quads along a side of a cell; the background's colour.
 MATRIX, AXES, NEAR, SUBDIVISIONS, BACKGROUND = 0, 16, 25, 26, 27
 
@@ -107,10 +106,10 @@ def sizes_of(scene: Scene, levels: NDArray[np.int32]) -> NDArray[np.int32]:
     return sizes
 
 
-def view_numbers(
+def view_uniforms(
     view: View, render: Render, factor: int, sheet: tuple[float, float], texture: tuple[int, int], rods: Sequence[Rod]
 ) -> Array:
-    """Build the array of numbers of a view.
+    """Build the array of uniforms of a view.
 
     Args:
         view: the camera.
@@ -121,7 +120,7 @@ def view_numbers(
         rods: the instruments.
 
     Returns:
-        The numbers, at the indices above.
+        The uniforms, at the indices above.
     """
     uniforms = np.zeros(CAPSULES + len(rods) * CAPSULE_STRIDE)
     uniforms[MATRIX:AXES] = (view.matrix * np.array([[factor], [factor], [1], [1]])).ravel()
@@ -148,17 +147,17 @@ def view_numbers(
         uniforms[VISIBLE:SAGITTA_FACTOR] = np.array(region.box) * factor
         uniforms[SAGITTA_FACTOR], uniforms[STRETCH_FACTOR] = region.sagitta_factor / factor, region.stretch_factor
     for n, rod in enumerate(rods):
-        uniforms[CAPSULES + n * CAPSULE_STRIDE : CAPSULES + (n + 1) * CAPSULE_STRIDE] = _capsule_numbers(
+        uniforms[CAPSULES + n * CAPSULE_STRIDE : CAPSULES + (n + 1) * CAPSULE_STRIDE] = _capsule_uniforms(
             rod, view, factor
         )
     return uniforms
 
 
 def set_lens(uniforms: Array, view: View, factor: int, radius: float) -> None:
-    """Set the numbers of a lens.
+    """Set the uniforms of a lens.
 
     Args:
-        uniforms: numbers of the view, updated.
+        uniforms: constants of the view, updated.
         view: camera with lens distortion.
         factor: samples per pixel along each axis.
         radius: largest distance from the optical axis at which points are distorted [m], at w = 1.
@@ -169,7 +168,7 @@ def set_lens(uniforms: Array, view: View, factor: int, radius: float) -> None:
     uniforms[PICTURE_X:FOCAL_X], uniforms[FOCAL_X:VISIBLE] = view.centre * factor, view.scale * factor
 
 
-def _capsule_numbers(capsule: Rod, view: View, factor: int) -> Array:
+def _capsule_uniforms(capsule: Rod, view: View, factor: int) -> Array:
     uniforms = np.empty(CAPSULE_STRIDE)
     uniforms[TIP:AXIS] = view.axes @ (capsule.tip - view.eye)
     uniforms[AXIS:LENGTH] = view.axes @ capsule.axis

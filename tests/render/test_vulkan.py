@@ -144,18 +144,18 @@ np.savez(sys.argv[1], **(bent_looks() if "bent" in sys.argv else looks()))
 AGAIN = """
 import os
 from pathlib import Path
-from tests.render.test_vulkan import Drawing, drawable, find, rest_positions, speckle, track_grid, view
+from tests.render.test_vulkan import Rasterizer, drawable, locate_points, rest_positions, speckle, track_grid, view
 from taichi_msm.system import runtime
 
 def again():
     for _ in range(3):
         drawing.draw(position)
-        find(made, track_grid(2), position, view(made))
+        locate_points(made, track_grid(2), position, view(made))
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 runtime.start("vulkan")
 made = drawable((200, 200), size=[128, 96], refine=0)
-drawing, position = Drawing(made, speckle(8, 8)), rest_positions(made.sheet)
+drawing, position = Rasterizer(made, speckle(8, 8)), rest_positions(made.sheet)
 print(-again() + again())
 """
 

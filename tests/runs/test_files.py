@@ -39,14 +39,14 @@ ENDLESS = """
 import itertools
 import sys
 from pathlib import Path
-from taichi_msm.render.labels import Observed
+from taichi_msm.render.labels import FrameOutputs
 from taichi_msm.runs.writer import ResultWriter
 from tests.scenes import scene_and_grid
 from tests.runs.test_files import picture, position, small_scene
 
 with ResultWriter(Path(sys.argv[1]), *scene_and_grid(small_scene())) as writer:
     for frame in itertools.count():
-        writer.add(position(frame), {"": Observed(picture(frame))})
+        writer.add(position(frame), {"": FrameOutputs(picture(frame))})
         if frame == 10:
             print(writer._encoder._process.pid, flush=True)
 """

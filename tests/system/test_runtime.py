@@ -231,14 +231,14 @@ def test_environment_and_other_threads_change_nothing_at_the_start(tmp_path: Pat
 # Starts after a stop; an object that was made before a stop is dropped after it.
 AGAIN = """
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.render.rasterizer import Drawing
+from taichi_msm.render.rasterizer import Rasterizer
 from taichi_msm.system import runtime
 from tests.scenes import scene, speckle
 
 made, sums, kept = scene(), set(), []
 for turn in range(3):
     runtime.start()
-    drawings = [Drawing(made, speckle(8, 8)) for _ in range(2)]
+    drawings = [Rasterizer(made, speckle(8, 8)) for _ in range(2)]
     sums.update(int(drawing.draw(rest_positions(made.sheet)).sum()) for drawing in drawings)
     kept.append(drawings.pop())
     runtime.stop()
