@@ -37,16 +37,15 @@ MAX_RADIUS = math.tan(math.radians(88))
 # Smaller coefficients have no effect within the maximum radius, and dividing by them may overflow.
 MIN_COEFFICIENT = 1e-100
 
-# In normalised image coordinates; well below 1e-6 px.
+# Maximum residual of the undistortion, in normalised image coordinates; well below 1e-6 px.
 UNDISTORTION_TOLERANCE = 1e-11
 MAX_NEWTON_STEPS = 50
 
-# Number of radii at which the first fold by tangential distortion is searched.
+# Number of radii that are tested for the first fold due to tangential distortion.
 FOLD_SAMPLES = 4096
 
 # At smaller radii a fisheye's quotient t / r is 1 to rounding.
 MIN_RADIUS = 1e-8
-
 
 # The oblique preset: 50 degrees above the sheet, from its lower edge, with a field of view in degrees.
 OBLIQUE_DIRECTION = np.array([0.0, -0.64, 0.77])
@@ -56,15 +55,14 @@ OBLIQUE_MARGIN = 1.04
 # Distance of the near plane, as a fraction of the sheet's diagonal.
 NEAR = 1e-6
 
-# Kernels multiply the matrix by the samples along a pixel, in f32.
+# Kernels multiply the matrix by the samples along a pixel, and hold the product in f32.
 MAX_MATRIX_ENTRY = float(np.finfo(np.float32).max) / MAX_SUPERSAMPLE
 
 # Maximum baseline of a stereo pair, in units of the sheet's larger side.
 MAX_BASELINE_RATIO = 1e6
 
-# Maximum time between the first two poses: in units of the scene's duration, if there are more than two; and always
-# [s].
-MAX_GAP_RATIO, MAX_GAP_S = 5, 1e5
+# Maximum time between the first two poses [s]; for more than two poses also in units of the scene's duration.
+MAX_GAP_S, MAX_GAP_RATIO = 1e5, 5
 
 # Maximum deviation of a rotation matrix from orthonormality.
 ROTATION_TOLERANCE = 1e-3
@@ -432,8 +430,10 @@ def _problems_of(camera: Camera, scene: Scene, name: str) -> Iterator[Problem]:
         if camera.distortion is not None and camera.outside == "refuse":
             yield from _lens_problems(view_at(scene, 0.0, name))
     elif abs(scene.render.origin(name)[1]) > MAX_BASELINE_RATIO * max(scene.sheet.size):
-        times = f"{MAX_BASELINE_RATIO:g} times"
-        message = f"puts it more than {times} the size of the sheet away; take a smaller number, in metres"
+        message = (
+            f"puts it more than {MAX_BASELINE_RATIO:g} times the size of the sheet away; take a smaller number, "
+            "in metres"
+        )
         yield Problem(("baseline",), message)
 
 
@@ -535,7 +535,7 @@ def _lens_problems(camera: View) -> Iterator[Problem]:
 
 
 def border_points(size: Array) -> Array:
-    """Return points along the edges of a picture of this width and height, one per pixel [px], shape (n, 2)."""
+    """Return points along the edges of a picture of size (width, height), one per pixel [px], shape (n, 2)."""
     width, height = (int(side) for side in size)
     across, down = np.arange(width + 1.0), np.arange(height + 1.0)
     sides = [(across, 0 * across), (across, 0 * across + height), (0 * down, down), (0 * down + width, down)]

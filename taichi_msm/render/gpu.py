@@ -95,7 +95,7 @@ class Threads:
             DeviceError: if the device stopped threads early.
         """
         launches, factor = Launches(bounded=True), self._config.supersample
-        (width, height), rods = self._size, int(sizes[uni.CAPSULE_COUNT])
+        (width, height), capsules = self._size, int(sizes[uni.CAPSULE_COUNT])
         samples_across, samples_down = width * factor, height * factor
         view = launches.give(uniforms), launches.give(sizes)
         with our_compilation(optimised=False):
@@ -116,8 +116,8 @@ class Threads:
         view = view[0], launches.give(sizes)
         # Rounds per sample: one per part, and three per triangle, for the triangle and its tiles.
         rounds_of_part = 1 + 3 * pieces_per_part
-        rounds_of_rods = rods * (1 + factor * (1 + factor))
-        rounds_of_shading = factor * (1 + factor * (1 + int(sizes[uni.LEVEL_COUNT]) + rods)) + 2
+        rounds_of_capsules = capsules * (1 + factor * (1 + factor))
+        rounds_of_shading = factor * (1 + factor * (1 + int(sizes[uni.LEVEL_COUNT]) + capsules)) + 2
         for row in range(0, height, self._rows):
             rows = min(self._rows, height - row)
             top, bottom = row * factor, (row + rows) * factor
@@ -132,7 +132,7 @@ class Threads:
             launches.launch(
                 self._resolve, rows * width,
                 row, *view, self._texels, self._samples, self._colours, self._labels,
-                rounds=rounds_of_rods + rounds_of_shading,
+                rounds=rounds_of_capsules + rounds_of_shading,
             )  # fmt: skip
         launches.require_ended()
         colours = launches.take(self._colours) if self._config.picture else np.empty(0, np.uint8)

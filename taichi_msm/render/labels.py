@@ -35,14 +35,14 @@ class Labels(NamedTuple):
 
 
 class Label(NamedTuple):
-    """The layout of a label in the output of kernel 2: one or several numbers for every pixel, row by row.
+    """The layout of a label in the output of kernel 2: one or several values per pixel, row by row.
 
     Attributes:
-        planes: names of the G-buffer's planes with the numbers (config.py).
-        missing_value: number of pixels without a visible surface.
-        sheet_only: whether pixels of instruments have the missing value too.
+        planes: names of the G-buffer's planes that hold the values (config.py).
+        missing_value: value in pixels without a visible surface.
+        sheet_only: whether pixels of instruments also have the missing value.
         dtype: type of the values.
-        offset: number of preceding numbers per pixel, of other labels.
+        offset: number of values per pixel of the labels before it.
     """
 
     planes: tuple[str, ...]
@@ -105,7 +105,7 @@ def labels_of(numbers: NDArray[np.float32], size: tuple[int, int]) -> Labels:
         values = numbers.reshape(-1, width * height)[label.offset : label.offset + count]
         if len(values):
             arrays[name] = values.reshape((height, width, count)[: 2 + (count > 1)]).astype(label.dtype, copy=False)
-    # Rounding may place them outside the sheet's edge.
+    # Rounding may move coordinates beyond the sheet's edge.
     arrays["coordinates"] = arrays["coordinates"].clip(0, 1)
     return Labels(**arrays)
 

@@ -61,7 +61,7 @@ class Renderer:
         self.restart(scene)
 
     def restart(self, scene: Scene) -> None:
-        """Set another scene."""
+        """Replace the scene, and discard its rasterisers."""
         self._rasterizers.clear()
         self.scene, self.view = scene, view(scene)
         names = scene.render.all_cameras

@@ -1,6 +1,6 @@
 """Shading: texture filtering and lighting of samples, then the colours and labels of pixels.
 
-The light of an endoscope on wet tissue and on metal is next to the main camera, and weakens with distance.
+Wet tissue and metal are lit by the light of an endoscope, which is next to the main camera and weakens with distance.
 
 All vectors are in the camera's frame: the eye at 0, x right, y up, z toward the camera. P is the surface point of a
 sample, N its normal on the camera's side, L the unit vector from P to the light, V that from P to the eye, and
