@@ -159,10 +159,10 @@ class Lens(NamedTuple):
             [x * ratio + 2 * p1 * x * y + p2 * (q + 2 * x * x), y * ratio + p1 * (q + 2 * y * y) + 2 * p2 * x * y],
             axis=-1,
         )
-        mixed = slope * x * y + 2 * p1 * x + 2 * p2 * y
-        across = ratio + slope * x * x + 2 * p1 * y + 6 * p2 * x
-        down = ratio + slope * y * y + 6 * p1 * y + 2 * p2 * x
-        return distorted, np.stack([np.stack([across, mixed], axis=-1), np.stack([mixed, down], axis=-1)], axis=-2)
+        dx_dy = slope * x * y + 2 * p1 * x + 2 * p2 * y
+        dx_dx = ratio + slope * x * x + 2 * p1 * y + 6 * p2 * x
+        dy_dy = ratio + slope * y * y + 6 * p1 * y + 2 * p2 * x
+        return distorted, np.stack([np.stack([dx_dx, dx_dy], axis=-1), np.stack([dx_dy, dy_dy], axis=-1)], axis=-2)
 
 
 def _rational_factors(lens: Lens) -> tuple[Polynomial, Polynomial]:
@@ -264,7 +264,7 @@ class View(NamedTuple):
     light_view: View | None = None
 
     @property
-    def model(self) -> str:
+    def lens_model(self) -> str:
         """Lens model, "pinhole" or "fisheye"; empty without lens distortion."""
         return "" if self.lens is None else "fisheye" if self.lens.fisheye else "pinhole"
 
@@ -537,8 +537,8 @@ def _lens_problems(camera: View) -> Iterator[Problem]:
 def border_points(size: Array) -> Array:
     """Return points along the edges of a picture of size (width, height), one per pixel [px], shape (n, 2)."""
     width, height = (int(side) for side in size)
-    across, down = np.arange(width + 1.0), np.arange(height + 1.0)
-    sides = [(across, 0 * across), (across, 0 * across + height), (0 * down, down), (0 * down + width, down)]
+    x, y = np.arange(width + 1.0), np.arange(height + 1.0)
+    sides = [(x, 0 * x), (x, 0 * x + height), (0 * y, y), (0 * y + width, y)]
     return np.concatenate([np.stack(side, axis=-1) for side in sides])
 
 
@@ -751,6 +751,6 @@ def _interpolate(poses: Sequence[Sequence[float]], time: float) -> tuple[Array, 
     if len(rows) == 1:
         return rows[0, 1:4], Rotation.from_quat(rows[0, 4:]).as_matrix()
     clamped_time = min(max(time, rows[0, 0]), rows[1, 0])
-    share = (clamped_time - rows[0, 0]) / (rows[1, 0] - rows[0, 0])
+    fraction = (clamped_time - rows[0, 0]) / (rows[1, 0] - rows[0, 0])
     rotation = Slerp(rows[:, 0], Rotation.from_quat(rows[:, 4:]))(clamped_time).as_matrix()
-    return rows[0, 1:4] * (1 - share) + rows[1, 1:4] * share, rotation
+    return rows[0, 1:4] * (1 - fraction) + rows[1, 1:4] * fraction, rotation

@@ -475,10 +475,10 @@ def store_normal(
         ]
         length = ti.sqrt(cross[0] * cross[0] + cross[1] * cross[1] + cross[2] * cross[2])
         normal = [cross[n] / ti.max(length, 1e-30) for n in ti.static(range(3))]
-        here = rows * cols * NODE_STRIDE + (i * cols + j) * NORMAL_STRIDE
+        normal_entry = rows * cols * NODE_STRIDE + (i * cols + j) * NORMAL_STRIDE
         for n in ti.static(range(3)):
             axis = uni.AXES + 3 * n
-            nodes[here + n] = (
+            nodes[normal_entry + n] = (
                 uniforms[axis] * normal[0] + uniforms[axis + 1] * normal[1] + uniforms[axis + 2] * normal[2]
                 if ti.static(config.tissue)
                 else normal[n]

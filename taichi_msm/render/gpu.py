@@ -289,8 +289,8 @@ def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callab
             for n in range(begin, ti.min(begin + count, starts[bin_index + 1])):
                 if is_in_bounds(entries[n], x, y, bounds):
                     cell, piece = owners[2 * entries[n]], owners[2 * entries[n] + 1]
-                    is_inverted, last = pieces[cell] == 1, ti.min(piece + pieces_per_part, pieces[cell])
-                    part = ti.static(Part(is_inverted, piece, last))
+                    is_inverted, end_piece = pieces[cell] == 1, ti.min(piece + pieces_per_part, pieces[cell])
+                    part = ti.static(Part(is_inverted, piece, end_piece))
                     cover_cell(cell // (cols - 1), cell % (cols - 1), part, sheet, band)
             end_thread(ended)
 
@@ -316,14 +316,15 @@ def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callab
         for index in range(first, end):
             width, height, capsule_count = sizes[uni.WIDTH], sizes[uni.HEIGHT], sizes[uni.CAPSULE_COUNT]
             x, y = index % width, row + index // width
-            left, top, across = x * factor, y * factor, width * factor
-            table = across * height * factor * config.map_planes
-            line, map_start = table + (y - row) * factor * across * planes, top * across * config.map_planes
+            left, top, samples_across = x * factor, y * factor, width * factor
+            table = samples_across * height * factor * config.map_planes
+            line = table + (y - row) * factor * samples_across * planes
+            map_start = top * samples_across * config.map_planes
             if ti.static(config.instruments):
                 band = ti.static(
                     Band(
-                        config, samples, line, across, left, left + factor, top, top + factor,
-                        across, height * factor, uniforms[uni.NEAR], uniforms, map_start,
+                        config, samples, line, samples_across, left, left + factor, top, top + factor,
+                        samples_across, height * factor, uniforms[uni.NEAR], uniforms, map_start,
                     )
                 )  # fmt: skip
                 cover_capsules(capsule_count, band)
@@ -332,7 +333,7 @@ def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callab
             )
             pixels = width * height
             output = ti.static(PixelArrays(colours, labels, pixels))
-            resolve(line, y, y + 1, x, x + 1, across, width, map_start, samples, appearance, output)
+            resolve(line, y, y + 1, x, x + 1, samples_across, width, map_start, samples, appearance, output)
             end_thread(ended)
 
     return cover_samples, resolve_pixels

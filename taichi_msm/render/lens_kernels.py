@@ -26,10 +26,10 @@ def arctangent(tangent):
         half_tangent = half_tangent / (1.0 + ti.sqrt(1.0 + half_tangent * half_tangent))
     square = half_tangent * half_tangent
     # In the precision of the argument: quotients of constants would be f32.
-    one = half_tangent * 0.0 + 1.0
+    unit = half_tangent * 0.0 + 1.0
     total = half_tangent * 0.0
     for divisor in ti.static(SERIES):
-        total = one / divisor + square * total
+        total = unit / divisor + square * total
     return total * half_tangent * 2.0**HALVINGS
 
 

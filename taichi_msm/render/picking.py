@@ -37,12 +37,12 @@ def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pixel) 
     cells = np.argwhere(_cells_on_ray(position, ray))
     for first in range(0, len(cells), CELLS_PER_BATCH):
         i, j = cells[first : first + CELLS_PER_BATCH].T
-        corners = np.stack([position[i + down, j + right] for down in (0, 1) for right in (0, 1)], axis=1)
+        corners = np.stack([position[i + below, j + right] for below in (0, 1) for right in (0, 1)], axis=1)
         hits += _hits_in_cells(ray.project(corners), i, j, refine, view.near)
     if not hits:
         return None
-    _, (across, down) = min(hits)
-    return across / (cols - 1), down / (rows - 1)
+    _, (column, row) = min(hits)
+    return column / (cols - 1), row / (rows - 1)
 
 
 def intersect_rest_plane(view: View, pixel: Pixel) -> NDArray[np.floating] | None:
@@ -79,9 +79,9 @@ def _cells_on_ray(position: NDArray[np.floating], ray: View) -> NDArray[np.bool_
 
 def _hits_in_cells(corners: Array, i: NDArray[np.intp], j: NDArray[np.intp], refine: int, near: float) -> list[Hit]:
     """List depth and position, in cells from the top left, of the hits in some cells."""
-    parts = refine + 1
-    share = np.arange(parts + 1) / parts
-    s, t = share[:, None], share[:, None, None]
+    subdivisions = refine + 1
+    fractions = np.arange(subdivisions + 1) / subdivisions
+    s, t = fractions[:, None], fractions[:, None, None]
     a, right, down, opposite = (corners[:, None, None, n] for n in range(4))
     vertex = a + (right - a) * s + (down - a) * t + (opposite - right - down + a) * s * t
     quads = np.stack([vertex[:, :-1, :-1], vertex[:, :-1, 1:], vertex[:, 1:, :-1], vertex[:, 1:, 1:]], axis=-2)
@@ -93,14 +93,14 @@ def _hits_in_cells(corners: Array, i: NDArray[np.intp], j: NDArray[np.intp], ref
     for third in (1, 2):  # index of the corner off the diagonal: upper right, lower left
         triangle = quad[:, [0, third, 3]]
         p, q, r = np.moveaxis(triangle[..., :2], 1, 0)
-        share = np.stack([_cross(q, r), _cross(r, p), _cross(p, q)], axis=-1)
+        weights = np.stack([_cross(q, r), _cross(r, p), _cross(p, q)], axis=-1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            share /= share.sum(axis=-1, keepdims=True)
-        w, depth = np.moveaxis((share[..., None] * triangle[..., 2:]).sum(axis=1), -1, 0)
-        for n in np.flatnonzero((share >= 0).all(axis=-1) & (w > near)):
-            across = j[cell[n]] + (quad_column[n] + share[n, 2] + (third == 1) * share[n, 1]) / parts
-            along = i[cell[n]] + (quad_row[n] + share[n, 2] + (third == 2) * share[n, 1]) / parts
-            hits.append((float(depth[n]), (float(across), float(along))))
+            weights /= weights.sum(axis=-1, keepdims=True)
+        w, depth = np.moveaxis((weights[..., None] * triangle[..., 2:]).sum(axis=1), -1, 0)
+        for n in np.flatnonzero((weights >= 0).all(axis=-1) & (w > near)):
+            x = j[cell[n]] + (quad_column[n] + weights[n, 2] + (third == 1) * weights[n, 1]) / subdivisions
+            y = i[cell[n]] + (quad_row[n] + weights[n, 2] + (third == 2) * weights[n, 1]) / subdivisions
+            hits.append((float(depth[n]), (float(x), float(y))))
     return hits
 
 

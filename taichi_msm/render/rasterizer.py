@@ -37,7 +37,7 @@ def drawing_config(
         picture: whether colours are drawn.
         labels: whether labels are written; together with the picture this requires one sample per pixel.
         normals: whether the labels include normals.
-        lens: lens model of the camera, as `View.model`; by default that of the scene's main camera.
+        lens: lens model of the camera, as `View.lens_model`; by default that of the scene's main camera.
     """
     render = scene.render
     tissue = picture and render.shading == "tissue"
@@ -54,7 +54,7 @@ def drawing_config(
         picture=picture,
         labels=labels,
         normals=labels and normals,
-        lens=view_at(scene, 0.0).model if lens is None else lens,
+        lens=view_at(scene, 0.0).lens_model if lens is None else lens,
         lanes=lanes("f32"),
     )
 

@@ -68,7 +68,7 @@ class Renderer:
         self._has_moving_camera = any(is_moving(scene, name) for name in names)
         self._views = {name: self.view if name == scene.render.main else view_at(scene, 0.0, name) for name in names}
 
-    def set_up(self, camera: CameraLike, time: float = 0.0) -> View:
+    def resolve_camera(self, camera: CameraLike, time: float = 0.0) -> View:
         """Resolve a camera.
 
         Args:
@@ -89,8 +89,8 @@ class Renderer:
         if isinstance(name, str) and name in self._views:
             return view_at(self.scene, time, name) if self._has_moving_camera else self._views[name]
         if isinstance(name, str) and render.cameras and name not in PRESETS:
-            known = [*render.cameras, *PRESETS]
-            message = f"camera: {name!r}; the cameras are {', '.join(known)}{did_you_mean(name, known)}"
+            names = [*render.cameras, *PRESETS]
+            message = f"camera: {name!r}; the cameras are {', '.join(names)}{did_you_mean(name, names)}"
             raise ArgumentError(message)
         # The complete scene is validated, so that errors name the keys of a scene.
         single_camera = {**dict(render), "camera": camera}
@@ -122,7 +122,7 @@ class Renderer:
         """Return all compile-time settings of the kernels of `observe`, as a cache key."""
         from taichi_msm.render.rasterizer import drawing_config
 
-        scene, lenses = self.scene, [view.model for view in self._views.values()]
+        scene, lenses = self.scene, [view.lens_model for view in self._views.values()]
         config_of = partial(drawing_config, scene, picture=scene.draws, labels=scene.labels_pixels)
         return (*(config_of(lens=lens) for lens in lenses), scene.output)
 
@@ -220,7 +220,7 @@ class Renderer:
 
             scene = self.scene if style is None else self.scene.model_copy(update={"render": style})
             texture = self._texture() if picture else np.zeros((1, 1, 3), np.uint8)
-            config = drawing_config(scene, picture=picture, labels=labels, normals=normals, lens=camera.model)
+            config = drawing_config(scene, picture=picture, labels=labels, normals=normals, lens=camera.lens_model)
             self._rasterizers[key] = Rasterizer(scene, texture, config)
         return self._rasterizers[key]
 

@@ -347,9 +347,11 @@ def apply_relief(normal: ti.template(), slope_x, slope_y, uniforms: ti.template(
     b = [uniforms[uni.UP + k] for k in ti.static(range(3))]
     n = [n_x * length, n_y * length, n_z * length]
     relief_x, relief_y = slope_x * uniforms[uni.SLOPE_X], slope_y * uniforms[uni.SLOPE_Y]
-    along = relief_x * (a[0] * n[0] + a[1] * n[1] + a[2] * n[2]) + relief_y * (b[0] * n[0] + b[1] * n[1] + b[2] * n[2])
+    projection = relief_x * (a[0] * n[0] + a[1] * n[1] + a[2] * n[2]) + relief_y * (
+        b[0] * n[0] + b[1] * n[1] + b[2] * n[2]
+    )
     for k in ti.static(range(3)):
-        normal[k] = n[k] * (along + 1.0) - relief_x * a[k] - relief_y * b[k]
+        normal[k] = n[k] * (projection + 1.0) - relief_x * a[k] - relief_y * b[k]
 
 
 @ti.func
@@ -376,19 +378,19 @@ def light_tissue(x, y, depth, normal: ti.template(), slope_x, slope_y, column, r
         apply_relief(tilted, slope_x, slope_y, uniforms)
     cosine, mirror, nearness, _ = illuminate(x, y, depth, tilted, uniforms)
     diffuse = ti.max(cosine + uni.WRAP, 0.0) * (1.0 / (1.0 + uni.WRAP)) * nearness * uniforms[uni.LIGHT_NORMALISATION]
-    share = uniforms[uni.AMBIENT] + (1.0 - uniforms[uni.AMBIENT]) * diffuse
+    factor = uniforms[uni.AMBIENT] + (1.0 - uniforms[uni.AMBIENT]) * diffuse
     gloss = specular(mirror) * nearness * (255.0 * uniforms[uni.GLOSS])
     if ti.static(config.instruments):
         transmission = light_transmission(x, y, depth, appearance.capsule_count, uniforms, config)
-        share, gloss = share * transmission, gloss * transmission
+        factor, gloss = factor * transmission, gloss * transmission
     if ti.static(config.vignette):
         # The distance from the centre of the picture is in units of half its diagonal.
         off_x, off_y = column - uniforms[uni.MIDDLE_X], row - uniforms[uni.MIDDLE_Y]
         diagonal = uniforms[uni.MIDDLE_X] * uniforms[uni.MIDDLE_X] + uniforms[uni.MIDDLE_Y] * uniforms[uni.MIDDLE_Y]
         attenuation = 1.0 - uniforms[uni.VIGNETTE] * (off_x * off_x + off_y * off_y) / diagonal
-        share, gloss = share * attenuation, gloss * attenuation
+        factor, gloss = factor * attenuation, gloss * attenuation
     # The normal of an infinite or NaN point is NaN; the limits remove it.
-    return ti.max(ti.min(share, 8.0), 0.0), ti.max(ti.min(gloss, 8.0 * 255.0), 0.0)
+    return ti.max(ti.min(factor, 8.0), 0.0), ti.max(ti.min(gloss, 8.0 * 255.0), 0.0)
 
 
 @ti.func
@@ -409,9 +411,9 @@ def light_metal(x, y, depth, normal: ti.template(), uniforms: ti.template()):
     lit_depth = ti.max(depth, uni.METAL_NEAREST * uniforms[uni.LIGHT_DISTANCE])
     cosine, mirror, _, upward = illuminate(x, y, lit_depth, normal, uniforms)
     brightness = ti.max(upward, 0.0)
-    share = uni.METAL_AMBIENT + uni.METAL_DIFFUSE * ti.max(cosine, 0.0) + uni.METAL_MIRROR * brightness * brightness
+    factor = uni.METAL_AMBIENT + uni.METAL_DIFFUSE * ti.max(cosine, 0.0) + uni.METAL_MIRROR * brightness * brightness
     gloss = specular(mirror) * (255.0 * uni.METAL_GLOSS)
-    return [ti.min(share * uni.METAL[n] + gloss, 255.0) for n in ti.static(range(3))]
+    return [ti.min(factor * uni.METAL[n] + gloss, 255.0) for n in ti.static(range(3))]
 
 
 def pack_rgb(colours: NDArray[np.uint8]) -> NDArray[np.float32]:

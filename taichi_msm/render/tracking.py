@@ -131,7 +131,7 @@ def _track(
     # Rounds per point: one per cell, and one per triangle.
     rounds = 1 + 2 * (scene.render.refine + 1) ** 2
     for listed, count in launches.parts(int(bins.lengths.max()), rounds):
-        launches.launch(_kernel(view.model), total, listed, count, *arguments, rounds=count * rounds + len(rods))
+        launches.launch(_kernel(view.lens_model), total, listed, count, *arguments, rounds=count * rounds + len(rods))
     launches.require_ended()
     return launches.take(pixels).reshape(-1, 2), launches.take(hidden)
 

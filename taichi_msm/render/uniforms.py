@@ -182,7 +182,7 @@ def _capsule_uniforms(capsule: Rod, view: View, factor: int) -> Array:
     left, right, top, bottom = (0, view.size[0], 0, view.size[1]) if view.lens is None else visible_region(view).box
     low, high = np.array([left, top]), np.array([right, bottom])
     if (w > view.near).all():
-        seen = np.stack([x / w, y / w], axis=-1)
-        low, high = np.clip([seen.min(axis=0), seen.max(axis=0)], low, high)
+        projected = np.stack([x / w, y / w], axis=-1)
+        low, high = np.clip([projected.min(axis=0), projected.max(axis=0)], low, high)
     uniforms[LEFT:] = np.concatenate([low, high]) * factor
     return uniforms

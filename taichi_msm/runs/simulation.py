@@ -356,7 +356,7 @@ class Simulation:
         if not (are_numbers(point, (2,)) and np.isfinite(point).all()):
             raise ArgumentError(f"pixel: {pixel!r}; take two numbers, x to the right and y down")
         x, y = point.tolist()
-        return pick(self._position, self.scene.render.refine, self.renderer.set_up(camera, self.time), (x, y))
+        return pick(self._position, self.scene.render.refine, self.renderer.resolve_camera(camera, self.time), (x, y))
 
     def observe(
         self,
@@ -469,7 +469,7 @@ class Simulation:
             time = self.time
         elif not (are_numbers(as_array(time, "time"), ()) and math.isfinite(time)):
             raise ArgumentError(f"time: {time!r}; take a number, in seconds, or None for now")
-        return Shot(positions, self.renderer.set_up(camera, time), rods(self.scene, positions, time))
+        return Shot(positions, self.renderer.resolve_camera(camera, time), rods(self.scene, positions, time))
 
     def _require_good(self, reading: Reading, fault: str) -> None:
         """Raise the error of a divergence, if there is a fault."""

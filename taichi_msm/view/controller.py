@@ -140,7 +140,7 @@ class Viewport:
         camera = self.render.main_camera
         moving = isinstance(camera, Camera) and camera.moves
         if moving:
-            self.view = self._renderer.set_up(None, time)
+            self.view = self._renderer.resolve_camera(None, time)
         return moving
 
     def recorded(self, duration: float) -> Render:
