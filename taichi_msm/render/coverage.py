@@ -431,20 +431,10 @@ def cell_at(i, j, patch: ti.template(), sheet: ti.template()):
     normal = sheet.rows * sheet.cols * NODE_STRIDE + (i * sheet.cols + j) * NORMAL_STRIDE
     return ti.static(
         Cell(
-            patch,
-            row,
-            column,
-            cell_rows,
-            cell_cols,
-            first_x,
-            first_y,
-            fraction_x,
-            fraction_y,
-            texels_across,
-            texels_down,
-            normal,
+            patch, row, column, cell_rows, cell_cols, first_x, first_y, fraction_x, fraction_y,
+            texels_across, texels_down, normal,
         )
-    )
+    )  # fmt: skip
 
 
 @ti.func

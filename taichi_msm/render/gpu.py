@@ -165,13 +165,8 @@ def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable
             project(position, index // cols, index % cols, cols, uniforms, nodes, False)
             store_normal(position, index // cols, index % cols, rows, cols, config, uniforms, nodes)
             if ti.static(config.has_distortion):
-                store_distorted(
-                    rows * cols * UNDISTORTED_STRIDE + index * DISTORTED_STRIDE,
-                    index * NODE_STRIDE,
-                    uniforms,
-                    nodes,
-                    config.lens,
-                )
+                distorted_entry = rows * cols * UNDISTORTED_STRIDE + index * DISTORTED_STRIDE
+                store_distorted(distorted_entry, index * NODE_STRIDE, uniforms, nodes, config.lens)
 
         for cell in range((sizes[uni.ROWS] - 1) * (sizes[uni.COLS] - 1)):
             cols, subdivisions = sizes[uni.COLS], ti.cast(uniforms[uni.SUBDIVISIONS], ti.i32)

@@ -114,15 +114,9 @@ def _track(
     sizes[[uni.BIN_SIZE, uni.BINS_ACROSS, uni.WIDTH, uni.HEIGHT]] = bins.size, bins.columns, *scene.render.size
     is_simple = launches.array(np.uint8, bins.lengths.size)
     launches.launch(
-        _mark_simple_bins,
-        bins.lengths.size,
-        cell,
-        cols,
-        bins.starts,
-        bins.entries,
-        is_simple,
+        _mark_simple_bins, bins.lengths.size, cell, cols, bins.starts, bins.entries, is_simple,
         rounds=3 * CELLS_AROUND_NODE,
-    )
+    )  # fmt: skip
     pixels, hidden = launches.array(np.float32, 2 * total), launches.array(np.uint8, total)
     arguments = (
         launches.give(np.ascontiguousarray(coordinates, np.float32).ravel()),
@@ -163,12 +157,8 @@ def _outline_cells(
             width, height = ti.cast(sizes[uni.WIDTH], ti.f64), ti.cast(sizes[uni.HEIGHT], ti.f64)
             if geometry.is_off_screen(corners, 0.0, width, 0.0, height):
                 left, right = 1.0, -1.0
-        cell[entry + CELL_MIN_X], cell[entry + CELL_MAX_X], cell[entry + CELL_MIN_Y], cell[entry + CELL_MAX_Y] = (
-            left,
-            right,
-            top,
-            bottom,
-        )
+        cell[entry + CELL_MIN_X], cell[entry + CELL_MAX_X] = left, right
+        cell[entry + CELL_MIN_Y], cell[entry + CELL_MAX_Y] = top, bottom
         cell[entry + CELL_MIN_DEPTH] = ti.min(
             nodes[corner + 3], nodes[corner + NODE_STRIDE + 3], nodes[below + 3], nodes[below + NODE_STRIDE + 3]
         )
@@ -314,10 +304,8 @@ def _kernel(lens: str) -> Callable[..., None]:
                 j, i = ti.min(ti.cast(s, ti.i32), cols - 2), ti.min(ti.cast(t, ti.i32), rows - 2)
                 s, t = s - j, t - i
                 own_cell, quad_side = i * (cols - 1) + j, 1.0 / subdivisions
-                quad_column, quad_row = (
-                    ti.min(ti.floor(s * subdivisions), subdivisions - 1.0),
-                    ti.min(ti.floor(t * subdivisions), subdivisions - 1.0),
-                )
+                quad_column = ti.min(ti.floor(s * subdivisions), subdivisions - 1.0)
+                quad_row = ti.min(ti.floor(t * subdivisions), subdivisions - 1.0)
                 s0, t0 = quad_column * quad_side, quad_row * quad_side
                 s1, t1 = s - s0, t - t0
                 own_triangle = 2 * ti.cast(quad_row * subdivisions + quad_column, ti.i32) + ti.cast(t1 > s1, ti.i32)
@@ -343,18 +331,9 @@ def _kernel(lens: str) -> Callable[..., None]:
                             for n in range(begin, ti.min(begin + count, starts[bin_index + 1])):
                                 if not is_hidden:
                                     is_hidden = _cell_occludes(
-                                        undistorted_x,
-                                        undistorted_y,
-                                        depth,
-                                        entries[n],
-                                        own_cell,
-                                        own_triangle,
-                                        cols,
-                                        subdivisions,
-                                        near,
-                                        nodes,
-                                        cell,
-                                    )
+                                        undistorted_x, undistorted_y, depth, entries[n], own_cell, own_triangle,
+                                        cols, subdivisions, near, nodes, cell,
+                                    )  # fmt: skip
                         is_hidden = is_hidden or _capsule_occludes(undistorted_x, undistorted_y, depth, uniforms, sizes)
                     if not is_valid:
                         x, y = ti.cast(NOT_VISIBLE, ti.f64), ti.cast(NOT_VISIBLE, ti.f64)
