@@ -18,8 +18,8 @@ from benchmarks.race import Progress
 from benchmarks.whole_run import SCENE, command
 from taichi_msm.model.surface import place_capsules
 from taichi_msm.render.camera import view
-from taichi_msm.render.rasterizer import Drawing, drawing_config
-from taichi_msm.render.tracking import find_flow
+from taichi_msm.render.rasterizer import Rasterizer, drawing_config
+from taichi_msm.render.tracking import compute_flow
 from taichi_msm.scene import outputs
 from taichi_msm.scene.camera import Camera
 from taichi_msm.scene.scene import Scene
@@ -66,7 +66,7 @@ def variants(problem: Problem) -> dict[str, Callable[[], Any]]:
         return problem.scene.model_copy(update={"render": render})
 
     def picture(made: Scene, *, picture: bool = True, labels: bool = False) -> Callable[[], Any]:
-        drawing = Drawing(made, problem.texture, drawing_config(made, picture=picture, labels=labels))
+        drawing = Rasterizer(made, problem.texture, drawing_config(made, picture=picture, labels=labels))
         return lambda: drawing.look(position, None, place_capsules(made, position, 0.2))
 
     def pinhole(lens: dict[str, Any]) -> Scene:
@@ -89,7 +89,7 @@ def variants(problem: Problem) -> dict[str, Callable[[], Any]]:
         INSTRUMENTED: picture(held(tissue)),
         "headlight and labels": picture(plain, labels=True),
         LABELS: picture(plain, picture=False, labels=True),
-        "flow and occlusion": lambda: find_flow(plain, seen, problem.rest, camera),
+        "flow and occlusion": lambda: compute_flow(plain, seen, problem.rest, camera),
         **{f"{INSTRUMENTED}, {name}": picture(made) for name, made in pinholes.items()},
         **{f"{LABELS}, {name}": picture(made, picture=False, labels=True) for name, made in pinholes.items()},
     }

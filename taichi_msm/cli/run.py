@@ -142,7 +142,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     from taichi_msm.model import tool_force
     from taichi_msm.model.tool_force import describe_forces, probe_records
     from taichi_msm.model.tools import path_warnings
-    from taichi_msm.render.notes import drawing_notes
+    from taichi_msm.render.notes import drawing_warnings
     from taichi_msm.render.texture import load_texture
 
     plan = load_plan(scene, overrides, image)
@@ -173,7 +173,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         "notes": [
             *tool_force.force_warnings(loaded, records),
             *path_warnings(loaded, plan.tools),
-            *drawing_notes(loaded),
+            *drawing_warnings(loaded),
         ],
     }
     if as_json:

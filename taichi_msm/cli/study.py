@@ -147,7 +147,7 @@ def view(
     loaded = load_scene(scene, overrides, image)
     directory = result_directory(out, f"{Path(scene).stem}-live")
 
-    from taichi_msm.render.notes import drawing_notes
+    from taichi_msm.render.notes import drawing_warnings
     from taichi_msm.view.script import film, load_script, timed
 
     done = load_script(script, loaded.render.size) if script is not None else None
@@ -156,7 +156,7 @@ def view(
     from taichi_msm.view.recording import Captures
     from taichi_msm.view.session import Session
 
-    tell([*drawing_notes(loaded)])
+    tell([*drawing_warnings(loaded)])
     captures, interruption = Captures(directory, scene), Interruption()
     notices: list[str] = []
 

@@ -1,1 +1,1 @@
-"""Kernel 2 and its surroundings: the camera, the texture, light, instruments, pictures, labels."""
+"""Rendering: cameras, textures, light, instruments, pictures and labels."""

@@ -1,4 +1,4 @@
-"""Bins: squares of the picture, each with a list of the cells whose bounds reach it."""
+"""Spatial bins: squares of the picture, each with a list of the cells whose bounding box overlaps it."""
 
 from typing import Any, NamedTuple
 
@@ -9,135 +9,174 @@ from taichi_msm.render.config import Integers
 from taichi_msm.system.launches import Launches, end_thread
 from taichi_msm.system.runtime import our_compilation, ti
 
-# The bounds of a cell: its first and last column and row, within the picture; the last is before the first for a cell
-# that is not seen.
-FIRST_X, FIRST_Y, LAST_X, LAST_Y, BOUNDS = range(5)
+# Offsets in the bounding box of a cell: its first and last column and row, clipped to the picture. The box of an
+# invisible cell is empty: its last column or row is before the first.
+FIRST_X, FIRST_Y, LAST_X, LAST_Y, BOUNDS_STRIDE = range(5)
 
-# Farther from the picture nothing is followed.
-FARTHEST = 1e6
+# Larger coordinates are clipped, so that they fit into an integer.
+MAX_BOUND = 1e6
 
-# The largest number of entries in all lists, per cell and bin.
-MOST_ENTRIES = 64
+# Maximum number of entries in all lists, per cell and bin.
+MAX_MEAN_ENTRIES = 64
 
-# Rounds of a search among as many cells as a sheet may have.
-ROUNDS_OF_SEARCH = 32
+# Maximum number of rounds of a binary search among the cells of a sheet.
+SEARCH_ROUNDS = 32
 
 
 class Bins(NamedTuple):
-    """Lists of cells."""
+    """Lists of the cells that overlap each bin.
 
-    size: int  # width and height of a bin
-    across: int  # bins in a row
-    lengths: NDArray[np.int32]  # of the lists, shape (rows of bins, bins in a row)
-    starts: Any  # where each list begins, and the end of the last; on the device
-    entries: Any  # the cells of all lists, on the device; on a GPU, the order within a list is arbitrary
+    Attributes:
+        size: width and height of a bin [px or samples, as the bounds].
+        columns: number of bins in a row.
+        lengths: number of cells in each list, shape (rows of bins, columns).
+        starts: first entry of each list, then the end of the last one; on the device.
+        entries: cells of all lists, on the device; on a GPU the order within a list is arbitrary.
+    """
+
+    size: int
+    columns: int
+    lengths: NDArray[np.int32]
+    starts: Any
+    entries: Any
 
 
-def binned(launches: Launches, bounds: Any, cells: int, extent: tuple[int, int], size: int) -> Bins:
-    """List the cells of every bin: on a CPU one after the other, on a GPU all at once.
+def build_bins(launches: Launches, bounds: Any, cells: int, extent: tuple[int, int], size: int) -> Bins:
+    """List the cells that overlap each bin: sequentially on a CPU, in parallel on a GPU.
 
-    The `bounds` of so many cells, in a picture of this width and height, are on the device. Bins have this size, or are
-    larger where the lists would be too long.
+    Args:
+        launches: launches on the device; a bounded one selects the parallel kernels.
+        bounds: bounding boxes as stored by `store_bounds`, on the device.
+        cells: number of cells.
+        extent: width and height of the picture, in the unit of the bounds.
+        size: width and height of a bin; doubled until the lists fit into `MAX_MEAN_ENTRIES` per cell and bin.
+
+    Returns:
+        The lists.
     """
     if launches.bounded:
-        return _at_once(launches, bounds, cells, extent, size)
+        return _build_in_parallel(launches, bounds, cells, extent, size)
     while True:
-        across, down = (-(-side // size) for side in extent)
-        ends = np.zeros(across * down + 1, np.int32)
+        columns, rows = (-(-side // size) for side in extent)
+        ends = np.zeros(columns * rows + 1, np.int32)
         with our_compilation(optimised=False):
-            _count(cells, size, across, bounds, ends)
+            _count_cells(cells, size, columns, bounds, ends)
         starts = np.cumsum(ends, dtype=np.int64)
-        if starts[-1] <= MOST_ENTRIES * (cells + across * down):
+        if starts[-1] <= MAX_MEAN_ENTRIES * (cells + columns * rows):
             break
         size *= 2
     entries = np.empty(max(1, starts[-1]), np.int32)
     with our_compilation(optimised=False):
-        _fill(cells, size, across, bounds, starts[:-1].astype(np.int32), entries)
-    return Bins(size, across, ends[1:].reshape(down, across), starts.astype(np.int32), entries)
+        _list_cells(cells, size, columns, bounds, starts[:-1].astype(np.int32), entries)
+    return Bins(size, columns, ends[1:].reshape(rows, columns), starts.astype(np.int32), entries)
 
 
-def _at_once(launches: Launches, bounds: Any, cells: int, extent: tuple[int, int], size: int) -> Bins:
+def _build_in_parallel(launches: Launches, bounds: Any, cells: int, extent: tuple[int, int], size: int) -> Bins:
     corners = launches.take(bounds).reshape(cells, 2, 2)
     while True:
-        across, down = (-(-side // size) for side in extent)
-        reached = np.maximum(corners[:, 1] // size - corners[:, 0] // size + 1, 0).prod(axis=1, dtype=np.int64)
-        ends = np.cumsum(reached)
-        if ends[-1] <= MOST_ENTRIES * (cells + across * down):
+        columns, rows = (-(-side // size) for side in extent)
+        bins_per_cell = np.maximum(corners[:, 1] // size - corners[:, 0] // size + 1, 0).prod(axis=1, dtype=np.int64)
+        ends = np.cumsum(bins_per_cell)
+        if ends[-1] <= MAX_MEAN_ENTRIES * (cells + columns * rows):
             break
         size *= 2
     total = int(ends[-1])
-    counts, of_cells = launches.give(np.zeros(across * down, np.int32)), launches.give(ends.astype(np.int32))
-    squares, places, entries = (launches.array(np.int32, max(1, total)) for _ in range(3))
+    counts, cell_ends = launches.give(np.zeros(columns * rows, np.int32)), launches.give(ends.astype(np.int32))
+    bins, positions, entries = (launches.array(np.int32, max(1, total)) for _ in range(3))
     launches.launch(
-        _enter, total, cells, size, across, bounds, of_cells, counts, squares, places, rounds=ROUNDS_OF_SEARCH
+        _assign_entries, total, cells, size, columns, bounds, cell_ends, counts, bins, positions, rounds=SEARCH_ROUNDS
     )
     lengths = launches.take(counts)
     starts = launches.give(np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32))
-    launches.launch(_enlist, total, cells, of_cells, squares, places, starts, entries, rounds=ROUNDS_OF_SEARCH)
-    return Bins(size, across, lengths.reshape(down, across), starts, entries)
+    launches.launch(_list_entries, total, cells, cell_ends, bins, positions, starts, entries, rounds=SEARCH_ROUNDS)
+    return Bins(size, columns, lengths.reshape(rows, columns), starts, entries)
 
 
 @ti.func
 def store_bounds(cell, left, right, top, bottom, width, height, bounds: ti.template()):
-    """Store the bounds of a cell in a picture of this width and height."""
-    here = cell * BOUNDS
-    bounds[here + FIRST_X] = ti.cast(ti.floor(ti.math.clamp(left, 0.0, FARTHEST)), ti.i32)
-    bounds[here + FIRST_Y] = ti.cast(ti.floor(ti.math.clamp(top, 0.0, FARTHEST)), ti.i32)
-    bounds[here + LAST_X] = ti.cast(ti.floor(ti.math.clamp(right, -1.0, width - 1.0)), ti.i32)
-    bounds[here + LAST_Y] = ti.cast(ti.floor(ti.math.clamp(bottom, -1.0, height - 1.0)), ti.i32)
+    """Store the bounding box of a cell, clipped to the picture.
+
+    Args:
+        cell: index of the cell.
+        left: left edge of the bounding box [px or samples].
+        right: right edge of the bounding box [px or samples].
+        top: top edge of the bounding box [px or samples].
+        bottom: bottom edge of the bounding box [px or samples].
+        width: width of the picture, in the same unit.
+        height: height of the picture, in the same unit.
+        bounds: destination, `BOUNDS_STRIDE` integers per cell.
+    """
+    entry = cell * BOUNDS_STRIDE
+    bounds[entry + FIRST_X] = ti.cast(ti.floor(ti.math.clamp(left, 0.0, MAX_BOUND)), ti.i32)
+    bounds[entry + FIRST_Y] = ti.cast(ti.floor(ti.math.clamp(top, 0.0, MAX_BOUND)), ti.i32)
+    bounds[entry + LAST_X] = ti.cast(ti.floor(ti.math.clamp(right, -1.0, width - 1.0)), ti.i32)
+    bounds[entry + LAST_Y] = ti.cast(ti.floor(ti.math.clamp(bottom, -1.0, height - 1.0)), ti.i32)
 
 
 @ti.func
-def reaches(cell, x, y, bounds: ti.template()):
-    """Tell whether (x, y) is within the bounds of a cell."""
-    here = cell * BOUNDS
+def is_in_bounds(cell, x, y, bounds: ti.template()):
+    """Return whether (x, y) is within the bounding box of a cell.
+
+    Args:
+        cell: index of the cell.
+        x: column, in the unit of the bounds.
+        y: row, in the unit of the bounds.
+        bounds: bounding boxes as stored by `store_bounds`.
+    """
+    entry = cell * BOUNDS_STRIDE
     return (
-        bounds[here + FIRST_X] <= x
-        and x <= bounds[here + LAST_X]
-        and bounds[here + FIRST_Y] <= y
-        and y <= bounds[here + LAST_Y]
+        bounds[entry + FIRST_X] <= x
+        and x <= bounds[entry + LAST_X]
+        and bounds[entry + FIRST_Y] <= y
+        and y <= bounds[entry + LAST_Y]
     )
 
 
 @ti.func
-def _reached(cell, size, bounds: ti.template()):
-    """Give the bins that a cell reaches: their first and end column, their first and end row."""
-    here = cell * BOUNDS
+def _bin_range(cell, size, bounds: ti.template()):
+    """Return the bins that a cell overlaps: first and end column, first and end row."""
+    entry = cell * BOUNDS_STRIDE
     return (
-        bounds[here + FIRST_X] // size,
-        bounds[here + LAST_X] // size + 1,
-        bounds[here + FIRST_Y] // size,
-        bounds[here + LAST_Y] // size + 1,
+        bounds[entry + FIRST_X] // size,
+        bounds[entry + LAST_X] // size + 1,
+        bounds[entry + FIRST_Y] // size,
+        bounds[entry + LAST_Y] // size + 1,
     )
 
 
 @ti.kernel
-def _count(cells: ti.i32, size: ti.i32, across: ti.i32, bounds: Integers, ends: Integers):
-    """Count the cells of every bin; the count of bin n is in entry n + 1."""
+def _count_cells(cells: ti.i32, size: ti.i32, columns: ti.i32, bounds: Integers, ends: Integers):
+    """Count the cells of every bin; the count of bin n is in `ends[n + 1]`."""
     ti.loop_config(serialize=True)
     for cell in range(cells):
-        left, right, top, bottom = _reached(cell, size, bounds)
+        left, right, top, bottom = _bin_range(cell, size, bounds)
         for row in range(top, bottom):
             for column in range(left, right):
-                ends[row * across + column + 1] += 1
+                ends[row * columns + column + 1] += 1
 
 
 @ti.kernel
-def _fill(cells: ti.i32, size: ti.i32, across: ti.i32, bounds: Integers, ends: Integers, entries: Integers):
-    """List the cells of every bin; `ends` holds where each list begins, and afterwards where it ends."""
+def _list_cells(cells: ti.i32, size: ti.i32, columns: ti.i32, bounds: Integers, ends: Integers, entries: Integers):
+    """List the cells of every bin; `ends` holds the start of each list, and afterwards its end."""
     ti.loop_config(serialize=True)
     for cell in range(cells):
-        left, right, top, bottom = _reached(cell, size, bounds)
+        left, right, top, bottom = _bin_range(cell, size, bounds)
         for row in range(top, bottom):
             for column in range(left, right):
-                entries[ends[row * across + column]] = cell
-                ends[row * across + column] += 1
+                entries[ends[row * columns + column]] = cell
+                ends[row * columns + column] += 1
 
 
 @ti.func
-def owner(item, count, ends: ti.template()):
-    """Find which of `count` owners an item is of, where `ends` counts the items of all owners up to each."""
-    low, high = 0, count - 1
+def owner_of(item, owners, ends: ti.template()):
+    """Return the owner of an item by binary search.
+
+    Args:
+        item: index of the item.
+        owners: number of owners.
+        ends: cumulative number of items up to and including each owner.
+    """
+    low, high = 0, owners - 1
     while low < high:
         middle = (low + high) // 2
         if ends[middle] > item:
@@ -148,27 +187,27 @@ def owner(item, count, ends: ti.template()):
 
 
 @ti.kernel
-def _enter(
-    first: ti.i32, end: ti.i32, ended: Integers, cells: ti.i32, size: ti.i32, across: ti.i32,
-    bounds: Integers, ends: Integers, counts: Integers, squares: Integers, places: Integers,
+def _assign_entries(
+    first: ti.i32, end: ti.i32, ended: Integers, cells: ti.i32, size: ti.i32, columns: ti.i32,
+    bounds: Integers, ends: Integers, counts: Integers, bins: Integers, positions: Integers,
 ):  # fmt: skip
-    """Find the bin and the place in its list of every entry, and so the length of every list."""
+    """Assign every entry to a bin and to a position in its list, and count the entries of each bin."""
     for entry in range(first, end):
-        cell = owner(entry, cells, ends)
-        left, right, top, bottom = _reached(cell, size, bounds)
-        # The cell's last entry is that before its end.
+        cell = owner_of(entry, cells, ends)
+        left, right, top, bottom = _bin_range(cell, size, bounds)
+        # The cell's entries are the last ones before its end.
         n = (right - left) * (bottom - top) + entry - ends[cell]
-        squares[entry] = (top + n // (right - left)) * across + left + n % (right - left)
-        places[entry] = ti.atomic_add(counts[squares[entry]], 1)
+        bins[entry] = (top + n // (right - left)) * columns + left + n % (right - left)
+        positions[entry] = ti.atomic_add(counts[bins[entry]], 1)
         end_thread(ended)
 
 
 @ti.kernel
-def _enlist(
-    first: ti.i32, end: ti.i32, ended: Integers, cells: ti.i32, ends: Integers, squares: Integers, places: Integers,
-    starts: Integers, entries: Integers,
+def _list_entries(
+    first: ti.i32, end: ti.i32, ended: Integers, cells: ti.i32, ends: Integers, bins: Integers,
+    positions: Integers, starts: Integers, entries: Integers,
 ):  # fmt: skip
-    """Put every entry into its place."""
+    """Write the cell of every entry to its position."""
     for entry in range(first, end):
-        entries[starts[squares[entry]] + places[entry]] = owner(entry, cells, ends)
+        entries[starts[bins[entry]] + positions[entry]] = owner_of(entry, cells, ends)
         end_thread(ended)

@@ -1,13 +1,15 @@
-"""What kernel 2 is compiled for, and what is stored of every sample of the picture between covering and shading.
+"""Compile-time configuration and G-buffer layout of the rasteriser (kernel 2).
 
-Samples are pixels, or parts of pixels where these are supersampled. A tile of samples is one vector: 4 x 4 samples for
-the 16 lanes of AVX-512, 4 x 2 for 8 lanes, 4 x 1 for 4, a single one on a GPU. A tile takes several vectors, its
-planes. On a CPU bands of rows of tiles are the unit of parallel work; a worker stores one band at a time.
+A sample is a pixel, or one of several per pixel with supersampling. A tile of samples is one vector: 4 x 4 samples for
+the 16 lanes of AVX-512, 4 x 2 for 8 lanes, 4 x 1 for 4 lanes, and a single sample on a GPU. The G-buffer has several
+vectors per tile, its planes. On a CPU a band of rows of tiles is the unit of parallel work; each worker stores one
+band.
 
-What functions of kernel 2 take: x and y are column and row of a tile's samples, a number for each; `at` the entry of
-`samples` where the tile begins; `numbers` and `sizes` the arrays of uniforms.py; `point` what `project` stores.
+Arguments that the functions of kernel 2 share: `x` and `y` are the column and row of a tile's samples, one number per
+lane; `entry` is the first entry of a tile in `samples`; `uniforms` and `sizes` are the arrays of uniforms.py; `nodes`
+holds the projected mass points as stored by `project`.
 
-Modules with kernels have no `from __future__ import annotations`: Taichi reads the annotations.
+Modules with kernels have no `from __future__ import annotations`, because Taichi reads the annotations.
 """
 
 from collections import namedtuple
@@ -20,13 +22,13 @@ from taichi_msm.system.runtime import ti
 # Approximate number of rows of samples in a band on a CPU.
 BAND_ROWS = 16
 
-# Samples in a row of a tile, if there are that many lanes.
+# Maximum number of samples in a row of a tile.
 TILE_WIDTH = 4
 
-# Farther than anything that is drawn.
+# Depth of samples without a surface.
 INFINITY = 3e38
 
-# Types of a kernel's arguments.
+# Types of kernel arguments.
 Floats = ti.types.ndarray(dtype=ti.f32, ndim=1)
 Doubles = ti.types.ndarray(dtype=ti.f64, ndim=1)
 Integers = ti.types.ndarray(dtype=ti.i32, ndim=1)
@@ -34,22 +36,39 @@ Bytes = ti.types.ndarray(dtype=ti.u8, ndim=1)
 
 
 class DrawingConfig(NamedTuple):
-    """What kernel 2 is compiled for; all else it takes as arguments."""
+    """Compile-time configuration of kernel 2; everything else is passed as an argument.
 
-    refined: bool  # whether vertices are inserted between mass points
-    supersample: int  # samples per pixel along each axis
-    headlit: bool  # whether the sheet is lit by the headlight
-    tissue: bool  # whether the sheet is shaded as wet tissue
-    relief: bool  # whether tissue is shaded with a relief
-    vignette: bool  # whether tissue is shaded with a vignette
-    wireframe: bool  # whether the mass-point mesh is drawn
-    instruments: bool  # whether there are any
-    metal: bool  # whether they are shaded
-    picture: bool  # whether colours are written
-    labels: bool  # whether labels are written; needs one sample per pixel
-    normals: bool  # whether normals are among them
-    lens: str  # the model of the lens, pinhole or fisheye; empty if it bends no lines
-    lanes: int  # samples in a tile
+    Attributes:
+        refined: whether cells are subdivided.
+        supersample: samples per pixel along each axis.
+        headlit: whether the sheet is lit by a headlight.
+        tissue: whether the sheet is shaded as wet tissue.
+        relief: whether tissue is shaded with a relief.
+        vignette: whether tissue is shaded with a vignette.
+        wireframe: whether the mass-point mesh is drawn.
+        instruments: whether the scene has instruments.
+        metal: whether instruments are shaded.
+        picture: whether colours are written.
+        labels: whether labels are written; requires one sample per pixel.
+        normals: whether the labels include normals.
+        lens: lens model, "pinhole" or "fisheye"; empty without lens distortion.
+        lanes: number of samples in a tile.
+    """
+
+    refined: bool
+    supersample: int
+    headlit: bool
+    tissue: bool
+    relief: bool
+    vignette: bool
+    wireframe: bool
+    instruments: bool
+    metal: bool
+    picture: bool
+    labels: bool
+    normals: bool
+    lens: str
+    lanes: int
 
     @property
     def tile_width(self) -> int:
@@ -63,42 +82,45 @@ class DrawingConfig(NamedTuple):
 
     @property
     def unordered(self) -> bool:
-        """Whether cells come to a sample in any order, as on a GPU, and not row by row."""
+        """Whether the cells of a sample are processed in arbitrary order, as on a GPU, and not row by row."""
         return self.lanes == 1
 
     @property
     def plane(self) -> Any:
-        """The planes of a tile by name, and which of its vectors each is."""
+        """Index of each plane of the G-buffer, by name."""
         return _planes(self)
 
     @property
     def planes(self) -> int:
-        """Vectors stored per tile."""
+        """Number of vectors per tile."""
         return len(self.plane)
 
     @property
-    def bends(self) -> bool:
-        """Whether there is a lens that bends lines."""
+    def has_distortion(self) -> bool:
+        """Whether the camera has lens distortion."""
         return self.lens != ""
 
     @property
-    def place_planes(self) -> int:
-        """Vectors of the table of places per tile: x, y, their changes (lens_table.py), and a box; 0 without a lens."""
-        return (6 if self.place_steps else 2) + (not self.unordered) if self.lens else 0
+    def map_planes(self) -> int:
+        """Vectors per tile of the undistortion map; 0 without lens distortion.
+
+        They are x and y, the steps to the next samples (`lens_table.undistortion_map`), and on a CPU a bounding box.
+        """
+        return (6 if self.map_has_steps else 2) + (not self.unordered) if self.lens else 0
 
     @property
-    def place_steps(self) -> bool:
-        """Whether the table has the way to the next samples."""
+    def map_has_steps(self) -> bool:
+        """Whether the undistortion map includes the steps to the next samples."""
         return bool(self.lens) and (self.tissue or self.wireframe)
 
     @property
-    def band_places(self) -> int:
-        """Vectors of the table of places per row of tiles and tile across, in a band on a CPU, less its bounds."""
-        return self.band_lines * self.place_planes
+    def band_map_vectors(self) -> int:
+        """Vectors of the undistortion map per column of tiles in a band on a CPU, without the bounds."""
+        return self.band_lines * self.map_planes
 
     @property
     def band_rows(self) -> int:
-        """Rows of pixels in a band on a CPU, a whole number of rows of tiles."""
+        """Rows of pixels in a band on a CPU."""
         return max(1, BAND_ROWS // self.supersample)
 
     @property
@@ -107,65 +129,89 @@ class DrawingConfig(NamedTuple):
         return -(-self.band_rows * self.supersample // self.tile_height)
 
     @property
-    def in_words(self) -> bool:
-        """Whether pixels are written in groups of four, as three words, and not as bytes."""
+    def writes_words(self) -> bool:
+        """Whether pixels are written in groups of four, as three 32-bit words, instead of bytes."""
         return self.supersample == 1 and self.tile_width == TILE_WIDTH
 
     def tiles_across(self, width: int) -> int:
-        """Count the tiles in a row of a picture of this width [px]."""
+        """Return the number of tiles in a row of a picture of this width [px]."""
         return -(-width * self.supersample // self.tile_width)
 
     @property
-    def floats(self) -> Any:
-        """Taichi's type of one floating-point number per lane."""
+    def float_vector(self) -> Any:
+        """Taichi type of a vector with one floating-point number per lane."""
         return ti.types.vector(self.lanes, ti.f32)
 
     @property
-    def integers(self) -> Any:
-        """Taichi's type of one whole number per lane."""
+    def integer_vector(self) -> Any:
+        """Taichi type of a vector with one integer per lane."""
         return ti.types.vector(self.lanes, ti.i32)
 
 
 @cache
 def _planes(config: DrawingConfig) -> Any:
-    """Number the planes that a config needs."""
+    """Number the planes that a configuration needs."""
     needed = {
         **{name: config.labels for label in LABELS.values() for name in label.planes},
         **dict.fromkeys(LABELS["normals"].planes, config.normals),
-        **dict.fromkeys(("depth", "texel_x", "texel_y"), True),  # of what is seen; its place in the texture [texels]
-        "light": config.headlit,  # share of the headlight that comes back
-        "wire": config.wireframe,  # share of the mesh's lines in the colour
-        "instrument": config.instruments,  # 255 where an instrument is seen, else 0
+        **dict.fromkeys(("depth", "texel_x", "texel_y"), True),  # of the visible surface; texture coordinates [texels]
+        "light": config.headlit,  # reflected share of the headlight
+        "wire": config.wireframe,  # opacity of the mesh's lines
+        "instrument": config.instruments,  # 255 for a visible instrument, else 0
         **dict.fromkeys(("normal_x", "normal_y", "normal_z"), config.tissue or config.metal),  # in the camera's frame
-        **dict.fromkeys(("cell", "triangle"), config.unordered),  # their numbers
-        "footprint": config.tissue,  # square of the texels of a sample's longer side
-        **dict.fromkeys(("red", "green", "blue"), config.picture and config.supersample > 1),  # to be averaged
+        **dict.fromkeys(("cell", "triangle"), config.unordered),  # indices of the visible cell and triangle
+        "footprint": config.tissue,  # squared size of a sample on the texture
+        **dict.fromkeys(("red", "green", "blue"), config.picture and config.supersample > 1),  # before averaging
     }
-    names = [name for name, there in needed.items() if there]
+    names = [name for name, is_needed in needed.items() if is_needed]
     return namedtuple("Planes", names)(*range(len(names)))
 
 
 class Band(NamedTuple):
-    """A band of the picture, or a part of one, and the view; all in samples."""
+    """A band of the picture, or a part of a band, with the view; all lengths in samples.
+
+    Attributes:
+        config: compile-time configuration.
+        samples: G-buffer; with lens distortion also the undistortion map.
+        first: first entry of the band in `samples`, at the left edge of the picture.
+        tiles_across: number of tiles in a row.
+        left, right: first column, and the column after the last one.
+        top, bottom: first row, and the row after the last one.
+        width, height: size of the picture.
+        near: near plane [m]; only surfaces with a larger w are drawn.
+        uniforms: constants of the view (uniforms.py).
+        map_start: first entry of the band's undistortion map in `samples`.
+    """
 
     config: DrawingConfig
-    samples: Any  # the planes of all tiles that are kept
-    first: Any  # entry of `samples` where the band begins, from the left edge of the picture
-    across: Any  # tiles in a row
-    left: Any  # first column
-    right: Any  # the column after the last
-    top: Any  # first row
-    bottom: Any  # the row after the last
-    width: Any  # of the picture
+    samples: Any
+    first: Any
+    tiles_across: Any
+    left: Any
+    right: Any
+    top: Any
+    bottom: Any
+    width: Any
     height: Any
-    near: Any  # only what is farther than this is drawn
-    numbers: Any
-    places: Any  # entry of `samples` where the band's places begin, if there is a lens
+    near: Any
+    uniforms: Any
+    map_start: Any
 
 
 @ti.func
 def clip(low_x, high_x, low_y, high_y, band: ti.template()):
-    """Clip a rectangle to a band: give its first and end column, its first and end row of samples."""
+    """Clip a rectangle to a band.
+
+    Args:
+        low_x: least column of the rectangle [samples].
+        high_x: largest column of the rectangle [samples].
+        low_y: least row of the rectangle [samples].
+        high_y: largest row of the rectangle [samples].
+        band: the band.
+
+    Returns:
+        First and end column, first and end row of samples.
+    """
     return (
         ti.cast(ti.math.clamp(ti.floor(low_x), band.left, band.right), ti.i32),
         ti.cast(ti.math.clamp(ti.ceil(high_x), band.left, band.right), ti.i32),
@@ -175,81 +221,145 @@ def clip(low_x, high_x, low_y, high_y, band: ti.template()):
 
 
 @ti.func
-def tiles_of(first_column, end_column, first_row, end_row, band: ti.template()):
-    """Give the tiles of a rectangle of samples: the first and end tile in a line of tiles, the first and end line."""
-    width, height = ti.static((band.config.tile_width, band.config.tile_height))
+def tile_range(first_column, end_column, first_row, end_row, band: ti.template()):
+    """Return the tiles that a rectangle of samples overlaps.
+
+    Args:
+        first_column: first column of the rectangle [samples].
+        end_column: column after the last one of the rectangle [samples].
+        first_row: first row of the rectangle [samples].
+        end_row: row after the last one of the rectangle [samples].
+        band: the band.
+
+    Returns:
+        First and end tile in a row of tiles, first and end row of tiles, both counted from the band's top.
+    """
+    tile_width, tile_height = ti.static((band.config.tile_width, band.config.tile_height))
     return (
-        first_column // width,
-        (end_column + (width - 1)) // width,
-        (first_row - band.top) // height,
-        (end_row - band.top + (height - 1)) // height,
+        first_column // tile_width,
+        (end_column + (tile_width - 1)) // tile_width,
+        (first_row - band.top) // tile_height,
+        (end_row - band.top + (tile_height - 1)) // tile_height,
     )
 
 
 @ti.func
-def centres(left, top, config: ti.template()):
-    """Give x and y of the samples of a tile, whose upper left corner is at (left, top)."""
-    width = ti.static(config.tile_width)
-    columns = config.floats([lane % width + 0.5 for lane in ti.static(range(config.lanes))])
-    lines = config.floats([lane // width + 0.5 for lane in ti.static(range(config.lanes))])
+def sample_centres(left, top, config: ti.template()):
+    """Return x and y of the sample centres of a tile [samples].
+
+    Args:
+        left: left edge of the tile [samples].
+        top: top edge of the tile [samples].
+        config: compile-time configuration.
+    """
+    tile_width = ti.static(config.tile_width)
+    columns = config.float_vector([lane % tile_width + 0.5 for lane in ti.static(range(config.lanes))])
+    lines = config.float_vector([lane // tile_width + 0.5 for lane in ti.static(range(config.lanes))])
     return columns + ti.cast(left, ti.f32), lines + ti.cast(top, ti.f32)
 
 
 @ti.func
-def places(left, top, at, samples: ti.template(), config: ti.template()):
-    """Give x and y of the samples of a tile, as `centres`, without distortion; `at` is the entry of its places."""
-    x, y = centres(left, top, config)
-    if ti.static(config.bends):
-        x, y = samples[at], samples[at + 1]
+def undistorted_centres(left, top, entry, samples: ti.template(), config: ti.template()):
+    """Return the undistorted x and y of the sample centres of a tile [samples].
+
+    Args:
+        left: left edge of the tile [samples].
+        top: top edge of the tile [samples].
+        entry: first entry of the tile in the undistortion map.
+        samples: G-buffer and undistortion map.
+        config: compile-time configuration.
+    """
+    x, y = sample_centres(left, top, config)
+    if ti.static(config.has_distortion):
+        x, y = samples[entry], samples[entry + 1]
     return x, y
 
 
 @ti.func
-def places_of(at, band: ti.template()):
-    """Give the entry of the places of a tile that begins at entry `at` of the samples."""
-    return band.places + (at - band.first) // band.config.planes * band.config.place_planes
+def map_entry(entry, band: ti.template()):
+    """Return the first entry of a tile in the undistortion map.
+
+    Args:
+        entry: first entry of the tile in the G-buffer.
+        band: the band.
+    """
+    return band.map_start + (entry - band.first) // band.config.planes * band.config.map_planes
 
 
 @ti.func
-def box_of(at, left, top, band: ti.template()):
-    """Give the left, right, top and bottom of the samples of a tile, without distortion; `left`, `top`: its corner."""
+def tile_box(entry, left, top, band: ti.template()):
+    """Return the bounding box of the undistorted sample centres of a tile: left, right, top and bottom [samples].
+
+    Args:
+        entry: first entry of the tile in the G-buffer.
+        left: left edge of the tile [samples].
+        top: top edge of the tile [samples].
+        band: the band.
+    """
     config = ti.static(band.config)
     x, y = left + 0.5, top + 0.5
     box = [x, x + (config.tile_width - 1.0), y, y + (config.tile_height - 1.0)]
-    if ti.static(config.bends):
-        known = places_of(at, band)
+    if ti.static(config.has_distortion):
+        stored = map_entry(entry, band)
         for n in ti.static(range(4)):
             if ti.static(config.unordered):
-                box[n] = band.samples[known + n // 2][0]
+                box[n] = band.samples[stored + n // 2][0]
             else:
-                box[n] = band.samples[known + config.place_planes - 1][n]
+                box[n] = band.samples[stored + config.map_planes - 1][n]
     return ti.static(box)
 
 
 @ti.func
-def steps(at, band: ti.template()):
-    """Give the ways from the samples of a tile to the next on the right and to the next below, without distortion."""
-    way = places_of(at, band) + 2
-    return [band.samples[way + n] for n in ti.static(range(4))]
+def map_steps(entry, band: ti.template()):
+    """Return the undistorted steps from the samples of a tile to the next ones on the right and below [samples].
+
+    Args:
+        entry: first entry of the tile in the G-buffer.
+        band: the band.
+
+    Returns:
+        x and y of the step to the right, x and y of the step downward.
+    """
+    steps_entry = map_entry(entry, band) + 2
+    return [band.samples[steps_entry + n] for n in ti.static(range(4))]
 
 
 @ti.func
-def clear(at, band: ti.template()):
-    """Empty a tile."""
-    band.samples[at + band.config.plane.depth] = band.config.floats(INFINITY)
+def clear_tile(entry, band: ti.template()):
+    """Mark the samples of a tile as empty.
+
+    Args:
+        entry: first entry of the tile in the G-buffer.
+        band: the band.
+    """
+    band.samples[entry + band.config.plane.depth] = band.config.float_vector(INFINITY)
     if ti.static(band.config.instruments):
-        band.samples[at + band.config.plane.instrument] = band.config.floats(0)
+        band.samples[entry + band.config.plane.instrument] = band.config.float_vector(0)
 
 
 @ti.func
-def keep(at, visible, value, samples: ti.template()):
-    """Store a plane's value for the samples where it is visible."""
-    samples[at] = ti.select(visible, value, samples[at])
+def store_visible(entry, visible, value, samples: ti.template()):
+    """Store values of one plane for the visible samples of a tile.
+
+    Args:
+        entry: entry of the plane's vector in `samples`.
+        visible: mask of the samples.
+        value: values, one per lane.
+        samples: G-buffer.
+    """
+    samples[entry] = ti.select(visible, value, samples[entry])
 
 
 @ti.func
-def keep_unit(at, visible, vector: ti.template(), samples: ti.template()):
-    """Store the direction of a vector in three planes, as `keep` stores one value."""
+def store_visible_unit(entry, visible, vector: ti.template(), samples: ti.template()):
+    """Store normalised vectors in three planes for the visible samples of a tile.
+
+    Args:
+        entry: entry of the first plane's vector in `samples`.
+        visible: mask of the samples.
+        vector: list of three components, one number per lane.
+        samples: G-buffer.
+    """
     length = ti.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
     for n in ti.static(range(3)):
-        keep(at + n, visible, vector[n] / length, samples)
+        store_visible(entry + n, visible, vector[n] / length, samples)

@@ -1,6 +1,6 @@
-"""Kernel 2 on a CPU: the picture is cut into bands of rows, which workers take one after the other.
+"""Kernel 2 on a CPU: the picture is divided into bands of rows, which the workers process one after the other.
 
-What is kept of a band fits into the cache, and no two workers write to one sample, so they need no locks.
+The G-buffer of a band fits into the cache, and no two workers write the same sample, so that no locks are needed.
 """
 
 from collections.abc import Callable
@@ -11,149 +11,187 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.render import uniforms as uni
-from taichi_msm.render.config import INFINITY, Band, Bytes, DrawingConfig, Floats, Integers, clear
-from taichi_msm.render.coverage import NORMAL_NUMBERS, DrawnSheet, cover, cover_with_rods, store_normal
-from taichi_msm.render.geometry import POINT_NUMBERS, SEEN, may_reach, project
-from taichi_msm.render.labels import label_numbers
-from taichi_msm.render.lens_kernels import BENT_NUMBERS, store_bent
-from taichi_msm.render.lens_table import bounds, tiled
+from taichi_msm.render.config import INFINITY, Band, Bytes, DrawingConfig, Floats, Integers, clear_tile
+from taichi_msm.render.coverage import NORMAL_STRIDE, DrawnSheet, cover_capsules, cover_cell, store_normal
+from taichi_msm.render.geometry import NODE_STRIDE, SCREEN, may_cover_rows, project
+from taichi_msm.render.labels import label_width
+from taichi_msm.render.lens_kernels import DISTORTED_STRIDE, store_distorted
+from taichi_msm.render.lens_table import bounds, tiled_map
 from taichi_msm.render.shading import Appearance, PixelArrays, resolve
 from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, Memory, our_compilation, started, ti, write
 
-# The numbers that are stored of all mass points come first; then, for every row of them, its highest and its lowest
-# place in the picture, without distortion.
-STORED = POINT_NUMBERS + NORMAL_NUMBERS
+# Numbers per mass point without the distorted ones. After the numbers of all mass points, two numbers per row follow:
+# the first and the last row of the picture that it reaches, without distortion.
+UNDISTORTED_STRIDE = NODE_STRIDE + NORMAL_STRIDE
 
 
 class Bands:
     """The memory of one sheet's pictures on a CPU, and their kernel.
 
-    The sheet has rows and columns of `points`, the picture is of this width and height [px]; texels are from `pyramid`.
+    Args:
+        config: compile-time configuration.
+        shape: rows and columns of mass points.
+        size: width and height of the picture [px].
+        texels: levels of the texture, as returned by `pyramid`.
     """
 
     def __init__(
-        self, config: DrawingConfig, points: tuple[int, int], size: tuple[int, int], texels: NDArray[np.float32]
+        self, config: DrawingConfig, shape: tuple[int, int], size: tuple[int, int], texels: NDArray[np.float32]
     ) -> None:
         self._config, self._size, self._texels = config, size, texels
         self._draw = _kernel(config)
-        (rows, cols), (width, height) = points, size
+        (rows, cols), (width, height) = shape, size
         self._workers = min(-(-height // config.band_rows), started().threads)
         self._memory = memory = Memory()
-        self._point = memory.array("f32", 0, rows * (cols * (STORED + BENT_NUMBERS * config.bends) + 2))
+        self._nodes = memory.array(
+            "f32", 0, rows * (cols * (UNDISTORTED_STRIDE + DISTORTED_STRIDE * config.has_distortion) + 2)
+        )
         band_vectors = config.band_lines * config.tiles_across(width) * config.planes
-        # Before the bands are the places of all samples, if there is a lens.
-        self._table = -(-height // config.band_rows) * _places_of_band(config, width)
+        # With lens distortion the undistortion map comes before the bands.
+        self._table = -(-height // config.band_rows) * _map_vectors(config, width)
         self._samples = memory.array("f32", config.lanes, self._table + self._workers * band_vectors)
 
-    def place(self, places: NDArray[np.float32]) -> None:
-        """Take the places of the samples of the pictures that follow, as of `sample_places`."""
-        config, bands = self._config, tiled(places, self._config)
+    def set_undistortion_map(self, table: NDArray[np.float32]) -> None:
+        """Set the undistortion map of the following pictures, as returned by `undistortion_map`."""
+        config, tiles = self._config, tiled_map(table, self._config)
         rows = config.band_rows * config.supersample
-        known = [bounds(places[first : first + rows, :, :2]) for first in range(0, len(places), rows)]
-        last = np.pad(known, ((0, 0), (0, config.lanes - len(known[0]))))
-        table = np.concatenate([bands, last[:, None].astype(np.float32)], axis=1)
-        write(self._samples, table.reshape(-1, config.lanes))
+        boxes = [bounds(table[first : first + rows, :, :2]) for first in range(0, len(table), rows)]
+        padded_boxes = np.pad(boxes, ((0, 0), (0, config.lanes - len(boxes[0]))))
+        bands = np.concatenate([tiles, padded_boxes[:, None].astype(np.float32)], axis=1)
+        write(self._samples, bands.reshape(-1, config.lanes))
 
     def draw(
-        self, position: NDArray[np.float32], numbers: NDArray[np.float32], sizes: NDArray[np.int32]
+        self, position: NDArray[np.float32], uniforms: NDArray[np.float32], sizes: NDArray[np.int32]
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Draw the picture, the labels or both, as the config says; `numbers` and `sizes` are those of uniforms.py.
+        """Draw the picture, the labels or both, as configured.
+
+        Args:
+            position: positions of the mass points [m], shape (rows, cols, 3).
+            uniforms: constants of the view (uniforms.py).
+            sizes: sizes and counters (uniforms.py).
 
         Returns:
-            Colours, shape (height, width, 3), and labels as `labels_of` takes them; each has meaning only if drawn.
+            Colours, shape (height, width, 3), and labels as expected by `labels_of`; each is undefined unless it is
+            drawn.
         """
         config, (width, height) = self._config, self._size
-        # Whole tiles are written, and the last of a row may reach beyond the picture.
-        stride = config.tiles_across(width) * config.tile_width if config.in_words else width
+        # Only complete tiles are written, and the last one of a row may extend beyond the picture.
+        stride = config.tiles_across(width) * config.tile_width if config.writes_words else width
         picture = np.empty((height, stride, 3) if config.picture else (1, 4, 3), np.uint8)
-        # Without labels nothing is written there; an array of Taichi's is passed in half the time of one of NumPy's.
-        labels: Any = self._point
+        # Without labels the argument is unused; passing an array of Taichi takes half the time of a NumPy array.
+        labels: Any = self._nodes
         if config.labels:
-            labels = np.zeros(label_numbers(normals=config.normals) * width * height, np.float32)
+            labels = np.zeros(label_width(normals=config.normals) * width * height, np.float32)
         sizes[[uni.ROWS_TAKEN, uni.ROWS_PROJECTED, uni.BANDS_TAKEN]] = 0
         with our_compilation(optimised=False):
             self._draw(
-                position, self._texels, numbers, self._workers, sizes, self._point, self._samples,
-                picture.ravel().view(np.int32) if config.in_words else picture.ravel(), labels,
+                position, self._texels, uniforms, self._workers, sizes, self._nodes, self._samples,
+                picture.ravel().view(np.int32) if config.writes_words else picture.ravel(), labels,
             )  # fmt: skip
         return picture[:, :width], labels
 
 
-def _places_of_band(config: DrawingConfig, width: int) -> int:
-    """Count the vectors that hold a band's places, and their bounds, in a picture of this width [px]."""
-    return config.band_places * config.tiles_across(width) + 1 if config.lens else 0
+def _map_vectors(config: DrawingConfig, width: int) -> int:
+    """Return the vectors per band of the undistortion map and its bounds, for a picture of this width [px]."""
+    return config.band_map_vectors * config.tiles_across(width) + 1 if config.lens else 0
 
 
 @ti.func
 def project_row(
-    position: ti.template(), i, rows, cols, config: ti.template(), numbers: ti.template(), point: ti.template()
+    position: ti.template(), i, rows, cols, config: ti.template(), uniforms: ti.template(), nodes: ti.template()
 ):
-    """Project a row of mass points; store how far up and down in the picture it reaches."""
-    low, high = INFINITY, -INFINITY
+    """Project a row of mass points, and store the first and last row of the picture that it reaches.
+
+    Args:
+        position: positions of the mass points [m], shape (rows, cols, 3).
+        i: row of mass points.
+        rows: number of rows of mass points.
+        cols: number of columns of mass points.
+        config: compile-time configuration.
+        uniforms: constants of the view.
+        nodes: destination.
+    """
+    first_row, last_row = INFINITY, -INFINITY
     for j in range(cols):
-        project(position, i, j, cols, numbers, point, False)
-        store_normal(position, i, j, rows, cols, config, numbers, point)
-        here = (i * cols + j) * POINT_NUMBERS
-        if ti.static(config.bends):
-            bent = rows * cols * STORED + (i * cols + j) * BENT_NUMBERS
-            store_bent(bent, here, numbers, point, config.lens)
-        if point[here + 2] > numbers[uni.NEAR]:
-            low = ti.min(low, point[here + SEEN + 1])
-            high = ti.max(high, point[here + SEEN + 1])
+        project(position, i, j, cols, uniforms, nodes, False)
+        store_normal(position, i, j, rows, cols, config, uniforms, nodes)
+        entry = (i * cols + j) * NODE_STRIDE
+        if ti.static(config.has_distortion):
+            distorted_entry = rows * cols * UNDISTORTED_STRIDE + (i * cols + j) * DISTORTED_STRIDE
+            store_distorted(distorted_entry, entry, uniforms, nodes, config.lens)
+        if nodes[entry + 2] > uniforms[uni.NEAR]:
+            first_row = ti.min(first_row, nodes[entry + SCREEN + 1])
+            last_row = ti.max(last_row, nodes[entry + SCREEN + 1])
         else:
-            low, high = -INFINITY, INFINITY
-    reach = rows * cols * (STORED + BENT_NUMBERS * config.bends) + 2 * i
-    point[reach] = low
-    point[reach + 1] = high
+            first_row, last_row = -INFINITY, INFINITY
+    row_entry = rows * cols * (UNDISTORTED_STRIDE + DISTORTED_STRIDE * config.has_distortion) + 2 * i
+    nodes[row_entry] = first_row
+    nodes[row_entry + 1] = last_row
 
 
 @ti.func
 def project_all(
-    position: ti.template(), rows, cols, config: ti.template(), numbers: ti.template(), sizes: ti.template(),
-    point: ti.template(),
+    position: ti.template(), rows, cols, config: ti.template(), uniforms: ti.template(), sizes: ti.template(),
+    nodes: ti.template(),
 ):  # fmt: skip
-    """Project all rows of mass points, shared among the workers; returns when every row is done.
+    """Project all mass points, row by row and shared among the workers; return when every row is finished.
 
-    A worker waits only for rows that a running worker has taken, so one that starts late holds up nobody.
+    A worker waits only for rows that a running worker has taken, so a worker that starts late delays nobody.
+
+    Args:
+        position: positions of the mass points [m], shape (rows, cols, 3).
+        rows: number of rows of mass points.
+        cols: number of columns of mass points.
+        config: compile-time configuration.
+        uniforms: constants of the view.
+        sizes: sizes and counters.
+        nodes: destination.
     """
-    taking = True
-    while taking:
+    has_row = True
+    while has_row:
         i = ti.atomic_add(sizes[uni.ROWS_TAKEN], 1)
-        taking = i < rows
-        if taking:
-            project_row(position, i, rows, cols, config, numbers, point)
+        has_row = i < rows
+        if has_row:
+            project_row(position, i, rows, cols, config, uniforms, nodes)
             ti.atomic_add(sizes[uni.ROWS_PROJECTED], 1)
-    projected = ti.atomic_add(sizes[uni.ROWS_PROJECTED], 0)
-    while projected < rows:
-        projected = ti.atomic_add(sizes[uni.ROWS_PROJECTED], 0)
+    finished = ti.atomic_add(sizes[uni.ROWS_PROJECTED], 0)
+    while finished < rows:
+        finished = ti.atomic_add(sizes[uni.ROWS_PROJECTED], 0)
 
 
 @ti.func
 def cover_band(sheet: ti.template(), band: ti.template()):
-    """Find what every sample of a band shows of the sheet."""
-    config, point = ti.static((band.config, sheet.point))
+    """Cover the samples of a band with the sheet.
+
+    Args:
+        sheet: the sheet.
+        band: the band.
+    """
+    config, nodes = ti.static((band.config, sheet.nodes))
     lines = (band.bottom - band.top + config.tile_height - 1) // config.tile_height
-    for tile in range(lines * band.across):
-        clear(band.first + tile * config.planes, band)
-    reach = sheet.rows * sheet.cols * (STORED + BENT_NUMBERS * config.bends)
-    # The rows of samples that the band shows, which without distortion are others.
+    for tile in range(lines * band.tiles_across):
+        clear_tile(band.first + tile * config.planes, band)
+    rows_start = sheet.rows * sheet.cols * (UNDISTORTED_STRIDE + DISTORTED_STRIDE * config.has_distortion)
+    # Undistorted rows of the samples of the band.
     top, bottom = ti.cast(band.top, ti.f32), ti.cast(band.bottom, ti.f32)
-    if ti.static(config.bends):
-        known = band.samples[band.places + config.band_places * band.across]
-        top, bottom = known[2] - 1.0, known[3] + 1.0
+    if ti.static(config.has_distortion):
+        box = band.samples[band.map_start + config.band_map_vectors * band.tiles_across]
+        top, bottom = box[2] - 1.0, box[3] + 1.0
     for i in range(sheet.rows - 1):
-        row = reach + 2 * i
-        low = ti.min(point[row], point[row + 2])
-        high = ti.max(point[row + 1], point[row + 3])
-        if low < bottom and high > top:
+        row_entry = rows_start + 2 * i
+        first_row = ti.min(nodes[row_entry], nodes[row_entry + 2])
+        last_row = ti.max(nodes[row_entry + 1], nodes[row_entry + 3])
+        if first_row < bottom and last_row > top:
             for j in range(sheet.cols - 1):
-                if ti.static(config.bends):
+                if ti.static(config.has_distortion):
                     cell = i * sheet.cols + j
-                    bent = sheet.bent + cell * BENT_NUMBERS
-                    if may_reach(cell * POINT_NUMBERS, bent, sheet.cols, band.top, band.bottom, band.numbers, point):
-                        cover(i, j, (), sheet, band)
+                    distorted_entry = sheet.distorted_start + cell * DISTORTED_STRIDE
+                    if may_cover_rows(
+                        cell * NODE_STRIDE, distorted_entry, sheet.cols, band.top, band.bottom, band.uniforms, nodes
+                    ):
+                        cover_cell(i, j, (), sheet, band)
                 else:
-                    cover(i, j, (), sheet, band)
+                    cover_cell(i, j, (), sheet, band)
 
 
 @cache
@@ -162,50 +200,58 @@ def _kernel(config: DrawingConfig) -> Callable[..., None]:
 
     @ti.kernel
     def draw(
-        position: ti.types.ndarray(dtype=ti.f32, ndim=3), texels: Floats, numbers: Floats, workers: ti.i32,
-        sizes: Integers, point: Floats, samples: ti.types.ndarray(dtype=config.floats, ndim=1),
-        colours: Integers if config.in_words else Bytes, labels: Floats,
+        position: ti.types.ndarray(dtype=ti.f32, ndim=3), texels: Floats, uniforms: Floats, workers: ti.i32,
+        sizes: Integers, nodes: Floats, samples: ti.types.ndarray(dtype=config.float_vector, ndim=1),
+        colours: Integers if config.writes_words else Bytes, labels: Floats,
     ):  # fmt: skip
         for index in range(workers * ITERATIONS_PER_THREAD):
             if index % ITERATIONS_PER_THREAD == 0:
                 rows, cols = sizes[uni.ROWS], sizes[uni.COLS]
                 width, height = sizes[uni.WIDTH], sizes[uni.HEIGHT]
-                # To start a loop for this alone takes longer than to project a sheet of usual size.
-                project_all(position, rows, cols, config, numbers, sizes, point)
+                # Starting a separate parallel loop takes longer than projecting a sheet of usual size.
+                project_all(position, rows, cols, config, uniforms, sizes, nodes)
                 texture_width, texture_height = sizes[uni.LEVELS + 1], sizes[uni.LEVELS + 2]
-                rod_count, parts, near = sizes[uni.ROD_COUNT], numbers[uni.PARTS], numbers[uni.NEAR]
-                across = (width * factor + config.tile_width - 1) // config.tile_width
-                first = index // ITERATIONS_PER_THREAD * across * (config.band_lines * config.planes)
-                band_places = 0
-                if ti.static(config.bends):
-                    band_places = across * config.band_places + 1
-                    first += (height + config.band_rows - 1) // config.band_rows * band_places
-                bent = rows * cols * STORED
-                sheet = ti.static(DrawnSheet(point, rows, cols, parts, texture_width, texture_height, bent))
+                capsule_count, subdivisions, near = (
+                    sizes[uni.CAPSULE_COUNT],
+                    uniforms[uni.SUBDIVISIONS],
+                    uniforms[uni.NEAR],
+                )
+                tiles_across = (width * factor + config.tile_width - 1) // config.tile_width
+                first = index // ITERATIONS_PER_THREAD * tiles_across * (config.band_lines * config.planes)
+                map_vectors = 0
+                if ti.static(config.has_distortion):
+                    map_vectors = tiles_across * config.band_map_vectors + 1
+                    first += (height + config.band_rows - 1) // config.band_rows * map_vectors
+                distorted_start = rows * cols * UNDISTORTED_STRIDE
+                sheet = ti.static(
+                    DrawnSheet(nodes, rows, cols, subdivisions, texture_width, texture_height, distorted_start)
+                )
                 appearance = ti.static(
-                    Appearance(config, texels, sizes, texture_width, texture_height, numbers, rod_count)
+                    Appearance(config, texels, sizes, texture_width, texture_height, uniforms, capsule_count)
                 )
                 pixels = width * height
                 output = ti.static(PixelArrays(colours, labels, pixels))
                 samples_width, samples_height = width * factor, height * factor
-                # Bands are taken one by one: if another program delays a worker, the others take its bands.
-                taking = True
-                while taking:
+                # Bands are taken one by one: if a worker is delayed, the others take its bands.
+                has_band = True
+                while has_band:
                     row = ti.atomic_add(sizes[uni.BANDS_TAKEN], 1) * config.band_rows
-                    taking = row < height
-                    if taking:
+                    has_band = row < height
+                    if has_band:
                         end_row = ti.min(row + config.band_rows, height)
                         top, bottom = row * factor, end_row * factor
-                        places = row // config.band_rows * band_places
+                        map_start = row // config.band_rows * map_vectors
                         band = ti.static(
                             Band(
-                                config, samples, first, across, 0.0, samples_width, top, bottom,
-                                samples_width, samples_height, near, numbers, places,
+                                config, samples, first, tiles_across, 0.0, samples_width, top, bottom,
+                                samples_width, samples_height, near, uniforms, map_start,
                             )
                         )  # fmt: skip
                         cover_band(sheet, band)
                         if ti.static(config.instruments):
-                            cover_with_rods(rod_count, band)
-                        resolve(first, row, end_row, 0, width, across, width, places, samples, appearance, output)
+                            cover_capsules(capsule_count, band)
+                        resolve(
+                            first, row, end_row, 0, width, tiles_across, width, map_start, samples, appearance, output
+                        )
 
     return draw

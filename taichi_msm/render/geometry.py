@@ -1,13 +1,13 @@
-"""Points and cells of the sheet as the camera sees them, for one sample or a vector of them, in f32 or f64.
+"""Projected mass points, cells and triangles, for one sample or a vector of samples, in f32 or f64.
 
-A point of the surface is represented by (X, Y, w, depth), the product of the camera's matrix and the point. That map is
-linear, so refining the projected mass points is the same as refining the surface, and perspective is no special case.
-In a cell, with s to the right and t down, the surface between the four mass points is
+A point of the surface is represented by (X, Y, w, depth), the product of the camera's matrix and the point. This map is
+linear, so subdividing the projected cells is the same as subdividing the surface, also in perspective. With s to the
+right and t down, the surface between the four mass points of a cell is
 
-    P(s, t) = A + B s + C t + D s t,    seen at sample (x, y) where    X - x w = 0,  Y - y w = 0.
+    P(s, t) = A + B s + C t + D s t,    projected to sample (x, y) where    X - x w = 0,  Y - y w = 0.
 
-It is cut into small quads, and these into triangles along the diagonal from top left to bottom right. Corners are
-listed row by row: upper left and right, lower left and right.
+A cell is divided into sub-quads, and each of these into two triangles along the diagonal from top left to bottom right.
+Corners are listed row by row: upper left and right, lower left and right.
 """
 
 from typing import Any, NamedTuple
@@ -17,159 +17,257 @@ from taichi_msm.render import uniforms as uni
 from taichi_msm.render.config import INFINITY
 from taichi_msm.system.runtime import ti
 
-# The numbers of a mass point: (X, Y, w, depth), its place in the picture [samples], at SEEN.
-SEEN, POINT_NUMBERS = uni.SEEN, 6
+# Numbers per mass point: X, Y, w, depth, and at SCREEN its x and y in the picture [samples].
+SCREEN, NODE_STRIDE = uni.SCREEN, 6
 
-# A triangle that is drawn by itself is enlarged a little, so that no gap is left beside it: by this fraction of its
-# side, and by this fraction of the picture's, which is what f32 resolves.
-OVERSTEP = 1e-5
-OVERSTEP_OF_PICTURE = 2e-6
+# Triangles of cells that are not inverted are enlarged, to close the gaps between them: by this fraction of their side,
+# and by this fraction of the picture's side, the resolution of f32.
+ENLARGEMENT = 1e-5
+SCREEN_ENLARGEMENT = 2e-6
 
-# By this fraction of its size a triangle or a cell must be beyond an edge of the picture to be left out.
-BESIDE = 1e-3
-
-# In f32, a cell is drawn as a whole only if its outline stays within this distance [samples].
-FARTHEST = float(1 << 16)
+# The bilinear map of a cell is inverted in f32 only if its outline is within this distance [samples].
+MAX_COORDINATE = float(1 << 16)
 
 
 class Outline(NamedTuple):
-    """A cell in the picture."""
+    """The projected corners of a cell, and their bounding box [samples].
 
-    x: Any  # of its corners, a list
+    Attributes:
+        x: x of the corners, a list.
+        y: y of the corners, a list.
+        left: left edge of the bounding box.
+        right: right edge of the bounding box.
+        top: top edge of the bounding box.
+        bottom: bottom edge of the bounding box.
+        facing: 1 if the front is visible, -1 for the back, 0 if the cell is folded.
+        in_front: whether all corners are in front of the near plane.
+        behind: whether all corners are behind it.
+    """
+
+    x: Any
     y: Any
-    left: Any  # its bounds
+    left: Any
     right: Any
     top: Any
     bottom: Any
-    side: Any  # 1 where its front is seen, -1 where its back is, 0 if it is folded
-    in_front: Any  # whether all of its corners are in front of the camera
-    behind: Any  # whether none is
+    facing: Any
+    in_front: Any
+    behind: Any
 
 
 class Patch(NamedTuple):
-    """The surface between four mass points."""
+    """The bilinear surface between four mass points.
 
-    a: Any  # coefficients, each (X, Y, w, depth)
+    Attributes:
+        a: coefficient A, a vector (X, Y, w, depth).
+        b: coefficient B.
+        c: coefficient C.
+        d: coefficient D.
+        facing: as in `Outline`.
+        invertible: whether the cell is drawn by inverting the bilinear map, and not triangle by triangle.
+    """
+
+    a: Any
     b: Any
     c: Any
     d: Any
-    side: Any  # as in its `Outline`
-    whole: Any  # whether it is drawn as a whole, and not triangle by triangle
+    facing: Any
+    invertible: Any
 
 
 class Triangle(NamedTuple):
-    """The triangle P + R s + D t of a small quad that a sample is on; P, R and D are lists of X, Y, w and depth."""
+    """A triangle P + R s + D t of a sub-quad.
+
+    Attributes:
+        p: origin P, a list of X, Y, w and depth.
+        r: direction R, to the right.
+        d: direction D, down.
+        below: whether it is the triangle below the diagonal, where t > s.
+    """
 
     p: Any
     r: Any
     d: Any
-    below: Any  # whether it is the one below the diagonal, where t > s
+    below: Any
 
 
 @ti.func
-def project(position: ti.template(), i, j, cols, numbers: ti.template(), point: ti.template(), double: ti.template()):
-    """Store the numbers of mass point (i, j); `double` tells that they are in f64, and summed in another order."""
-    here = (i * cols + j) * POINT_NUMBERS
+def project(position: ti.template(), i, j, cols, uniforms: ti.template(), nodes: ti.template(), double: ti.template()):
+    """Project a mass point, and store its numbers.
+
+    Args:
+        position: positions of the mass points [m], shape (rows, cols, 3).
+        i: row of the mass point.
+        j: column of the mass point.
+        cols: number of columns.
+        uniforms: constants of the view.
+        nodes: destination, `NODE_STRIDE` numbers per mass point.
+        double: whether the numbers are f64, which are summed in a different order.
+    """
+    entry = (i * cols + j) * NODE_STRIDE
     x, y, z = position[i, j, 0], position[i, j, 1], position[i, j, 2]
     for n in ti.static(range(4)):
         row = uni.MATRIX + 4 * n
         if ti.static(double):
-            point[here + n] = numbers[row + 3] + numbers[row] * x + numbers[row + 1] * y + numbers[row + 2] * z
+            nodes[entry + n] = uniforms[row + 3] + uniforms[row] * x + uniforms[row + 1] * y + uniforms[row + 2] * z
         else:
-            point[here + n] = numbers[row] * x + numbers[row + 1] * y + numbers[row + 2] * z + numbers[row + 3]
-    point[here + SEEN] = point[here] / point[here + 2]
-    point[here + SEEN + 1] = point[here + 1] / point[here + 2]
+            nodes[entry + n] = uniforms[row] * x + uniforms[row + 1] * y + uniforms[row + 2] * z + uniforms[row + 3]
+    nodes[entry + SCREEN] = nodes[entry] / nodes[entry + 2]
+    nodes[entry + SCREEN + 1] = nodes[entry + 1] / nodes[entry + 2]
 
 
 @ti.func
-def w_at(depth, numbers: ti.template()):
-    """Give w of points at a depth."""
-    return depth * numbers[uni.PINHOLE] + (1.0 - numbers[uni.PINHOLE])
+def w_at(depth, uniforms: ti.template()):
+    """Return w at a depth.
+
+    Args:
+        depth: depth [m].
+        uniforms: constants of the view.
+    """
+    return depth * uniforms[uni.PINHOLE] + (1.0 - uniforms[uni.PINHOLE])
 
 
 @ti.func
-def line_of_sight(x, y, numbers: ti.template()):
-    """Give how far points that are seen at (x, y) are to the right and above the axis of view, at w = 1 [m]."""
-    return (x - numbers[uni.CENTRE_X]) * numbers[uni.SPREAD_X], (numbers[uni.CENTRE_Y] - y) * numbers[uni.SPREAD_Y]
+def line_of_sight(x, y, uniforms: ti.template()):
+    """Return the offsets of lines of sight from the optical axis at w = 1, to the right and up [m].
+
+    Args:
+        x: column of the undistorted samples.
+        y: row of the undistorted samples.
+        uniforms: constants of the view.
+    """
+    return (x - uniforms[uni.CENTRE_X]) * uniforms[uni.SPREAD_X], (uniforms[uni.CENTRE_Y] - y) * uniforms[uni.SPREAD_Y]
 
 
 @ti.func
-def corner_of(cell, cols):
-    """Give the first number of a cell's upper left mass point."""
-    return (cell // (cols - 1) * cols + cell % (cols - 1)) * POINT_NUMBERS
+def corner_entry(cell, cols):
+    """Return the first entry of a cell's upper left mass point.
+
+    Args:
+        cell: index of the cell.
+        cols: number of columns of mass points.
+    """
+    return (cell // (cols - 1) * cols + cell % (cols - 1)) * NODE_STRIDE
 
 
 @ti.func
-def outlined(corner, cols, near, point: ti.template()):
-    """Find the `Outline` of the cell whose upper left mass point has its numbers from `corner` on."""
-    below = corner + cols * POINT_NUMBERS
-    corners = ti.static((corner, corner + POINT_NUMBERS, below, below + POINT_NUMBERS))
-    x = [point[at + SEEN] for at in corners]
-    y = [point[at + SEEN + 1] for at in corners]
-    w = [point[at + 2] for at in corners]
-    side = seen_side(x, y)
+def cell_outline(corner, cols, near, nodes: ti.template()):
+    """Return the `Outline` of a cell.
+
+    Args:
+        corner: first entry of the cell's upper left mass point.
+        cols: number of columns of mass points.
+        near: near plane [m].
+        nodes: projected mass points.
+    """
+    below = corner + cols * NODE_STRIDE
+    corners = ti.static((corner, corner + NODE_STRIDE, below, below + NODE_STRIDE))
+    x = [nodes[entry + SCREEN] for entry in corners]
+    y = [nodes[entry + SCREEN + 1] for entry in corners]
+    w = [nodes[entry + 2] for entry in corners]
+    facing = facing_of(x, y)
     in_front = w[0] > near and w[1] > near and w[2] > near and w[3] > near
     behind = w[0] <= near and w[1] <= near and w[2] <= near and w[3] <= near
     left, right = ti.min(x[0], x[1], x[2], x[3]), ti.max(x[0], x[1], x[2], x[3])
     top, bottom = ti.min(y[0], y[1], y[2], y[3]), ti.max(y[0], y[1], y[2], y[3])
-    return ti.static(Outline(x, y, left, right, top, bottom, side, in_front, behind))
+    return ti.static(Outline(x, y, left, right, top, bottom, facing, in_front, behind))
 
 
 @ti.func
-def is_whole(outline: ti.template()):
-    """Tell whether a cell can be drawn as a whole in f32."""
+def is_invertible(outline: ti.template()):
+    """Return whether the bilinear map of a cell can be inverted in f32."""
     return (
         outline.in_front
-        and outline.side != 0
-        and ti.max(-outline.left, outline.right) < FARTHEST
-        and ti.max(-outline.top, outline.bottom) < FARTHEST
+        and outline.facing != 0
+        and ti.max(-outline.left, outline.right) < MAX_COORDINATE
+        and ti.max(-outline.top, outline.bottom) < MAX_COORDINATE
     )
 
 
 @ti.func
-def patch_of(corner, cols, side, whole, point: ti.template(), double: ti.template()):
-    """Make the `Patch` of a cell; `double` tells that numbers are in f64, where D is summed in another order."""
-    below = corner + cols * POINT_NUMBERS
-    a = ti.Vector([point[corner + n] for n in ti.static(range(4))])
-    right = ti.Vector([point[corner + POINT_NUMBERS + n] for n in ti.static(range(4))])
-    down = ti.Vector([point[below + n] for n in ti.static(range(4))])
-    far = ti.Vector([point[below + POINT_NUMBERS + n] for n in ti.static(range(4))])
-    b, c = right - a, down - a
-    d = far - right - down + a if ti.static(double) else far - right - c
-    return ti.static(Patch(a, b, c, d, side, whole))
+def cell_patch(corner, cols, facing, invertible, nodes: ti.template(), double: ti.template()):
+    """Return the `Patch` of a cell.
 
-
-@ti.func
-def edge(p_x, p_y, q_x, q_y, x, y, side):
-    """Twice the signed area of p, q and (x, y), times side, which is 1 or -1.
-
-    The sign tells on which side of the line (x, y) is. Both cells of an edge get the same bits, but for the sign.
+    Args:
+        corner: first entry of the cell's upper left mass point.
+        cols: number of columns of mass points.
+        facing: as in `Outline`.
+        invertible: whether the cell is drawn by inverting its bilinear map.
+        nodes: projected mass points.
+        double: whether the numbers are f64, for which D is summed in a different order.
     """
-    right, down = (q_x - p_x) * side, (q_y - p_y) * side
-    return right * (y - p_y) - down * (x - p_x)
+    below = corner + cols * NODE_STRIDE
+    a = ti.Vector([nodes[corner + n] for n in ti.static(range(4))])
+    right = ti.Vector([nodes[corner + NODE_STRIDE + n] for n in ti.static(range(4))])
+    down = ti.Vector([nodes[below + n] for n in ti.static(range(4))])
+    opposite = ti.Vector([nodes[below + NODE_STRIDE + n] for n in ti.static(range(4))])
+    b, c = right - a, down - a
+    d = opposite - right - down + a if ti.static(double) else opposite - right - c
+    return ti.static(Patch(a, b, c, d, facing, invertible))
 
 
 @ti.func
-def edges(x, y, side, outline: ti.template()):
-    """Give `edge` for the left, right, upper and lower edge of a cell; none is negative where the cell is seen."""
+def edge(p_x, p_y, q_x, q_y, x, y, facing):
+    """Return twice the signed area of the triangle p, q, (x, y), times `facing`.
+
+    Its sign is the side of the line p q on which (x, y) lies. Both cells of an edge compute the same bits up to the
+    sign.
+
+    Args:
+        p_x: x of the edge's first end [samples].
+        p_y: y of the edge's first end [samples].
+        q_x: x of the edge's second end [samples].
+        q_y: y of the edge's second end [samples].
+        x: column of the samples.
+        y: row of the samples.
+        facing: 1 or -1.
+    """
+    step_x, step_y = (q_x - p_x) * facing, (q_y - p_y) * facing
+    return step_x * (y - p_y) - step_y * (x - p_x)
+
+
+@ti.func
+def edges(x, y, facing, outline: ti.template()):
+    """Return `edge` for the left, right, upper and lower edge of a cell; all are non-negative inside the cell.
+
+    Args:
+        x: column of the samples.
+        y: row of the samples.
+        facing: 1 if the front of the cell is visible, -1 for its back.
+        outline: outline of the cell.
+    """
     p, q = ti.static((outline.x, outline.y))
     return (
-        edge(p[0], q[0], p[2], q[2], x, y, -side),
-        edge(p[1], q[1], p[3], q[3], x, y, side),
-        edge(p[0], q[0], p[1], q[1], x, y, side),
-        edge(p[2], q[2], p[3], q[3], x, y, -side),
+        edge(p[0], q[0], p[2], q[2], x, y, -facing),
+        edge(p[1], q[1], p[3], q[3], x, y, facing),
+        edge(p[0], q[0], p[1], q[1], x, y, facing),
+        edge(p[2], q[2], p[3], q[3], x, y, -facing),
     )
 
 
 @ti.func
 def turn(p_x, p_y, q_x, q_y, r_x, r_y):
-    """Twice the signed area of p, q and r: above 0 if the path from p over q to r turns right in the picture."""
+    """Return twice the signed area of a triangle: positive if the path from p over q to r turns right in the picture.
+
+    Args:
+        p_x: x of the first vertex.
+        p_y: y of the first vertex.
+        q_x: x of the second vertex.
+        q_y: y of the second vertex.
+        r_x: x of the third vertex.
+        r_y: y of the third vertex.
+    """
     return (q_x - p_x) * (r_y - q_y) - (q_y - p_y) * (r_x - q_x)
 
 
 @ti.func
-def seen_side(x: ti.template(), y: ti.template()):
-    """Tell which side of a cell is seen, given its corners: 1: front; -1: back; 0: both, as it is folded."""
+def facing_of(x: ti.template(), y: ti.template()):
+    """Return 1 if the front of a cell is visible, -1 for its back, 0 if it is folded and both are visible.
+
+    Args:
+        x: x of the corners, a list.
+        y: y of the corners, a list.
+    """
     turns = [
         turn(x[n], y[n], x[m], y[m], x[k], y[k]) for n, m, k in ti.static(((0, 1, 3), (1, 3, 2), (3, 2, 0), (2, 0, 1)))
     ]
@@ -178,10 +276,15 @@ def seen_side(x: ti.template(), y: ti.template()):
 
 
 @ti.func
-def small_quad(x, y, inside, parts, patch: ti.template()):
-    """Find column and line of the small quads of a patch that are seen at (x, y).
+def find_quads(x, y, inside, subdivisions, patch: ti.template()):
+    """Return column and row of the sub-quads of a patch at samples.
 
-    `inside` are those that it covers; `parts` is the number of small quads along its side.
+    Args:
+        x: column of the undistorted samples.
+        y: row of the undistorted samples.
+        inside: mask of the samples that the patch covers.
+        subdivisions: number of sub-quads along a side of the patch.
+        patch: the patch.
     """
     coefficients = ti.static((patch.a, patch.b, patch.c, patch.d))
     a_1, b_1, c_1, d_1 = [k[0] - x * k[2] for k in coefficients]
@@ -193,35 +296,42 @@ def small_quad(x, y, inside, parts, patch: ti.template()):
     ab = a_1 * b_2 - b_1 * a_2
     bd = b_1 * d_2 - d_1 * b_2
     linear = ad + bc
-    root = ti.sqrt(ti.max(linear * linear - 4.0 * bd * ac, 0.0)) * patch.side
+    root = ti.sqrt(ti.max(linear * linear - 4.0 * bd * ac, 0.0)) * patch.facing
     s = ti.select(inside, -2.0 * ac / (linear + root), 0.0)
     t = ti.select(inside, -2.0 * ab / (ad - bc - root), 0.0)
     return (
-        ti.max(ti.min(ti.floor(s * parts), parts - 1.0), 0.0),
-        ti.max(ti.min(ti.floor(t * parts), parts - 1.0), 0.0),
+        ti.max(ti.min(ti.floor(s * subdivisions), subdivisions - 1.0), 0.0),
+        ti.max(ti.min(ti.floor(t * subdivisions), subdivisions - 1.0), 0.0),
     )
 
 
 @ti.func
-def triangle_at(x, y, column, line, part, lower, patch: ti.template()):
-    """Find the `Triangle` of a small quad that (x, y) is on; in a patch that is not whole, the `lower` or upper one.
+def triangle_at(x, y, quad_column, quad_row, quad_side, lower, patch: ti.template()):
+    """Return the `Triangle` of a sub-quad at samples.
 
-    The small quad is in this column and line of the cell, and `part` is its side as a fraction of the cell's.
+    Args:
+        x: column of the undistorted samples.
+        y: row of the undistorted samples.
+        quad_column: column of the sub-quad in the cell.
+        quad_row: row of the sub-quad in the cell.
+        quad_side: side of the sub-quad, as a fraction of the cell's.
+        lower: whether the triangle below the diagonal is returned, if the patch is not invertible.
+        patch: the patch.
     """
     a, b, c, d = ti.static((patch.a, patch.b, patch.c, patch.d))
-    s0 = column * part
-    t0 = line * part
+    s0 = quad_column * quad_side
+    t0 = quad_row * quad_side
     p = [a[n] + b[n] * s0 + (c[n] + d[n] * s0) * t0 for n in ti.static(range(4))]
-    # The small quad: P + R s + Q t + twist s t.
-    r = [(b[n] + d[n] * t0) * part for n in ti.static(range(4))]
-    q = [(c[n] + d[n] * s0) * part for n in ti.static(range(4))]
-    twist = d * (part * part)
+    # The sub-quad is P + R s + Q t + twist s t.
+    r = [(b[n] + d[n] * t0) * quad_side for n in ti.static(range(4))]
+    q = [(c[n] + d[n] * s0) * quad_side for n in ti.static(range(4))]
+    twist = d * (quad_side * quad_side)
     f_w = p[2] + r[2] + q[2] + twist[2]
     below = (
         (p[0] - x * p[2]) * (p[1] + r[1] + q[1] + twist[1] - y * f_w)
         - (p[1] - y * p[2]) * (p[0] + r[0] + q[0] + twist[0] - x * f_w)
-    ) * patch.side >= 0.0
-    if not patch.whole:
+    ) * patch.facing >= 0.0
+    if not patch.invertible:
         below = lower
     for n in ti.static(range(4)):
         r[n] = ti.select(below, r[n] + twist[n], r[n])
@@ -231,130 +341,196 @@ def triangle_at(x, y, column, line, part, lower, patch: ti.template()):
 
 @ti.func
 def on_triangle(x, y, triangle: ti.template()):
-    """Find (s, t) where the triangle is seen at (x, y)."""
+    """Return (s, t) of a triangle at samples.
+
+    Args:
+        x: column of the undistorted samples.
+        y: row of the undistorted samples.
+        triangle: the triangle.
+    """
     coefficients = ti.static((triangle.p, triangle.r, triangle.d))
     p_1, r_1, d_1 = [k[0] - x * k[2] for k in coefficients]
     p_2, r_2, d_2 = [k[1] - y * k[2] for k in coefficients]
-    share = 1.0 / (r_1 * d_2 - r_2 * d_1)
-    return (p_2 * d_1 - p_1 * d_2) * share, (p_1 * r_2 - p_2 * r_1) * share
+    inverse_determinant = 1.0 / (r_1 * d_2 - r_2 * d_1)
+    return (p_2 * d_1 - p_1 * d_2) * inverse_determinant, (p_1 * r_2 - p_2 * r_1) * inverse_determinant
 
 
 @ti.func
-def is_within(s, t, overstep, near, triangle: ti.template()):
-    """Tell whether (s, t) is in a triangle that is enlarged by a fraction of its side, and in front of the camera."""
+def is_within(s, t, enlargement, near, triangle: ti.template()):
+    """Return whether (s, t) is in an enlarged triangle and in front of the near plane.
+
+    Args:
+        s: horizontal coordinate in the triangle.
+        t: vertical coordinate in the triangle.
+        enlargement: fraction of the side by which the triangle is enlarged.
+        near: near plane [m].
+        triangle: the triangle.
+    """
     larger = ti.select(triangle.below, t, s)
     smaller = ti.select(triangle.below, s, t)
     return (
-        (smaller >= -overstep)
-        & (larger <= 1.0 + overstep)
-        & (smaller <= larger + overstep)
+        (smaller >= -enlargement)
+        & (larger <= 1.0 + enlargement)
+        & (smaller <= larger + enlargement)
         & (triangle.p[2] + triangle.r[2] * s + triangle.d[2] * t > near)
     )
 
 
 @ti.func
 def depth_at(s, t, triangle: ti.template()):
-    """Give the depth of a triangle's plane at (s, t)."""
+    """Return the depth of a triangle's plane [m].
+
+    Args:
+        s: horizontal coordinate in the triangle.
+        t: vertical coordinate in the triangle.
+        triangle: the triangle.
+    """
     return triangle.p[3] + triangle.r[3] * s + triangle.d[3] * t
 
 
 @ti.func
-def facet(x, y, triangle: ti.template(), numbers: ti.template()):
-    """Give the normal of a triangle on the side that is seen at (x, y), of any length, in OpenCV's axes, a list."""
+def facet(x, y, triangle: ti.template(), uniforms: ti.template()):
+    """Return the normal of a triangle on its visible side, a list of three components of any length, in OpenCV's axes.
+
+    Args:
+        x: column of the undistorted samples.
+        y: row of the undistorted samples.
+        triangle: the triangle.
+        uniforms: constants of the view.
+    """
     sides = [
         [
-            (k[0] - k[2] * numbers[uni.CENTRE_X]) * numbers[uni.SPREAD_X],
-            (k[1] - k[2] * numbers[uni.CENTRE_Y]) * numbers[uni.SPREAD_Y],
+            (k[0] - k[2] * uniforms[uni.CENTRE_X]) * uniforms[uni.SPREAD_X],
+            (k[1] - k[2] * uniforms[uni.CENTRE_Y]) * uniforms[uni.SPREAD_Y],
             k[3],
         ]
         for k in ti.static((triangle.r, triangle.d))
     ]
     r, d = ti.static(sides)
     normal = [r[1] * d[2] - r[2] * d[1], r[2] * d[0] - r[0] * d[2], r[0] * d[1] - r[1] * d[0]]
-    right, up = line_of_sight(x, y, numbers)
-    along = (normal[0] * right - normal[1] * up) * numbers[uni.PINHOLE] + normal[2]
-    toward = ti.select(along > 0.0, -1.0, 1.0)
-    return [normal[n] * toward for n in ti.static(range(3))]
+    right, up = line_of_sight(x, y, uniforms)
+    cosine = (normal[0] * right - normal[1] * up) * uniforms[uni.PINHOLE] + normal[2]
+    sign = ti.select(cosine > 0.0, -1.0, 1.0)
+    return [normal[n] * sign for n in ti.static(range(3))]
 
 
 @ti.func
-def may_reach(corner, at, cols, top, bottom, numbers: ti.template(), point: ti.template()):
-    """Tell whether a cell may be seen between two rows of a picture that a lens has bent: what saves `cell_bounds`.
+def may_cover_rows(corner, distorted_entry, cols, top, bottom, uniforms: ti.template(), nodes: ti.template()):
+    """Return whether a cell may overlap rows of a picture with lens distortion; cheaper than `distorted_cell_bounds`.
 
-    The numbers of its upper left mass point begin at `corner`, and what `store_bent` stored of it at `at`.
+    Args:
+        corner: first entry of the cell's upper left mass point.
+        distorted_entry: first entry of this mass point after distortion, as stored by `store_distorted`.
+        cols: number of columns of mass points.
+        top: top edge of the rows [samples].
+        bottom: bottom edge of the rows [samples].
+        uniforms: constants of the view.
+        nodes: projected mass points.
     """
-    below, under = corner + cols * POINT_NUMBERS, at + cols * lens_kernels.BENT_NUMBERS
-    bent_corners = ti.static((at, at + lens_kernels.BENT_NUMBERS, under, under + lens_kernels.BENT_NUMBERS))
-    within = [point[here + 2] for here in bent_corners]
-    seen = [point[here + 1] for here in bent_corners]
-    corners = ti.static((corner, corner + POINT_NUMBERS, below, below + POINT_NUMBERS))
-    x = [point[here + SEEN] for here in corners]
-    y = [point[here + SEEN + 1] for here in corners]
-    longest = ti.max(
-        lens_kernels.side(x, y, 0, 1),
-        lens_kernels.side(x, y, 1, 3),
-        lens_kernels.side(x, y, 3, 2),
-        lens_kernels.side(x, y, 2, 0),
+    below, distorted_below = corner + cols * NODE_STRIDE, distorted_entry + cols * lens_kernels.DISTORTED_STRIDE
+    distorted_corners = ti.static(
+        (
+            distorted_entry,
+            distorted_entry + lens_kernels.DISTORTED_STRIDE,
+            distorted_below,
+            distorted_below + lens_kernels.DISTORTED_STRIDE,
+        )
     )
-    far = numbers[uni.BEND] * longest + 2.0
-    lowest, highest = ti.max(seen[0], seen[1], seen[2], seen[3]), ti.min(seen[0], seen[1], seen[2], seen[3])
-    partly = within[0] + within[1] + within[2] + within[3] < 3.5
-    return partly or (lowest + far > top and highest - far < bottom)
+    within = [nodes[entry + 2] for entry in distorted_corners]
+    rows = [nodes[entry + 1] for entry in distorted_corners]
+    corners = ti.static((corner, corner + NODE_STRIDE, below, below + NODE_STRIDE))
+    x = [nodes[entry + SCREEN] for entry in corners]
+    y = [nodes[entry + SCREEN + 1] for entry in corners]
+    longest = ti.max(
+        lens_kernels.squared_side(x, y, 0, 1),
+        lens_kernels.squared_side(x, y, 1, 3),
+        lens_kernels.squared_side(x, y, 3, 2),
+        lens_kernels.squared_side(x, y, 2, 0),
+    )
+    margin = uniforms[uni.SAGITTA_FACTOR] * longest + 2.0
+    last_row, first_row = ti.max(rows[0], rows[1], rows[2], rows[3]), ti.min(rows[0], rows[1], rows[2], rows[3])
+    partly_valid = within[0] + within[1] + within[2] + within[3] < 3.5
+    return partly_valid or (last_row + margin > top and first_row - margin < bottom)
 
 
 @ti.func
-def cell_bounds(at, cols, outline: ti.template(), numbers: ti.template(), point: ti.template()):
-    """Find the bounds of a cell in a picture that a lens has bent.
+def distorted_cell_bounds(distorted_entry, cols, outline: ti.template(), uniforms: ti.template(), nodes: ti.template()):
+    """Return the bounding box of a cell in a picture with lens distortion, as `lens_kernels.distorted_bounds`.
 
-    What `store_bent` stored of its upper left mass point is at `at`, in a sheet of so many columns.
+    Args:
+        distorted_entry: first entry of the cell's upper left mass point, as stored by `store_distorted`.
+        cols: number of columns of mass points.
+        outline: outline of the cell without distortion.
+        uniforms: constants of the view.
+        nodes: projected mass points.
     """
-    below = at + cols * lens_kernels.BENT_NUMBERS
-    corners = ti.static((at, at + lens_kernels.BENT_NUMBERS, below, below + lens_kernels.BENT_NUMBERS))
+    below = distorted_entry + cols * lens_kernels.DISTORTED_STRIDE
+    corners = ti.static(
+        (distorted_entry, distorted_entry + lens_kernels.DISTORTED_STRIDE, below, below + lens_kernels.DISTORTED_STRIDE)
+    )
     x, y = ti.static((outline.x, outline.y))
     longest = ti.max(
-        lens_kernels.side(x, y, 0, 1),
-        lens_kernels.side(x, y, 1, 3),
-        lens_kernels.side(x, y, 3, 2),
-        lens_kernels.side(x, y, 2, 0),
+        lens_kernels.squared_side(x, y, 0, 1),
+        lens_kernels.squared_side(x, y, 1, 3),
+        lens_kernels.squared_side(x, y, 3, 2),
+        lens_kernels.squared_side(x, y, 2, 0),
     )
-    within = point[corners[0] + 2] + point[corners[1] + 2] + point[corners[2] + 2] + point[corners[3] + 2] > 3.5
-    seen_x = [point[here] for here in corners]
-    seen_y = [point[here + 1] for here in corners]
-    return lens_kernels.bent_bounds(x, y, seen_x, seen_y, within, longest, numbers)
+    within = nodes[corners[0] + 2] + nodes[corners[1] + 2] + nodes[corners[2] + 2] + nodes[corners[3] + 2] > 3.5
+    distorted_x = [nodes[entry] for entry in corners]
+    distorted_y = [nodes[entry + 1] for entry in corners]
+    return lens_kernels.distorted_bounds(x, y, distorted_x, distorted_y, within, longest, uniforms)
 
 
 @ti.func
-def is_beside(corners: ti.template(), left, right, top, bottom):
-    """Tell whether all between corners, some of which may be behind the camera, is beyond an edge of the picture.
+def is_off_screen(corners: ti.template(), left, right, top, bottom):
+    """Return whether a polygon, possibly partly behind the camera, is beyond an edge of the picture.
 
-    X = x w is a plane for each edge x, behind the camera too; a point beyond it has a larger X, or a smaller one.
+    For each edge x of the picture, X = x w is a plane, also behind the camera; beyond it, X is larger or smaller.
+
+    Args:
+        corners: corners of the polygon, vectors (X, Y, w, ...).
+        left: left edge of the picture [samples].
+        right: right edge of the picture [samples].
+        top: top edge of the picture [samples].
+        bottom: bottom edge of the picture [samples].
     """
-    beside = False
-    for axis, way, edge in ti.static(((0, -1.0, left), (0, 1.0, right), (1, -1.0, top), (1, 1.0, bottom))):
-        beyond = [(k[axis] - edge * k[2]) * way for k in ti.static(corners)]
+    off_screen = False
+    for axis, sign, edge in ti.static(((0, -1.0, left), (0, 1.0, right), (1, -1.0, top), (1, 1.0, bottom))):
+        beyond = [(k[axis] - edge * k[2]) * sign for k in ti.static(corners)]
         size = ti.max(*[ti.abs(k[axis]) + ti.abs(edge * k[2]) for k in ti.static(corners)])
-        # By more than it is enlarged, and than f32 can tell.
-        beside = beside or ti.min(*beyond) > BESIDE * size
-    return beside
+        # The margin exceeds the enlargement and the resolution of f32.
+        off_screen = off_screen or ti.min(*beyond) > 1e-3 * size
+    return off_screen
 
 
 @ti.func
 def triangle_bounds(
-    column, line, lower, part, near, width, height,
-    patch: ti.template(), numbers: ti.template(), lens: ti.template(),
+    quad_column, quad_row, lower, quad_side, near, width, height,
+    patch: ti.template(), uniforms: ti.template(), lens: ti.template(),
 ):  # fmt: skip
-    """Find the bounds of a small triangle in a picture of this width and height; other arguments as for `triangle_at`.
+    """Return the bounding box of a triangle of a sub-quad in the picture.
 
-    `lens` is the model of the camera's lens, empty if it bends no lines.
+    Args:
+        quad_column: column of the sub-quad in the cell.
+        quad_row: row of the sub-quad in the cell.
+        lower: whether it is the triangle below the diagonal.
+        quad_side: side of the sub-quad, as a fraction of the cell's.
+        near: near plane [m].
+        width: width of the picture [samples].
+        height: height of the picture [samples].
+        patch: surface of the cell.
+        uniforms: constants of the view.
+        lens: lens model; empty without lens distortion.
 
     Returns:
-        Least and largest x, least and largest y; and by what fraction of its side it is enlarged.
+        Least and largest x, least and largest y [samples]; and the fraction of its side by which the triangle is
+        enlarged.
     """
     a, b, c, d = ti.static((patch.a, patch.b, patch.c, patch.d))
     low_x, high_x, low_y, high_y = 0.0, ti.cast(width, ti.f32), -INFINITY, INFINITY
-    overstep = OVERSTEP
-    s0, t0 = column * part, line * part
-    s1, t1 = (column + 1) * part, (line + 1) * part
+    enlargement = ENLARGEMENT
+    s0, t0 = quad_column * quad_side, quad_row * quad_side
+    s1, t1 = (quad_column + 1) * quad_side, (quad_row + 1) * quad_side
     p = a + b * s0 + (c + d * s0) * t0
     q = a + b * s1 + (c + d * s1) * t1
     r = a + b * s0 + (c + d * s0) * t1
@@ -368,26 +544,29 @@ def triangle_bounds(
         extent = ti.max(high_x - low_x, high_y - low_y, 1e-3)
         if ti.static(lens != ""):
             box = uni.VISIBLE
-            around = numbers[box + 1] - numbers[box] + numbers[box + 3] - numbers[box + 2]
-            overstep += OVERSTEP_OF_PICTURE * around / extent
+            perimeter = uniforms[box + 1] - uniforms[box] + uniforms[box + 3] - uniforms[box + 2]
+            enlargement += SCREEN_ENLARGEMENT * perimeter / extent
             x = [k[0] / k[2] for k in ti.static((p, q, r))]
             y = [k[1] / k[2] for k in ti.static((p, q, r))]
             longest = ti.max(
-                lens_kernels.side(x, y, 0, 1), lens_kernels.side(x, y, 1, 2), lens_kernels.side(x, y, 2, 0)
+                lens_kernels.squared_side(x, y, 0, 1),
+                lens_kernels.squared_side(x, y, 1, 2),
+                lens_kernels.squared_side(x, y, 2, 0),
             )
-            seen = [lens_kernels.bent(x[n], y[n], numbers, lens) for n in ti.static(range(3))]
-            low_x, high_x, low_y, high_y = lens_kernels.bent_bounds(
-                x, y, [one[0] for one in seen], [one[1] for one in seen], seen[0][2] and seen[1][2] and seen[2][2],
-                longest, numbers,
+            distorted = [lens_kernels.distorted_point(x[n], y[n], uniforms, lens) for n in ti.static(range(3))]
+            low_x, high_x, low_y, high_y = lens_kernels.distorted_bounds(
+                x, y, [vertex[0] for vertex in distorted], [vertex[1] for vertex in distorted],
+                distorted[0][2] and distorted[1][2] and distorted[2][2],
+                longest, uniforms,
             )  # fmt: skip
         else:
-            overstep += OVERSTEP_OF_PICTURE * (width + height) / extent
+            enlargement += SCREEN_ENLARGEMENT * (width + height) / extent
     elif p[2] <= near and q[2] <= near and r[2] <= near:
         high_x = -1.0
     else:
         left, right, top, bottom = 0.0, high_x, 0.0, ti.cast(height, ti.f32)
         if ti.static(lens != ""):
-            left, right, top, bottom = [numbers[uni.VISIBLE + n] for n in ti.static(range(4))]
-        if is_beside([p, q, r], left, right, top, bottom):
+            left, right, top, bottom = [uniforms[uni.VISIBLE + n] for n in ti.static(range(4))]
+        if is_off_screen([p, q, r], left, right, top, bottom):
             high_x = -1.0
-    return low_x, high_x, low_y, high_y, overstep
+    return low_x, high_x, low_y, high_y, enlargement

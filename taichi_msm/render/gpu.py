@@ -1,9 +1,9 @@
 """Kernel 2 on a GPU: every mass point, cell, sample and pixel is a thread.
 
-Cells, or the triangles of those that are drawn triangle by triangle, are listed in bins (bins.py): the parts of the
-sheet. A sample tries the parts of its bin's list, in as many launches as it takes for no thread to take long; what is
-nearest is kept in between. Then a pixel covers its samples with the instruments and shades them. A strip of rows is
-drawn at a time, with a sample a thread.
+A part is a cell, or some triangles of a cell that is drawn triangle by triangle. Parts are listed in bins (bins.py).
+Each sample processes the list of its bin, in as many launches as are needed to bound the time of a thread; the nearest
+surface is kept between launches. Then each pixel covers its samples with the instruments and shades them. A strip of
+rows is drawn at a time, with a thread per sample.
 """
 
 from collections.abc import Callable
@@ -13,112 +13,126 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.render import uniforms as uni
-from taichi_msm.render.bins import BOUNDS, ROUNDS_OF_SEARCH, binned, owner, reaches, store_bounds
-from taichi_msm.render.config import INFINITY, Band, Bytes, DrawingConfig, Floats, Integers, clear
-from taichi_msm.render.coverage import NORMAL_NUMBERS, DrawnSheet, Part, cover, cover_with_rods, store_normal
+from taichi_msm.render.bins import BOUNDS_STRIDE, SEARCH_ROUNDS, build_bins, is_in_bounds, owner_of, store_bounds
+from taichi_msm.render.config import INFINITY, Band, Bytes, DrawingConfig, Floats, Integers, clear_tile
+from taichi_msm.render.coverage import NORMAL_STRIDE, DrawnSheet, Part, cover_capsules, cover_cell, store_normal
 from taichi_msm.render.geometry import (
-    POINT_NUMBERS,
-    cell_bounds,
-    corner_of,
-    is_whole,
-    outlined,
-    patch_of,
+    NODE_STRIDE,
+    cell_outline,
+    cell_patch,
+    corner_entry,
+    distorted_cell_bounds,
+    is_invertible,
     project,
     triangle_bounds,
 )
-from taichi_msm.render.labels import label_numbers
-from taichi_msm.render.lens_kernels import BENT_NUMBERS, store_bent
+from taichi_msm.render.labels import label_width
+from taichi_msm.render.lens_kernels import DISTORTED_STRIDE, store_distorted
 from taichi_msm.render.shading import Appearance, PixelArrays, resolve
 from taichi_msm.system.launches import THREADS, Launches, end_thread
 from taichi_msm.system.runtime import our_compilation, ti, write
 
-# The smallest width of a bin [samples].
-SMALLEST_BIN = 8
+# Minimum width of a bin [samples].
+MIN_BIN_SIZE = 8
 
-# A part reaches at most so much farther than its corners, by rounding and to the centres of samples [samples].
+# Margin of bounding boxes for rounding and for the centres of samples [samples].
 MARGIN = 1.5
 
-# The largest number of parts. If cells would have more, several of their triangles make one.
-MOST_PARTS = 1 << 22
+# Maximum number of parts; beyond it, a part consists of several triangles of a cell.
+MAX_PARTS = 1 << 22
 
-
-# Where the numbers of bent mass points begin, per mass point, and how many numbers it has in all.
-BENT = POINT_NUMBERS + NORMAL_NUMBERS
-STORED = BENT + BENT_NUMBERS
+# Numbers per mass point without the distorted ones, and in all.
+UNDISTORTED_STRIDE = NODE_STRIDE + NORMAL_STRIDE
+TOTAL_STRIDE = UNDISTORTED_STRIDE + DISTORTED_STRIDE
 
 
 class Threads:
     """The memory of one sheet's pictures on a GPU, and their kernels; arguments as for `cpu.Bands`."""
 
     def __init__(
-        self, config: DrawingConfig, points: tuple[int, int], size: tuple[int, int], texels: NDArray[np.float32]
+        self, config: DrawingConfig, shape: tuple[int, int], size: tuple[int, int], texels: NDArray[np.float32]
     ) -> None:
         self._config, self._size = config, size
         self._project, self._bound = _sheet_kernels(config)
         self._cover, self._resolve = _picture_kernels(config)
         launches = Launches(bounded=True)
-        (rows, cols), (width, height) = points, size
+        (rows, cols), (width, height) = shape, size
         self._cells = (rows - 1) * (cols - 1)
-        across = width * config.supersample
+        samples_across = width * config.supersample
         # Rows of pixels in a strip.
-        self._rows = min(max(1, THREADS // (across * config.supersample)), height)
+        self._rows = min(max(1, THREADS // (samples_across * config.supersample)), height)
         self._texels = launches.give(texels)
-        self._point = launches.array(np.float32, rows * cols * STORED)
+        self._nodes = launches.array(np.float32, rows * cols * TOTAL_STRIDE)
         self._pieces = launches.array(np.int32, self._cells)
-        strip = self._rows * config.supersample * across * config.planes
-        # Before the strip are the places of all samples, if there is a lens.
-        self._samples = ti.ndarray(config.floats, height * config.supersample * across * config.place_planes + strip)
+        strip = self._rows * config.supersample * samples_across * config.planes
+        # With lens distortion the undistortion map comes before the strip.
+        self._samples = ti.ndarray(
+            config.float_vector, height * config.supersample * samples_across * config.map_planes + strip
+        )
         self._colours = launches.array(np.uint8, 3 * width * height if config.picture else 1)
-        numbers = label_numbers(normals=config.normals) if config.labels else 0
-        self._labels = launches.array(np.float32, max(numbers * width * height, 1))
+        label_count = label_width(normals=config.normals) if config.labels else 0
+        self._labels = launches.array(np.float32, max(label_count * width * height, 1))
 
-    def place(self, places: NDArray[np.float32]) -> None:
-        """Take the places of the samples of the pictures that follow, as `cpu.Bands.place` does."""
-        write(self._samples, places.reshape(-1, 1))
+    def set_undistortion_map(self, table: NDArray[np.float32]) -> None:
+        """Set the undistortion map of the following pictures, as returned by `undistortion_map`."""
+        write(self._samples, table.reshape(-1, 1))
 
     def draw(
-        self, position: NDArray[np.float32], numbers: NDArray[np.float32], sizes: NDArray[np.int32]
+        self, position: NDArray[np.float32], uniforms: NDArray[np.float32], sizes: NDArray[np.int32]
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Draw as `cpu.Bands.draw` does; raises a DeviceError when the device cut threads short."""
+        """Draw the picture, the labels or both, as configured.
+
+        Args:
+            position: positions of the mass points [m], shape (rows, cols, 3).
+            uniforms: constants of the view (uniforms.py).
+            sizes: sizes and counters (uniforms.py).
+
+        Returns:
+            Colours, shape (height, width, 3), and labels as expected by `labels_of`; each is undefined unless it is
+            drawn.
+
+        Raises:
+            DeviceError: if the device stopped threads early.
+        """
         launches, factor = Launches(bounded=True), self._config.supersample
-        (width, height), rods = self._size, int(sizes[uni.ROD_COUNT])
-        across, down = width * factor, height * factor
-        view = launches.give(numbers), launches.give(sizes)
+        (width, height), capsules = self._size, int(sizes[uni.CAPSULE_COUNT])
+        samples_across, samples_down = width * factor, height * factor
+        view = launches.give(uniforms), launches.give(sizes)
         with our_compilation(optimised=False):
-            self._project(position, *view, self._point, self._pieces)
+            self._project(position, *view, self._nodes, self._pieces)
         pieces = launches.take(self._pieces)
-        together = max(1, min(-(-int(pieces.sum(dtype=np.int64)) // MOST_PARTS), int(pieces.max())))
-        # What is behind the eye makes one empty part.
-        ends = np.cumsum(np.maximum(-(-pieces // together), 1), dtype=np.int32)
+        pieces_per_part = max(1, min(-(-int(pieces.sum(dtype=np.int64)) // MAX_PARTS), int(pieces.max())))
+        # A cell behind the eye is one empty part.
+        ends = np.cumsum(np.maximum(-(-pieces // pieces_per_part), 1), dtype=np.int32)
         parts = int(ends[-1])
-        owners, bounds = launches.array(np.int32, 2 * parts), launches.array(np.int32, BOUNDS * parts)
+        owners, bounds = launches.array(np.int32, 2 * parts), launches.array(np.int32, BOUNDS_STRIDE * parts)
         launches.launch(
-            self._bound, parts, together, *view, launches.give(ends), self._point, self._pieces, owners, bounds,
-            rounds=ROUNDS_OF_SEARCH + together,
+            self._bound, parts, pieces_per_part, *view, launches.give(ends), self._nodes, self._pieces, owners, bounds,
+            rounds=SEARCH_ROUNDS + pieces_per_part,
         )  # fmt: skip
-        bin_size = max(SMALLEST_BIN, round((across * down / self._cells) ** 0.5))
-        bins = binned(launches, bounds, parts, (across, down), bin_size)
-        sizes[[uni.BIN_SIZE, uni.BINS_ACROSS]] = bins.size, bins.across
+        bin_size = max(MIN_BIN_SIZE, round((samples_across * samples_down / self._cells) ** 0.5))
+        bins = build_bins(launches, bounds, parts, (samples_across, samples_down), bin_size)
+        sizes[[uni.BIN_SIZE, uni.BINS_ACROSS]] = bins.size, bins.columns
         view = view[0], launches.give(sizes)
-        # A sample takes one round for a part, and for each of its triangles one and one or two for tiles.
-        rounds_of_part = 1 + 3 * together
-        rounds_of_rods = rods * (1 + factor * (1 + factor))
-        rounds_of_shading = factor * (1 + factor * (1 + int(sizes[uni.LEVEL_COUNT]) + rods)) + 2
+        # Rounds per sample: one per part, and three per triangle, for the triangle and its tiles.
+        rounds_of_part = 1 + 3 * pieces_per_part
+        rounds_of_capsules = capsules * (1 + factor * (1 + factor))
+        rounds_of_shading = factor * (1 + factor * (1 + int(sizes[uni.LEVEL_COUNT]) + capsules)) + 2
         for row in range(0, height, self._rows):
             rows = min(self._rows, height - row)
             top, bottom = row * factor, (row + rows) * factor
             longest = int(bins.lengths[top // bins.size : (bottom - 1) // bins.size + 1].max())
             for listed, count in launches.parts(longest, rounds_of_part):
                 launches.launch(
-                    self._cover, rows * factor * across,
-                    top, listed, count, together, *view, self._point, self._pieces, owners, bounds,
+                    self._cover, rows * factor * samples_across,
+                    top, listed, count, pieces_per_part, *view, self._nodes, self._pieces, owners, bounds,
                     bins.starts, bins.entries, self._samples,
                     rounds=count * rounds_of_part,
                 )  # fmt: skip
             launches.launch(
                 self._resolve, rows * width,
                 row, *view, self._texels, self._samples, self._colours, self._labels,
-                rounds=rounds_of_rods + rounds_of_shading,
+                rounds=rounds_of_capsules + rounds_of_shading,
             )  # fmt: skip
         launches.require_ended()
         colours = launches.take(self._colours) if self._config.picture else np.empty(0, np.uint8)
@@ -127,61 +141,86 @@ class Threads:
 
 @cache
 def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable[..., None]]:
-    """Make the kernels that project the sheet, and find the bounds of its parts."""
+    """Return the kernels that project the sheet and compute the bounding boxes of its parts."""
     factor = config.supersample
 
     @ti.kernel
     def project_points(
-        position: ti.types.ndarray(dtype=ti.f32, ndim=3), numbers: Floats, sizes: Integers, point: Floats,
+        position: ti.types.ndarray(dtype=ti.f32, ndim=3), uniforms: Floats, sizes: Integers, nodes: Floats,
         pieces: Integers,
     ):  # fmt: skip
-        """Project the mass points, and tell in how many pieces each cell is drawn.
+        """Project the mass points, and count the pieces of each cell.
 
-        This is 1 for a cell that is drawn as a whole, else the number of its triangles; 0 if it is behind the eye.
+        A cell has 1 piece if its bilinear map is inverted, otherwise one per triangle, and 0 behind the eye.
+
+        Args:
+            position: positions of the mass points [m], shape (rows, cols, 3).
+            uniforms: constants of the view.
+            sizes: sizes and counters.
+            nodes: projected mass points, written.
+            pieces: number of pieces of each cell, written.
         """
         for index in range(sizes[uni.ROWS] * sizes[uni.COLS]):
             rows, cols = sizes[uni.ROWS], sizes[uni.COLS]
-            project(position, index // cols, index % cols, cols, numbers, point, False)
-            store_normal(position, index // cols, index % cols, rows, cols, config, numbers, point)
-            if ti.static(config.bends):
-                store_bent(
-                    rows * cols * BENT + index * BENT_NUMBERS, index * POINT_NUMBERS, numbers, point, config.lens
-                )
+            project(position, index // cols, index % cols, cols, uniforms, nodes, False)
+            store_normal(position, index // cols, index % cols, rows, cols, config, uniforms, nodes)
+            if ti.static(config.has_distortion):
+                distorted_entry = rows * cols * UNDISTORTED_STRIDE + index * DISTORTED_STRIDE
+                store_distorted(distorted_entry, index * NODE_STRIDE, uniforms, nodes, config.lens)
 
         for cell in range((sizes[uni.ROWS] - 1) * (sizes[uni.COLS] - 1)):
-            cols, parts = sizes[uni.COLS], ti.cast(numbers[uni.PARTS], ti.i32)
-            outline = ti.static(outlined(corner_of(cell, cols), cols, numbers[uni.NEAR], point))
-            pieces[cell] = ti.select(outline.behind, 0, ti.select(is_whole(outline), 1, 2 * parts * parts))
+            cols, subdivisions = sizes[uni.COLS], ti.cast(uniforms[uni.SUBDIVISIONS], ti.i32)
+            outline = ti.static(cell_outline(corner_entry(cell, cols), cols, uniforms[uni.NEAR], nodes))
+            pieces[cell] = ti.select(
+                outline.behind, 0, ti.select(is_invertible(outline), 1, 2 * subdivisions * subdivisions)
+            )
 
     @ti.kernel
     def bound(
-        first: ti.i32, end: ti.i32, ended: Integers, together: ti.i32, numbers: Floats, sizes: Integers,
-        ends: Integers, point: Floats, pieces: Integers, owners: Integers, bounds: Integers,
+        first: ti.i32, end: ti.i32, ended: Integers, pieces_per_part: ti.i32, uniforms: Floats, sizes: Integers,
+        ends: Integers, nodes: Floats, pieces: Integers, owners: Integers, bounds: Integers,
     ):  # fmt: skip
-        """Find the cell and the first piece of every part, which has `together` pieces; and its bounds [samples]."""
+        """Compute the cell, the first piece and the bounding box [samples] of parts.
+
+        Args:
+            first: first part of the launch.
+            end: part after the last one.
+            ended: counter of finished threads.
+            pieces_per_part: maximum number of pieces in a part.
+            uniforms: constants of the view.
+            sizes: sizes and counters.
+            ends: cumulative number of parts up to and including each cell.
+            nodes: projected mass points.
+            pieces: number of pieces of each cell.
+            owners: cell and first piece of each part, written.
+            bounds: bounding box of each part, written.
+        """
         for item in range(first, end):
             cols, width, height = sizes[uni.COLS], sizes[uni.WIDTH] * factor, sizes[uni.HEIGHT] * factor
-            cell = owner(item, (sizes[uni.ROWS] - 1) * (cols - 1), ends)
-            parts_of_cell = ti.max((pieces[cell] + together - 1) // together, 1)
-            piece = (item - ends[cell] + parts_of_cell) * together
+            cell = owner_of(item, (sizes[uni.ROWS] - 1) * (cols - 1), ends)
+            parts_of_cell = ti.max((pieces[cell] + pieces_per_part - 1) // pieces_per_part, 1)
+            piece = (item - ends[cell] + parts_of_cell) * pieces_per_part
             owners[2 * item], owners[2 * item + 1] = cell, piece
-            outline = ti.static(outlined(corner_of(cell, cols), cols, numbers[uni.NEAR], point))
+            outline = ti.static(cell_outline(corner_entry(cell, cols), cols, uniforms[uni.NEAR], nodes))
             left, right, top, bottom = outline.left, outline.right, outline.top, outline.bottom
-            if ti.static(config.bends):
-                at = sizes[uni.ROWS] * cols * BENT + corner_of(cell, cols) // POINT_NUMBERS * BENT_NUMBERS
-                left, right, top, bottom = cell_bounds(at, cols, outline, numbers, point)
+            if ti.static(config.has_distortion):
+                distorted_entry = (
+                    sizes[uni.ROWS] * cols * UNDISTORTED_STRIDE
+                    + corner_entry(cell, cols) // NODE_STRIDE * DISTORTED_STRIDE
+                )
+                left, right, top, bottom = distorted_cell_bounds(distorted_entry, cols, outline, uniforms, nodes)
             if pieces[cell] != 1:
                 left, right, top, bottom = INFINITY, -INFINITY, INFINITY, -INFINITY
-                patch = ti.static(patch_of(corner_of(cell, cols), cols, outline.side, False, point, False))
-                per_side = ti.cast(numbers[uni.PARTS], ti.i32)
-                for n in range(piece, ti.min(piece + together, pieces[cell])):
-                    s, t = ti.cast(n // 2 % per_side, ti.f32), ti.cast(n // 2 // per_side, ti.f32)
+                patch = ti.static(cell_patch(corner_entry(cell, cols), cols, outline.facing, False, nodes, False))
+                subdivisions = ti.cast(uniforms[uni.SUBDIVISIONS], ti.i32)
+                for triangle in range(piece, ti.min(piece + pieces_per_part, pieces[cell])):
+                    s, t = ti.cast(triangle // 2 % subdivisions, ti.f32), ti.cast(triangle // 2 // subdivisions, ti.f32)
                     low_x, high_x, low_y, high_y, _ = triangle_bounds(
-                        s, t, n % 2 == 0, 1.0 / numbers[uni.PARTS], numbers[uni.NEAR], width, height,
-                        patch, numbers, config.lens,
+                        s, t, triangle % 2 == 0, 1.0 / uniforms[uni.SUBDIVISIONS], uniforms[uni.NEAR], width, height,
+                        patch, uniforms, config.lens,
                     )  # fmt: skip
                     if not high_x < low_x:
-                        # Where it is NaN it may be anywhere.
+                        # NaN bounds: the triangle may be anywhere.
                         if not (low_x <= high_x and low_y <= high_y):
                             low_x, high_x, low_y, high_y = -INFINITY, INFINITY, -INFINITY, INFINITY
                         left, right = ti.min(left, low_x), ti.max(right, high_x)
@@ -194,66 +233,102 @@ def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable
 
 @cache
 def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable[..., None]]:
-    """Make the kernels that cover the samples of a strip, and shade its pixels."""
+    """Return the kernels that cover the samples of a strip and shade its pixels."""
     factor, planes = config.supersample, config.planes
 
     @ti.kernel
     def cover_samples(
-        first: ti.i32, end: ti.i32, ended: Integers, top: ti.i32, listed: ti.i32, count: ti.i32, together: ti.i32,
-        numbers: Floats, sizes: Integers, point: Floats, pieces: Integers, owners: Integers, bounds: Integers,
-        starts: Integers, entries: Integers, samples: ti.types.ndarray(dtype=config.floats, ndim=1),
+        first: ti.i32, end: ti.i32, ended: Integers, top: ti.i32, listed: ti.i32, count: ti.i32,
+        pieces_per_part: ti.i32, uniforms: Floats, sizes: Integers, nodes: Floats, pieces: Integers, owners: Integers,
+        bounds: Integers, starts: Integers, entries: Integers,
+        samples: ti.types.ndarray(dtype=config.float_vector, ndim=1),
     ):  # fmt: skip
-        """Cover the samples of a strip that begins at row `top`, with `count` parts of their lists from `listed` on."""
+        """Cover the samples of a strip with some parts of their lists.
+
+        Args:
+            first: first sample of the launch, counted in the strip.
+            end: sample after the last one.
+            ended: counter of finished threads.
+            top: first row of samples of the strip.
+            listed: position in the lists of the first part.
+            count: number of parts.
+            pieces_per_part: maximum number of pieces in a part.
+            uniforms: constants of the view.
+            sizes: sizes and counters.
+            nodes: projected mass points.
+            pieces: number of pieces of each cell.
+            owners: cell and first piece of each part.
+            bounds: bounding box of each part.
+            starts: start of the list of each bin.
+            entries: parts of all lists.
+            samples: undistortion map and G-buffer, written.
+        """
         for index in range(first, end):
-            rows, cols, parts = sizes[uni.ROWS], sizes[uni.COLS], numbers[uni.PARTS]
+            rows, cols, subdivisions = sizes[uni.ROWS], sizes[uni.COLS], uniforms[uni.SUBDIVISIONS]
             width, height = sizes[uni.WIDTH] * factor, sizes[uni.HEIGHT] * factor
             x, y = index % width, top + index // width
-            table = width * height * config.place_planes
-            line, near = table + index // width * width * planes, numbers[uni.NEAR]
-            placed, bent = y * width * config.place_planes, rows * cols * BENT
+            table = width * height * config.map_planes
+            line, near = table + index // width * width * planes, uniforms[uni.NEAR]
+            map_start, distorted_start = y * width * config.map_planes, rows * cols * UNDISTORTED_STRIDE
             texture_width, texture_height = sizes[uni.LEVELS + 1], sizes[uni.LEVELS + 2]
-            sheet = ti.static(DrawnSheet(point, rows, cols, parts, texture_width, texture_height, bent))
+            sheet = ti.static(
+                DrawnSheet(nodes, rows, cols, subdivisions, texture_width, texture_height, distorted_start)
+            )
             band = ti.static(
-                Band(config, samples, line, width, x, x + 1, y, y + 1, width, height, near, numbers, placed)
+                Band(config, samples, line, width, x, x + 1, y, y + 1, width, height, near, uniforms, map_start)
             )
             if listed == 0:
-                clear(table + index * planes, band)
-            square = y // sizes[uni.BIN_SIZE] * sizes[uni.BINS_ACROSS] + x // sizes[uni.BIN_SIZE]
-            begin = starts[square] + listed
-            for n in range(begin, ti.min(begin + count, starts[square + 1])):
-                if reaches(entries[n], x, y, bounds):
+                clear_tile(table + index * planes, band)
+            bin_index = y // sizes[uni.BIN_SIZE] * sizes[uni.BINS_ACROSS] + x // sizes[uni.BIN_SIZE]
+            begin = starts[bin_index] + listed
+            for n in range(begin, ti.min(begin + count, starts[bin_index + 1])):
+                if is_in_bounds(entries[n], x, y, bounds):
                     cell, piece = owners[2 * entries[n]], owners[2 * entries[n] + 1]
-                    whole, last = pieces[cell] == 1, ti.min(piece + together, pieces[cell])
-                    part = ti.static(Part(whole, piece, last))
-                    cover(cell // (cols - 1), cell % (cols - 1), part, sheet, band)
+                    is_inverted, end_piece = pieces[cell] == 1, ti.min(piece + pieces_per_part, pieces[cell])
+                    part = ti.static(Part(is_inverted, piece, end_piece))
+                    cover_cell(cell // (cols - 1), cell % (cols - 1), part, sheet, band)
             end_thread(ended)
 
     @ti.kernel
     def resolve_pixels(
-        first: ti.i32, end: ti.i32, ended: Integers, row: ti.i32, numbers: Floats, sizes: Integers, texels: Floats,
-        samples: ti.types.ndarray(dtype=config.floats, ndim=1), colours: Bytes, labels: Floats,
+        first: ti.i32, end: ti.i32, ended: Integers, row: ti.i32, uniforms: Floats, sizes: Integers, texels: Floats,
+        samples: ti.types.ndarray(dtype=config.float_vector, ndim=1), colours: Bytes, labels: Floats,
     ):  # fmt: skip
-        """Cover the pixels of a strip that begins at `row` with the instruments, and write them."""
+        """Cover the pixels of a strip with the instruments, and write them.
+
+        Args:
+            first: first pixel of the launch, counted in the strip.
+            end: pixel after the last one.
+            ended: counter of finished threads.
+            row: first row of pixels of the strip.
+            uniforms: constants of the view.
+            sizes: sizes and counters.
+            texels: levels of the texture.
+            samples: undistortion map and G-buffer.
+            colours: colours of all pixels, written.
+            labels: labels of all pixels, written.
+        """
         for index in range(first, end):
-            width, height, rod_count = sizes[uni.WIDTH], sizes[uni.HEIGHT], sizes[uni.ROD_COUNT]
+            width, height, capsule_count = sizes[uni.WIDTH], sizes[uni.HEIGHT], sizes[uni.CAPSULE_COUNT]
             x, y = index % width, row + index // width
-            left, top, across = x * factor, y * factor, width * factor
-            table = across * height * factor * config.place_planes
-            line, placed = table + (y - row) * factor * across * planes, top * across * config.place_planes
+            left, top, samples_across = x * factor, y * factor, width * factor
+            table = samples_across * height * factor * config.map_planes
+            line = table + (y - row) * factor * samples_across * planes
+            map_start = top * samples_across * config.map_planes
             if ti.static(config.instruments):
                 band = ti.static(
                     Band(
-                        config, samples, line, across, left, left + factor, top, top + factor,
-                        across, height * factor, numbers[uni.NEAR], numbers, placed,
+                        config, samples, line, samples_across, left, left + factor, top, top + factor,
+                        samples_across, height * factor, uniforms[uni.NEAR], uniforms, map_start,
                     )
                 )  # fmt: skip
-                cover_with_rods(rod_count, band)
+                cover_capsules(capsule_count, band)
             appearance = ti.static(
-                Appearance(config, texels, sizes, sizes[uni.LEVELS + 1], sizes[uni.LEVELS + 2], numbers, rod_count)
+                Appearance(config, texels, sizes, sizes[uni.LEVELS + 1], sizes[uni.LEVELS + 2], uniforms, capsule_count)
             )
             pixels = width * height
             output = ti.static(PixelArrays(colours, labels, pixels))
-            resolve(line, y, y + 1, x, x + 1, across, width, placed, samples, appearance, output)
+            resolve(line, y, y + 1, x, x + 1, samples_across, width, map_start, samples, appearance, output)
             end_thread(ended)
 
     return cover_samples, resolve_pixels

@@ -1,117 +1,151 @@
-"""Lenses that bend lines, in kernels: where a place is seen, and the bounds of what a cell or a triangle covers.
+"""Lens distortion in kernels: distorted points, and bounding boxes of distorted cells and triangles.
 
-The formulas are those of camera.py, the bounds those of `lens_table.Visible`. A place is what a camera without the lens
-sees there, in samples of its picture.
+The formulas are those of camera.py, the bounds those of `lens_table.VisibleRegion`. Undistorted points are in samples
+of the picture of the same camera without lens distortion.
 """
 
 from taichi_msm.render import uniforms as uni
-from taichi_msm.render.lens_table import BEYOND
+from taichi_msm.render.lens_table import INVALID_COORDINATE
 from taichi_msm.system.runtime import ti
 
-# Numbers that are stored of a mass point: where it is seen [samples], and 1 if it is in front of the camera and within
-# the radius of the lens.
-BENT_NUMBERS = 3
+# Numbers per distorted mass point: x and y [samples], and 1 if it is in front of the camera and within the radius of
+# the lens.
+DISTORTED_STRIDE = 3
 
-# An angle is found from a half of a half of half of it, by its series in the tangent: the terms' divisors, the smallest
-# term first.
+# An angle is computed by a power series in the tangent of an eighth of it. The list has the divisors of the terms, the
+# smallest term first.
 HALVINGS = 3
 SERIES = [(-1.0) ** n * (2 * n + 1) for n in reversed(range(12))]
 
 
 @ti.func
-def arc(tangent):
-    """Give the angle, 0 to pi / 2, that has a tangent; GPUs have no such function in f64."""
-    part = tangent
+def arctangent(tangent):
+    """Return the angle, 0 to pi / 2, of a tangent; GPUs have no arctangent in f64."""
+    half_tangent = tangent
     for _ in ti.static(range(HALVINGS)):
-        part = part / (1.0 + ti.sqrt(1.0 + part * part))
-    square = part * part
-    # Constants are f32, in which quotients are not exact.
-    one = part * 0.0 + 1.0
-    total = part * 0.0
+        half_tangent = half_tangent / (1.0 + ti.sqrt(1.0 + half_tangent * half_tangent))
+    square = half_tangent * half_tangent
+    # In the precision of the argument: quotients of constants would be f32.
+    unit = half_tangent * 0.0 + 1.0
+    total = half_tangent * 0.0
     for divisor in ti.static(SERIES):
-        total = one / divisor + square * total
-    return total * part * 2.0**HALVINGS
+        total = unit / divisor + square * total
+    return total * half_tangent * 2.0**HALVINGS
 
 
 @ti.func
-def bent(x, y, numbers: ti.template(), lens: ti.template()):
-    """Find where a place is seen [samples], and whether it is within the radius of the lens.
+def distorted_point(x, y, uniforms: ti.template(), lens: ti.template()):
+    """Distort a point.
 
-    Beyond it, the nearest place within it is taken.
+    Args:
+        x: column of the undistorted point [samples].
+        y: row of the undistorted point [samples].
+        uniforms: constants of the view.
+        lens: lens model, "pinhole" or "fisheye".
+
+    Returns:
+        x and y of the distorted point [samples], and whether the undistorted one is within the radius of the lens; if
+        it is not, the nearest point within it is distorted.
     """
-    a = (x - numbers[uni.CENTRE_X]) * numbers[uni.SPREAD_X]
-    b = (y - numbers[uni.CENTRE_Y]) * numbers[uni.SPREAD_Y]
-    square = a * a + b * b
-    within = square < numbers[uni.LENS_RADIUS] * numbers[uni.LENS_RADIUS]
-    if not within:
-        shorter = numbers[uni.LENS_RADIUS] / ti.sqrt(square)
-        a, b = a * shorter, b * shorter
-    k = [numbers[uni.LENS + n] for n in ti.static(range(8))]
+    a = (x - uniforms[uni.CENTRE_X]) * uniforms[uni.SPREAD_X]
+    b = (y - uniforms[uni.CENTRE_Y]) * uniforms[uni.SPREAD_Y]
+    squared_radius = a * a + b * b
+    is_valid = squared_radius < uniforms[uni.LENS_RADIUS] * uniforms[uni.LENS_RADIUS]
+    if not is_valid:
+        factor = uniforms[uni.LENS_RADIUS] / ti.sqrt(squared_radius)
+        a, b = a * factor, b * factor
+    k = [uniforms[uni.LENS + n] for n in ti.static(range(8))]
     q = a * a + b * b
     if ti.static(lens == "fisheye"):
         r = ti.max(ti.sqrt(q), 1e-8)
-        t = arc(r)
+        t = arctangent(r)
         p = t * t
         ratio = t * (1.0 + p * (k[0] + p * (k[1] + p * (k[2] + p * k[3])))) / r
         a, b = a * ratio, b * ratio
     else:
         ratio = (1.0 + q * (k[0] + q * (k[1] + q * k[4]))) / (1.0 + q * (k[5] + q * (k[6] + q * k[7])))
         mixed = 2.0 * a * b
-        across = a * ratio + k[2] * mixed + k[3] * (q + 2.0 * a * a)
+        distorted_a = a * ratio + k[2] * mixed + k[3] * (q + 2.0 * a * a)
         b = b * ratio + k[2] * (q + 2.0 * b * b) + k[3] * mixed
-        a = across
+        a = distorted_a
     return (
-        numbers[uni.PICTURE_X] + numbers[uni.FOCAL_X] * a,
-        numbers[uni.PICTURE_Y] + numbers[uni.FOCAL_Y] * b,
-        within,
+        uniforms[uni.PICTURE_X] + uniforms[uni.FOCAL_X] * a,
+        uniforms[uni.PICTURE_Y] + uniforms[uni.FOCAL_Y] * b,
+        is_valid,
     )
 
 
 @ti.func
-def store_bent(at, here, numbers: ti.template(), point: ti.template(), lens: ti.template()):
-    """Store at `at` where the mass point is seen whose numbers begin at `here`."""
-    seen_x, seen_y, within = bent(point[here + uni.SEEN], point[here + uni.SEEN + 1], numbers, lens)
-    point[at], point[at + 1] = seen_x, seen_y
-    point[at + 2] = ti.cast(within and point[here + 2] > numbers[uni.NEAR], ti.f32)
+def store_distorted(distorted_entry, entry, uniforms: ti.template(), nodes: ti.template(), lens: ti.template()):
+    """Distort a projected mass point, and store it.
+
+    Args:
+        distorted_entry: destination in `nodes`, `DISTORTED_STRIDE` numbers.
+        entry: first entry of the projected mass point in `nodes`.
+        uniforms: constants of the view.
+        nodes: projected mass points.
+        lens: lens model, "pinhole" or "fisheye".
+    """
+    x, y, is_valid = distorted_point(nodes[entry + uni.SCREEN], nodes[entry + uni.SCREEN + 1], uniforms, lens)
+    nodes[distorted_entry], nodes[distorted_entry + 1] = x, y
+    nodes[distorted_entry + 2] = ti.cast(is_valid and nodes[entry + 2] > uniforms[uni.NEAR], ti.f32)
 
 
 @ti.func
-def side(x: ti.template(), y: ti.template(), n: ti.template(), m: ti.template()):
-    """Square of the distance between two corners of an outline."""
+def squared_side(x: ti.template(), y: ti.template(), n: ti.template(), m: ti.template()):
+    """Return the square of the distance between two vertices.
+
+    Args:
+        x: x of the vertices, a list.
+        y: y of the vertices, a list.
+        n: index of the first vertex.
+        m: index of the second vertex.
+    """
     return (x[n] - x[m]) * (x[n] - x[m]) + (y[n] - y[m]) * (y[n] - y[m])
 
 
 @ti.func
-def bent_bounds(
-    x: ti.template(), y: ti.template(), seen_x: ti.template(), seen_y: ti.template(), within, longest,
-    numbers: ti.template(),
+def distorted_bounds(
+    x: ti.template(), y: ti.template(), distorted_x: ti.template(), distorted_y: ti.template(), is_valid,
+    squared_length, uniforms: ti.template(),
 ):  # fmt: skip
-    """Find bounds of all samples that show a convex outline, from its corners' places, and where these are seen.
+    """Return the bounding box of the samples that a convex polygon covers after distortion.
 
-    `within` tells whether all of them are within the radius of the lens; `longest` is the square of the longest side.
+    Args:
+        x: x of the undistorted vertices, a list [samples].
+        y: y of the undistorted vertices, a list [samples].
+        distorted_x: x of the distorted vertices, a list [samples].
+        distorted_y: y of the distorted vertices, a list [samples].
+        is_valid: whether all vertices are within the radius of the lens.
+        squared_length: square of the longest side [samples^2].
+        uniforms: constants of the view.
 
     Returns:
-        Least and largest x, least and largest y [samples]; the largest are below the least where nothing is seen.
+        Least and largest x, least and largest y [samples]; an empty box, with the largest below the least, if the
+        polygon is outside the picture.
     """
-    far = ti.min(numbers[uni.STRETCH] * ti.sqrt(longest), 1e6)
-    if within:
-        far = ti.min(far, numbers[uni.BEND] * longest)
+    margin = ti.min(uniforms[uni.STRETCH_FACTOR] * ti.sqrt(squared_length), 1e6)
+    if is_valid:
+        margin = ti.min(margin, uniforms[uni.SAGITTA_FACTOR] * squared_length)
     left, right = x[0], x[0]
     top, bottom = y[0], y[0]
-    low_x, high_x = seen_x[0], seen_x[0]
-    low_y, high_y = seen_y[0], seen_y[0]
+    low_x, high_x = distorted_x[0], distorted_x[0]
+    low_y, high_y = distorted_y[0], distorted_y[0]
     for n in ti.static(range(1, len(x))):
         left, right = ti.min(left, x[n]), ti.max(right, x[n])
         top, bottom = ti.min(top, y[n]), ti.max(bottom, y[n])
-        low_x, high_x = ti.min(low_x, seen_x[n]), ti.max(high_x, seen_x[n])
-        low_y, high_y = ti.min(low_y, seen_y[n]), ti.max(high_y, seen_y[n])
+        low_x, high_x = ti.min(low_x, distorted_x[n]), ti.max(high_x, distorted_x[n])
+        low_y, high_y = ti.min(low_y, distorted_y[n]), ti.max(high_y, distorted_y[n])
     box = uni.VISIBLE
-    shown = (
-        right >= numbers[box] and left <= numbers[box + 1] and bottom >= numbers[box + 2] and top <= numbers[box + 3]
+    is_visible = (
+        right >= uniforms[box]
+        and left <= uniforms[box + 1]
+        and bottom >= uniforms[box + 2]
+        and top <= uniforms[box + 3]
     )
     return (
-        ti.select(shown, low_x - far, BEYOND),
-        ti.select(shown, high_x + far, -BEYOND),
-        ti.select(shown, low_y - far, BEYOND),
-        ti.select(shown, high_y + far, -BEYOND),
+        ti.select(is_visible, low_x - margin, INVALID_COORDINATE),
+        ti.select(is_visible, high_x + margin, -INVALID_COORDINATE),
+        ti.select(is_visible, low_y - margin, INVALID_COORDINATE),
+        ti.select(is_visible, high_y + margin, -INVALID_COORDINATE),
     )

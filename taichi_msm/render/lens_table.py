@@ -1,6 +1,6 @@
-"""Where the samples of a picture that a lens has bent would be without it: a table, made once for a lens and a size.
+"""Undistortion maps: the undistorted position of every sample of a picture, computed once per lens and picture size.
 
-With it, and with bounds of how far cells are bent, kernel 2 covers bent pictures as it covers others.
+With this map, and with bounds of the distortion of cells, kernel 2 covers distorted pictures like undistorted ones.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.render.camera import Lens, View, border
+from taichi_msm.render.camera import Lens, View, border_points
 
 if TYPE_CHECKING:
     from taichi_msm.render.config import DrawingConfig
@@ -19,123 +19,145 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Pair = tuple[float, float]
 
-# The place of a sample that shows nothing, as it is beyond the limit of the lens.
-BEYOND = 1e9
+# Undistorted coordinate of samples beyond the limit of the lens.
+INVALID_COORDINATE = 1e9
 
-# A picture without the lens is at most so many times larger.
-LARGEST_WINDOW = 4
+# Maximum size of the undistorted picture, relative to the distorted one.
+MAX_VIEW_SCALE = 4
 
-# Rows of samples whose places are found at a time.
-ROWS = 64
-
-# Derivatives of the lens are taken at so many radii and angles, and the largest is enlarged for what lies between.
-RADII, ANGLES, ENLARGED = 256, 64, 1.25
-STEP = 1e-5
+# Derivatives of the lens are bounded by their maximum on a polar grid, with a safety factor for the points between.
+RADII, ANGLES, SAFETY_FACTOR = 256, 64, 1.25
 
 
-class Visible(NamedTuple):
-    """What a picture shows of the plane at depth 1, and how the lens bends it there.
+class VisibleRegion(NamedTuple):
+    """The region of the plane at depth 1 that is visible in a picture, with bounds of the lens distortion in it.
 
-    A line of length L becomes a curve, which is at most `bend` L^2 away from the straight line between its ends, as its
-    second derivatives are at most 8 `bend`; and the curve is at most 2 `stretch` L long.
+    A line of length L is distorted into a curve whose distance from the chord is at most `sagitta_factor` L^2, because
+    its second derivatives are at most 8 `sagitta_factor`; and whose length is at most 2 `stretch_factor` L.
+
+    Attributes:
+        radius: largest distance from the optical axis.
+        box: left, right, top and bottom without distortion [px].
+        sagitta_factor: bound of the sagitta over L^2 [1/px].
+        stretch_factor: half the bound of the length over L.
     """
 
-    radius: float  # the largest distance from the axis of view
-    box: tuple[float, float, float, float]  # left, right, top and bottom without distortion [px]
-    bend: float  # [1/px]
-    stretch: float
+    radius: float
+    box: tuple[float, float, float, float]
+    sagitta_factor: float
+    stretch_factor: float
 
 
-def visible(view: View) -> Visible:
-    """Find what a camera with a lens shows."""
+def visible_region(view: View) -> VisibleRegion:
+    """Return the visible region of a camera with lens distortion."""
     assert view.lens is not None
-    scale, centre, size = ((float(one[0]), float(one[1])) for one in (view.scale, view.centre, view.size))
-    return _visible(view.lens, scale, centre, size)
+    scale, centre, size = ((float(pair[0]), float(pair[1])) for pair in (view.scale, view.centre, view.size))
+    return _visible_region(view.lens, scale, centre, size)
 
 
 @lru_cache(maxsize=16)
-def _visible(lens: Lens, scale: Pair, centre: Pair, size: Pair) -> Visible:
-    place = lens.undistort((border(np.array(size)) - centre) / scale)
-    radius = float(np.linalg.norm(place, axis=-1).max())
+def _visible_region(lens: Lens, scale: Pair, centre: Pair, size: Pair) -> VisibleRegion:
+    border = lens.undistort((border_points(np.array(size)) - centre) / scale)
+    radius = float(np.linalg.norm(border, axis=-1).max())
     if np.isnan(radius):
         radius = lens.limit
-        place = np.array([[-radius, -radius], [radius, radius]])
-    # Between two places of the border, a pixel apart, it may reach a little farther.
-    (left, top), (right, bottom) = place.min(axis=0) * scale + centre - 1, place.max(axis=0) * scale + centre + 1
-    away, turn = np.meshgrid(radius * np.linspace(0, 1, RADII), np.linspace(0, 2 * np.pi, ANGLES))
-    points = np.stack([away * np.cos(turn), away * np.sin(turn)], axis=-1)
-    step = STEP * radius
-    change = [lens.jacobian(points + shift) - lens.jacobian(points - shift) for shift in np.eye(2) * step]
-    curving = np.sqrt((np.stack(change) ** 2).sum(axis=(0, -1))).max() / (2 * step)
-    growing = np.sqrt((lens.jacobian(points) ** 2).sum(axis=-1)).max()
-    high, low = max(scale), min(scale)
-    return Visible(
+        border = np.array([[-radius, -radius], [radius, radius]])
+    # One pixel of margin: the border is sampled at a distance of one pixel.
+    (left, top), (right, bottom) = border.min(axis=0) * scale + centre - 1, border.max(axis=0) * scale + centre + 1
+    radii, angles = np.meshgrid(radius * np.linspace(0, 1, RADII), np.linspace(0, 2 * np.pi, ANGLES))
+    points = np.stack([radii * np.cos(angles), radii * np.sin(angles)], axis=-1)
+    step = 1e-5 * radius
+    differences = [lens.jacobian(points + shift) - lens.jacobian(points - shift) for shift in np.eye(2) * step]
+    second_derivative = np.sqrt((np.stack(differences) ** 2).sum(axis=(0, -1))).max() / (2 * step)
+    derivative = np.sqrt((lens.jacobian(points) ** 2).sum(axis=-1)).max()
+    max_scale, min_scale = max(scale), min(scale)
+    return VisibleRegion(
         radius * (1 + 1e-5),
         (float(left), float(right), float(top), float(bottom)),
-        ENLARGED * float(curving) * high / low**2 / 8,
-        ENLARGED * float(growing) * high / low / 2,
+        SAFETY_FACTOR * float(second_derivative) * max_scale / min_scale**2 / 8,
+        SAFETY_FACTOR * float(derivative) * max_scale / min_scale / 2,
     )
 
 
-def window(view: View) -> View:
-    """Give a camera without the lens, whose picture is all that is seen through it; smaller, if the lens is wide."""
-    left, right, top, bottom = visible(view).box
-    share = min(1.0, LARGEST_WINDOW * float(view.size.max()) / max(right - left, bottom - top))
-    corner, matrix = np.array([left, top]), view.matrix.copy()
+def undistorted_view(view: View) -> View:
+    """Return a camera without lens distortion that has the same visible region.
+
+    For wide lenses its resolution is lower.
+    """
+    left, right, top, bottom = visible_region(view).box
+    view_scale = min(1.0, MAX_VIEW_SCALE * float(view.size.max()) / max(right - left, bottom - top))
+    origin, matrix = np.array([left, top]), view.matrix.copy()
     for row in (0, 1):
-        matrix[row] = (matrix[row] - corner[row] * matrix[2]) * share
-    size = np.ceil(np.array([right - left, bottom - top]) * share)
+        matrix[row] = (matrix[row] - origin[row] * matrix[2]) * view_scale
+    size = np.ceil(np.array([right - left, bottom - top]) * view_scale)
     return view._replace(
-        matrix=matrix, scale=view.scale * share, centre=(view.centre - corner) * share, size=size, lens=None
+        matrix=matrix, scale=view.scale * view_scale, centre=(view.centre - origin) * view_scale, size=size, lens=None
     )
 
 
-def sample_places(view: View, factor: int, *, steps: bool) -> NDArray[np.float32]:
-    """Give the places of all samples, `factor` a pixel along each axis, without distortion.
+def undistortion_map(view: View, supersample: int, *, with_steps: bool) -> NDArray[np.float32]:
+    """Compute the undistorted positions of all samples of a picture.
+
+    Args:
+        view: camera with lens distortion.
+        supersample: samples per pixel along each axis.
+        with_steps: whether the steps to the next samples are included.
 
     Returns:
-        x and y [samples], BEYOND where nothing is seen, shape (rows, columns, 2). With `steps` also their changes to
-        the next sample on the right, and to that below; shape (rows, columns, 6).
+        x and y [samples], INVALID_COORDINATE outside the lens, shape (rows, columns, 2). With steps also x and y of the
+        step to the next sample on the right, and x and y of the step to the next one below; shape (rows, columns, 6).
     """
     assert view.lens is not None
-    columns, rows = (int(side) * factor for side in view.size)
-    table = np.empty((rows, columns, 6 if steps else 2), np.float32)
-    for first in range(0, rows, ROWS):
-        end = min(first + ROWS, rows)
-        pixels = (np.stack(np.meshgrid(np.arange(columns), np.arange(first, end)), axis=-1) + 0.5) / factor
-        place = view.undistorted(pixels)
-        seen = ~np.isnan(place[..., :1])
-        table[first:end, :, :2] = np.where(seen, place * factor, BEYOND)
-        if steps:
-            slope = view.lens.jacobian((np.where(seen, place, view.centre) - view.centre) / view.scale)
-            back = np.linalg.inv(slope) * view.scale[:, None] / view.scale
-            table[first:end, :, 2:] = np.where(seen, np.moveaxis(back, -1, -2).reshape(*seen.shape[:2], 4), 0)
+    width, height = (int(side) * supersample for side in view.size)
+    table = np.empty((height, width, 6 if with_steps else 2), np.float32)
+    # In blocks of rows, to limit the memory of the iterations.
+    for first_row in range(0, height, 64):
+        end_row = min(first_row + 64, height)
+        pixels = (np.stack(np.meshgrid(np.arange(width), np.arange(first_row, end_row)), axis=-1) + 0.5) / supersample
+        undistorted = view.undistort(pixels)
+        is_valid = ~np.isnan(undistorted[..., :1])
+        table[first_row:end_row, :, :2] = np.where(is_valid, undistorted * supersample, INVALID_COORDINATE)
+        if with_steps:
+            jacobian = view.lens.jacobian((np.where(is_valid, undistorted, view.centre) - view.centre) / view.scale)
+            inverse = np.linalg.inv(jacobian) * view.scale[:, None] / view.scale
+            table[first_row:end_row, :, 2:] = np.where(
+                is_valid, np.moveaxis(inverse, -1, -2).reshape(*is_valid.shape[:2], 4), 0
+            )
     return table
 
 
-def bounds(places: NDArray[np.float32]) -> Array:
-    """Give the left, right, top and bottom of places, shape (..., 2); without any, what nothing is in."""
-    known = places[places[..., 0] < BEYOND]
-    if not len(known):
-        return np.array([BEYOND, -BEYOND, BEYOND, -BEYOND])
-    (left, top), (right, bottom) = known.min(axis=0), known.max(axis=0)
+def bounds(coordinates: NDArray[np.float32]) -> Array:
+    """Return left, right, top and bottom of the valid coordinates, shape (..., 2); an empty box if none is valid."""
+    valid = coordinates[coordinates[..., 0] < INVALID_COORDINATE]
+    if not len(valid):
+        return np.array([INVALID_COORDINATE, -INVALID_COORDINATE, INVALID_COORDINATE, -INVALID_COORDINATE])
+    (left, top), (right, bottom) = valid.min(axis=0), valid.max(axis=0)
     return np.array([left, right, top, bottom])
 
 
-def tiled(places: NDArray[np.float32], config: DrawingConfig) -> NDArray[np.float32]:
-    """Arrange places in the bands and tiles of kernel 2, with bounds; shape (bands, vectors of each, lanes)."""
-    rows, columns, planes = places.shape
-    height, lines = config.band_rows * config.supersample, config.band_lines
+def tiled_map(table: NDArray[np.float32], config: DrawingConfig) -> NDArray[np.float32]:
+    """Rearrange an undistortion map into the bands and tiles of kernel 2, and add the bounding box of each tile.
+
+    Args:
+        table: undistortion map, shape (rows, columns, 2 or 6).
+        config: compile-time configuration.
+
+    Returns:
+        The map, shape (bands, vectors per band, lanes).
+    """
+    rows, columns, planes = table.shape
+    band_height, lines = config.band_rows * config.supersample, config.band_lines
     tile_height, tile_width = config.tile_height, config.tile_width
-    bands, across = -(-rows // height), -(-columns // tile_width)
-    padding = (0, bands * height - rows), (0, across * tile_width - columns), (0, 0)
-    cut = np.pad(places, padding, constant_values=BEYOND).reshape(bands, height, -1, planes)
-    cut = np.pad(cut, ((0, 0), (0, lines * tile_height - height), (0, 0), (0, 0)), constant_values=BEYOND)
-    tiles = cut.reshape(bands, lines, tile_height, across, tile_width, planes).transpose(0, 1, 3, 5, 2, 4)
-    tiles = tiles.reshape(bands, lines, across, planes, config.lanes)
-    # Where a tile has no place, its bounds are far away too.
-    least = tiles[..., :2, :].min(axis=-1)
-    most = np.where(tiles[..., :2, :] < BEYOND, tiles[..., :2, :], least[..., None]).max(axis=-1)
-    box = np.stack([least, most], axis=-1).reshape(bands, lines, across, 1, 4)
+    bands, tiles_across = -(-rows // band_height), -(-columns // tile_width)
+    padding = (0, bands * band_height - rows), (0, tiles_across * tile_width - columns), (0, 0)
+    padded = np.pad(table, padding, constant_values=INVALID_COORDINATE).reshape(bands, band_height, -1, planes)
+    padding_of_lines = (0, 0), (0, lines * tile_height - band_height), (0, 0), (0, 0)
+    padded = np.pad(padded, padding_of_lines, constant_values=INVALID_COORDINATE)
+    tiles = padded.reshape(bands, lines, tile_height, tiles_across, tile_width, planes).transpose(0, 1, 3, 5, 2, 4)
+    tiles = tiles.reshape(bands, lines, tiles_across, planes, config.lanes)
+    # A tile without valid coordinates has an invalid box.
+    low = tiles[..., :2, :].min(axis=-1)
+    high = np.where(tiles[..., :2, :] < INVALID_COORDINATE, tiles[..., :2, :], low[..., None]).max(axis=-1)
+    box = np.stack([low, high], axis=-1).reshape(bands, lines, tiles_across, 1, 4)
     box = np.pad(box, ((0, 0), (0, 0), (0, 0), (0, 0), (0, config.lanes - 4)))
     return np.concatenate([tiles, box], axis=3).reshape(bands, -1, config.lanes)

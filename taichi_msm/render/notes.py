@@ -1,4 +1,4 @@
-"""Warnings about a scene that will not look as intended."""
+"""Warnings about scenes that will not look as intended."""
 
 from __future__ import annotations
 
@@ -8,34 +8,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.render import texture
-from taichi_msm.render.camera import View, moves, view_at
+from taichi_msm.render.camera import View, is_moving, view_at
 from taichi_msm.scene.render import Light
 from taichi_msm.scene.scene import Scene
 
-# A picture whose proportions differ from those of the sheet by this factor is visibly stretched.
-STRETCHED = 1.02
+# Maximum ratio of the picture's and the sheet's proportions without visible stretching.
+ASPECT_TOLERANCE = 1.02
 
-# The radius of an instrument is rarely above this share of the sheet's larger side.
-WIDEST = 0.25
-
-# No sheet of tissue has a larger side [m]; one of 75 m is meant in millimetres.
-LARGEST_SHEET = 5.0
-
-# Whether a camera shows the sheet is found at so many places across and down. What is between them is a dot, as the
-# sheet is to a camera that is placed in millimetres.
-DOTS = 100
+# The sheet is searched at this number of pixels per axis. A smaller sheet is a dot, as for a camera placed in
+# millimetres.
+SAMPLES_PER_SIDE = 100
 
 
-def drawing_notes(scene: Scene) -> Iterator[str]:
-    """List warnings about how a scene is drawn, each in a line."""
+def drawing_warnings(scene: Scene) -> Iterator[str]:
+    """List warnings about the rendering of a scene, one line each."""
     height, width = scene.sheet.size
-    if max(height, width) > LARGEST_SHEET:
+    # Tissue is smaller than 5 m; a larger sheet was probably given in millimetres.
+    if max(height, width) > 5.0:
         yield (
             f"sheet.size: {height:g} x {width:g} m is large for tissue; if these are millimetres, take "
             f"[{height / 1000:g}, {width / 1000:g}]"
         )
     if scene.draws:
-        yield from _stretched(scene)
+        yield from _stretched_picture(scene)
         if texture.is_see_through(scene):
             yield (
                 f"the picture is see-through in parts, which show render.background: {list(scene.render.background)}"
@@ -43,7 +38,7 @@ def drawing_notes(scene: Scene) -> Iterator[str]:
         if scene.render.light != Light() and scene.render.shading != "tissue":
             yield f"render.light has no effect with shading: {scene.render.shading}; take render.shading: tissue"
     if scene.renders:
-        yield from _blind(scene)
+        yield from _invisible_sheet(scene)
     for index, probe in enumerate(scene.probes):
         if (instrument := probe.instrument) is None:
             continue
@@ -52,67 +47,71 @@ def drawing_notes(scene: Scene) -> Iterator[str]:
                 f"probes.{index}.instrument: its shaft points down, through the sheet at rest; it goes from the tip "
                 "to the hand, upward for z above 0"
             )
-        if instrument.radius > WIDEST * max(scene.sheet.size):
+        if instrument.radius > 0.25 * max(scene.sheet.size):
             yield (
                 f"probes.{index}.instrument: {instrument.radius:g} m is a wide rod for a sheet of "
                 f"{max(scene.sheet.size):g} m; the radius is in metres"
             )
 
 
-def _blind(scene: Scene) -> Iterator[str]:
-    """Warn of cameras that show nothing of the sheet at rest, or only a dot, in all frames."""
+def _invisible_sheet(scene: Scene) -> Iterator[str]:
+    """Warn of cameras in which the sheet at rest is invisible or tiny in all frames."""
     rate = scene.time.frames_per_second
     for name in scene.render.all_cameras:
         camera = view_at(scene, 0.0, name)
-        middle = (np.arange(DOTS) + 0.5) / DOTS
-        places = camera.undistorted(np.stack(np.meshgrid(*(middle * side for side in camera.size)), axis=-1))
-        frames = range(scene.time.frames + 1 if moves(scene, name) else 1)
-        if not any(_shows(view_at(scene, frame / rate, name), places, scene.sheet.size) for frame in frames):
+        centres = (np.arange(SAMPLES_PER_SIDE) + 0.5) / SAMPLES_PER_SIDE
+        pixels = camera.undistort(np.stack(np.meshgrid(*(centres * side for side in camera.size)), axis=-1))
+        frames = range(scene.time.frames + 1 if is_moving(scene, name) else 1)
+        if not any(_is_visible(view_at(scene, frame / rate, name), pixels, scene.sheet.size) for frame in frames):
             key = f"render.cameras.{name}" if name else "render.camera"
             yield f"{key} shows nothing of the sheet at rest, or only a dot, in all frames; lengths are in metres"
 
 
-def _shows(camera: View, places: NDArray[np.float64], size: tuple[float, float]) -> bool:
-    """Tell whether a camera shows a sheet of this height and width, at rest, at any of some places [px], (..., 2)."""
+def _is_visible(camera: View, pixels: NDArray[np.float64], size: tuple[float, float]) -> bool:
+    """Return whether any of some pixels [px], shape (..., 2), shows a sheet of this height and width at rest."""
     try:
-        # From the plane of the sheet to the picture, and back.
-        back = np.linalg.inv(camera.matrix[:3][:, [0, 1, 3]])
+        # The homography from the plane of the sheet to the picture, inverted.
+        inverse = np.linalg.inv(camera.matrix[:3][:, [0, 1, 3]])
     except np.linalg.LinAlgError:
         return False
-    x, y, per_w = np.moveaxis(places @ back[:, :2].T + back[:, 2], -1, 0)
+    x, y, per_w = np.moveaxis(pixels @ inverse[:, :2].T + inverse[:, 2], -1, 0)
     height, width = size
-    # Where nothing is shown they are NaN.
-    seen = (per_w > 0) & (np.abs(x) <= width / 2 * per_w) & (np.abs(y) <= height / 2 * per_w)
-    return bool((seen & (per_w * camera.near < 1)).any())
+    # Pixels without a line of sight are NaN, and compare false.
+    is_inside = (per_w > 0) & (np.abs(x) <= width / 2 * per_w) & (np.abs(y) <= height / 2 * per_w)
+    return bool((is_inside & (per_w * camera.near < 1)).any())
 
 
-def _stretched(scene: Scene) -> Iterator[str]:
-    """Warn of a picture that is stretched onto the sheet, and name two remedies."""
+def _stretched_picture(scene: Scene) -> Iterator[str]:
+    """Warn of a picture that is stretched onto the sheet, with two remedies."""
     size = texture.image_size(scene)
     if size is None:
         return
     left, top, width, height = scene.region or (0, 0, *size)
-    high, wide = scene.sheet.size
-    if _fits(wide * height, high * width):
+    sheet_height, sheet_width = scene.sheet.size
+    if _fits(sheet_width * height, sheet_height * width):
         return
-    side = max(high, wide) / max(height, width)
+    side = max(sheet_height, sheet_width) / max(height, width)
     settings = f'--set "sheet.size=[{height * side:.4g},{width * side:.4g}]"'
     if scene.tissue is not None:
-        # With cells that stay square, as tissue allows none that are much longer than wide.
+        # Tissue requires cells that are nearly square.
         cells = (max(scene.sheet.points) - 1) / max(height, width)
         rows, cols = (max(1, round(cells * count)) + 1 for count in (height, width))
         settings += f' --set "sheet.points=[{rows},{cols}]"'
     warning = (
-        f"the picture of {width} x {height} pixels is stretched onto a sheet {wide:g} m wide and {high:g} m high; "
+        f"the picture of {width} x {height} pixels is stretched onto a sheet {sheet_width:g} m wide and "
+        f"{sheet_height:g} m high; "
         f"{settings} makes the sheet like the picture"
     )
-    cut_width, cut_height = min(width, round(height * wide / high)), min(height, round(width * high / wide))
-    # Of few pixels, even the part whose proportions are nearest to the sheet's may be stretched.
-    if cut_width and cut_height and _fits(wide * cut_height, high * cut_width):
-        cut = left + (width - cut_width) // 2, top + (height - cut_height) // 2, cut_width, cut_height
-        warning += f', --set "region=[{",".join(map(str, cut))}]" cuts a part like the sheet'
+    cut_width, cut_height = (
+        min(width, round(height * sheet_width / sheet_height)),
+        min(height, round(width * sheet_height / sheet_width)),
+    )
+    # In a picture of few pixels even the best region may be stretched.
+    if cut_width and cut_height and _fits(sheet_width * cut_height, sheet_height * cut_width):
+        region = left + (width - cut_width) // 2, top + (height - cut_height) // 2, cut_width, cut_height
+        warning += f', --set "region=[{",".join(map(str, region))}]" cuts a part like the sheet'
     yield warning
 
 
 def _fits(area: float, expected: float) -> bool:
-    return expected / STRETCHED < area < expected * STRETCHED
+    return expected / ASPECT_TOLERANCE < area < expected * ASPECT_TOLERANCE

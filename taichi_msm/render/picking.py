@@ -1,4 +1,4 @@
-"""Which material point is seen at a pixel: the inverse of projection."""
+"""Picking: the material point at a pixel, the inverse of projection."""
 
 from __future__ import annotations
 
@@ -7,91 +7,101 @@ from numpy.typing import NDArray
 
 from taichi_msm.render.camera import View
 
-# How many cells are examined at a time.
-CELLS = 1024
+# Number of cells that are processed at once, to bound the memory.
+CELLS_PER_BATCH = 1024
 
 Array = NDArray[np.float64]
 Pixel = tuple[float, float]
-Place = tuple[float, float]
-Seen = tuple[float, Place]
+SheetCoordinates = tuple[float, float]
+Hit = tuple[float, SheetCoordinates]
 
 
-def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pixel) -> Place | None:
-    """Find the material point that is drawn at the centre of a pixel, on the nearest of the triangles there.
+def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pixel) -> SheetCoordinates | None:
+    """Return the material point at the centre of a pixel, on the nearest triangle there.
 
     The camera maps a point to (X, Y, w, depth). Then a = X - x w and b = Y - y w are linear in the point, and both are
-    0 if it is seen at (x, y). This needs no division by w, which is 0 or negative behind the camera. Arguments are as
-    for `surface` and `View.sight`.
+    0 if it projects to (x, y). This avoids a division by w, which is 0 or negative behind the camera.
+
+    Args:
+        position: positions of the mass points [m], shape (rows, cols, 3).
+        refine: vertices inserted between neighbouring mass points.
+        view: the camera.
+        pixel: column and row, counted from (0, 0).
 
     Returns:
-        Fractions of the sheet's width from its left and of its height from its top; None if no surface is there.
+        Fractions of the sheet's width from its left and of its height from its top; None if there is no surface.
     """
     rows, cols = position.shape[:2]
-    sight = view.sight(pixel)
-    seen: list[Seen] = []
-    cells = np.argwhere(_may_show(position, sight))
-    for first in range(0, len(cells), CELLS):
-        i, j = cells[first : first + CELLS].T
-        corners = np.stack([position[i + down, j + right] for down in (0, 1) for right in (0, 1)], axis=1)
-        seen += _in_cells(sight.project(corners), i, j, refine, view.near)
-    if not seen:
+    ray = view.centred_at(pixel)
+    hits: list[Hit] = []
+    cells = np.argwhere(_cells_on_ray(position, ray))
+    for first in range(0, len(cells), CELLS_PER_BATCH):
+        i, j = cells[first : first + CELLS_PER_BATCH].T
+        corners = np.stack([position[i + below, j + right] for below in (0, 1) for right in (0, 1)], axis=1)
+        hits += _hits_in_cells(ray.project(corners), i, j, refine, view.near)
+    if not hits:
         return None
-    _, (across, down) = min(seen)
-    return across / (cols - 1), down / (rows - 1)
+    _, (column, row) = min(hits)
+    return column / (cols - 1), row / (rows - 1)
 
 
-def on_rest_plane(view: View, pixel: Pixel) -> NDArray[np.floating] | None:
-    """Find x and y [m] where the line of sight through a pixel's centre meets the plane of the sheet at rest.
+def intersect_rest_plane(view: View, pixel: Pixel) -> NDArray[np.floating] | None:
+    """Intersect the line of sight through a pixel's centre with the plane of the sheet at rest.
 
-    None if they do not meet in front of the camera.
+    Args:
+        view: the camera.
+        pixel: column and row, counted from (0, 0).
+
+    Returns:
+        x and y [m]; None without an intersection in front of the camera.
     """
-    matrix = view.sight(pixel).matrix
+    matrix = view.centred_at(pixel).matrix
     planar = matrix[:2, :2]
-    size = np.linalg.norm(planar, axis=1).prod()
-    if not abs(np.linalg.det(planar)) > 1e-9 * size:
+    scale = np.linalg.norm(planar, axis=1).prod()
+    if not abs(np.linalg.det(planar)) > 1e-9 * scale:
         return None
     point = np.linalg.solve(planar, -matrix[:2, 3])
     return point if matrix[2] @ [*point, 0, 1] > view.near else None
 
 
-def _may_show(position: NDArray[np.floating], sight: View) -> NDArray[np.bool_]:
+def _cells_on_ray(position: NDArray[np.floating], ray: View) -> NDArray[np.bool_]:
     """Mark the cells in which a and b can both be 0."""
     rows, cols = position.shape[:2]
-    marked = np.ones((rows - 1, cols - 1), dtype=bool)
-    for row in sight.matrix[:2]:
-        # One number per point at a time: for a large sheet, all of them together do not fit into the cache.
+    is_candidate = np.ones((rows - 1, cols - 1), dtype=bool)
+    for row in ray.matrix[:2]:
+        # One coordinate at a time, which fits into the cache for large sheets.
         value = position @ row[:3] + row[3]
-        for side in (value <= 0, value >= 0):
-            pairs = side[:-1] | side[1:]
-            marked &= pairs[:, :-1] | pairs[:, 1:]
-    return marked
+        for half in (value <= 0, value >= 0):
+            rows_of_cells = half[:-1] | half[1:]
+            is_candidate &= rows_of_cells[:, :-1] | rows_of_cells[:, 1:]
+    return is_candidate
 
 
-def _in_cells(corners: Array, i: NDArray[np.intp], j: NDArray[np.intp], refine: int, near: float) -> list[Seen]:
-    """List what is seen of some cells at the pixel: each time the depth, and the place in cells from the top left."""
-    parts = refine + 1
-    share = np.arange(parts + 1) / parts
-    s, t = share[:, None], share[:, None, None]
-    a, right, down, far = (corners[:, None, None, n] for n in range(4))
-    vertex = a + (right - a) * s + (down - a) * t + (far - right - down + a) * s * t
+def _hits_in_cells(corners: Array, i: NDArray[np.intp], j: NDArray[np.intp], refine: int, near: float) -> list[Hit]:
+    """List depth and position, in cells from the top left, of the hits in some cells."""
+    subdivisions = refine + 1
+    fractions = np.arange(subdivisions + 1) / subdivisions
+    s, t = fractions[:, None], fractions[:, None, None]
+    a, right, down, opposite = (corners[:, None, None, n] for n in range(4))
+    vertex = a + (right - a) * s + (down - a) * t + (opposite - right - down + a) * s * t
     quads = np.stack([vertex[:, :-1, :-1], vertex[:, :-1, 1:], vertex[:, 1:, :-1], vertex[:, 1:, 1:]], axis=-2)
-    # Only where a and b can both be 0.
-    least, most = quads[..., :2].min(axis=-2), quads[..., :2].max(axis=-2)
-    cell, line, column = np.nonzero(((least <= 0) & (most >= 0)).all(axis=-1))
-    quad = quads[cell, line, column]
-    seen: list[Seen] = []
-    for third in (1, 2):  # the third corner, beside the two ends of the diagonal: upper right, lower left
+    # The sub-quads in which a and b can both be 0.
+    low, high = quads[..., :2].min(axis=-2), quads[..., :2].max(axis=-2)
+    cell, quad_row, quad_column = np.nonzero(((low <= 0) & (high >= 0)).all(axis=-1))
+    quad = quads[cell, quad_row, quad_column]
+    hits: list[Hit] = []
+    for third in (1, 2):  # index of the corner off the diagonal: upper right, lower left
         triangle = quad[:, [0, third, 3]]
         p, q, r = np.moveaxis(triangle[..., :2], 1, 0)
-        share = np.stack([_cross(q, r), _cross(r, p), _cross(p, q)], axis=-1)
+        weights = np.stack([_cross(q, r), _cross(r, p), _cross(p, q)], axis=-1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            share /= share.sum(axis=-1, keepdims=True)
-        w, depth = np.moveaxis((share[..., None] * triangle[..., 2:]).sum(axis=1), -1, 0)
-        for n in np.flatnonzero((share >= 0).all(axis=-1) & (w > near)):
-            across = j[cell[n]] + (column[n] + share[n, 2] + (third == 1) * share[n, 1]) / parts
-            along = i[cell[n]] + (line[n] + share[n, 2] + (third == 2) * share[n, 1]) / parts
-            seen.append((float(depth[n]), (float(across), float(along))))
-    return seen
+            weights /= weights.sum(axis=-1, keepdims=True)
+        w, depth = np.moveaxis((weights[..., None] * triangle[..., 2:]).sum(axis=1), -1, 0)
+        for n in np.flatnonzero((weights >= 0).all(axis=-1) & (w > near)):
+            x = j[cell[n]] + (quad_column[n] + weights[n, 2] + (third == 1) * weights[n, 1]) / subdivisions
+            y = i[cell[n]] + (quad_row[n] + weights[n, 2] + (third == 2) * weights[n, 1]) / subdivisions
+            hits.append((float(depth[n]), (float(x), float(y))))
+    return hits
 
 
 def _cross(p: Array, q: Array) -> Array:

@@ -1,10 +1,9 @@
-"""Kernel 2: bilinear refinement, projection, rasterisation of textured triangles, shading.
+"""Kernel 2: bilinear subdivision, projection, rasterisation of textured triangles, shading.
 
-It finds what each sample of the picture shows: the sheet (coverage.py) or an instrument in front of it
-(coverage.py). From that it writes the colours of pixels, their labels, or both (shading.py). Samples are
-shared among the workers of a CPU in bands (cpu.py), and are threads of a GPU (gpu.py). As in
-kernel 1, vectors stay vectors down to the machine code (docs/decisions/0010), and casts, floor and abs of vectors are
-written to allow this.
+For each sample of the picture it computes the visible surface: the sheet, or an instrument in front of it
+(coverage.py). From this it writes the colours of pixels, their labels, or both (shading.py). Samples are divided among
+the workers of a CPU in bands (cpu.py), and are threads of a GPU (gpu.py). As in kernel 1, vectors remain vectors down
+to the machine code (docs/decisions/0010); casts, floor and abs of vectors are written accordingly.
 """
 
 from __future__ import annotations
@@ -21,8 +20,8 @@ from taichi_msm.render.camera import View, view, view_at
 from taichi_msm.render.config import DrawingConfig
 from taichi_msm.render.cpu import Bands
 from taichi_msm.render.gpu import Threads
-from taichi_msm.render.labels import Observed, labels_of
-from taichi_msm.render.lens_table import sample_places
+from taichi_msm.render.labels import FrameOutputs, labels_of
+from taichi_msm.render.lens_table import undistortion_map
 from taichi_msm.render.shading import pyramid
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import lanes
@@ -31,14 +30,14 @@ from taichi_msm.system.runtime import lanes
 def drawing_config(
     scene: Scene, *, picture: bool = True, labels: bool = False, normals: bool = False, lens: str | None = None
 ) -> DrawingConfig:
-    """Decide what the kernel must be compiled for; `picture` and `labels` together take one sample per pixel.
+    """Return the compile-time configuration of kernel 2 for a scene.
 
     Args:
         scene: the scene.
         picture: whether colours are drawn.
-        labels: whether labels are written.
-        normals: whether normals are among them.
-        lens: the model of the camera's lens, `View.model`; None: of the scene's own camera.
+        labels: whether labels are written; together with the picture this requires one sample per pixel.
+        normals: whether the labels include normals.
+        lens: lens model of the camera, as `View.lens_model`; by default that of the scene's main camera.
     """
     render = scene.render
     tissue = picture and render.shading == "tissue"
@@ -55,63 +54,86 @@ def drawing_config(
         picture=picture,
         labels=labels,
         normals=labels and normals,
-        lens=view_at(scene, 0.0).model if lens is None else lens,
+        lens=view_at(scene, 0.0).lens_model if lens is None else lens,
         lanes=lanes("f32"),
     )
 
 
-class Drawing:
-    """Draws one scene's sheet with a texture, shape (height, width, 3); call `runtime.start` first."""
+class Rasterizer:
+    """Draws pictures and labels of the sheet of one scene; call `runtime.start` first.
+
+    Args:
+        scene: the scene.
+        texture: texture of the sheet, shape (height, width, 3).
+        config: compile-time configuration; by default that of the scene's pictures.
+    """
 
     def __init__(self, scene: Scene, texture: NDArray[np.uint8], config: DrawingConfig | None = None) -> None:
         self.scene = scene
         self.config = config or drawing_config(scene)
         self._view = view(scene)
-        self._known: tuple[View, NDArray[np.float32]] | None = None
+        self._cached: tuple[View, NDArray[np.float32]] | None = None
         self._optics: tuple[object, ...] = ()
         self._texture_size = texture.shape[1], texture.shape[0]
         texels, levels = pyramid(texture, minified=self.config.tissue)
         self._sizes = uni.sizes_of(scene, levels)
-        form = Threads if self.config.lanes == 1 else Bands
-        self._form: Bands | Threads = form(self.config, scene.sheet.points, scene.render.size, texels)
+        backend = Threads if self.config.lanes == 1 else Bands
+        self._backend: Bands | Threads = backend(self.config, scene.sheet.points, scene.render.size, texels)
 
     def draw(
         self, position: NDArray[Any], camera: View | None = None, rods: Sequence[Capsule] = ()
     ) -> NDArray[np.uint8]:
-        """Draw the picture alone, shape (height, width, 3); arguments as for `look`."""
+        """Draw the picture alone.
+
+        Args:
+            position: positions of the mass points [m], shape (rows, cols, 3).
+            camera: the camera; by default the scene's main camera at the start.
+            rods: the instruments.
+
+        Returns:
+            Colours, shape (height, width, 3).
+        """
         picture = self.look(position, camera, rods).picture
         assert picture is not None
         return picture
 
-    def look(self, position: NDArray[Any], camera: View | None = None, rods: Sequence[Capsule] = ()) -> Observed:
-        """Draw the picture, the labels or both, as the config says, of points [m] at `position`, shape (rows, cols, 3).
+    def look(self, position: NDArray[Any], camera: View | None = None, rods: Sequence[Capsule] = ()) -> FrameOutputs:
+        """Draw the picture, the labels or both, as configured.
 
-        The scene's own camera is taken if none is given.
+        Args:
+            position: positions of the mass points [m], shape (rows, cols, 3).
+            camera: the camera; by default the scene's main camera at the start.
+            rods: the instruments.
+
+        Returns:
+            The picture and the labels.
         """
-        self._sizes[uni.ROD_COUNT] = len(rods)
+        self._sizes[uni.CAPSULE_COUNT] = len(rods)
         camera = camera or self._view
-        numbers = self._numbers(camera, rods)
-        self._place(camera)
-        picture, labels = self._form.draw(np.ascontiguousarray(position, np.float32), numbers, self._sizes)
-        return Observed(
+        uniforms = self._uniforms(camera, rods)
+        self._update_undistortion_map(camera)
+        picture, labels = self._backend.draw(np.ascontiguousarray(position, np.float32), uniforms, self._sizes)
+        return FrameOutputs(
             np.ascontiguousarray(picture) if self.config.picture else None,
             labels_of(labels, self.scene.render.size) if self.config.labels else None,
         )
 
-    def _place(self, camera: View) -> None:
-        """Find the places of the samples, where a lens bends lines, again only if its view of them changes."""
+    def _update_undistortion_map(self, camera: View) -> None:
+        """Set the undistortion map again if the optics of the camera changed."""
         if not self.config.lens:
             return
         if camera.optics != self._optics:
             self._optics = camera.optics
-            self._form.place(sample_places(camera, self.config.supersample, steps=self.config.place_steps))
+            self._backend.set_undistortion_map(
+                undistortion_map(camera, self.config.supersample, with_steps=self.config.map_has_steps)
+            )
 
-    def _numbers(self, camera: View, rods: Sequence[Capsule]) -> NDArray[np.float32]:
-        """Give the numbers of a view; without instruments they are computed again only when the camera changes."""
-        if rods or self._known is None or self._known[0] is not camera:
+    def _uniforms(self, camera: View, rods: Sequence[Capsule]) -> NDArray[np.float32]:
+        """Return the uniforms of a view; without instruments they are cached until the camera changes."""
+        if rods or self._cached is None or self._cached[0] is not camera:
             render, size = self.scene.render, self.scene.sheet.size
-            numbers = uni.view_numbers(camera, render, self.config.supersample, size, self._texture_size, rods)
+            uniforms = uni.view_uniforms(camera, render, self.config.supersample, size, self._texture_size, rods)
             if rods:
-                return numbers.astype(np.float32)
-            self._known = camera, numbers.astype(np.float32)
-        return self._known[1]
+                return uniforms.astype(np.float32)
+            self._cached = camera, uniforms.astype(np.float32)
+        return self._cached[1]

@@ -1,4 +1,4 @@
-"""The picture that the sheet carries."""
+"""The texture of the sheet: the scene's picture."""
 
 from __future__ import annotations
 
@@ -15,10 +15,19 @@ if TYPE_CHECKING:
 
 
 def load_texture(scene: Scene, sha256: str | None = None) -> NDArray[np.uint8]:
-    """Read the scene's picture: upright, in 8-bit RGB, cut to the scene's region, shape (height, width, 3).
+    """Read the scene's picture: upright, in 8-bit RGB, cropped to the scene's region.
 
-    If a file has several pictures, the first is taken; a transparent one is laid over the scene's background. Its file
-    must have the SHA-256, if one is given. Raises a SceneError when there is none, or it cannot be used.
+    Only the first picture of a file is read; transparent ones are composited onto the scene's background.
+
+    Args:
+        scene: the scene.
+        sha256: required SHA-256 of the file, if any.
+
+    Returns:
+        Colours, shape (height, width, 3).
+
+    Raises:
+        SceneError: if there is no picture, or it is invalid.
     """
     import numpy as np
 
@@ -36,7 +45,17 @@ def load_texture(scene: Scene, sha256: str | None = None) -> NDArray[np.uint8]:
 
 
 def require_texture(texture: Any) -> NDArray[np.uint8]:
-    """Check that an array can be the picture on the sheet; raises an ArgumentError when it cannot."""
+    """Check that an array is a valid texture.
+
+    Args:
+        texture: any object.
+
+    Returns:
+        The texture, shape (height, width, 3).
+
+    Raises:
+        ArgumentError: if it is invalid.
+    """
     import numpy as np
 
     picture = as_array(texture, "texture")
@@ -50,7 +69,7 @@ def require_texture(texture: Any) -> NDArray[np.uint8]:
 
 
 def image_size(scene: Scene) -> tuple[int, int] | None:
-    """Give the whole picture's width and height [px] without decoding it; None if there is no usable picture."""
+    """Return the picture's width and height [px] without decoding it; None if there is no valid picture."""
     try:
         return None if scene.image is None else picture_size(scene.image)
     except PictureError:
@@ -58,7 +77,7 @@ def image_size(scene: Scene) -> tuple[int, int] | None:
 
 
 def is_see_through(scene: Scene) -> bool:
-    """Tell whether the scene's picture lets the background through; False if there is no usable picture."""
+    """Return whether the scene's picture has transparent pixels; False if there is no valid picture."""
     try:
         return scene.image is not None and has_transparency(scene.image)
     except PictureError:
@@ -66,7 +85,7 @@ def is_see_through(scene: Scene) -> bool:
 
 
 def image_problems(scene: Scene) -> Iterator[Problem]:
-    """Find, from the file's header alone, why the scene's picture or the region of it cannot be used."""
+    """List the problems of the scene's picture and region, from the header of the file."""
     size = None
     if scene.image is not None:
         try:

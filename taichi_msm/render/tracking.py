@@ -1,7 +1,7 @@
-"""Where material points are seen, and whether anything is in front of them: found in f64, without a depth map.
+"""Pixels and occlusion of material points, computed in f64 without a depth map.
 
-A point is placed on the drawn surface, and projected. It is hidden if another part of the surface, or an instrument, is
-nearer on the same line of sight. Bins tell which cells may be there.
+A material point is located on the drawn triangles, and projected. It is hidden if another part of the surface, or an
+instrument, is nearer on the same line of sight. Bins list the cells that may be there.
 """
 
 import math
@@ -14,300 +14,338 @@ from numpy.typing import NDArray
 from taichi_msm.model.surface import Capsule
 from taichi_msm.render import geometry, lens_kernels
 from taichi_msm.render import uniforms as uni
-from taichi_msm.render.bins import BOUNDS, binned, store_bounds
+from taichi_msm.render.bins import BOUNDS_STRIDE, build_bins, store_bounds
 from taichi_msm.render.camera import View
 from taichi_msm.render.config import INFINITY, Bytes, Doubles, Floats, Integers
-from taichi_msm.render.coverage import meet
-from taichi_msm.render.geometry import POINT_NUMBERS
+from taichi_msm.render.coverage import intersect_capsule
+from taichi_msm.render.geometry import NODE_STRIDE
 from taichi_msm.render.labels import NO_FLOW, Flow, Sight
-from taichi_msm.render.lens_table import window
+from taichi_msm.render.lens_table import undistorted_view
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.launches import Launches, end_thread
 from taichi_msm.system.runtime import lanes, our_compilation, ti
 
 Array = NDArray[np.floating]
 
-# The smallest width of a bin [px].
-SMALLEST_BIN = 4
+# Minimum width of a bin [px].
+MIN_BIN_SIZE = 4
 
-# The numbers of a cell: its bounds in the picture; its least depth; and its side, 0 for a cell drawn triangle by
-# triangle, else 1 or -1 as its front or its back is seen.
-MIN_X, MAX_X, MIN_Y, MAX_Y, NEAREST, SIDE, CELL_NUMBERS = range(7)
+# Offsets in the numbers of a cell: its bounds in the picture [px]; its least depth [m]; and 1 if its front is visible,
+# -1 for its back, 0 if it is drawn triangle by triangle.
+CELL_MIN_X, CELL_MAX_X, CELL_MIN_Y, CELL_MAX_Y, CELL_MIN_DEPTH, CELL_FACING, CELL_STRIDE = range(7)
 
-# The bounds of a cell that may be anywhere [px].
-ANYWHERE = 1e9
+# Bounds of a cell that may be anywhere [px].
+UNBOUNDED = 1e9
 
-# The cells around a mass point.
-AROUND = 4
+# Number of cells around a mass point.
+CELLS_AROUND_NODE = 4
 
-# The pixel of a point that is seen nowhere.
-NOWHERE = math.nan
+# Pixel coordinate of points that have no projection.
+NOT_VISIBLE = math.nan
 
 
-def find(scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Capsule] = ()) -> Sight:
-    """Find material points by their coordinates on the sheet, as in `Labels`, shape (n, 2).
+def locate_points(scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Capsule] = ()) -> Sight:
+    """Locate material points in the picture.
 
-    The mass points are at `position` [m], shape (rows, cols, 3). Raises a DeviceError when threads were cut short.
+    Args:
+        scene: the scene.
+        coordinates: coordinates of the points on the sheet, as in `Labels`, shape (n, 2).
+        position: positions of the mass points [m], shape (rows, cols, 3).
+        view: the camera.
+        rods: the instruments.
+
+    Returns:
+        Pixels and occlusion of the points.
+
+    Raises:
+        DeviceError: if the device stopped threads early.
     """
-    pixels, hidden = _search(scene, coordinates, position, view, rods, moved=False)
+    pixels, hidden = _track(scene, coordinates, position, view, rods, as_flow=False)
     return Sight(pixels, hidden.view(np.bool_))
 
 
-def find_flow(scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Capsule] = ()) -> Flow:
-    """Find how far the points that the pixels of another frame show have moved in the picture; else as `find`.
+def compute_flow(scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Capsule] = ()) -> Flow:
+    """Compute the optical flow from another frame.
 
-    `coordinates` are those in the labels of the other frame, shape (height, width, 2); NaN where no sheet is seen.
+    Args:
+        scene: the scene.
+        coordinates: coordinates in the labels of the other frame, shape (height, width, 2); NaN without a sheet.
+        position: positions of the mass points in this frame [m], shape (rows, cols, 3).
+        view: the camera of this frame.
+        rods: the instruments of this frame.
+
+    Returns:
+        Optical flow and occlusion of the pixels of the other frame.
+
+    Raises:
+        DeviceError: if the device stopped threads early.
     """
     shape = coordinates.shape[:2]
-    moved, hidden = _search(scene, coordinates.reshape(-1, 2), position, view, rods, moved=True)
+    moved, hidden = _track(scene, coordinates.reshape(-1, 2), position, view, rods, as_flow=True)
     return Flow(moved.reshape(*shape, 2), hidden.reshape(shape) * np.uint8(255))
 
 
-def _search(
-    scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Capsule], *, moved: bool
+def _track(
+    scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Capsule], *, as_flow: bool
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Find material points, or how far they are from the centres of all pixels, row by row; and which are hidden."""
+    """Return pixels of material points, or as flow their offsets from another frame's pixels; and occlusion."""
     total = len(coordinates)
     if total == 0:
         return np.empty((0, 2), np.float32), np.empty(0, np.uint8)
     rows, cols = scene.sheet.points
     cells = (rows - 1) * (cols - 1)
-    # What hides what is found without the lens.
-    straight = view if view.lens is None else window(view)
-    width, height = (int(side) for side in straight.size)
-    # If a bin is half as wide as a cell, the cells of most bins are around one mass point only.
-    bin_size = max(SMALLEST_BIN, round((width * height / cells) ** 0.5 / 2))
+    # Occlusion is computed without lens distortion.
+    undistorted = view if view.lens is None else undistorted_view(view)
+    width, height = (int(side) for side in undistorted.size)
+    # With bins half as wide as cells, most bins only overlap cells around one mass point.
+    bin_size = max(MIN_BIN_SIZE, round((width * height / cells) ** 0.5 / 2))
     launches = Launches(bounded=lanes("f64") == 1)
-    told = uni.view_numbers(straight, scene.render, 1, scene.sheet.size, (1, 1), rods)
+    uniform_values = uni.view_uniforms(undistorted, scene.render, 1, scene.sheet.size, (1, 1), rods)
     if view.lens is not None:
-        uni.tell_lens(told, view, 1, view.lens.limit)
-    numbers = launches.give(told)
+        uni.set_lens(uniform_values, view, 1, view.lens.limit)
+    uniforms = launches.give(uniform_values)
     sizes = uni.sizes_of(scene, np.empty((0, 3), np.int32))
-    sizes[[uni.ROD_COUNT, uni.WIDTH, uni.HEIGHT]] = len(rods), width, height
-    point, cell = (launches.array(np.float64, n) for n in (rows * cols * POINT_NUMBERS, cells * CELL_NUMBERS))
-    bounds = launches.array(np.int32, cells * BOUNDS)
+    sizes[[uni.CAPSULE_COUNT, uni.WIDTH, uni.HEIGHT]] = len(rods), width, height
+    nodes, cell = (launches.array(np.float64, n) for n in (rows * cols * NODE_STRIDE, cells * CELL_STRIDE))
+    bounds = launches.array(np.int32, cells * BOUNDS_STRIDE)
     with our_compilation(optimised=False):
-        _outline(np.ascontiguousarray(position, np.float64), numbers, launches.give(sizes), point, cell, bounds)
-    bins = binned(launches, bounds, cells, (width, height), bin_size)
-    sizes[[uni.BIN_SIZE, uni.BINS_ACROSS, uni.WIDTH, uni.HEIGHT]] = bins.size, bins.across, *scene.render.size
-    simple = launches.array(np.uint8, bins.lengths.size)
-    launches.launch(_judge, bins.lengths.size, cell, cols, bins.starts, bins.entries, simple, rounds=3 * AROUND)
+        _outline_cells(np.ascontiguousarray(position, np.float64), uniforms, launches.give(sizes), nodes, cell, bounds)
+    bins = build_bins(launches, bounds, cells, (width, height), bin_size)
+    sizes[[uni.BIN_SIZE, uni.BINS_ACROSS, uni.WIDTH, uni.HEIGHT]] = bins.size, bins.columns, *scene.render.size
+    is_simple = launches.array(np.uint8, bins.lengths.size)
+    launches.launch(
+        _mark_simple_bins, bins.lengths.size, cell, cols, bins.starts, bins.entries, is_simple,
+        rounds=3 * CELLS_AROUND_NODE,
+    )  # fmt: skip
     pixels, hidden = launches.array(np.float32, 2 * total), launches.array(np.uint8, total)
     arguments = (
         launches.give(np.ascontiguousarray(coordinates, np.float32).ravel()),
-        int(moved), numbers, launches.give(sizes), point, cell, bins.starts, bins.entries, simple, pixels, hidden,
+        int(as_flow), uniforms, launches.give(sizes), nodes, cell, bins.starts, bins.entries, is_simple, pixels, hidden,
     )  # fmt: skip
-    # A point takes one round for a cell, and one for each of its triangles.
+    # Rounds per point: one per cell, and one per triangle.
     rounds = 1 + 2 * (scene.render.refine + 1) ** 2
     for listed, count in launches.parts(int(bins.lengths.max()), rounds):
-        launches.launch(_finding(view.model), total, listed, count, *arguments, rounds=count * rounds + len(rods))
+        launches.launch(_kernel(view.lens_model), total, listed, count, *arguments, rounds=count * rounds + len(rods))
     launches.require_ended()
     return launches.take(pixels).reshape(-1, 2), launches.take(hidden)
 
 
 @ti.kernel
-def _outline(
-    position: ti.types.ndarray(dtype=ti.f64, ndim=3), numbers: Doubles, sizes: Integers, point: Doubles, cell: Doubles,
+def _outline_cells(
+    position: ti.types.ndarray(dtype=ti.f64, ndim=3), uniforms: Doubles, sizes: Integers, nodes: Doubles, cell: Doubles,
     bounds: Integers,
 ):  # fmt: skip
-    """Project the mass points, and find the outlines of the cells, and their bounds in whole pixels."""
+    """Project the mass points, and compute the outlines of the cells and their bounds in whole pixels."""
     for index in range(sizes[uni.ROWS] * sizes[uni.COLS]):
         cols = sizes[uni.COLS]
-        geometry.project(position, index // cols, index % cols, cols, numbers, point, True)
+        geometry.project(position, index // cols, index % cols, cols, uniforms, nodes, True)
 
     for index in range((sizes[uni.ROWS] - 1) * (sizes[uni.COLS] - 1)):
-        cols, here = sizes[uni.COLS], index * CELL_NUMBERS
-        corner = geometry.corner_of(index, cols)
-        below = corner + cols * POINT_NUMBERS
-        outline = ti.static(geometry.outlined(corner, cols, numbers[uni.NEAR], point))
-        left, right, top, bottom, side = outline.left, outline.right, outline.top, outline.bottom, outline.side
+        cols, entry = sizes[uni.COLS], index * CELL_STRIDE
+        corner = geometry.corner_entry(index, cols)
+        below = corner + cols * NODE_STRIDE
+        outline = ti.static(geometry.cell_outline(corner, cols, uniforms[uni.NEAR], nodes))
+        left, right, top, bottom, facing = outline.left, outline.right, outline.top, outline.bottom, outline.facing
         corners = [
-            [point[at + n] for n in ti.static(range(3))]
-            for at in ti.static((corner, corner + POINT_NUMBERS, below, below + POINT_NUMBERS))
+            [nodes[corner_start + n] for n in ti.static(range(3))]
+            for corner_start in ti.static((corner, corner + NODE_STRIDE, below, below + NODE_STRIDE))
         ]
         if outline.behind:
             left, right, top, bottom = 1.0, -1.0, 1.0, -1.0
         elif not outline.in_front:
-            left, right, top, bottom, side = -ANYWHERE, ANYWHERE, -ANYWHERE, ANYWHERE, 0.0
+            left, right, top, bottom, facing = -UNBOUNDED, UNBOUNDED, -UNBOUNDED, UNBOUNDED, 0.0
             width, height = ti.cast(sizes[uni.WIDTH], ti.f64), ti.cast(sizes[uni.HEIGHT], ti.f64)
-            if geometry.is_beside(corners, 0.0, width, 0.0, height):
+            if geometry.is_off_screen(corners, 0.0, width, 0.0, height):
                 left, right = 1.0, -1.0
-        cell[here + MIN_X], cell[here + MAX_X], cell[here + MIN_Y], cell[here + MAX_Y] = left, right, top, bottom
-        cell[here + NEAREST] = ti.min(
-            point[corner + 3], point[corner + POINT_NUMBERS + 3], point[below + 3], point[below + POINT_NUMBERS + 3]
+        cell[entry + CELL_MIN_X], cell[entry + CELL_MAX_X] = left, right
+        cell[entry + CELL_MIN_Y], cell[entry + CELL_MAX_Y] = top, bottom
+        cell[entry + CELL_MIN_DEPTH] = ti.min(
+            nodes[corner + 3], nodes[corner + NODE_STRIDE + 3], nodes[below + 3], nodes[below + NODE_STRIDE + 3]
         )
-        cell[here + SIDE] = side
+        cell[entry + CELL_FACING] = facing
         store_bounds(index, left, right, top, bottom, sizes[uni.WIDTH], sizes[uni.HEIGHT], bounds)
 
 
 @ti.kernel
-def _judge(
+def _mark_simple_bins(
     first: ti.i32, end: ti.i32, ended: Integers, cell: Doubles, cols: ti.i32, starts: Integers, entries: Integers,
-    simple: Bytes,
+    is_simple: Bytes,
 ):  # fmt: skip
-    """Mark the bins in which no two cells can be seen at the same place.
+    """Mark the bins in which no two cells overlap.
 
-    This is so if the cells of a bin are among the four around one mass point, and these four are all drawn as a whole
-    and seen from the same side: each is convex, so it lies within the angle between its two edges at the point, and
-    the four angles add up to 360 degrees without overlapping.
+    This holds if the cells of a bin are among the four around one mass point, and all of these four are invertible and
+    face the same way: each is convex, so it lies within the angle between its two edges at the mass point, and the four
+    angles add up to 360 degrees without overlapping.
     """
-    for square in range(first, end):
+    for bin_index in range(first, end):
         first_i, last_i, first_j, last_j = 1 << 30, -1, 1 << 30, -1
-        length = starts[square + 1] - starts[square]
-        for n in range(starts[square], starts[square] + ti.min(length, AROUND)):
+        length = starts[bin_index + 1] - starts[bin_index]
+        for n in range(starts[bin_index], starts[bin_index] + ti.min(length, CELLS_AROUND_NODE)):
             i, j = entries[n] // (cols - 1), entries[n] % (cols - 1)
             first_i, last_i = ti.min(first_i, i), ti.max(last_i, i)
             first_j, last_j = ti.min(first_j, j), ti.max(last_j, j)
-        around_a_point = length <= AROUND and last_i - first_i <= 1 and last_j - first_j <= 1
-        if around_a_point:
-            sides, around = 0.0, 0.0
-            # All four matter, even those that do not reach the bin.
+        around_node = length <= CELLS_AROUND_NODE and last_i - first_i <= 1 and last_j - first_j <= 1
+        if around_node:
+            facing_sum, count = 0.0, 0.0
+            # All four must be checked, even those that do not overlap the bin.
             for i in range(first_i, last_i + 1):
                 for j in range(first_j, last_j + 1):
-                    sides += cell[(i * (cols - 1) + j) * CELL_NUMBERS + SIDE]
-                    around += 1.0
-            around_a_point = abs(sides) == around
-        simple[square] = ti.cast(around_a_point, ti.u8)
+                    facing_sum += cell[(i * (cols - 1) + j) * CELL_STRIDE + CELL_FACING]
+                    count += 1.0
+            around_node = abs(facing_sum) == count
+        is_simple[bin_index] = ti.cast(around_node, ti.u8)
         end_thread(ended)
 
 
 @ti.func
-def _depth(x, y, column, line, part, lower, near, patch: ti.template()):
-    """Find the depth at which (x, y) shows a small quad of a cell, or INFINITY.
+def _quad_depth(x, y, quad_column, quad_row, quad_side, lower, near, patch: ti.template()):
+    """Return the depth of a sub-quad of a cell at (x, y), or INFINITY.
 
-    Of a cell that is not whole this is the depth of the triangle below the diagonal, if `lower`, or above.
+    In a cell that is not invertible, this is the depth of the triangle below the diagonal, if `lower`, or above it.
     """
-    triangle = ti.static(geometry.triangle_at(x, y, column, line, part, lower, patch))
+    triangle = ti.static(geometry.triangle_at(x, y, quad_column, quad_row, quad_side, lower, patch))
     s, t = geometry.on_triangle(x, y, triangle)
     depth = geometry.depth_at(s, t, triangle)
-    return ti.select(patch.whole | geometry.is_within(s, t, 0.0, near, triangle), depth, INFINITY)
+    return ti.select(patch.invertible | geometry.is_within(s, t, 0.0, near, triangle), depth, INFINITY)
 
 
 @ti.func
-def _hides(x, y, depth, index, own, own_triangle, cols, parts, near, point: ti.template(), cell: ti.template()):
-    """Tell whether a cell is seen at (x, y) at a smaller depth than `depth`.
+def _cell_occludes(
+    x, y, depth, index, own_cell, own_triangle, cols, subdivisions, near, nodes: ti.template(), cell: ti.template()
+):
+    """Return whether a cell occludes a point at (x, y) and `depth`.
 
-    `depth` is that of a point that is on the cell `own`, there on the small triangle `own_triangle`.
+    The point lies on the triangle `own_triangle` of the cell `own_cell`; this triangle does not occlude it.
     """
-    here, part = index * CELL_NUMBERS, 1.0 / parts
-    side = cell[here + SIDE]
-    whole = side != 0.0
-    hides = False
-    # A cell that is drawn as a whole shows at most one of its points at a place of the picture.
-    possible = cell[here + NEAREST] < depth and not (index == own and whole)
+    entry, quad_side = index * CELL_STRIDE, 1.0 / subdivisions
+    facing = cell[entry + CELL_FACING]
+    invertible = facing != 0.0
+    occluded = False
+    # An invertible cell has at most one point on a line of sight.
+    possible = cell[entry + CELL_MIN_DEPTH] < depth and not (index == own_cell and invertible)
     if (
         possible
-        and x >= cell[here + MIN_X]
-        and x <= cell[here + MAX_X]
-        and y >= cell[here + MIN_Y]
-        and y <= cell[here + MAX_Y]
+        and x >= cell[entry + CELL_MIN_X]
+        and x <= cell[entry + CELL_MAX_X]
+        and y >= cell[entry + CELL_MIN_Y]
+        and y <= cell[entry + CELL_MAX_Y]
     ):
-        corner = geometry.corner_of(index, cols)
-        patch = ti.static(geometry.patch_of(corner, cols, side, whole, point, True))
-        if whole:
-            outline = ti.static(geometry.outlined(corner, cols, near, point))
-            of_left, of_right, of_top, of_bottom = geometry.edges(x, y, side, outline)
-            if of_left >= 0.0 and of_right >= 0.0 and of_top >= 0.0 and of_bottom >= 0.0:
-                column, line = geometry.small_quad(x, y, True, parts, patch)
-                hides = _depth(x, y, column, line, part, False, near, patch) < depth
+        corner = geometry.corner_entry(index, cols)
+        patch = ti.static(geometry.cell_patch(corner, cols, facing, invertible, nodes, True))
+        if invertible:
+            outline = ti.static(geometry.cell_outline(corner, cols, near, nodes))
+            left_edge, right_edge, top_edge, bottom_edge = geometry.edges(x, y, facing, outline)
+            if left_edge >= 0.0 and right_edge >= 0.0 and top_edge >= 0.0 and bottom_edge >= 0.0:
+                column, row = geometry.find_quads(x, y, True, subdivisions, patch)
+                occluded = _quad_depth(x, y, column, row, quad_side, False, near, patch) < depth
         else:
-            per_side = ti.cast(parts, ti.i32)
+            per_side = ti.cast(subdivisions, ti.i32)
             for triangle in range(2 * per_side * per_side):
-                if not hides and not (index == own and triangle == own_triangle):
+                if not occluded and not (index == own_cell and triangle == own_triangle):
                     quad = triangle // 2
-                    column, line = ti.cast(quad % per_side, ti.f64), ti.cast(quad // per_side, ti.f64)
-                    hides = _depth(x, y, column, line, part, triangle % 2 == 1, near, patch) < depth
-    return hides
+                    column, row = ti.cast(quad % per_side, ti.f64), ti.cast(quad // per_side, ti.f64)
+                    occluded = _quad_depth(x, y, column, row, quad_side, triangle % 2 == 1, near, patch) < depth
+    return occluded
 
 
 @ti.func
-def _is_behind_rod(x, y, depth, numbers: ti.template(), sizes: ti.template()):
-    """Tell whether an instrument is seen at (x, y) at a smaller depth than `depth`."""
-    hides = False
-    for n in range(sizes[uni.ROD_COUNT]):
-        rod = uni.RODS + n * uni.ROD_NUMBERS
-        across_it = x >= numbers[rod + uni.LEFT] and x <= numbers[rod + uni.RIGHT]
-        if across_it and y >= numbers[rod + uni.TOP] and y <= numbers[rod + uni.BOTTOM]:
-            met, _, _, _ = meet(x, y, n, numbers)
-            if met < depth and geometry.w_at(met, numbers) > numbers[uni.NEAR]:
-                hides = True
-    return hides
+def _capsule_occludes(x, y, depth, uniforms: ti.template(), sizes: ti.template()):
+    """Return whether an instrument occludes a point at (x, y) and `depth`."""
+    occluded = False
+    for index in range(sizes[uni.CAPSULE_COUNT]):
+        capsule = uni.CAPSULES + index * uni.CAPSULE_STRIDE
+        is_between = x >= uniforms[capsule + uni.LEFT] and x <= uniforms[capsule + uni.RIGHT]
+        if is_between and y >= uniforms[capsule + uni.TOP] and y <= uniforms[capsule + uni.BOTTOM]:
+            hit_depth, _, _, _ = intersect_capsule(x, y, index, uniforms)
+            if hit_depth < depth and geometry.w_at(hit_depth, uniforms) > uniforms[uni.NEAR]:
+                occluded = True
+    return occluded
 
 
 @cache
-def _finding(lens: str) -> Callable[..., None]:
-    """Make the kernel that finds points, for a model of the lens, empty if it bends no lines."""
+def _kernel(lens: str) -> Callable[..., None]:
+    """Return the kernel that locates points, for a lens model; empty without lens distortion."""
 
     @ti.kernel
-    def find_points(
-        first: ti.i32, end: ti.i32, ended: Integers, listed: ti.i32, count: ti.i32, coordinates: Floats, moved: ti.i32,
-        numbers: Doubles, sizes: Integers, point: Doubles, cell: Doubles, starts: Integers, entries: Integers,
-        simple: Bytes, pixels: Floats, hidden: Bytes,
+    def locate_kernel(
+        first: ti.i32, end: ti.i32, ended: Integers, listed: ti.i32, count: ti.i32, coordinates: Floats,
+        as_flow: ti.i32, uniforms: Doubles, sizes: Integers, nodes: Doubles, cell: Doubles,
+        starts: Integers, entries: Integers, is_simple: Bytes, pixels: Floats, hidden: Bytes,
     ):  # fmt: skip
-        """Find where material points are seen, and which are hidden by `count` cells of their lists from `listed` on.
+        """Locate material points, and compare them with some cells of the lists of their bins.
 
-        If `moved` is 0, `pixels` gets their places [px]. Otherwise they are what the pixels of another frame showed,
-        and `pixels` gets how far each has moved from its pixel's centre [px].
+        Args:
+            first: first point of the launch.
+            end: point after the last one.
+            ended: counter of finished threads.
+            listed: position in the lists of the first cell.
+            count: number of cells.
+            coordinates: coordinates of the points on the sheet.
+            as_flow: 0 to return pixels; otherwise the points are those of the pixels of another frame, and their
+                displacements from these pixels' centres are returned.
+            uniforms: constants of the view.
+            sizes: sizes and counters.
+            nodes: projected mass points.
+            cell: outlines of the cells.
+            starts: start of the list of each bin.
+            entries: cells of all lists.
+            is_simple: whether no two cells of a bin overlap.
+            pixels: pixels or displacements [px], written.
+            hidden: whether the points are hidden, updated.
         """
         for k in range(first, end):
             rows, cols, width, height = sizes[uni.ROWS], sizes[uni.COLS], sizes[uni.WIDTH], sizes[uni.HEIGHT]
-            near, parts = numbers[uni.NEAR], numbers[uni.PARTS]
+            near, subdivisions = uniforms[uni.NEAR], uniforms[uni.SUBDIVISIONS]
             u, v = coordinates[2 * k], coordinates[2 * k + 1]
-            x, y, out_of_sight = ti.cast(NOWHERE, ti.f64), ti.cast(NOWHERE, ti.f64), False
+            x, y, is_hidden = ti.cast(NOT_VISIBLE, ti.f64), ti.cast(NOT_VISIBLE, ti.f64), False
             if abs(u) < 2.0:  # False for NaN
                 s = ti.math.clamp(ti.cast(u, ti.f64), 0.0, 1.0) * (cols - 1)
                 t = ti.math.clamp(ti.cast(v, ti.f64), 0.0, 1.0) * (rows - 1)
                 j, i = ti.min(ti.cast(s, ti.i32), cols - 2), ti.min(ti.cast(t, ti.i32), rows - 2)
                 s, t = s - j, t - i
-                own, part = i * (cols - 1) + j, 1.0 / parts
-                column, line = ti.min(ti.floor(s * parts), parts - 1.0), ti.min(ti.floor(t * parts), parts - 1.0)
-                s0, t0 = column * part, line * part
+                own_cell, quad_side = i * (cols - 1) + j, 1.0 / subdivisions
+                quad_column = ti.min(ti.floor(s * subdivisions), subdivisions - 1.0)
+                quad_row = ti.min(ti.floor(t * subdivisions), subdivisions - 1.0)
+                s0, t0 = quad_column * quad_side, quad_row * quad_side
                 s1, t1 = s - s0, t - t0
-                own_triangle = 2 * ti.cast(line * parts + column, ti.i32) + ti.cast(t1 > s1, ti.i32)
-                patch = ti.static(geometry.patch_of(geometry.corner_of(own, cols), cols, 0.0, True, point, True))
-                # In the small quad, D s t is replaced by a function that is linear on either side of the diagonal.
-                twist = s0 * t0 + s1 * t0 + s0 * t1 + ti.min(s1, t1) * part
+                own_triangle = 2 * ti.cast(quad_row * subdivisions + quad_column, ti.i32) + ti.cast(t1 > s1, ti.i32)
+                patch = ti.static(
+                    geometry.cell_patch(geometry.corner_entry(own_cell, cols), cols, 0.0, True, nodes, True)
+                )
+                # In the sub-quad, D s t is replaced by a function that is linear on either side of the diagonal.
+                twist = s0 * t0 + s1 * t0 + s0 * t1 + ti.min(s1, t1) * quad_side
                 p = patch.a + patch.b * s + patch.c * t + patch.d * twist
-                out_of_sight = True
+                is_hidden = True
                 if p[2] > near:
                     x, y = p[0] / p[2], p[1] / p[2]
-                    place_x, place_y, within = x, y, True
+                    undistorted_x, undistorted_y, is_valid = x, y, True
                     if ti.static(lens != ""):
-                        x, y, within = lens_kernels.bent(place_x, place_y, numbers, lens)
-                    if within and x >= 0.0 and y >= 0.0 and x < width and y < height:
-                        out_of_sight = False
-                        depth = p[3] - numbers[uni.TOUCHING]
-                        square = ti.cast(place_y, ti.i32) // sizes[uni.BIN_SIZE] * sizes[uni.BINS_ACROSS]
-                        square += ti.cast(place_x, ti.i32) // sizes[uni.BIN_SIZE]
-                        if simple[square] == 0:
-                            begin = starts[square] + listed
-                            for n in range(begin, ti.min(begin + count, starts[square + 1])):
-                                if not out_of_sight:
-                                    out_of_sight = _hides(
-                                        place_x,
-                                        place_y,
-                                        depth,
-                                        entries[n],
-                                        own,
-                                        own_triangle,
-                                        cols,
-                                        parts,
-                                        near,
-                                        point,
-                                        cell,
-                                    )
-                        out_of_sight = out_of_sight or _is_behind_rod(place_x, place_y, depth, numbers, sizes)
-                    if not within:
-                        x, y = ti.cast(NOWHERE, ti.f64), ti.cast(NOWHERE, ti.f64)
-            if moved > 0:
-                seen = x > -INFINITY  # False for NaN
-                x = ti.select(seen, x - ti.cast(k % width, ti.f64) - 0.5, NO_FLOW)
-                y = ti.select(seen, y - ti.cast(k // width, ti.f64) - 0.5, NO_FLOW)
+                        x, y, is_valid = lens_kernels.distorted_point(undistorted_x, undistorted_y, uniforms, lens)
+                    if is_valid and x >= 0.0 and y >= 0.0 and x < width and y < height:
+                        is_hidden = False
+                        depth = p[3] - uniforms[uni.DEPTH_TOLERANCE]
+                        bin_index = ti.cast(undistorted_y, ti.i32) // sizes[uni.BIN_SIZE] * sizes[uni.BINS_ACROSS]
+                        bin_index += ti.cast(undistorted_x, ti.i32) // sizes[uni.BIN_SIZE]
+                        if is_simple[bin_index] == 0:
+                            begin = starts[bin_index] + listed
+                            for n in range(begin, ti.min(begin + count, starts[bin_index + 1])):
+                                if not is_hidden:
+                                    is_hidden = _cell_occludes(
+                                        undistorted_x, undistorted_y, depth, entries[n], own_cell, own_triangle,
+                                        cols, subdivisions, near, nodes, cell,
+                                    )  # fmt: skip
+                        is_hidden = is_hidden or _capsule_occludes(undistorted_x, undistorted_y, depth, uniforms, sizes)
+                    if not is_valid:
+                        x, y = ti.cast(NOT_VISIBLE, ti.f64), ti.cast(NOT_VISIBLE, ti.f64)
+            if as_flow > 0:
+                is_visible = x > -INFINITY  # False for NaN
+                x = ti.select(is_visible, x - ti.cast(k % width, ti.f64) - 0.5, NO_FLOW)
+                y = ti.select(is_visible, y - ti.cast(k // width, ti.f64) - 0.5, NO_FLOW)
             pixels[2 * k] = ti.cast(x, ti.f32)
             pixels[2 * k + 1] = ti.cast(y, ti.f32)
             if listed > 0:
-                out_of_sight = out_of_sight or hidden[k] > 0
-            hidden[k] = ti.cast(out_of_sight, ti.u8)
+                is_hidden = is_hidden or hidden[k] > 0
+            hidden[k] = ti.cast(is_hidden, ti.u8)
             end_thread(ended)
 
-    return find_points
+    return locate_kernel

@@ -35,8 +35,8 @@ from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.tool_force import ProbeRecord, probe_records
 from taichi_msm.render.camera import view_at
-from taichi_msm.render.labels import Observed
-from taichi_msm.render.notes import drawing_notes
+from taichi_msm.render.labels import FrameOutputs
+from taichi_msm.render.notes import drawing_warnings
 from taichi_msm.render.texture import load_texture
 from taichi_msm.runs.manifest import Manifest, digests, read_manifest
 from taichi_msm.runs.simulation import Simulation
@@ -297,7 +297,7 @@ class _Run:
         """Simulate, draw and write every frame that is missing, and finish the results."""
         writer, simulation, scene = self._writer, self._simulation, self._task.plan.scene
         stage, rest = self._watch.stage, rest_positions(scene.sheet)
-        observed = dict.fromkeys(scene.render.all_cameras, Observed())
+        observed = dict.fromkeys(scene.render.all_cameras, FrameOutputs())
         # Frames that need no step are told apart, as they say nothing of the time that the others will take.
         without_steps = max(self._resumed, 1)
         for frame in range(writer.frames, self._frames):
@@ -436,7 +436,7 @@ def _facts(
         "notes": [
             *run_notes(plan, probes, progress, *known, _affords, _scale(scene)),
             *path_dependence,
-            *drawing_notes(scene),
+            *drawing_warnings(scene),
         ],
         "error_estimate": error_record(known),
         **({"error_estimate_reason": known.reason} if known.estimate is None else {}),

@@ -26,7 +26,7 @@ from taichi_msm.load.check import checked
 from taichi_msm.load.resolve import resolve
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.surface import Surface, place_capsules, refine_surface, to_positions
-from taichi_msm.render.labels import Flow, Labels, Observed, Sight
+from taichi_msm.render.labels import Flow, FrameOutputs, Labels, Sight
 from taichi_msm.render.picking import pick
 from taichi_msm.render.renderer import Array, CameraLike, Renderer, Shot
 from taichi_msm.render.texture import require_texture
@@ -356,7 +356,7 @@ class Simulation:
         if not (are_numbers(point, (2,)) and np.isfinite(point).all()):
             raise ArgumentError(f"pixel: {pixel!r}; take two numbers, x to the right and y down")
         x, y = point.tolist()
-        return pick(self._position, self.scene.render.refine, self.renderer.set_up(camera, self.time), (x, y))
+        return pick(self._position, self.scene.render.refine, self.renderer.resolve_camera(camera, self.time), (x, y))
 
     def observe(
         self,
@@ -364,7 +364,7 @@ class Simulation:
         camera: CameraLike = None,
         positions: Array | None = None,
         time: float | None = None,
-    ) -> Observed:
+    ) -> FrameOutputs:
         """Give all that the scene's output asks for of a frame; `before`: the labels of the frame before, if any."""
         return self.renderer.observe(before, self._shot(camera, positions, time))
 
@@ -469,7 +469,7 @@ class Simulation:
             time = self.time
         elif not (are_numbers(as_array(time, "time"), ()) and math.isfinite(time)):
             raise ArgumentError(f"time: {time!r}; take a number, in seconds, or None for now")
-        return Shot(positions, self.renderer.set_up(camera, time), place_capsules(self.scene, positions, time))
+        return Shot(positions, self.renderer.resolve_camera(camera, time), place_capsules(self.scene, positions, time))
 
     def _require_good(self, reading: Reading, fault: str) -> None:
         """Raise the error of a divergence, if there is a fault."""

@@ -25,8 +25,8 @@ from taichi_msm.errors import Pause, writing
 from taichi_msm.model.surface import surface_positions
 from taichi_msm.model.time_grid import TimeGrid
 from taichi_msm.model.tool_force import ProbeRecord
-from taichi_msm.render.camera import calibration, moves, pose, view_at
-from taichi_msm.render.labels import Observed, track_grid
+from taichi_msm.render.camera import calibration, is_moving, pose, view_at
+from taichi_msm.render.labels import FrameOutputs, track_grid
 from taichi_msm.runs.arrays import Pieces, write_arrays, write_flo
 from taichi_msm.runs.checkpoint import CHECKPOINT, PATTERNS, Checkpoint
 from taichi_msm.runs.directory import Contents, Listed, Publication, add, create
@@ -108,7 +108,7 @@ class ResultWriter:
     def add(
         self,
         position: NDArray[Any],
-        observed: Mapping[str, Observed],
+        observed: Mapping[str, FrameOutputs],
         forces: Sequence[TipForce] = (),
         pause: Pause = lambda: None,
     ) -> None:
@@ -257,7 +257,7 @@ class LabelWriter:
         self._grid = track_grid(scene.render.tracks)
         self._added = 0
 
-    def add(self, frame: int, observed: Observed, position: NDArray[Any]) -> None:
+    def add(self, frame: int, observed: FrameOutputs, position: NDArray[Any]) -> None:
         """Write the labels of a frame, whose points are at `position` [m], and the flow from the frame before."""
         self._added = frame + 1
         for output in self._series:
@@ -281,7 +281,7 @@ class LabelWriter:
         if self._described:
             scene, name = self._scene, self._camera
             matrices = {"size": list(scene.render.size), **calibration(view_at(scene, 0.0, name))}
-            if moves(scene, name):
+            if is_moving(scene, name):
                 rate = scene.time.frames_per_second
                 matrices["poses"] = [pose(view_at(scene, frame / rate, name)) for frame in range(frames)]
             add(self._folder / CAMERA, (json.dumps(matrices, indent=2) + "\n").encode())

@@ -46,7 +46,7 @@ class Output(NamedTuple):
 
     name: str
     file: str  # with a folder, that of the first frame of a series
-    # Field of `Observed`; positions and forces: none.
+    # Field of `FrameOutputs`; positions and forces: none.
     source: Literal["picture", "labels", "flow", "stereo", "tracks", "positions", "forces"]
     means: str  # what the file holds, for users
     pixel_bytes: float = 0  # the most that a pixel takes in a file, as one of noise; 0: the size is not by pixels

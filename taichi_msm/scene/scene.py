@@ -160,7 +160,7 @@ class Scene(Section):
         return folders
 
     def asks_for(self, *sources: str) -> bool:
-        """Tell whether the values of any output are in one of these fields of `Observed`."""
+        """Tell whether the values of any output are in one of these fields of `FrameOutputs`."""
         return any(OUTPUTS[name].source in sources for name in self.output)
 
     @property

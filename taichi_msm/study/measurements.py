@@ -34,7 +34,7 @@ from taichi_msm.model.sheet import area_shares, axes, spacing
 from taichi_msm.model.time_grid import Precision
 from taichi_msm.model.tool_force import probe_force
 from taichi_msm.model.tools import min_steps_per_frame
-from taichi_msm.render.rasterizer import Drawing
+from taichi_msm.render.rasterizer import Rasterizer
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_POINTS
 from taichi_msm.solver.dynamics import Dynamics
@@ -418,7 +418,7 @@ def measure_pictures(
     if cost.drawing_bytes(finest) > memory:
         study.notes.append("drawing was not measured: there is no memory for a picture fine enough to compare with")
         return
-    truth = Drawing(finest, texture).draw(position)
+    truth = Rasterizer(finest, texture).draw(position)
     drawings, compared = [], list(settings(scene, quick))
     for number, (refine, supersample) in enumerate(compared):
         progress(number, len(compared) * PICTURE_ROUNDS)
@@ -427,7 +427,7 @@ def measure_pictures(
         if memory < 0:
             study.notes.append(f"drawing was not measured from refine {refine}, supersample {supersample} on: memory")
             break
-        drawing = Drawing(changed, texture)
+        drawing = Rasterizer(changed, texture)
         drawings.append(drawing)
         picture = drawing.draw(position)
         apart = int(np.abs(picture.astype(np.int16) - truth).max())

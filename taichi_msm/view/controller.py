@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.model.surface import Capsule
-from taichi_msm.render.camera import View, held, pinhole, turned, view
-from taichi_msm.render.picking import on_rest_plane
+from taichi_msm.render.camera import View, frozen_camera, orbit_camera, pinhole, view
+from taichi_msm.render.picking import intersect_rest_plane
 from taichi_msm.render.renderer import Renderer, Shot
 from taichi_msm.runs.media import Picture
 from taichi_msm.runs.simulation import Simulation
@@ -53,7 +53,7 @@ class Controller:
             place = self._at_rest(x, y) or self.tool.goal
         self.tool.press(place, direction)
         self._pointer = x, y
-        self._held = place, on_rest_plane(self._viewport.view, self._pointer)
+        self._held = place, intersect_rest_plane(self._viewport.view, self._pointer)
         return True
 
     def over(self) -> Place | None:
@@ -76,7 +76,7 @@ class Controller:
         if self._held is None:
             return
         self._pointer = x, y
-        ((across, down), begun), here = self._held, on_rest_plane(self._viewport.view, self._pointer)
+        ((across, down), begun), here = self._held, intersect_rest_plane(self._viewport.view, self._pointer)
         if begun is None or here is None:
             return
         (right, up), (height, width) = here - begun, self._simulation.scene.sheet.size
@@ -91,7 +91,7 @@ class Controller:
     def hold_on(self) -> None:
         """Keep the tool where it is after the camera moved; a drag goes on from there."""
         if self._held is not None:
-            self._held = self.tool.goal, on_rest_plane(self._viewport.view, self._pointer)
+            self._held = self.tool.goal, intersect_rest_plane(self._viewport.view, self._pointer)
 
     def forget(self) -> None:
         """Put the tool at rest."""
@@ -100,7 +100,7 @@ class Controller:
 
     def _at_rest(self, x: float, y: float) -> Place | None:
         """Find the place of the sheet at rest that a pixel shows; None if it shows none of its plane."""
-        if (point := on_rest_plane(self._viewport.view, (x, y))) is None:
+        if (point := intersect_rest_plane(self._viewport.view, (x, y))) is None:
             return None
         height, width = self._simulation.scene.sheet.size
         return float(point[0]) / width + 0.5, 0.5 - float(point[1]) / height
@@ -130,7 +130,7 @@ class Viewport:
     def look(self, camera: AnyCamera) -> None:
         """Choose another camera; those beside it follow."""
         if isinstance(camera, Camera) and not self._plays:
-            camera = held(camera, 0.0)
+            camera = frozen_camera(camera, 0.0)
         self.render = self.render.with_main(camera)
         self.view = view(self._renderer.scene.model_copy(update={"render": self.render, "output": ()}), self._time)
 
@@ -140,7 +140,7 @@ class Viewport:
         camera = self.render.main_camera
         moving = isinstance(camera, Camera) and camera.moves
         if moving:
-            self.view = self._renderer.set_up(None, time)
+            self.view = self._renderer.resolve_camera(None, time)
         return moving
 
     def recorded(self, duration: float) -> Render:
@@ -155,7 +155,7 @@ class Viewport:
         """Turn the picture as if its nearest side were pushed by this many pixels; its height is half a turn."""
         angle = math.pi / self.render.size[1]
         seen = self._renderer.scene.model_copy(update={"render": self.render})
-        self.look(turned(pinhole(seen, self._time), -right * angle, down * angle))
+        self.look(orbit_camera(pinhole(seen, self._time), -right * angle, down * angle))
 
     def light(self) -> None:
         """Switch the light off or on; on is the scene's shading if it has one, else the headlight."""

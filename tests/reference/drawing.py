@@ -222,7 +222,7 @@ def draw(
     else:
         lit = sample(texture, u, v)
     if scene.render.shading == "headlight":
-        lit *= headlight(normal, (camera.lamp or camera).axes[2])[..., None]
+        lit *= headlight(normal, (camera.light_view or camera).axes[2])[..., None]
     wire = seen.wire[..., None]
     lit = lit * (1 - wire) + np.array(uniforms.WIRE_COLOUR) * wire
     colour = np.where(sheet[..., None], lit, np.array(scene.render.background, float))

@@ -179,12 +179,12 @@ def illuminate(camera: View, factor: int, depth: Array, normal: Array) -> tuple[
         Unit vectors: the normal, the direction to the light, the direction to the eye; and the
         distance from the light to the point in the middle of the main camera's picture over that to the sample.
     """
-    lamp = camera.lamp or camera
-    right, up, toward = lamp.axes
+    light_view = camera.light_view or camera
+    right, up, toward = light_view.axes
     point = points(camera, factor, depth)
-    light = lamp.eye + lamp.distance * (uniforms.LIGHT_RIGHT * right + uniforms.LIGHT_UP * up)
+    light = light_view.eye + light_view.distance * (uniforms.LIGHT_RIGHT * right + uniforms.LIGHT_UP * up)
     to_eye = unit(camera.eye - point) if camera.pinhole else np.broadcast_to(camera.axes[2], point.shape)
-    middle = np.linalg.norm(light - (lamp.eye - lamp.distance * toward))
+    middle = np.linalg.norm(light - (light_view.eye - light_view.distance * toward))
     nearness = np.minimum(middle / np.linalg.norm(light - point, axis=-1), 4)
     return unit(normal), unit(light - point), to_eye, nearness
 
@@ -246,7 +246,7 @@ def tissue(
 
 def metal(camera: View, factor: int, depth: Array, normal: Array) -> Array:
     """Shade metal, which reflects a room that is bright above and dark below; colours, shape (height, width, 3)."""
-    far = (camera.lamp or camera).distance * np.hypot(1, np.hypot(uniforms.LIGHT_RIGHT, uniforms.LIGHT_UP))
+    far = (camera.light_view or camera).distance * np.hypot(1, np.hypot(uniforms.LIGHT_RIGHT, uniforms.LIGHT_UP))
     below = np.maximum(np.where(np.isfinite(depth), depth, far), uniforms.METAL_NEAREST * far)
     facing, to_light, to_eye, _ = illuminate(camera, factor, below, normal)
     cosine = np.maximum((facing * to_light).sum(axis=-1), 0)

@@ -13,9 +13,9 @@ from taichi_msm.model.surface import place_capsules
 from taichi_msm.render import tracking
 from taichi_msm.render.camera import view
 from taichi_msm.render.labels import Labels
-from taichi_msm.render.rasterizer import Drawing, drawing_config
+from taichi_msm.render.rasterizer import Rasterizer, drawing_config
 from taichi_msm.render.renderer import Renderer, Shot
-from taichi_msm.render.tracking import find, find_flow
+from taichi_msm.render.tracking import compute_flow, locate_points
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system import launches
 from taichi_msm.system.runtime import Device
@@ -29,7 +29,7 @@ CAMERAS = pytest.mark.parametrize("camera", ["top", "oblique", NEAR], ids=["top"
 def look(made: Scene, position: Array) -> Labels:
     config = drawing_config(made, picture=False, labels=True)
     placed = place_capsules(made, position, 0)
-    found = Drawing(made, np.zeros((1, 1, 3), np.uint8), config).look(position, rods=placed).labels
+    found = Rasterizer(made, np.zeros((1, 1, 3), np.uint8), config).look(position, rods=placed).labels
     assert found is not None
     return found
 
@@ -79,7 +79,7 @@ def test_points_are_found_and_hidden_as_the_twin_says(shape: Any, refine: int, c
     made = drawable(camera=camera, refine=refine)
     position = shape(made)
     coordinates = np.random.default_rng(9).uniform(0, 1, (3000, 2)).astype(np.float32)
-    found = find(made, coordinates, position, view(made))
+    found = locate_points(made, coordinates, position, view(made))
     pixels, hidden = twin.find(made, coordinates.astype(float), position)
     np.testing.assert_array_equal(np.isnan(found.pixels), np.isnan(pixels))
     near = np.abs(pixels).max(axis=1) < 1e4
@@ -95,14 +95,14 @@ def test_on_a_gpu_the_same_points_are_found(shape: Any, device: Device, monkeypa
     made = with_instruments(drawable(camera="oblique", refine=2))
     position, coordinates = shape(made), np.random.default_rng(9).uniform(0, 1, (3000, 2)).astype(np.float32)
     placed = place_capsules(made, position, 0)
-    expected = find(made, coordinates, position, view(made), placed)
+    expected = locate_points(made, coordinates, position, view(made), placed)
     monkeypatch.setattr(tracking, "lanes", lambda precision: 1)
-    assert find(made, coordinates[:0], position, view(made), placed).pixels.shape == (0, 2)
-    found = [find(made, coordinates, position, view(made), placed)]
+    assert locate_points(made, coordinates[:0], position, view(made), placed).pixels.shape == (0, 2)
+    found = [locate_points(made, coordinates, position, view(made), placed)]
     # Two cells in a launch.
     monkeypatch.setattr(launches, "MOST_ROUNDS", launches.SPARE + 2 * (1 + 2 * 3**2))
     monkeypatch.setattr(launches, "THREADS", 100)
-    found.append(find(made, coordinates, position, view(made), placed))
+    found.append(locate_points(made, coordinates, position, view(made), placed))
     for sight in found:
         np.testing.assert_array_equal(sight.pixels, expected.pixels)
         np.testing.assert_array_equal(sight.hidden, expected.hidden)
@@ -113,7 +113,7 @@ def test_what_is_seen_is_not_hidden_in_the_same_frame(device: Device) -> None:
         made = with_instruments(drawable(camera="oblique"))
         position = shape(made)
         seen = look(made, position).coordinates
-        found = find_flow(made, seen, position, view(made), place_capsules(made, position, 0))
+        found = compute_flow(made, seen, position, view(made), place_capsules(made, position, 0))
         sheet = ~np.isnan(seen[..., 0])
         assert np.abs(found.flow[sheet]).max() < 1e-3
         assert (found.flow[~sheet] == 1e10).all()
@@ -129,7 +129,7 @@ def test_an_instrument_hides_what_is_behind_it(device: Device) -> None:
     labels = look(made, position)
     down, across = np.meshgrid((np.arange(60) + 0.5) / 60, (np.arange(80) + 0.5) / 80, indexing="ij")
     points = np.stack([across, down], axis=-1).reshape(-1, 2)
-    found = find(made, points, position, view(made), placed)
+    found = locate_points(made, points, position, view(made), placed)
     # At rest, from the top, a point is seen where it is: 80 x 60 pixels of 0.4 m x 0.3 m.
     np.testing.assert_allclose(found.pixels, points * [80, 60], atol=1e-4)
     np.testing.assert_array_equal(found.hidden, (labels.instrument == 255).ravel())
@@ -151,7 +151,7 @@ def test_a_sheet_that_is_shifted_flows_by_its_shift(device: Device) -> None:
     rest = rest_positions(made.sheet)
     seen = look(made, rest).coordinates
     # 200 px a metre.
-    found = find_flow(made, seen, rest + np.array([0.01, 0.02, -0.1]), view(made))
+    found = compute_flow(made, seen, rest + np.array([0.01, 0.02, -0.1]), view(made))
     np.testing.assert_allclose(found.flow, np.tile([2.0, -4.0], (60, 80, 1)), atol=1e-3)
     # The right two columns and the upper four rows leave the picture.
     gone = np.zeros((60, 80), bool)
@@ -173,7 +173,7 @@ def test_coordinates_at_an_edge_are_on_the_sheet(device: Device) -> None:
 
 def test_points_behind_the_eye_are_nowhere(device: Device) -> None:
     made = drawable(camera={"eye": [0, 0, 0.02], "target": [0, 1, 0.02], "up": [0, 0, 1], "fov": 90})
-    found = find(made, np.array([[0.5, 0.9], [0.5, 0.1]]), rest_positions(made.sheet), view(made))
+    found = locate_points(made, np.array([[0.5, 0.9], [0.5, 0.1]]), rest_positions(made.sheet), view(made))
     assert np.isnan(found.pixels[0]).all()
     assert np.isfinite(found.pixels[1]).all()
     assert found.hidden[0]

@@ -16,8 +16,8 @@ from taichi_msm.render import tracking
 from taichi_msm.render.camera import Lens, calibration, view
 from taichi_msm.render.labels import track_grid
 from taichi_msm.render.picking import pick
-from taichi_msm.render.rasterizer import Drawing, drawing_config
-from taichi_msm.render.tracking import find, find_flow
+from taichi_msm.render.rasterizer import Rasterizer, drawing_config
+from taichi_msm.render.tracking import compute_flow, locate_points
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests import reference
@@ -158,7 +158,7 @@ def test_pictures_are_like_the_twins(lens: str, render: dict[str, Any], device: 
     for shape in (dented, folded):
         position = shape(made)
         placed = place_capsules(made, position, 0)
-        drawn = Drawing(made, texture).draw(position, rods=placed)
+        drawn = Rasterizer(made, texture).draw(position, rods=placed)
         apart = difference(drawn, reference.draw(made, position, texture, placed))
         # As without a lens (test_drawing.py).
         assert (apart > 1).mean() < 0.005
@@ -214,7 +214,7 @@ def test_labels_are_on_the_ray_of_each_pixel(lens: str, shape: Any, device: Devi
     pose = np.array(calibration(view(made))["pose"])
     np.testing.assert_allclose(found.depth[sheet], points @ pose[2, :3] + pose[2, 3], rtol=1e-5)
     # Nothing moved: no flow, and nothing is hidden.
-    still = find_flow(made, found.coordinates, position, view(made), placed)
+    still = compute_flow(made, found.coordinates, position, view(made), placed)
     seen = ~np.isnan(found.coordinates[..., 0])
     assert np.abs(still.flow[seen]).max() < 0.01
     assert (still.occlusion > 0).sum() <= 3
@@ -231,7 +231,7 @@ def test_points_are_found_and_hidden_as_the_twin_says(
     coordinates = np.random.default_rng(9).uniform(0, 1, (2000, 2)).astype(np.float32)
     if lanes:
         monkeypatch.setattr(tracking, "lanes", lambda precision: lanes)
-    found = find(made, coordinates, position, view(made))
+    found = locate_points(made, coordinates, position, view(made))
     pixels, hidden = twin.find(made, coordinates.astype(float), position)
     np.testing.assert_allclose(found.pixels, pixels, atol=1e-4)
     np.testing.assert_array_equal(found.hidden, hidden)
@@ -249,14 +249,14 @@ def test_what_is_beyond_the_limit_is_outside_the_picture(device: Device) -> None
     assert not np.isnan(labels.coordinates[away < rim - 0.01]).any()
     assert np.isnan(labels.coordinates[away > rim]).all()
     assert (labels.depth[away > rim] == 0).all()
-    drawn = Drawing(made, speckle(9, 9)).draw(position)
+    drawn = Rasterizer(made, speckle(9, 9)).draw(position)
     assert (drawn[away > rim] == [10, 20, 30]).all()
     # Nor is there a second picture of what folds back.
-    moved = find_flow(made, labels.coordinates, position + np.array([0.05, 0, 0]), view(made))
+    moved = compute_flow(made, labels.coordinates, position + np.array([0.05, 0, 0]), view(made))
     gone: NDArray[np.bool_] = np.all(moved.flow > 1e9, axis=-1)
     assert (moved.occlusion[gone & ~np.isnan(labels.coordinates[..., 0])] == 255).all()
     assert gone[31, 68]
-    found = find(made, np.array([[0.5, 0.5], [0.99, 0.5]]), position, view(made))
+    found = locate_points(made, np.array([[0.5, 0.5], [0.99, 0.5]]), position, view(made))
     np.testing.assert_array_equal(np.isnan(found.pixels[:, 0]), [False, True])
     np.testing.assert_array_equal(found.hidden, [False, True])
 
@@ -268,7 +268,7 @@ def test_what_tangential_distortion_folds_back_is_outside_the_picture(device: De
     places, (height, width) = track_grid(100), made.sheet.size
     points = np.stack([(places[:, 0] - 0.5) * width, (0.5 - places[:, 1]) * height, np.zeros(len(places))], axis=-1)
     away = (view(made)._replace(lens=None).pixels(points) - [37.5, 31.5]) / [60, 62]
-    found = find(made, places, rest_positions(made.sheet), view(made))
+    found = locate_points(made, places, rest_positions(made.sheet), view(made))
     np.testing.assert_array_equal(np.isnan(found.pixels[:, 0]), ~(np.linalg.norm(away, axis=-1) < 1 / 0.3))
     assert 0.1 < np.isnan(found.pixels).mean() < 0.9
 
@@ -290,7 +290,7 @@ def test_a_lens_without_coefficients_has_the_bits_of_none(device: Device) -> Non
     plain, zero = drawable(camera=camera), drawable(camera={**camera, "distortion": {"k1": 0.0}})
     position, texture = dented(plain), speckle(13, 17)
     assert drawing_config(plain) == drawing_config(zero)
-    np.testing.assert_array_equal(Drawing(plain, texture).draw(position), Drawing(zero, texture).draw(position))
+    np.testing.assert_array_equal(Rasterizer(plain, texture).draw(position), Rasterizer(zero, texture).draw(position))
 
 
 @pytest.mark.parametrize(

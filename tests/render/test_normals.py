@@ -14,7 +14,7 @@ from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.surface import Capsule, place_capsules
 from taichi_msm.render.camera import view
 from taichi_msm.render.labels import Labels
-from taichi_msm.render.rasterizer import Drawing, drawing_config
+from taichi_msm.render.rasterizer import Rasterizer, drawing_config
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.reference import labels as twin
@@ -38,7 +38,7 @@ EVERY_CAMERA = pytest.mark.parametrize("camera", CAMERAS)
 
 def look(made: Scene, position: Array, placed: list[Capsule] | None = None, **config: Any) -> Labels:
     kernel = drawing_config(made, picture=False, labels=True, normals=True)._replace(**config)
-    found = Drawing(made, speckle(9, 9), kernel).look(position, rods=placed or []).labels
+    found = Rasterizer(made, speckle(9, 9), kernel).look(position, rods=placed or []).labels
     assert found is not None
     return found
 
@@ -52,7 +52,7 @@ def points(made: Scene, depth: NDArray[np.float32]) -> Array:
     """The points that pixels show [m], in OpenCV's axes of the camera, shape (height, width, 3)."""
     camera, (width, height) = view(made), made.render.size
     y, x = np.mgrid[:height, :width] + 0.5
-    aside = (camera.undistorted(np.stack([x, y], axis=-1)) - camera.centre) / camera.scale
+    aside = (camera.undistort(np.stack([x, y], axis=-1)) - camera.centre) / camera.scale
     far = depth[..., None].astype(float)
     return np.concatenate([aside * far if camera.pinhole else aside, far], axis=-1)
 

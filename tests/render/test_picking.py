@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.render.camera import pinhole, placed, turned, view
-from taichi_msm.render.picking import on_rest_plane, pick
-from taichi_msm.render.rasterizer import Drawing
+from taichi_msm.render.camera import extrinsics, orbit_camera, pinhole, view
+from taichi_msm.render.picking import intersect_rest_plane, pick
+from taichi_msm.render.rasterizer import Rasterizer
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests import reference
@@ -50,7 +50,7 @@ def folded() -> NDArray[np.float64]:
 @pytest.mark.parametrize("camera", ["top", "oblique", NEAR_EYE], ids=["top", "oblique", "near"])
 def test_what_is_picked_is_what_is_drawn(camera: Any, refine: int, device: Device) -> None:
     shown, position = sheet(camera, refine), folded()
-    picture = Drawing(shown, place_texture()).draw(position).astype(int)
+    picture = Rasterizer(shown, place_texture()).draw(position).astype(int)
     pixels = [(x, y) for y in range(0, SIZE[1], 3) for x in range(0, SIZE[0], 3)]
     covered, missed = 0, 0
     for x, y in pixels:
@@ -87,7 +87,10 @@ def test_on_the_rest_plane_is_where_the_sheet_at_rest_is_picked(camera: Any) -> 
     height, width = shown.sheet.size
     found = 0
     for pixel in [(30, 40), (48, 44), (60.5, 50.25)]:
-        place, point = pick(rest_positions(shown.sheet), 2, view(shown), pixel), on_rest_plane(view(shown), pixel)
+        place, point = (
+            pick(rest_positions(shown.sheet), 2, view(shown), pixel),
+            intersect_rest_plane(view(shown), pixel),
+        )
         if place is not None:
             found += 1
             assert point == pytest.approx([(place[0] - 0.5) * width, (0.5 - place[1]) * height], abs=1e-12)
@@ -96,24 +99,24 @@ def test_on_the_rest_plane_is_where_the_sheet_at_rest_is_picked(camera: Any) -> 
 
 def test_above_the_horizon_there_is_no_rest_plane() -> None:
     camera = {"eye": [0, -1, 0.1], "target": [0, 0, 0.1], "up": [0, 0, 1], "fov": 60}
-    assert on_rest_plane(view(sheet(camera)), (48, 10)) is None
-    assert on_rest_plane(view(sheet(camera)), (48, 39.5)) is None, "the line of sight never gets there"
-    assert on_rest_plane(view(sheet(camera)), (48, 70)) is not None
+    assert intersect_rest_plane(view(sheet(camera)), (48, 10)) is None
+    assert intersect_rest_plane(view(sheet(camera)), (48, 39.5)) is None, "the line of sight never gets there"
+    assert intersect_rest_plane(view(sheet(camera)), (48, 70)) is not None
 
 
 def test_a_camera_turned_keeps_its_target_and_distance() -> None:
     camera = pinhole(sheet("oblique"))
-    moved = turned(camera, 0.4, -0.2)
-    apart = placed(camera, 0).eye - camera.target
-    assert np.linalg.norm(placed(moved, 0).eye - moved.target) == pytest.approx(np.linalg.norm(apart))
+    moved = orbit_camera(camera, 0.4, -0.2)
+    apart = extrinsics(camera, 0).eye - camera.target
+    assert np.linalg.norm(extrinsics(moved, 0).eye - moved.target) == pytest.approx(np.linalg.norm(apart))
     assert moved.target == camera.target
-    back = turned(turned(camera, 0.4, 0), -0.4, 0)
-    assert placed(back, 0).eye == pytest.approx(placed(camera, 0).eye)
+    back = orbit_camera(orbit_camera(camera, 0.4, 0), -0.4, 0)
+    assert extrinsics(back, 0).eye == pytest.approx(extrinsics(camera, 0).eye)
     # Over the sheet: higher.
-    assert placed(turned(camera, 0, 0.2), 0).eye[2] > placed(camera, 0).eye[2]
+    assert extrinsics(orbit_camera(camera, 0, 0.2), 0).eye[2] > extrinsics(camera, 0).eye[2]
     # About the normal: as high as it was, and counter-clockwise seen from above.
-    assert placed(turned(camera, 0.2, 0), 0).eye[2] == pytest.approx(placed(camera, 0).eye[2])
-    assert placed(turned(camera, 0.2, 0), 0).eye[0] > placed(camera, 0).eye[0]
+    assert extrinsics(orbit_camera(camera, 0.2, 0), 0).eye[2] == pytest.approx(extrinsics(camera, 0).eye[2])
+    assert extrinsics(orbit_camera(camera, 0.2, 0), 0).eye[0] > extrinsics(camera, 0).eye[0]
 
 
 def test_the_pinhole_above_shows_the_sheet_as_large_as_from_the_top() -> None:

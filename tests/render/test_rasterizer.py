@@ -15,7 +15,7 @@ from taichi_msm.render import bins, gpu, tracking
 from taichi_msm.render.camera import view
 from taichi_msm.render.cpu import Bands
 from taichi_msm.render.labels import track_grid
-from taichi_msm.render.rasterizer import Drawing, drawing_config
+from taichi_msm.render.rasterizer import Rasterizer, drawing_config
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system import launches
 from taichi_msm.system.runtime import Device
@@ -30,7 +30,7 @@ def drawable(points: tuple[int, int] = (9, 11), **render: Any) -> Scene:
 
 
 def draw(made: Scene, position: NDArray[Any], texture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    return Drawing(made, texture).draw(position)
+    return Rasterizer(made, texture).draw(position)
 
 
 def dented(made: Scene, seed: int = 1) -> NDArray[np.float64]:
@@ -62,11 +62,11 @@ def test_nothing_is_drawn_before_every_mass_point_is_projected(device: Device) -
     """
     made = scene(sheet={**SHEET, "points": [3, 4000]}, render={"size": [8, 32], "refine": 0})
     texture = speckle(16, 16)
-    together, alone = Drawing(made, texture), Drawing(made, texture)
-    assert isinstance(together._form, Bands)
-    assert isinstance(alone._form, Bands)
-    alone._form._workers = 1
-    assert together._form._workers == 2
+    together, alone = Rasterizer(made, texture), Rasterizer(made, texture)
+    assert isinstance(together._backend, Bands)
+    assert isinstance(alone._backend, Bands)
+    alone._backend._workers = 1
+    assert together._backend._workers == 2
     position = rest_positions(made.sheet) * [1, -1, 1]
     for _ in range(40):
         together.draw(position - 1)
@@ -115,18 +115,18 @@ def test_what_passes_behind_the_camera_is_looked_for_only_where_it_may_be_seen(
     lists: list[float] = []
 
     def counted(*arguments: Any) -> bins.Bins:
-        found = bins.binned(*arguments)
+        found = bins.build_bins(*arguments)
         lists.append(found.lengths.mean())
         return found
 
-    monkeypatch.setattr(gpu, "binned", counted)
-    monkeypatch.setattr(tracking, "binned", counted)
+    monkeypatch.setattr(gpu, "build_bins", counted)
+    monkeypatch.setattr(tracking, "build_bins", counted)
     for eye in ([0, 0, 0.1], [0, -0.9, 0.1]):
         camera = {"eye": eye, "target": [eye[0], eye[1] + 0.1, 0], "fov": 60, "distortion": distortion}
         made = drawable((40, 40), camera=camera)
         position = rest_positions(made.sheet)
-        Drawing(made, speckle(13, 17), drawing_config(made)._replace(lanes=1)).draw(position)
-        tracking.find(made, track_grid(2), position, view(made))
+        Rasterizer(made, speckle(13, 17), drawing_config(made)._replace(lanes=1)).draw(position)
+        tracking.locate_points(made, track_grid(2), position, view(made))
     # The first stands over the sheet, so that a row of cells crosses the camera's plane. 2 x 3^2 triangles of each of
     # the 39 would be everywhere. All that the second could see is above the picture.
     assert max(lists) < 39
@@ -137,8 +137,8 @@ def assert_alike_in_other_tiles(made: Scene, texture: NDArray[np.uint8], positio
     """Pictures and labels have the same bits if so many pixels are drawn at a time; labels have one sample a pixel."""
     config = drawing_config(made, labels=made.render.supersample == 1, normals=True)
     placed = place_capsules(made, position, 0)
-    expected = Drawing(made, texture, config).look(position, rods=placed)
-    other = Drawing(made, texture, config._replace(lanes=lanes)).look(position, rods=placed)
+    expected = Rasterizer(made, texture, config).look(position, rods=placed)
+    other = Rasterizer(made, texture, config._replace(lanes=lanes)).look(position, rods=placed)
     np.testing.assert_array_equal(other.picture, expected.picture)
     for label, same in zip(other.labels or (), expected.labels or (), strict=True):
         np.testing.assert_array_equal(label, same)
@@ -157,7 +157,7 @@ def test_the_shape_of_a_tile_does_not_change_the_bits(lanes: int, device: Device
         assert_alike_in_other_tiles(made, texture, dented(made), lanes)
 
 
-@pytest.mark.parametrize("parts", [gpu.MOST_PARTS, 100])
+@pytest.mark.parametrize("parts", [gpu.MAX_PARTS, 100])
 def test_launches_do_not_change_the_bits(parts: int, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """On a GPU, many strips, many launches for the lists of a strip, several triangles taken together, shuffled lists.
 
@@ -175,23 +175,23 @@ def test_launches_do_not_change_the_bits(parts: int, device: Device, monkeypatch
         launch(self, kernel, total, *arguments, rounds=rounds)
 
     def shuffled(of: launches.Launches, *arguments: Any) -> bins.Bins:
-        found = bins.binned(of, *arguments)
+        found = bins.build_bins(of, *arguments)
         entries, starts = of.take(found.entries), of.take(found.starts)
         for first, end in pairwise(starts):
             rng.shuffle(entries[first:end])
         return found._replace(entries=of.give(entries))
 
     monkeypatch.setattr(launches.Launches, "launch", counted)
-    monkeypatch.setattr(gpu, "binned", shuffled)
-    pictures = [Drawing(made, texture, config).draw(position, rods=placed)]
+    monkeypatch.setattr(gpu, "build_bins", shuffled)
+    pictures = [Rasterizer(made, texture, config).draw(position, rods=placed)]
     few = len(begun)
     monkeypatch.setattr(launches, "MOST_ROUNDS", launches.SPARE + 250)
     monkeypatch.setattr(launches, "THREADS", 700)
     monkeypatch.setattr(gpu, "THREADS", 700)
-    monkeypatch.setattr(gpu, "MOST_PARTS", parts)
-    pictures += [Drawing(made, texture, config).draw(position, rods=placed) for _ in range(3)]
+    monkeypatch.setattr(gpu, "MAX_PARTS", parts)
+    pictures += [Rasterizer(made, texture, config).draw(position, rods=placed) for _ in range(3)]
     assert len(begun) > 30 * few
-    expected = Drawing(made, texture).draw(position, rods=placed)
+    expected = Rasterizer(made, texture).draw(position, rods=placed)
     for picture in pictures:
         np.testing.assert_array_equal(picture, expected)
 
@@ -201,8 +201,8 @@ def test_the_bound_of_a_thread_is_asserted(device: Device, monkeypatch: pytest.M
     made = with_instruments(drawable((4, 4), size=[9, 7], refine=64, camera="oblique", supersample=4))
     made = made.model_copy(update={"probes": made.probes * 8})
     position = np.random.default_rng(4).normal(0, 0.2, (4, 4, 3))
-    drawing = Drawing(made, speckle(8, 8), drawing_config(made)._replace(lanes=1))
-    monkeypatch.setattr(gpu, "MOST_PARTS", 1)
+    drawing = Rasterizer(made, speckle(8, 8), drawing_config(made)._replace(lanes=1))
+    monkeypatch.setattr(gpu, "MAX_PARTS", 1)
     drawing.draw(position, rods=place_capsules(made, position, 0))
     monkeypatch.setattr(launches, "MOST_ROUNDS", launches.SPARE + 3 * 2 * 65**2)
     with pytest.raises(AssertionError):
@@ -221,7 +221,7 @@ def test_instruments_are_like_the_twin(shading: str, camera: Any, device: Device
     made = with_instruments(drawable(camera=camera, shading=shading))
     position, texture = dented(made), np.full((9, 9, 3), 120, np.uint8)
     placed = place_capsules(made, position, 0)
-    drawn = Drawing(made, texture).draw(position, rods=placed)
+    drawn = Rasterizer(made, texture).draw(position, rods=placed)
     apart = difference(drawn, reference.draw(made, position, texture, placed))
     assert (apart > 1).mean() < 0.005, "but for outlines"
     bare = reference.draw(made, position, texture)
@@ -282,7 +282,8 @@ def test_points_thrown_far_away_do_not_make_bits_depend_on_tiles(far: float, dev
         position = rest_positions(made.sheet)
         position[point] = far
         pictures = [
-            Drawing(made, texture, drawing_config(made)._replace(lanes=lanes)).draw(position) for lanes in (1, 4, 8, 16)
+            Rasterizer(made, texture, drawing_config(made)._replace(lanes=lanes)).draw(position)
+            for lanes in (1, 4, 8, 16)
         ]
         assert all((picture == pictures[0]).all() for picture in pictures), point
 
@@ -304,7 +305,7 @@ def test_a_flat_sheet_that_faces_the_camera_keeps_its_colours(device: Device) ->
     camera = {"eye": [0, 0, 0.5], "target": [0, 0, 0], "fov": 2 * np.degrees(np.arctan(0.3))}
     made = drawable(shading="headlight")
     position = rest_positions(made.sheet)
-    lit, plain = Drawing(made, texture), Drawing(drawable(shading="none"), texture)
+    lit, plain = Rasterizer(made, texture), Rasterizer(drawable(shading="none"), texture)
     for seen in (view(drawable()), view(drawable(camera=camera))):
         np.testing.assert_array_equal(lit.draw(position, seen), plain.draw(position, seen))
 
@@ -321,7 +322,7 @@ def test_a_slope_is_darker_by_its_cosine(device: Device) -> None:
 def test_there_are_no_gaps_between_cells(refine: int, device: Device) -> None:
     # Inner points are moved at random, in some cases onto pixel centres, and in some so far that cells fold over.
     made = drawable((7, 9), size=[48, 36], refine=refine, shading="none")
-    drawing = Drawing(made, np.full((4, 4, 3), 255, np.uint8))
+    drawing = Rasterizer(made, np.full((4, 4, 3), 255, np.uint8))
     rest, pixel = rest_positions(made.sheet), 0.4 / 48
     for seed in range(8):
         shift = np.random.default_rng(seed).uniform(-1, 1, (5, 7, 2)) * (0.04 if seed % 3 else 0.01)
@@ -347,7 +348,7 @@ def test_a_sheet_that_passes_through_the_eye_is_seen_in_part(device: Device) -> 
     for y in (0.0, 1e-9, 3e-9, 1e-8, 1e-6, 3e-6):
         camera = {"eye": [0.0123, y, 0.03], "target": [0.0123, y - 1, 0.03], "up": [0, 0, 1], "fov": 90}
         made = drawable((5, 5), size=[200, 150], refine=1, shading="none", camera=camera)
-        drawing = drawing or Drawing(made, texture)
+        drawing = drawing or Rasterizer(made, texture)
         position = rest_positions(made.sheet)
         apart = difference(drawing.draw(position, view(made)), reference.draw(made, position, texture))
         assert (apart > 1).mean() < 0.002, y

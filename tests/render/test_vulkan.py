@@ -20,8 +20,8 @@ from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.surface import place_capsules
 from taichi_msm.render.camera import view
 from taichi_msm.render.labels import track_grid
-from taichi_msm.render.rasterizer import Drawing, drawing_config
-from taichi_msm.render.tracking import find, find_flow
+from taichi_msm.render.rasterizer import Rasterizer, drawing_config
+from taichi_msm.render.tracking import compute_flow, locate_points
 from taichi_msm.runs.arrays import read_flo
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
@@ -144,18 +144,18 @@ np.savez(sys.argv[1], **(bent_looks() if "bent" in sys.argv else looks()))
 AGAIN = """
 import os
 from pathlib import Path
-from tests.render.test_vulkan import Drawing, drawable, find, rest_positions, speckle, track_grid, view
+from tests.render.test_vulkan import Rasterizer, drawable, locate_points, rest_positions, speckle, track_grid, view
 from taichi_msm.system import runtime
 
 def again():
     for _ in range(3):
         drawing.draw(position)
-        find(made, track_grid(2), position, view(made))
+        locate_points(made, track_grid(2), position, view(made))
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 runtime.start("vulkan")
 made = drawable((200, 200), size=[128, 96], refine=0)
-drawing, position = Drawing(made, speckle(8, 8)), rest_positions(made.sheet)
+drawing, position = Rasterizer(made, speckle(8, 8)), rest_positions(made.sheet)
 print(-again() + again())
 """
 
@@ -183,22 +183,24 @@ def looks() -> dict[str, NDArray[Any]]:
     )  # fmt: skip
     position, view_now = draped(made), view(made)
     placed, texture = place_capsules(made, position, 0), speckle(300, 400)
-    seen["picture"] = Drawing(made, texture).draw(position, rods=placed)
-    labels = Drawing(made, texture, drawing_config(made, picture=False, labels=True)).look(position, rods=placed).labels
+    seen["picture"] = Rasterizer(made, texture).draw(position, rods=placed)
+    labels = (
+        Rasterizer(made, texture, drawing_config(made, picture=False, labels=True)).look(position, rods=placed).labels
+    )
     assert labels is not None
     seen |= {f"label_{name}": value for name, value in labels._asdict().items()}
     moved = position + np.array([0.002, 0.001, 0])
-    seen["flow"], seen["occlusion"] = find_flow(
+    seen["flow"], seen["occlusion"] = compute_flow(
         made, labels.coordinates, moved, view_now, place_capsules(made, moved, 0)
     )
     rough = position + np.random.default_rng(5).normal(0, 0.004, position.shape)
-    seen["pixels"], seen["hidden"] = find(made, track_grid(60), rough, view_now, placed)
+    seen["pixels"], seen["hidden"] = locate_points(made, track_grid(60), rough, view_now, placed)
     # One cell, larger than the picture, which is a single row.
     made = drawable((2, 2), size=[1400, 1], refine=0, supersample=4, camera={"eye": [0, 0, 1e-4]})
-    seen["row"] = Drawing(made, texture).draw(rest_positions(made.sheet))
+    seen["row"] = Rasterizer(made, texture).draw(rest_positions(made.sheet))
     # More cells in a bin than a thread may try.
     made = drawable((200, 200), size=[4, 4], refine=0, camera=TINY)
-    seen["dot"] = Drawing(made, texture).draw(dented(made))
+    seen["dot"] = Rasterizer(made, texture).draw(dented(made))
     return seen
 
 
@@ -212,15 +214,17 @@ def bent_looks() -> dict[str, NDArray[Any]]:
         made = with_instruments(drawable((41, 41), size=[320, 240], camera=camera, shading="tissue", wireframe=True))
         position, view_now, texture = draped(made), view(made), speckle(300, 400)
         placed = place_capsules(made, position, 0)
-        drawn = Drawing(made, texture, drawing_config(made, labels=True)).look(position, rods=placed)
+        drawn = Rasterizer(made, texture, drawing_config(made, labels=True)).look(position, rods=placed)
         assert drawn.labels is not None
         seen[f"{model}_picture"] = np.asarray(drawn.picture)
         seen |= {f"{model}_{name}": value for name, value in drawn.labels._asdict().items()}
         moved = position + np.array([0.002, 0.001, 0])
         placed_then = place_capsules(made, moved, 0)
-        flow = find_flow(made, drawn.labels.coordinates, moved, view_now, placed_then)
+        flow = compute_flow(made, drawn.labels.coordinates, moved, view_now, placed_then)
         seen[f"{model}_flow"], seen[f"{model}_occlusion"] = flow
-        seen[f"{model}_pixels"], seen[f"{model}_hidden"] = find(made, track_grid(60), position, view_now, placed)
+        seen[f"{model}_pixels"], seen[f"{model}_hidden"] = locate_points(
+            made, track_grid(60), position, view_now, placed
+        )
     return seen
 
 

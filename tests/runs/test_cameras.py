@@ -18,8 +18,8 @@ from taichi_msm.load.scene_file import load_plan, load_scene
 from taichi_msm.model.surface import place_capsules
 from taichi_msm.render import rasterizer
 from taichi_msm.render.camera import View, view, view_at
-from taichi_msm.render.lens_table import sample_places
-from taichi_msm.render.rasterizer import Drawing
+from taichi_msm.render.lens_table import undistortion_map
+from taichi_msm.render.rasterizer import Rasterizer
 from taichi_msm.runs.finished import read_run
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
@@ -118,13 +118,13 @@ def test_the_light_is_that_of_the_main_camera(shading: str, device: Device) -> N
     made = made.model_copy(update={"render": render})
     position, texture = dented(made), np.full((9, 9, 3), 120, np.uint8)
     placed, config = place_capsules(made, position, 0), rasterizer.drawing_config(made)
-    drawing, of_gpu = (Drawing(made, texture, config._replace(lanes=lanes)) for lanes in (config.lanes, 1))
+    drawing, of_gpu = (Rasterizer(made, texture, config._replace(lanes=lanes)) for lanes in (config.lanes, 1))
     for name in made.render.all_cameras:
         seen = view_at(made, 0.0, name)
         drawn = drawing.draw(position, seen, placed)
         apart = difference(drawn, twin.draw(made, position, texture, placed, seen))
         assert (apart > 1).mean() < 0.01, f"{name}, but for outlines"
-        own = drawing.draw(position, seen._replace(lamp=None), placed)
+        own = drawing.draw(position, seen._replace(light_view=None), placed)
         assert (difference(drawn, own).max() > 20) == (name != "main")
         np.testing.assert_array_equal(of_gpu.draw(position, seen, placed), drawn)
 
@@ -201,9 +201,9 @@ def test_two_lenses_find_their_places_once_each(small: Path, device: Device, mon
 
     def counted(camera: View, *arguments: Any, **more: Any) -> Any:
         found.append(camera)
-        return sample_places(camera, *arguments, **more)
+        return undistortion_map(camera, *arguments, **more)
 
-    monkeypatch.setattr(rasterizer, "sample_places", counted)
+    monkeypatch.setattr(rasterizer, "undistortion_map", counted)
     made = seen_by({**cameras, "c": {"beside": "b", "baseline": 0.1}}, "[png, depth]")
     with Simulation(made, threads=device.threads) as simulation:
         for _ in range(3):

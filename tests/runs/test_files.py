@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm.errors import FilesError
-from taichi_msm.render.labels import Observed
+from taichi_msm.render.labels import FrameOutputs
 from taichi_msm.runs import media
 from taichi_msm.runs.encoder import Encoder, encode
 from taichi_msm.runs.media import Job
@@ -39,14 +39,14 @@ ENDLESS = """
 import itertools
 import sys
 from pathlib import Path
-from taichi_msm.render.labels import Observed
+from taichi_msm.render.labels import FrameOutputs
 from taichi_msm.runs.writer import ResultWriter
 from tests.scenes import scene_and_grid
 from tests.runs.test_files import picture, position, small_scene
 
 with ResultWriter(Path(sys.argv[1]), *scene_and_grid(small_scene())) as writer:
     for frame in itertools.count():
-        writer.add(position(frame), {"": Observed(picture(frame))})
+        writer.add(position(frame), {"": FrameOutputs(picture(frame))})
         if frame == 10:
             print(writer._encoder._process.pid, flush=True)
 """
@@ -73,7 +73,7 @@ def picture(frame: int) -> NDArray[np.uint8]:
 def write(directory: Path, frames: int, scene: Scene, *, beside: bool = True) -> list[str]:
     with ResultWriter(directory, *scene_and_grid(scene), beside=beside) as writer:
         for frame in range(frames):
-            writer.add(position(frame), {"": Observed(picture(frame) if scene.draws else None)})
+            writer.add(position(frame), {"": FrameOutputs(picture(frame) if scene.draws else None)})
         names: list[str] = writer.publish({})["outputs"]
         assert writer.frames == frames
     return names
@@ -152,8 +152,8 @@ def test_the_animation_is_like_its_frames(tmp_path: Path, light: float) -> None:
     background = (1, 99, 255)
     first[:, 0] = later[:, 0] = background
     with ResultWriter(tmp_path, *scene_and_grid(small_scene("gif", background=background, size=[16, 16]))) as writer:
-        writer.add(position(0), {"": Observed(first)})
-        writer.add(position(1), {"": Observed(later)})
+        writer.add(position(0), {"": FrameOutputs(first)})
+        writer.add(position(1), {"": FrameOutputs(later)})
         writer.publish({})
     with Image.open(tmp_path / "animation.gif") as image:
         image.seek(1)
@@ -169,7 +169,7 @@ def test_leaving_without_publishing_leaves_what_was_there(beside: bool, tmp_path
     before = files(tmp_path / "out")
     for directory in (tmp_path / "out", tmp_path / "fresh"):
         with ResultWriter(directory, *scene_and_grid(small_scene()), beside=beside) as writer:
-            writer.add(position(9), {"": Observed(picture(9))})
+            writer.add(position(9), {"": FrameOutputs(picture(9))})
     assert files(tmp_path / "out") == before
     assert not (tmp_path / "fresh").exists()
 
@@ -188,11 +188,11 @@ def test_an_interrupted_hand_over_leaves_whole_frames(
 
     add = Encoder.add
     with ResultWriter(tmp_path / "interrupted", *scene_and_grid(small_scene())) as writer:
-        writer.add(position(0), {"": Observed(picture(0))})
+        writer.add(position(0), {"": FrameOutputs(picture(0))})
         with monkeypatch.context() as patch:
             patch.setattr(Encoder, "add", interrupted)
             with pytest.raises(KeyboardInterrupt):
-                writer.add(position(1), {"": Observed(picture(1))})
+                writer.add(position(1), {"": FrameOutputs(picture(1))})
         writer.finish()
         assert writer.frames == frames
         writer.publish({})
@@ -201,7 +201,7 @@ def test_an_interrupted_hand_over_leaves_whole_frames(
 
 
 def finish_after_another(writer: ResultWriter) -> None:
-    writer.add(position(1), {"": Observed(picture(1))})
+    writer.add(position(1), {"": FrameOutputs(picture(1))})
     writer.finish()
 
 
@@ -220,7 +220,7 @@ def test_an_interruption_while_a_picture_is_encoded_here_leaves_whole_frames(
         return original(*arguments, **keywords)
 
     with ResultWriter(tmp_path / "interrupted", *scene_and_grid(small_scene()), beside=False) as writer:
-        writer.add(position(0), {"": Observed(picture(0))})
+        writer.add(position(0), {"": FrameOutputs(picture(0))})
         with monkeypatch.context() as patch:
             patch.setattr(owner, part, interrupted)
             with pytest.raises(KeyboardInterrupt):
@@ -257,7 +257,7 @@ def test_in_a_hurry_frames_are_given_up_and_those_left_are_whole(tmp_path: Path)
     large = [speckle(1000, 1500, frame) for frame in range(7)]
     with ResultWriter(tmp_path, *scene_and_grid(made)) as writer:
         for frame, shown in enumerate(large):
-            writer.add(position(frame), {"": Observed(shown)})
+            writer.add(position(frame), {"": FrameOutputs(shown)})
         writer.finish(hurry=True)
         writer.publish({})
         frames = writer.frames
@@ -291,7 +291,7 @@ def test_who_waits_for_a_stopped_encoder_can_stop_waiting(tmp_path: Path) -> Non
         assert isinstance(writer._encoder, Encoder)
         os.kill(writer._encoder._process.pid, signal.SIGSTOP)
         for frame in range(3):
-            writer.add(position(frame), {"": Observed(picture(frame))})
+            writer.add(position(frame), {"": FrameOutputs(picture(frame))})
         with pytest.raises(KeyboardInterrupt):
             writer.finish(stop)
         writer.finish(hurry=True)
@@ -302,7 +302,7 @@ def test_who_waits_for_a_stopped_encoder_can_stop_waiting(tmp_path: Path) -> Non
 @pytest.mark.parametrize("beside", [True, False])
 def test_the_time_spent_encoding_is_told(beside: bool, tmp_path: Path) -> None:
     with ResultWriter(tmp_path, *scene_and_grid(small_scene()), beside=beside) as writer:
-        writer.add(position(0), {"": Observed(picture(0))})
+        writer.add(position(0), {"": FrameOutputs(picture(0))})
         writer.finish()
         assert 0 < writer.encode_seconds < 60
 
@@ -368,7 +368,7 @@ def test_positions_that_cannot_be_written(tmp_path: Path, points: int, limit: in
     def run() -> None:
         with ResultWriter(tmp_path, *scene_and_grid(scene(sheet=sheet, output=["trajectory"]))) as writer:
             resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
-            writer.add(np.zeros((points, points, 3)), {"": Observed()})
+            writer.add(np.zeros((points, points, 3)), {"": FrameOutputs()})
             writer.publish({})
 
     try:
@@ -386,7 +386,7 @@ def refused(directory: Path, meanwhile: Callable[[ResultWriter], None] = lambda 
         with ResultWriter(directory, *scene_and_grid(small_scene()), beside=beside) as writer:
             meanwhile(writer)
             for frame in range(1000):
-                writer.add(position(frame), {"": Observed(picture(frame))})
+                writer.add(position(frame), {"": FrameOutputs(picture(frame))})
             writer.publish({})
 
     with pytest.raises(FilesError) as told:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from taichi_msm.errors import FilesError
-from taichi_msm.render.labels import Observed
+from taichi_msm.render.labels import FrameOutputs
 from taichi_msm.runs.checkpoint import MANIFEST, is_unfinished
 from taichi_msm.runs.manifest import read_manifest
 from taichi_msm.runs.writer import ResultWriter
@@ -48,7 +48,7 @@ def write(directory: Path, *, resumes: bool = False) -> None:
     made = small_scene()
     with ResultWriter(directory, *scene_and_grid(made), {}, resumes=resumes) as writer:
         for frame in range(made.time.frames + 1):
-            writer.add(np.zeros((3, 4, 3)), {"": Observed(speckle(6, 8, frame))})
+            writer.add(np.zeros((3, 4, 3)), {"": FrameOutputs(speckle(6, 8, frame))})
         writer.publish({"status": "complete"})
 
 

@@ -9,7 +9,7 @@ import pytest
 
 import taichi_msm
 from taichi_msm import DivergedError, Simulation
-from taichi_msm.render.labels import Observed
+from taichi_msm.render.labels import FrameOutputs
 from taichi_msm.runs import run
 from taichi_msm.system import process
 from taichi_msm.system.compiler import chosen
@@ -37,7 +37,7 @@ def test_frames_positions_and_pictures(device: Device) -> None:
 def test_kernels_are_compiled_once_in_a_process(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     observed, own = [], Simulation.observe
 
-    def observe(simulation: Simulation, *given: Any) -> Observed:
+    def observe(simulation: Simulation, *given: Any) -> FrameOutputs:
         observed.append(given)
         return own(simulation, *given)
 

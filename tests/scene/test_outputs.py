@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from taichi_msm.render.labels import Flow, Labels, Observed, Stereo
+from taichi_msm.render.labels import Flow, FrameOutputs, Labels, Stereo
 from taichi_msm.runs.writer import _WRITERS
 from taichi_msm.scene.outputs import OUTPUTS, PATTERNS, file_names, results
 
@@ -16,7 +16,7 @@ FIELDS = {"labels": Labels._fields, "flow": Flow._fields, "stereo": Stereo._fiel
 
 def test_every_label_has_its_field_and_a_format() -> None:
     for output in OUTPUTS.values():
-        assert output.source in (*Observed._fields, "positions", "forces")
+        assert output.source in (*FrameOutputs._fields, "positions", "forces")
         if output.source in FIELDS:
             assert output.name in FIELDS[output.source]
             assert Path(output.file).suffix in _WRITERS

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.render.rasterizer import Drawing
+from taichi_msm.render.rasterizer import Rasterizer
 from taichi_msm.system import process as process_module
 from taichi_msm.system import runtime
 from taichi_msm.system.compiler import chosen
@@ -82,7 +82,7 @@ def test_a_process_may_have_many_sheets_and_gets_their_memory_back(device: runti
     for _ in range(3):
         for _ in range(100):
             sheets.append(dynamics_of(made, device))
-            sheets.append(Drawing(made, texture))
+            sheets.append(Rasterizer(made, texture))
         sheets[-2].advance(1)
         sheets[-1].draw(rest_positions(made.sheet))
         sheets.clear()
@@ -231,14 +231,14 @@ def test_environment_and_other_threads_change_nothing_at_the_start(tmp_path: Pat
 # Starts after a stop; an object that was made before a stop is dropped after it.
 AGAIN = """
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.render.rasterizer import Drawing
+from taichi_msm.render.rasterizer import Rasterizer
 from taichi_msm.system import runtime
 from tests.scenes import scene, speckle
 
 made, sums, kept = scene(), set(), []
 for turn in range(3):
     runtime.start()
-    drawings = [Drawing(made, speckle(8, 8)) for _ in range(2)]
+    drawings = [Rasterizer(made, speckle(8, 8)) for _ in range(2)]
     sums.update(int(drawing.draw(rest_positions(made.sheet)).sum()) for drawing in drawings)
     kept.append(drawings.pop())
     runtime.stop()
@@ -260,14 +260,14 @@ def test_taichi_starts_again_after_a_stop(tmp_path: Path, root: Path) -> None:
 def test_pictures_are_compiled_quickly_and_steps_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
     config = runtime.ti.lang.impl.current_cfg()
     made = scene(render={"size": [8, 8]})
-    drawing = Drawing(made, speckle(8, 8))
+    drawing = Rasterizer(made, speckle(8, 8))
     seen: list[bool] = []
 
     def draw(*arguments: Any) -> None:
         seen.append(config.advanced_optimization)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(drawing._form, "_draw", draw)
+    monkeypatch.setattr(drawing._backend, "_draw", draw)
     with pytest.raises(KeyboardInterrupt):
         drawing.draw(rest_positions(made.sheet))
     assert [*seen, config.advanced_optimization] == [False, True]
