@@ -17,7 +17,7 @@ from taichi_msm.system.process import Interruption, tell
 
 if TYPE_CHECKING:
     from taichi_msm.sweeps.spec import Sweep
-    from taichi_msm.sweeps.tables import Cost
+    from taichi_msm.sweeps.tables import SweepCost
 # Sweeps of more runs, or of more seconds, must be meant.
 MANY_RUNS, LONG = 10_000, 86400
 
@@ -45,26 +45,26 @@ def sweep(
     from taichi_msm.cli.console import Progress
     from taichi_msm.sweeps.runs import begin_sweep
     from taichi_msm.sweeps.spec import load_sweep
-    from taichi_msm.sweeps.sweep import finish, go_on, opened
-    from taichi_msm.sweeps.tables import choose_workers, cost_line, count, estimate, summary_lines
+    from taichi_msm.sweeps.sweep import finish_sweep, open_executor, run_missing
+    from taichi_msm.sweeps.tables import choose_worker_count, cost_line, count_statuses, estimate_cost, summary_lines
 
     if workers is not None and dask is not None:
         raise click.UsageError("--workers are processes here, and --dask has its own; leave out one of them")
     described = load_sweep(file)
     directory = result_directory(out, Path(file).stem)
-    cost = estimate(described)
-    chosen = choose_workers(cost, described.runs, workers)
+    cost = estimate_cost(described)
+    chosen = choose_worker_count(cost, described.runs, workers)
     if dry_run:
         return print_plan(described, cost, shard or (1, 1), workers, as_json)
     if not yes and (described.runs > MANY_RUNS or cost.seconds > LONG):
         raise click.UsageError(f"{cost_line(described.runs, cost, chosen)}; add --yes if that is meant")
-    under_way = begin_sweep(described, directory, shard or (1, 1))
-    outcomes, missing, total = under_way.done, len(under_way.missing), under_way.total
-    chosen = choose_workers(cost, missing, workers)
+    state = begin_sweep(described, directory, shard or (1, 1))
+    outcomes, missing, total = state.done, len(state.missing), state.total
+    chosen = choose_worker_count(cost, missing, workers)
     if not as_json:
         tell([f"{len(outcomes)} of {total} runs have ended before"] if outcomes else [])
         here = chosen if dask is None else None
-        tell([cost_line(missing, cost.of(missing / described.runs), here)] if missing else [])
+        tell([cost_line(missing, cost.scaled(missing / described.runs), here)] if missing else [])
     interruption = Interruption()
     files: list[str] = []
     notes: list[str] = []
@@ -72,40 +72,40 @@ def sweep(
         with Progress(quiet=as_json) as bar:
             progress = interruptible(bar, interruption)
             where = dask if missing else None  # Nothing else needs a cluster.
-            with opened(where, chosen.number, under_way, progress) as executor:
-                for _ in go_on(under_way, executor, progress):
+            with open_executor(where, chosen.number, state, progress) as executor:
+                for _ in run_missing(state, executor, progress):
                     pass
                 if shard is None:
-                    files, notes = finish(under_way, executor, progress)
+                    files, notes = finish_sweep(state, executor, progress)
     except KeyboardInterrupt:
         return interrupted(interruption, as_json, f"interrupted; {so_far(len(outcomes), total)}")
     except LostExecutorError as error:
         report("error", [f"{error}; {so_far(len(outcomes), total)}"], as_json)
         return FILES
     if as_json:
-        counts = count(outcomes)
+        counts = count_statuses(outcomes)
         print_json({"directory": str(directory), "runs": len(outcomes), **counts, "outputs": files, "notes": notes})
     else:
         click.echo("\n".join(map(printable, summary_lines(directory, outcomes, shard, files, notes))))
     return DONE
 
 
-def print_plan(described: Sweep, cost: Cost, shard: tuple[int, int], workers: int | None, as_json: bool) -> int:
+def print_plan(described: Sweep, cost: SweepCost, shard: tuple[int, int], workers: int | None, as_json: bool) -> int:
     """Print the values of the runs of a shard, and what they take."""
-    from taichi_msm.sweeps.spec import cell
-    from taichi_msm.sweeps.tables import choose_workers, cost_line, csv_line
+    from taichi_msm.sweeps.spec import format_value
+    from taichi_msm.sweeps.tables import choose_worker_count, cost_line, csv_line
 
     (part, parts), values = shard, described.values()
     runs = range(part - 1, len(values), parts)
-    cost = cost.of(len(runs) / len(values))
-    chosen = choose_workers(cost, len(runs), workers)
+    cost = cost.scaled(len(runs) / len(values))
+    chosen = choose_worker_count(cost, len(runs), workers)
     if as_json:
         rows = {"keys": described.keys, "runs": list(runs), "values": [values[run] for run in runs]}
         print_json({**rows, **cost._asdict(), "workers": chosen.number})
         return DONE
     click.echo(csv_line(["run", *described.keys]))
     for run in runs:
-        click.echo(printable(csv_line([run, *map(cell, values[run])])))
+        click.echo(printable(csv_line([run, *map(format_value, values[run])])))
     click.echo(cost_line(len(runs), cost, chosen))
     return DONE
 
