@@ -26,7 +26,7 @@ def leave_at_once(original=process.leave_at_once):
     tell("heard", 0)
     from taichi_msm.cli import export, fit, run, session, study, sweep  # as the program does next
 
-    def interruptible(*arguments, original=session.interruptible):
+    def interruptible_progress(*arguments, original=session.interruptible_progress):
         progress = original(*arguments)
         def telling(stage, done, total):
             tell(stage, done)
@@ -34,8 +34,8 @@ def leave_at_once(original=process.leave_at_once):
         return telling
 
     for module in (export, fit, run, session, study, sweep):
-        if hasattr(module, "interruptible"):
-            module.interruptible = interruptible
+        if hasattr(module, "interruptible_progress"):
+            module.interruptible_progress = interruptible_progress
 
 process.leave_at_once = leave_at_once
 runpy.run_module("taichi_msm", run_name="__main__")

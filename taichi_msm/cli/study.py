@@ -1,11 +1,10 @@
-"""taichi_msm.cli.main.study."""
+"""The commands `study` and `view`."""
 
 from __future__ import annotations
 
 import math
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -22,20 +21,15 @@ from taichi_msm.cli.session import (
     DIVERGED,
     DONE,
     EXIT_CODES,
-    interrupted,
-    interruptible,
-    naming,
+    interruptible_progress,
+    prefix_errors,
     print_json,
+    report_interruption,
     result_directory,
 )
-from taichi_msm.errors import (
-    printable,
-)
+from taichi_msm.errors import printable
 from taichi_msm.runs.directory import without_link
 from taichi_msm.system.process import Interruption, tell
-
-if TYPE_CHECKING:
-    pass
 
 
 @program.command()
@@ -76,26 +70,26 @@ def study(
         expected = f"expected a number, {SMALLEST_TOLERANCE:g} to {LARGEST_TOLERANCE:g}"
         raise click.BadParameter(f"{tolerance:g} is not allowed; {expected}", param_hint="--tolerance")
 
-    from taichi_msm.cli.console import Progress
+    from taichi_msm.cli.console import ProgressDisplay
     from taichi_msm.study.report import RECORD, as_record, require_writable, summary, write_report
-    from taichi_msm.study.study import study as measure
+    from taichi_msm.study.study import study as study_scene
 
     require_writable(directory)
     interruption = Interruption()
-    with Progress(quiet=as_json) as bar, naming(scene):
-        results = measure(
+    with ProgressDisplay(quiet=as_json) as bar, prefix_errors(scene):
+        results = study_scene(
             loaded,
             Path(scene).stem,
             tolerance=tolerance,
             quick=quick,
             arch=arch,
             threads=threads,
-            progress=interruptible(bar, interruption),
+            progress=interruptible_progress(bar, interruption),
         )
     if not results.stepping:
-        return interrupted(interruption, as_json)
+        return report_interruption(interruption, as_json)
     if results.status == "interrupted" and (directory / RECORD).exists():
-        # An earlier study is not replaced by part of a new one.
+        # A partial study must not replace a complete one.
         directory = without_link(directory / "interrupted", "--out")
     outputs = write_report(results, directory)
     if as_json:
@@ -150,9 +144,9 @@ def view(
     from taichi_msm.render.notes import drawing_notes
     from taichi_msm.view.script import film, load_script, timed
 
-    done = load_script(script, loaded.render.size) if script is not None else None
+    loaded_script = load_script(script, loaded.render.size) if script is not None else None
 
-    from taichi_msm.cli.console import Progress
+    from taichi_msm.cli.console import ProgressDisplay
     from taichi_msm.view.recording import Captures
     from taichi_msm.view.session import Session
 
@@ -161,12 +155,12 @@ def view(
     notices: list[str] = []
 
     def begin() -> Session:
-        with Progress(quiet=False) as bar:
-            progress = interruptible(bar, interruption)
+        with ProgressDisplay(quiet=False) as bar:
+            progress = interruptible_progress(bar, interruption)
             return Session(loaded, captures, arch, threads, play=play, progress=lambda stage: progress(stage, 0, 0))
 
     try:
-        with naming(scene):
+        with prefix_errors(scene):
             if record is None or seconds is None:
                 from taichi_msm.view.window import Window, show
 
@@ -175,13 +169,15 @@ def view(
                     with begin() as session:
                         show(session, window, interruption.grant)
             else:
-                with begin() as session, Progress(quiet=False) as bar:
-                    events = timed(done, session.rate, loaded.render.size) if done else ()
-                    progress = partial(interruptible(bar, interruption), "film")
+                with begin() as session, ProgressDisplay(quiet=False) as bar:
+                    events = timed(loaded_script, session.rate, loaded.render.size) if loaded_script else ()
+                    progress = partial(interruptible_progress(bar, interruption), "film")
                     film(session, Path(record), seconds, events, progress, notices.append)
                 click.echo(printable(record))
     except KeyboardInterrupt:
-        return interrupted(interruption, False, "interrupted" if record is None else "interrupted; no film was written")
+        return report_interruption(
+            interruption, False, "interrupted" if record is None else "interrupted; no film was written"
+        )
     finally:
         tell(notices)
         for path in captures.saved:

@@ -476,7 +476,7 @@ def test_a_log_shows_what_is_done_and_left(capsys: pytest.CaptureFixture[str], m
     """Of a run that goes on with frame 40: 5 s for the frames that were finished, then 3 s for each."""
     now = 100.0
     monkeypatch.setattr(time, "monotonic", lambda: now)
-    with console.Progress(quiet=False) as progress, console.Progress(quiet=True) as silent:
+    with console.ProgressDisplay(quiet=False) as progress, console.ProgressDisplay(quiet=True) as silent:
         for shown in (progress, silent):
             now = 100.0
             for frame in range(40):
@@ -513,7 +513,7 @@ def test_a_frame_that_is_being_stepped_counts_as_time(
 ) -> None:
     now = 0.0
     monkeypatch.setattr(time, "monotonic", lambda: now)
-    with console.Progress(quiet=False) as progress:
+    with console.ProgressDisplay(quiet=False) as progress:
         for now, frame in ((0, 1), (11, 1), (50, 2), (51, 2), (61, 2), (250, 2)):  # noqa: B007
             progress.update("frames", frame, 4)
         # A pilot begins again from its first frame.

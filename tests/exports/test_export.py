@@ -444,6 +444,6 @@ def raise_interrupt(_: object) -> None:
 
 
 def test_a_long_export_says_how_far_it_is(results: Path, program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(console, "LINE_EVERY", 0.0)
+    monkeypatch.setattr(console, "LINE_INTERVAL_S", 0.0)
     assert "exporting: 3 of 5 done, about " in program("export", str(results), "--format", "obj").stderr
     assert program("export", str(results), "--format", "obj", "--quiet").stderr == ""
