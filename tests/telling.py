@@ -21,7 +21,7 @@ def tell(stage, done):
     with suppress(OSError):
         os.write(pipe, f"{stage} {done}\\n".encode())
 
-def leave_at_once(original=process.leave_at_once):
+def exit_on_signals(original=process.exit_on_signals):
     original()
     tell("heard", 0)
     from taichi_msm.cli import export, fit, run, session, study, sweep  # as the program does next
@@ -37,7 +37,7 @@ def leave_at_once(original=process.leave_at_once):
         if hasattr(module, "interruptible_progress"):
             module.interruptible_progress = interruptible_progress
 
-process.leave_at_once = leave_at_once
+process.exit_on_signals = exit_on_signals
 runpy.run_module("taichi_msm", run_name="__main__")
 """
 

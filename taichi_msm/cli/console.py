@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from taichi_msm.errors import printable
 from taichi_msm.load.cost import rough_time
 from taichi_msm.model.tool_force import in_words
-from taichi_msm.system.process import tell
+from taichi_msm.system.process import write_stderr
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Bar
@@ -77,7 +77,7 @@ class ProgressDisplay:
         elif now >= self._next_line:
             self._next_line = now + LINE_INTERVAL_S
             count = f": {done} of {total} done" if total else ""
-            tell([f"{STAGES[stage]}{count}{remaining and f', about {remaining}'}"])
+            write_stderr([f"{STAGES[stage]}{count}{remaining and f', about {remaining}'}"])
 
     def __enter__(self) -> ProgressDisplay:
         if self._bar is not None:

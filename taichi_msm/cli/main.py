@@ -20,7 +20,7 @@ from taichi_msm.errors import (
     NotInstalledError,
     SceneError,
 )
-from taichi_msm.system.process import mute, tell
+from taichi_msm.system.process import discard_buffer, write_stderr
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -41,10 +41,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return code
     except OSError as error:
         # The reader of stdout has exited, or its disk is full.
-        mute(sys.stdout)
+        discard_buffer(sys.stdout)
         if not isinstance(error, BrokenPipeError):
             name = f" {error.filename}" if error.filename else ""
-            tell([f"taichi-msm: cannot read or write{name}: {error.strerror or error}"])
+            write_stderr([f"taichi-msm: cannot read or write{name}: {error.strerror or error}"])
         return FILES
 
 

@@ -13,7 +13,7 @@ from taichi_msm.errors import MAX_WORKERS, did_you_mean
 from taichi_msm.version import __version__
 
 
-class SuggestingChoice(click.SuggestingChoice):  # type: ignore[type-arg]  # not generic before click 8.2
+class SuggestingChoice(click.Choice):  # type: ignore[type-arg]  # not generic before click 8.2
     """Type of an option with a fixed set of words; errors suggest the nearest word."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
@@ -89,10 +89,10 @@ def print_version(context: click.Context, _option: click.Parameter, requested: b
         requested: whether the option was given.
     """
     if requested:
-        from taichi_msm.system.compiler import chosen
+        from taichi_msm.system.compiler import active_compiler
 
         click.echo(f"taichi-msm {__version__}")
-        click.echo(f"{chosen().title} {chosen().version}")
+        click.echo(f"{active_compiler().title} {active_compiler().version}")
         context.exit()
 
 

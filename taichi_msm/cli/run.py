@@ -31,7 +31,7 @@ from taichi_msm.cli.session import (
     result_directory,
     resume_hint,
 )
-from taichi_msm.system.process import Interruption, tell
+from taichi_msm.system.process import Interruption, write_stderr
 
 # Parameters that may be given together with --resume and --again.
 RESUME_OPTIONS = ("resume", "threads", "quiet", "as_json")
@@ -122,7 +122,7 @@ def run(
     if record["status"] != "complete":
         message = f"{name}: {record.get('error', 'interrupted')}; frames in {directory}: {record['frames']}"
         remedy = f"; last good state: {record['dump']}" if record.get("dump") else resume_hint(directory)
-        tell([message + remedy])
+        write_stderr([message + remedy])
     elif not quiet and not as_json:
         click.echo(run_summary(record, directory))
     return EXIT_CODES.get(record["status"], interruption.code)

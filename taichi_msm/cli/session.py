@@ -13,7 +13,7 @@ import click
 
 from taichi_msm.errors import FilesError, SceneError
 from taichi_msm.runs.directory import without_link
-from taichi_msm.system.process import Interruption, tell
+from taichi_msm.system.process import Interruption, write_stderr
 
 if TYPE_CHECKING:
     from taichi_msm.cli.console import ProgressDisplay
@@ -96,7 +96,7 @@ def interruptible_progress(bar: ProgressDisplay, interruption: Interruption) -> 
         # Before the first stage, a signal may end the process at once. Moving results into place is not interrupted.
         interruption.listen()
         if stage != "write":
-            interruption.grant()
+            interruption.raise_if_requested()
 
     return progress
 
@@ -131,6 +131,6 @@ def report_failure(status: str, lines: Sequence[str], as_json: bool) -> None:
         lines: messages, which are printed to stderr.
         as_json: whether to print a JSON object on stdout too.
     """
-    tell(lines)
+    write_stderr(lines)
     if as_json:
         print_json({"status": status, "errors": list(lines)})

@@ -29,7 +29,7 @@ from taichi_msm.cli.session import (
 )
 from taichi_msm.errors import printable
 from taichi_msm.runs.directory import without_link
-from taichi_msm.system.process import Interruption, tell
+from taichi_msm.system.process import Interruption, write_stderr
 
 
 @program.command()
@@ -150,7 +150,7 @@ def view(
     from taichi_msm.view.recording import Captures
     from taichi_msm.view.session import Session
 
-    tell([*drawing_notes(loaded)])
+    write_stderr([*drawing_notes(loaded)])
     captures, interruption = Captures(directory, scene), Interruption()
     notices: list[str] = []
 
@@ -167,7 +167,7 @@ def view(
                 with Window(f"taichi-msm {scene}", loaded.render.size) as window:
                     window.say("one moment: compiling")
                     with begin() as session:
-                        show(session, window, interruption.grant)
+                        show(session, window, interruption.raise_if_requested)
             else:
                 with begin() as session, ProgressDisplay(quiet=False) as bar:
                     events = timed(loaded_script, session.rate, loaded.render.size) if loaded_script else ()
@@ -179,7 +179,7 @@ def view(
             interruption, False, "interrupted" if record is None else "interrupted; no film was written"
         )
     finally:
-        tell(notices)
+        write_stderr(notices)
         for path in captures.saved:
             click.echo(printable(str(path)))
     return DIVERGED if record is not None and session.fault else DONE

@@ -18,7 +18,7 @@ from taichi_msm.cli.session import (
     result_directory,
 )
 from taichi_msm.errors import LostExecutorError, printable
-from taichi_msm.system.process import Interruption, tell
+from taichi_msm.system.process import Interruption, write_stderr
 
 if TYPE_CHECKING:
     from taichi_msm.sweeps.spec import Sweep
@@ -68,9 +68,9 @@ def sweep(
     outcomes, missing, total = state.done, len(state.missing), state.total
     chosen = choose_worker_count(cost, missing, workers)
     if not as_json:
-        tell([f"{len(outcomes)} of {total} runs have ended before"] if outcomes else [])
+        write_stderr([f"{len(outcomes)} of {total} runs have ended before"] if outcomes else [])
         local_workers = chosen if dask is None else None
-        tell([cost_line(missing, cost.scaled(missing / loaded.runs), local_workers)] if missing else [])
+        write_stderr([cost_line(missing, cost.scaled(missing / loaded.runs), local_workers)] if missing else [])
     interruption = Interruption()
     files: list[str] = []
     notes: list[str] = []

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.render.config import Integers
 from taichi_msm.system.launches import Launches, end_thread
-from taichi_msm.system.runtime import our_compilation, ti
+from taichi_msm.system.runtime import compilation_options, ti
 
 # The bounds of a cell: its first and last column and row, within the picture; the last is before the first for a cell
 # that is not seen.
@@ -44,20 +44,20 @@ def binned(launches: Launches, bounds: Any, cells: int, extent: tuple[int, int],
     while True:
         across, down = (-(-side // size) for side in extent)
         ends = np.zeros(across * down + 1, np.int32)
-        with our_compilation(optimised=False):
+        with compilation_options(optimised=False):
             _count(cells, size, across, bounds, ends)
         starts = np.cumsum(ends, dtype=np.int64)
         if starts[-1] <= MOST_ENTRIES * (cells + across * down):
             break
         size *= 2
     entries = np.empty(max(1, starts[-1]), np.int32)
-    with our_compilation(optimised=False):
+    with compilation_options(optimised=False):
         _fill(cells, size, across, bounds, starts[:-1].astype(np.int32), entries)
     return Bins(size, across, ends[1:].reshape(down, across), starts.astype(np.int32), entries)
 
 
 def _at_once(launches: Launches, bounds: Any, cells: int, extent: tuple[int, int], size: int) -> Bins:
-    corners = launches.take(bounds).reshape(cells, 2, 2)
+    corners = launches.download(bounds).reshape(cells, 2, 2)
     while True:
         across, down = (-(-side // size) for side in extent)
         reached = np.maximum(corners[:, 1] // size - corners[:, 0] // size + 1, 0).prod(axis=1, dtype=np.int64)
@@ -66,13 +66,13 @@ def _at_once(launches: Launches, bounds: Any, cells: int, extent: tuple[int, int
             break
         size *= 2
     total = int(ends[-1])
-    counts, of_cells = launches.give(np.zeros(across * down, np.int32)), launches.give(ends.astype(np.int32))
+    counts, of_cells = launches.upload(np.zeros(across * down, np.int32)), launches.upload(ends.astype(np.int32))
     squares, places, entries = (launches.array(np.int32, max(1, total)) for _ in range(3))
     launches.launch(
         _enter, total, cells, size, across, bounds, of_cells, counts, squares, places, rounds=ROUNDS_OF_SEARCH
     )
-    lengths = launches.take(counts)
-    starts = launches.give(np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32))
+    lengths = launches.download(counts)
+    starts = launches.upload(np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32))
     launches.launch(_enlist, total, cells, of_cells, squares, places, starts, entries, rounds=ROUNDS_OF_SEARCH)
     return Bins(size, across, lengths.reshape(down, across), starts, entries)
 

@@ -18,7 +18,14 @@ from taichi_msm.render.labels import label_numbers
 from taichi_msm.render.lens_kernels import BENT_NUMBERS, store_bent
 from taichi_msm.render.lens_table import bounds, tiled
 from taichi_msm.render.shading import Appearance, PixelArrays, resolve
-from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, Memory, our_compilation, started, ti, write
+from taichi_msm.system.runtime import (
+    ITERATIONS_PER_THREAD,
+    Memory,
+    compilation_options,
+    current_device,
+    ti,
+    write_vectors,
+)
 
 # The numbers that are stored of all mass points come first; then, for every row of them, its highest and its lowest
 # place in the picture, without distortion.
@@ -37,7 +44,7 @@ class Bands:
         self._config, self._size, self._texels = config, size, texels
         self._draw = _kernel(config)
         (rows, cols), (width, height) = points, size
-        self._workers = min(-(-height // config.band_rows), started().threads)
+        self._workers = min(-(-height // config.band_rows), current_device().threads)
         self._memory = memory = Memory()
         self._point = memory.array("f32", 0, rows * (cols * (STORED + BENT_NUMBERS * config.bends) + 2))
         band_vectors = config.band_lines * config.tiles_across(width) * config.planes
@@ -52,7 +59,7 @@ class Bands:
         known = [bounds(places[first : first + rows, :, :2]) for first in range(0, len(places), rows)]
         last = np.pad(known, ((0, 0), (0, config.lanes - len(known[0]))))
         table = np.concatenate([bands, last[:, None].astype(np.float32)], axis=1)
-        write(self._samples, table.reshape(-1, config.lanes))
+        write_vectors(self._samples, table.reshape(-1, config.lanes))
 
     def draw(
         self, position: NDArray[np.float32], numbers: NDArray[np.float32], sizes: NDArray[np.int32]
@@ -71,7 +78,7 @@ class Bands:
         if config.labels:
             labels = np.zeros(label_numbers(normals=config.normals) * width * height, np.float32)
         sizes[[uni.ROWS_TAKEN, uni.ROWS_PROJECTED, uni.BANDS_TAKEN]] = 0
-        with our_compilation(optimised=False):
+        with compilation_options(optimised=False):
             self._draw(
                 position, self._texels, numbers, self._workers, sizes, self._point, self._samples,
                 picture.ravel().view(np.int32) if config.in_words else picture.ravel(), labels,

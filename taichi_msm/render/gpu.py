@@ -29,8 +29,8 @@ from taichi_msm.render.geometry import (
 from taichi_msm.render.labels import label_numbers
 from taichi_msm.render.lens_kernels import BENT_NUMBERS, store_bent
 from taichi_msm.render.shading import Appearance, PixelArrays, resolve
-from taichi_msm.system.launches import THREADS, Launches, end_thread
-from taichi_msm.system.runtime import our_compilation, ti, write
+from taichi_msm.system.launches import VULKAN_THREADS, Launches, end_thread
+from taichi_msm.system.runtime import compilation_options, ti, write_vectors
 
 # The smallest width of a bin [samples].
 SMALLEST_BIN = 8
@@ -61,8 +61,8 @@ class Threads:
         self._cells = (rows - 1) * (cols - 1)
         across = width * config.supersample
         # Rows of pixels in a strip.
-        self._rows = min(max(1, THREADS // (across * config.supersample)), height)
-        self._texels = launches.give(texels)
+        self._rows = min(max(1, VULKAN_THREADS // (across * config.supersample)), height)
+        self._texels = launches.upload(texels)
         self._point = launches.array(np.float32, rows * cols * STORED)
         self._pieces = launches.array(np.int32, self._cells)
         strip = self._rows * config.supersample * across * config.planes
@@ -74,7 +74,7 @@ class Threads:
 
     def place(self, places: NDArray[np.float32]) -> None:
         """Take the places of the samples of the pictures that follow, as `cpu.Bands.place` does."""
-        write(self._samples, places.reshape(-1, 1))
+        write_vectors(self._samples, places.reshape(-1, 1))
 
     def draw(
         self, position: NDArray[np.float32], numbers: NDArray[np.float32], sizes: NDArray[np.int32]
@@ -83,23 +83,23 @@ class Threads:
         launches, factor = Launches(bounded=True), self._config.supersample
         (width, height), rods = self._size, int(sizes[uni.ROD_COUNT])
         across, down = width * factor, height * factor
-        view = launches.give(numbers), launches.give(sizes)
-        with our_compilation(optimised=False):
+        view = launches.upload(numbers), launches.upload(sizes)
+        with compilation_options(optimised=False):
             self._project(position, *view, self._point, self._pieces)
-        pieces = launches.take(self._pieces)
+        pieces = launches.download(self._pieces)
         together = max(1, min(-(-int(pieces.sum(dtype=np.int64)) // MOST_PARTS), int(pieces.max())))
         # What is behind the eye makes one empty part.
         ends = np.cumsum(np.maximum(-(-pieces // together), 1), dtype=np.int32)
         parts = int(ends[-1])
         owners, bounds = launches.array(np.int32, 2 * parts), launches.array(np.int32, BOUNDS * parts)
         launches.launch(
-            self._bound, parts, together, *view, launches.give(ends), self._point, self._pieces, owners, bounds,
+            self._bound, parts, together, *view, launches.upload(ends), self._point, self._pieces, owners, bounds,
             rounds=ROUNDS_OF_SEARCH + together,
         )  # fmt: skip
         bin_size = max(SMALLEST_BIN, round((across * down / self._cells) ** 0.5))
         bins = binned(launches, bounds, parts, (across, down), bin_size)
         sizes[[uni.BIN_SIZE, uni.BINS_ACROSS]] = bins.size, bins.across
-        view = view[0], launches.give(sizes)
+        view = view[0], launches.upload(sizes)
         # A sample takes one round for a part, and for each of its triangles one and one or two for tiles.
         rounds_of_part = 1 + 3 * together
         rounds_of_rods = rods * (1 + factor * (1 + factor))
@@ -108,7 +108,7 @@ class Threads:
             rows = min(self._rows, height - row)
             top, bottom = row * factor, (row + rows) * factor
             longest = int(bins.lengths[top // bins.size : (bottom - 1) // bins.size + 1].max())
-            for listed, count in launches.parts(longest, rounds_of_part):
+            for listed, count in launches.chunks(longest, rounds_of_part):
                 launches.launch(
                     self._cover, rows * factor * across,
                     top, listed, count, together, *view, self._point, self._pieces, owners, bounds,
@@ -120,9 +120,9 @@ class Threads:
                 row, *view, self._texels, self._samples, self._colours, self._labels,
                 rounds=rounds_of_rods + rounds_of_shading,
             )  # fmt: skip
-        launches.require_ended()
-        colours = launches.take(self._colours) if self._config.picture else np.empty(0, np.uint8)
-        return colours.reshape(-1, width, 3), launches.take(self._labels)
+        launches.require_completion()
+        colours = launches.download(self._colours) if self._config.picture else np.empty(0, np.uint8)
+        return colours.reshape(-1, width, 3), launches.download(self._labels)
 
 
 @cache

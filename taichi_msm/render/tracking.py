@@ -23,7 +23,7 @@ from taichi_msm.render.labels import NO_FLOW, Flow, Sight
 from taichi_msm.render.lens_table import window
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.launches import Launches, end_thread
-from taichi_msm.system.runtime import lanes, our_compilation, ti
+from taichi_msm.system.runtime import compilation_options, lanes, ti
 
 Array = NDArray[np.floating]
 
@@ -81,28 +81,28 @@ def _search(
     told = uni.view_numbers(straight, scene.render, 1, scene.sheet.size, (1, 1), rods)
     if view.lens is not None:
         uni.tell_lens(told, view, 1, view.lens.limit)
-    numbers = launches.give(told)
+    numbers = launches.upload(told)
     sizes = uni.sizes_of(scene, np.empty((0, 3), np.int32))
     sizes[[uni.ROD_COUNT, uni.WIDTH, uni.HEIGHT]] = len(rods), width, height
     point, cell = (launches.array(np.float64, n) for n in (rows * cols * POINT_NUMBERS, cells * CELL_NUMBERS))
     bounds = launches.array(np.int32, cells * BOUNDS)
-    with our_compilation(optimised=False):
-        _outline(np.ascontiguousarray(position, np.float64), numbers, launches.give(sizes), point, cell, bounds)
+    with compilation_options(optimised=False):
+        _outline(np.ascontiguousarray(position, np.float64), numbers, launches.upload(sizes), point, cell, bounds)
     bins = binned(launches, bounds, cells, (width, height), bin_size)
     sizes[[uni.BIN_SIZE, uni.BINS_ACROSS, uni.WIDTH, uni.HEIGHT]] = bins.size, bins.across, *scene.render.size
     simple = launches.array(np.uint8, bins.lengths.size)
     launches.launch(_judge, bins.lengths.size, cell, cols, bins.starts, bins.entries, simple, rounds=3 * AROUND)
     pixels, hidden = launches.array(np.float32, 2 * total), launches.array(np.uint8, total)
     arguments = (
-        launches.give(np.ascontiguousarray(coordinates, np.float32).ravel()),
-        int(moved), numbers, launches.give(sizes), point, cell, bins.starts, bins.entries, simple, pixels, hidden,
+        launches.upload(np.ascontiguousarray(coordinates, np.float32).ravel()),
+        int(moved), numbers, launches.upload(sizes), point, cell, bins.starts, bins.entries, simple, pixels, hidden,
     )  # fmt: skip
     # A point takes one round for a cell, and one for each of its triangles.
     rounds = 1 + 2 * (scene.render.refine + 1) ** 2
-    for listed, count in launches.parts(int(bins.lengths.max()), rounds):
+    for listed, count in launches.chunks(int(bins.lengths.max()), rounds):
         launches.launch(_finding(view.model), total, listed, count, *arguments, rounds=count * rounds + len(rods))
-    launches.require_ended()
-    return launches.take(pixels).reshape(-1, 2), launches.take(hidden)
+    launches.require_completion()
+    return launches.download(pixels).reshape(-1, 2), launches.download(hidden)
 
 
 @ti.kernel

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.solver.state import State
-from taichi_msm.system.runtime import Memory, ti, write
+from taichi_msm.system.runtime import Memory, ti, write_vectors
 from taichi_msm.terms.base import AREA, GAIN, MOTION, MOVES, KernelSheet, StepCode
 
 # Bytes of a number.
@@ -108,7 +108,7 @@ class SheetArrays:
         self.stiffness = self.rows(1 if start.stiffness is None else len(start.stiffness))
         real = np.float32 if layout.code.precision == "f32" else np.float64
         with np.errstate(over="ignore"):
-            write(self.numbers, np.repeat(start.numbers[:, None].astype(real), lanes, axis=1))
+            write_vectors(self.numbers, np.repeat(start.numbers[:, None].astype(real), lanes, axis=1))
         self._set(self.by_column, start.by_column)
         if start.stiffness is not None:
             self._set(self.stiffness, start.stiffness)
@@ -139,7 +139,7 @@ class SheetArrays:
 
     def _set(self, array: Any, values: NDArray[Any]) -> None:
         """Set the first rows of an array to values, shape (..., cols), and the others to zero."""
-        write(array, in_lanes(self._layout, values))
+        write_vectors(array, in_lanes(self._layout, values))
 
     def rows(self, count: int) -> Any:
         """Allocate an array of `count` rows; its content is arbitrary."""

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from taichi_msm.solver.arrays import BYTES, SheetArrays, SheetLayout, Start, reading
 from taichi_msm.solver.bands import COUNTER_STRIDE, MOMENTS, PLACE_END, ROUND, STEP, TURN, WORKER_STRIDE, advancing
 from taichi_msm.system import process
-from taichi_msm.system.compiler import chosen
-from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, our_compilation, ti
+from taichi_msm.system.compiler import active_compiler
+from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, compilation_options, ti
 from taichi_msm.terms.base import StepCode
 from taichi_msm.terms.bending import BendingTerm
 
@@ -26,7 +26,7 @@ from taichi_msm.terms.bending import BendingTerm
 PAGE = 4096
 
 # How many times a worker looks for its neighbour before it gives up: for about 1.3 ms.
-PATIENCE = round(1.32e-3 / chosen().look)
+PATIENCE = round(1.32e-3 / active_compiler().poll_s)
 
 # After a worker has given up, a single worker steps for some time [s]. Where other programs want the cores, that is
 # four times the last such rest, halved for every HALF_LIFE that all workers have stepped since then; else it is the
@@ -84,7 +84,7 @@ class Scatter:
 
     def read(self, differences: bool, values: NDArray[Any], measures: NDArray[Any]) -> None:
         """Copy displacements or differences into values, shape (rows, cols, 3), and the measures of every row."""
-        with our_compilation():
+        with compilation_options():
             self._read(0, self._layout.rows, self._layout.cols, differences, values, measures, *self.arrays.all)
 
     def _advance_alone(self, done: int, end: int, table: NDArray[Any]) -> None:
@@ -107,7 +107,7 @@ class Scatter:
         """Take steps with all workers; returns how many are done, which may be fewer than `end` if a worker gave up."""
         if self._rests_until:
             # The rest itself tells nothing: a single worker waits for no core.
-            self._had, self._waited = time.process_time(), process.waited_for_cores() or 0.0
+            self._had, self._waited = time.process_time(), process.core_wait_s() or 0.0
             self._rests_until = 0.0
         start = time.perf_counter()
         count, gave_up = self._launch_together(done, end, table)
@@ -122,7 +122,7 @@ class Scatter:
 
     def _is_crowded(self) -> bool:
         """Tell whether other programs have wanted the cores since the last rest; True if it is not known."""
-        had, waited = time.process_time(), process.waited_for_cores()
+        had, waited = time.process_time(), process.core_wait_s()
         return waited is None or waited - self._waited > CROWDED * (had - self._had)
 
     def _launch_together(self, done: int, end: int, table: NDArray[Any]) -> tuple[int, bool]:
@@ -143,7 +143,7 @@ class Scatter:
 
     def _copy_borders(self) -> None:
         """Bring the copies of the rows at the borders of bands up to date, after steps of a single worker."""
-        with our_compilation():
+        with compilation_options():
             _copying(self._layout.code)(*self.arrays.u, self._borders, self._layout.rows, self._layout.width)
         self._progress[::COUNTER_STRIDE] = self._steps
 
@@ -159,7 +159,7 @@ class Scatter:
             self._steps, count, workers, layout.depth, self._carried_rows, layout.rows, layout.strip,
             self._first_row, self._end_row, layout.rows + len(self._borders), PATIENCE,
         ])  # fmt: skip
-        with our_compilation():
+        with compilation_options():
             kernel(sizes, self._progress, table, *self._carried, *self.arrays.all)
         self._steps += count
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.solver.arrays import SheetArrays, SheetLayout, Start, point_step, reading
-from taichi_msm.system.runtime import our_compilation, ti
+from taichi_msm.system.runtime import compilation_options, ti
 from taichi_msm.terms.base import DX, DY, HAS_LEFT, HAS_RIGHT, Entry, KernelRow, KernelSheet, StepCode
 from taichi_msm.terms.bending import BendingTerm
 from taichi_msm.terms.contact import ContactTerm
@@ -38,7 +38,7 @@ class Gather:
 
     def advance(self, count: int, table: NDArray[Any]) -> None:
         """Take at most STEPS_PER_LAUNCH steps; table: of the loads, shape (count, columns)."""
-        with our_compilation():
+        with compilation_options():
             self._advance(self._now, count, self._layout.rows, self._layout.cols, table, *self.arrays.all)
         self._now = (self._now + count) % 2
 
@@ -49,7 +49,7 @@ class Gather:
     def read(self, differences: bool, values: NDArray[Any], measures: NDArray[Any]) -> None:
         """Copy displacements or differences into values, shape (rows, cols, 3), and the measures of every row."""
         first, layout = self._now * (self._layout.rows + 2) + 1, self._layout
-        with our_compilation():
+        with compilation_options():
             self._read(first, layout.rows, layout.cols, differences, values, measures, *self.arrays.all)
 
 

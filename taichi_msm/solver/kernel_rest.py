@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.solver.arrays import SheetArrays, SheetLayout, Start, in_lanes, point_forces, reading
 from taichi_msm.solver.bands import MOMENTS, RowBand, joining, stepping_row
-from taichi_msm.system.runtime import our_compilation, ti, write
+from taichi_msm.system.runtime import compilation_options, ti, write_vectors
 from taichi_msm.terms.base import MOVES, Entry, KernelRow, KernelSheet, StepCode
 from taichi_msm.terms.bending import BendingTerm
 from taichi_msm.terms.contact import ContactTerm
@@ -85,7 +85,7 @@ class Relaxation:
         self._stored = np.concatenate([np.arange(layout.rows, dtype=np.int32), np.full(moments + 1, -1, np.int32)])
         self.arrays = arrays = SheetArrays(layout, self._stored, start)
         self._q, self._work = [arrays.rows(layout.rows) for _ in range(3)], arrays.rows(layout.rows + SUMS)
-        write(self._work, in_lanes(layout, 1 / masses))
+        write_vectors(self._work, in_lanes(layout, 1 / masses))
         first_fixed, last_fixed = layout.fixed_rows
         self._fire = np.zeros(NUMBERS)
         self._fire[:COUNT] = layout.rows, layout.strip, int(first_fixed), layout.rows - int(last_fixed)
@@ -94,7 +94,7 @@ class Relaxation:
     def stop(self) -> None:
         """Let the points stand still, and begin again with FIRE's first step."""
         for q in self._q:
-            write(q, np.zeros((0, self._layout.code.lanes)))
+            write_vectors(q, np.zeros((0, self._layout.code.lanes)))
         self._fire[[STEP, SHARE, WORKED, PLACED]] = LARGEST_STEP, FIRST_SHARE, 0, 1
 
     def place(self, displacement: NDArray[Any]) -> None:
@@ -102,7 +102,7 @@ class Relaxation:
         held = (self._stored >= 0)[:, None]
         self._fire[PLACED] = 1
         for c in range(3):
-            write(self.arrays.u[c], in_lanes(self._layout, np.where(held, displacement[self._stored, :, c], 0)))
+            write_vectors(self.arrays.u[c], in_lanes(self._layout, np.where(held, displacement[self._stored, :, c], 0)))
 
     def relax(self, count: int, enough: float, row: NDArray[Any]) -> tuple[int, float]:
         """Evaluate the forces up to `count` times, and move the points after each; until all forces are small.
@@ -118,7 +118,7 @@ class Relaxation:
         """
         fire = self._fire
         fire[[COUNT, ENOUGH]] = count, enough * enough
-        with our_compilation():
+        with compilation_options():
             self._relax(fire, row, *self._q, self._work, *self.arrays.all)
         largest = float(np.sqrt(fire[LARGEST])) if fire[SLOPE] < np.inf else np.inf
         return int(fire[EVALUATIONS]), largest
@@ -126,13 +126,13 @@ class Relaxation:
     def scale(self, row: NDArray[Any]) -> float:
         """Give the largest force of a spring, a load or the foundation on a point [N]."""
         largest = np.zeros(1)
-        with our_compilation():
+        with compilation_options():
             self._compare(self._layout.rows, self._layout.width, largest, row, *self.arrays.all)
         return float(np.sqrt(largest[0]))
 
     def read(self, differences: bool, values: NDArray[Any], measures: NDArray[Any]) -> None:
         """Copy displacements or forces into values, shape (rows, cols, 3), and the measures of every row."""
-        with our_compilation():
+        with compilation_options():
             self._read(0, self._layout.rows, self._layout.cols, differences, values, measures, *self.arrays.all)
 
 

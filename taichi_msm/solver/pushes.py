@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.solver.arrays import SheetArrays, SheetLayout
-from taichi_msm.system.runtime import our_compilation, ti
+from taichi_msm.system.runtime import compilation_options, ti
 from taichi_msm.terms.base import AREA, StepCode
 from taichi_msm.terms.contact import PUSHES, ContactTerm
 
@@ -26,7 +26,7 @@ def sum_pushes(layout: SheetLayout, arrays: SheetArrays, *, clear: bool) -> NDAr
     if contact is None:
         return np.zeros((0, 3))
     sums = np.empty((PUSHES * contact.tools, layout.rows))
-    with our_compilation():
+    with compilation_options():
         _summing(layout.code)(layout.rows, layout.cols, clear, arrays.by_column, arrays.fields, sums)
     return sums.sum(axis=1).reshape(-1, PUSHES)
 

@@ -29,7 +29,7 @@ from taichi_msm.images import copied
 from taichi_msm.scene.outputs import SWEEP
 from taichi_msm.sweeps.runs import Outcome, RunTask, execute_run
 from taichi_msm.sweeps.spec import Sweep
-from taichi_msm.system.compiler import versions, what_decides_bits
+from taichi_msm.system.compiler import result_versions, versions
 
 # Time limit for the answer of a scheduler [s].
 MAX_WAIT_S = 10
@@ -60,7 +60,7 @@ class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
         # The current directory may not exist on the machine of a worker, so paths must be absolute.
         self.scene, self.directory = scene._replace(folder=scene.folder.absolute()), directory.absolute()
         self.home = Path.cwd()
-        self.versions = what_decides_bits(versions(), "cpu")
+        self.versions = result_versions(versions(), "cpu")
         self._digests = {str(Path(path).absolute()): digest for path, digest in sweep.files.items()}
         self._contents = {digest: Path(path).read_bytes() for path, digest in self._digests.items()}
         self.error = ""

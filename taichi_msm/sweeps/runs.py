@@ -32,7 +32,7 @@ from taichi_msm.runs.directory import FILE, FOLDER, MAX_RECORD, give_name, kind,
 from taichi_msm.scene.outputs import RECORD, RUNS, SWEEP, numbered
 from taichi_msm.sweeps.pool import DiedError
 from taichi_msm.sweeps.spec import Sweep
-from taichi_msm.system.compiler import versions, what_decides_bits
+from taichi_msm.system.compiler import result_versions, versions
 
 # A run with one of these statuses is not run again.
 FINAL_STATUSES = ("complete", "diverged")
@@ -78,7 +78,7 @@ def register_sweep(directory: Path, sweep: Sweep) -> list[list[Any]]:
         with record.open("rb") as file:
             stored = json.loads(file.read(max(MAX_DESCRIPTION_BYTES, 2 * len(expected_values))))
         earlier = {name: stored.get(name) for name in description}
-        stored_values, stored_versions = json.dumps(stored["values"]), what_decides_bits(stored["versions"], "cpu")
+        stored_values, stored_versions = json.dumps(stored["values"]), result_versions(stored["versions"], "cpu")
     except OSError as error:
         raise FilesError(f"{record}: {(error.strerror or str(error)).lower()}") from None
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
@@ -87,7 +87,7 @@ def register_sweep(directory: Path, sweep: Sweep) -> list[list[Any]]:
         nouns = {"digest": "the scene file", "files": _changed_file(description["files"], earlier["files"])}
         message = f"holds the runs of another sweep: {nouns.get(changed[0], changed[0])} differs"
         raise SceneError([f"{directory}: {message}; choose another --out"])
-    current = what_decides_bits(versions(), "cpu")
+    current = result_versions(versions(), "cpu")
     if required := [f"{name} {version}" for name, version in stored_versions.items() if version != current.get(name)]:
         raise SceneError(
             [f"{directory}: the sweep began with {', '.join(required)}; use these, or choose another --out"]

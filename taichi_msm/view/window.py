@@ -12,7 +12,7 @@ import numpy as np
 
 from taichi_msm.errors import DeviceError, FilesError, Pause
 from taichi_msm.runs.media import Picture
-from taichi_msm.system.process import silenced
+from taichi_msm.system.process import discarded_output
 from taichi_msm.view import overlay
 from taichi_msm.view.events import KEYS, NOTCH, Drag, Event, Harder, Hover, Key, Press, Release, Turn
 from taichi_msm.view.session import Session
@@ -65,7 +65,7 @@ class Window:
         self._hand = Hand(size)
         self._shown: Picture = np.zeros((size[1], size[0], 3), np.uint8)
         try:
-            with silenced(2):
+            with discarded_output(2):
                 pygame.display.init()
                 if pygame.display.get_driver() == "x11":
                     # By way of OpenGL a picture takes longer, without a GPU several times as long.

@@ -433,7 +433,7 @@ def test_an_interrupted_export_changes_nothing(name: str, results: Path) -> None
 def test_the_command_says_that_it_was_interrupted(
     results: Path, program: Program, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("taichi_msm.system.process.Interruption.grant", raise_interrupt)
+    monkeypatch.setattr("taichi_msm.system.process.Interruption.raise_if_requested", raise_interrupt)
     done = program("export", str(results), "--format", "obj", "--json")
     assert (done.returncode, done.stderr) == (130, "interrupted; nothing was written\n")
     assert json.loads(done.stdout)["status"] == "interrupted"
