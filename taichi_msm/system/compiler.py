@@ -133,7 +133,7 @@ class Compiler:
 
         return [
             (nodes.ASTTransformerFuncContext, "memoized_get_pos_info", lambda context, node: ""),
-            # Quadrants parses every kernel twice, to find the used fields of dataclasses. These kernels use no dataclasses.
+            # Quadrants parses every kernel twice, to find used fields of dataclasses; these kernels have none.
             (kernels.Kernel, "_try_load_fastcache", skip_dataclasses),
             (kernels._kernel_impl_dataclass, "unpack_ast_struct_expressions", lambda tree, struct_locals: tree),
         ]

@@ -41,7 +41,7 @@ def read_regular(path: str | Path, limit: int) -> bytes:
 
 
 def private_folder() -> str:
-    """Return a directory within the temporary directory that only this user can write; it replaces the home directory."""
+    """Return a temporary directory that only this user can write, for use without a home directory."""
     if sys.platform == "win32":
         return tempfile.gettempdir()  # of this user
     folder = Path(tempfile.gettempdir(), f"taichi-msm-{os.geteuid()}")

@@ -1,9 +1,9 @@
 """Bounded launches of kernels with loops, so that no GPU ends a thread early, and a proof that none did.
 
 llvmpipe ends all loops of a thread after 65,535 iterations in total, without an error; other drivers have other limits.
-So the loops of a thread need a bound that does not grow with the picture or the sheet, and every launch states that
-bound. An inner loop must not contain an atomic operation: in Mesa 22.3, llvmpipe leaves such a loop after two iterations
-if a group of threads is not full.
+So the number of iterations in a thread needs a bound that does not grow with the picture or the sheet, and every launch
+states that bound. An inner loop must not contain an atomic operation: in Mesa 22.3, llvmpipe leaves such a loop after
+two iterations if a group of threads is not full.
 """
 
 # No `from __future__ import annotations`: Taichi evaluates the annotations of kernels.
@@ -40,7 +40,7 @@ class Launches:
 
     def __init__(self, *, bounded: bool) -> None:
         self.bounded = bounded
-        self._launched_indices = 0
+        self._launched = 0
         # Taichi leaks an array that is dropped before the kernels that use it have ended.
         self._arrays: list[Any] = []
         self._ended = self.upload(np.array([0, PROOF_ROUNDS if bounded else 0], np.int32))
@@ -101,7 +101,7 @@ class Launches:
             rounds += PROOF_ROUNDS + 1
             assert rounds <= MAX_ROUNDS, rounds
             batch = MAX_ROUNDS // rounds * VULKAN_THREADS
-            self._launched_indices += total
+            self._launched += total
         for first in range(0, total, batch):
             with compilation_options(optimised=False):
                 kernel(first, min(first + batch, total), self._ended, *arguments)
@@ -115,11 +115,11 @@ class Launches:
         if not self.bounded:
             return
         # The device counts in 32 bits.
-        missing = (self._launched_indices - int(self.download(self._ended)[0])) % (1 << 32)
+        missing = (self._launched - int(self.download(self._ended)[0])) % (1 << 32)
         if missing:
             raise DeviceError(
-                f"--arch {current_device().arch}: the device left out part of the work ({missing} of {self._launched_indices} pieces), "
-                "so pictures and labels would be wrong; take --arch cpu"
+                f"--arch {current_device().arch}: the device left out part of the work ({missing} of {self._launched} "
+                "pieces), so pictures and labels would be wrong; take --arch cpu"
             )
 
 

@@ -194,8 +194,8 @@ def require_start_thread() -> None:
     process, thread = _start_thread
     if process != os.getpid():
         raise MsmError(
-            f"{active_compiler().title} was started before this process was forked from another, and would hang here; start "
-            "processes by multiprocessing's 'spawn' or 'forkserver'"
+            f"{active_compiler().title} was started before this process was forked from another, and would hang here; "
+            "start processes by multiprocessing's 'spawn' or 'forkserver'"
         )
     if thread != threading.get_ident():
         raise MsmError(f"{active_compiler().title} works in the thread that started it; simulate and draw there")
@@ -272,8 +272,8 @@ def _require_address_space() -> None:
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     if limit != resource.RLIM_INFINITY and limit < ADDRESS_SPACE_BYTES:
         raise DeviceError(
-            f"{active_compiler().title} needs {ADDRESS_SPACE_BYTES >> 20} MiB of address space, and this process may have "
-            f"{limit >> 20} MiB; raise its limit (ulimit -v)"
+            f"{active_compiler().title} needs {ADDRESS_SPACE_BYTES >> 20} MiB of address space, and this process may "
+            f"have {limit >> 20} MiB; raise its limit (ulimit -v)"
         )
 
 

@@ -288,9 +288,9 @@ def test_another_picture_or_version_is_not_gone_on_with(
     others = {**versions(), active_compiler().name: "1.7.99"}
     with monkeypatch.context() as patch:
         patch.setattr(run_module, "versions", lambda: others)
+        compiler = active_compiler()
         with pytest.raises(
-            FilesError,
-            match=rf"^the run began with {active_compiler().name} {active_compiler().version}; use these versions, or run",
+            FilesError, match=rf"^the run began with {compiler.name} {compiler.version}; use these versions, or run"
         ):
             resume("parts", threads=device.threads)
     Image.fromarray(speckle(30, 40, 1)).save(small / "speckle.png")

@@ -177,8 +177,8 @@ def test_other_threads_and_forked_processes_are_refused(tmp_path: Path, root: Pa
         [sys.executable, str(script)], capture_output=True, text=True, timeout=60, check=True, env=environment
     )
     thread = f"{active_compiler().title} works in the thread that started it; simulate and draw there"
-    fork = f"{active_compiler().title} was started before this process was forked from another, and would hang here; start "
-    fork += "processes by multiprocessing's 'spawn' or 'forkserver'"
+    fork = f"{active_compiler().title} was started before this process was forked from another, and would hang here; "
+    fork += "start processes by multiprocessing's 'spawn' or 'forkserver'"
     assert done.stdout.splitlines() == [*4 * [thread], *2 * [fork], "2"]
     assert done.stderr == ""
 
