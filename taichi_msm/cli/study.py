@@ -142,7 +142,7 @@ def view(
     directory = result_directory(out, f"{Path(scene).stem}-live")
 
     from taichi_msm.render.notes import drawing_notes
-    from taichi_msm.view.script import film, load_script, timed
+    from taichi_msm.view.script import load_script, record_film, schedule_events
 
     loaded_script = load_script(script, loaded.render.size) if script is not None else None
 
@@ -162,17 +162,19 @@ def view(
     try:
         with prefix_errors(scene):
             if record is None or seconds is None:
-                from taichi_msm.view.window import Window, show
+                from taichi_msm.view.window import Window, run_session
 
                 with Window(f"taichi-msm {scene}", loaded.render.size) as window:
-                    window.say("one moment: compiling")
+                    window.announce("one moment: compiling")
                     with begin() as session:
-                        show(session, window, interruption.raise_if_requested)
+                        run_session(session, window, interruption.raise_if_requested)
             else:
                 with begin() as session, ProgressDisplay(quiet=False) as bar:
-                    events = timed(loaded_script, session.rate, loaded.render.size) if loaded_script else ()
+                    events = (
+                        schedule_events(loaded_script, session.frame_rate, loaded.render.size) if loaded_script else ()
+                    )
                     progress = partial(interruptible_progress(bar, interruption), "film")
-                    film(session, Path(record), seconds, events, progress, notices.append)
+                    record_film(session, Path(record), seconds, events, progress, notices.append)
                 click.echo(printable(record))
     except KeyboardInterrupt:
         return report_interruption(
@@ -182,4 +184,4 @@ def view(
         write_stderr(notices)
         for path in captures.saved:
             click.echo(printable(str(path)))
-    return DIVERGED if record is not None and session.fault else DONE
+    return DIVERGED if record is not None and session.divergence_error else DONE
