@@ -71,7 +71,7 @@ def processor_name() -> str:
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
             if line.startswith("model name"):
                 return line.split(":", 1)[1].strip()
-    return platform.processor_name() or platform.machine()
+    return platform.processor() or platform.machine()
 
 
 def available_memory() -> int:

@@ -197,7 +197,7 @@ def test_the_folder_of_compiled_kernels(named: bool, tmp_path: Path) -> None:
 
 
 def test_replacements_are_in_place_for_a_while(device: runtime.Device) -> None:
-    patches = active_compiler().shortcuts
+    patches = active_compiler().patches
 
     def parts() -> list[object]:
         return [getattr(owner, name) for owner, name, _ in patches]
