@@ -98,7 +98,16 @@ class _Pace:
         self._last = now
 
     def remaining_s(self, done: int, total: int, now: float) -> float | None:
-        """Estimate the remaining time of the stage [s], or None if it is not known or the stage is finished."""
+        """Estimate the remaining time of the stage.
+
+        Args:
+            done: number of finished items.
+            total: number of items.
+            now: current time [s].
+
+        Returns:
+            The time [s], or None if it is not known or the stage is finished.
+        """
         if done > self.done:
             self._last, self.done = now, done
         if done == self._initially_done or done >= total:

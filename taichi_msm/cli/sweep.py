@@ -128,5 +128,10 @@ def print_dry_run(loaded: Sweep, cost: SweepCost, shard: tuple[int, int], worker
 
 
 def progress_message(done: int, total: int) -> str:
-    """Return the message of an unfinished sweep, from the number of finished runs and the number of runs."""
+    """Format the progress of an unfinished sweep.
+
+    Args:
+        done: number of finished runs.
+        total: number of runs.
+    """
     return f"{done} of {total} runs have ended; the same command goes on"

@@ -245,8 +245,8 @@ def write_contact_sheet(result: SweepResult, executor: Executor, progress: Progr
         displacement = [] if largest is None else [f"max_displacement = {format_short(largest)}"]
         tiles.append(Tile(frames.get(run), outcome.status, [f"run {run}", *displacement, *map(printable, values)]))
     total = len(result.outcomes)
-    which = f"{total} runs" if len(runs) == total else f"{len(runs)} of {total} runs, evenly spread"
-    heading = printable(f"{result.sweep.scene.name}: the last frames of {which}")
+    subset = f"{total} runs" if len(runs) == total else f"{len(runs)} of {total} runs, evenly spread"
+    heading = printable(f"{result.sweep.scene.name}: the last frames of {subset}")
     sheet = _draw_tiles(tiles, _column_count(result, len(runs)), heading)
     with replacing(result.directory / CONTACT) as file:
         sheet.save(file, "JPEG", quality=90)

@@ -236,7 +236,7 @@ def format_value(value: Any) -> str:
 
 
 def _relocate(data: dict[str, Any], folder: Path, home: Path) -> Iterator[Problem]:
-    """Make paths relative to `folder` relative to `home`, the folder of the scene, and expand patterns of files."""
+    """Rewrite paths relative to `folder` as paths relative to `home`, the scene's folder, and expand file patterns."""
     vary, fixed = _mappings(data)
     for name, distribution in vary.items():
         for kind in {"choice", "grid"} & set(distribution if isinstance(distribution, dict) else ()):

@@ -207,7 +207,7 @@ class Viewport:
         return self._renderer.draw(Shot(positions, self.view, rods), self.render)
 
     def project(self, point: NDArray[np.floating]) -> tuple[float, float] | None:
-        """Project a point [m], shape (3,), to a pixel; None if it is behind the camera."""
+        """Project a point [m], shape (3,), to a pixel (x, y), or to None if it is behind the camera."""
         x, y = self.view.pixels(point.astype(float)).tolist()
         return (x, y) if math.isfinite(x) else None
 

@@ -126,7 +126,7 @@ def load_script(path: str | Path, size: tuple[int, int]) -> Script:
 
 
 def _outside(script: Script, size: tuple[int, int]) -> Iterator[Problem]:
-    """Find events at pixels outside the picture."""
+    """Check that presses are inside the picture."""
     width, height = size
     for n, entry in enumerate(script.events):
         if entry.do in ("press", "pull") and entry.at is not None:
