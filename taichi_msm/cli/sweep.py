@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from taichi_msm.sweeps.spec import Sweep
     from taichi_msm.sweeps.tables import SweepCost
 
-# Larger sweeps need the option --yes.
-MAX_UNCONFIRMED_RUNS, MAX_UNCONFIRMED_S = 10_000, 86400
+# A sweep with more runs needs the option --yes.
+MAX_UNCONFIRMED_RUNS = 10_000
 
 
 @program.command()
@@ -62,7 +62,7 @@ def sweep(
     chosen = choose_worker_count(cost, loaded.runs, workers)
     if dry_run:
         return print_dry_run(loaded, cost, shard or (1, 1), workers, as_json)
-    if not yes and (loaded.runs > MAX_UNCONFIRMED_RUNS or cost.seconds > MAX_UNCONFIRMED_S):
+    if not yes and (loaded.runs > MAX_UNCONFIRMED_RUNS or cost.seconds > 86400):
         raise click.UsageError(f"{cost_line(loaded.runs, cost, chosen)}; add --yes if that is meant")
     state = begin_sweep(loaded, directory, shard or (1, 1))
     outcomes, missing, total = state.done, len(state.missing), state.total

@@ -37,9 +37,6 @@ from taichi_msm.system.compiler import result_versions, versions
 # A run with one of these statuses is not run again.
 FINAL_STATUSES = ("complete", "diverged")
 
-# Largest size of sweep.json that is read [bytes]; twice the size of the sweep's own values, where that is more.
-MAX_DESCRIPTION_BYTES = 1 << 28
-
 
 def register_sweep(directory: Path, sweep: Sweep) -> list[list[Any]]:
     """Write the description of a sweep into its directory, or check that the directory holds the same sweep.
@@ -76,7 +73,8 @@ def register_sweep(directory: Path, sweep: Sweep) -> list[list[Any]]:
     expected_values = json.dumps(values)
     try:
         with record.open("rb") as file:
-            stored = json.loads(file.read(max(MAX_DESCRIPTION_BYTES, 2 * len(expected_values))))
+            # The limit bounds the memory for a foreign file.
+            stored = json.loads(file.read(max(1 << 28, 2 * len(expected_values))))
         earlier = {name: stored.get(name) for name in description}
         stored_values, stored_versions = json.dumps(stored["values"]), result_versions(stored["versions"], "cpu")
     except OSError as error:
@@ -191,9 +189,6 @@ def report_lock(directory: Path, pause: Pause) -> Iterator[None]:
         yield
 
 
-# Largest number of runs submitted to an executor at a time.
-MAX_SUBMITTED_RUNS = 4096
-
 # Interval between calls of `pause` or `progress` while all workers are busy [s].
 POLL_INTERVAL_S = 0.1
 
@@ -224,7 +219,8 @@ def execute_tasks(tasks: Iterable[RunTask], executor: Executor, pause: Pause) ->
         future.add_done_callback(done.put)
 
     remaining = iter(tasks)
-    for task in islice(remaining, MAX_SUBMITTED_RUNS):
+    # A limit on submitted runs bounds the memory of the executor.
+    for task in islice(remaining, 4096):
         submit(task)
     while pending:
         pause()

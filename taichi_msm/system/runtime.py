@@ -38,9 +38,6 @@ ARCHS = ("cpu", "cuda", "vulkan")
 # No machine has more cores; Taichi would start all of these threads.
 MAX_THREADS = 1024
 
-# A lock on Taichi's cache that is older than this was left by a killed process [s].
-MAX_LOCK_AGE_S = 60.0
-
 # Taichi reserves 1 GiB of address space, and its libraries need nearly the same amount [bytes].
 ADDRESS_SPACE_BYTES = 1900 << 20
 
@@ -255,10 +252,11 @@ def _cache() -> dict[str, Any]:
         # Taichi crashes at exit if it cannot write to the directory, even if the cache is off.
         os.environ.pop(active_compiler().folder_variable, None)
         return {"offline_cache": False, "offline_cache_file_path": private_folder()}
-    # Taichi holds the lock for milliseconds. A killed process leaves it, which blocks the cache for all others.
+    # Taichi holds the lock for milliseconds. One that is older than 60 s was left by a killed process, and blocks the
+    # cache for all other processes.
     lock = folder / active_compiler().lock
     with contextlib.suppress(OSError):
-        if time.time() - lock.stat().st_mtime > MAX_LOCK_AGE_S:
+        if time.time() - lock.stat().st_mtime > 60:
             lock.unlink()
     return {}
 

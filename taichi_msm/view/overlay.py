@@ -14,20 +14,10 @@ from PIL import Image, ImageDraw, ImageFont
 
 from taichi_msm.runs.media import Picture
 
-# Height of letters as a fraction of the picture's height, and its limits [px].
-RELATIVE_LETTER_HEIGHT = 1 / 36
-MIN_LETTER_PX, MAX_LETTER_PX = 11, 22
-
-# Upper bound of the average width of a letter as a fraction of its height.
-LETTER_WIDTH = 0.56
-
 # Width of a bar [letter heights].
 BAR_LETTERS = 10
 
-SHADOW_COLOUR = (0, 0, 0)
 OUTLINE_GREY = 140
-PUSH_COLOUR = (255, 255, 255)
-PULL_COLOUR = (255, 214, 90)
 
 
 class ValueBar(NamedTuple):
@@ -68,7 +58,8 @@ def write_text(
         if panel is not None and len(panel):
             _blend(picture, panel, edge, top)
             top += len(panel) + edge
-    panel = _panel(size, *textwrap.wrap(below, max(1, int((width - 4 * edge) / (LETTER_WIDTH * size)))))
+    # The average width of a letter is at most 0.56 of its height.
+    panel = _panel(size, *textwrap.wrap(below, max(1, int((width - 4 * edge) / (0.56 * size)))))
     _blend(picture, panel, edge, height - len(panel) - edge)
 
 
@@ -100,8 +91,8 @@ def mark_tool(picture: Picture, tool: tuple[float, float], *, pulls: bool) -> No
         return
     image = Image.fromarray(region)
     x, y = tool[0] - left, tool[1] - top
-    colour = PULL_COLOUR if pulls else PUSH_COLOUR
-    for r, outline, line in ((radius + 1, SHADOW_COLOUR, 3), (radius, colour, 1)):
+    colour = (255, 214, 90) if pulls else (255, 255, 255)
+    for r, outline, line in ((radius + 1, (0, 0, 0), 3), (radius, colour, 1)):
         ImageDraw.Draw(image).ellipse((x - r, y - r, x + r, y + r), outline=outline, width=line)
     region[:] = np.asarray(image)
 
@@ -148,4 +139,5 @@ def _bar(size: int, filled: int, end: str) -> NDArray[np.uint8]:
 
 
 def _letter_size(picture: Picture) -> int:
-    return int(min(MAX_LETTER_PX, max(MIN_LETTER_PX, picture.shape[0] * RELATIVE_LETTER_HEIGHT)))
+    """Return the height of letters [px], which depends on the height of the picture."""
+    return int(min(22, max(11, picture.shape[0] * (1 / 36))))

@@ -33,9 +33,6 @@ SECONDS = f"a number from 0 to {MAX_SCRIPT_S:g}, in seconds"
 REQUIRED_KEYS = {"press": "at", "pull": "at", "drag": "at", "release": "", "turn": "by", "percent": "to", "key": "name"}
 *KINDS, LAST_KIND = REQUIRED_KEYS
 
-# Kinds of events with a duration, which are spread over its frames.
-CONTINUOUS_KINDS = ("drag", "turn")
-
 # A script cannot quit, as the duration of a film is given.
 SCRIPT_KEYS = tuple(name for name in KEYS if name != "q")
 
@@ -71,7 +68,7 @@ class ScriptEvent(Section):
         if self.name is not None and self.name not in SCRIPT_KEYS:
             message = "there is no key '{name}' here; expected one of: {keys}"
             raise _refused("name", message, name=self.name, keys=", ".join(SCRIPT_KEYS))
-        if self.seconds > 0 and self.do not in CONTINUOUS_KINDS:
+        if self.seconds > 0 and self.do not in ("drag", "turn"):
             raise _refused("seconds", "{do} takes no time; remove it", do=self.do)
         return self
 

@@ -32,9 +32,6 @@ TEXT_KEYS = {" ": "space", "=": "up", "+": "up", "-": "down", "\x1b": "q"}
 ARROW_KEYS = {pygame.K_UP: "up", pygame.K_DOWN: "down"}
 SHIFT_KEYS = {pygame.K_LSHIFT, pygame.K_RSHIFT}
 
-# Keys that repeat while they are held down.
-REPEATING_KEYS = ("up", "down")
-
 LEFT_BUTTON, RIGHT_BUTTON = 1, 3
 
 QUIT = Key("q")
@@ -172,8 +169,8 @@ class InputReader:
             if event.type == pygame.QUIT:
                 yield QUIT
             elif event.type == pygame.KEYDOWN:
-                # pygame repeats the event of a key that is held down.
-                if (name := key_name(event)) and (event.key not in self._down or name in REPEATING_KEYS):
+                # pygame repeats the event of a key that is held down, which only the strength uses.
+                if (name := key_name(event)) and (event.key not in self._down or name in ("up", "down")):
                     yield Key(name)
                 self._down.add(event.key)
             elif event.type == pygame.KEYUP:
