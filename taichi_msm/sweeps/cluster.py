@@ -118,7 +118,12 @@ class Cluster(Executor):
         self._executor, self._name = client.get_executor(pure=False), name
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any, **_: Any) -> Future[Any]:
-        """Schedule a call of an importable function in an idle worker."""
+        """Schedule a call in an idle worker.
+
+        Args:
+            function: the function, which must be importable.
+            *arguments: its positional arguments; named ones are not supported.
+        """
         result: Future[Any] = Future()
         try:
             if function is execute_run:
@@ -187,7 +192,7 @@ def _inputs(name: str) -> Inputs:
 
 
 @contextmanager
-def connected(address: str, sweep: Sweep, directory: Path, progress: Progress) -> Iterator[Cluster]:
+def cluster_connection(address: str, sweep: Sweep, directory: Path, progress: Progress) -> Iterator[Cluster]:
     """Connect to a scheduler, and provide its workers with the inputs of a sweep until the block ends.
 
     Args:

@@ -44,7 +44,13 @@ class Pool(Executor):
             self._idle.put(None)
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
-        """Schedule a call of an importable function in an idle process."""
+        """Schedule a call in an idle process.
+
+        Args:
+            function: the function, which must be importable.
+            *arguments: its positional arguments.
+            **named: its named arguments.
+        """
         return self._threads.submit(self._call, (function, arguments, named))
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:

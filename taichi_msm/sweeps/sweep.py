@@ -107,15 +107,15 @@ def open_executor(
 
     Raises:
         NotInstalledError: when dask.distributed is needed and not installed.
-        ExecutorError, LostExecutorError: as `cluster.connected`.
+        ExecutorError, LostExecutorError: as `cluster.cluster_connection`.
     """
     if isinstance(executor, str):
         try:
-            from taichi_msm.sweeps.cluster import connected
+            from taichi_msm.sweeps.cluster import cluster_connection
         except ImportError:
             message = "a cluster needs dask.distributed, which is not installed; pip install distributed"
             raise NotInstalledError(message) from None
-        with connected(executor, state.sweep, state.directory, progress) as cluster:
+        with cluster_connection(executor, state.sweep, state.directory, progress) as cluster:
             yield cluster
         return
     if executor is not None:

@@ -38,13 +38,13 @@ class Turn(NamedTuple):
     down: float
 
 
-class Percent(NamedTuple):
+class Strength(NamedTuple):
     """The strength is set [% of the full force or depth]; negative values lift a grip."""
 
     percent: float
 
 
-class Harder(NamedTuple):
+class StrengthChange(NamedTuple):
     """The strength is increased [% of the full force or depth]; negative values decrease it."""
 
     percent: float
@@ -56,7 +56,7 @@ class Key(NamedTuple):
     name: str
 
 
-Event = Hover | Press | Drag | Release | Turn | Percent | Harder | Key
+Event = Hover | Press | Drag | Release | Turn | Strength | StrengthChange | Key
 
 # Change of the strength by a notch of the wheel, or by the up or down key [% of the full force or depth].
 STRENGTH_STEP = 5.0

@@ -15,7 +15,7 @@ from taichi_msm.errors import FilesError, Problem, SceneError, writing
 from taichi_msm.load.check import parse
 from taichi_msm.load.scene_file import Draft, Kind, read_file
 from taichi_msm.scene.section import MAX_PIXELS, REFUSED, NotNegative, Number, Pixels, Section, key
-from taichi_msm.view.events import KEYS, Drag, Event, Key, Percent, Press, Release, Turn
+from taichi_msm.view.events import KEYS, Drag, Event, Key, Press, Release, Strength, Turn
 from taichi_msm.view.recording import Film
 
 if TYPE_CHECKING:
@@ -165,7 +165,7 @@ def schedule_events(script: Script, rate: float, size: tuple[int, int]) -> Itera
                     right, down = entry.by or (0.0, 0.0)
                     yield frame, Turn(right * scale[0] / frames, down * scale[1] / frames)
                 case "percent":
-                    yield frame, Percent(entry.to or 0.0)
+                    yield frame, Strength(entry.to or 0.0)
                 case "key":
                     yield frame, Key(entry.name or "")
 

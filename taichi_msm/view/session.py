@@ -182,10 +182,10 @@ class Session:
             case events.Turn(right, down):
                 self.viewport.turn(right, down)
                 self._controller.rebase_drag()
-            case events.Percent(percent):
+            case events.Strength(percent):
                 self.tool.set_strength(percent)
-            case events.Harder(percent):
-                self.handle(events.Percent(self.tool.strength + percent))
+            case events.StrengthChange(percent):
+                self.handle(events.Strength(self.tool.strength + percent))
             case events.Key(name):
                 self._handle_key(name)
 
@@ -284,9 +284,9 @@ class Session:
     def _handle_key(self, key: str) -> None:
         match key:
             case "up":
-                self.handle(events.Harder(events.STRENGTH_STEP))
+                self.handle(events.StrengthChange(events.STRENGTH_STEP))
             case "down":
-                self.handle(events.Harder(-events.STRENGTH_STEP))
+                self.handle(events.StrengthChange(-events.STRENGTH_STEP))
             case "c" | "t" | "o":
                 self.viewport.set_camera({"c": self.scene.render.main_camera, "t": "top", "o": "oblique"}[key])
                 self._controller.rebase_drag()

@@ -14,7 +14,7 @@ from taichi_msm.errors import DeviceError, FilesError, Pause
 from taichi_msm.runs.media import Picture
 from taichi_msm.system.process import discarded_output
 from taichi_msm.view import overlay
-from taichi_msm.view.events import KEYS, STRENGTH_STEP, Drag, Event, Harder, Hover, Key, Press, Release, Turn
+from taichi_msm.view.events import KEYS, STRENGTH_STEP, Drag, Event, Hover, Key, Press, Release, StrengthChange, Turn
 from taichi_msm.view.session import Session
 
 # pygame must print no greeting on stdout, and the desktop's effects stay on.
@@ -177,7 +177,7 @@ class InputReader:
                 self._down.discard(event.key)
             elif event.type == pygame.MOUSEWHEEL:
                 if event.y != 0:
-                    yield Harder(STRENGTH_STEP * event.y)
+                    yield StrengthChange(STRENGTH_STEP * event.y)
             elif event.type in (pygame.MOUSEBUTTONDOWN, pygame.MOUSEBUTTONUP):
                 yield from self._button(event, *self._pixel(event.pos, area))
             elif event.type == pygame.MOUSEMOTION:

@@ -250,12 +250,15 @@ def test_a_transport_whose_requirements_are_missing(address: str, said: str, lab
 
 
 def test_a_command_whose_inputs_another_one_has_removed_ends_well(lab: Path, machines: Machines) -> None:
-    from taichi_msm.sweeps.cluster import connected
+    from taichi_msm.sweeps.cluster import cluster_connection
 
     address, described = machines.schedule(), load_sweep("here/sweep.yaml")
     machines.work(address)
     register_sweep(lab / "out", described)
-    with connected(address, described, lab / "out", quiet), connected(address, described, lab / "out", quiet):
+    with (
+        cluster_connection(address, described, lab / "out", quiet),
+        cluster_connection(address, described, lab / "out", quiet),
+    ):
         pass
 
 

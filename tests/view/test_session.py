@@ -21,7 +21,7 @@ from taichi_msm.model.sheet import rest_positions
 from taichi_msm.system.runtime import Device
 from taichi_msm.view import overlay, recording
 from taichi_msm.view import session as live_session
-from taichi_msm.view.events import KEYS, Drag, Event, Harder, Hover, Key, Percent, Press, Release, Turn
+from taichi_msm.view.events import KEYS, Drag, Event, Hover, Key, Press, Release, Strength, StrengthChange, Turn
 from taichi_msm.view.recording import Captures
 from taichi_msm.view.script import record_film
 from taichi_msm.view.session import Session, divide_frames
@@ -159,13 +159,13 @@ def test_run_repeats_a_session_to_the_bit(overrides: dict[str, Any], play: bool,
     events: dict[int, list[Event]] = {
         2: [Press(20, 12)],
         9: [Drag(23, 14)],
-        11: [Drag(25, 15), Percent(40)],
+        11: [Drag(25, 15), Strength(40)],
         16: [Release(), Press(14, 16, pull=True)],
         17: [Turn(5, -3)],
         30: [Release()],
         33: [Press(22, 11), Release()],
         36: [Press(22, 18), Key("space"), Key("m")],
-        38: [Key("space"), Harder(15)],
+        38: [Key("space"), StrengthChange(15)],
     }
     for position in played(session, events, 50):
         found.append(position)
@@ -241,11 +241,11 @@ def test_reset_begins_anew(begin: Begin) -> None:
 def test_percent_by_wheel_and_keys_stays_between_nothing_and_all(begin: Begin) -> None:
     session = begin()
     events: list[tuple[Event, float]] = [
-        (Harder(5), 100),
-        (Harder(-30), 70),
+        (StrengthChange(5), 100),
+        (StrengthChange(-30), 70),
         (Key("up"), 75),
         (Key("down"), 70),
-        (Percent(3), 3),
+        (Strength(3), 3),
         (Key("down"), 0),
     ]
     for event, expected in events:
@@ -337,7 +337,7 @@ def test_a_film_shows_as_much_time_as_went_by(begin: Begin) -> None:
         # Slower than the film: every picture is of two of its frames.
         for _ in range(12):
             session.advance()
-        session.handle(Harder(-5))
+        session.handle(StrengthChange(-5))
         session.picture()
     session.close()
     assert duration("captures/film-1.gif") == 1300, (
@@ -445,7 +445,7 @@ def test_a_sheet_that_nothing_holds_may_fly_after_a_press(begin: Begin) -> None:
     session = begin({**TILTED, "sheet.fixed": "none", "springs.virtual": 0.0, "probes.0.falloff": 0.0, "damping": 0.0})
     session.handle(Press(60, 50))
     advance(session, 15)
-    session.handle(Percent(1))
+    session.handle(Strength(1))
     advance(session, 20)
     session.handle(Release())
     advance(session, 400)
@@ -583,11 +583,11 @@ BY_HAND = {**TILTED, "probes.0.instrument": WIDE}
 EVENTS: dict[int, list[Event]] = {
     1: [Hover(15, 14)],
     4: [Press(18, 14)],
-    14: [Drag(22, 16), Harder(10)],
+    14: [Drag(22, 16), StrengthChange(10)],
     16: [Drag(25, 15)],
     20: [Release(), Hover(20, 17)],
     24: [Press(20, 17, pull=True)],
-    36: [Percent(-30)],
+    36: [Strength(-30)],
     46: [Turn(5, -3), Release()],
     50: [Press(22, 11), Key("space")],
     52: [Key("space"), Key("m")],
@@ -646,7 +646,7 @@ def test_by_position_the_tip_follows_the_pointer_and_feels_what_it_touches(begin
     pressed = session.felt_force()
     assert pressed > 0
     assert session.positions()[8, 6, 2] == pytest.approx(-0.03, abs=0.002), "a press is a radius deep"
-    session.handle(Harder(20))
+    session.handle(StrengthChange(20))
     advance(session, 20)
     assert session.felt_force() > 1.2 * pressed
     beside = session.positions()[8, 8, 0]
@@ -738,7 +738,7 @@ def test_the_force_felt_is_shown_with_a_bar(begin: Begin) -> None:
     advance(session, 20)
     hardest = session.felt_force()
     for percent in (100, 60):
-        session.handle(Percent(percent))
+        session.handle(Strength(percent))
         advance(session, 20)
         hardest = max(hardest, session.felt_force())
     said = session._figure_lines("")[0]
@@ -746,7 +746,7 @@ def test_the_force_felt_is_shown_with_a_bar(begin: Begin) -> None:
     bar = overlay.ValueBar(session.felt_force(), hardest, "N")
     assert bar_of(session.picture()) == pytest.approx(session.felt_force() / bar.end, abs=0.02)
     session.handle(Key("r"))
-    session.handle(Percent(40))
+    session.handle(Strength(40))
     assert session._figure_lines("")[0] == "next press 30 mm deep  ·  0 N"
     session.handle(Key("i"))
     session.handle(Key("i"))

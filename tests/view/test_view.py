@@ -23,7 +23,7 @@ from taichi_msm import load_scene
 from taichi_msm.cli.main import main
 from taichi_msm.errors import SceneError
 from taichi_msm.scene.scene import Scene
-from taichi_msm.view.events import Drag, Harder, Hover, Key, Percent, Press, Release, Turn
+from taichi_msm.view.events import Drag, Hover, Key, Press, Release, Strength, StrengthChange, Turn
 from taichi_msm.view.script import load_script, schedule_events
 from taichi_msm.view.window import MAX_DELAY_S, QUIT, InputReader, Pacing, fit_picture, initial_window_size
 from tests.conftest import Program
@@ -188,7 +188,7 @@ events:
         (4, Release()),
         (5, Turn(10.0, 4.0)),
         (6, Turn(10.0, 4.0)),
-        (7, Percent(40)),
+        (7, Strength(40)),
         (7, Key("m")),
     ]
 
@@ -303,8 +303,9 @@ def test_what_the_hand_does() -> None:
     ]
     assert understood(button(2, 1, 1), motion(2, 2), let_go(2, 2, 2)) == [Hover(2, 2)]
     # The wheel is reported as buttons 4 and 5, too.
-    assert understood(button(4, 0, 0), let_go(4, 0, 0), pygame.Event(pygame.MOUSEWHEEL, x=0, y=1)) == [Harder(5)]
-    assert understood(pygame.Event(pygame.MOUSEWHEEL, x=1, y=-2)) == [Harder(-10)]
+    wheel = button(4, 0, 0), let_go(4, 0, 0), pygame.Event(pygame.MOUSEWHEEL, x=0, y=1)
+    assert understood(*wheel) == [StrengthChange(5)]
+    assert understood(pygame.Event(pygame.MOUSEWHEEL, x=1, y=-2)) == [StrengthChange(-10)]
     assert understood(pygame.Event(pygame.MOUSEWHEEL, x=1, y=0)) == []
     assert understood(pygame.Event(pygame.QUIT)) == [QUIT]
 
