@@ -62,14 +62,14 @@ class Case:
             self.session.advance()
             self.window.show(self.session.picture("00 pictures/s"))
             self.latencies.append(time.perf_counter() - event)
-            self.steppings.append(self.session.seconds_a_frame)
+            self.steppings.append(self.session.frame_time_s)
         self.periods.append((time.perf_counter() - begun) / PICTURES)
         self.session.handle(Release())
 
     def row(self) -> str:
         """Give the line of the table."""
         latency, period = statistics.median(self.latencies), statistics.median(self.periods)
-        speed = 1 / self.session.rate / statistics.median(self.steppings)
+        speed = 1 / self.session.frame_rate / statistics.median(self.steppings)
         what = f"{self.size} × {self.size} | {self.points} × {self.points}"
         return f"| {what} | {1e3 * latency:.1f} ms | {1 / period:.0f} | {speed:.0f} × |"
 

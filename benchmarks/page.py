@@ -18,7 +18,7 @@ from taichi_msm.solver.planning import make_plan
 from taichi_msm.study import study
 from taichi_msm.study.format import duration, markdown, number, timing
 from taichi_msm.study.result import Timing
-from taichi_msm.system.compiler import COMPILERS, chosen
+from taichi_msm.system.compiler import COMPILERS, active_compiler
 from taichi_msm.system.process import available_threads
 from taichi_msm.system.runtime import Device, vector_bits
 
@@ -35,7 +35,7 @@ Entry = dict[str, Any]
 def machine() -> Results:
     """Describe where the benchmarks run."""
     found = study.machine(Device("cpu", available_threads()))
-    versions = {chosen().title: chosen().version, "NumPy": found["versions"]["numpy"]}
+    versions = {active_compiler().title: active_compiler().version, "NumPy": found["versions"]["numpy"]}
     for package in PACKAGES:
         try:
             versions[package] = metadata.version(package)

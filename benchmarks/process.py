@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from taichi_msm.system import runtime
-from taichi_msm.system.compiler import CHOICE, COMPILERS, chosen
+from taichi_msm.system.compiler import COMPILER_VARIABLE, COMPILERS, active_compiler
 
 ROOT = Path(__file__).parent.parent
 
@@ -55,7 +55,7 @@ def call(task: str, **arguments: Any) -> Any:
         done = subprocess.run(
             command,
             cwd=ROOT,
-            env=_environment(arguments.get("threads"), bits, compiler or chosen().name),
+            env=_environment(arguments.get("threads"), bits, compiler or active_compiler().name),
             capture_output=True,
             text=True,
             check=False,
@@ -83,7 +83,7 @@ def _environment(threads: int | None, bits: int | None, compiler: str) -> dict[s
         **os.environ,
         "JAX_PLATFORMS": "cpu",
         "NUMBA_CACHE_DIR": str(CACHE / "numba"),
-        CHOICE: compiler,
+        COMPILER_VARIABLE: compiler,
         COMPILERS[compiler].folder_variable: str(CACHE / compiler),
         "WARP_CACHE_PATH": str(CACHE / "warp"),
     }

@@ -24,7 +24,7 @@ from distributed import Client
 from benchmarks.process import OUTPUT
 from taichi_msm.sweeps.runs import begin_sweep
 from taichi_msm.sweeps.spec import Sweep, load_sweep
-from taichi_msm.sweeps.sweep import finish, go_on, opened
+from taichi_msm.sweeps.sweep import finish_sweep, open_executor, run_missing
 from taichi_msm.system.process import available_threads
 
 FOLDER = OUTPUT / "sweep_scale"
@@ -63,16 +63,16 @@ class Clock:
 def measure(described: Sweep, directory: Path, executor: str | None) -> dict[str, Any]:
     """Take all runs, and look for them again as the next command would."""
     clock, taken = Clock(), dict[str, Any]()
-    under_way = begin_sweep(described, directory)
+    state = begin_sweep(described, directory)
     taken["begin"] = clock.seconds()
-    with opened(executor, available_threads(), under_way, _ignore) as taking:
+    with open_executor(executor, available_threads(), state, _ignore) as taking:
         clock.seconds()
-        for row in go_on(under_way, taking, _ignore):
+        for row in run_missing(state, taking, _ignore):
             assert row.status == "complete", row
         taken["run"] = clock.seconds()
         again = begin_sweep(described, directory)
         taken["scan"] = clock.seconds()
-        finish(again, taking, _ignore)
+        finish_sweep(again, taking, _ignore)
         taken["finish"] = clock.seconds()
     return taken
 

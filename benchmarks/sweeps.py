@@ -98,8 +98,8 @@ def main() -> None:
     made = Made(*(statistics.median(column) for column in zip(*films, strict=True)))
     all_cores = cores * made.seconds
     text = (
-        f"On {cores} cores of an {process.processor()} with vectors of {vector_bits()} bits, medians of {ROUNDS} and "
-        f"{FILM_ROUNDS} rounds, kernels compiled before:\n\n"
+        f"On {cores} cores of an {process.processor_name()} with vectors of {vector_bits()} bits, medians of {ROUNDS} "
+        f"and {FILM_ROUNDS} rounds, kernels compiled before:\n\n"
         f"- {RUNS} runs of `press.yaml` with 31 × 31 points and without pictures take "
         f"{statistics.median(sweeps):.1f} s; {SINGLE} of them as single commands, one after another, take "
         f"{statistics.median(singles):.1f} s. That is {ratio:.2f} of the time for {RUNS // SINGLE} times the runs.\n"

@@ -11,7 +11,7 @@ import time
 
 from benchmarks.process import ROOT
 from benchmarks.race import Progress
-from taichi_msm.system.compiler import CHOICE, COMPILERS, chosen
+from taichi_msm.system.compiler import COMPILER_VARIABLE, COMPILERS, active_compiler
 
 SCENE = "scenes/press.yaml"
 
@@ -26,14 +26,14 @@ def command(*arguments: str, cache: str, compiler: str | None = None) -> tuple[f
         cache: folder of compiled kernels.
         compiler: name of the compiler; None: that of this process.
     """
-    used = COMPILERS[compiler] if compiler else chosen()
+    used = COMPILERS[compiler] if compiler else active_compiler()
     # Python keeps what it compiles, as it does for a user.
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     start = time.perf_counter()
     done = subprocess.run(
         [sys.executable, "-m", "taichi_msm", *arguments],
         cwd=ROOT,
-        env={**environment, CHOICE: used.name, used.folder_variable: cache},
+        env={**environment, COMPILER_VARIABLE: used.name, used.folder_variable: cache},
         check=True,
         capture_output=True,
         text=True,

@@ -22,7 +22,7 @@ from benchmarks import stored_form
 from taichi_msm.study.format import markdown
 from taichi_msm.study.measurements import FINEST, MARGIN
 from taichi_msm.study.result import REFINED_ENOUGH
-from taichi_msm.system.compiler import named
+from taichi_msm.system.compiler import compiler_label
 
 ROOT = Path(__file__).parent.parent
 PAGE, TEMPLATE = ROOT / "docs" / "accuracy.md", ROOT / "docs" / "accuracy.template"
@@ -253,7 +253,7 @@ def main() -> None:
             cpu=machine["cpu"],
             threads=machine["threads"],
             vectors=machine["vectors"],
-            compiler=named(versions),
+            compiler=compiler_label(versions),
             python=versions["python"],
             margin=MARGIN,
             coarse_step=f"{1000 * first['step']:.3g} ms",

@@ -24,7 +24,7 @@ from taichi_msm.load.scene_file import plan_file
 from taichi_msm.scene.camera import Camera
 from taichi_msm.sweeps.spec import load_sweep
 from taichi_msm.view.recording import Captures
-from taichi_msm.view.script import film, load_script, timed
+from taichi_msm.view.script import load_script, record_film, schedule_events
 from taichi_msm.view.session import Session
 
 Floats = NDArray[np.float64]
@@ -183,7 +183,9 @@ def live(name: str, size: int, rate: float, seconds: float) -> None:
     scene = load_scene(SCENES / "press.yaml", settings)
     script = load_script(SCENES / "scripts" / "press.yaml", scene.render.size)
     with tempfile.TemporaryDirectory() as directory, Session(scene, Captures(Path(directory), "press.yaml")) as session:
-        film(session, IMAGES / f"{name}.gif", seconds, timed(script, session.rate, scene.render.size))
+        record_film(
+            session, IMAGES / f"{name}.gif", seconds, schedule_events(script, session.frame_rate, scene.render.size)
+        )
 
 
 def sweep() -> None:
@@ -202,7 +204,7 @@ def data_set(runs: int, moment: float, size: int) -> list[Image.Image]:
     """Draw the first runs of the sweep tracking at a moment [s]."""
     described = load_sweep(SCENES / "sweeps" / "tracking.yaml")
     pictures = []
-    for values in described.some_values(runs):
+    for values in described.sample_values(runs):
         plan = plan_file(described.scene, (*described.overrides(values), f"render.size=[{size},{size}]"))
         with Simulation(plan) as simulation:
             simulation.advance(round(moment * plan.scene.time.frames_per_second))

@@ -69,7 +69,7 @@ def stiffer(times: int) -> Scene:
 
 def motion(plan: Plan) -> Array:
     """Displacements of every frame but the first, as they are written."""
-    dynamics = Dynamics(plan, runtime.started())
+    dynamics = Dynamics(plan, runtime.current_device())
     rest, frames = rest_positions(plan.scene.sheet), []
     for _ in range(plan.grid.frames):
         dynamics.advance(plan.grid.steps_per_frame)
@@ -98,7 +98,7 @@ def silent_table() -> str:
         exact = truth(plan)
         largest = longest(exact)
         errors = [longest(motion(one) - exact) / largest for one in (plan.with_grid(precision="f32"), plan)]
-        told = estimate_error(plan, runtime.started()).error
+        told = estimate_error(plan, runtime.current_device()).error
         rows.append([name, *(f"{error:.2g}" for error in errors), f"{told:.2g}", plan.grid.precision])
     return markdown(["run", "error in f32", "error with auto", "error told", "auto takes"], rows, left=(0, 4))
 
@@ -169,7 +169,7 @@ def buckling() -> dict[str, Any]:
     """Follow the smallest eigenvalue through a stiffer press, and draw it and its mode."""
     scene = stiffer(BUCKLING)
     plan = make_plan(scene).with_grid(precision="f64")
-    grid, dynamics = plan.grid, Dynamics(plan, runtime.started())
+    grid, dynamics = plan.grid, Dynamics(plan, runtime.current_device())
     moves = ~fixed_points(scene.sheet)
     times, values, modes = [], [], []
     for frame in range(grid.frames + 1):
@@ -235,7 +235,7 @@ def energy() -> dict[str, Any]:
         axes = figure.subplots()
         colours: dict[Precision, str] = {"f32": VERMILION, "f64": BLUE}
         for kind, colour in colours.items():
-            dynamics = Dynamics(make_plan(made).with_grid(precision=kind), runtime.started())
+            dynamics = Dynamics(make_plan(made).with_grid(precision=kind), runtime.current_device())
             found = []
             for _ in range(ENERGY_STEPS // every):
                 dynamics.advance(every)
@@ -273,7 +273,7 @@ def static() -> dict[str, Any]:
         "probes.0.load=[[0, 0], [0.36, 100]]", f"time.duration={seconds}", "damping=0.04", "time.precision=f64"
     )
     plan = make_plan(scene)
-    dynamics = Dynamics(plan, runtime.started())
+    dynamics = Dynamics(plan, runtime.current_device())
     dynamics.advance(plan.grid.steps)
     stepped = dynamics.displacement()
     dynamics.close()
@@ -306,12 +306,12 @@ def at_rest() -> dict[str, Any]:
         for side in sides:
             points = f"sheet.points=[{side}, {side}]"
             found = load_scene(ROOT / press, [*held, *change, points, "time.motion=quasistatic"])
-            still = QuasiStatics(make_plan(found), runtime.started())
+            still = QuasiStatics(make_plan(found), runtime.current_device())
             still.advance(0)
             counts.append(f"{still.evaluations}")
             if not change:
                 moving = Dynamics(
-                    make_plan(load_scene(ROOT / press, [*held, points, "time.precision=f64"])), runtime.started()
+                    make_plan(load_scene(ROOT / press, [*held, points, "time.precision=f64"])), runtime.current_device()
                 )
                 wanted = still.displacement()
                 while longest(moving.displacement() - wanted) > CLOSE * longest(wanted):
@@ -342,7 +342,7 @@ def indentation() -> dict[str, Any]:
             time={"motion": "quasistatic", "duration": count, "frames_per_second": 1},
             output=[],
         )
-        rest = QuasiStatics(make_plan(scene), runtime.started())
+        rest = QuasiStatics(make_plan(scene), runtime.current_device())
         for row, depth in zip(rows, depths, strict=True):
             rest.advance(1)
             error = -rest.tool_forces()[0, 2] / resistance(depth, radius, tension, foundation) - 1
@@ -376,7 +376,7 @@ def frequencies() -> dict[str, Any]:
     moves, grid = ~plan.fixed, plan.grid
     values, vectors = lowest(stiffness(scene, np.zeros((*scene.sheet.points, 3)), 1.0), 0.0, MODES)
     rows = []
-    dynamics = Dynamics(plan, runtime.started())
+    dynamics = Dynamics(plan, runtime.current_device())
     for value, vector in zip(values, vectors.T, strict=True):
         w = math.sqrt(value / plan.material.mass)
         theta = 2 * math.asin(w * grid.step / 2)

@@ -23,8 +23,8 @@ def main() -> int:
     # OpenBLAS starts a thread for every core, each of which spins for a while; what we multiply is too small for two.
     # NumPy loads it later, here and in the encoder's process.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    process.open_missing()
-    process.leave_at_once()
+    process.open_standard_streams()
+    process.exit_on_signals()
     if isinstance(sys.stdout, io.TextIOWrapper):
         # A file name need not be text; errors, on stderr, are printed this way already.
         sys.stdout.reconfigure(errors="backslashreplace")

@@ -11,7 +11,7 @@ from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from taichi_msm.system.process import silenced
+from taichi_msm.system.process import discarded_output
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -127,7 +127,7 @@ def _open(path: str, sha256: str | None = None) -> Iterator[Image.Image]:
 
     _require_file(path)
     # The output of libtiff and of Pillow's log is silenced: the error that is raised says the same.
-    with silenced(2), warnings.catch_warnings():
+    with discarded_output(2), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.simplefilter("error", Image.DecompressionBombWarning)
         try:

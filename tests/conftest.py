@@ -14,7 +14,7 @@ from taichi_msm.cli.main import main
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.runs.run import run
 from taichi_msm.system import runtime
-from taichi_msm.system.compiler import chosen
+from taichi_msm.system.compiler import active_compiler
 from taichi_msm.system.process import SIGNALS
 from tests.scenes import SMALL, speckle
 
@@ -44,7 +44,7 @@ def own_kernel_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
     base = tmp_path_factory.getbasetemp()
     # All workers of pytest-xdist share one.
     shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
-    os.environ[chosen().folder_variable] = str(shared / "kernels")
+    os.environ[active_compiler().folder_variable] = str(shared / "kernels")
 
 
 @pytest.fixture

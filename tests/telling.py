@@ -21,12 +21,12 @@ def tell(stage, done):
     with suppress(OSError):
         os.write(pipe, f"{stage} {done}\\n".encode())
 
-def leave_at_once(original=process.leave_at_once):
+def exit_on_signals(original=process.exit_on_signals):
     original()
     tell("heard", 0)
     from taichi_msm.cli import export, fit, run, session, study, sweep  # as the program does next
 
-    def interruptible(*arguments, original=session.interruptible):
+    def interruptible_progress(*arguments, original=session.interruptible_progress):
         progress = original(*arguments)
         def telling(stage, done, total):
             tell(stage, done)
@@ -34,10 +34,10 @@ def leave_at_once(original=process.leave_at_once):
         return telling
 
     for module in (export, fit, run, session, study, sweep):
-        if hasattr(module, "interruptible"):
-            module.interruptible = interruptible
+        if hasattr(module, "interruptible_progress"):
+            module.interruptible_progress = interruptible_progress
 
-process.leave_at_once = leave_at_once
+process.exit_on_signals = exit_on_signals
 runpy.run_module("taichi_msm", run_name="__main__")
 """
 

@@ -196,7 +196,7 @@ def test_every_key_of_the_record_has_its_row() -> None:
 
 
 def test_every_exit_code_has_its_row() -> None:
-    codes = {session.DONE, session.BUG, session.WRONG_INPUT, session.DIVERGED, session.FILES, 130, 143}
+    codes = {session.DONE, session.BUG, session.INVALID_INPUT, session.DIVERGED, session.FILES, 130, 143}
     assert [int(code) for cell in table(DOCS / "command-line.md", "exit codes") for code in cell.split(", ")] == sorted(
         codes
     )

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from taichi_msm.system.compiler import chosen
+from taichi_msm.system.compiler import active_compiler
 from tests.outputs import results
 
 # Large enough for two workers to step it.
@@ -115,7 +115,9 @@ def test_the_same_bytes_while_bounds_are_checked(runs: Runs, root: Path, tmp_pat
     overrides = [word for setting in SETTINGS for word in ("--set", setting)]
     command = [sys.executable, "-m", "taichi_msm", "run", str(root / "scenes" / "press.yaml"), *overrides]
     subprocess.run(
-        [*command, "--out", str(tmp_path / "out")], env={**os.environ, f"{chosen().prefix}_DEBUG": "1"}, check=True
+        [*command, "--out", str(tmp_path / "out")],
+        env={**os.environ, f"{active_compiler().prefix}_DEBUG": "1"},
+        check=True,
     )
     assert results(tmp_path / "out") == results(runs.folder / "here" / NAMES[0])
 
@@ -138,7 +140,7 @@ def test_tissue_gives_the_same_bytes_while_bounds_are_checked(fixed: str, root: 
     for debug in ("0", "1"):
         subprocess.run(
             [*command, "--out", str(tmp_path / debug)],
-            env={**os.environ, f"{chosen().prefix}_DEBUG": debug},
+            env={**os.environ, f"{active_compiler().prefix}_DEBUG": debug},
             check=True,
         )
     assert results(tmp_path / "0") == results(tmp_path / "1")
@@ -161,7 +163,7 @@ def test_nothing_is_written_elsewhere(runs: Runs) -> None:
             "trajectory.npz",
         ]
     files = [path.relative_to(home).parts for path in home.rglob("*") if path.is_file()]
-    assert {parts[:3] for parts in files} == {Path(chosen().cache).parts}
+    assert {parts[:3] for parts in files} == {Path(active_compiler().cache).parts}
     assert list((runs.folder / "temporary").iterdir()) == []
     lines = (runs.folder / "watched").read_text().splitlines()
     written = [Path(line.removeprefix("write ")) for line in lines if line.startswith("write ")]

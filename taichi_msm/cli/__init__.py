@@ -1,6 +1,6 @@
-"""The command line, a file for each command."""
+"""The command line, with a module for each group of commands."""
 
 import time
 
-# The clock starts before the other imports do.
-STARTED = time.perf_counter()
+# Timings of a run include the time of the imports.
+START_TIME = time.perf_counter()

@@ -1,4 +1,4 @@
-"""What a person sees of a run: its progress, and a summary at the end."""
+"""Console output of a run: its progress, and a summary at the end."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from taichi_msm.errors import printable
 from taichi_msm.load.cost import rough_time
 from taichi_msm.model.tool_force import describe_forces
-from taichi_msm.system.process import tell
+from taichi_msm.system.process import write_stderr
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Bar
@@ -38,38 +38,48 @@ STAGES = {
     "contact": "drawing the last frames",
 }
 
-# Time between two lines when stderr is not a terminal [s].
-LINE_EVERY = 10.0
+# Interval between lines of progress when stderr is not a terminal [s].
+LINE_INTERVAL_S = 10.0
 
 
-class Progress:
-    """Progress on stderr: a bar on a terminal, else a line every ten seconds; or nothing."""
+class ProgressDisplay:
+    """Progress on stderr: a bar on a terminal, otherwise a line every ten seconds.
+
+    Args:
+        quiet: whether to print nothing.
+    """
 
     def __init__(self, quiet: bool) -> None:
         self._quiet = quiet
         self._bar = None if quiet or not sys.stderr.isatty() else _bar()
-        self._next_line = time.monotonic() + LINE_EVERY
+        self._next_line = time.monotonic() + LINE_INTERVAL_S
         self._pace = _Pace("", 0, 0.0)
         if self._bar is not None:
             self._task = self._bar.add_task(STAGES["start"], total=None, left="")
 
     def update(self, stage: str, done: int, total: int) -> None:
-        """Show the stage, how much of it is done, and the time left."""
+        """Show the progress of a stage, and the remaining time.
+
+        Args:
+            stage: a key of `STAGES`.
+            done: number of finished items.
+            total: number of items; 0 if it is not known.
+        """
         if self._quiet:
             return
         now = time.monotonic()
         if stage != self._pace.stage or done < self._pace.done:
             self._pace = _Pace(stage, done, now)
-        left = self._pace.left(done, total, now)
-        said = "" if left is None else f"{rough_time(left)} left"
+        remaining_s = self._pace.remaining_s(done, total, now)
+        remaining = "" if remaining_s is None else f"{rough_time(remaining_s)} left"
         if self._bar is not None:
-            self._bar.update(self._task, description=STAGES[stage], completed=done, total=total, left=said)
+            self._bar.update(self._task, description=STAGES[stage], completed=done, total=total, left=remaining)
         elif now >= self._next_line:
-            self._next_line = now + LINE_EVERY
-            much = f": {done} of {total} done" if total else ""
-            tell([f"{STAGES[stage]}{much}{said and f', about {said}'}"])
+            self._next_line = now + LINE_INTERVAL_S
+            count = f": {done} of {total} done" if total else ""
+            write_stderr([f"{STAGES[stage]}{count}{remaining and f', about {remaining}'}"])
 
-    def __enter__(self) -> Progress:
+    def __enter__(self) -> ProgressDisplay:
         if self._bar is not None:
             self._bar.start()
         return self
@@ -80,21 +90,30 @@ class Progress:
 
 
 class _Pace:
-    """How fast a stage goes, of which a part was done when it began."""
+    """Rate of progress in a stage, from the time when it began."""
 
     def __init__(self, stage: str, done: int, now: float) -> None:
         self.stage, self.done = stage, done
-        self._begun, self._before = now, done
+        self._start, self._initially_done = now, done
         self._last = now
 
-    def left(self, done: int, total: int, now: float) -> float | None:
-        """Tell how long the rest will take [s]; None: not known yet, or nothing is left."""
+    def remaining_s(self, done: int, total: int, now: float) -> float | None:
+        """Estimate the remaining time of the stage.
+
+        Args:
+            done: number of finished items.
+            total: number of items.
+            now: current time [s].
+
+        Returns:
+            The time [s], or None if it is not known or the stage is finished.
+        """
         if done > self.done:
             self._last, self.done = now, done
-        if done == self._before or done >= total:
+        if done == self._initially_done or done >= total:
             return None
-        each = (self._last - self._begun) / (done - self._before)
-        return max(0.0, (total - done) * each - (now - self._last))
+        item_s = (self._last - self._start) / (done - self._initially_done)
+        return max(0.0, (total - done) * item_s - (now - self._last))
 
 
 def _bar() -> Bar:
@@ -105,11 +124,16 @@ def _bar() -> Bar:
     return Progress(*columns, TextColumn("{task.fields[left]}"), console=Console(stderr=True), transient=True)
 
 
-def summary(record: Mapping[str, Any], directory: Path) -> str:
-    """Say in a few lines what a run did, how large its error is, and how long it took."""
+def run_summary(record: Mapping[str, Any], directory: Path) -> str:
+    """Summarise a run in a few lines: frames, steps, forces, warnings and timings.
+
+    Args:
+        record: content of its run.json.
+        directory: of its results.
+    """
     times, (rows, cols) = record["timings"], record["points"]
     stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in times.items() if stage != "total")
-    beside = times["encode"] > 0 and record["threads"] > 1
+    parallel = times["encode"] > 0 and record["threads"] > 1
     steps = (
         f"at rest to {record['residual']:.1g} of the largest force, {record['evaluations']} evaluations of the forces"
         if record["step"] is None
@@ -121,6 +145,6 @@ def summary(record: Mapping[str, Any], directory: Path) -> str:
         *([f"the first {record['resumed']} frames were simulated by an earlier run"] if record["resumed"] else []),
         *(f"probes.{index}: {describe_forces(probe)}" for index, probe in enumerate(record["probes"])),
         *record["notes"],
-        f"{times['total']:.2f} s: {stages}{' (encoding runs in parallel)' if beside else ''}",
+        f"{times['total']:.2f} s: {stages}{' (encoding runs in parallel)' if parallel else ''}",
     ]
     return "\n".join(lines)

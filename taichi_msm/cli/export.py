@@ -1,25 +1,16 @@
-"""taichi_msm.cli.main.export."""
+"""The command `export`."""
 
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING
 
 import click
 
-from taichi_msm.cli.options import Choice, json_option, program
-from taichi_msm.cli.session import DONE, interrupted, interruptible, print_json, result_directory
-from taichi_msm.errors import (
-    printable,
-)
+from taichi_msm.cli.options import SuggestingChoice, json_option, program
+from taichi_msm.cli.session import DONE, interruptible_progress, print_json, report_interruption, result_directory
+from taichi_msm.errors import printable
 from taichi_msm.exports.formats import FORMATS
 from taichi_msm.system.process import Interruption
-
-if TYPE_CHECKING:
-    pass
-
-# So many files of an export are named at the end; more are counted.
-FEW = 2
 
 
 @program.command()
@@ -27,7 +18,7 @@ FEW = 2
 @click.option(
     "--format",
     "name",
-    type=Choice(FORMATS),
+    type=SuggestingChoice(FORMATS),
     metavar="FORMAT",
     required=True,
     help="; ".join(f"{name}: {row.means}" for name, row in FORMATS.items()) + ".",
@@ -47,20 +38,24 @@ def export(
     runs = [result_directory(directory, option="DIR") for directory in directories]
     folder = None if out is None else result_directory(out)
 
-    from taichi_msm.cli.console import Progress
+    from taichi_msm.cli.console import ProgressDisplay
     from taichi_msm.exports import export as export_module
 
     interruption = Interruption()
     try:
-        with Progress(quiet=quiet or as_json) as bar:
-            done = export_module.export(runs, name, folder, partial(interruptible(bar, interruption), "export"), camera)
+        with ProgressDisplay(quiet=quiet or as_json) as bar:
+            exported = export_module.export(
+                runs, name, folder, partial(interruptible_progress(bar, interruption), "export"), camera
+            )
     except KeyboardInterrupt:
-        return interrupted(interruption, as_json)
+        return report_interruption(interruption, as_json)
     if as_json:
-        print_json({"directory": str(done.directory), "format": name, "files": done.files, "notes": done.notes})
+        print_json(
+            {"directory": str(exported.directory), "format": name, "files": exported.files, "notes": exported.notes}
+        )
     elif not quiet:
-        files = ", ".join(done.files) if len(done.files) <= FEW else f"{len(done.files)} files"
-        click.echo(printable(f"{done.directory}: {files}"))
-        for note in done.notes:
+        files = ", ".join(exported.files) if len(exported.files) <= 2 else f"{len(exported.files)} files"
+        click.echo(printable(f"{exported.directory}: {files}"))
+        for note in exported.notes:
             click.echo(printable(note))
     return DONE

@@ -1,22 +1,23 @@
-"""taichi_msm.cli.main.fit."""
+"""The command `fit`."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from taichi_msm.cli.options import json_option, program, scene_argument, set_option, workers_option
-from taichi_msm.cli.session import DIVERGED, DONE, interrupted, interruptible, print_json, report, result_directory
-from taichi_msm.errors import (
-    DivergedError,
-    printable,
+from taichi_msm.cli.session import (
+    DIVERGED,
+    DONE,
+    interruptible_progress,
+    print_json,
+    report_failure,
+    report_interruption,
+    result_directory,
 )
+from taichi_msm.errors import DivergedError, printable
 from taichi_msm.system.process import Interruption
-
-if TYPE_CHECKING:
-    pass
 
 
 @program.command()
@@ -63,31 +64,31 @@ def fit(
     """Find numbers of SCENE from what was seen of the tissue, OBSERVED, and how well they are known."""
     from taichi_msm.load.scene_file import load_scene
 
-    # Both options take several words.
+    # Both options accept several words, of which click assigns all but the first to `more`.
     free = (*free, *(word for word in more if "=" not in word))
     limits: dict[str, tuple[float, float]] = {}
-    for key, ends in map(read_bounds, (*bounds, *(word for word in more if "=" in word))):
+    for key, interval in map(parse_bounds, (*bounds, *(word for word in more if "=" in word))):
         if key in limits:
             raise click.BadParameter(f"{key}: given twice; leave one of them out", param_hint="--bounds")
-        limits[key] = ends
+        limits[key] = interval
     loaded = load_scene(scene, overrides)
     directory = result_directory(out, f"{Path(scene).stem}-fit")
 
-    from taichi_msm.cli.console import Progress
-    from taichi_msm.fitting.fit import fit as find
+    from taichi_msm.cli.console import ProgressDisplay
+    from taichi_msm.fitting.fit import fit as fit_scene
 
     interruption = Interruption()
     try:
-        with Progress(quiet=as_json) as bar:
-            found = find(
+        with ProgressDisplay(quiet=as_json) as bar:
+            result = fit_scene(
                 loaded,
                 observed,
                 free,
                 bounds=limits,
-                forces=None if forces is None else read_forces_option(forces),
+                forces=None if forces is None else parse_forces(forces),
                 directory=directory,
                 workers=workers,
-                progress=interruptible(bar, interruption),
+                progress=interruptible_progress(bar, interruption),
                 sigma=sigma,
                 robust=robust,
                 profile=profile,
@@ -96,37 +97,37 @@ def fit(
                 resolution=resolution,
             )
     except KeyboardInterrupt:
-        return interrupted(interruption, as_json)
+        return report_interruption(interruption, as_json)
     except DivergedError as error:
-        report("diverged", [f"{scene}: where the search begins: {error}"], as_json)
+        report_failure("diverged", [f"{scene}: where the search begins: {error}"], as_json)
         return DIVERGED
     if as_json:
-        print_json({"directory": str(directory), **found.as_json()})
+        print_json({"directory": str(directory), **result.as_json()})
     else:
-        click.echo("\n".join(map(printable, [f"{directory}: fit of {observed}", *found.summary()])))
+        click.echo("\n".join(map(printable, [f"{directory}: fit of {observed}", *result.summary()])))
     return DONE
 
 
-def read_bounds(text: str) -> tuple[str, tuple[float, float]]:
-    """Read KEY=LOW,HIGH; an end that is left out is infinite."""
-    key, _, ends = text.partition("=")
-    low, comma, high = ends.partition(",")
+def parse_bounds(text: str) -> tuple[str, tuple[float, float]]:
+    """Parse KEY=LOW,HIGH; a missing bound is infinite."""
+    key, _, interval = text.partition("=")
+    low, comma, high = interval.partition(",")
     try:
         if not comma:
             raise ValueError
         return key.strip(), (float(low or "-inf"), float(high or "inf"))
     except ValueError:
-        said = f"{text}: expected KEY=LOW,HIGH, such as tissue.young=5e3,1e5"
-        raise click.BadParameter(said, param_hint="--bounds") from None
+        message = f"{text}: expected KEY=LOW,HIGH, such as tissue.young=5e3,1e5"
+        raise click.BadParameter(message, param_hint="--bounds") from None
 
 
-def read_forces_option(text: str) -> tuple[str, float]:
-    """Read FILE,SIGMA."""
+def parse_forces(text: str) -> tuple[str, float]:
+    """Parse FILE,SIGMA."""
     name, _, sigma = text.rpartition(",")
     try:
         if not name:
             raise ValueError
         return name, float(sigma)
     except ValueError:
-        said = f"{text}: expected FILE,SIGMA, such as forces.csv,0.01"
-        raise click.BadParameter(said, param_hint="--forces") from None
+        message = f"{text}: expected FILE,SIGMA, such as forces.csv,0.01"
+        raise click.BadParameter(message, param_hint="--forces") from None

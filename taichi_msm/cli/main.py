@@ -1,4 +1,4 @@
-"""The command line: arguments, exit codes, printing. No other module prints or exits."""
+"""Entry point of the command line: exit codes and messages of errors."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
-from taichi_msm.cli import export, fit, run, study, sweep  # noqa: F401, each adds its commands
+from taichi_msm.cli import export, fit, run, study, sweep  # noqa: F401  # each registers its commands
 from taichi_msm.cli.options import program
-from taichi_msm.cli.session import BUG, DONE, FILES, WRONG_INPUT, report
+from taichi_msm.cli.session import BUG, DONE, FILES, INVALID_INPUT, report_failure
 from taichi_msm.errors import (
     ArgumentError,
     DeviceError,
@@ -21,29 +20,31 @@ from taichi_msm.errors import (
     NotInstalledError,
     SceneError,
 )
-from taichi_msm.system.process import mute, tell
-
-if TYPE_CHECKING:
-    pass
+from taichi_msm.system.process import discard_buffer, write_stderr
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line, with arguments instead of the process's, and give the exit code.
+    """Run the command line.
 
-    0 done, 1 a bug, 2 wrong scene or arguments, 3 diverged, 4 files, 130 Ctrl-C, 143 SIGTERM.
+    Args:
+        arguments: words of the command line, or None for those of the process.
+
+    Returns:
+        The exit code: 0 done, 1 a bug, 2 invalid scene or arguments, 3 diverged, 4 files cannot be read or written,
+        130 Ctrl-C, 143 SIGTERM.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         code, lines = _run(words)
         if lines:
-            report("error", lines, "--json" in words)
+            report_failure("error", lines, "--json" in words)
         return code
     except OSError as error:
-        # The reader of stdout is gone, or its disk is full.
-        mute(sys.stdout)
+        # The reader of stdout has exited, or its disk is full.
+        discard_buffer(sys.stdout)
         if not isinstance(error, BrokenPipeError):
-            where = f" {error.filename}" if error.filename else ""
-            tell([f"taichi-msm: cannot read or write{where}: {error.strerror or error}"])
+            name = f" {error.filename}" if error.filename else ""
+            write_stderr([f"taichi-msm: cannot read or write{name}: {error.strerror or error}"])
         return FILES
 
 
@@ -56,26 +57,26 @@ def _run(words: list[str]) -> tuple[int, Sequence[str]]:
     try:
         return int(program.main(words, prog_name="taichi-msm", standalone_mode=False) or DONE), ()
     except SystemExit:
-        # This is how click ends when the reader of stdout is gone.
+        # click exits like this when the reader of stdout has exited.
         raise BrokenPipeError from None
     except SceneError as error:
-        return WRONG_INPUT, error.lines
+        return INVALID_INPUT, error.lines
     except (ArgumentError, DeviceError, ExecutorError, NotInstalledError) as error:
-        return WRONG_INPUT, [str(error)]
+        return INVALID_INPUT, [str(error)]
     except FilesError as error:
         return FILES, [str(error)]
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message())
-        return WRONG_INPUT, ()
+        return INVALID_INPUT, ()
     except click.ClickException as error:
-        said = " ".join(error.format_message().split())
-        if "--set" in words and "unexpected extra argument" in said:
-            said = f'{said.rstrip(".")}; a value with blanks needs quotes: --set "KEY=VALUE"'
-        return WRONG_INPUT, [f"taichi-msm: {said} (see taichi-msm --help)"]
+        message = " ".join(error.format_message().split())
+        if "--set" in words and "unexpected extra argument" in message:
+            message = f'{message.rstrip(".")}; a value with blanks needs quotes: --set "KEY=VALUE"'
+        return INVALID_INPUT, [f"taichi-msm: {message} (see taichi-msm --help)"]
     except OSError:
         raise
     except Exception as error:
         if os.environ.get("TAICHI_MSM_TRACEBACK"):
             raise
-        said = f"a bug: {type(error).__name__}: {' '.join(str(error).split())}"
-        return BUG, [f"taichi-msm: {said}; please report it with what TAICHI_MSM_TRACEBACK=1 prints"]
+        message = f"a bug: {type(error).__name__}: {' '.join(str(error).split())}"
+        return BUG, [f"taichi-msm: {message}; please report it with what TAICHI_MSM_TRACEBACK=1 prints"]

@@ -1,43 +1,55 @@
-"""taichi_msm.cli.main.options."""
+"""Options and arguments that several commands share."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
-from taichi_msm.errors import (
-    MAX_WORKERS,
-    did_you_mean,
-)
+from taichi_msm.errors import MAX_WORKERS, did_you_mean
 from taichi_msm.version import __version__
 
-if TYPE_CHECKING:
-    pass
 
-
-class Choice(click.Choice):  # type: ignore[type-arg]  # before click 8.2 it takes none
-    """One of some words; the message about any other names the nearest."""
+class SuggestingChoice(click.Choice):  # type: ignore[type-arg]  # not generic before click 8.2
+    """Type of an option with a fixed set of words; errors suggest the nearest word."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """Give the word, or say which may have been meant."""
+        """Return the word.
+
+        Args:
+            value: the word on the command line.
+            param: the option.
+            ctx: of the command.
+
+        Raises:
+            click.BadParameter: when the word is not allowed; suggests the nearest word.
+        """
         try:
             return str(super().convert(value, param, ctx))
         except click.BadParameter as error:
-            said = error.message.rstrip(".") + did_you_mean(str(value), [str(word) for word in self.choices])
-            raise click.BadParameter(said, ctx, param) from None
+            message = error.message.rstrip(".") + did_you_mean(str(value), [str(word) for word in self.choices])
+            raise click.BadParameter(message, ctx, param) from None
 
 
-class Shard(click.ParamType):  # type: ignore[type-arg]  # as above
-    """A part of some work, I/N: part I of N, from 1."""
+class ShardType(click.ParamType):  # type: ignore[type-arg]  # as above
+    """Type of an option I/N: part I of N, from 1."""
 
     name = "I/N"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
-        """Read the two numbers."""
+        """Return I and N.
+
+        Args:
+            value: the word on the command line.
+            param: the option.
+            ctx: of the command.
+
+        Raises:
+            click.BadParameter: when the word is not I/N with 1 <= I <= N.
+        """
         numbers = re.fullmatch("([0-9]{1,9})/([0-9]{1,9})", value)
         if numbers is None or not 1 <= int(numbers[1]) <= int(numbers[2]):
             self.fail(f"{value} is no part; take I/N with 1 <= I <= N, such as 3/8", param, ctx)
@@ -69,28 +81,42 @@ workers_option = partial(click.option, "--workers", type=click.IntRange(1, MAX_W
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout and nothing else.")
 
 
-def tell_version(context: click.Context, _option: click.Parameter, asked: bool) -> None:
-    """Print the versions of the program and of its compiler, and end, if that was asked for."""
-    if asked:
-        from taichi_msm.system.compiler import chosen
+def print_version(context: click.Context, _option: click.Parameter, requested: bool) -> None:
+    """Print the versions of the program and of its compiler, and exit; a callback of click.
+
+    Args:
+        context: of the program.
+        requested: whether the option was given.
+    """
+    if requested:
+        from taichi_msm.system.compiler import active_compiler
 
         click.echo(f"taichi-msm {__version__}")
-        click.echo(f"{chosen().title} {chosen().version}")
+        click.echo(f"{active_compiler().title} {active_compiler().version}")
         context.exit()
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
 @click.option(
-    "--version", is_flag=True, is_eager=True, expose_value=False, callback=tell_version, help="Print the versions."
+    "--version", is_flag=True, is_eager=True, expose_value=False, callback=print_version, help="Print the versions."
 )
 def program() -> None:
     """Deform an image as tissue deforms."""
 
 
-def require_alone(context: click.Context, does: str, allowed: Sequence[str]) -> None:
-    """Make sure that no scene and no settings were given with an option that takes those of an earlier run."""
+def require_no_settings(context: click.Context, action: str, allowed: Sequence[str]) -> None:
+    """Check that an option that reuses the settings of an earlier run was given without other settings.
+
+    Args:
+        context: of the command.
+        action: the option and its verb, for the message.
+        allowed: names of the parameters that may be given.
+
+    Raises:
+        click.UsageError: when another parameter was given.
+    """
     for option in context.command.params:
         typed = context.get_parameter_source(str(option.name)) is click.core.ParameterSource.COMMANDLINE
         if typed and option.name not in allowed:
             name = option.opts[0] if isinstance(option, click.Option) else "SCENE"
-            raise click.UsageError(f"{does} a run with its own settings; leave out {name}")
+            raise click.UsageError(f"{action} a run with its own settings; leave out {name}")

@@ -1,20 +1,20 @@
-"""taichi_msm.cli.main.run."""
+"""The commands `run`, `check` and `schema`."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
-from taichi_msm.cli import STARTED
+from taichi_msm.cli import START_TIME
 from taichi_msm.cli.options import (
     arch_option,
     image_option,
     json_option,
     program,
     quality_option,
-    require_alone,
+    require_no_settings,
     scene_argument,
     set_option,
     threads_option,
@@ -22,22 +22,20 @@ from taichi_msm.cli.options import (
 from taichi_msm.cli.session import (
     DONE,
     EXIT_CODES,
-    going_on,
-    interrupted,
-    interruptible,
-    naming,
+    add_resume_hint,
+    interruptible_progress,
+    plan_repetition,
+    prefix_errors,
     print_json,
-    repeated,
+    report_interruption,
     result_directory,
-    resumable,
+    resume_hint,
 )
-from taichi_msm.system.process import Interruption, tell
+from taichi_msm.system.process import Interruption, write_stderr
 
-if TYPE_CHECKING:
-    pass
-# What may be given together with --resume, and with --again.
-RESUMABLE = ("resume", "threads", "quiet", "as_json")
-REPEATABLE = ("again", "out", "arch", "threads", "estimate_error", "quiet", "as_json")
+# Parameters that may be given together with --resume and --again.
+RESUME_OPTIONS = ("resume", "threads", "quiet", "as_json")
+REPEAT_OPTIONS = ("again", "out", "arch", "threads", "estimate_error", "quiet", "as_json")
 
 
 @program.command()
@@ -81,14 +79,14 @@ def run(
     overrides += () if quality is None else (f"render.quality={quality}",)
     typed = [*overrides, *([f"image={image}"] if image is not None else [])]
     if resume is not None:
-        require_alone(context, "--resume continues", RESUMABLE)
+        require_no_settings(context, "--resume continues", RESUME_OPTIONS)
         directory = result_directory(resume, option="--resume")
-        if not going_on(directory):
+        if not resume_hint(directory):
             raise click.BadParameter(f"there is no unfinished run in {resume}", param_hint="--resume")
     elif again is not None:
-        require_alone(context, "--again repeats", REPEATABLE)
+        require_no_settings(context, "--again repeats", REPEAT_OPTIONS)
         directory = result_directory(again, option="--again") if out is None else result_directory(out)
-        plan, typed = repeated(again)
+        plan, typed = plan_repetition(again)
     elif scene is None:
         raise click.MissingParameter(param_hint="'SCENE'", param_type="argument")
     else:
@@ -97,15 +95,15 @@ def run(
         plan = load_plan(scene, overrides, image)
         directory = result_directory(out, Path(scene).stem)
 
-    from taichi_msm.cli.console import Progress, summary
+    from taichi_msm.cli.console import ProgressDisplay, run_summary
     from taichi_msm.runs import run as run_module
 
     interruption, name = Interruption(), str(scene or resume or again)
     try:
-        with Progress(quiet=quiet or as_json) as bar, resumable(directory), naming(name):
-            progress = interruptible(bar, interruption)
+        with ProgressDisplay(quiet=quiet or as_json) as bar, add_resume_hint(directory), prefix_errors(name):
+            progress = interruptible_progress(bar, interruption)
             if resume is not None:
-                record = run_module.resume(directory, threads=threads, started=STARTED, progress=progress)
+                record = run_module.resume(directory, threads=threads, started=START_TIME, progress=progress)
             else:
                 record = run_module.run(
                     plan,
@@ -114,19 +112,19 @@ def run(
                     threads=threads,
                     overrides=typed,
                     estimate_error=estimate_error,
-                    started=STARTED,
+                    started=START_TIME,
                     progress=progress,
                 )
     except KeyboardInterrupt:
-        return interrupted(interruption, as_json, f"interrupted; nothing was written{going_on(directory)}")
+        return report_interruption(interruption, as_json, f"interrupted; nothing was written{resume_hint(directory)}")
     if as_json:
         print_json({"directory": str(directory), **record})
     if record["status"] != "complete":
-        said = f"{name}: {record.get('error', 'interrupted')}; frames in {directory}: {record['frames']}"
-        then = f"; last good state: {record['dump']}" if record.get("dump") else going_on(directory)
-        tell([said + then])
+        message = f"{name}: {record.get('error', 'interrupted')}; frames in {directory}: {record['frames']}"
+        remedy = f"; last good state: {record['dump']}" if record.get("dump") else resume_hint(directory)
+        write_stderr([message + remedy])
     elif not quiet and not as_json:
-        click.echo(summary(record, directory))
+        click.echo(run_summary(record, directory))
     return EXIT_CODES.get(record["status"], interruption.code)
 
 
@@ -146,7 +144,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     from taichi_msm.render.texture import load_texture
 
     plan = load_plan(scene, overrides, image)
-    with naming(scene):
+    with prefix_errors(scene):
         cost_module.require_disk(plan, Path("output"))
         if plan.scene.draws:
             load_texture(plan.scene)
@@ -160,12 +158,12 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     }
     if loaded.time.at_rest:
         steps |= dict.fromkeys(("step", "stable_step", "steps_per_frame", "steps"))
-    need, takes = cost_module.estimate_memory(plan), cost_module.estimate_duration(plan)
+    need, duration = cost_module.estimate_memory(plan), cost_module.estimate_duration(plan)
     facts: dict[str, Any] = {
         "scene": loaded.model_dump(mode="json"),
         **steps,
         "frames": need.frames,
-        "estimated_seconds": takes.seconds,
+        "estimated_seconds": duration.seconds,
         "memory": need.memory_bytes,
         "disk": need.disk_bytes,
         "disk_while_running": need.disk_bytes + need.working_bytes,
@@ -183,24 +181,26 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
 
     from taichi_msm.load.cost import rough_time
 
-    asking = [f"{name}.tolerance" for name in ("sheet", "time") if getattr(loaded, name).tolerance is not None]
-    more, longer = (", or more", f", or longer, as {' and '.join(asking)} may ask for more") if asking else ("", "")
+    tolerances = [f"{name}.tolerance" for name in ("sheet", "time") if getattr(loaded, name).tolerance is not None]
+    # Pilot runs may refine a scene with a tolerance.
+    more = ", or more" if tolerances else ""
+    longer = f", or longer, as {' and '.join(tolerances)} may ask for more" if tolerances else ""
     click.echo(yaml.safe_dump(facts["scene"], sort_keys=False, default_flow_style=None), nl=False)
-    stepped = (
+    stepping = (
         f"each at rest{more}, in {grid.precision}"
         if loaded.time.at_rest
         else f"{need.steps} steps of {grid.step:.6g} s (limit {limit:.6g} s), {grid.steps_per_frame} a frame{more}, in "
         f"{grid.precision}"
     )
     click.echo(
-        f"\n{need.points} points, {need.frames} frames, {stepped}\n"
-        f"about {rough_time(takes.seconds)} to run{longer} (estimated from its work)\n"
+        f"\n{need.points} points, {need.frames} frames, {stepping}\n"
+        f"about {rough_time(duration.seconds)} to run{longer} (estimated from its work)\n"
         f"about {need.memory_bytes / 2**20:.0f} MiB of memory, at most {need.disk_bytes / 2**20:.1f} MiB on disk, "
         f"{need.working_bytes / 2**20:.1f} MiB more while it runs"
     )
     for index, probe in enumerate(facts["probes"]):
-        if said := describe_forces(probe):
-            click.echo(f"probes.{index}: {said}")
+        if description := describe_forces(probe):
+            click.echo(f"probes.{index}: {description}")
     for note in facts["notes"]:
         click.echo(note)
     return DONE

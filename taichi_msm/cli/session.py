@@ -1,4 +1,4 @@
-"""taichi_msm.cli.main.session."""
+"""Exit codes, directories, interruption and error messages that the commands share."""
 
 from __future__ import annotations
 
@@ -11,25 +11,22 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from taichi_msm.errors import (
-    FilesError,
-    SceneError,
-)
+from taichi_msm.errors import FilesError, SceneError
 from taichi_msm.runs.directory import without_link
-from taichi_msm.system.process import Interruption, tell
+from taichi_msm.system.process import Interruption, write_stderr
 
 if TYPE_CHECKING:
-    from taichi_msm.cli.console import Progress
+    from taichi_msm.cli.console import ProgressDisplay
     from taichi_msm.model.plan import Plan
 
 
-DONE, BUG, WRONG_INPUT, DIVERGED, FILES = 0, 1, 2, 3, 4
+DONE, BUG, INVALID_INPUT, DIVERGED, FILES = 0, 1, 2, 3, 4
 
 EXIT_CODES = {"complete": DONE, "diverged": DIVERGED}
 
 
-def repeated(directory: str) -> tuple[Plan, list[str]]:
-    """Plan the scene of an earlier run, with its pictures where they are, and the overrides that made it."""
+def plan_repetition(directory: str) -> tuple[Plan, list[str]]:
+    """Return the plan of an earlier run, whose pictures are read again, and the overrides of that run."""
     from taichi_msm.load.check import checked
     from taichi_msm.runs.finished import read_run
 
@@ -39,7 +36,16 @@ def repeated(directory: str) -> tuple[Plan, list[str]]:
 
 
 def result_directory(out: str | None, default: str = "", option: str = "--out") -> Path:
-    """Choose where results go."""
+    """Return the directory of results.
+
+    Args:
+        out: the directory that the user has named, or None.
+        default: name of the default directory within output/.
+        option: name of the option in messages.
+
+    Raises:
+        click.BadParameter: when the name is empty, or no default directory has this name.
+    """
     if out == "":
         raise click.BadParameter("is empty; name a directory", param_hint=option)
     if out is not None:
@@ -49,8 +55,8 @@ def result_directory(out: str | None, default: str = "", option: str = "--out") 
     return without_link(without_link(Path("output"), option) / default, option)
 
 
-def going_on(directory: Path) -> str:
-    """Say how to continue the unfinished run in a directory; empty if there is none."""
+def resume_hint(directory: Path) -> str:
+    """Return the command that continues the unfinished run in a directory; empty if there is no such run."""
     from taichi_msm.runs.checkpoint import is_unfinished
 
     if not is_unfinished(directory):
@@ -59,33 +65,38 @@ def going_on(directory: Path) -> str:
 
 
 @contextmanager
-def resumable(directory: Path) -> Iterator[None]:
-    """Add to errors how to continue a run that has begun."""
+def add_resume_hint(directory: Path) -> Iterator[None]:
+    """Append the command that continues an unfinished run to errors about its files."""
     try:
         yield
     except FilesError as error:
-        # What cannot be written now may be written later; trying again does not help if a file is damaged or locked.
-        raise FilesError(f"{error}{going_on(directory) if isinstance(error.__cause__, OSError) else ''}") from None
+        # Continuing may help if a file cannot be written now, but not if it is damaged or locked.
+        raise FilesError(f"{error}{resume_hint(directory) if isinstance(error.__cause__, OSError) else ''}") from None
 
 
 @contextmanager
-def naming(scene: str) -> Iterator[None]:
-    """Add the name of the scene to errors that are found after it was loaded."""
+def prefix_errors(scene: str) -> Iterator[None]:
+    """Prefix errors that are raised after a scene was loaded with the name of the scene."""
     try:
         yield
     except SceneError as error:
         raise SceneError([f"{scene}: {line}" for line in error.lines]) from None
 
 
-def interruptible(bar: Progress, interruption: Interruption) -> Callable[[str, int, int], None]:
-    """Show the progress of some work, and stop it after an interruption when it next reports its progress."""
+def interruptible_progress(bar: ProgressDisplay, interruption: Interruption) -> Callable[[str, int, int], None]:
+    """Return a progress callback that updates a display and raises KeyboardInterrupt after an interruption.
+
+    Args:
+        bar: shows the progress.
+        interruption: receives the signals from the first call on.
+    """
 
     def progress(stage: str, done: int, total: int) -> None:
         bar.update(stage, done, total)
-        # Before the first stage, the process may end at once. While results are put in place, nothing interrupts that.
+        # Before the first stage, a signal may end the process at once. Moving results into place is not interrupted.
         interruption.listen()
         if stage != "write":
-            interruption.grant()
+            interruption.raise_if_requested()
 
     return progress
 
@@ -95,14 +106,31 @@ def print_json(value: Any) -> None:
     click.echo(json.dumps(value, indent=2, allow_nan=False))
 
 
-def interrupted(interruption: Interruption, as_json: bool, said: str = "interrupted; nothing was written") -> int:
-    """Say that there are no results, and give the exit code."""
-    report("interrupted", [said], as_json)
+def report_interruption(
+    interruption: Interruption, as_json: bool, message: str = "interrupted; nothing was written"
+) -> int:
+    """Report that a command was interrupted.
+
+    Args:
+        interruption: the signal.
+        as_json: whether to print a JSON object on stdout too.
+        message: printed to stderr.
+
+    Returns:
+        The exit code.
+    """
+    report_failure("interrupted", [message], as_json)
     return interruption.code
 
 
-def report(status: str, lines: Sequence[str], as_json: bool) -> None:
-    """Say why there are no results."""
-    tell(lines)
+def report_failure(status: str, lines: Sequence[str], as_json: bool) -> None:
+    """Report that a command has no results.
+
+    Args:
+        status: of the JSON object.
+        lines: messages, which are printed to stderr.
+        as_json: whether to print a JSON object on stdout too.
+    """
+    write_stderr(lines)
     if as_json:
         print_json({"status": status, "errors": list(lines)})

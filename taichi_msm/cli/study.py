@@ -1,11 +1,10 @@
-"""taichi_msm.cli.main.study."""
+"""The commands `study` and `view`."""
 
 from __future__ import annotations
 
 import math
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -22,20 +21,15 @@ from taichi_msm.cli.session import (
     DIVERGED,
     DONE,
     EXIT_CODES,
-    interrupted,
-    interruptible,
-    naming,
+    interruptible_progress,
+    prefix_errors,
     print_json,
+    report_interruption,
     result_directory,
 )
-from taichi_msm.errors import (
-    printable,
-)
+from taichi_msm.errors import printable
 from taichi_msm.runs.directory import without_link
-from taichi_msm.system.process import Interruption, tell
-
-if TYPE_CHECKING:
-    pass
+from taichi_msm.system.process import Interruption, write_stderr
 
 
 @program.command()
@@ -76,26 +70,26 @@ def study(
         expected = f"expected a number, {SMALLEST_TOLERANCE:g} to {LARGEST_TOLERANCE:g}"
         raise click.BadParameter(f"{tolerance:g} is not allowed; {expected}", param_hint="--tolerance")
 
-    from taichi_msm.cli.console import Progress
+    from taichi_msm.cli.console import ProgressDisplay
     from taichi_msm.study.report import RECORD, as_record, require_writable, summary, write_report
-    from taichi_msm.study.study import study as measure
+    from taichi_msm.study.study import study as study_scene
 
     require_writable(directory)
     interruption = Interruption()
-    with Progress(quiet=as_json) as bar, naming(scene):
-        results = measure(
+    with ProgressDisplay(quiet=as_json) as bar, prefix_errors(scene):
+        results = study_scene(
             loaded,
             Path(scene).stem,
             tolerance=tolerance,
             quick=quick,
             arch=arch,
             threads=threads,
-            progress=interruptible(bar, interruption),
+            progress=interruptible_progress(bar, interruption),
         )
     if not results.stepping:
-        return interrupted(interruption, as_json)
+        return report_interruption(interruption, as_json)
     if results.status == "interrupted" and (directory / RECORD).exists():
-        # An earlier study is not replaced by part of a new one.
+        # A partial study must not replace a complete one.
         directory = without_link(directory / "interrupted", "--out")
     outputs = write_report(results, directory)
     if as_json:
@@ -148,42 +142,46 @@ def view(
     directory = result_directory(out, f"{Path(scene).stem}-live")
 
     from taichi_msm.render.notes import drawing_warnings
-    from taichi_msm.view.script import film, load_script, timed
+    from taichi_msm.view.script import load_script, record_film, schedule_events
 
-    done = load_script(script, loaded.render.size) if script is not None else None
+    loaded_script = load_script(script, loaded.render.size) if script is not None else None
 
-    from taichi_msm.cli.console import Progress
+    from taichi_msm.cli.console import ProgressDisplay
     from taichi_msm.view.recording import Captures
     from taichi_msm.view.session import Session
 
-    tell([*drawing_warnings(loaded)])
+    write_stderr([*drawing_warnings(loaded)])
     captures, interruption = Captures(directory, scene), Interruption()
     notices: list[str] = []
 
     def begin() -> Session:
-        with Progress(quiet=False) as bar:
-            progress = interruptible(bar, interruption)
+        with ProgressDisplay(quiet=False) as bar:
+            progress = interruptible_progress(bar, interruption)
             return Session(loaded, captures, arch, threads, play=play, progress=lambda stage: progress(stage, 0, 0))
 
     try:
-        with naming(scene):
+        with prefix_errors(scene):
             if record is None or seconds is None:
-                from taichi_msm.view.window import Window, show
+                from taichi_msm.view.window import Window, run_session
 
                 with Window(f"taichi-msm {scene}", loaded.render.size) as window:
-                    window.say("one moment: compiling")
+                    window.announce("one moment: compiling")
                     with begin() as session:
-                        show(session, window, interruption.grant)
+                        run_session(session, window, interruption.raise_if_requested)
             else:
-                with begin() as session, Progress(quiet=False) as bar:
-                    events = timed(done, session.rate, loaded.render.size) if done else ()
-                    progress = partial(interruptible(bar, interruption), "film")
-                    film(session, Path(record), seconds, events, progress, notices.append)
+                with begin() as session, ProgressDisplay(quiet=False) as bar:
+                    events = (
+                        schedule_events(loaded_script, session.frame_rate, loaded.render.size) if loaded_script else ()
+                    )
+                    progress = partial(interruptible_progress(bar, interruption), "film")
+                    record_film(session, Path(record), seconds, events, progress, notices.append)
                 click.echo(printable(record))
     except KeyboardInterrupt:
-        return interrupted(interruption, False, "interrupted" if record is None else "interrupted; no film was written")
+        return report_interruption(
+            interruption, False, "interrupted" if record is None else "interrupted; no film was written"
+        )
     finally:
-        tell(notices)
+        write_stderr(notices)
         for path in captures.saved:
             click.echo(printable(str(path)))
-    return DIVERGED if record is not None and session.fault else DONE
+    return DIVERGED if record is not None and session.divergence_error else DONE

@@ -1,4 +1,4 @@
-"""taichi_msm.cli.main.sweep."""
+"""The command `sweep`."""
 
 from __future__ import annotations
 
@@ -7,19 +7,25 @@ from typing import TYPE_CHECKING
 
 import click
 
-from taichi_msm.cli.options import Shard, json_option, program, workers_option
-from taichi_msm.cli.session import DONE, FILES, interrupted, interruptible, print_json, report, result_directory
-from taichi_msm.errors import (
-    LostExecutorError,
-    printable,
+from taichi_msm.cli.options import ShardType, json_option, program, workers_option
+from taichi_msm.cli.session import (
+    DONE,
+    FILES,
+    interruptible_progress,
+    print_json,
+    report_failure,
+    report_interruption,
+    result_directory,
 )
-from taichi_msm.system.process import Interruption, tell
+from taichi_msm.errors import LostExecutorError, printable
+from taichi_msm.system.process import Interruption, write_stderr
 
 if TYPE_CHECKING:
     from taichi_msm.sweeps.spec import Sweep
-    from taichi_msm.sweeps.tables import Cost
-# Sweeps of more runs, or of more seconds, must be meant.
-MANY_RUNS, LONG = 10_000, 86400
+    from taichi_msm.sweeps.tables import SweepCost
+
+# A sweep with more runs needs the option --yes.
+MAX_UNCONFIRMED_RUNS = 10_000
 
 
 @program.command()
@@ -27,9 +33,9 @@ MANY_RUNS, LONG = 10_000, 86400
 @click.option("--out", metavar="DIR", help="Directory for the runs.  [default: output/<name of the sweep file>]")
 @workers_option(help="Processes that take the runs.  [default: one for each core, as far as memory goes]")
 @click.option("--dask", metavar="ADDRESS", help="Let the workers of a dask scheduler take the runs.")
-@click.option("--shard", type=Shard(), metavar="I/N", help="Take only part I of N of the runs; write no table.")
+@click.option("--shard", type=ShardType(), metavar="I/N", help="Take only part I of N of the runs; write no table.")
 @click.option("--dry-run", is_flag=True, help="Print the values of all runs, and what they take; run nothing.")
-@click.option("--yes", is_flag=True, help=f"Take more than {MANY_RUNS} runs, or longer than a day.")
+@click.option("--yes", is_flag=True, help=f"Take more than {MAX_UNCONFIRMED_RUNS} runs, or longer than a day.")
 @json_option
 def sweep(
     file: str,
@@ -42,74 +48,90 @@ def sweep(
     as_json: bool,
 ) -> int:
     """Run a scene many times with varied values, as SWEEP says, and write a table of the results."""
-    from taichi_msm.cli.console import Progress
+    from taichi_msm.cli.console import ProgressDisplay
     from taichi_msm.sweeps.runs import begin_sweep
     from taichi_msm.sweeps.spec import load_sweep
-    from taichi_msm.sweeps.sweep import finish, go_on, opened
-    from taichi_msm.sweeps.tables import choose_workers, cost_line, count, estimate, summary_lines
+    from taichi_msm.sweeps.sweep import finish_sweep, open_executor, run_missing
+    from taichi_msm.sweeps.tables import choose_worker_count, cost_line, count_statuses, estimate_cost, summary_lines
 
     if workers is not None and dask is not None:
         raise click.UsageError("--workers are processes here, and --dask has its own; leave out one of them")
-    described = load_sweep(file)
+    loaded = load_sweep(file)
     directory = result_directory(out, Path(file).stem)
-    cost = estimate(described)
-    chosen = choose_workers(cost, described.runs, workers)
+    cost = estimate_cost(loaded)
+    chosen = choose_worker_count(cost, loaded.runs, workers)
     if dry_run:
-        return print_plan(described, cost, shard or (1, 1), workers, as_json)
-    if not yes and (described.runs > MANY_RUNS or cost.seconds > LONG):
-        raise click.UsageError(f"{cost_line(described.runs, cost, chosen)}; add --yes if that is meant")
-    under_way = begin_sweep(described, directory, shard or (1, 1))
-    outcomes, missing, total = under_way.done, len(under_way.missing), under_way.total
-    chosen = choose_workers(cost, missing, workers)
+        return print_dry_run(loaded, cost, shard or (1, 1), workers, as_json)
+    if not yes and (loaded.runs > MAX_UNCONFIRMED_RUNS or cost.seconds > 86400):
+        raise click.UsageError(f"{cost_line(loaded.runs, cost, chosen)}; add --yes if that is meant")
+    state = begin_sweep(loaded, directory, shard or (1, 1))
+    outcomes, missing, total = state.done, len(state.missing), state.total
+    chosen = choose_worker_count(cost, missing, workers)
     if not as_json:
-        tell([f"{len(outcomes)} of {total} runs have ended before"] if outcomes else [])
-        here = chosen if dask is None else None
-        tell([cost_line(missing, cost.of(missing / described.runs), here)] if missing else [])
+        write_stderr([f"{len(outcomes)} of {total} runs have ended before"] if outcomes else [])
+        local_workers = chosen if dask is None else None
+        write_stderr([cost_line(missing, cost.scaled(missing / loaded.runs), local_workers)] if missing else [])
     interruption = Interruption()
     files: list[str] = []
     notes: list[str] = []
     try:
-        with Progress(quiet=as_json) as bar:
-            progress = interruptible(bar, interruption)
-            where = dask if missing else None  # Nothing else needs a cluster.
-            with opened(where, chosen.number, under_way, progress) as executor:
-                for _ in go_on(under_way, executor, progress):
+        with ProgressDisplay(quiet=as_json) as bar:
+            progress = interruptible_progress(bar, interruption)
+            scheduler = dask if missing else None  # Only runs need a cluster.
+            with open_executor(scheduler, chosen.number, state, progress) as executor:
+                for _ in run_missing(state, executor, progress):
                     pass
                 if shard is None:
-                    files, notes = finish(under_way, executor, progress)
+                    files, notes = finish_sweep(state, executor, progress)
     except KeyboardInterrupt:
-        return interrupted(interruption, as_json, f"interrupted; {so_far(len(outcomes), total)}")
+        return report_interruption(interruption, as_json, f"interrupted; {progress_message(len(outcomes), total)}")
     except LostExecutorError as error:
-        report("error", [f"{error}; {so_far(len(outcomes), total)}"], as_json)
+        report_failure("error", [f"{error}; {progress_message(len(outcomes), total)}"], as_json)
         return FILES
     if as_json:
-        counts = count(outcomes)
+        counts = count_statuses(outcomes)
         print_json({"directory": str(directory), "runs": len(outcomes), **counts, "outputs": files, "notes": notes})
     else:
         click.echo("\n".join(map(printable, summary_lines(directory, outcomes, shard, files, notes))))
     return DONE
 
 
-def print_plan(described: Sweep, cost: Cost, shard: tuple[int, int], workers: int | None, as_json: bool) -> int:
-    """Print the values of the runs of a shard, and what they take."""
-    from taichi_msm.sweeps.spec import cell
-    from taichi_msm.sweeps.tables import choose_workers, cost_line, csv_line
+def print_dry_run(loaded: Sweep, cost: SweepCost, shard: tuple[int, int], workers: int | None, as_json: bool) -> int:
+    """Print the values of the runs of a shard, and their cost.
 
-    (part, parts), values = shard, described.values()
+    Args:
+        loaded: the sweep.
+        cost: of the whole sweep.
+        shard: part I of N, as (I, N).
+        workers: number of processes that the user has chosen, or None.
+        as_json: whether to print a JSON object instead of a table.
+
+    Returns:
+        The exit code.
+    """
+    from taichi_msm.sweeps.spec import format_value
+    from taichi_msm.sweeps.tables import choose_worker_count, cost_line, csv_line
+
+    (part, parts), values = shard, loaded.values()
     runs = range(part - 1, len(values), parts)
-    cost = cost.of(len(runs) / len(values))
-    chosen = choose_workers(cost, len(runs), workers)
+    cost = cost.scaled(len(runs) / len(values))
+    chosen = choose_worker_count(cost, len(runs), workers)
     if as_json:
-        rows = {"keys": described.keys, "runs": list(runs), "values": [values[run] for run in runs]}
+        rows = {"keys": loaded.keys, "runs": list(runs), "values": [values[run] for run in runs]}
         print_json({**rows, **cost._asdict(), "workers": chosen.number})
         return DONE
-    click.echo(csv_line(["run", *described.keys]))
+    click.echo(csv_line(["run", *loaded.keys]))
     for run in runs:
-        click.echo(printable(csv_line([run, *map(cell, values[run])])))
+        click.echo(printable(csv_line([run, *map(format_value, values[run])])))
     click.echo(cost_line(len(runs), cost, chosen))
     return DONE
 
 
-def so_far(done: int, total: int) -> str:
-    """Say how much of a sweep is done, and how to go on."""
+def progress_message(done: int, total: int) -> str:
+    """Format the progress of an unfinished sweep.
+
+    Args:
+        done: number of finished runs.
+        total: number of runs.
+    """
     return f"{done} of {total} runs have ended; the same command goes on"

@@ -202,7 +202,7 @@ def points_error(plan: Plan, pause: Pause) -> float | None:
     if coarser(plan) is None:
         return None
     try:
-        error = estimate_points(plan, runtime.started(), lambda done, total: pause()).error
+        error = estimate_points(plan, runtime.current_device(), lambda done, total: pause()).error
     except (DivergedError, SceneError):
         return None
     return error if math.isfinite(error) else None

@@ -41,7 +41,7 @@ from taichi_msm.solver.bands import MOMENT_ROWS
 from taichi_msm.solver.dynamics import STEPS_PER_TABLE, Dynamics
 from taichi_msm.solver.kernel_cpu import MAX_CHECKS, PAGE
 from taichi_msm.solver.state import State, largest_displacement
-from taichi_msm.system.runtime import Memory, our_compilation, write
+from taichi_msm.system.runtime import Memory, compilation_options, write_vectors
 from taichi_msm.terms.base import GAIN
 from taichi_msm.terms.damping import coefficients
 from taichi_msm.terms.foundation import point_shares
@@ -158,10 +158,10 @@ class MotionAdjoint(Dynamics):
         for c in range(3):
             # p, an empty buffer, and q.
             parts = start[..., c], 0 * start[..., c], start[..., c]
-            write(arrays.adjoint[c], to_lanes(layout, np.concatenate(parts)))
+            write_vectors(arrays.adjoint[c], to_lanes(layout, np.concatenate(parts)))
         none = np.zeros((SUM_PARTS * layout.rows, layout.cols))
         slopes = self._slopes.reshape(-1, layout.cols)
-        write(arrays.found, to_lanes(layout, np.concatenate([none, slopes])))
+        write_vectors(arrays.found, to_lanes(layout, np.concatenate([none, slopes])))
         loads, self._buffer, totals = LoadSlopes(self.plan), BUFFERS, np.zeros(2)
         block = max(1, STEPS_PER_TABLE // self._segment) * self._segment
         for first in reversed(range(0, grid.steps, block)):
@@ -203,7 +203,7 @@ class MotionAdjoint(Dynamics):
 
     def _copy_entries(self, source: int, target: int, of: list[Any], to: list[Any]) -> None:
         """Copy a shape from one entry of three arrays to one of others."""
-        with our_compilation():
+        with compilation_options():
             copying(self.layout.config)(self._entries, source, target, *of, *to)
 
     def _record(self, first: int, table: Array, pause: Pause) -> None:
@@ -243,7 +243,7 @@ class MotionAdjoint(Dynamics):
     def _put(self, slopes: Array) -> None:
         """Put the derivative by the shape of a frame where the kernel adds it."""
         for c in range(3):
-            write(self._arrays.loss[c], to_lanes(self.layout, slopes[..., c]))
+            write_vectors(self._arrays.loss[c], to_lanes(self.layout, slopes[..., c]))
         self._copy_entries(0, LOSS * self._entries, self._arrays.loss, self._arrays.adjoint)
 
     def _collect(self, gain: float, totals: Array) -> Slopes:
@@ -285,5 +285,5 @@ class MotionAdjoint(Dynamics):
         progress = np.zeros(STRIDE * workers, np.int64)
         for parallel in (True, False) if workers > 1 else (False,):
             if (progress[::STRIDE] < sizes[0]).any():
-                with our_compilation():
+                with compilation_options():
                     kernels(code, parallel=parallel)[which](sizes, progress, *arguments)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.render.config import Integers
 from taichi_msm.system.launches import Launches, end_thread
-from taichi_msm.system.runtime import our_compilation, ti
+from taichi_msm.system.runtime import compilation_options, ti
 
 # Offsets in the bounding box of a cell: its first and last column and row, clipped to the picture. The box of an
 # invisible cell is empty: its last column or row is before the first.
@@ -59,20 +59,20 @@ def build_bins(launches: Launches, bounds: Any, cells: int, extent: tuple[int, i
     while True:
         columns, rows = (-(-side // size) for side in extent)
         ends = np.zeros(columns * rows + 1, np.int32)
-        with our_compilation(optimised=False):
+        with compilation_options(optimised=False):
             _count_cells(cells, size, columns, bounds, ends)
         starts = np.cumsum(ends, dtype=np.int64)
         if starts[-1] <= MAX_MEAN_ENTRIES * (cells + columns * rows):
             break
         size *= 2
     entries = np.empty(max(1, starts[-1]), np.int32)
-    with our_compilation(optimised=False):
+    with compilation_options(optimised=False):
         _list_cells(cells, size, columns, bounds, starts[:-1].astype(np.int32), entries)
     return Bins(size, columns, ends[1:].reshape(rows, columns), starts.astype(np.int32), entries)
 
 
 def _build_in_parallel(launches: Launches, bounds: Any, cells: int, extent: tuple[int, int], size: int) -> Bins:
-    corners = launches.take(bounds).reshape(cells, 2, 2)
+    corners = launches.download(bounds).reshape(cells, 2, 2)
     while True:
         columns, rows = (-(-side // size) for side in extent)
         bins_per_cell = np.maximum(corners[:, 1] // size - corners[:, 0] // size + 1, 0).prod(axis=1, dtype=np.int64)
@@ -81,13 +81,13 @@ def _build_in_parallel(launches: Launches, bounds: Any, cells: int, extent: tupl
             break
         size *= 2
     total = int(ends[-1])
-    counts, cell_ends = launches.give(np.zeros(columns * rows, np.int32)), launches.give(ends.astype(np.int32))
+    counts, cell_ends = launches.upload(np.zeros(columns * rows, np.int32)), launches.upload(ends.astype(np.int32))
     bins, positions, entries = (launches.array(np.int32, max(1, total)) for _ in range(3))
     launches.launch(
         _assign_entries, total, cells, size, columns, bounds, cell_ends, counts, bins, positions, rounds=SEARCH_ROUNDS
     )
-    lengths = launches.take(counts)
-    starts = launches.give(np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32))
+    lengths = launches.download(counts)
+    starts = launches.upload(np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32))
     launches.launch(_list_entries, total, cells, cell_ends, bins, positions, starts, entries, rounds=SEARCH_ROUNDS)
     return Bins(size, columns, lengths.reshape(rows, columns), starts, entries)
 

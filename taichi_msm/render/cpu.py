@@ -18,7 +18,14 @@ from taichi_msm.render.labels import label_width
 from taichi_msm.render.lens_kernels import DISTORTED_STRIDE, store_distorted
 from taichi_msm.render.lens_table import bounds, tiled_map
 from taichi_msm.render.shading import Appearance, PixelArrays, resolve
-from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, Memory, our_compilation, started, ti, write
+from taichi_msm.system.runtime import (
+    ITERATIONS_PER_THREAD,
+    Memory,
+    compilation_options,
+    current_device,
+    ti,
+    write_vectors,
+)
 
 # Numbers per mass point without the distorted ones. After the numbers of all mass points, two numbers per row follow:
 # the first and the last row of the picture that it reaches, without distortion.
@@ -41,7 +48,7 @@ class Bands:
         self._config, self._size, self._texels = config, size, texels
         self._draw = _kernel(config)
         (rows, cols), (width, height) = shape, size
-        self._workers = min(-(-height // config.band_rows), started().threads)
+        self._workers = min(-(-height // config.band_rows), current_device().threads)
         self._memory = memory = Memory()
         self._nodes = memory.array(
             "f32", 0, rows * (cols * (UNDISTORTED_STRIDE + DISTORTED_STRIDE * config.has_distortion) + 2)
@@ -58,7 +65,7 @@ class Bands:
         boxes = [bounds(table[first : first + rows, :, :2]) for first in range(0, len(table), rows)]
         padded_boxes = np.pad(boxes, ((0, 0), (0, config.lanes - len(boxes[0]))))
         bands = np.concatenate([tiles, padded_boxes[:, None].astype(np.float32)], axis=1)
-        write(self._samples, bands.reshape(-1, config.lanes))
+        write_vectors(self._samples, bands.reshape(-1, config.lanes))
 
     def draw(
         self, position: NDArray[np.float32], uniforms: NDArray[np.float32], sizes: NDArray[np.int32]
@@ -83,7 +90,7 @@ class Bands:
         if config.labels:
             labels = np.zeros(label_width(normals=config.normals) * width * height, np.float32)
         sizes[[uni.ROWS_TAKEN, uni.ROWS_PROJECTED, uni.BANDS_TAKEN]] = 0
-        with our_compilation(optimised=False):
+        with compilation_options(optimised=False):
             self._draw(
                 position, self._texels, uniforms, self._workers, sizes, self._nodes, self._samples,
                 picture.ravel().view(np.int32) if config.writes_words else picture.ravel(), labels,

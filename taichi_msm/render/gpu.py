@@ -29,8 +29,8 @@ from taichi_msm.render.geometry import (
 from taichi_msm.render.labels import label_width
 from taichi_msm.render.lens_kernels import DISTORTED_STRIDE, store_distorted
 from taichi_msm.render.shading import Appearance, PixelArrays, resolve
-from taichi_msm.system.launches import THREADS, Launches, end_thread
-from taichi_msm.system.runtime import our_compilation, ti, write
+from taichi_msm.system.launches import VULKAN_THREADS, Launches, end_thread
+from taichi_msm.system.runtime import compilation_options, ti, write_vectors
 
 # Minimum width of a bin [samples].
 MIN_BIN_SIZE = 8
@@ -60,8 +60,8 @@ class Threads:
         self._cells = (rows - 1) * (cols - 1)
         samples_across = width * config.supersample
         # Rows of pixels in a strip.
-        self._rows = min(max(1, THREADS // (samples_across * config.supersample)), height)
-        self._texels = launches.give(texels)
+        self._rows = min(max(1, VULKAN_THREADS // (samples_across * config.supersample)), height)
+        self._texels = launches.upload(texels)
         self._nodes = launches.array(np.float32, rows * cols * TOTAL_STRIDE)
         self._pieces = launches.array(np.int32, self._cells)
         strip = self._rows * config.supersample * samples_across * config.planes
@@ -75,7 +75,7 @@ class Threads:
 
     def set_undistortion_map(self, table: NDArray[np.float32]) -> None:
         """Set the undistortion map of the following pictures, as returned by `undistortion_map`."""
-        write(self._samples, table.reshape(-1, 1))
+        write_vectors(self._samples, table.reshape(-1, 1))
 
     def draw(
         self, position: NDArray[np.float32], uniforms: NDArray[np.float32], sizes: NDArray[np.int32]
@@ -97,23 +97,23 @@ class Threads:
         launches, factor = Launches(bounded=True), self._config.supersample
         (width, height), capsules = self._size, int(sizes[uni.CAPSULE_COUNT])
         samples_across, samples_down = width * factor, height * factor
-        view = launches.give(uniforms), launches.give(sizes)
-        with our_compilation(optimised=False):
+        view = launches.upload(uniforms), launches.upload(sizes)
+        with compilation_options(optimised=False):
             self._project(position, *view, self._nodes, self._pieces)
-        pieces = launches.take(self._pieces)
+        pieces = launches.download(self._pieces)
         pieces_per_part = max(1, min(-(-int(pieces.sum(dtype=np.int64)) // MAX_PARTS), int(pieces.max())))
         # A cell behind the eye is one empty part.
         ends = np.cumsum(np.maximum(-(-pieces // pieces_per_part), 1), dtype=np.int32)
         parts = int(ends[-1])
         owners, bounds = launches.array(np.int32, 2 * parts), launches.array(np.int32, BOUNDS_STRIDE * parts)
         launches.launch(
-            self._bound, parts, pieces_per_part, *view, launches.give(ends), self._nodes, self._pieces, owners, bounds,
+            self._bound, parts, pieces_per_part, *view, launches.upload(ends), self._nodes, self._pieces, owners, bounds,
             rounds=SEARCH_ROUNDS + pieces_per_part,
         )  # fmt: skip
         bin_size = max(MIN_BIN_SIZE, round((samples_across * samples_down / self._cells) ** 0.5))
         bins = build_bins(launches, bounds, parts, (samples_across, samples_down), bin_size)
         sizes[[uni.BIN_SIZE, uni.BINS_ACROSS]] = bins.size, bins.columns
-        view = view[0], launches.give(sizes)
+        view = view[0], launches.upload(sizes)
         # Rounds per sample: one per part, and three per triangle, for the triangle and its tiles.
         rounds_of_part = 1 + 3 * pieces_per_part
         rounds_of_capsules = capsules * (1 + factor * (1 + factor))
@@ -122,7 +122,7 @@ class Threads:
             rows = min(self._rows, height - row)
             top, bottom = row * factor, (row + rows) * factor
             longest = int(bins.lengths[top // bins.size : (bottom - 1) // bins.size + 1].max())
-            for listed, count in launches.parts(longest, rounds_of_part):
+            for listed, count in launches.chunks(longest, rounds_of_part):
                 launches.launch(
                     self._cover, rows * factor * samples_across,
                     top, listed, count, pieces_per_part, *view, self._nodes, self._pieces, owners, bounds,
@@ -134,9 +134,9 @@ class Threads:
                 row, *view, self._texels, self._samples, self._colours, self._labels,
                 rounds=rounds_of_capsules + rounds_of_shading,
             )  # fmt: skip
-        launches.require_ended()
-        colours = launches.take(self._colours) if self._config.picture else np.empty(0, np.uint8)
-        return colours.reshape(-1, width, 3), launches.take(self._labels)
+        launches.require_completion()
+        colours = launches.download(self._colours) if self._config.picture else np.empty(0, np.uint8)
+        return colours.reshape(-1, width, 3), launches.download(self._labels)
 
 
 @cache

@@ -23,7 +23,7 @@ from taichi_msm.render.labels import NO_FLOW, Flow, Sight
 from taichi_msm.render.lens_table import undistorted_view
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.launches import Launches, end_thread
-from taichi_msm.system.runtime import lanes, our_compilation, ti
+from taichi_msm.system.runtime import compilation_options, lanes, ti
 
 Array = NDArray[np.floating]
 
@@ -103,13 +103,13 @@ def _track(
     uniform_values = uni.view_uniforms(undistorted, scene.render, 1, scene.sheet.size, (1, 1), rods)
     if view.lens is not None:
         uni.set_lens(uniform_values, view, 1, view.lens.limit)
-    uniforms = launches.give(uniform_values)
+    uniforms = launches.upload(uniform_values)
     sizes = uni.sizes_of(scene, np.empty((0, 3), np.int32))
     sizes[[uni.CAPSULE_COUNT, uni.WIDTH, uni.HEIGHT]] = len(rods), width, height
     nodes, cell = (launches.array(np.float64, n) for n in (rows * cols * NODE_STRIDE, cells * CELL_STRIDE))
     bounds = launches.array(np.int32, cells * BOUNDS_STRIDE)
-    with our_compilation(optimised=False):
-        _outline_cells(np.ascontiguousarray(position, np.float64), uniforms, launches.give(sizes), nodes, cell, bounds)
+    with compilation_options(optimised=False):
+        _outline_cells(np.ascontiguousarray(position, np.float64), uniforms, launches.upload(sizes), nodes, cell, bounds)
     bins = build_bins(launches, bounds, cells, (width, height), bin_size)
     sizes[[uni.BIN_SIZE, uni.BINS_ACROSS, uni.WIDTH, uni.HEIGHT]] = bins.size, bins.columns, *scene.render.size
     is_simple = launches.array(np.uint8, bins.lengths.size)
@@ -119,15 +119,15 @@ def _track(
     )  # fmt: skip
     pixels, hidden = launches.array(np.float32, 2 * total), launches.array(np.uint8, total)
     arguments = (
-        launches.give(np.ascontiguousarray(coordinates, np.float32).ravel()),
-        int(as_flow), uniforms, launches.give(sizes), nodes, cell, bins.starts, bins.entries, is_simple, pixels, hidden,
+        launches.upload(np.ascontiguousarray(coordinates, np.float32).ravel()),
+        int(as_flow), uniforms, launches.upload(sizes), nodes, cell, bins.starts, bins.entries, is_simple, pixels, hidden,
     )  # fmt: skip
     # Rounds per point: one per cell, and one per triangle.
     rounds = 1 + 2 * (scene.render.refine + 1) ** 2
-    for listed, count in launches.parts(int(bins.lengths.max()), rounds):
+    for listed, count in launches.chunks(int(bins.lengths.max()), rounds):
         launches.launch(_kernel(view.lens_model), total, listed, count, *arguments, rounds=count * rounds + len(rods))
-    launches.require_ended()
-    return launches.take(pixels).reshape(-1, 2), launches.take(hidden)
+    launches.require_completion()
+    return launches.download(pixels).reshape(-1, 2), launches.download(hidden)
 
 
 @ti.kernel

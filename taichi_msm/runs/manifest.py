@@ -22,7 +22,7 @@ from taichi_msm.runs.checkpoint import CHECKPOINT, MANIFEST, open_manifest, unse
 from taichi_msm.runs.directory import STAGING
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.planning import try_plan
-from taichi_msm.system.compiler import what_decides_bits
+from taichi_msm.system.compiler import result_versions
 from taichi_msm.system.runtime import ARCHS
 
 # A manifest contains its scene twice; each may come from a file of 1 MiB.
@@ -56,7 +56,7 @@ class Manifest:
         for key, path in self.scene.pictures.items():
             if sha256.get(key) != self.sha256.get(key):
                 raise FilesError(f"{path} has changed since the run began; put it back, or run the scene again")
-        began, here = what_decides_bits(self.versions, self.arch), what_decides_bits(versions, self.arch)
+        began, here = result_versions(self.versions, self.arch), result_versions(versions, self.arch)
         if began != here:
             # Where a tested compiler began the run, only the one that is here decides bits.
             named = began if any(version != here.get(name) for name, version in began.items()) else self.versions
@@ -76,7 +76,7 @@ class Manifest:
             list(scene.render.all_cameras),
             self.arch,
             self.sha256,
-            what_decides_bits(self.versions, self.arch),
+            result_versions(self.versions, self.arch),
         )
 
 

@@ -407,7 +407,7 @@ class Simulation:
 
     def close(self) -> None:
         """Free the memory. `positions` still gives the last frame."""
-        runtime.require_here()
+        runtime.require_start_thread()
         self._closed = True
         self._dynamics.close()
         self.renderer.close()
@@ -452,7 +452,7 @@ class Simulation:
         # The kernels would write to memory that was freed.
         if self._closed:
             raise MsmError("this simulation is closed; make another")
-        runtime.require_here()
+        runtime.require_start_thread()
 
     def _shot(self, camera: CameraLike, positions: Array | None, time: float | None) -> Shot:
         """Check positions and a time, place the instruments on the sheet, and set up the camera."""

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.solver.state import State
-from taichi_msm.system.runtime import Memory, ti, write
+from taichi_msm.system.runtime import Memory, ti, write_vectors
 from taichi_msm.terms.base import AREA_SHARE, GAIN, MOBILITY, SQUARED_MOTION, KernelConfig, KernelSheet
 
 # Bytes per number.
@@ -122,7 +122,7 @@ class SheetArrays:
         self.stiffness = self.rows(1 if start.stiffness is None else len(start.stiffness))
         real = np.float32 if layout.config.precision == "f32" else np.float64
         with np.errstate(over="ignore"):
-            write(self.constants, np.repeat(start.constants[:, None].astype(real), lanes, axis=1))
+            write_vectors(self.constants, np.repeat(start.constants[:, None].astype(real), lanes, axis=1))
         self._set(self.by_column, start.by_column)
         if start.stiffness is not None:
             self._set(self.stiffness, start.stiffness)
@@ -166,7 +166,7 @@ class SheetArrays:
 
     def _set(self, array: Any, values: NDArray[Any]) -> None:
         """Set the first rows of an array to values, shape (..., cols), and all others to 0."""
-        write(array, to_lanes(self._layout, values))
+        write_vectors(array, to_lanes(self._layout, values))
 
     def rows(self, count: int) -> Any:
         """Allocate an array of `count` rows with arbitrary content."""

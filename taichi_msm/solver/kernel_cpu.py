@@ -26,8 +26,8 @@ from taichi_msm.solver.bands import (
     build_advance,
 )
 from taichi_msm.system import process
-from taichi_msm.system.compiler import chosen
-from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, our_compilation, ti
+from taichi_msm.system.compiler import active_compiler
+from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, compilation_options, ti
 from taichi_msm.terms.base import KernelConfig
 from taichi_msm.terms.bending import BendingTerm
 
@@ -35,7 +35,7 @@ from taichi_msm.terms.bending import BendingTerm
 PAGE = 4096
 
 # Number of checks after which a worker stops waiting for its neighbour, after about 1.3 ms.
-MAX_CHECKS = round(1.32e-3 / chosen().look)
+MAX_CHECKS = round(1.32e-3 / active_compiler().poll_s)
 
 # Back-off period in which a single worker steps after a timeout [s]. If other programs compete for the cores, it is
 # four times the last period, halved for every BACKOFF_HALF_LIFE_S in which all workers have stepped since; otherwise it
@@ -109,7 +109,7 @@ class ScatterKernel:
             values: output [m], shape (rows, cols, 3).
             measures: output, shape (rows, measures).
         """
-        with our_compilation():
+        with compilation_options():
             self._read(0, self._layout.rows, self._layout.cols, differences, values, measures, *self.arrays.all)
 
     def _advance_alone(self, first: int, end: int, table: NDArray[Any]) -> None:
@@ -132,7 +132,7 @@ class ScatterKernel:
         """Advance with all workers; return the number of the next step, below `end` after a timeout."""
         if self._backoff_until:
             # The back-off itself is excluded, because a single worker rarely waits for a core.
-            self._cpu_time, self._wait_time = time.process_time(), process.waited_for_cores() or 0.0
+            self._cpu_time, self._wait_time = time.process_time(), process.core_wait_s() or 0.0
             self._backoff_until = 0.0
         start = time.perf_counter()
         count, timed_out = self._launch_together(first, end, table)
@@ -147,7 +147,7 @@ class ScatterKernel:
 
     def _is_crowded(self) -> bool:
         """Return whether other programs compete for the cores since the last back-off; True if unknown."""
-        cpu_time, wait_time = time.process_time(), process.waited_for_cores()
+        cpu_time, wait_time = time.process_time(), process.core_wait_s()
         return wait_time is None or wait_time - self._wait_time > MAX_WAIT_SHARE * (cpu_time - self._cpu_time)
 
     def _launch_together(self, first: int, end: int, table: NDArray[Any]) -> tuple[int, bool]:
@@ -168,7 +168,7 @@ class ScatterKernel:
 
     def _copy_borders(self) -> None:
         """Update the copies of the rows at the borders of bands after steps of a single worker."""
-        with our_compilation():
+        with compilation_options():
             _build_copy(self._layout.config)(*self.arrays.u, self._borders, self._layout.rows, self._layout.width)
         self._progress[::COUNTER_STRIDE] = self._steps
 
@@ -184,7 +184,7 @@ class ScatterKernel:
             self._steps, count, workers, layout.depth, self._carried_rows, layout.rows, layout.strip,
             self._first_row, self._end_row, layout.rows + len(self._borders), MAX_CHECKS,
         ])  # fmt: skip
-        with our_compilation():
+        with compilation_options():
             kernel(sizes, self._progress, table, *self._carried, *self.arrays.all)
         self._steps += count
 

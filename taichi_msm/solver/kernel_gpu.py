@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.solver.arrays import InitialData, SheetArrays, SheetLayout, build_point_step, build_read
-from taichi_msm.system.runtime import our_compilation, ti
+from taichi_msm.system.runtime import compilation_options, ti
 from taichi_msm.terms.base import DX, DY, HAS_LEFT, HAS_RIGHT, Entry, KernelConfig, KernelRow, KernelSheet
 from taichi_msm.terms.bending import BendingTerm
 from taichi_msm.terms.contact import ContactTerm
@@ -48,7 +48,7 @@ class GatherKernel:
             count: number of steps, at most STEPS_PER_LAUNCH.
             table: rows of the load table, shape (count, columns).
         """
-        with our_compilation():
+        with compilation_options():
             self._advance(self._now, count, self._layout.rows, self._layout.cols, table, *self.arrays.all)
         self._now = (self._now + count) % 2
 
@@ -65,7 +65,7 @@ class GatherKernel:
             measures: output, shape (rows, measures).
         """
         first, layout = self._now * (self._layout.rows + 2) + 1, self._layout
-        with our_compilation():
+        with compilation_options():
             self._read(first, layout.rows, layout.cols, differences, values, measures, *self.arrays.all)
 
 

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.solver.arrays import InitialData, SheetArrays, SheetLayout, build_read, point_forces, to_lanes
 from taichi_msm.solver.bands import MOMENT_ROWS, RowBand, build_join_strips, build_step_row
-from taichi_msm.system.runtime import our_compilation, ti, write
+from taichi_msm.system.runtime import compilation_options, ti, write_vectors
 from taichi_msm.terms.base import MOBILITY, Entry, KernelConfig, KernelRow, KernelSheet
 from taichi_msm.terms.bending import BendingTerm
 from taichi_msm.terms.contact import ContactTerm
@@ -88,7 +88,7 @@ class Relaxation:
         self._stored = np.concatenate([np.arange(layout.rows, dtype=np.int32), np.full(moments + 1, -1, np.int32)])
         self.arrays = arrays = SheetArrays(layout, self._stored, start)
         self._q, self._work = [arrays.rows(layout.rows) for _ in range(3)], arrays.rows(layout.rows + SUMS)
-        write(self._work, to_lanes(layout, 1 / masses))
+        write_vectors(self._work, to_lanes(layout, 1 / masses))
         first_fixed, last_fixed = layout.fixed_rows
         self._fire = np.zeros(NUMBERS)
         self._fire[:COUNT] = layout.rows, layout.strip, int(first_fixed), layout.rows - int(last_fixed)
@@ -97,7 +97,7 @@ class Relaxation:
     def stop(self) -> None:
         """Set all momenta to 0 and reset the state of FIRE."""
         for q in self._q:
-            write(q, np.zeros((0, self._layout.config.lanes)))
+            write_vectors(q, np.zeros((0, self._layout.config.lanes)))
         self._fire[[STEP, SHARE, POSITIVE_COUNT, PLACED]] = LARGEST_STEP, FIRST_SHARE, 0, 1
 
     def place(self, displacement: NDArray[Any]) -> None:
@@ -105,7 +105,7 @@ class Relaxation:
         held = (self._stored >= 0)[:, None]
         self._fire[PLACED] = 1
         for c in range(3):
-            write(self.arrays.u[c], to_lanes(self._layout, np.where(held, displacement[self._stored, :, c], 0)))
+            write_vectors(self.arrays.u[c], to_lanes(self._layout, np.where(held, displacement[self._stored, :, c], 0)))
 
     def relax(self, count: int, tolerance: float, row: NDArray[Any]) -> tuple[int, float]:
         """Evaluate the forces repeatedly and move the mass points after each evaluation, until all forces are small.
@@ -120,7 +120,7 @@ class Relaxation:
         """
         fire = self._fire
         fire[[COUNT, SQUARED_TOLERANCE]] = count, tolerance * tolerance
-        with our_compilation():
+        with compilation_options():
             self._relax(fire, row, *self._q, self._work, *self.arrays.all)
         largest = float(np.sqrt(fire[LARGEST])) if fire[FORCE_SUM] < np.inf else np.inf
         return int(fire[EVALUATIONS]), largest
@@ -128,7 +128,7 @@ class Relaxation:
     def scale(self, row: NDArray[Any]) -> float:
         """Return the largest force of a spring, a load or the foundation on a mass point [N]."""
         largest = np.zeros(1)
-        with our_compilation():
+        with compilation_options():
             self._compare(self._layout.rows, self._layout.width, largest, row, *self.arrays.all)
         return float(np.sqrt(largest[0]))
 
@@ -140,7 +140,7 @@ class Relaxation:
             values: output, shape (rows, cols, 3).
             measures: output, shape (rows, measures).
         """
-        with our_compilation():
+        with compilation_options():
             self._read(0, self._layout.rows, self._layout.cols, differences, values, measures, *self.arrays.all)
 
 

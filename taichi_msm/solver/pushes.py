@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.solver.arrays import SheetArrays, SheetLayout
-from taichi_msm.system.runtime import our_compilation, ti
+from taichi_msm.system.runtime import compilation_options, ti
 from taichi_msm.terms.base import AREA_SHARE, KernelConfig
 from taichi_msm.terms.contact import CORRECTIONS, ContactTerm
 
@@ -29,7 +29,7 @@ def sum_corrections(layout: SheetLayout, arrays: SheetArrays, *, clear: bool) ->
     if contact is None:
         return np.zeros((0, 3))
     sums = np.empty((CORRECTIONS * contact.tools, layout.rows))
-    with our_compilation():
+    with compilation_options():
         _build_sum(layout.config)(layout.rows, layout.cols, clear, arrays.by_column, arrays.fields, sums)
     return sums.sum(axis=1).reshape(-1, CORRECTIONS)
 

@@ -37,7 +37,7 @@ from taichi_msm.plot_style import (
 )
 from taichi_msm.study.format import mostly_rounding, number, unit, where
 from taichi_msm.study.result import Drawn, Peer, Points, Stepping, Study
-from taichi_msm.system.compiler import named
+from taichi_msm.system.compiler import compiler_label
 
 # Colour shows the damping difference, dashes and markers the precision.
 DIFFERENCE_COLOURS = {"central": BLUE, "backward": VERMILION}
@@ -95,7 +95,7 @@ def _figure(study: Study) -> Figure:
     versions = study.machine["versions"]
     state = " (interrupted)" if study.status == "interrupted" else ""
     figure.suptitle(f"{printable(study.scene)}: speed against error{state}", x=0.01, ha="left", parse_math=False)
-    machine = f"{where(study)}; taichi-msm {versions['taichi-msm']}, {named(versions)}"
+    machine = f"{where(study)}; taichi-msm {versions['taichi-msm']}, {compiler_label(versions)}"
     figure.supxlabel(f"{_advice(study)}\n{machine}", x=0.01, ha="left", size=8, parse_math=False, wrap=True)
     axes = figure.subplot_mosaic(layout)
     for name, panel in zip("ABCD", every, strict=False):

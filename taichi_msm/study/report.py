@@ -17,7 +17,7 @@ from taichi_msm.runs.directory import staged
 from taichi_msm.scene.section import MAX_POINTS
 from taichi_msm.study.format import Columns, duration, number, size, table, timing, where, wrong
 from taichi_msm.study.result import Drawn, Measured, Peer, Points, Reference, Stepping, Study
-from taichi_msm.system.compiler import named
+from taichi_msm.system.compiler import compiler_label
 
 pass  # REMOVED
 
@@ -140,7 +140,7 @@ def page(study: Study) -> str:
     state = "" if study.status == "complete" else f" ({study.status})"
     blocks = [
         f"# {printable(study.scene)}: speed against error{state}",
-        f"Measured on {where(study)}, with taichi-msm {versions['taichi-msm']}, {named(versions)}, "
+        f"Measured on {where(study)}, with taichi-msm {versions['taichi-msm']}, {compiler_label(versions)}, "
         f"NumPy {versions['numpy']} and Python {versions['python']} ({versions['platform']}). "
         "Times are medians, with the fastest and the slowest in brackets.",
         *(_stepping(study) if study.stepping or study.peers else ()),

@@ -113,7 +113,7 @@ def study(
 def machine(device: Device) -> dict[str, Any]:
     """Describe the machine that the study ran on."""
     return {
-        "cpu": process.processor(),
+        "cpu": process.processor_name(),
         "cores": os.cpu_count(),
         "arch": device.arch,
         "threads": device.threads,

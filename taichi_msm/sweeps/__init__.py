@@ -1,1 +1,1 @@
-"""Many runs of one scene with varied values: their samples, the processes that take them, and what is made of them."""
+"""Sweeps: runs of one scene with varied values, their execution, and reports of their results."""

@@ -1,7 +1,7 @@
-"""Workers of dask.distributed, on any machines, as an executor of `concurrent.futures`.
+"""A dask.distributed cluster as a `concurrent.futures` executor.
 
-A plugin brings the scene and the files that it names to every worker once, also to those that come later. Besides, a
-worker needs only this package and the folder of the sweep.
+A worker plugin sends the scene and its files to every worker once, also to workers that join later. Apart from that, a
+worker needs this package and access to the directory of the sweep.
 """
 
 from __future__ import annotations
@@ -27,46 +27,56 @@ from distributed.utils import LoopRunner, silence_logging_cmgr
 from taichi_msm.errors import ExecutorError, LostExecutorError, MsmError, Progress
 from taichi_msm.images import copied
 from taichi_msm.scene.outputs import SWEEP
-from taichi_msm.sweeps.runs import Outcome, Task, take
+from taichi_msm.sweeps.runs import Outcome, RunTask, execute_run
 from taichi_msm.sweeps.spec import Sweep
-from taichi_msm.system.compiler import versions, what_decides_bits
+from taichi_msm.system.compiler import result_versions, versions
 
-# How long a scheduler may take to answer [s].
-PATIENCE = 10
+# Time limit for the answer of a scheduler [s].
+MAX_WAIT_S = 10
 
-# What transports need besides dask.
+# Requirements of transports in addition to dask.
 _CERTIFICATES = "certificates; name them in dask's configuration, under distributed.comm.tls"
-REQUIREMENTS = {
+TRANSPORT_REQUIREMENTS = {
     "tls": _CERTIFICATES,
     "wss": _CERTIFICATES,
     "ucx": "UCX, which is not installed; pip install distributed-ucxx, or use tcp://",
 }
 
-# How often we look whether a worker has come [s].
-LOOK = 0.2
-
 
 class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
-    """What the runs of a sweep have in common, on its way to a worker and there."""
+    """Worker plugin with the inputs that all runs of a sweep share.
 
-    def __init__(self, described: Sweep, directory: Path) -> None:
-        scene = described.scene
-        # Absolute, as there may be no such current directory where a worker is.
+    Args:
+        sweep: the sweep.
+        directory: of the sweep.
+
+    Attributes:
+        error: reason why the worker cannot execute runs; empty if it can.
+        copies: local copies of the files, by their paths on the machine where the sweep was started.
+    """
+
+    def __init__(self, sweep: Sweep, directory: Path) -> None:
+        scene = sweep.scene
+        # The current directory may not exist on the machine of a worker, so paths must be absolute.
         self.scene, self.directory = scene._replace(folder=scene.folder.absolute()), directory.absolute()
         self.home = Path.cwd()
-        self.versions = what_decides_bits(versions(), "cpu")
-        self._digests = {str(Path(path).absolute()): digest for path, digest in described.files.items()}
+        self.versions = result_versions(versions(), "cpu")
+        self._digests = {str(Path(path).absolute()): digest for path, digest in sweep.files.items()}
         self._contents = {digest: Path(path).read_bytes() for path, digest in self._digests.items()}
-        self.fault = ""
-        self.copies: dict[str, Path] = {}  # of the files, by their paths where the sweep was started
-        self._folder = Path()  # of these copies
+        self.error = ""
+        self.copies: dict[str, Path] = {}
+        self._folder = Path()
         self._ended = False
 
     def setup(self, worker: Any) -> None:
-        """Write the files into a temporary folder of the worker; ExecutorError: it cannot take runs."""
-        self.fault = self._fault(worker)
-        if self.fault:
-            raise ExecutorError(self.fault)
+        """Write the files into a temporary folder of the worker.
+
+        Raises:
+            ExecutorError: when the worker cannot execute runs.
+        """
+        self.error = self._check(worker)
+        if self.error:
+            raise ExecutorError(self.error)
         if not self.home.is_dir():
             self.home = Path.cwd()
         self._folder = Path(tempfile.mkdtemp(dir=worker.local_directory))
@@ -76,170 +86,186 @@ class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
         self.copies = {path: self._folder / digest for path, digest in self._digests.items()}
 
     def teardown(self, worker: Any) -> None:  # noqa: ARG002
-        """Stop the run of the worker, which is ending or whose sweep is."""
+        """Stop the run of the worker, as the worker or the sweep ends."""
         self._ended = True
         if self.copies:
             shutil.rmtree(self._folder, ignore_errors=True)
 
     def pause(self, _stage: str, _done: int, _total: int) -> None:
-        """Interrupt a run if it should be stopped."""
+        """Interrupt a run after `teardown`; a `Progress` callback."""
         if self._ended:
             raise KeyboardInterrupt
 
-    def _fault(self, worker: Any) -> str:
-        """Say why a worker cannot take runs, if so."""
+    def _check(self, worker: Any) -> str:
+        """Return the reason why a worker cannot execute runs, or an empty string."""
         if (threads := worker.state.nthreads) != 1:
             return f"worker {worker.address} has {threads} threads; start it with one: dask worker --nthreads 1"
-        # What a worker wrote into a folder of its own would be lost.
+        # Results that a worker writes into a local directory would be lost.
         if not (self.directory / SWEEP).is_file():
             return f"worker {worker.address} does not see {self.directory}; choose an --out that all machines share"
-        here = versions()
-        if others := [f"{name} {version}" for name, version in self.versions.items() if here.get(name) != version]:
-            return f"worker {worker.address} has other versions; install there {', '.join(others)}"
+        installed = versions()
+        if missing := [
+            f"{name} {version}" for name, version in self.versions.items() if installed.get(name) != version
+        ]:
+            return f"worker {worker.address} has other versions; install there {', '.join(missing)}"
         return ""
 
 
 class Cluster(Executor):
-    """The workers of a scheduler; of the tasks of a sweep they are sent only what differs."""
+    """Executor of the workers of a scheduler; of each run it sends only the number and the overrides."""
 
     def __init__(self, client: Any, name: str) -> None:
         self._executor, self._name = client.get_executor(pure=False), name
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any, **_: Any) -> Future[Any]:
-        """Call a function, which must be importable, in a worker that is free."""
-        answer: Future[Any] = Future()
+        """Schedule a call in an idle worker.
+
+        Args:
+            function: the function, which must be importable.
+            *arguments: its positional arguments; named ones are not supported.
+        """
+        result: Future[Any] = Future()
         try:
-            if function is take:
+            if function is execute_run:
                 (task,) = arguments
-                given = self._executor.submit(_take, self._name, task.run, task.overrides)
+                dask_future = self._executor.submit(_execute_run, self._name, task.run, task.overrides)
             else:
-                given = self._executor.submit(_call, self._name, function, *arguments)
+                dask_future = self._executor.submit(_call, self._name, function, *arguments)
         except ClosedClientError:
-            _cancel(answer)
+            _cancel(result)
         else:
-            given.add_done_callback(partial(_pass_on, answer))
-        return answer
+            dask_future.add_done_callback(partial(_forward_result, result))
+        return result
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Wait for all calls, or cancel those that have not begun."""
+        """Wait for all calls, or cancel calls that have not begun.
+
+        Args:
+            wait: whether to wait for all calls.
+            cancel_futures: whether to cancel calls that have not begun, without waiting for the others.
+        """
         self._executor.shutdown(wait and not cancel_futures)
 
 
-def _pass_on(answer: Future[Any], given: Future[Any]) -> None:
-    """Pass on the end of a call; what dask says of workers that died would differ from time to time."""
-    if given.cancelled():
-        _cancel(answer)
-    elif isinstance(error := given.exception(), KilledWorker):
-        answer.set_exception(MsmError(f"its workers died, {error.allowed_failures + 1} one after another"))
+def _forward_result(result: Future[Any], dask_future: Future[Any]) -> None:
+    """Copy the result of a call, with a reproducible message for workers that died."""
+    if dask_future.cancelled():
+        _cancel(result)
+    elif isinstance(error := dask_future.exception(), KilledWorker):
+        result.set_exception(MsmError(f"its workers died, {error.allowed_failures + 1} one after another"))
     elif error is not None:
-        answer.set_exception(error)
+        result.set_exception(error)
     else:
-        answer.set_result(given.result())
+        result.set_result(dask_future.result())
 
 
-def _cancel(answer: Future[Any]) -> None:
-    answer.cancel()
-    answer.set_running_or_notify_cancel()
+def _cancel(result: Future[Any]) -> None:
+    result.cancel()
+    result.set_running_or_notify_cancel()
 
 
 def _call(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a function in a worker, where the files are those that it was sent."""
+    """Call a function in a worker, which reads its local copies of the files."""
     with copied(_inputs(name).copies):
         return function(*arguments)
 
 
-def _take(name: str, run: int, overrides: tuple[str, ...]) -> Outcome:
-    """Take a run in a worker."""
+def _execute_run(name: str, run: int, overrides: tuple[str, ...]) -> Outcome:
     inputs = _inputs(name)
     with suppress(KeyboardInterrupt):
-        task = Task(run, inputs.scene, overrides, inputs.directory, inputs.home)
-        outcome: Outcome = _call(name, take, task, inputs.pause)
+        task = RunTask(run, inputs.scene, overrides, inputs.directory, inputs.home)
+        outcome: Outcome = _call(name, execute_run, task, inputs.pause)
         inputs.pause("", 0, 0)
         return outcome
-    # Where the sweep has not ended, the worker is about to.
+    # The run was interrupted as its worker ends, so another worker must execute it.
     raise Reschedule
 
 
 def _inputs(name: str) -> Inputs:
-    """Find in a worker what it was sent."""
+    """Return the inputs that this worker was sent."""
     inputs: Inputs | None = get_worker().plugins.get(name)
     if inputs is None:
         raise ExecutorError("another command for the same folder has ended meanwhile")
-    if inputs.fault:
-        raise ExecutorError(inputs.fault)
+    if inputs.error:
+        raise ExecutorError(inputs.error)
     return inputs
 
 
 @contextmanager
-def connected(address: str, described: Sweep, directory: Path, progress: Progress) -> Iterator[Cluster]:
-    """Use the workers of a scheduler for a sweep, once there is one; at the end they forget it.
+def cluster_connection(address: str, sweep: Sweep, directory: Path, progress: Progress) -> Iterator[Cluster]:
+    """Connect to a scheduler, and provide its workers with the inputs of a sweep until the block ends.
+
+    Args:
+        address: of the scheduler, such as tcp://10.0.0.1:8786.
+        sweep: the sweep.
+        directory: of the sweep.
+        progress: called while the first worker is awaited.
 
     Raises:
-        ExecutorError: when no scheduler answers, or a worker cannot take runs.
-        LostExecutorError: instead of the error of a block in which the connection is lost.
+        ExecutorError: when no scheduler answers, or a worker cannot execute runs.
+        LostExecutorError: when the connection is lost within the block; replaces the error of the block.
     """
     with silence_logging_cmgr(logging.CRITICAL):
         client = _client(address)
-        # Another command for this folder replaces what one that was killed has left there.
+        # The name is unique per directory, so a new command replaces the plugin of a killed one.
         name = f"taichi-msm {directory.absolute()}"
         cluster, lost = Cluster(client, name), False
         try:
-            _bring(Inputs(described, directory), name, client)
-            _wait(client, progress)
+            _register_inputs(Inputs(sweep, directory), name, client)
+            _wait_for_worker(client, progress)
             yield cluster
         except ExecutorError as error:
-            # While we wait for runs, only the loss of the connection cancels any.
+            # Within the block, runs are cancelled only when the connection is lost.
             if lost := isinstance(error.__cause__, (CancelledError, OSError)):
                 raise LostExecutorError(f"lost the scheduler at {address}") from error
             raise
         finally:
             if not lost:
-                with suppress(OSError, ValueError):  # lost just now; forgotten by another command for this folder
+                # The connection may be lost now, or another command for this directory may have removed the plugin.
+                with suppress(OSError, ValueError):
                     cluster.shutdown(cancel_futures=True)
                     client.unregister_worker_plugin(name)
             client.close()
 
 
 def _client(address: str) -> Any:
-    """Connect to a scheduler."""
     remedy = "give the address that `dask scheduler` prints, such as tcp://10.0.0.1:8786"
     try:
-        # A client would wait for ever for the greeting of another program, such as the scheduler's own web page.
-        LoopRunner(asynchronous=False).run_sync(_greet, address)
+        # A client would wait forever for the handshake of another program, such as the scheduler's web page.
+        LoopRunner(asynchronous=False).run_sync(_check_scheduler, address)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Workers compare versions.
-            return Client(address, timeout=PATIENCE, set_as_default=False)
+            warnings.simplefilter("ignore")  # `Inputs` compares versions.
+            return Client(address, timeout=MAX_WAIT_S, set_as_default=False)
     except (OSError, asyncio.TimeoutError):
         raise ExecutorError(f"{address}: no dask scheduler answers; {remedy}") from None
-    except TypeError as error:  # by a transport whose requirements are missing
-        needs = REQUIREMENTS.get(address.partition("://")[0], " ".join(str(error).split()))
+    except TypeError as error:  # raised by a transport whose requirements are not installed
+        needs = TRANSPORT_REQUIREMENTS.get(address.partition("://")[0], " ".join(str(error).split()))
         raise ExecutorError(f"{address}: needs {needs}") from None
     except Exception as error:
         raise ExecutorError(f"{address}: {' '.join(str(error).split())}; {remedy}") from None
 
 
-async def _greet(address: str) -> None:
-    how = Security().get_connection_args("client")
-    comm = await asyncio.wait_for(connect(address, timeout=PATIENCE, **how), PATIENCE)
+async def _check_scheduler(address: str) -> None:
+    arguments = Security().get_connection_args("client")
+    comm = await asyncio.wait_for(connect(address, timeout=MAX_WAIT_S, **arguments), MAX_WAIT_S)
     await comm.close()
 
 
-def _bring(inputs: Inputs, name: str, client: Any) -> None:
-    """Bring the inputs to the workers that are there, and to those that will come."""
+def _register_inputs(inputs: Inputs, name: str, client: Any) -> None:
+    """Send the inputs to all workers, also to workers that join later."""
     try:
         client.register_plugin(inputs, name=name)
     except ExecutorError:
         raise
     except Exception as error:
-        # Unpickling what is sent raises whatever a worker lacks.
+        # Unpickling the inputs raises an arbitrary error if a worker lacks a package.
         raise ExecutorError(f"a worker cannot take runs: {error}; install there what is here") from None
 
 
-def _wait(client: Any, progress: Progress) -> None:
-    """Wait for the first worker."""
+def _wait_for_worker(client: Any, progress: Progress) -> None:
     try:
         while not client.nthreads():
             progress("workers", 0, 0)
-            time.sleep(LOOK)
+            time.sleep(0.2)
     except OSError as error:
         raise LostExecutorError("the scheduler does not answer") from error

@@ -1,7 +1,7 @@
-"""Processes of this machine that take calls, one at a time each, as an executor of `concurrent.futures`.
+"""A process pool as a `concurrent.futures` executor, whose processes may be killed one by one.
 
-Those of the standard library import the caller's main module again, and all fail when one of them is killed. Here a
-call whose process is killed raises `DiedError`, and the next call starts another process.
+Processes of the standard library's pool import the caller's main module again, and all calls fail when one process is
+killed. In this pool only the call of the killed process raises `DiedError`, and the next call starts a new process.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from typing import Any
 
 from taichi_msm.errors import MsmError
 
-# How often a process looks whether its parent is there [s].
-ORPHANED = 0.2
+# Interval at which a process checks that its parent is alive [s].
+PARENT_POLL_S = 0.2
 
 _CHILD = "import sys; sys.path[:] = {path!r}; from taichi_msm.sweeps.pool import serve; serve()"
 
 
 class DiedError(MsmError):
-    """The process of a call ended before it returned."""
+    """Raised when the process of a call ended before the call returned."""
 
 
 class Pool(Executor):
-    """So many processes, each started when it is first needed; what they are given and return must be picklable."""
+    """Executor whose processes are started on demand; functions, arguments and results must be picklable."""
 
     def __init__(self, workers: int) -> None:
         self._threads = ThreadPoolExecutor(workers)
@@ -44,11 +44,23 @@ class Pool(Executor):
             self._idle.put(None)
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
-        """Call a function, which must be importable, in a process that is free."""
+        """Schedule a call in an idle process.
+
+        Args:
+            function: the function, which must be importable.
+            *arguments: its positional arguments.
+            **named: its named arguments.
+        """
         return self._threads.submit(self._call, (function, arguments, named))
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the processes: after all calls, or at once if those that wait are cancelled."""
+        """End the processes.
+
+        Args:
+            wait: whether to wait until all threads of the pool have ended.
+            cancel_futures: whether to cancel waiting calls and kill the processes at once, instead of ending them after
+                all calls.
+        """
         self._threads.shutdown(wait=False, cancel_futures=cancel_futures)
         if cancel_futures:
             self._closed = True
@@ -71,7 +83,7 @@ class Pool(Executor):
             code = process.close() if process else None
             self._live.discard(process)
             process = None
-            raise DiedError(_in_words(code)) from error
+            raise DiedError(_exit_reason(code)) from error
         finally:
             self._idle.put(process)
         if not success:
@@ -80,20 +92,20 @@ class Pool(Executor):
 
 
 class _Process:
-    """A process that takes calls."""
+    """A process that executes calls, one at a time."""
 
     def __init__(self) -> None:
         self._process = subprocess.Popen(
             [sys.executable, "-c", _CHILD.format(path=sys.path)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            # Ctrl-C must reach only us.
+            # Ctrl-C must reach only the parent process.
             start_new_session=True,
             creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
         )
 
     def call(self, call: tuple[Any, ...]) -> Any:
-        """Give the answer to a call: whether it succeeded, and its value or what it raised."""
+        """Execute a call; returns whether it succeeded, and its value or exception."""
         assert self._process.stdin
         assert self._process.stdout
         pickle.dump(call, self._process.stdin)
@@ -101,11 +113,11 @@ class _Process:
         return pickle.load(self._process.stdout)
 
     def kill(self) -> None:
-        """End it at once."""
+        """End the process at once."""
         self._process.kill()
 
     def close(self) -> int:
-        """End it when it has returned; gives its exit code."""
+        """End the process after its call; returns its exit code."""
         assert self._process.stdin
         assert self._process.stdout
         with suppress(BrokenPipeError):
@@ -115,8 +127,7 @@ class _Process:
         return code
 
 
-def _in_words(code: int | None) -> str:
-    """Say how a process ended."""
+def _exit_reason(code: int | None) -> str:
     if code is not None and code < 0:
         name = signal.Signals(-code).name
         hint = ", as the system does when memory runs out; take fewer --workers" if -code == signal.SIGKILL else ""
@@ -125,11 +136,11 @@ def _in_words(code: int | None) -> str:
 
 
 def serve() -> None:
-    """Run as a process of the pool, until the other end closes the pipe or is killed."""
+    """Execute calls from stdin as a process of the pool, until the parent closes the pipe or dies."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    Thread(target=_leave_orphaned, args=[os.getppid()], daemon=True).start()
+    Thread(target=_exit_with_parent, args=[os.getppid()], daemon=True).start()
     answers = os.fdopen(os.dup(1), "wb")
-    # Whatever is printed must not get among the answers.
+    # Output of libraries must not mix with the answers.
     os.dup2(2, 1)
     while True:
         try:
@@ -143,12 +154,12 @@ def serve() -> None:
         answers.write(pickle.dumps(answer))
         answers.flush()
     if runtime := sys.modules.get("taichi_msm.system.runtime"):
-        runtime.stop()  # which writes the cache of kernels
-    gc.freeze()  # The search for cycles at the end would take time.
+        runtime.stop()  # This writes the cache of kernels.
+    gc.freeze()  # This avoids a slow garbage collection at exit.
 
 
-def _leave_orphaned(parent: int) -> None:
-    """End this process soon after its parent was killed, so that the run's folder is free for another one."""
+def _exit_with_parent(parent: int) -> None:
+    """End this process after its parent was killed, which unlocks the directory of its run."""
     while os.getppid() == parent:
-        time.sleep(ORPHANED)
+        time.sleep(PARENT_POLL_S)
     os._exit(1)

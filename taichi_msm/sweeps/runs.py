@@ -1,13 +1,4 @@
-"""The folder of a sweep: what it is of, and which of its runs are done.
-
-Hand the runs of a sweep to an executor, and take their outcomes as they come.
-
-One run of a sweep, as a worker takes it.
-
-What is known of a run of a sweep: a row of the table.
-
-A sweep whose runs have ended.
-"""
+"""Runs of a sweep: the sweep's directory, execution of the missing runs, and their outcomes."""
 
 from __future__ import annotations
 
@@ -41,34 +32,31 @@ from taichi_msm.runs.directory import FILE, FOLDER, MAX_RECORD, give_name, kind,
 from taichi_msm.scene.outputs import RECORD, RUNS, SWEEP, numbered
 from taichi_msm.sweeps.pool import DiedError
 from taichi_msm.sweeps.spec import Sweep
-from taichi_msm.system.compiler import versions, what_decides_bits
+from taichi_msm.system.compiler import result_versions, versions
 
-pass  # REMOVED
-pass  # REMOVED
-pass  # REMOVED
-
-# Runs that ended so need not be taken again.
-ENDED = ("complete", "diverged")
-
-# A record is not read further than this, or twice the bytes of its values where these are more.
-MAX_BYTES = 1 << 28
-
-# How often a folder that another command has is tried again [s].
-LOCK_POLL_S = 0.1
+# A run with one of these statuses is not run again.
+FINAL_STATUSES = ("complete", "diverged")
 
 
-def values_in(directory: Path, sweep: Sweep) -> list[list[Any]]:
-    """Compute the values of all runs, which the folder keeps, after making sure that it holds no other sweep.
+def register_sweep(directory: Path, sweep: Sweep) -> list[list[Any]]:
+    """Write the description of a sweep into its directory, or check that the directory holds the same sweep.
+
+    Args:
+        directory: of the sweep.
+        sweep: the sweep to register.
+
+    Returns:
+        The values of the varied keys for each run.
 
     Raises:
-        SceneError: when the folder holds another sweep, or the same of versions that give other bits.
-        FilesError: when it cannot be read or written, something is in the way, or it keeps other values.
+        SceneError: when the directory holds another sweep, or the same sweep of versions with other results.
+        FilesError: when the directory cannot be read or written, contains other files, or is damaged.
     """
     record = require(directory / SWEEP, FILE)
     require(directory / RUNS, FOLDER)
     description, values = sweep.description(), sweep.values()
     if not record.exists():
-        for name in (RUNS, *FILES, RECORD):
+        for name in (RUNS, *REPORT_FILES, RECORD):
             if (directory / name).exists():
                 raise ForeignError.at(directory / name, "something")
         content = {
@@ -81,138 +69,172 @@ def values_in(directory: Path, sweep: Sweep) -> list[list[Any]]:
         with writing(directory), staged(directory) as hidden:
             (hidden / SWEEP).write_text(json.dumps(content) + "\n", encoding="utf-8", errors="backslashreplace")
             give_name(hidden / SWEEP, record)  # unless another shard has just done so
-    # As a text, in which no number equals another one, and NaN itself.
-    own_values = json.dumps(values)
+    # Values are compared as text: 1 differs from 1.0, and NaN equals itself.
+    expected_values = json.dumps(values)
     try:
         with record.open("rb") as file:
-            kept = json.loads(file.read(max(MAX_BYTES, 2 * len(own_values))))
-        earlier = {name: kept.get(name) for name in description}
-        kept_values, began = json.dumps(kept["values"]), what_decides_bits(kept["versions"], "cpu")
+            # The limit bounds the memory for a foreign file.
+            stored = json.loads(file.read(max(1 << 28, 2 * len(expected_values))))
+        earlier = {name: stored.get(name) for name in description}
+        stored_values, stored_versions = json.dumps(stored["values"]), result_versions(stored["versions"], "cpu")
     except OSError as error:
         raise FilesError(f"{record}: {(error.strerror or str(error)).lower()}") from None
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise FilesError(f"{record}: damaged; choose another --out") from None
-    if other := [name for name, value in json.loads(json.dumps(description)).items() if value != earlier[name]]:
-        what = {"digest": "the scene file", "files": _changed(description["files"], earlier["files"])}
-        said = f"holds the runs of another sweep: {what.get(other[0], other[0])} differs"
-        raise SceneError([f"{directory}: {said}; choose another --out"])
-    here = what_decides_bits(versions(), "cpu")
-    if others := [f"{name} {version}" for name, version in began.items() if version != here.get(name)]:
-        raise SceneError([f"{directory}: the sweep began with {', '.join(others)}; use these, or choose another --out"])
-    if kept_values != own_values:
-        said = "its values are not those of the sweep file, as it is damaged or of another SciPy"
-        raise FilesError(f"{record}: {said}; choose another --out")
+    if changed := [name for name, value in json.loads(json.dumps(description)).items() if value != earlier[name]]:
+        nouns = {"digest": "the scene file", "files": _changed_file(description["files"], earlier["files"])}
+        message = f"holds the runs of another sweep: {nouns.get(changed[0], changed[0])} differs"
+        raise SceneError([f"{directory}: {message}; choose another --out"])
+    current = result_versions(versions(), "cpu")
+    if required := [f"{name} {version}" for name, version in stored_versions.items() if version != current.get(name)]:
+        raise SceneError(
+            [f"{directory}: the sweep began with {', '.join(required)}; use these, or choose another --out"]
+        )
+    if stored_values != expected_values:
+        message = "its values are not those of the sweep file, as it is damaged or of another SciPy"
+        raise FilesError(f"{record}: {message}; choose another --out")
     return values
 
 
-def _changed(files: dict[str, str], earlier: Any) -> str:
-    """Name a file whose digest is not what it was."""
+def _changed_file(files: dict[str, str], earlier: Any) -> str:
+    """Return the path of a file whose digest has changed."""
     known = earlier if isinstance(earlier, dict) else files
     return next((path for path, digest in files.items() if known.get(path) != digest), "a file")
 
 
 @dataclass
-class UnderWay:
-    """A sweep in its folder, of which some runs may have ended."""
+class SweepState:
+    """A sweep, or a shard of it, in its directory.
+
+    Attributes:
+        directory: of the sweep.
+        sweep: the scene and its variation.
+        values: of the varied keys, for each run of the sweep.
+        done: outcomes of the finished runs; grows while the sweep runs.
+        missing: runs that were not finished at the beginning.
+        total: number of runs, of the sweep or the shard.
+    """
 
     directory: Path
     sweep: Sweep
-    values: list[list[Any]]  # of the varied keys, for each run
-    done: list[Outcome]  # of the runs that have ended, which grows
-    missing: list[Task]  # those that had not when it began
-    total: int  # of runs, of all or of a shard
+    values: list[list[Any]]
+    done: list[Outcome]
+    missing: list[RunTask]
+    total: int
 
 
-def begin_sweep(sweep: Sweep, directory: Path, shard: tuple[int, int] = (1, 1)) -> UnderWay:
-    """Begin a sweep in a folder, or a shard of it, or go on; errors as for `values_in`."""
-    values = values_in(directory, sweep)
+def begin_sweep(sweep: Sweep, directory: Path, shard: tuple[int, int] = (1, 1)) -> SweepState:
+    """Begin or resume a sweep in a directory.
+
+    Args:
+        sweep: the sweep.
+        directory: of the sweep; created if it does not exist.
+        shard: part I of N of the runs, (I, N) with 1 <= I <= N.
+
+    Raises:
+        SceneError, FilesError: as `register_sweep`.
+    """
+    values = register_sweep(directory, sweep)
     part, parts = shard
     home = Path.cwd()
     done, missing = [], []
     for run in range(part - 1, len(values), parts):
-        task = Task(run, sweep.scene, sweep.overrides(values[run]), directory, home)
+        task = RunTask(run, sweep.scene, sweep.overrides(values[run]), directory, home)
         require(task.directory, FOLDER)
-        if outcome := ended(task, sweep):
+        if outcome := read_outcome(task, sweep):
             done.append(outcome)
         else:
             missing.append(task)
-    return UnderWay(directory, sweep, values, done, missing, len(done) + len(missing))
+    return SweepState(directory, sweep, values, done, missing, len(done) + len(missing))
 
 
-def ended(task: Task, sweep: Sweep) -> Outcome | None:
-    """Find the outcome of a run that has ended; None: it is missing, was interrupted, or is another task's."""
-    # A record that no run has written is as none.
+def read_outcome(task: RunTask, sweep: Sweep) -> Outcome | None:
+    """Read the outcome of a finished run.
+
+    Args:
+        task: the run.
+        sweep: the sweep it belongs to.
+
+    Returns:
+        The outcome, or None if the run is missing, was interrupted, or belongs to another task.
+    """
+    # A damaged record counts as missing, so the run is repeated.
     with suppress(OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         if kind(task.directory / RECORD) == FILE:
             with (task.directory / RECORD).open("rb") as file:
                 record = json.loads(file.read(MAX_RECORD))
-            is_own = tuple(record["overrides"]) == task.overrides
+            has_same_overrides = tuple(record["overrides"]) == task.overrides
             has_same_files = sweep.digests.issuperset(record["sha256"].values())
-            if record["status"] in ENDED and is_own and has_same_files:
-                return outcome_of(task.run, record)
+            if record["status"] in FINAL_STATUSES and has_same_overrides and has_same_files:
+                return outcome_from_record(task.run, record)
     return None
 
 
 @contextmanager
-def alone(directory: Path, pause: Pause) -> Iterator[None]:
-    """Wait until no other command writes the files that a sweep ends with; `pause` is called meanwhile."""
-    with ExitStack() as opened:
+def report_lock(directory: Path, pause: Pause) -> Iterator[None]:
+    """Hold the lock under which the reports of a sweep are written.
+
+    Args:
+        directory: of the sweep.
+        pause: called while another command holds the lock.
+    """
+    with ExitStack() as stack:
         while True:
             try:
-                opened.enter_context(lock(directory / SWEEP))
+                stack.enter_context(lock(directory / SWEEP))
                 break
             except BlockingIOError:
                 pause()
-                time.sleep(LOCK_POLL_S)
+                time.sleep(0.1)
         yield
 
 
-pass  # REMOVED
-pass  # REMOVED
-
-# The most runs that an executor is given at a time.
-WINDOW = 4096
-
-# While all workers are busy, this is how long until `pause` is called again [s].
+# Interval between calls of `pause` or `progress` while all workers are busy [s].
 POLL_INTERVAL_S = 0.1
 
 
-def outcomes(tasks: Iterable[Task], executor: Executor, pause: Pause) -> Iterator[Outcome]:
-    """Take runs; one whose process in our own pool ended before it was done is taken once more.
+def execute_tasks(tasks: Iterable[RunTask], executor: Executor, pause: Pause) -> Iterator[Outcome]:
+    """Execute runs, and yield their outcomes in the order in which they end.
 
-    `pause` is called some times a second; what it raises ends the sweep.
+    A run whose process in `Pool` ended early is executed once more.
+
+    Args:
+        tasks: the runs.
+        executor: executes them.
+        pause: called several times a second; an exception from it ends the sweep.
 
     Raises:
-        LostExecutorError: when the executor takes no more runs.
+        LostExecutorError: when the executor accepts no more runs.
     """
     done: SimpleQueue[Future[Outcome]] = SimpleQueue()
-    waiting: dict[Future[Outcome], Task] = {}
+    pending: dict[Future[Outcome], RunTask] = {}
     died: set[int] = set()
 
-    def submit(task: Task) -> None:
+    def submit(task: RunTask) -> None:
         try:
-            future = executor.submit(take, task)
+            future = executor.submit(execute_run, task)
         except RuntimeError as error:  # such as that of a broken executor
-            raise _ended(executor, error) from error
-        waiting[future] = task
+            raise _executor_error(executor, error) from error
+        pending[future] = task
         future.add_done_callback(done.put)
 
-    rest = iter(tasks)
-    for task in islice(rest, WINDOW):
+    remaining = iter(tasks)
+    # A limit on submitted runs bounds the memory of the executor.
+    for task in islice(remaining, 4096):
         submit(task)
-    while waiting:
+    while pending:
         pause()
         try:
             future = done.get(timeout=POLL_INTERVAL_S)
         except Empty:
             continue
-        task = waiting.pop(future)
+        task = pending.pop(future)
         try:
             outcome = future.result()
         except ExecutorError as error:
             raise LostExecutorError(str(error)) from error
         except (BrokenExecutor, CancelledError) as error:
-            raise _ended(executor, error) from error
+            raise _executor_error(executor, error) from error
         except DiedError as error:
             if task.run not in died:
                 died.add(task.run)
@@ -220,40 +242,41 @@ def outcomes(tasks: Iterable[Task], executor: Executor, pause: Pause) -> Iterato
                 continue
             outcome = Outcome(task.run, "died", f"{error}, twice")
         except Exception as error:
-            # `take` raises nothing, so this is its worker's end; other executors try as often as they were told.
+            # `execute_run` raises nothing, so the worker has died; other executors have their own setting for retries.
             outcome = Outcome(task.run, "died", " ".join(str(error).split()))
         yield outcome
-        for following in islice(rest, 1):
-            submit(following)
+        for task in islice(remaining, 1):
+            submit(task)
 
 
-def _ended(executor: Executor, error: Exception) -> LostExecutorError:
-    """Make the error for an executor that takes no more runs."""
+def _executor_error(executor: Executor, error: Exception) -> LostExecutorError:
     return LostExecutorError(f"{type(executor).__name__} takes no more runs: {error}; start the sweep again")
 
 
-pass  # REMOVED
+class RunTask(NamedTuple):
+    """A run of a sweep that is to be executed."""
 
-
-class Task(NamedTuple):
-    """A run that is to be taken."""
-
-    run: int  # its number
+    run: int  # number of the run, from 0
     scene: File
     overrides: tuple[str, ...]
-    folder: Path  # of the sweep
-    home: Path  # from which its paths start
+    folder: Path  # directory of the sweep
+    home: Path  # current directory for relative paths
 
     @property
     def directory(self) -> Path:
-        """Where its results go."""
+        """The directory of the run's results."""
         return self.folder / RUNS / numbered(self.run)
 
 
-def take(task: Task, progress: Progress = lambda stage, done, total: None) -> Outcome:
-    """Run a scene with its overrides on one thread, as `run --set` does; whatever fails is in the outcome.
+def execute_run(task: RunTask, progress: Progress = lambda stage, done, total: None) -> Outcome:
+    """Run a scene with its overrides on one thread, as `run --set` does.
 
-    `progress` is called some times a second; it may raise a KeyboardInterrupt, as from `runs.run.run`.
+    Args:
+        task: the run.
+        progress: called several times a second; may raise KeyboardInterrupt, as in `runs.run.run`.
+
+    Returns:
+        The outcome, also of a run that fails.
     """
     os.chdir(task.home)
     try:
@@ -272,53 +295,61 @@ def take(task: Task, progress: Progress = lambda stage, done, total: None) -> Ou
         record = run_module.run(
             plan, task.directory, threads=1, overrides=task.overrides, started=time.perf_counter(), progress=progress
         )
-    except SceneError as error:  # found only now, such as a picture that cannot be decoded
+    except SceneError as error:  # raised only by the run, such as for a picture that cannot be decoded
         return _without_results(task, "refused", "; ".join(error.lines))
     except MsmError as error:
         return _without_results(task, "failed", str(error))
     except Exception as error:
         return _without_results(task, "failed", f"a bug, please report it: {type(error).__name__}: {error}")
-    return outcome_of(task.run, record)
+    return outcome_from_record(task.run, record)
 
 
-def _without_results(task: Task, status: Status, reason: str) -> Outcome:
-    """Make the outcome of a run without results; its reason names neither the folder of the sweep nor the scene's."""
-    said = " ".join(reason.split()).replace(str(task.directory), task.directory.name)
+def _without_results(task: RunTask, status: Status, reason: str) -> Outcome:
+    """Build the outcome of a run without results; its reason must not depend on the location of the directories."""
+    reason = " ".join(reason.split()).replace(str(task.directory), task.directory.name)
     # The path of a picture follows a blank.
-    return Outcome(task.run, status, said.replace(f" {task.scene.folder / '_'}"[:-1], " "))
+    return Outcome(task.run, status, reason.replace(f" {task.scene.folder / '_'}"[:-1], " "))
 
 
-# How a run ended. Refused: its values are not valid; failed: by an error; died: its process ended twice before it did.
+# "refused": its values are not valid; "failed": by an error; "died": its process ended early twice.
 Status = Literal["complete", "diverged", "refused", "failed", "died"]
 STATUSES: tuple[Status, ...] = get_args(Status)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a run of a sweep ended, and its results; None: it has none."""
+    """Status and results of a run of a sweep; results are None if the run has none."""
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(allow_inf_nan=False)
 
-    run: int  # its number, from 0
+    run: int  # number of the run, from 0
     status: Status
-    error: str = ""  # why, if it is not complete
+    error: str = ""  # the reason, if the run is not complete
     max_displacement: float | None = None  # [m]
     shortest_spring: float | None = None  # smallest ratio of a spring's length to its rest length
-    error_estimate: float | None = None  # as a fraction of the largest displacement
-    mesh_error: float | None = None  # likewise
-    forces: tuple[float | None, ...] = ()  # the greatest force of every probe at any frame [N]
-    notes: tuple[str, ...] = ()  # what to know before trusting the results, besides the errors
-    seconds: float | None = field(default=None, compare=False)  # the time that it took [s]
+    error_estimate: float | None = None  # discretisation error (time step), as a fraction of the largest displacement
+    mesh_error: float | None = None  # discretisation error (mesh), as a fraction of the largest displacement
+    forces: tuple[float | None, ...] = ()  # largest force of each probe over all frames [N]
+    notes: tuple[str, ...] = ()  # warnings of the run, without that about the errors
+    seconds: float | None = field(default=None, compare=False)  # wall-clock time of the run [s]
 
 
 _OUTCOME = TypeAdapter(Outcome)
 
-# The columns of the table after those of the keys, in their order; then come the forces of the probes, and seconds.
-COLUMNS = ("status", "error", "max_displacement", "shortest_spring", "error_estimate", "mesh_error")
+# Columns of the table after those of the keys; the forces of the probes and `seconds` follow.
+RESULT_COLUMNS = ("status", "error", "max_displacement", "shortest_spring", "error_estimate", "mesh_error")
 
 
-def outcome_of(run: int, record: Mapping[str, Any]) -> Outcome:
-    """Take from the record of a run that has ended what the table shows; ValueError: no run has written that."""
+def outcome_from_record(run: int, record: Mapping[str, Any]) -> Outcome:
+    """Extract the outcome of a finished run from its record.
+
+    Args:
+        run: number of the run.
+        record: content of its run.json.
+
+    Raises:
+        ValueError: when the record was not written by a run.
+    """
     estimate = record["error_estimate"] or {}
     return _OUTCOME.validate_python(
         {
@@ -330,16 +361,14 @@ def outcome_of(run: int, record: Mapping[str, Any]) -> Outcome:
             "error_estimate": estimate.get("error"),
             "mesh_error": estimate.get("mesh_error"),
             "forces": tuple(probe.get("greatest_force") for probe in record["probes"]),
-            "notes": tuple(record["notes"][1:]),  # The first one is of the errors.
+            "notes": tuple(record["notes"][1:]),  # The first one is about the errors.
             "seconds": record["timings"]["total"],
         }
     )
 
 
-pass  # REMOVED
-
-# The files that a sweep ends with.
-FILES = TABLE, PARQUET, DATASET, CONTACT, PLOT, SENSITIVITY = (
+# Reports written at the end of a sweep.
+REPORT_FILES = TABLE, PARQUET, DATASET, CONTACT, PLOT, SENSITIVITY = (
     "table.csv",
     "table.parquet",
     "dataset.json",
@@ -351,29 +380,29 @@ FILES = TABLE, PARQUET, DATASET, CONTACT, PLOT, SENSITIVITY = (
 
 @dataclass(frozen=True)
 class SweepResult:
-    """What came out of all runs of a sweep."""
+    """Outcomes of all runs of a sweep."""
 
     directory: Path
     sweep: Sweep
     values: list[list[Any]]  # of the varied keys, for each run
-    outcomes: list[Outcome]  # one for each run, in the order of their numbers
+    outcomes: list[Outcome]  # for each run, in the order of their numbers
 
     def columns(self) -> dict[str, list[Any]]:
-        """Give the columns of the table after those of the keys, by their names: a value for each run."""
-        runs = self.outcomes
-        columns = {name: [getattr(one, name) for one in runs] for name in COLUMNS}
-        for n in range(max((len(one.forces) for one in runs), default=0)):
+        """Return the result columns of the table by name, with a value for each run."""
+        outcomes = self.outcomes
+        columns = {name: [getattr(outcome, name) for outcome in outcomes] for name in RESULT_COLUMNS}
+        for n in range(max((len(outcome.forces) for outcome in outcomes), default=0)):
             name = f"probes.{n}.force"
-            # Which is a key of a scene, too.
+            # A scene has a key of this name, which the sweep may vary.
             name += ".greatest" if name in self.sweep.keys else ""
-            columns[name] = [one.forces[n] if n < len(one.forces) else None for one in runs]
-        return columns | {"seconds": [one.seconds for one in runs]}
+            columns[name] = [outcome.forces[n] if n < len(outcome.forces) else None for outcome in outcomes]
+        return columns | {"seconds": [outcome.seconds for outcome in outcomes]}
 
     def run_directory(self, run: int) -> Path:
-        """Name the folder of a run."""
+        """Return the directory of a run."""
         return self.directory / RUNS / numbered(run)
 
-    def some(self, most: int) -> list[int]:
-        """Give the numbers of at most so many runs, evenly spread over all."""
-        total, count = len(self.outcomes), min(len(self.outcomes), most)
+    def sample_runs(self, limit: int) -> list[int]:
+        """Return the numbers of at most `limit` runs, evenly spread over all runs."""
+        total, count = len(self.outcomes), min(len(self.outcomes), limit)
         return [(2 * n + 1) * total // (2 * count) for n in range(count)]

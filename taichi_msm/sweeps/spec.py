@@ -1,8 +1,6 @@
-"""Sweep file -> Sweep, with file, line and column in every error.
+"""Sweep files: parsing, distributions of the varied keys, and the values of every run.
 
-The values of every run of a sweep.
-
-How a key of a scene is varied.
+Errors contain the file, line and column.
 """
 
 from __future__ import annotations
@@ -41,19 +39,14 @@ from taichi_msm.load.yaml_reader import UnreadableError, read
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import LARGEST, MAX_PATH, FilePath, Section, Whole, cut, flow, key, refused
 
-pass  # REMOVED
-pass  # REMOVED
-
 MAX_RUNS = 10**7
 
-# SciPy has no Sobol sequence of more dimensions.
-MAX_NUMBERS = 21201
-
-SWEEP = Kind("sweep", "scene and vary")
+# SciPy's Sobol sequences have no more dimensions.
+MAX_DIMENSIONS = 21201
 
 
 class SweepSettings(Section):
-    """The content of a sweep file."""
+    """Content of a sweep file."""
 
     scene: FilePath = key(..., "the scene file; relative to the sweep file", "the path of a scene file")
     samples: Annotated[Whole, Field(ge=1, le=MAX_RUNS)] | None = key(
@@ -80,7 +73,7 @@ class SweepSettings(Section):
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
-        grids = [name for name, one in self.vary.items() if one.kind == "grid"]
+        grids = [name for name, distribution in self.vary.items() if distribution.kind == "grid"]
         if self.samples is not None and grids:
             raise refused(
                 f"{grids[0]} is a grid, which gives every combination; take choice, or leave out samples", "samples"
@@ -89,28 +82,28 @@ class SweepSettings(Section):
             raise refused("missing; expected the number of runs, as not every key is a grid", "samples")
         if (runs := count_runs(self.vary, self.samples)) > MAX_RUNS:
             raise refused(f"{runs} combinations, more than the {MAX_RUNS} that can be run; take smaller grids", "vary")
-        if (numbers := sum(one.dimensions for one in self.vary.values())) > MAX_NUMBERS:
-            raise refused(f"{numbers} numbers, more than the {MAX_NUMBERS} that can vary; take fewer", "vary")
-        keys = [_as_key(name) for name in (*self.set, *self.vary)]
+        if (numbers := sum(distribution.dimensions for distribution in self.vary.values())) > MAX_DIMENSIONS:
+            raise refused(f"{numbers} numbers, more than the {MAX_DIMENSIONS} that can vary; take fewer", "vary")
+        keys = [_split_key(name) for name in (*self.set, *self.vary)]
         for number, later in enumerate(keys):
-            if hidden := [earlier for earlier in keys[:number] if earlier[: len(later)] == later]:
-                name, other = (".".join(map(str, one)) for one in (later, hidden[0]))
-                remedy = "keep one" if later == hidden[0] else f"keep one, or give {name} first"
-                where = "vary" if number >= len(self.set) else "set"
-                raise refused(f"{name} replaces {other}, which comes before it; {remedy}", where)
+            if replaced := [earlier for earlier in keys[:number] if earlier[: len(later)] == later]:
+                name, earlier_name = (".".join(map(str, key)) for key in (later, replaced[0]))
+                remedy = "keep one" if later == replaced[0] else f"keep one, or give {name} first"
+                section = "vary" if number >= len(self.set) else "set"
+                raise refused(f"{name} replaces {earlier_name}, which comes before it; {remedy}", section)
         return self
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """A scene file and how it is varied. Paths of pictures in its values are relative to the scene file."""
+    """A scene file and the variation of its keys. Paths of pictures in the values are relative to the scene file."""
 
     scene: File
     settings: SweepSettings
 
     @property
     def keys(self) -> list[str]:
-        """The keys that vary."""
+        """The varied keys, as dotted paths."""
         return list(self.settings.vary)
 
     @property
@@ -119,55 +112,63 @@ class Sweep:
         return count_runs(self.settings.vary, self.settings.samples)
 
     def values(self) -> list[list[Any]]:
-        """Give the values of the keys that vary, for every run."""
-        return values_of_runs(self.settings.vary, self.settings.samples, self.settings.seed)
+        """Return the values of the varied keys, for every run."""
+        return run_values(self.settings.vary, self.settings.samples, self.settings.seed)
 
-    def some_values(self, most: int) -> list[list[Any]]:
-        """Give those of at most so many runs, spread over all."""
-        return values_of_some(self.settings.vary, self.settings.samples, self.settings.seed, most)
+    def sample_values(self, limit: int) -> list[list[Any]]:
+        """Return the values of the varied keys for at most `limit` runs, spread over all runs."""
+        return sample_run_values(self.settings.vary, self.settings.samples, self.settings.seed, limit)
 
     def overrides(self, values: list[Any]) -> tuple[str, ...]:
-        """Give what `run --set` takes for the run with these values."""
+        """Return the arguments of `run --set` for the run with these values."""
         pairs = [*self.settings.set.items(), *zip(self.keys, values, strict=True)]
-        return tuple(f"{name}={cell(value)}" for name, value in pairs)
+        return tuple(f"{name}={format_value(value)}" for name, value in pairs)
 
     @cached_property
     def files(self) -> dict[str, str]:
-        """The SHA-256 of every file that the runs may need, by its path; without those that cannot be read."""
+        """The SHA-256 of every readable file that the runs may need, by path."""
         names: list[str] = []
 
-        def noted(_: Key, text: str) -> str:
+        def collect(_: Key, text: str) -> str:
             names.append(text)
             return text
 
-        listed = [(name, one.values) for name, one in self.settings.vary.items() if one.kind in ("choice", "grid")]
-        pairs = [(name, value) for name, values in listed for value in values]
-        _with_files((), self.scene.document.data, noted)
-        for name, value in [*self.settings.set.items(), *pairs]:
-            _with_files(_as_key(name), value, noted)
+        varied = [
+            (name, value)
+            for name, distribution in self.settings.vary.items()
+            if distribution.kind in ("choice", "grid")
+            for value in distribution.values
+        ]
+        _map_files((), self.scene.document.data, collect)
+        for name, value in [*self.settings.set.items(), *varied]:
+            _map_files(_split_key(name), value, collect)
         digests = {}
         for path in dict.fromkeys(str(self.scene.folder / name) for name in names):
-            with suppress(PictureError):  # The run that needs it says why.
+            with suppress(PictureError):  # The run that needs the file reports the error.
                 digests[path] = file_sha256(path)
         return digests
 
     @cached_property
     def digests(self) -> frozenset[str]:
-        """The digests of these files."""
+        """The digests of `files`."""
         return frozenset(self.files.values())
 
     def description(self) -> dict[str, Any]:
-        """Give all that its results follow from, for JSON; two sweeps that are described equally are one."""
+        """Return everything that determines the results, for JSON; sweeps with equal descriptions are the same."""
         settings = self.settings.model_dump(mode="json", exclude={"scene", "vary"})
-        vary = {name: {one.kind: one.values} for name, one in self.settings.vary.items()}
+        vary = {name: {distribution.kind: distribution.values} for name, distribution in self.settings.vary.items()}
         scene = json.dumps(self.scene.document.data).encode()
         files = {os.path.relpath(path, self.scene.folder): digest for path, digest in self.files.items()}
         return {**settings, "vary": vary, "digest": hashlib.sha256(scene).hexdigest(), "files": files}
 
 
 def load_sweep(path: str | Path) -> Sweep:
-    """Read a sweep file and check it; SceneError: with all its faults, one line each, in their order."""
-    draft = Draft(read_file(str(path), SWEEP))
+    """Read and check a sweep file.
+
+    Raises:
+        SceneError: with a line for each error of the file, in the order of the file.
+    """
+    draft = Draft(read_file(str(path), Kind("sweep", "scene and vary")))
     if "sheet" in draft.data and "vary" not in draft.data:
         raise SceneError([f"{path}:1:1: a scene; use `taichi-msm run`, or name it by `scene:` in a sweep file"])
     sweep, problems = _checked(draft.data, Path(path).parent)
@@ -178,7 +179,16 @@ def load_sweep(path: str | Path) -> Sweep:
 
 
 def make_sweep(scene: str | Path, settings: Mapping[str, Any]) -> Sweep:
-    """Build a sweep without a file; its paths are relative to the scene file. SceneError: with all its faults."""
+    """Build a sweep without a sweep file.
+
+    Args:
+        scene: path of the scene file; paths in `settings` are relative to it.
+        settings: content of a sweep file, without `scene`.
+
+    Raises:
+        ArgumentError: when a value cannot be represented in JSON.
+        SceneError: with a line for each error of the settings.
+    """
     try:
         data = json.loads(json.dumps({**settings, "scene": Path(scene).name}))
     except (TypeError, ValueError) as error:
@@ -190,24 +200,24 @@ def make_sweep(scene: str | Path, settings: Mapping[str, Any]) -> Sweep:
 
 
 def _checked(data: dict[str, Any], folder: Path) -> tuple[Sweep | None, list[Problem]]:
-    """Check the content of a sweep file in a folder, and read its scene; gives all that is wrong."""
+    """Check the content of a sweep file in a folder, and read its scene; returns the sweep and all errors."""
     problems: list[Problem] = []
     file, name = None, data.get("scene")
     if isinstance(name, str) and name:
         path = folder / name
         problems += _relocate(data, folder, path.parent)
         try:
-            # In the errors of runs it is named without its folder, wherever the sweep is started.
-            file = read_file(_short(path), SCENE)._replace(name=path.name)
+            # Errors of runs must not depend on the current directory, so the name of the scene has no folder.
+            file = read_file(_normalised(path), SCENE)._replace(name=path.name)
             problems += _unknown_keys(file, data)
         except SceneError as error:
             problems.append(Problem(("scene",), error.lines[0]))
-    settings, wrong = parse(SweepSettings, data)
-    return (None if settings is None or file is None else Sweep(file, settings)), [*problems, *wrong]
+    settings, setting_problems = parse(SweepSettings, data)
+    return (None if settings is None or file is None else Sweep(file, settings)), [*problems, *setting_problems]
 
 
-def _short(path: Path) -> str:
-    """Leave .. out of a path, if that leads to the same file, as it may not where folders are links."""
+def _normalised(path: Path) -> str:
+    """Remove .. from a path if the result is the same file; through symbolic links it may not be."""
     short = Path(os.path.normpath(path))
     try:
         return str(short if short.samefile(path) else path)
@@ -215,8 +225,8 @@ def _short(path: Path) -> str:
         return str(path)
 
 
-def cell(value: Any) -> str:
-    """Write a value as `--set` takes it."""
+def format_value(value: Any) -> str:
+    """Format a value for `--set`."""
     if isinstance(value, str):
         with suppress(UnreadableError):
             document = read(value)
@@ -226,30 +236,32 @@ def cell(value: Any) -> str:
 
 
 def _relocate(data: dict[str, Any], folder: Path, home: Path) -> Iterator[Problem]:
-    """Make paths of files, given relative to a folder, relative to the scene's, its home; expand patterns."""
+    """Rewrite paths relative to `folder` as paths relative to `home`, the scene's folder, and expand file patterns."""
     vary, fixed = _mappings(data)
-    for name, ways in vary.items():
-        for way in {"choice", "grid"} & set(ways if isinstance(ways, dict) else ()):
-            path: Key = ("vary", name, way)
-            if isinstance(pattern := ways[way], str) and names_file(_as_key(name)):
-                noun, suffixes = _kind_of_file(_as_key(name))
+    for name, distribution in vary.items():
+        for kind in {"choice", "grid"} & set(distribution if isinstance(distribution, dict) else ()):
+            path: Key = ("vary", name, kind)
+            if isinstance(pattern := distribution[kind], str) and names_file(_split_key(name)):
+                noun, suffixes = _kind_of_file(_split_key(name))
                 names = sorted(glob(pattern, root_dir=folder))  # noqa: PTH207  # Path.glob refuses absolute patterns
-                ways[way] = [text for text in names if text.lower().endswith(suffixes) and (folder / text).is_file()]
-                if not ways[way]:
-                    said = f"{flow(pattern)} matches no {noun}; give a pattern relative to the sweep file"
-                    yield Problem(path, said)
-            if isinstance(ways[way], list):
-                for index, value in enumerate(ways[way]):
-                    ways[way][index], faults = _relocated(name, value, folder, home)
-                    yield from (Problem((*path, index), fault) for fault in faults)
+                distribution[kind] = [
+                    text for text in names if text.lower().endswith(suffixes) and (folder / text).is_file()
+                ]
+                if not distribution[kind]:
+                    message = f"{flow(pattern)} matches no {noun}; give a pattern relative to the sweep file"
+                    yield Problem(path, message)
+            if isinstance(distribution[kind], list):
+                for index, value in enumerate(distribution[kind]):
+                    distribution[kind][index], errors = _relocated(name, value, folder, home)
+                    yield from (Problem((*path, index), error) for error in errors)
     for name, value in fixed.items():
-        fixed[name], faults = _relocated(name, value, folder, home)
-        yield from (Problem(("set", name), fault) for fault in faults)
+        fixed[name], errors = _relocated(name, value, folder, home)
+        yield from (Problem(("set", name), error) for error in errors)
 
 
 def _relocated(name: str, value: Any, folder: Path, home: Path) -> tuple[Any, list[str]]:
-    """Relocate the files in the value of a key; returns it, and what is wrong with them."""
-    faults = []
+    """Relocate the files in the value of a key; returns the value and the errors."""
+    errors = []
 
     def relocated(key: Key, text: str) -> str:
         noun, _ = _kind_of_file(key)
@@ -259,80 +271,83 @@ def _relocated(name: str, value: Any, folder: Path, home: Path) -> tuple[Any, li
         except (OSError, ValueError):
             is_file = False
         if not (is_below(path, folder) or is_below(path, home)):
-            faults.append(
+            errors.append(
                 f"{text} is neither below the sweep file's folder nor below the scene's; put the {noun} there"
             )
         elif not is_file:
-            faults.append(f"{cut(text)}: no such file; name a {noun} relative to the sweep file")
-        # A folder may be a link, from which .. leads elsewhere.
+            errors.append(f"{cut(text)}: no such file; name a {noun} relative to the sweep file")
+        # The folder is resolved first, as .. after a symbolic link leads to the parent of its target.
         return Path(os.path.relpath(path.parent.resolve() / path.name, home.resolve())).as_posix()
 
-    return _with_files(_as_key(name), value, relocated), faults
+    return _map_files(_split_key(name), value, relocated), errors
 
 
 def _kind_of_file(key: Key) -> tuple[str, tuple[str, ...]]:
-    """Return the noun for the file that a key names, and the ends that its name may have."""
+    """Return the noun for the file of a key in messages, and the allowed suffixes."""
     return ("picture", SUFFIXES) if key in PICTURES else ("file", ("",))
 
 
-def _with_files(path: Key, value: Any, change: Callable[[Key, str], str]) -> Any:
-    """Change the paths of files in the value of a key."""
+def _map_files(path: Key, value: Any, change: Callable[[Key, str], str]) -> Any:
+    """Apply a function to the paths of files in the value of a key."""
     if names_file(path):
         return change(path, value) if isinstance(value, str) and 0 < len(value) <= MAX_PATH else value
     if isinstance(value, dict):
-        return {name: _with_files((*path, name), one, change) for name, one in value.items()}
+        return {name: _map_files((*path, name), item, change) for name, item in value.items()}
     return value
 
 
-def _as_key(name: str) -> Key:
-    """Split a dotted key; empty: it is none that `--set` takes."""
+def _split_key(name: str) -> Key:
+    """Split a dotted key; the result is empty if `--set` does not accept the key."""
     return parse_key(name.strip()) if "=" not in name else ()
 
 
 def _unknown_keys(scene: File, data: dict[str, Any]) -> Iterator[Problem]:
-    """Find the keys that no scene has, by trying one value of each."""
+    """Check that a scene has the keys, by setting each to one of its values."""
     vary, fixed = _mappings(data)
-    tried: dict[Key, Any] = {("set", name): value for name, value in fixed.items()}
-    for name, ways in vary.items():
-        values = next(iter(ways.values()), None) if isinstance(ways, dict) else None
-        tried["vary", name] = values[0] if isinstance(values, list) and values else None
+    trials: dict[Key, Any] = {("set", name): value for name, value in fixed.items()}
+    for name, distribution in vary.items():
+        values = next(iter(distribution.values()), None) if isinstance(distribution, dict) else None
+        trials["vary", name] = values[0] if isinstance(values, list) and values else None
     draft = Draft(scene)
-    for place in [place for place in tried if not _as_key(str(place[1]))]:
-        yield Problem(place, "not a key; expected a dotted path such as sheet.points")
-        del tried[place]
-    for place, value in tried.items():
+    for path in [path for path in trials if not _split_key(str(path[1]))]:
+        yield Problem(path, "not a key; expected a dotted path such as sheet.points")
+        del trials[path]
+    for path, value in trials.items():
         known = len(draft.problems)
-        draft.override(parse_override(f"{place[1]}={cell(value)}"))
-        yield from (Problem(place, problem.message) for _, problem in draft.problems[known:])
+        draft.override(parse_override(f"{path[1]}={format_value(value)}"))
+        yield from (Problem(path, problem.message) for _, problem in draft.problems[known:])
     for problem in parse(Scene, draft.data)[1]:
         if not problem.message.startswith("unknown key"):
             continue
-        # The fault may be above a key or, in a section that is given as a whole, below it; or in the scene itself.
-        around = [place for place in tried if _on_one_way(_as_key(str(place[1])), problem.path)]
-        for place in around or [("scene",)]:
-            told = f"{problem.key}: " if problem.path != _as_key(str(place[-1])) else ""
-            yield Problem(place, f"{told}{problem.message}")
+        # The unknown key may be above a tried key, below one whose value is a whole section, or in the scene file.
+        related = [path for path in trials if _is_prefix(_split_key(str(path[1])), problem.path)]
+        for path in related or [("scene",)]:
+            prefix = f"{problem.key}: " if problem.path != _split_key(str(path[-1])) else ""
+            yield Problem(path, f"{prefix}{problem.message}")
 
 
-def _on_one_way(key: Key, other: Key) -> bool:
-    """Tell whether one of two keys leads to the other."""
-    return all(part == also for part, also in zip(key, other, strict=False))
+def _is_prefix(first: Key, second: Key) -> bool:
+    """Return whether one of two keys is a prefix of the other."""
+    return all(part == counterpart for part, counterpart in zip(first, second, strict=False))
 
 
 def _mappings(data: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Give what varies and what is set, each empty where it is no mapping."""
+    """Return the sections `vary` and `set`, each empty if it is not a mapping."""
     vary, fixed = (data.get(name) for name in ("vary", "set"))
     return vary if isinstance(vary, dict) else {}, fixed if isinstance(fixed, dict) else {}
 
 
-pass  # REMOVED
+def run_values(vary: Mapping[str, Distribution], samples: int | None, seed: int) -> list[list[Any]]:
+    """Compute the values of the varied keys, in their order, for every run.
 
+    Without `samples` the runs are all combinations of the grids, the last key varying fastest. Otherwise they are the
+    first points of a scrambled Sobol sequence, with a dimension for every number and every choice, in the order of the
+    keys.
 
-def values_of_runs(vary: Mapping[str, Distribution], samples: int | None, seed: int) -> list[list[Any]]:
-    """Give the values of the varied keys, in their order, for every run.
-
-    Every combination of the grids, the last key varying fastest; or, with a number of samples, the first points of a
-    scrambled Sobol sequence, of which every number and every choice takes a dimension, in the order of the keys.
+    Args:
+        vary: distributions by key.
+        samples: number of runs, or None for grids.
+        seed: of the scrambling.
 
     Source: Owen, "Randomly permuted (t,m,s)-nets and (t,s)-sequences", 1995; SciPy's `qmc.Sobol`.
     """
@@ -341,48 +356,59 @@ def values_of_runs(vary: Mapping[str, Distribution], samples: int | None, seed: 
     import numpy as np
     from scipy.stats import qmc
 
-    counts = [one.dimensions for one in vary.values()]
-    # A generator, as SciPy turns a number into different ones from version to version; a power of two, as it warns of
-    # any other number, whose first points are the same.
+    counts = [distribution.dimensions for distribution in vary.values()]
+    # A generator is passed, as SciPy's versions derive different ones from the same integer. A power of two is drawn,
+    # as SciPy warns about other numbers of points; the first points are the same.
     sequence = qmc.Sobol(sum(counts), scramble=True, seed=np.random.default_rng(seed))
     points = sequence.random_base2(math.ceil(math.log2(samples)))[:samples]
-    parts = np.split(points, np.cumsum(counts)[:-1], axis=1)
-    columns = [[one.value(shares) for shares in part.tolist()] for one, part in zip(vary.values(), parts, strict=True)]
+    columns = [
+        [distribution.value(fractions) for fractions in block.tolist()]
+        for distribution, block in zip(vary.values(), np.split(points, np.cumsum(counts)[:-1], axis=1), strict=True)
+    ]
     return [list(values) for values in zip(*columns, strict=True)]
 
 
-def values_of_some(vary: Mapping[str, Distribution], samples: int | None, seed: int, most: int) -> list[list[Any]]:
-    """Give the values of at most so many runs, spread over all, without making those of the others."""
+def sample_run_values(vary: Mapping[str, Distribution], samples: int | None, seed: int, limit: int) -> list[list[Any]]:
+    """Compute the values of at most `limit` runs, spread over all runs, without those of the other runs.
+
+    Args:
+        vary: distributions by key.
+        samples: number of runs, or None for grids.
+        seed: of the scrambling.
+        limit: largest number of runs that are returned.
+    """
     if samples is not None:
-        # The first points of the sequence are spread over all.
-        return values_of_runs(vary, min(samples, most), seed)
+        # The first points of a Sobol sequence cover the whole range.
+        return run_values(vary, min(samples, limit), seed)
     total = count_runs(vary, None)
-    return [_combination(vary, run) for run in sorted({(2 * n + 1) * total // (2 * most) for n in range(most)})]
+    return [_combination(vary, run) for run in sorted({(2 * n + 1) * total // (2 * limit) for n in range(limit)})]
 
 
 def count_runs(vary: Mapping[str, Distribution], samples: int | None) -> int:
-    """Count the runs without making their values."""
-    return math.prod(len(one.values) for one in vary.values()) if samples is None else samples
+    """Count the runs, without computing their values.
+
+    Args:
+        vary: distributions by key.
+        samples: number of runs, or None for grids.
+    """
+    return math.prod(len(distribution.values) for distribution in vary.values()) if samples is None else samples
 
 
 def _combination(vary: Mapping[str, Distribution], run: int) -> list[Any]:
-    """Give the combination of the grids with a number."""
+    """Return the combination of grid values with this number."""
     values = []
-    for one in reversed(list(vary.values())):
-        run, index = divmod(run, len(one.values))
-        values.append(one.values[index])
+    for distribution in reversed(list(vary.values())):
+        run, index = divmod(run, len(distribution.values))
+        values.append(distribution.values[index])
     return values[::-1]
 
-
-# Sobol points are multiples of 2^-30, 0 among them, where a normal distribution has no value.
-SMALLEST_SHARE = 2.0**-31
 
 RANGE = "[low, high]: numbers, or lists of one shape"
 LIST = "a list of values that is not empty"
 
 
 class Distribution(Section):
-    """Exactly one way in which a key varies. Lists of numbers vary componentwise."""
+    """Distribution of a varied key: exactly one of its fields. Lists of numbers vary componentwise."""
 
     model_config = ConfigDict(validate_default=False)
 
@@ -451,60 +477,61 @@ class Distribution(Section):
 
     @property
     def kind(self) -> str:
-        """Which of the ways it is."""
+        """The name of the field that is set."""
         return next(iter(self.model_fields_set))
 
     @property
     def values(self) -> Any:
-        """The numbers or values that it is made from."""
+        """The parameters of the distribution, or the values of a choice or grid."""
         return getattr(self, self.kind)
 
     @property
     def dimensions(self) -> int:
-        """How many shares a value is made from: one for each number, one for a choice, none for a grid."""
+        """The number of fractions that `value` takes: one for each number, one for a choice, none for a grid."""
         if self.kind in ("choice", "grid"):
             return int(self.kind == "choice")
         return len(_numbers(self.values[0]))
 
-    def value(self, shares: Sequence[float]) -> Any:
-        """Turn shares, 0 <= share < 1, one for each dimension, into a value."""
+    def value(self, fractions: Sequence[float]) -> Any:
+        """Map fractions from [0, 1), shape (dimensions,), to a value by the inverse distribution function."""
         if self.kind == "choice":
-            return self.values[int(shares[0] * len(self.values))]
-        rest = iter(shares)
-        return _each(lambda first, second: _NUMBERS[self.kind](first, second, next(rest)), *self.values)
+            return self.values[int(fractions[0] * len(self.values))]
+        remaining = iter(fractions)
+        return _map_pairs(lambda first, second: _QUANTILES[self.kind](first, second, next(remaining)), *self.values)
 
 
-def _uniform(low: float, high: float, share: float) -> float:
-    return low + (high - low) * share
+def _uniform(low: float, high: float, fraction: float) -> float:
+    return low + (high - low) * fraction
 
 
-def _log_uniform(low: float, high: float, share: float) -> float:
-    # Rounding must not lead outside.
-    return min(max(math.exp(_uniform(math.log(low), math.log(high), share)), low), high)
+def _log_uniform(low: float, high: float, fraction: float) -> float:
+    # Rounding must not lead outside the interval.
+    return min(max(math.exp(_uniform(math.log(low), math.log(high), fraction)), low), high)
 
 
-def _normal(mean: float, deviation: float, share: float) -> float:
+def _normal(mean: float, deviation: float, fraction: float) -> float:
     from scipy.special import ndtri
 
-    return mean + deviation * float(ndtri(max(share, SMALLEST_SHARE)))
+    # Sobol points are multiples of 2^-30 and include 0, where the quantile is infinite.
+    return mean + deviation * float(ndtri(max(fraction, 2.0**-31)))
 
 
-_NUMBERS: dict[str, Callable[[float, float, float], float]] = {
+_QUANTILES: dict[str, Callable[[float, float, float], float]] = {
     "uniform": _uniform,
     "log_uniform": _log_uniform,
     "normal": _normal,
 }
 
 
-def _each(make: Callable[[float, float], float], first: Any, second: Any) -> Any:
-    """Make a value from two of one shape, number by number."""
+def _map_pairs(function: Callable[[float, float], float], first: Any, second: Any) -> Any:
+    """Apply a function to pairs of numbers in two values of the same shape."""
     if isinstance(first, list):
-        return list(map(partial(_each, make), first, second))
-    return float(make(first, second))
+        return list(map(partial(_map_pairs, function), first, second))
+    return float(function(first, second))
 
 
 def _numbers(value: Any) -> list[float]:
-    """List the numbers in a value; empty: it holds something else."""
+    """Return the numbers in a value; empty if it contains anything else."""
     if isinstance(value, list):
         parts = [_numbers(item) for item in value]
         return [number for part in parts for number in part] if all(parts) else []
@@ -519,7 +546,7 @@ def _is_finite(value: Any) -> bool:
 
 
 def _shape(value: Any) -> Any:
-    """Tell values of different nesting apart; a number is None, anything else itself."""
+    """Return the nesting of a value: its numbers are replaced by None."""
     if isinstance(value, list):
         return [_shape(item) for item in value]
     return None if _numbers(value) else value

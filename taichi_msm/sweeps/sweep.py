@@ -1,4 +1,4 @@
-"""Run a scene many times with varied values, on all cores or on any executor."""
+"""The Python API of sweeps, and the steps that it shares with the command line."""
 
 from __future__ import annotations
 
@@ -10,9 +10,18 @@ from typing import Any
 
 from taichi_msm.errors import MAX_WORKERS, ArgumentError, NotInstalledError, Progress, require_path, writing
 from taichi_msm.sweeps.pool import Pool
-from taichi_msm.sweeps.runs import ENDED, Outcome, SweepResult, UnderWay, alone, begin_sweep, ended, outcomes
+from taichi_msm.sweeps.runs import (
+    FINAL_STATUSES,
+    Outcome,
+    SweepResult,
+    SweepState,
+    begin_sweep,
+    execute_tasks,
+    read_outcome,
+    report_lock,
+)
 from taichi_msm.sweeps.spec import make_sweep
-from taichi_msm.sweeps.tables import choose_workers, estimate, write_reports
+from taichi_msm.sweeps.tables import choose_worker_count, estimate_cost, write_reports
 
 
 def sweep(
@@ -29,31 +38,33 @@ def sweep(
 ) -> Iterator[Outcome]:
     """Run a scene many times with varied values.
 
-    Runs are taken while the outcomes are iterated over, which come in the order in which runs end; after the last one
-    the table and the other files of the sweep are written. The same call goes on with the runs that are missing.
+    Runs are executed while the iterator is consumed, which yields outcomes in the order in which runs end. After the
+    last run the table and the other reports are written. Repeating the same call executes only the missing runs.
 
     Args:
-        scene: the scene file.
-        vary: keys of the scene by their dotted paths, and how each varies, as in a sweep file. Files are relative
-            to the scene file, and below its folder.
-        directory: where runs/, table.csv and the other files go.
-        samples: number of runs; None: every combination of the keys' grids.
-        seed: what the samples are chosen by.
-        overrides: values of keys in all runs, by their dotted paths.
-        executor: takes the runs; each of its workers must be a process, of one thread, that finds scene and directory
-            where they are here. The address of a scheduler of dask.distributed: its workers. None: processes here.
-        workers: how many of these; None: one for each core, as far as memory goes.
-        progress: called often, with the stage, the runs done and the runs in all; what it raises stops the sweep there.
+        scene: path of the scene file.
+        vary: distributions by dotted key, as in a sweep file. Paths of files are relative to the scene file, and below
+            its folder.
+        directory: directory for runs/, table.csv and the other reports.
+        samples: number of runs, or None for every combination of the keys' grids.
+        seed: seed of the samples.
+        overrides: values of keys in all runs, by dotted key.
+        executor: executes the runs. Each of its workers must be a process with one thread, and must find scene and
+            directory at the same paths. A string is the address of a dask.distributed scheduler, whose workers execute
+            the runs. None starts processes on this machine.
+        workers: number of processes on this machine, or None for one per core, limited by the free memory.
+        progress: called often with the stage, the number of finished runs and the number of runs; an exception from it
+            stops the sweep.
 
     Returns:
         An iterator over the outcomes of all runs.
 
     Raises:
         ArgumentError: when the directory cannot be a path.
-        SceneError: with everything that is wrong with the arguments; when the directory holds another sweep.
+        SceneError: when arguments are invalid, with a line for each error; when the directory holds another sweep.
         FilesError: when the directory cannot be written.
         NotInstalledError: while iterating, when dask.distributed is needed and not installed.
-        MsmError: while iterating, when there is no such scheduler, or the executor takes no more runs.
+        MsmError: while iterating, when no scheduler answers, or the executor accepts no more runs.
 
     Example:
         >>> from taichi_msm import sweep
@@ -68,33 +79,43 @@ def sweep(
     if workers is not None and not (type(workers) is int and 1 <= workers <= MAX_WORKERS):
         raise ArgumentError(f"workers: {workers!r}; take a whole number, 1 to {MAX_WORKERS}, or None")
     settings = {"vary": vary, "seed": seed, "set": overrides or {}} | ({} if samples is None else {"samples": samples})
-    described = make_sweep(scene, settings)
+    spec = make_sweep(scene, settings)
     # The caller may change the current directory meanwhile.
-    folder = Path(directory).absolute()
-    under_way = begin_sweep(described, folder)
-    count = choose_workers(estimate(described), len(under_way.missing), workers).number
+    state = begin_sweep(spec, Path(directory).absolute())
+    worker_count = choose_worker_count(estimate_cost(spec), len(state.missing), workers).number
 
-    def go_through() -> Iterator[Outcome]:
-        with opened(executor, count, under_way, progress) as taking:
-            yield from list(under_way.done)
-            yield from go_on(under_way, taking, progress)
-            finish(under_way, taking, progress)
+    def execute() -> Iterator[Outcome]:
+        with open_executor(executor, worker_count, state, progress) as opened:
+            yield from list(state.done)
+            yield from run_missing(state, opened, progress)
+            finish_sweep(state, opened, progress)
 
-    return go_through()
+    return execute()
 
 
 @contextmanager
-def opened(
-    executor: Executor | str | None, workers: int, under_way: UnderWay, progress: Progress
+def open_executor(
+    executor: Executor | str | None, workers: int, state: SweepState, progress: Progress
 ) -> Iterator[Executor]:
-    """Use an executor, a cluster, or else a pool of processes here, which end with the block, at once if it raises."""
+    """Open the executor of a sweep; processes that it starts end with the block.
+
+    Args:
+        executor: an executor, which is used as it is; the address of a dask scheduler; or None for a new `Pool`.
+        workers: number of processes of the pool.
+        state: the sweep.
+        progress: called while the first worker of a cluster is awaited.
+
+    Raises:
+        NotInstalledError: when dask.distributed is needed and not installed.
+        ExecutorError, LostExecutorError: as `cluster.cluster_connection`.
+    """
     if isinstance(executor, str):
         try:
-            from taichi_msm.sweeps.cluster import connected
+            from taichi_msm.sweeps.cluster import cluster_connection
         except ImportError:
-            said = "a cluster needs dask.distributed, which is not installed; pip install distributed"
-            raise NotInstalledError(said) from None
-        with connected(executor, under_way.sweep, under_way.directory, progress) as cluster:
+            message = "a cluster needs dask.distributed, which is not installed; pip install distributed"
+            raise NotInstalledError(message) from None
+        with cluster_connection(executor, state.sweep, state.directory, progress) as cluster:
             yield cluster
         return
     if executor is not None:
@@ -109,22 +130,43 @@ def opened(
     pool.shutdown()
 
 
-def go_on(under_way: UnderWay, executor: Executor, progress: Progress) -> Iterator[Outcome]:
-    """Take the runs that are missing, and give their outcomes as they come; errors as for `outcomes`."""
-    done = under_way.done
-    for outcome in outcomes(under_way.missing, executor, lambda: progress("runs", len(done), under_way.total)):
+def run_missing(state: SweepState, executor: Executor, progress: Progress) -> Iterator[Outcome]:
+    """Execute the missing runs of a sweep, and yield their outcomes in the order in which they end.
+
+    Args:
+        state: the sweep; outcomes are appended to `state.done`.
+        executor: executes the runs.
+        progress: called several times a second; an exception from it ends the sweep.
+
+    Raises:
+        LostExecutorError: when the executor accepts no more runs.
+    """
+    done = state.done
+    for outcome in execute_tasks(state.missing, executor, lambda: progress("runs", len(done), state.total)):
         done.append(outcome)
         yield outcome
 
 
-def finish(under_way: UnderWay, executor: Executor, progress: Progress) -> tuple[list[str], list[str]]:
-    """Write the table and the other files of a sweep; gives their names, and what the user should know."""
-    directory, total, sweep = under_way.directory, under_way.total, under_way.sweep
-    with writing(directory), alone(directory, lambda: progress("runs", total, total)):
-        # Another command may have taken a run that it kept from us.
-        tasks = {task.run: task for task in under_way.missing}
+def finish_sweep(state: SweepState, executor: Executor, progress: Progress) -> tuple[list[str], list[str]]:
+    """Write the table and the other reports of a sweep.
+
+    Args:
+        state: the sweep, all of whose runs have ended.
+        executor: draws frames for the contact sheet.
+        progress: called several times a second.
+
+    Returns:
+        The names of the files written, and warnings for the user.
+
+    Raises:
+        FilesError: when the table cannot be written.
+    """
+    directory, total, sweep = state.directory, state.total, state.sweep
+    with writing(directory), report_lock(directory, lambda: progress("runs", total, total)):
+        # A run that failed here, as another command held its lock, may have been finished by that command.
+        tasks = {task.run: task for task in state.missing}
         rows = [
-            (None if row.status in ENDED else ended(tasks[row.run], sweep)) or row
-            for row in sorted(under_way.done, key=lambda row: row.run)
+            (None if row.status in FINAL_STATUSES else read_outcome(tasks[row.run], sweep)) or row
+            for row in sorted(state.done, key=lambda row: row.run)
         ]
-        return write_reports(SweepResult(directory, sweep, under_way.values, rows), executor, progress)
+        return write_reports(SweepResult(directory, sweep, state.values, rows), executor, progress)

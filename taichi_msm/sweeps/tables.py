@@ -1,16 +1,8 @@
-"""The files that a sweep ends with.
+"""Reports of a sweep: its table, the data set description, plots, a summary, and an estimate of its cost.
 
-The table of a sweep: a row for each run.
-
-What a sweep is as a data set: what varied, what the runs have, and which of them are for training.
-
-A tenth of all runs is for testing and a tenth for validation, to the nearest run: the first and the next in the order
-of the SHA-256 of "SEED RUN". So the part of a run follows from the seed, its number and the number of runs alone: not
-from which runs failed, nor from the version of any library.
-
-What a person reads of a sweep: what it will take, and how it ended.
-
-What a sweep will take, from some of its runs, and how many processes to share it among.
+A tenth of all runs is for testing and a tenth for validation, rounded to the nearest run: the first runs and the next
+ones in the order of the SHA-256 of "SEED RUN". So the split of a run depends only on the seed, the number of the run
+and the number of runs: neither on which runs failed, nor on the version of a library.
 """
 
 from __future__ import annotations
@@ -37,49 +29,56 @@ from taichi_msm.load.scene_file import plan_file
 from taichi_msm.model.plan import Plan
 from taichi_msm.runs.directory import MAX_RECORD, replacing
 from taichi_msm.scene.outputs import RECORD
-from taichi_msm.sweeps.plots import parameters, results, sensitivity, write_contact
+from taichi_msm.sweeps.plots import (
+    PlotData,
+    estimate_sensitivity,
+    plot,
+    varied_parameters,
+    varied_results,
+    write_contact_sheet,
+)
 from taichi_msm.sweeps.runs import (
     CONTACT,
     DATASET,
-    FILES,
     PARQUET,
     PLOT,
+    REPORT_FILES,
     SENSITIVITY,
     STATUSES,
     TABLE,
     Outcome,
     SweepResult,
 )
-from taichi_msm.sweeps.spec import Sweep, cell
+from taichi_msm.sweeps.spec import Sweep, format_value
 from taichi_msm.system.compiler import versions
 from taichi_msm.system.files import read_regular
 from taichi_msm.system.process import available_memory, available_threads
 
-pass  # REMOVED
-pass  # REMOVED
-
 WITHOUT_MATPLOTLIB = f"{PLOT} needs matplotlib: pip install matplotlib"
 WITHOUT_SALIB = f"{SENSITIVITY} needs SALib: pip install SALib"
 
-# The most runs, evenly spread, that are plotted, and whose sensitivity is estimated.
-MOST_RUNS = 4096
-
-# Names of files that were written, and what the user should know about them.
-Written = tuple[list[str], list[str]]
+# Names of the files written, and warnings for the user.
+WrittenFiles = tuple[list[str], list[str]]
 
 
-def write_reports(result: SweepResult, executor: Executor, progress: Progress) -> Written:
-    """Write them, each whole or not at all; the executor draws what the runs have not drawn.
+def write_reports(result: SweepResult, executor: Executor, progress: Progress) -> WrittenFiles:
+    """Write the reports of a sweep, each atomically, and remove outdated ones of an earlier call.
 
-    Files of an earlier call that cannot be made any more are removed.
+    Args:
+        result: the finished sweep.
+        executor: draws the last frames of runs without pictures.
+        progress: called with the stage, the frames drawn and the frames to draw.
+
+    Returns:
+        The names of the files written, and warnings for the user, also about reports that could not be written.
 
     Raises:
-        FilesError: when the table cannot be written; that another file cannot is a note.
+        FilesError: when the table cannot be written.
     """
-    writers: dict[str, Callable[[SweepResult], Written]] = {
+    writers: dict[str, Callable[[SweepResult], WrittenFiles]] = {
         PARQUET: write_parquet,
         DATASET: write_dataset,
-        CONTACT: partial(write_contact, executor=executor, progress=progress),
+        CONTACT: partial(write_contact_sheet, executor=executor, progress=progress),
         PLOT: _write_plots,
     }
     with writing(result.directory):
@@ -87,28 +86,29 @@ def write_reports(result: SweepResult, executor: Executor, progress: Progress) -
         names, notes = [TABLE], list[str]()
         for name, write in writers.items():
             try:
-                more, said = write(result)
+                new_names, new_notes = write(result)
             except Exception as error:
-                # Hours of runs must not end without their table because of a picture.
-                more, said = [], [f"{name} could not be made: {type(error).__name__}: {error}"]
-            names += more
-            notes += said
-        for name in set(FILES).difference(names):
+                # An error in a plot must not discard the table of hours of runs.
+                new_names, new_notes = [], [f"{name} could not be made: {type(error).__name__}: {error}"]
+            names += new_names
+            notes += new_notes
+        for name in set(REPORT_FILES).difference(names):
             (result.directory / name).unlink(missing_ok=True)
     return names, notes
 
 
-def _write_plots(result: SweepResult) -> Written:
-    """Write sensitivity.csv if there are runs enough, and sweep.png if some complete runs differ."""
-    runs = result.some(MOST_RUNS)
-    varied, columns = parameters(result, runs), results(result, runs)
+def _write_plots(result: SweepResult) -> WrittenFiles:
+    """Write sensitivity.csv if there are enough runs, and sweep.png if complete runs differ."""
+    # More runs would slow down the plot and hardly change it.
+    runs = result.sample_runs(4096)
+    varied, columns = varied_parameters(result, runs), varied_results(result, runs)
     names: list[str] = []
     notes: list[str] = []
     if not (varied and columns):
         return names, [f"no {PLOT}: it needs complete runs with results that differ"]
     failed = np.array([result.outcomes[run].status != "complete" for run in runs])
     try:
-        indices = sensitivity(varied, columns)
+        indices = estimate_sensitivity(varied, columns)
     except ImportError:
         indices = []
         notes.append(WITHOUT_SALIB)
@@ -118,26 +118,26 @@ def _write_plots(result: SweepResult) -> Written:
                 file.write(f"{csv_line(row)}\n".encode("utf-8", "backslashreplace"))
         names.append(SENSITIVITY)
     try:
-        from taichi_msm.sweeps.plots import Content, plot
+        import matplotlib  # noqa: F401
     except ImportError:
         return names, [*notes, WITHOUT_MATPLOTLIB]
     complete = sum(outcome.status == "complete" for outcome in result.outcomes)
-    some = f", {len(runs)} of them shown" if len(runs) < len(result.outcomes) else ""
-    title = f"{result.sweep.scene.name}: {complete} of {len(result.outcomes)} runs complete{some}"
+    subset = f", {len(runs)} of them shown" if len(runs) < len(result.outcomes) else ""
+    title = f"{result.sweep.scene.name}: {complete} of {len(result.outcomes)} runs complete{subset}"
     with replacing(result.directory / PLOT) as file:
-        plot(Content(title, varied, columns, failed, indices), file)
+        plot(PlotData(title, varied, columns, failed, indices), file)
     return [*names, PLOT], notes
 
 
 def write_table(result: SweepResult) -> None:
-    """Write table.csv."""
+    """Write table.csv, with a row for each run."""
     with replacing(result.directory / TABLE) as file:
-        for row in [_names(result), *_rows(result, cell)]:
+        for row in [_names(result), *_rows(result, format_value)]:
             file.write(f"{csv_line(row)}\n".encode("utf-8", "backslashreplace"))
 
 
-def write_parquet(result: SweepResult) -> tuple[list[str], list[str]]:
-    """Write table.parquet where pyarrow is installed; returns its name, and no notes."""
+def write_parquet(result: SweepResult) -> WrittenFiles:
+    """Write table.parquet if pyarrow is installed."""
     try:
         import pyarrow
         from pyarrow import parquet
@@ -146,12 +146,12 @@ def write_parquet(result: SweepResult) -> tuple[list[str], list[str]]:
     rows = zip(*_rows(result, lambda value: value), strict=True)
     columns: dict[str, Any] = dict(zip(_names(result), map(list, rows), strict=True))
     for name in result.sweep.keys:
-        # Values of several types, such as a number and none, have no common one.
+        # A column of values with different types, such as numbers and null, is written as text.
         try:
             pyarrow.array(columns[name])
         except pyarrow.ArrowException:
-            columns[name] = list(map(cell, columns[name]))
-    for name in result.columns():  # also if there is no value at all
+            columns[name] = list(map(format_value, columns[name]))
+    for name in result.columns():  # An explicit type is needed for columns without a value.
         kind = pyarrow.string() if name in ("status", "error") else pyarrow.float64()
         columns[name] = pyarrow.array(columns[name], kind)
     with replacing(result.directory / PARQUET) as file:
@@ -160,7 +160,7 @@ def write_parquet(result: SweepResult) -> tuple[list[str], list[str]]:
 
 
 def csv_line(row: Iterable[Any]) -> str:
-    """Write a row of a table as a line of a CSV file."""
+    """Format a row as a line of a CSV file, without the line end."""
     text = io.StringIO()
     csv.writer(text, lineterminator="").writerow(row)
     return text.getvalue()
@@ -171,22 +171,19 @@ def _names(result: SweepResult) -> list[str]:
 
 
 def _rows(result: SweepResult, write: Callable[[Any], Any]) -> Iterator[list[Any]]:
-    """Give the entries of every row, in which the values of keys are written somehow."""
+    """Yield the rows of the table, with `write` applied to the values of the keys."""
     columns = zip(*result.columns().values(), strict=True)
-    for values, outcome, others in zip(result.values, result.outcomes, columns, strict=True):
-        yield [outcome.run, *map(write, values), *others]
+    for values, outcome, results in zip(result.values, result.outcomes, columns, strict=True):
+        yield [outcome.run, *map(write, values), *results]
 
 
-# Where the keys of a scene are that decide what a run writes.
-DECIDING = ("output", "render", "time")
-
-
-def write_dataset(result: SweepResult) -> tuple[list[str], list[str]]:
-    """Write the data set, with a line for every complete run; returns its name, and no notes."""
+def write_dataset(result: SweepResult) -> WrittenFiles:
+    """Write dataset.json, with a line for every complete run."""
     sweep, complete = result.sweep, [outcome.run for outcome in result.outcomes if outcome.status == "complete"]
-    common = _facts(result.run_directory(complete[0])) if complete else {}
-    differ = any(key.split(".")[0] in DECIDING for key in sweep.keys)
-    parts = split(len(result.outcomes), sweep.settings.seed)
+    common = _output_format(result.run_directory(complete[0])) if complete else {}
+    # These sections of a scene determine the outputs of a run.
+    differ = any(key.split(".")[0] in ("output", "render", "time") for key in sweep.keys)
+    splits = assign_splits(len(result.outcomes), sweep.settings.seed)
     head = {"scene": sweep.settings.scene, **sweep.description(), "versions": versions(), **common}
     with replacing(result.directory / DATASET) as file:
         file.write(b"{\n")
@@ -197,26 +194,34 @@ def write_dataset(result: SweepResult) -> tuple[list[str], list[str]]:
             directory = result.run_directory(run)
             folder = directory.relative_to(result.directory).as_posix()
             values = dict(zip(sweep.keys, result.values[run], strict=True))
-            own = _facts(directory) if differ else {}
-            row = {"run": run, "folder": folder, "part": parts[run], "values": values, **own}
+            outputs = _output_format(directory) if differ else {}
+            row = {"run": run, "folder": folder, "part": splits[run], "values": values, **outputs}
             file.write((b"" if run == complete[0] else b",") + b"\n" + _json(row))
         file.write(b"\n]\n}\n")
     return [DATASET], []
 
 
-def split(runs: int, seed: int) -> list[str]:
-    """Give the part of every run: train, val or test."""
+def assign_splits(runs: int, seed: int) -> list[str]:
+    """Assign every run to a split of the data set.
+
+    Args:
+        runs: number of runs.
+        seed: seed of the assignment.
+
+    Returns:
+        "train", "val" or "test" for each run.
+    """
     order = sorted(range(runs), key=lambda run: hashlib.sha256(f"{seed} {run}".encode()).digest())
     tenth = (runs + 5) // 10
-    parts = ["train"] * runs
+    splits = ["train"] * runs
     for name, chosen in (("test", order[:tenth]), ("val", order[tenth : 2 * tenth])):
         for run in chosen:
-            parts[run] = name
-    return parts
+            splits[run] = name
+    return splits
 
 
-def _facts(directory: Path) -> dict[str, Any]:
-    """Give what a loader needs to know of a run: its outputs, the frames, their size [px] and how many a second."""
+def _output_format(directory: Path) -> dict[str, Any]:
+    """Read the outputs, number of frames, frame size [px] and frame rate of a run, which a data loader needs."""
     record = json.loads(read_regular(directory / RECORD, MAX_RECORD))
     scene = record["scene"]
     return {
@@ -231,56 +236,60 @@ def _json(value: Any) -> bytes:
     return json.dumps(value, ensure_ascii=False).encode("utf-8", "backslashreplace")
 
 
-pass  # REMOVED
+def cost_line(runs: int, cost: SweepCost, workers: WorkerCount | None) -> str:
+    """Format the cost of a sweep as a line.
 
-# The errors that runs estimate, and what makes them.
-ERRORS = {"error_estimate": "the time step", "mesh_error": "the number of points"}
-
-# The most kinds of notes that are shown.
-MOST_NOTES = 5
-
-
-def cost_line(runs: int, cost: Cost, workers: Workers | None) -> str:
-    """Say what a sweep takes; None: its workers are elsewhere."""
+    Args:
+        runs: number of runs.
+        cost: of these runs.
+        workers: processes on this machine, or None if the runs are executed elsewhere.
+    """
     if workers is None:
-        where = "if they were run here"
+        location = "if they were run here"
     else:
         processes = f"{workers.number} {'process' if workers.number == 1 else 'processes'}"
-        where = f"in {processes} ({workers.cores} cores; memory for {workers.fitting})"
+        location = f"in {processes} ({workers.cores} cores; memory for {workers.memory_limit})"
     disk = f"at most {cost.disk_bytes / 2**20:.1f} MiB on disk"
     refused = f"; of {cost.looked_at} that were checked, {cost.refused} will be refused, for example: {cost.example}"
-    return f"{_runs(runs)}: about {rough_time(cost.seconds)} {where}, {disk}{refused if cost.refused else ''}"
+    return f"{_runs(runs)}: about {rough_time(cost.seconds)} {location}, {disk}{refused if cost.refused else ''}"
 
 
 def summary_lines(
     directory: Path, outcomes: Sequence[Outcome], shard: tuple[int, int] | None, files: list[str], notes: list[str]
 ) -> list[str]:
-    """Say in some lines how the runs of a sweep ended, with an example of each failure, and what was written."""
-    of = f" of part {shard[0]} of {shard[1]}" if shard else ""
-    counts = count(outcomes)
-    said = ", ".join(f"{number} {status}" for status, number in counts.items() if number)
-    lines = [f"{directory}: {_runs(len(outcomes))}{of}: {said}"]
+    """Summarise a sweep: the number of runs with each status, an example of each failure, and the reports.
+
+    Args:
+        directory: of the sweep.
+        outcomes: of the runs of the sweep or the shard.
+        shard: part I of N as (I, N), or None for the whole sweep.
+        files: names of the reports.
+        notes: warnings about the reports.
+    """
+    part = f" of part {shard[0]} of {shard[1]}" if shard else ""
+    counts = ", ".join(f"{number} {status}" for status, number in count_statuses(outcomes).items() if number)
+    lines = [f"{directory}: {_runs(len(outcomes))}{part}: {counts}"]
     for status in STATUSES:
         example = next((outcome for outcome in outcomes if outcome.status == status), None)
         if example and example.error:
             lines.append(f"{status}, for example run {example.run:06}: {example.error}")
-    for name, what in ERRORS.items():
+    for name, cause in (("error_estimate", "the time step"), ("mesh_error", "the number of points")):
         errors = [(getattr(outcome, name), outcome.run) for outcome in outcomes if getattr(outcome, name) is not None]
         if errors:
             largest, run = max(errors)
-            said = f"median {median(error for error, _ in errors):.2g}, largest {largest:.2g} (run {run:06})"
-            lines.append(f"error, as a fraction of the largest displacement, due to {what}: {said}")
-    lines += _noted(outcomes)
+            statistics = f"median {median(error for error, _ in errors):.2g}, largest {largest:.2g} (run {run:06})"
+            lines.append(f"error, as a fraction of the largest displacement, due to {cause}: {statistics}")
+    lines += _note_examples(outcomes)
     return [*lines, "without --shard, the same command writes the table" if shard else ", ".join(files), *notes]
 
 
-def _noted(outcomes: Sequence[Outcome]) -> Iterator[str]:
-    """Give an example of each note that some runs have, whatever its numbers are."""
-    alike: dict[str, list[str]] = {}
+def _note_examples(outcomes: Sequence[Outcome]) -> Iterator[str]:
+    """Yield an example of each of the five most frequent notes; notes that differ only in numbers count as the same."""
+    groups: dict[str, list[str]] = {}
     for outcome in outcomes:
         for note in outcome.notes:
-            alike.setdefault(re.sub(r"[0-9.e+-]+", "", note), []).append(f"run {outcome.run:06}: {note}")
-    for notes in sorted(alike.values(), key=len, reverse=True)[:MOST_NOTES]:
+            groups.setdefault(re.sub(r"[0-9.e+-]+", "", note), []).append(f"run {outcome.run:06}: {note}")
+    for notes in sorted(groups.values(), key=len, reverse=True)[:5]:
         yield f"{_runs(len(notes))} with a note, for example {notes[0]}"
 
 
@@ -288,71 +297,75 @@ def _runs(number: int) -> str:
     return "1 run" if number == 1 else f"{number} runs"
 
 
-def count(outcomes: Sequence[Outcome]) -> dict[str, int]:
-    """Count the runs that ended in each way."""
+def count_statuses(outcomes: Sequence[Outcome]) -> dict[str, int]:
+    """Count the runs with each status."""
     counts = Counter(outcome.status for outcome in outcomes)
     return {status: counts[status] for status in STATUSES}
 
 
-# The runs that are planned for the estimate, evenly spread over all; each takes milliseconds.
-LOOKED_AT = 64
-
-# Memory of a process besides that of its run: Python, the compiler, kernels [bytes].
+# Memory of a process without that of its run: Python, the compiler, kernels [bytes].
 PROCESS_BYTES = 400 << 20
 
-# What a run takes besides its work, and each of its frames [s]: folders, files, calls; measured on Zen 4.
-RUN_SECONDS, FRAME_SECONDS = 0.04, 0.003
+# Overhead of a run and of each of its frames [s]: directories, files, calls; measured on Zen 4.
+RUN_OVERHEAD_S, FRAME_OVERHEAD_S = 0.04, 0.003
 
 
-class Cost(NamedTuple):
-    """What all runs take, about."""
+class SweepCost(NamedTuple):
+    """Estimated cost of the runs of a sweep. The command line prints these fields as JSON."""
 
-    seconds: float  # on this machine, with every core
-    disk_bytes: int  # at most
+    seconds: float  # on all cores of this machine
+    disk_bytes: int  # upper bound
     memory_bytes: int  # of one process
-    looked_at: int  # how many runs this follows from
-    refused: int  # how many of them are
-    example: str  # why one of them is
+    looked_at: int  # number of runs on which the estimate is based
+    refused: int  # number of these runs with invalid values
+    example: str  # the error of a refused run
 
-    def of(self, share: float) -> Cost:
-        """Give the cost of a share of the runs."""
-        return self._replace(seconds=share * self.seconds, disk_bytes=round(share * self.disk_bytes))
+    def scaled(self, fraction: float) -> SweepCost:
+        """Return the cost of a fraction of the runs."""
+        return self._replace(seconds=fraction * self.seconds, disk_bytes=round(fraction * self.disk_bytes))
 
 
-class Workers(NamedTuple):
-    """How many processes take runs."""
+class WorkerCount(NamedTuple):
+    """Number of processes, and its limits."""
 
     number: int
-    cores: int  # that this program may use
-    fitting: int  # processes whose memory is free
+    cores: int  # available to this program
+    memory_limit: int  # number of processes that fit into the free memory
 
 
-def estimate(sweep: Sweep) -> Cost:
-    """Estimate what the runs of a sweep take."""
+def estimate_cost(sweep: Sweep) -> SweepCost:
+    """Estimate the cost of a sweep from at most 64 of its runs."""
     plans: list[Plan] = []
-    reasons: list[str] = []
-    for values in sweep.some_values(LOOKED_AT):
+    errors: list[str] = []
+    for values in sweep.sample_values(64):
         try:
             plans.append(plan_file(sweep.scene, sweep.overrides(values)))
         except SceneError as error:
-            reasons.append(error.lines[0])
-    times, needs = list(map(cost_module.estimate_duration, plans)), list(map(cost_module.estimate_memory, plans))
-    looked_at = len(plans) + len(reasons)
-    share, cores = sweep.runs / looked_at, available_threads()
-    seconds = sum(one.seconds - one.start for one in times)
-    seconds += sum(RUN_SECONDS + FRAME_SECONDS * need.frames for need in needs) / cores
-    return Cost(
+            errors.append(error.lines[0])
+    durations = list(map(cost_module.estimate_duration, plans))
+    needs = list(map(cost_module.estimate_memory, plans))
+    looked_at = len(plans) + len(errors)
+    scale, cores = sweep.runs / looked_at, available_threads()
+    seconds = sum(duration.seconds - duration.start for duration in durations)
+    seconds += sum(RUN_OVERHEAD_S + FRAME_OVERHEAD_S * need.frames for need in needs) / cores
+    return SweepCost(
         # A process starts once, for many runs.
-        seconds=max((one.start for one in times), default=0.0) + share * seconds,
-        disk_bytes=round(share * sum(need.disk_bytes for need in needs)),
+        seconds=max((duration.start for duration in durations), default=0.0) + scale * seconds,
+        disk_bytes=round(scale * sum(need.disk_bytes for need in needs)),
         memory_bytes=PROCESS_BYTES + max((need.memory_bytes for need in needs), default=0),
         looked_at=looked_at,
-        refused=len(reasons),
-        example=next(iter(reasons), ""),
+        refused=len(errors),
+        example=next(iter(errors), ""),
     )
 
 
-def choose_workers(cost: Cost, runs: int, asked: int | None = None) -> Workers:
-    """Choose a process for each core, as far as the free memory goes, or as many as are asked for."""
-    cores, fitting = available_threads(), available_memory() // cost.memory_bytes
-    return Workers(asked or max(1, min(cores, fitting, runs)), cores, fitting)
+def choose_worker_count(cost: SweepCost, runs: int, requested: int | None = None) -> WorkerCount:
+    """Choose the number of processes: one per core, limited by the free memory and the number of runs.
+
+    Args:
+        cost: of the sweep.
+        runs: number of runs.
+        requested: number that the user has chosen, which is used without limits.
+    """
+    cores, memory_limit = available_threads(), available_memory() // cost.memory_bytes
+    return WorkerCount(requested or max(1, min(cores, memory_limit, runs)), cores, memory_limit)

@@ -1,1 +1,1 @@
-"""The machine: the compiler, cores and memory, signals, streams."""
+"""The machine: the compiler, cores and memory, signals, standard streams."""

@@ -1,7 +1,4 @@
-"""The compiler of our kernels: Taichi, or Quadrants, its maintained fork. No other module knows which of them it is.
-
-The versions that results depend on.
-"""
+"""The compiler of the kernels: Taichi, or Quadrants, its maintained fork. Only this module knows which one is used."""
 
 from __future__ import annotations
 
@@ -20,31 +17,41 @@ from taichi_msm.errors import DeviceError, NotInstalledError, did_you_mean
 from taichi_msm.system.files import private_folder
 from taichi_msm.version import __version__
 
-# The environment variable that chooses.
-CHOICE = "TAICHI_MSM_COMPILER"
+# Environment variable with the name of the compiler.
+COMPILER_VARIABLE = "TAICHI_MSM_COMPILER"
 
-# Attributes to replace: object, name, value.
-Parts = list[tuple[Any, str, Any]]
+# Attributes to patch: object, name, value.
+Patches = list[tuple[Any, str, Any]]
 
 
 @dataclass(frozen=True)
 class Compiler:
-    """A compiler that can be imported."""
+    """A supported compiler, which may not be installed.
 
-    name: str  # of its package, also in run.json
-    title: str  # its name in a sentence
-    prefix: str  # of its environment variables
-    cache: str  # folder of compiled kernels, from the home directory
-    lock: str  # on that folder, from the folder
-    tested: str  # the version whose results on a CPU have the same bits as those of the other compiler
-    pythons: str  # that it can be installed for
-    # Time of a look at a counter that another thread writes [s], measured on Zen 4: Taichi's LLVM fences it by
-    # `mfence`, that of Quadrants by a locked `or`.
-    look: float
+    Attributes:
+        name: name of its package, also in run.json.
+        title: name in messages.
+        prefix: prefix of its environment variables.
+        cache: directory of compiled kernels, relative to the home directory.
+        lock: lock file of the cache, relative to that directory.
+        tested_version: version whose results on a CPU have the same bits as those of the other compiler's.
+        python_versions: Python versions for which it can be installed.
+        poll_s: time to poll a counter that another thread writes [s], measured on Zen 4. Taichi's LLVM fences the read
+            by `mfence`, that of Quadrants by a locked `or`.
+    """
+
+    name: str
+    title: str
+    prefix: str
+    cache: str
+    lock: str
+    tested_version: str
+    python_versions: str
+    poll_s: float
 
     @property
     def version(self) -> str:
-        """The version that is installed; empty if none is."""
+        """The installed version; empty if it is not installed."""
         from importlib import metadata
 
         try:
@@ -54,33 +61,37 @@ class Compiler:
 
     @property
     def remedy(self) -> str:
-        """What to do where it is not installed."""
-        return f"pip install {self.name}=={self.tested} ({self.pythons})"
+        """The command that installs it."""
+        return f"pip install {self.name}=={self.tested_version} ({self.python_versions})"
 
     @property
     def folder_variable(self) -> str:
-        """The environment variable that names another folder of compiled kernels."""
+        """The environment variable that overrides the directory of compiled kernels."""
         return f"{self.prefix}_OFFLINE_CACHE_FILE_PATH"
 
     def folder(self) -> Path:
-        """Give the folder of compiled kernels; RuntimeError: there is no home directory."""
+        """Return the directory of compiled kernels.
+
+        Raises:
+            RuntimeError: when there is no home directory.
+        """
         return Path(os.environ.get(self.folder_variable) or Path.home() / self.cache)
 
     def load(self) -> Any:
-        """Import it, without its banner on stdout, which may be JSON, and its look for a newer version.
+        """Import the compiler, without its banner on stdout and its check for a newer version.
 
         Raises:
             NotInstalledError: when it cannot be imported.
         """
         if not os.environ.get("HOME"):
-            # Without HOME, it aborts the process.
+            # Taichi aborts the process if HOME is missing.
             os.environ.pop("HOME", None)
-            folder = os.path.expanduser("~")  # noqa: PTH111  # Path.home raises where there is none
+            folder = os.path.expanduser("~")  # noqa: PTH111  # Path.home raises if there is no home directory
             os.environ["HOME"] = folder if folder != "~" else private_folder()
         os.environ.setdefault(f"ENABLE_{self.name.upper()}_HEADER_PRINT", "0")
         os.environ.setdefault(f"{self.prefix}_SKIP_VERSION_CHECK", "ON")
-        # In a notebook, it reports on import that it is in one, and a level that it does not know ends the import. This
-        # level is for the import only; `init` sets its own.
+        # In a notebook the import logs a message, and an unknown log level makes the import fail. This level applies to
+        # the import only; `init` sets its own.
         level = f"{self.prefix}_LOG_LEVEL"
         before = os.environ.get(level)
         os.environ[level] = "error"
@@ -94,13 +105,13 @@ class Compiler:
                 os.environ[level] = before
 
     @cached_property
-    def shortcuts(self) -> Parts:
-        """What to replace while a kernel of ours is read; nothing in a version that was not tested.
+    def patches(self) -> Patches:
+        """The patches that are applied while a kernel of this package is parsed; empty for an untested version.
 
-        A compiler reads every kernel in every process, as the key of its cache is made from what it reads. Meanwhile it
-        prepares, for every node, the source lines that an error would show: useful only to those who change a kernel.
+        A compiler parses every kernel in every process, as the key of its cache depends on the parsed kernel. For every
+        node it prepares the source lines for an error message, which only developers of kernels need.
         """
-        if "TAICHI_MSM_TRACEBACK" in os.environ or self.version != self.tested:
+        if "TAICHI_MSM_TRACEBACK" in os.environ or self.version != self.tested_version:
             return []
         nodes = import_module(f"{self.name}.lang.ast.ast_transformer_utils")
         if self.name == "taichi":
@@ -116,14 +127,14 @@ class Compiler:
         kernels = import_module("quadrants.lang.kernel")
         look_up = kernels.Kernel._try_load_fastcache
 
-        def use_none(kernel: Any, arguments: Any, key: Any) -> Any:
+        def skip_dataclasses(kernel: Any, arguments: Any, key: Any) -> Any:
             look_up(kernel, arguments, key)
             return kernel.used_py_dataclass_parameters_by_key_enforcing.setdefault(key, set())
 
         return [
             (nodes.ASTTransformerFuncContext, "memoized_get_pos_info", lambda context, node: ""),
-            # Quadrants reads every kernel twice, to find which fields of dataclasses it uses. Ours take none.
-            (kernels.Kernel, "_try_load_fastcache", use_none),
+            # Quadrants parses every kernel twice, to find used fields of dataclasses; these kernels have none.
+            (kernels.Kernel, "_try_load_fastcache", skip_dataclasses),
             (kernels._kernel_impl_dataclass, "unpack_ast_struct_expressions", lambda tree, struct_locals: tree),
         ]
 
@@ -134,9 +145,9 @@ _TAICHI = Compiler(
     prefix="TI",
     cache=".cache/taichi/ticache",
     lock="ticache.lock",
-    tested="1.7.4",
-    pythons="Python 3.10 to 3.13",
-    look=33e-9,
+    tested_version="1.7.4",
+    python_versions="Python 3.10 to 3.13",
+    poll_s=33e-9,
 )
 _QUADRANTS = Compiler(
     name="quadrants",
@@ -144,63 +155,69 @@ _QUADRANTS = Compiler(
     prefix="QD",
     cache=".cache/quadrants/qdcache",
     lock="kernel_compilation_manager/qdcache.lock",
-    tested="1.4.0",
-    pythons="Python 3.12 to 3.14",
-    look=3.4e-9,
+    tested_version="1.4.0",
+    python_versions="Python 3.12 to 3.14",
+    poll_s=3.4e-9,
 )
 
-# The first of them that is installed is taken.
-COMPILERS = {one.name: one for one in (_TAICHI, _QUADRANTS)}
+# Supported compilers, in the order of preference.
+COMPILERS = {compiler.name: compiler for compiler in (_TAICHI, _QUADRANTS)}
 
 
 @cache
-def chosen() -> Compiler:
-    """Choose the compiler, without importing it.
+def active_compiler() -> Compiler:
+    """Return the compiler that this process uses, without importing it.
 
     Raises:
-        DeviceError: when the one that the environment asks for is not known.
-        NotInstalledError: when it, or any, is not installed.
+        DeviceError: when the environment variable names an unknown compiler.
+        NotInstalledError: when the named compiler, or any compiler, is not installed.
     """
-    wanted = os.environ.get(CHOICE)
+    wanted = os.environ.get(COMPILER_VARIABLE)
     if wanted and wanted not in COMPILERS:
         near = did_you_mean(wanted, list(COMPILERS))
-        raise DeviceError(f"{CHOICE}: {wanted!r} is not a compiler; take {' or '.join(COMPILERS)}{near}")
+        raise DeviceError(f"{COMPILER_VARIABLE}: {wanted!r} is not a compiler; take {' or '.join(COMPILERS)}{near}")
     candidates = [COMPILERS[wanted]] if wanted else list(COMPILERS.values())
-    for one in candidates:
-        if one.version:
-            return one
+    for compiler in candidates:
+        if compiler.version:
+            return compiler
     if wanted:
-        raise NotInstalledError(f"{CHOICE}: {wanted} is not installed; {candidates[0].remedy}, or unset {CHOICE}")
-    raise NotInstalledError(f"no compiler is installed; {' or '.join(one.remedy for one in candidates)}")
+        raise NotInstalledError(
+            f"{COMPILER_VARIABLE}: {wanted} is not installed; {candidates[0].remedy}, or unset {COMPILER_VARIABLE}"
+        )
+    raise NotInstalledError(f"no compiler is installed; {' or '.join(compiler.remedy for compiler in candidates)}")
 
 
-def named(versions: Mapping[str, str]) -> str:
-    """Name the compiler, and its version, that was used where these versions were: Taichi 1.7.4."""
-    return next(f"{one.title} {versions[one.name]}" for one in COMPILERS.values() if one.name in versions)
+def compiler_label(versions: Mapping[str, str]) -> str:
+    """Return title and version of the compiler among recorded versions, such as "Taichi 1.7.4"."""
+    return next(
+        f"{compiler.title} {versions[compiler.name]}" for compiler in COMPILERS.values() if compiler.name in versions
+    )
 
 
-def what_decides_bits(versions: Mapping[str, str], arch: str) -> dict[str, str]:
-    """Leave out of some versions that of the compiler, if its results are known to have the bits of another one's."""
+def result_versions(versions: Mapping[str, str], arch: str) -> dict[str, str]:
+    """Return the versions that determine the bits of results: all except that of a tested compiler on a CPU.
+
+    Args:
+        versions: versions by name, as `versions` returns them.
+        arch: cpu, cuda or vulkan.
+    """
     return {
         name: version
         for name, version in versions.items()
-        if arch != "cpu" or name not in COMPILERS or version != COMPILERS[name].tested
+        if arch != "cpu" or name not in COMPILERS or version != COMPILERS[name].tested_version
     }
 
 
-pass  # REMOVED
-
-
 def versions() -> dict[str, str]:
-    """Name the versions that the results depend on."""
-    # Imported here, as they take a while.
+    """Return the versions on which results depend, by name."""
+    # These imports are slow, and most commands do not need them.
     import numpy as np
     import PIL
 
     return {
         "taichi-msm": __version__,
         "python": platform.python_version(),
-        chosen().name: chosen().version,
+        active_compiler().name: active_compiler().version,
         "numpy": np.__version__,
         "pillow": PIL.__version__,
         "platform": f"{sys.platform} {platform.machine()}",

@@ -1,4 +1,4 @@
-"""Files and folders that may come from anybody."""
+"""Files and directories that other users may have created."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from pathlib import Path
 
 
 def read_regular(path: str | Path, limit: int) -> bytes:
-    """Read a whole file without waiting for a pipe or a device, and without more memory than its limit.
+    """Read a regular file within a size limit, without blocking on a pipe or a device.
 
     Args:
-        path: the file; links are followed.
-        limit: the most that is read [bytes].
+        path: the file; symbolic links are followed.
+        limit: largest size [bytes].
 
     Returns:
-        Its content.
+        The content.
 
     Raises:
-        OSError: when it cannot be read, is no regular file or is larger; `strerror` says which.
-        ValueError: when it cannot be a path.
+        OSError: when the file cannot be read, is not a regular file or exceeds the limit; `strerror` has the reason.
+        ValueError: when the path is invalid.
     """
-    # Opening a pipe would wait for its other end, and opening some devices does something; Windows has neither flag.
+    # Opening a pipe would block, and opening some devices has side effects; Windows lacks these flags.
     flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0) | getattr(os, "O_BINARY", 0)
     with open(os.open(path, flags), "rb") as file:  # noqa: PTH123  # a descriptor
         status = os.fstat(file.fileno())
@@ -41,7 +41,7 @@ def read_regular(path: str | Path, limit: int) -> bytes:
 
 
 def private_folder() -> str:
-    """Find a folder of this user in the temporary directory, where others cannot write, for what has no home."""
+    """Return a temporary directory that only this user can write, for use without a home directory."""
     if sys.platform == "win32":
         return tempfile.gettempdir()  # of this user
     folder = Path(tempfile.gettempdir(), f"taichi-msm-{os.geteuid()}")
@@ -51,7 +51,7 @@ def private_folder() -> str:
         status = folder.lstat()
         if stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid() and not status.st_mode & 0o077:
             return str(folder)
-    # Somebody else has taken the name: a folder for this process alone.
-    own = tempfile.mkdtemp(prefix="taichi-msm-")
-    atexit.register(shutil.rmtree, own, ignore_errors=True)
-    return own
+    # Another user has taken the name, so this process gets a directory of its own.
+    process_folder = tempfile.mkdtemp(prefix="taichi-msm-")
+    atexit.register(shutil.rmtree, process_folder, ignore_errors=True)
+    return process_folder

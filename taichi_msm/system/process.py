@@ -1,11 +1,8 @@
-"""The resources that this process may use: cores and memory; and the processor's name.
+"""Resources and signals of this process: cores, memory, interruption, standard streams.
 
-Ctrl-C and SIGTERM as a request to stop, granted only where the work can stop.
-
-By default Python raises KeyboardInterrupt between any two bytecodes; raised in an import, a destructor or a callback of
-a library, it is lost or turned into another error.
-
-The standard streams of the process, which may be closed, full, or without a reader.
+By default Python raises KeyboardInterrupt between any two bytecodes. Raised in an import, a destructor or a callback of
+a library, it is lost or turned into another error. So Ctrl-C and SIGTERM only request an interruption here, which
+happens where the program can stop.
 """
 
 from __future__ import annotations
@@ -30,14 +27,14 @@ CONTROL_GROUPS, MEMBERSHIP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 
 
 def available_threads() -> int:
-    """Count the cores that this process may use, by its affinity and the quotas of its control groups."""
+    """Return the number of cores that this process may use, by its affinity and the quotas of its control groups."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     quotas = [quota for group in _control_groups("cpu") if (quota := _quota(group)) is not None]
     return max(1, min([cores, *map(math.floor, quotas)]))
 
 
 def _quota(group: Path) -> float | None:
-    """Read the cores that a control group may use, of version 2 or 1; None: no limit."""
+    """Read the number of cores that a control group of version 2 or 1 may use, or None without a limit."""
     with contextlib.suppress(OSError, ValueError):
         quota, period = map(int, (group / "cpu.max").read_text().split())
         return quota / period
@@ -48,19 +45,19 @@ def _quota(group: Path) -> float | None:
 
 
 def _control_groups(controller: str) -> Iterator[Path]:
-    """List the control groups of this process and those above them, of version 2 and of a controller of version 1."""
+    """Yield the control groups of this process and their parents, of version 2 and of a controller of version 1."""
     with contextlib.suppress(OSError):
         for line in MEMBERSHIP.read_text().splitlines():
-            number, controllers, own = line.split(":", 2)
+            number, controllers, path = line.split(":", 2)
             if number != "0" and controller not in controllers.split(","):
                 continue
             root = CONTROL_GROUPS if number == "0" else CONTROL_GROUPS / controller
-            group = root / own.lstrip("/")
-            yield from (each for each in (group, *group.parents) if each.is_relative_to(root))
+            group = root / path.lstrip("/")
+            yield from (ancestor for ancestor in (group, *group.parents) if ancestor.is_relative_to(root))
 
 
-def waited_for_cores(tasks: Path = Path("/proc/self/task")) -> float | None:
-    """Add up the time that this process's threads have waited for a core that others had [s]; None: not known."""
+def core_wait_s(tasks: Path = Path("/proc/self/task")) -> float | None:
+    """Return the total time that the threads of this process have waited for a core [s], or None if not known."""
     try:
         waits = [int((task / "schedstat").read_text().split()[1]) for task in tasks.iterdir()]
     except (OSError, ValueError, IndexError):
@@ -68,8 +65,8 @@ def waited_for_cores(tasks: Path = Path("/proc/self/task")) -> float | None:
     return 1e-9 * sum(waits)
 
 
-def processor() -> str:
-    """Name the processor."""
+def processor_name() -> str:
+    """Return the name of the processor."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
             if line.startswith("model name"):
@@ -78,13 +75,13 @@ def processor() -> str:
 
 
 def available_memory() -> int:
-    """Give the memory that a run may take [bytes]: what is free and what the control group still allows.
+    """Return the memory that a run may use [bytes]: the free memory, limited by the control groups.
 
-    Without /proc it is all physical memory; sys.maxsize if the system does not report that.
+    Without /proc, returns the physical memory, or sys.maxsize if the system does not report it.
     """
     with contextlib.suppress(OSError, KeyError, ValueError, IndexError):
         free = _free_memory(Path("/proc/meminfo"))
-        return min([free, *map(_group_rest, _control_groups("memory"))])
+        return min([free, *map(_group_memory, _control_groups("memory"))])
     try:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, OSError, ValueError):
@@ -97,31 +94,31 @@ def _free_memory(meminfo: Path) -> int:
     return int(fields["MemAvailable"].split()[0]) * 1024
 
 
-def _group_rest(group: Path) -> int:
-    """Read the memory that a control group still allows [bytes], of version 2 or 1; sys.maxsize: no limit."""
+def _group_memory(group: Path) -> int:
+    """Read the memory left in a control group of version 2 or 1 [bytes], or sys.maxsize without a limit."""
     for limit, usage, cache in (
         ("memory.max", "memory.current", "inactive_file"),
         ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
     ):
         with contextlib.suppress(OSError, ValueError):
-            most, used = (int((group / name).read_text()) for name in (limit, usage))
+            maximum, used = (int((group / name).read_text()) for name in (limit, usage))
             cached = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
-            # Cached files count as used, but are dropped when memory is needed.
-            return max(0, most - used + int(cached.get(cache, 0)))
+            # Cached files count as used, but the system drops them when memory is needed.
+            return max(0, maximum - used + int(cached.get(cache, 0)))
     return sys.maxsize
 
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-# A descriptor of stderr that works even while libraries are kept from writing there.
+# A descriptor of stderr that works even while `discarded_output` redirects stderr.
 _outlet = 2
 
 
 class Interruption:
-    """Remembers a request to stop; a second request ends the process at once.
+    """A pending interruption by Ctrl-C or SIGTERM; a second signal ends the process at once.
 
     Attributes:
-        code: exit code of a program that was stopped: 128 plus the number of the signal.
+        code: exit code of an interrupted program, 128 plus the number of the signal.
     """
 
     def __init__(self) -> None:
@@ -129,89 +126,94 @@ class Interruption:
         self._requested = False
 
     def listen(self) -> None:
-        """Treat the signals as requests from now on."""
+        """Record signals from now on, instead of ending the process."""
         for number in SIGNALS:
             signal.signal(number, self._request)
 
-    def grant(self) -> None:
-        """Raise KeyboardInterrupt if a signal came since `listen`."""
+    def raise_if_requested(self) -> None:
+        """Raise KeyboardInterrupt if a signal arrived since `listen`."""
         if self._requested:
             raise KeyboardInterrupt
 
     def _request(self, number: int, _frame: FrameType | None) -> None:
         self.code = 128 + number
         if self._requested:
-            _end(self.code, b"interrupted twice; ended at once\n")
+            _exit(self.code, b"interrupted twice; ended at once\n")
         self._requested = True
 
 
-def leave_at_once() -> None:
-    """From now on let a signal end the process at once; for use while there are no results to keep."""
+def exit_on_signals() -> None:
+    """Let a signal end the process at once, for use while there are no results."""
     global _outlet
     _outlet = os.dup(2)
     for number in SIGNALS:
-        signal.signal(number, _leave)
+        signal.signal(number, _exit_on_signal)
 
 
-def _leave(number: int, _frame: FrameType | None) -> None:
-    _end(128 + number, b"interrupted; nothing was written\n")
+def _exit_on_signal(number: int, _frame: FrameType | None) -> None:
+    _exit(128 + number, b"interrupted; nothing was written\n")
 
 
-def _end(code: int, message: bytes) -> None:
-    with suppress(OSError):  # nobody can read it
+def _exit(code: int, message: bytes) -> None:
+    with suppress(OSError):  # stderr may be closed
         os.write(_outlet, message)
     os._exit(code)
 
 
-# Held while descriptors are redirected, which belong to all threads.
+# Held while descriptors are redirected, as all threads share them.
 _redirecting = threading.RLock()
 
 
-def open_missing() -> None:
-    """Open standard streams that the process was started without, so that no other file gets their descriptors."""
+def open_standard_streams() -> None:
+    """Open missing standard streams, so that no other file gets their descriptors."""
     for descriptor in (0, 1, 2):
         try:
             os.fstat(descriptor)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # gets the lowest free descriptor
+            os.open(os.devnull, os.O_RDWR)  # This gets the lowest free descriptor.
     for name, descriptor in (("stdout", 1), ("stderr", 2)):
         if getattr(sys, name) is None:
             setattr(sys, name, io.TextIOWrapper(io.FileIO(descriptor, "w", closefd=False), "utf-8"))
 
 
-def tell(lines: Iterable[str]) -> None:
-    """Write lines to stderr, whatever characters they contain; discard them if nobody can read them."""
-    # Imported here, as the library needs no command line.
+def write_stderr(lines: Iterable[str]) -> None:
+    """Write lines with any characters to stderr; errors of the stream are ignored."""
+    # Imported here, so that the Python API does not load click.
     import click
 
     try:
         for line in lines:
             click.echo(printable(line), err=True)
     except OSError:
-        mute(sys.stderr)
+        discard_buffer(sys.stderr)
 
 
-def mute(stream: TextIO) -> None:
-    """Discard what is still buffered in a stream; otherwise the interpreter would try to write it when it ends."""
+def discard_buffer(stream: TextIO) -> None:
+    """Discard buffered text of a stream, which the interpreter would otherwise try to write at exit."""
     with suppress(OSError, ValueError):
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, stream.fileno())
-        os.close(nowhere)
+        sink = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(sink, stream.fileno())
+        os.close(sink)
 
 
 @contextmanager
-def silenced(*descriptors: int, into: str = os.devnull) -> Iterator[None]:
-    """Discard, or write into a file, what libraries write to some file descriptors; a closed one stays closed."""
-    with _redirecting, Path(into).open("wb") as nowhere:
-        kept = {}
+def discarded_output(*descriptors: int, into: str = os.devnull) -> Iterator[None]:
+    """Redirect the output of libraries; a closed descriptor stays closed.
+
+    Args:
+        *descriptors: file descriptors to redirect.
+        into: file that receives the output.
+    """
+    with _redirecting, Path(into).open("wb") as sink:
+        copies = {}
         for descriptor in descriptors:
             with suppress(OSError):
-                kept[descriptor] = os.dup(descriptor)
-        for descriptor in kept:
-            os.dup2(nowhere.fileno(), descriptor)
+                copies[descriptor] = os.dup(descriptor)
+        for descriptor in copies:
+            os.dup2(sink.fileno(), descriptor)
         try:
             yield
         finally:
-            for descriptor, copy in kept.items():
+            for descriptor, copy in copies.items():
                 os.dup2(copy, descriptor)
                 os.close(copy)

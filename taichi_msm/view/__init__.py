@@ -1,1 +1,1 @@
-"""The live session and its window."""
+"""The live session: interactive simulation in a window, or filmed from a script."""

@@ -1,7 +1,4 @@
-"""The pointer over the picture of a simulation, which moves the tool in the hand.
-
-How the tissue is shown: the camera, the light and the mesh, which a person may change while it moves.
-"""
+"""The pointer and the camera of a session: the controller of the tool, and the viewport."""
 
 from __future__ import annotations
 
@@ -20,86 +17,109 @@ from taichi_msm.runs.media import Picture
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.camera import Camera
 from taichi_msm.scene.render import AnyCamera, Render
-from taichi_msm.view.tools import HeldTool, MovedTool, Place
-
-pass  # REMOVED
+from taichi_msm.view.tools import ForceControlledTool, PositionControlledTool, SheetPosition
 
 
 class Controller:
-    """Moves a tool with a pointer over the picture of a simulation.
+    """Controller of a tool with a pointer over the picture of a simulation.
 
-    A tool that is held by force acts on the material that is seen under the pointer. One that is held by position is in
-    space: above the point of the sheet at rest that is under the pointer, or as deep below it.
+    A force-controlled tool acts on the material that is visible under the pointer. A position-controlled tool acts in
+    space: its tip is above or below the position of the sheet at rest that is under the pointer.
+
+    Args:
+        tool: the initial tool.
+        viewport: has the camera of the picture.
+        simulation: has the sheet.
 
     Attributes:
-        tool: the tool; may be replaced by another one while nothing is held.
+        tool: the tool; may be replaced while it does not press.
     """
 
-    def __init__(self, tool: HeldTool | MovedTool, viewport: Viewport, simulation: Simulation) -> None:
+    def __init__(
+        self, tool: ForceControlledTool | PositionControlledTool, viewport: Viewport, simulation: Simulation
+    ) -> None:
         self.tool = tool
         self._viewport = viewport
         self._simulation = simulation
-        # Where a drag begins: the place of the tool, and the point of the rest plane that was then under the pointer.
-        self._held: tuple[Place, NDArray[np.floating] | None] | None = None
+        # Start of a drag: position of the tool, and the point of the rest plane under the pointer [m].
+        self._drag_start: tuple[SheetPosition, NDArray[np.floating] | None] | None = None
         self._pointer = (0.0, 0.0)
-        self._hovering: tuple[float, float] | None = None
+        self._hover_pixel: tuple[float, float] | None = None
 
     def press(self, x: float, y: float, direction: int) -> bool:
-        """Press (1), or pull or grip (-1), what is seen at a pixel; returns whether there is anything."""
-        place = self._simulation.pick((x, y), self._viewport.view)
-        if place is None:
+        """Press the tissue that is visible at a pixel.
+
+        Args:
+            x: column of the pixel.
+            y: row of the pixel.
+            direction: 1 to press, -1 to pull or grip.
+
+        Returns:
+            Whether tissue is visible there.
+        """
+        position = self._simulation.pick((x, y), self._viewport.view)
+        if position is None:
             return False
-        if isinstance(self.tool, MovedTool):
-            place = self._at_rest(x, y) or self.tool.goal
-        self.tool.press(place, direction)
+        if isinstance(self.tool, PositionControlledTool):
+            position = self._rest_position(x, y) or self.tool.target
+        self.tool.press(position, direction)
         self._pointer = x, y
-        self._held = place, intersect_rest_plane(self._viewport.view, self._pointer)
+        self._drag_start = position, intersect_rest_plane(self._viewport.view, self._pointer)
         return True
 
-    def over(self) -> Place | None:
-        """Find the place on the sheet where a tool held by force would press; None if there is none, or it presses."""
-        if isinstance(self.tool, MovedTool) or self.tool.held or self.tool.percent != 0 or self._hovering is None:
+    def hover_position(self) -> SheetPosition | None:
+        """Return the position at which a force-controlled tool would press, or None if there is none or it presses."""
+        if isinstance(self.tool, PositionControlledTool) or self.tool.engaged or self.tool.percent != 0:
             return None
-        return self._simulation.pick(self._hovering, self._viewport.view)
+        return None if self._hover_pixel is None else self._simulation.pick(self._hover_pixel, self._viewport.view)
 
     def hover(self, x: float, y: float) -> None:
-        """Note where a pointer is that presses nothing; a tool held by position goes there."""
-        self._hovering = x, y
-        if isinstance(self.tool, MovedTool) and (place := self._at_rest(x, y)):
-            self.tool.move(place)
+        """Move the pointer without pressing; the tip of a position-controlled tool follows.
+
+        Args:
+            x: column of the pixel.
+            y: row of the pixel.
+        """
+        self._hover_pixel = x, y
+        if isinstance(self.tool, PositionControlledTool) and (position := self._rest_position(x, y)):
+            self.tool.move(position)
 
     def drag(self, x: float, y: float) -> None:
-        """Move the control point as far over the sheet at rest as the pointer moved.
+        """Move the pressing tool over the sheet at rest by the movement of the pointer.
 
-        The deformed sheet cannot serve for this: it gives way to the tool, so each move would cause another.
+        The deformed sheet cannot be used: it moves with the tool, so each movement would cause another one.
+
+        Args:
+            x: column of the pixel under the pointer.
+            y: row of that pixel.
         """
-        if self._held is None:
+        if self._drag_start is None:
             return
         self._pointer = x, y
-        ((across, down), begun), here = self._held, intersect_rest_plane(self._viewport.view, self._pointer)
-        if begun is None or here is None:
+        ((across, down), start), end = self._drag_start, intersect_rest_plane(self._viewport.view, self._pointer)
+        if start is None or end is None:
             return
-        (right, up), (height, width) = here - begun, self._simulation.scene.sheet.size
+        (right, up), (height, width) = end - start, self._simulation.scene.sheet.size
         self.tool.move((across + right / width, down - up / height))
 
     def release(self) -> None:
-        """Let go."""
-        self._held = self._hovering = None
-        if self.tool.held:
+        """Release the tissue."""
+        self._drag_start = self._hover_pixel = None
+        if self.tool.engaged:
             self.tool.release()
 
-    def hold_on(self) -> None:
-        """Keep the tool where it is after the camera moved; a drag goes on from there."""
-        if self._held is not None:
-            self._held = self.tool.goal, intersect_rest_plane(self._viewport.view, self._pointer)
+    def rebase_drag(self) -> None:
+        """Keep the position of the tool after the camera has moved; a drag continues from there."""
+        if self._drag_start is not None:
+            self._drag_start = self.tool.target, intersect_rest_plane(self._viewport.view, self._pointer)
 
-    def forget(self) -> None:
-        """Put the tool at rest."""
-        self.tool.rest()
-        self._held = self._hovering = None
+    def reset(self) -> None:
+        """Reset the tool and the pointer."""
+        self.tool.reset()
+        self._drag_start = self._hover_pixel = None
 
-    def _at_rest(self, x: float, y: float) -> Place | None:
-        """Find the place of the sheet at rest that a pixel shows; None if it shows none of its plane."""
+    def _rest_position(self, x: float, y: float) -> SheetPosition | None:
+        """Return the position of the sheet at rest at a pixel, or None if the pixel does not show its plane."""
         if (point := intersect_rest_plane(self._viewport.view, (x, y))) is None:
             return None
         height, width = self._simulation.scene.sheet.size
@@ -107,35 +127,37 @@ class Controller:
 
 
 class Viewport:
-    """Shows what a renderer draws in the way chosen now, at first as its scene says.
+    """Camera, light and mesh display of a session, which the user can change.
 
-    Of a scene that is played, a camera that moves is followed; otherwise it stays where it is at first.
+    Args:
+        renderer: draws the sheet; its scene has the initial settings.
+        play: whether to follow a moving camera of the scene, which otherwise stays at its initial pose.
 
     Attributes:
-        render: how the sheet is drawn now.
-        view: the camera now.
+        render: current drawing settings.
+        view: current camera.
     """
 
     def __init__(self, renderer: Renderer, *, play: bool = False) -> None:
         self._renderer, self._plays, self._time = renderer, play, 0.0
         self.render: Render = renderer.scene.render
         self.view: View = renderer.view
-        self.look(self.render.main_camera)
+        self.set_camera(self.render.main_camera)
 
     @property
-    def compiled(self) -> bool:
+    def is_compiled(self) -> bool:
         """Whether the next picture can be drawn without compiling a kernel."""
         return self._renderer.is_compiled(self.render, self.view)
 
-    def look(self, camera: AnyCamera) -> None:
-        """Choose another camera; those beside it follow."""
+    def set_camera(self, camera: AnyCamera) -> None:
+        """Set the main camera; the other cameras of the rig move with it."""
         if isinstance(camera, Camera) and not self._plays:
             camera = frozen_camera(camera, 0.0)
         self.render = self.render.with_main(camera)
         self.view = view(self._renderer.scene.model_copy(update={"render": self.render, "output": ()}), self._time)
 
-    def follow(self, time: float) -> bool:
-        """Go where a moving camera is at a time [s]; returns whether it moves."""
+    def set_time(self, time: float) -> bool:
+        """Move a moving camera to its pose at a time [s]; returns whether the camera moves."""
         self._time = time
         camera = self.render.main_camera
         moving = isinstance(camera, Camera) and camera.moves
@@ -143,8 +165,8 @@ class Viewport:
             self.view = self._renderer.resolve_camera(None, time)
         return moving
 
-    def recorded(self, duration: float) -> Render:
-        """Give how it is drawn for a scene of some duration [s], to the end of which the last pose is held."""
+    def recorded_render(self, duration: float) -> Render:
+        """Return the drawing settings for a scene of a duration [s]; the camera's last pose is held until its end."""
         camera = self.render.main_camera
         if isinstance(camera, Camera) and isinstance(camera.poses, tuple) and camera.poses[-1][0] < duration:
             last = (duration, *camera.poses[-1][1:])
@@ -152,27 +174,40 @@ class Viewport:
         return self.render
 
     def turn(self, right: float, down: float) -> None:
-        """Turn the picture as if its nearest side were pushed by this many pixels; its height is half a turn."""
-        angle = math.pi / self.render.size[1]
-        seen = self._renderer.scene.model_copy(update={"render": self.render})
-        self.look(orbit_camera(pinhole(seen, self._time), -right * angle, down * angle))
+        """Orbit the camera as if the nearest side of the tissue were dragged.
 
-    def light(self) -> None:
-        """Switch the light off or on; on is the scene's shading if it has one, else the headlight."""
-        own = self._renderer.scene.render.shading
-        lit = own if own != "none" else "headlight"
+        Args:
+            right: horizontal distance of the drag [px]; the height of the picture is half a turn.
+            down: vertical distance of the drag [px].
+        """
+        angle = math.pi / self.render.size[1]
+        scene = self._renderer.scene.model_copy(update={"render": self.render})
+        self.set_camera(orbit_camera(pinhole(scene, self._time), -right * angle, down * angle))
+
+    def toggle_light(self) -> None:
+        """Switch between no shading and that of the scene, or the headlight if the scene has none."""
+        scene_shading = self._renderer.scene.render.shading
+        lit = scene_shading if scene_shading != "none" else "headlight"
         self._change(shading="none" if self.render.shading != "none" else lit)
 
-    def mesh(self) -> None:
-        """Show the mesh, or hide it."""
+    def toggle_mesh(self) -> None:
+        """Show or hide the mesh."""
         self._change(wireframe=not self.render.wireframe)
 
     def draw(self, positions: NDArray[Any], rods: Sequence[Capsule] = ()) -> Picture:
-        """Draw the sheet with some instruments; positions and picture as those of `Simulation`."""
+        """Draw the sheet and instruments.
+
+        Args:
+            positions: of the mass points [m], shape (rows, cols, 3).
+            rods: capsules of the instruments.
+
+        Returns:
+            The picture, shape (height, width, 3).
+        """
         return self._renderer.draw(Shot(positions, self.view, rods), self.render)
 
-    def pixel(self, point: NDArray[np.floating]) -> tuple[float, float] | None:
-        """Find where a point [m] is seen; None if it is behind the camera."""
+    def project(self, point: NDArray[np.floating]) -> tuple[float, float] | None:
+        """Project a point [m], shape (3,), to a pixel (x, y), or to None if it is behind the camera."""
         x, y = self.view.pixels(point.astype(float)).tolist()
         return (x, y) if math.isfinite(x) else None
 

@@ -1,4 +1,4 @@
-"""What a person does, as events for the session. Pixels count from the picture's top-left one, x right and y down."""
+"""Input events of a session. Pixels count from the top left of the picture, x to the right and y down."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from typing import NamedTuple
 
 
 class Hover(NamedTuple):
-    """The pointer is over a pixel, and no button is pressed."""
+    """The pointer moves to a pixel without a pressed button."""
 
     x: float
     y: float
 
 
 class Press(NamedTuple):
-    """The tool touches the tissue at a pixel; `pull` reverses its force, or makes a tool held by position grip."""
+    """The tool presses at a pixel; with `pull` it pulls, or grips if it is position-controlled."""
 
     x: float
     y: float
@@ -21,31 +21,31 @@ class Press(NamedTuple):
 
 
 class Drag(NamedTuple):
-    """The tool is dragged to another pixel."""
+    """The pressed tool moves to another pixel."""
 
     x: float
     y: float
 
 
 class Release(NamedTuple):
-    """The tool leaves the tissue."""
+    """The tool releases the tissue."""
 
 
 class Turn(NamedTuple):
-    """The picture is turned as if its nearest side were pushed by this many pixels."""
+    """The camera orbits the tissue, as if its nearest side were dragged by this distance [px]."""
 
     right: float
     down: float
 
 
-class Percent(NamedTuple):
-    """The strength is set to another percentage of the full force or depth; below 0, a grip lifts."""
+class Strength(NamedTuple):
+    """The strength is set [% of the full force or depth]; negative values lift a grip."""
 
     percent: float
 
 
-class Harder(NamedTuple):
-    """The strength grows by this many percent of the full force or depth; below 0 it falls."""
+class StrengthChange(NamedTuple):
+    """The strength is increased [% of the full force or depth]; negative values decrease it."""
 
     percent: float
 
@@ -56,23 +56,23 @@ class Key(NamedTuple):
     name: str
 
 
-Event = Hover | Press | Drag | Release | Turn | Percent | Harder | Key
+Event = Hover | Press | Drag | Release | Turn | Strength | StrengthChange | Key
 
-# How much a notch of the wheel, or the up or down key, changes the strength [percent of the full force or depth].
-NOTCH = 5.0
+# Change of the strength by a notch of the wheel, or by the up or down key [% of the full force or depth].
+STRENGTH_STEP = 5.0
 
-# What the pointer does.
+# Pointer actions and their help texts.
 POINTER = {
     "left button": "press; dragged, the tool moves",
     "shift + left button": "the opposite force, such as pull; by position: grip",
-    "wheel": f"press harder or deeper, by {NOTCH:g} %; lift what is gripped",
+    "wheel": f"press harder or deeper, by {STRENGTH_STEP:g} %; lift what is gripped",
     "right button": "dragged, turn the picture",
 }
 
-# Every key, and what it does.
+# Keys and their help texts.
 KEYS = {
-    "up": f"press harder or deeper, by {NOTCH:g} %; so does +",
-    "down": f"press less, by {NOTCH:g} %; so does -",
+    "up": f"press harder or deeper, by {STRENGTH_STEP:g} %; so does +",
+    "down": f"press less, by {STRENGTH_STEP:g} %; so does -",
     "f": "reset, and hold the tool by position or by force",
     "c": "the scene's own camera",
     "t": "look from the top",

@@ -1,4 +1,4 @@
-"""The files that a session saves: pictures, films and scenes, each whole or not at all; none replaces another."""
+"""Files that a session saves: pictures, films and scenes. Each is written atomically under a new name."""
 
 from __future__ import annotations
 
@@ -22,57 +22,72 @@ from taichi_msm.scene.outputs import OUTPUTS
 from taichi_msm.scene.render import Render
 from taichi_msm.scene.scene import Scene
 
-# The C emitter is ten times faster; a PyYAML that was built without it writes the same text.
+# The C emitter is ten times faster; it writes the same text as the other one.
 _DUMPER: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-
-# A scene has at most this many values besides the keys of its probes.
-OTHER_VALUES = 1000
 
 
 class Film:
-    """A GIF of a session, encoded in a hidden folder while the session runs. On closing, it is removed unless moved.
+    """A GIF of a session, encoded in a hidden folder while the session runs.
 
-    It shows `rate` pictures per second, each of `parts` frames of the session, from frame `begin` on. A FilesError,
-    here and in the methods, says that it cannot be written, and to choose another folder by `option`.
+    Closing removes the file unless it was moved. The constructor and the methods raise a FilesError when the GIF cannot
+    be written.
+
+    Args:
+        folder: directory of the hidden folder.
+        render: has the size and the background of the pictures.
+        rate: pictures per second.
+        subframes: frames of the session for each picture.
+        begin: first frame of the session.
+        option: name of the option in the message of an error.
 
     Attributes:
-        pictures: how many it has.
+        pictures: number of pictures.
     """
 
     def __init__(
-        self, folder: Path, render: Render, rate: float, parts: int, begin: int = 0, option: str = "--out"
+        self, folder: Path, render: Render, rate: float, subframes: int, begin: int = 0, option: str = "--out"
     ) -> None:
         self.pictures = 0
-        self._parts, self._begin, self._place = parts, begin, (folder, option)
-        with writing(*self._place), ExitStack() as opened:
+        self._subframes, self._begin, self._location = subframes, begin, (folder, option)
+        with writing(*self._location), ExitStack() as opened:
             self._hidden = opened.enter_context(staged(folder))
             job = Job((self._hidden,), render.size, rate, png=False, gif=True, background=render.background)
             self._encoder = Encoder(job)
             opened.callback(self._encoder.abort)
             self._opened = opened.pop_all()
 
-    def show(self, picture: Picture, frame: int, pause: Pause = lambda: None) -> None:
-        """Film a picture of a frame of the session; one that comes late is taken several times. `pause`: as Encoder."""
-        with writing(*self._place):
-            while self.pictures * self._parts <= frame - self._begin:
+    def add_frame(self, picture: Picture, frame: int, pause: Pause = lambda: None) -> None:
+        """Append a picture, repeated if earlier pictures are missing.
+
+        Args:
+            picture: shape (height, width, 3).
+            frame: frame of the session.
+            pause: called while the encoder is busy.
+        """
+        with writing(*self._location):
+            while self.pictures * self._subframes <= frame - self._begin:
                 self._encoder.add(picture[None], pause)
                 self.pictures += 1
 
-    def encoded(self, pause: Pause = lambda: None) -> Path:
-        """Wait until the last picture is encoded; there must be one. Returns the file, which is to be moved away."""
-        with writing(*self._place):
+    def finish(self, pause: Pause = lambda: None) -> Path:
+        """Finish the film, which must have a picture; returns the file, which the caller must move."""
+        with writing(*self._location):
             self._encoder.finish(pause)
         return self._hidden / OUTPUTS["gif"].path()
 
     def close(self) -> None:
-        """End it."""
+        """Stop the encoder, and remove the hidden folder."""
         self._opened.close()
 
 
 class Captures:
-    """The folder where a session of what has this name saves its files; made with the first file.
+    """The directory of the files that a session saves, which is created with the first file.
 
-    Its methods raise a FilesError when the folder cannot be written.
+    The methods raise a FilesError when the directory cannot be written.
+
+    Args:
+        folder: the directory.
+        name: name of the scene, for comments.
 
     Attributes:
         saved: the saved files, in order.
@@ -84,37 +99,38 @@ class Captures:
         self._name = name
 
     def save_picture(self, picture: Picture) -> Path:
-        """Save a picture as PNG; returns its file."""
+        """Save a picture, shape (height, width, 3), as PNG; returns its file."""
         with writing(self.folder), staged(self.folder) as hidden:
             Image.fromarray(picture).save(hidden / "picture", "PNG")
-            return self._place(hidden / "picture", "picture", ".png")
+            return self._move_to_free_name(hidden / "picture", "picture", ".png")
 
     def save_scene(self, scene: Scene) -> Path:
-        """Save a scene, and beside it copies of its pictures, where a scene file must have them; returns its file."""
+        """Save a scene and copies of its pictures in the same directory; returns the scene file."""
         with writing(self.folder), staged(self.folder) as hidden:
-            scene = scene.with_pictures(lambda path: self._copied(Path(path)).name)
+            scene = scene.with_pictures(lambda path: self._copy_picture(Path(path)).name)
             data = scene.model_dump(mode="json", exclude_none=True)
             text = yaml.dump(
                 data, Dumper=_DUMPER, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True
             )
             text = f"# What was done in a live session of {printable(self._name)}; `run` repeats it.\n{text}"
-            if len(text.encode()) > MAX_BYTES or probe_values(scene) + OTHER_VALUES > MAX_NODES:
+            # A scene has at most 1000 values in addition to the keyframes of its probes.
+            if len(text.encode()) > MAX_BYTES or count_probe_values(scene) + 1000 > MAX_NODES:
                 raise FilesError("this session is too long for a scene file; reset it, and do less")
             (hidden / "session").write_text(text, "utf-8")
-            return self._place(hidden / "session", "session", ".yaml")
+            return self._move_to_free_name(hidden / "session", "session", ".yaml")
 
     def save_film(self, film: Film) -> Path:
-        """End a film that has a picture, and save it; returns its file."""
+        """Finish and save a film that has a picture; returns its file."""
         with closing(film), writing(self.folder):
-            return self._place(film.encoded(), "film", ".gif")
+            return self._move_to_free_name(film.finish(), "film", ".gif")
 
-    def _place(self, draft: Path, stem: str, suffix: str) -> Path:
-        """Give a file the next free name."""
+    def _move_to_free_name(self, draft: Path, stem: str, suffix: str) -> Path:
+        """Move a file to the next free name."""
         self.saved.append(place(draft, self.folder, stem, suffix))
         return self.saved[-1]
 
-    def _copied(self, image: Path) -> Path:
-        """Make sure that the folder has a copy of a picture, under the picture's own name if that is free."""
+    def _copy_picture(self, image: Path) -> Path:
+        """Copy a picture into the directory, under its name or a numbered one, unless an equal copy exists."""
         copy, number = self.folder / image.name, 1
         if not image.is_file():
             raise FilesError(f"{image}: missing; put the picture back, the scene needs a copy of it")
@@ -127,8 +143,8 @@ class Captures:
         return copy
 
 
-def probe_values(scene: Scene) -> int:
-    """Count the values that the keys of a scene's probes add to its file, which may have `MAX_NODES` in all."""
+def count_probe_values(scene: Scene) -> int:
+    """Return the number of values in the keyframes of a scene's probes, for the limit `MAX_NODES` of scene files."""
     return sum(
         4 * len(probe.at) + 3 * len(probe.load) + 5 * len(probe.path or ()) + 3 * len(probe.grip)
         for probe in scene.probes

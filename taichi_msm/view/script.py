@@ -1,4 +1,4 @@
-"""A script of events, read from a YAML file: what a person would do. With it a session without a window is filmed."""
+"""Scripts of input events, read from YAML files, and films of sessions without a window."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from taichi_msm.errors import FilesError, Problem, SceneError, writing
 from taichi_msm.load.check import parse
 from taichi_msm.load.scene_file import Draft, Kind, read_file
 from taichi_msm.scene.section import MAX_PIXELS, REFUSED, NotNegative, Number, Pixels, Section, key
-from taichi_msm.view.events import KEYS, Drag, Event, Key, Percent, Press, Release, Turn
+from taichi_msm.view.events import KEYS, Drag, Event, Key, Press, Release, Strength, Turn
 from taichi_msm.view.recording import Film
 
 if TYPE_CHECKING:
@@ -23,27 +23,24 @@ if TYPE_CHECKING:
 
 OPTION = "--record"
 
-LONGEST = 3600.0
+MAX_SCRIPT_S = 3600.0
 
 Pair = tuple[Number, Number]
-Seconds = Annotated[NotNegative, Field(le=LONGEST)]
-SECONDS = f"a number from 0 to {LONGEST:g}, in seconds"
+Seconds = Annotated[NotNegative, Field(le=MAX_SCRIPT_S)]
+SECONDS = f"a number from 0 to {MAX_SCRIPT_S:g}, in seconds"
 
-# The key that every kind of entry needs besides its time.
-NEEDS = {"press": "at", "pull": "at", "drag": "at", "release": "", "turn": "by", "percent": "to", "key": "name"}
-*KINDS, LAST_KIND = NEEDS
+# The key that each kind of event requires in addition to its time.
+REQUIRED_KEYS = {"press": "at", "pull": "at", "drag": "at", "release": "", "turn": "by", "percent": "to", "key": "name"}
+*KINDS, LAST_KIND = REQUIRED_KEYS
 
-# The kinds that may last; such an entry is spread over the frames of its duration.
-LASTING = ("drag", "turn")
-
-# A script may not quit: the session ends at its given time.
-PRESSABLE = tuple(name for name in KEYS if name != "q")
+# A script cannot quit, as the duration of a film is given.
+SCRIPT_KEYS = tuple(name for name in KEYS if name != "q")
 
 _SCRIPT = Kind("script", "events")
 
 
 class ScriptEvent(Section):
-    """One entry of a script."""
+    """An event of a script."""
 
     t: Seconds = key(..., means="when, or when it begins [s]", expects=SECONDS)
     do: Literal["press", "pull", "drag", "release", "turn", "percent", "key"] = key(
@@ -64,20 +61,20 @@ class ScriptEvent(Section):
     @model_validator(mode="after")
     def _complete(self) -> ScriptEvent:
         for name in ("at", "by", "to", "name"):
-            given, needed = getattr(self, name) is not None, NEEDS[self.do] == name
-            if given != needed:
-                message = "missing; {do} needs it" if needed else "{do} takes none; remove it"
+            given, required = getattr(self, name) is not None, REQUIRED_KEYS[self.do] == name
+            if given != required:
+                message = "missing; {do} needs it" if required else "{do} takes none; remove it"
                 raise _refused(name, message, do=self.do)
-        if self.name is not None and self.name not in PRESSABLE:
+        if self.name is not None and self.name not in SCRIPT_KEYS:
             message = "there is no key '{name}' here; expected one of: {keys}"
-            raise _refused("name", message, name=self.name, keys=", ".join(PRESSABLE))
-        if self.seconds > 0 and self.do not in LASTING:
+            raise _refused("name", message, name=self.name, keys=", ".join(SCRIPT_KEYS))
+        if self.seconds > 0 and self.do not in ("drag", "turn"):
             raise _refused("seconds", "{do} takes no time; remove it", do=self.do)
         return self
 
 
 class Script(Section):
-    """The file."""
+    """Content of a script file."""
 
     size: tuple[Pixels, Pixels] | None = key(
         None,
@@ -103,12 +100,19 @@ class Script(Section):
 
 
 def _refused(key: str | int, message: str, **values: str) -> PydanticCustomError:
-    """Make the error of a key."""
     return PydanticCustomError(REFUSED, message, {"below": (key,), **values})
 
 
 def load_script(path: str | Path, size: tuple[int, int]) -> Script:
-    """Read a script for a picture of a width and height [px]; raises a SceneError with all faults, in their order."""
+    """Read and check a script.
+
+    Args:
+        path: the script file.
+        size: width and height of the session's picture [px].
+
+    Raises:
+        SceneError: with a line for each error of the file, in the order of the file.
+    """
     draft = Draft(read_file(str(path), _SCRIPT))
     script, problems = parse(Script, draft.data)
     draft.report(problems)
@@ -119,7 +123,7 @@ def load_script(path: str | Path, size: tuple[int, int]) -> Script:
 
 
 def _outside(script: Script, size: tuple[int, int]) -> Iterator[Problem]:
-    """Find the entries that point outside the picture."""
+    """Check that presses are inside the picture."""
     width, height = size
     for n, entry in enumerate(script.events):
         if entry.do in ("press", "pull") and entry.at is not None:
@@ -129,68 +133,74 @@ def _outside(script: Script, size: tuple[int, int]) -> Iterator[Problem]:
                 yield Problem(("events", n, "at"), message)
 
 
-def timed(script: Script, rate: float, size: tuple[int, int]) -> Iterator[tuple[int, Event]]:
-    """Give the events of a script, in order, each with the frame before which it happens.
+def schedule_events(script: Script, rate: float, size: tuple[int, int]) -> Iterator[tuple[int, Event]]:
+    """Convert a script to events of a session.
 
-    There are `rate` frames per second, and the picture that is shown has this width and height [px].
+    Args:
+        script: the script.
+        rate: frames per second of the session.
+        size: width and height of the session's picture [px].
+
+    Returns:
+        The events in order, each with the frame before which it happens.
     """
-    scale = [shown / meant for shown, meant in zip(size, script.size or size, strict=True)]
+    scale = [actual / assumed for actual, assumed in zip(size, script.size or size, strict=True)]
     x = y = 0.0
     for entry in script.events:
         first = round(entry.t * rate)
         frames = max(1, round(entry.seconds * rate))
         begin_x, begin_y = x, y
         if entry.at:
-            x, y = ((n + 0.5) * factor - 0.5 for n, factor in zip(entry.at, scale, strict=True))
+            x, y = ((pixel + 0.5) * factor - 0.5 for pixel, factor in zip(entry.at, scale, strict=True))
         for n in range(1, frames + 1):
-            share, frame = n / frames, first + n - 1
+            fraction, frame = n / frames, first + n - 1
             match entry.do:
                 case "press" | "pull":
                     yield frame, Press(x, y, entry.do == "pull")
                 case "drag":
-                    yield frame, Drag(begin_x + share * (x - begin_x), begin_y + share * (y - begin_y))
+                    yield frame, Drag(begin_x + fraction * (x - begin_x), begin_y + fraction * (y - begin_y))
                 case "release":
                     yield frame, Release()
                 case "turn":
                     right, down = entry.by or (0.0, 0.0)
                     yield frame, Turn(right * scale[0] / frames, down * scale[1] / frames)
                 case "percent":
-                    yield frame, Percent(entry.to or 0.0)
+                    yield frame, Strength(entry.to or 0.0)
                 case "key":
                     yield frame, Key(entry.name or "")
 
 
-def film(
+def record_film(
     session: Session,
     path: Path,
     seconds: float,
     events: Iterable[tuple[int, Event]] = (),
     progress: Callable[[int, int], None] = lambda done, total: None,
-    say: Callable[[str], None] = lambda notice: None,
+    notify: Callable[[str], None] = lambda notice: None,
 ) -> None:
-    """Run a session for some time and film it as a GIF, which replaces an earlier one when it is whole.
+    """Run a session without a window and record it as a GIF, which replaces an earlier file at the end.
 
     Args:
-        session: it has no window.
+        session: the session.
         path: the GIF.
-        seconds: how long.
-        events: as from `timed`, read one at a time.
-        progress: called often, with the frames done and the frames in all; what it raises stops the session there.
-        say: called with what the person should know.
+        seconds: duration of the film [s].
+        events: from `schedule_events`; read one at a time.
+        progress: called often with the number of finished frames and the number of frames; an exception from it stops
+            the session.
+        notify: called with notices for the user.
 
     Raises:
-        FilesError: when the film cannot be written; or, after it was written, when a file that an event was to save
-            could not be.
+        FilesError: when the film cannot be written; after it was written, when an event could not save its file.
     """
     if path.is_dir():
         raise FilesError(f"{path}: a directory; choose another {OPTION}")
-    frames = round(seconds * session.rate)
+    frames = round(seconds * session.frame_rate)
     events = iter(events)
     upcoming = next(events, None)
     failures: list[FilesError] = []
     notice = ""
-    rate, parts = session.rate / session.parts, session.parts
-    with closing(Film(path.parent, session.scene.render, rate, parts, option=OPTION)) as gif:
+    rate, subframes = session.frame_rate / session.subframes, session.subframes
+    with closing(Film(path.parent, session.scene.render, rate, subframes, option=OPTION)) as gif:
         for frame in range(frames + 1):
             progress(frame, frames)
             while upcoming is not None and upcoming[0] <= frame:
@@ -199,19 +209,19 @@ def film(
                 except FilesError as error:
                     failures.append(error)
                 if session.notice not in ("", notice):
-                    say(f"{frame / session.rate:g} s: {session.notice}")
+                    notify(f"{frame / session.frame_rate:g} s: {session.notice}")
                 notice = session.notice
                 upcoming = next(events, None)
-            if frame % parts == 0:
-                gif.show(session.picture(), frame, partial(progress, frame, frames))
+            if frame % subframes == 0:
+                gif.add_frame(session.picture(), frame, partial(progress, frame, frames))
             if frame < frames:
                 session.advance()
-            if session.fault:
-                say(session.fault)
+            if session.divergence_error:
+                notify(session.divergence_error)
                 break
         if upcoming is not None:
-            say(f"the film ends at {frame / session.rate:g} s, before some of the script's events")
+            notify(f"the film ends at {frame / session.frame_rate:g} s, before some of the script's events")
         with writing(path, OPTION):
-            gif.encoded(partial(progress, frames, frames)).replace(path)
+            gif.finish(partial(progress, frames, frames)).replace(path)
     if failures:
         raise failures[0]

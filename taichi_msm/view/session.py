@@ -1,4 +1,7 @@
-"""A session: it takes events, and gives the state of the tissue and its picture. It has no window and no clock."""
+"""An interactive session: it processes events, and provides the state of the tissue and its picture.
+
+It has no window and no clock.
+"""
 
 from __future__ import annotations
 
@@ -26,60 +29,57 @@ from taichi_msm.solver.planning import plan_variant, with_time
 from taichi_msm.system import runtime
 from taichi_msm.view import events, overlay
 from taichi_msm.view.controller import Controller, Viewport
-from taichi_msm.view.recording import Captures, Film, probe_values
-from taichi_msm.view.tools import HeldTool, MovedTool, Place
+from taichi_msm.view.recording import Captures, Film, count_probe_values
+from taichi_msm.view.tools import ForceControlledTool, PositionControlledTool, SheetPosition
 
-# A session has at most this many frames per second, what a screen shows; each is a whole part of a frame of the scene.
-MOST_FRAMES = 60.0
+# Largest number of frames per second of a session, which a screen can show.
+MAX_FRAME_RATE = 60.0
 
-# A displacement below this share of the sheet's larger side is shown as 0.
-AT_REST = 1e-6
-
-# What stands between two figures.
-SEPARATOR = "  ·  "
-
-# How long a notice is shown [s].
-NOTICE = 3.0
-
-# The length of the recorded scene is checked once in this many frames; a warning comes at this share of the limit.
-CHECKED = 200
-NEARLY = 0.75
-
-# The time of stepping is averaged over about this many frames.
-AVERAGED = 20
+NOTICE_DURATION_S = 3.0
 
 
-def with_live_frames(plan: Plan) -> tuple[Plan, int]:
-    """Divide a scene's frames into as many equal parts as a screen shows; give that plan, and the parts of a frame."""
+def divide_frames(plan: Plan) -> tuple[Plan, int]:
+    """Divide the frames of a scene into equal subframes, at most `MAX_FRAME_RATE` per second.
+
+    Returns:
+        The plan with the subframes as frames, and the number of subframes per frame.
+    """
     scene = plan.scene
-    parts = max(1, int(MOST_FRAMES / scene.time.frames_per_second * (1 + 1e-9)))
+    subframes = max(1, int(MAX_FRAME_RATE / scene.time.frames_per_second * (1 + 1e-9)))
     if scene.time.step != "auto":
         steps = plan.grid.steps_per_frame
-        while steps % parts:
-            parts -= 1
-    return plan_variant(plan, with_time(scene, frames_per_second=scene.time.frames_per_second * parts)), parts
+        while steps % subframes:
+            subframes -= 1
+    return plan_variant(plan, with_time(scene, frames_per_second=scene.time.frames_per_second * subframes)), subframes
 
 
 class Session:
-    """A person presses the tissue of a scene with a tool. Usable in a with statement, which saves a film that is on.
+    """An interactive simulation of a scene with a tool; a context manager, which saves a running film.
 
-    The tool has the force, the falloff and the offset of the scene's first probe with a force. Held by position, it has
-    the instrument and the friction of the first probe with a path, or else the first instrument. At first it is held as
-    the scene's first probe is. If it is to `play`, the scene's own probes act as well. `progress` is called often with
-    the name of the stage; what it raises stops the work there.
+    A force-controlled tool has the force, the falloff and the offset of the scene's first probe with a force. A
+    position-controlled tool has the instrument and the friction of the first probe with a path, or otherwise the first
+    instrument. The initial tool corresponds to the scene's first probe.
+
+    Args:
+        scene: the scene.
+        captures: receives saved files.
+        arch: cpu, cuda or vulkan.
+        threads: number of CPU threads, or None for one per core.
+        play: whether the scene's own probes act too.
+        progress: called often with the name of the stage; an exception from it stops the session.
 
     Raises:
-        SceneError: when the scene has no picture, no probe, or no room for another probe.
+        SceneError: when the scene has no picture, no probe, or too many probes.
         DeviceError: when the arch is not available.
 
     Attributes:
-        scene: the scene, with the frames and the step of the session.
-        tool: the tool in the person's hand.
-        viewport: how the tissue is shown.
-        parts: how many frames of the session make one of the given scene's.
-        paused: whether time stands still.
-        fault: why the tissue no longer moves; empty while it does.
-        seconds_a_frame: how long the steps of a frame take [s].
+        scene: the scene, with the frames and the time step of the session.
+        tool: the current tool.
+        viewport: camera, light and mesh display.
+        subframes: number of frames of the session per frame of the given scene.
+        paused: whether the simulation is paused.
+        divergence_error: message of a divergence, which stops the simulation; empty otherwise.
+        frame_time_s: average time of the steps of a frame [s].
     """
 
     def __init__(
@@ -96,73 +96,77 @@ class Session:
         progress("start")
         device = runtime.start(arch, threads)
         texture = load_texture(scene)
-        live, self.parts = with_live_frames(checked(scene))
+        live, self.subframes = divide_frames(checked(scene))
         plan = resolve(live, device, lambda done, total: progress("pilot")).plan
         scene = plan.scene
         self._captures = captures
         self._film: Film | None = None
-        self._others = scene.probes if play else ()
-        # Without outputs nothing is compiled for them.
+        self._scene_probes = scene.probes if play else ()
+        # Without outputs their kernels are not compiled.
         self._plan = replace(plan, scene=scene.model_copy(update={"output": ()}))
-        self._by_force, self._by_position = _by_force(plan), _by_position(plan)
-        tool = self._by_position if scene.probes[0].moved else self._by_force
+        self._force_tool, self._position_tool = _force_tool(plan), _position_tool(plan)
+        tool = self._position_tool if scene.probes[0].moved else self._force_tool
         assert tool is not None
         self.tool = tool
         plan = self._with_tool(tool)
         self.scene = scene.model_copy(update={"probes": plan.scene.probes})
-        self._figures, self._keys = True, False
-        self._once = self._warned = self.paused = False
-        # Frames that have passed, including those while it was paused.
+        self._shows_figures, self._shows_keys = True, False
+        self._single_step = self._length_warned = self.paused = False
+        # Elapsed frames, including those of pauses.
         self._elapsed = 0
         self._notice, self._notice_until = "", 0
-        self.fault = ""
-        self.seconds_a_frame = 0.0
-        # The largest force that the hand has felt since the tissue was at rest [N].
-        self._hardest = 0.0
+        self.divergence_error = ""
+        self.frame_time_s = 0.0
+        # Largest felt force since the last reset [N].
+        self._max_felt_force = 0.0
         progress("compile")
         self._simulation = Simulation(plan, arch, threads, texture)
         self._simulation.compile(lambda: progress("compile"))
-        self._beginning = self._simulation.save()
+        self._initial_state = self._simulation.save()
         self.viewport = Viewport(self._simulation.renderer, play=play)
         self._controller = Controller(self.tool, self.viewport, self._simulation)
         self._draw()
 
     @property
-    def rate(self) -> float:
-        """Frames per second of the session."""
+    def frame_rate(self) -> float:
+        """The frames per second of the session."""
         return self.scene.time.frames_per_second
 
     @property
     def frame(self) -> int:
-        """Frames simulated since the tissue was at rest."""
+        """The number of frames simulated since the last reset."""
         return self._simulation.frame
 
     def positions(self) -> NDArray[np.floating]:
-        """Positions of the points [m], shape (rows, cols, 3)."""
+        """Return the positions of the mass points [m], shape (rows, cols, 3)."""
         return self._simulation.positions()
 
     def displacement(self) -> float:
-        """Tell how far the tissue at the tool is from rest [m]."""
-        return float(np.linalg.norm(self._touched() - [*self._rest_point(self.tool.place), 0.0]))
+        """Return the displacement of the tissue at the tool [m]."""
+        return float(np.linalg.norm(self._touched_point() - [*self._rest_point(self.tool.position), 0.0]))
 
-    def felt(self) -> float:
-        """Tell the force that a hand feels which holds the tool by position, the mean over the last frame [N]."""
-        if isinstance(self.tool, HeldTool):
+    def felt_force(self) -> float:
+        """Return the force on a position-controlled tool, averaged over the last frame [N]; 0 for other tools."""
+        if isinstance(self.tool, ForceControlledTool):
             return 0.0
         return float(np.linalg.norm(self._simulation.forces()[-1].force))
 
-    def recorded(self) -> Scene:
-        """Give what was done as a scene; a run of it has the same bits."""
+    def recorded_scene(self) -> Scene:
+        """Return the recorded session as a scene, whose run has the same bits."""
         # After a divergence, the frame in which it happened is part of the scene, whose run diverges as well.
-        frames = max(1, self.frame + bool(self.fault))
-        time = self.scene.time.model_copy(update={"duration": frames / self.rate, "tolerance": None})
-        probes = (*self._others, self.tool.recorded(frames))
+        frames = max(1, self.frame + bool(self.divergence_error))
+        time = self.scene.time.model_copy(update={"duration": frames / self.frame_rate, "tolerance": None})
+        probes = (*self._scene_probes, self.tool.recorded_probe(frames))
         return self.scene.model_copy(
-            update={"probes": probes, "time": time, "render": self.viewport.recorded(time.duration)}
+            update={"probes": probes, "time": time, "render": self.viewport.recorded_render(time.duration)}
         )
 
     def handle(self, event: events.Event) -> None:
-        """Do what an event asks for, from the next frame on; raises a FilesError when a file cannot be saved."""
+        """Process an event, which takes effect from the next frame on.
+
+        Raises:
+            FilesError: when a file cannot be saved.
+        """
         match event:
             case events.Hover(x, y):
                 self._controller.hover(x, y)
@@ -170,80 +174,85 @@ class Session:
                 if self._controller.press(x, y, -1 if pull else 1):
                     self._notice_until = 0
                 else:
-                    self.say(f"no tissue at pixel {x:g}, {y:g}")
+                    self.show_notice(f"no tissue at pixel {x:g}, {y:g}")
             case events.Drag(x, y):
                 self._controller.drag(x, y)
             case events.Release():
                 self._controller.release()
             case events.Turn(right, down):
                 self.viewport.turn(right, down)
-                self._controller.hold_on()
-            case events.Percent(percent):
-                self.tool.ask(percent)
-            case events.Harder(percent):
-                self.handle(events.Percent(self.tool.strength + percent))
+                self._controller.rebase_drag()
+            case events.Strength(percent):
+                self.tool.set_strength(percent)
+            case events.StrengthChange(percent):
+                self.handle(events.Strength(self.tool.strength + percent))
             case events.Key(name):
-                self._do(name)
+                self._handle_key(name)
 
     def advance(self) -> None:
-        """Let a frame's time pass: the tissue moves, unless it is paused."""
+        """Advance by a frame; the tissue moves unless the session is paused."""
         self._elapsed += 1
-        if (self.paused and not self._once) or self.fault:
+        if (self.paused and not self._single_step) or self.divergence_error:
             return
-        self._once = False
-        if self.frame % CHECKED == 0 and not self._warned and probe_values(self.recorded()) > NEARLY * MAX_NODES:
-            self._warned = True
-            self.say("this session will soon be too long for a scene: save it now (w), then reset it (r)")
-        begun = time.perf_counter()
+        self._single_step = False
+        if self.frame % 200 == 0 and not self._length_warned and self._is_nearly_too_long():
+            self._length_warned = True
+            self.show_notice("this session will soon be too long for a scene: save it now (w), then reset it (r)")
+        start = time.perf_counter()
         try:
-            if probe := self.tool.follow(self.frame):
-                self._simulation.steer((*self._others, probe))
+            if probe := self.tool.advance(self.frame):
+                self._simulation.steer((*self._scene_probes, probe))
             self._simulation.advance()
-            self._hardest = max(self._hardest, self.felt())
-            if self.viewport.follow(self._simulation.time):
-                self._controller.hold_on()
+            self._max_felt_force = max(self._max_felt_force, self.felt_force())
+            if self.viewport.set_time(self._simulation.time):
+                self._controller.rebase_drag()
         except DivergedError as error:
-            self.fault = str(error)
-        spent = time.perf_counter() - begun
-        share = 1 / AVERAGED if self.seconds_a_frame else 1.0
-        self.seconds_a_frame += share * (spent - self.seconds_a_frame)
+            self.divergence_error = str(error)
+        duration = time.perf_counter() - start
+        # Exponential moving average over about 20 frames.
+        weight = 1 / 20 if self.frame_time_s else 1.0
+        self.frame_time_s += weight * (duration - self.frame_time_s)
 
     def picture(self, pacing: str = "") -> Picture:
-        """Draw the tissue, and write the texts over it, `pacing` among them: how fast pictures come.
+        """Draw the tissue and the overlay; a running film gets the picture without the overlay.
 
-        A film that is on takes the picture without texts; if it cannot, the film ends.
+        Args:
+            pacing: text about the speed of the session.
+
+        Returns:
+            The picture, shape (height, width, 3).
         """
         picture = self._draw()
         tool = self.tool
-        hidden = isinstance(tool, MovedTool) or tool.percent == 0 or tool.probe.instrument is not None
-        if not hidden and (pixel := self.viewport.pixel(self._touched())):
-            overlay.mark(picture, pixel, pulls=self._pulls)
+        hidden = isinstance(tool, PositionControlledTool) or tool.percent == 0 or tool.probe.instrument is not None
+        if not hidden and (pixel := self.viewport.project(self._touched_point())):
+            overlay.mark_tool(picture, pixel, pulls=self._pulls)
         if self._film is not None:
             try:
-                self._film.show(picture, self._elapsed)
+                self._film.add_frame(picture, self._elapsed)
             except FilesError as error:
                 self._film.close()
                 self._film = None
-                self.say(str(error))
-        above = self._figure_lines(pacing) if self._figures else ["paused"] if self.paused else []
-        keys, bar = (events.POINTER | events.KEYS if self._keys else None), None
-        # A small picture has no room for both.
-        if self._figures and self._hardest > 0 and keys is None:
-            bar = overlay.Bar(self.felt(), self._hardest, "N")
-        overlay.write(picture, above, self.notice, keys, bar)
+                self.show_notice(str(error))
+        above = self._figure_lines(pacing) if self._shows_figures else ["paused"] if self.paused else []
+        keys, bar = (events.POINTER | events.KEYS if self._shows_keys else None), None
+        # A small picture has no space for both the keys and the bar.
+        if self._shows_figures and self._max_felt_force > 0 and keys is None:
+            bar = overlay.ValueBar(self.felt_force(), self._max_felt_force, "N")
+        overlay.write_text(picture, above, self.notice, keys, bar)
         return picture
 
-    def say(self, notice: str) -> None:
-        """Show a notice for a few seconds."""
-        self._notice, self._notice_until = notice, self._elapsed + round(NOTICE * self.rate)
+    def show_notice(self, notice: str) -> None:
+        """Show a notice for `NOTICE_DURATION_S`."""
+        self._notice, self._notice_until = notice, self._elapsed + round(NOTICE_DURATION_S * self.frame_rate)
 
     @property
     def notice(self) -> str:
-        """The notice that is shown now."""
-        return self._notice if self._elapsed < self._notice_until else self.fault
+        """The current notice."""
+        return self._notice if self._elapsed < self._notice_until else self.divergence_error
 
     def close(self) -> None:
-        """Save the film that is on, and free the memory."""
+        """Save a running film, and release the memory."""
         self._simulation.close()
         self._end_film()
 
@@ -254,171 +263,177 @@ class Session:
         self.close()
 
     def _draw(self) -> Picture:
-        """Draw the tissue and the instruments; the tool's is where the tool acts, or would if it were pressed."""
+        """Draw the tissue and the instruments; that of the tool is where the tool acts, or would act."""
         positions, scene = self.positions(), self._simulation.scene
         instruments = place_capsules(scene, positions, self._simulation.time)
         instrument = scene.probes[-1].instrument
-        if instrument is not None and (place := self._controller.over()):
-            instruments[-1] = place_capsule(instrument, scene, positions, self._rest_point(place))
+        if instrument is not None and (position := self._controller.hover_position()):
+            instruments[-1] = place_capsule(instrument, scene, positions, self._rest_point(position))
         return self.viewport.draw(positions, instruments)
 
-    def _rest_point(self, place: Place) -> NDArray[np.float64]:
-        """Give x and y of a place on the sheet at rest [m]."""
-        (across, down), (height, width) = place, self.scene.sheet.size
+    def _rest_point(self, position: SheetPosition) -> NDArray[np.float64]:
+        """Return x and y of a position on the sheet at rest [m]."""
+        (across, down), (height, width) = position, self.scene.sheet.size
         return np.array([(across - 0.5) * width, (0.5 - down) * height])
 
-    def _touched(self) -> NDArray[np.float64]:
-        """Find the point of the sheet at which the tool acts [m]."""
-        rest = self._rest_point(self.tool.place)
+    def _touched_point(self) -> NDArray[np.float64]:
+        """Return the point of the sheet at which the tool acts [m], shape (3,)."""
+        rest = self._rest_point(self.tool.position)
         return surface_point(self.positions(), self.scene.render.refine, self.scene.sheet, rest)[0]
 
-    def _do(self, key: str) -> None:
+    def _handle_key(self, key: str) -> None:
         match key:
             case "up":
-                self.handle(events.Harder(events.NOTCH))
+                self.handle(events.StrengthChange(events.STRENGTH_STEP))
             case "down":
-                self.handle(events.Harder(-events.NOTCH))
+                self.handle(events.StrengthChange(-events.STRENGTH_STEP))
             case "c" | "t" | "o":
-                self.viewport.look({"c": self.scene.render.main_camera, "t": "top", "o": "oblique"}[key])
-                self._controller.hold_on()
+                self.viewport.set_camera({"c": self.scene.render.main_camera, "t": "top", "o": "oblique"}[key])
+                self._controller.rebase_drag()
             case "m":
-                self.viewport.mesh()
+                self.viewport.toggle_mesh()
             case "l":
-                self.viewport.light()
+                self.viewport.toggle_light()
             case "space":
-                self.paused, self._once = not self.paused, False
+                self.paused, self._single_step = not self.paused, False
             case ".":
-                self._once = self.paused
+                self._single_step = self.paused
             case "r":
-                self._controller.forget()
-                self._simulation.restore(self._beginning)
-                self._simulation.steer((*self._others, self.tool.recorded(0)))
-                self.viewport.follow(0.0)
-                self._begin()
+                self._controller.reset()
+                self._simulation.restore(self._initial_state)
+                self._simulation.steer((*self._scene_probes, self.tool.recorded_probe(0)))
+                self.viewport.set_time(0.0)
+                self._reset_figures()
             case "f":
                 self._switch()
             case "p":
-                self.say(f"saved {self._captures.save_picture(self._draw())}")
+                self.show_notice(f"saved {self._captures.save_picture(self._draw())}")
             case "g":
                 if self._film is None:
-                    rate = self.rate / self.parts
-                    self._film = Film(self._captures.folder, self.scene.render, rate, self.parts, self._elapsed)
+                    rate = self.frame_rate / self.subframes
+                    self._film = Film(self._captures.folder, self.scene.render, rate, self.subframes, self._elapsed)
                 else:
                     self._end_film()
             case "w":
-                self.say(f"saved {self._captures.save_scene(self.recorded())}")
+                self.show_notice(f"saved {self._captures.save_scene(self.recorded_scene())}")
             case "i":
-                self._figures = not self._figures
+                self._shows_figures = not self._shows_figures
             case "h":
-                self._keys = not self._keys
+                self._shows_keys = not self._shows_keys
 
-    def _with_tool(self, tool: HeldTool | MovedTool) -> Plan:
-        """Plan the scene with a tool at rest; SceneError: it cannot be held by position."""
-        plan = self._plan.with_probes((*self._others, tool.recorded(0)))
-        mine = [own for own in plan.tools if own.probe == len(self._others)]
-        if any(path_problems(plan.scene, mine, plan.grid)):
+    def _with_tool(self, tool: ForceControlledTool | PositionControlledTool) -> Plan:
+        """Plan the scene with a tool at rest; raises a SceneError if its instrument cannot be position-controlled."""
+        plan = self._plan.with_probes((*self._scene_probes, tool.recorded_probe(0)))
+        session_tools = [tool for tool in plan.tools if tool.probe == len(self._scene_probes)]
+        if any(path_problems(plan.scene, session_tools, plan.grid)):
             raise SceneError(
                 ["this tool cannot be held by position: its shaft leads down into the sheet; let it lead up"]
             )
         return plan
 
     def _switch(self) -> None:
-        """Hold the other tool, with the tissue at rest again."""
-        tool = self._by_position if isinstance(self.tool, HeldTool) else self._by_force
+        """Switch to the other tool, and reset the tissue."""
+        tool = self._position_tool if isinstance(self.tool, ForceControlledTool) else self._force_tool
         if tool is None:
-            needs = "an instrument" if isinstance(self.tool, HeldTool) else "a force"
-            self.say(f"a tool that is held so needs {needs}; give a probe of the scene one")
+            needs = "an instrument" if isinstance(self.tool, ForceControlledTool) else "a force"
+            self.show_notice(f"a tool that is held so needs {needs}; give a probe of the scene one")
             return
         try:
             plan = self._with_tool(tool)
         except SceneError as error:
-            self.say(error.lines[0])
+            self.show_notice(error.lines[0])
             return
-        self._controller.forget()
+        self._controller.reset()
         self._simulation.restart(plan)
         self._simulation.compile()
-        self._beginning = self._simulation.save()
+        self._initial_state = self._simulation.save()
         self.tool = self._controller.tool = tool
-        self.seconds_a_frame = 0.0
-        self._begin()
-        mine = [own for own in plan.tools if own.probe == len(self._others)]
-        self.say("; ".join(path_warnings(plan.scene, mine)))
+        self.frame_time_s = 0.0
+        self._reset_figures()
+        session_tools = [tool for tool in plan.tools if tool.probe == len(self._scene_probes)]
+        self.show_notice("; ".join(path_warnings(plan.scene, session_tools)))
 
-    def _begin(self) -> None:
-        """Forget what was said and felt of the session so far."""
-        self._once = self._warned = False
-        self._hardest, self.fault = 0.0, ""
+    def _reset_figures(self) -> None:
+        """Reset warnings and figures of the session."""
+        self._single_step = self._length_warned = False
+        self._max_felt_force, self.divergence_error = 0.0, ""
 
     def _end_film(self) -> None:
-        """End the film that is on, and save it if it has a picture."""
+        """End a running film, and save it if it has a picture."""
         film, self._film = self._film, None
         if film is None:
             return
         if film.pictures > 0:
-            self.say(f"saved {self._captures.save_film(film)}")
+            self.show_notice(f"saved {self._captures.save_film(film)}")
         else:
             film.close()
-            self.say("no film was saved: it had no picture yet")
+            self.show_notice("no film was saved: it had no picture yet")
+
+    def _is_nearly_too_long(self) -> bool:
+        """Return whether the recorded scene has reached three quarters of the limit of scene files."""
+        return count_probe_values(self.recorded_scene()) > 0.75 * MAX_NODES
 
     @property
     def _pulls(self) -> bool:
-        """Whether the force of the tool points away from the sheet; a scene's force may do so by itself."""
+        """Whether the force of the tool points away from the sheet, as that of a scene may."""
         tool = self.tool
-        return isinstance(tool, HeldTool) and tool.percent * probe_force(tool.probe, self.scene.sheet).force[2] > 0
+        return (
+            isinstance(tool, ForceControlledTool)
+            and tool.percent * probe_force(tool.probe, self.scene.sheet).force[2] > 0
+        )
 
     def _figure_lines(self, pacing: str) -> list[str]:
         speed = ""
-        if self.seconds_a_frame > 0:
-            speed = f"steps {1 / self.rate / self.seconds_a_frame:.2g} x real time"
+        if self.frame_time_s > 0:
+            speed = f"steps {1 / self.frame_rate / self.frame_time_s:.2g} x real time"
         state = [word for word, on in (("paused", self.paused), ("film", self._film is not None)) if on]
-        lines = self._of_tool(), [pacing, speed, *state]
-        return [SEPARATOR.join(part for part in line if part) for line in lines]
+        lines = self._tool_figures(), [pacing, speed, *state]
+        return ["  ·  ".join(part for part in line if part) for line in lines]
 
-    def _of_tool(self) -> list[str]:
-        """Tell what the tool does."""
+    def _tool_figures(self) -> list[str]:
         tool = self.tool
-        if isinstance(tool, MovedTool):
-            height = tool.height if tool.held else -tool.depth
-            does = "grip" if tool.grips else "press" if tool.held else "next press"
-            return [f"{does} {length(abs(height))} {'up' if height > 0 else 'deep'}", newtons(self.felt())]
-        does = "pull" if self._pulls else "push"
-        percent = f"{does} {abs(tool.percent):.0f} %" if tool.percent else f"tool {tool.strength:.0f} %"
-        moved = self.displacement()
+        if isinstance(tool, PositionControlledTool):
+            height = tool.height if tool.engaged else -tool.depth
+            action = "grip" if tool.gripping else "press" if tool.engaged else "next press"
+            return [f"{action} {length(abs(height))} {'up' if height > 0 else 'deep'}", newtons(self.felt_force())]
+        action = "pull" if self._pulls else "push"
+        percent = f"{action} {abs(tool.percent):.0f} %" if tool.percent else f"tool {tool.strength:.0f} %"
+        displacement = self.displacement()
         # Smaller displacements are rounding errors of positions in f32.
-        return [percent, length(moved if moved > AT_REST * max(self.scene.sheet.size) else 0.0)]
+        return [percent, length(displacement if displacement > 1e-6 * max(self.scene.sheet.size) else 0.0)]
 
 
 def _require_usable(scene: Scene, *, play: bool) -> None:
-    faults = {
+    errors = {
         "image: missing; a session needs one, name it here or with --image": scene.image is None,
         "probes: empty; the tool takes its force from the first probe, add one": not scene.probes,
         f"probes: {MAX_PROBES} leave no room for the tool; remove one, or leave out --play": play
         and len(scene.probes) == MAX_PROBES,
     }
-    if any(faults.values()):
-        raise SceneError([message for message, is_so in faults.items() if is_so])
+    if any(errors.values()):
+        raise SceneError([message for message, applies in errors.items() if applies])
 
 
-def _by_force(plan: Plan) -> HeldTool | None:
-    """Make the tool that is held by force, if a probe has one."""
+def _force_tool(plan: Plan) -> ForceControlledTool | None:
+    """Build the force-controlled tool, if a probe has a force."""
     probe = next((probe for probe in plan.scene.probes if not probe.moved), None)
-    return HeldTool(probe, plan.grid.frames_per_second) if probe else None
+    return ForceControlledTool(probe, plan.grid.frames_per_second) if probe else None
 
 
-def _by_position(plan: Plan) -> MovedTool | None:
-    """Make the tool that is held by position, if a probe has an instrument; one that is moved comes first."""
+def _position_tool(plan: Plan) -> PositionControlledTool | None:
+    """Build the position-controlled tool, if a probe has an instrument; a probe with a path takes precedence."""
     probes = sorted(plan.scene.probes, key=lambda probe: not probe.moved)
     probe = next((probe for probe in probes if probe.instrument is not None), None)
-    return MovedTool(probe, plan) if probe else None
+    return PositionControlledTool(probe, plan) if probe else None
 
 
 def newtons(force: float) -> str:
-    """Write a force [N] with two digits, or all before the point."""
+    """Format a force [N] with two significant digits, or as an integer."""
     return f"{force:.2g} N" if force < 10 else f"{force:.0f} N"
 
 
 def length(metres: float) -> str:
-    """Write a length in a readable unit."""
+    """Format a length [m] in mm or m."""
     if metres == 0 or 1e-7 <= metres < 1:
         return f"{1e3 * metres:.3g} mm"
     return f"{metres:.3g} m"

@@ -1,4 +1,4 @@
-"""The window: it turns the pointer and the keys into events, and shows pictures in real time."""
+"""The window of a session: conversion of pointer and keyboard input to events, and display in real time."""
 
 from __future__ import annotations
 
@@ -12,66 +12,63 @@ import numpy as np
 
 from taichi_msm.errors import DeviceError, FilesError, Pause
 from taichi_msm.runs.media import Picture
-from taichi_msm.system.process import silenced
+from taichi_msm.system.process import discarded_output
 from taichi_msm.view import overlay
-from taichi_msm.view.events import KEYS, NOTCH, Drag, Event, Harder, Hover, Key, Press, Release, Turn
+from taichi_msm.view.events import KEYS, STRENGTH_STEP, Drag, Event, Hover, Key, Press, Release, StrengthChange, Turn
 from taichi_msm.view.session import Session
 
-# No greeting on stdout, and the desktop's effects stay on.
+# pygame must print no greeting on stdout, and the desktop's effects stay on.
 ENVIRONMENT = {"PYGAME_HIDE_SUPPORT_PROMPT": "1", "SDL_VIDEO_X11_NET_WM_BYPASS_COMPOSITOR": "0"}
 if sys.platform not in ("win32", "darwin"):
-    # Without this SDL draws into memory that nobody sees where there is no display.
+    # Without this SDL draws into invisible memory if there is no display.
     ENVIRONMENT["SDL_VIDEODRIVER"] = "x11,wayland"
 for _name, _value in ENVIRONMENT.items():
     os.environ.setdefault(_name, _value)
 
 import pygame  # noqa: E402
 
-# Our names for keys: by what they type, and by their codes in pygame.
-TYPED = {" ": "space", "=": "up", "+": "up", "-": "down", "\x1b": "q"}
-ARROWS = {pygame.K_UP: "up", pygame.K_DOWN: "down"}
-SHIFT = {pygame.K_LSHIFT, pygame.K_RSHIFT}
+# Names of keys by their text, and by their codes in pygame.
+TEXT_KEYS = {" ": "space", "=": "up", "+": "up", "-": "down", "\x1b": "q"}
+ARROW_KEYS = {pygame.K_UP: "up", pygame.K_DOWN: "down"}
+SHIFT_KEYS = {pygame.K_LSHIFT, pygame.K_RSHIFT}
 
-# These keys repeat while they are held down: after this time, and at this interval [ms].
-REPEATED = ("up", "down")
-REPETITION = 400, 40
-
-LEFT, RIGHT = 1, 3
+LEFT_BUTTON, RIGHT_BUTTON = 1, 3
 
 QUIT = Key("q")
 
-# This key compiles another kernel.
-SWITCH = Key("f")
+# The other tool may need another kernel, which is compiled first.
+SWITCH_TOOL = Key("f")
 COMPILING = "one moment: compiling"
 
-# A delay beyond this is not made up for; and no picture waits longer than this for its frames [s].
-LONGEST = 0.1
-
-# The speed is averaged over this time [s].
-OBSERVED = 1.0
-
-# Below this share of real time the speed is reported as too slow.
-SLOW = 0.95
+# Delays beyond this are not made up for, and no picture waits longer for its frames [s].
+MAX_DELAY_S = 0.1
 
 
 class Window:
-    """A window with a picture of a width and height [px], as large as fits. A with statement closes it.
+    """A window that shows pictures, scaled to its size; a context manager.
 
-    There may be one at a time: it takes all events of the process. Raises a DeviceError when there is no display.
+    A process may have only one window at a time, as it receives all events of the process.
+
+    Args:
+        title: of the window.
+        size: width and height of the pictures [px].
+
+    Raises:
+        DeviceError: when there is no display.
     """
 
     def __init__(self, title: str, size: tuple[int, int]) -> None:
         self._size = size
-        self._hand = Hand(size)
-        self._shown: Picture = np.zeros((size[1], size[0], 3), np.uint8)
+        self._reader = InputReader(size)
+        self._picture: Picture = np.zeros((size[1], size[0], 3), np.uint8)
         try:
-            with silenced(2):
+            with discarded_output(2):
                 pygame.display.init()
                 if pygame.display.get_driver() == "x11":
-                    # By way of OpenGL a picture takes longer, without a GPU several times as long.
+                    # OpenGL is slower, without a GPU several times.
                     os.environ.setdefault("SDL_FRAMEBUFFER_ACCELERATION", "0")
                 screen = pygame.display.get_desktop_sizes()[0]
-                self._window = pygame.Window(title, opening(size, screen), resizable=True)
+                self._window = pygame.Window(title, initial_window_size(size, screen), resizable=True)
                 self._window.get_surface()
         except pygame.error as error:
             raise DeviceError(
@@ -79,33 +76,35 @@ class Window:
                 "--record FILE.gif --seconds N"
             ) from None
         pygame.display.set_allow_screensaver(True)
-        pygame.key.set_repeat(*REPETITION)
+        pygame.key.set_repeat(400, 40)  # delay and interval [ms]
 
     def show(self, picture: Picture) -> None:
         """Show a picture, shape (height, width, 3)."""
-        self._shown = picture
-        # After the window was resized, its surface is another.
+        self._picture = picture
+        # A resized window has a new surface.
         surface = self._window.get_surface()
-        area = placed(self._size, surface.get_size())
-        drawn = pygame.image.frombuffer(picture.data, self._size, "RGB")
+        area = fit_picture(self._size, surface.get_size())
+        image = pygame.image.frombuffer(picture.data, self._size, "RGB")
         if surface.get_size() == self._size:
-            surface.blit(drawn, area)
+            surface.blit(image, area)
         else:
             surface.fill("black")
-            surface.blit(pygame.transform.smoothscale(drawn, area.size), area)
+            surface.blit(pygame.transform.smoothscale(image, area.size), area)
         self._window.flip()
 
-    def say(self, text: str) -> None:
-        """Write a text over the picture that is shown."""
+    def announce(self, text: str) -> None:
+        """Write text over the current picture."""
         # Some systems show a new window only when it asks for its events.
         pygame.event.pump()
-        picture = self._shown.copy()
+        picture = self._picture.copy()
         overlay.announce(picture, text)
         self.show(picture)
 
     def events(self) -> Iterator[Event]:
-        """Give the events since the last call."""
-        yield from self._hand.events(pygame.event.get(), placed(self._size, self._window.get_surface().get_size()))
+        """Return the events since the last call."""
+        yield from self._reader.events(
+            pygame.event.get(), fit_picture(self._size, self._window.get_surface().get_size())
+        )
 
     def __enter__(self) -> Window:
         return self
@@ -114,24 +113,44 @@ class Window:
         self._window.destroy()
 
 
-def opening(picture: tuple[int, int], screen: tuple[int, int]) -> tuple[int, int]:
-    """Choose the size of a new window; all sizes are width, height [px].
+def initial_window_size(picture: tuple[int, int], screen: tuple[int, int]) -> tuple[int, int]:
+    """Choose the size of a new window.
 
-    It is the largest whole multiple of the picture's in half of the screen each way, or the picture's own if that fits.
+    It is the largest integer multiple of the picture's size that fits into half of the screen in both directions. If
+    there is none, it is the picture's size, reduced to fit the screen.
+
+    Args:
+        picture: width and height of the pictures [px].
+        screen: width and height of the screen [px].
+
+    Returns:
+        Width and height of the window [px].
     """
-    times = max(1, min(screen[0] // (2 * picture[0]), screen[1] // (2 * picture[1])))
-    return placed(picture, (min(times * picture[0], screen[0]), min(times * picture[1], screen[1]))).size
+    multiple = max(1, min(screen[0] // (2 * picture[0]), screen[1] // (2 * picture[1])))
+    return fit_picture(picture, (min(multiple * picture[0], screen[0]), min(multiple * picture[1], screen[1]))).size
 
 
-def placed(picture: tuple[int, int], window: tuple[int, int]) -> pygame.Rect:
-    """Place a picture in the middle of a window, as large as fits; both sizes are width, height [px]."""
+def fit_picture(picture: tuple[int, int], window: tuple[int, int]) -> pygame.Rect:
+    """Fit a picture into the centre of a window.
+
+    Args:
+        picture: width and height of the picture [px].
+        window: width and height of the window [px].
+
+    Returns:
+        The rectangle of the scaled picture [px].
+    """
     scale = min(window[0] / picture[0], window[1] / picture[1])
     width, height = (max(1, round(scale * side)) for side in picture)
     return pygame.Rect((window[0] - width) // 2, (window[1] - height) // 2, width, height)
 
 
-class Hand:
-    """Turns a window's reports of the pointer and the keyboard into events; `size`: of the picture [px]."""
+class InputReader:
+    """Converter from input of pygame to events of a session.
+
+    Args:
+        size: width and height of the pictures [px].
+    """
 
     def __init__(self, size: tuple[int, int]) -> None:
         self._size = size
@@ -139,32 +158,37 @@ class Hand:
         self._turning: tuple[float, float] | None = None
         self._down: set[int] = set()
 
-    def events(self, reports: Iterable[pygame.Event], area: pygame.Rect) -> Iterator[Event]:
-        """Turn pygame's events, in their order, into ours; `area`: where the picture is in the window."""
-        for event in reports:
+    def events(self, inputs: Iterable[pygame.Event], area: pygame.Rect) -> Iterator[Event]:
+        """Convert events of pygame to events of the session.
+
+        Args:
+            inputs: events of pygame, in order.
+            area: rectangle of the picture in the window [px].
+        """
+        for event in inputs:
             if event.type == pygame.QUIT:
                 yield QUIT
             elif event.type == pygame.KEYDOWN:
-                # A key that is held down is reported again and again.
-                if (name := key_name(event)) and (event.key not in self._down or name in REPEATED):
+                # pygame repeats the event of a key that is held down, which only the strength uses.
+                if (name := key_name(event)) and (event.key not in self._down or name in ("up", "down")):
                     yield Key(name)
                 self._down.add(event.key)
             elif event.type == pygame.KEYUP:
                 self._down.discard(event.key)
             elif event.type == pygame.MOUSEWHEEL:
                 if event.y != 0:
-                    yield Harder(NOTCH * event.y)
+                    yield StrengthChange(STRENGTH_STEP * event.y)
             elif event.type in (pygame.MOUSEBUTTONDOWN, pygame.MOUSEBUTTONUP):
                 yield from self._button(event, *self._pixel(event.pos, area))
             elif event.type == pygame.MOUSEMOTION:
                 yield from self._motion(*self._pixel(event.pos, area))
             elif event.type == pygame.WINDOWFOCUSLOST:
-                # Whatever took the focus may get the release.
+                # The window that took the focus may receive the release.
                 yield from self._release()
                 self._turning = None
 
     def _pixel(self, position: tuple[int, int], area: pygame.Rect) -> tuple[float, float]:
-        """Find the picture's pixel that is shown at a position in the window; whole numbers are pixels' centres."""
+        """Convert a position in the window to a pixel of the picture; integers are the centres of pixels."""
         x, y = (
             (at + 0.5 - begin) * pixels / extent - 0.5
             for at, begin, pixels, extent in zip(position, area.topleft, self._size, area.size, strict=True)
@@ -173,12 +197,12 @@ class Hand:
 
     def _button(self, event: pygame.Event, x: float, y: float) -> Iterator[Event]:
         pressed = event.type == pygame.MOUSEBUTTONDOWN
-        if event.button == LEFT and pressed:
+        if event.button == LEFT_BUTTON and pressed:
             self._pressing = True
-            yield Press(x, y, not SHIFT.isdisjoint(self._down))
-        elif event.button == LEFT:
+            yield Press(x, y, not SHIFT_KEYS.isdisjoint(self._down))
+        elif event.button == LEFT_BUTTON:
             yield from self._release()
-        elif event.button == RIGHT:
+        elif event.button == RIGHT_BUTTON:
             self._turning = (x, y) if pressed else None
 
     def _motion(self, x: float, y: float) -> Iterator[Event]:
@@ -197,74 +221,86 @@ class Hand:
 
 
 def key_name(event: pygame.Event) -> str | None:
-    """Name the key that was pressed, as in `KEYS`; None if it is none of them.
+    """Return the name of the pressed key in `KEYS`, or None.
 
-    A key is what it types, on every layout; where that is no Latin letter, it is the letter of a US keyboard there.
+    A key is identified by its text on any keyboard layout, or by its position if the text is not a Latin letter.
     """
     typed = event.unicode.lower()
     if not typed.isascii():
         typed = chr(ord("a") + event.scancode - pygame.KSCAN_A)
-    name = ARROWS.get(event.key) or TYPED.get(typed, typed)
+    name = ARROW_KEYS.get(event.key) or TEXT_KEYS.get(typed, typed)
     return name if name in KEYS else None
 
 
 class Pacing:
-    """Decides how many frames to simulate before the next picture, so that simulated time keeps up with real time."""
+    """Scheduler of frames, which keeps simulated time in step with real time.
+
+    Args:
+        rate: frames per second of the session.
+        clock: current time [s].
+    """
 
     def __init__(self, rate: float, clock: Callable[[], float]) -> None:
         self._rate = rate
         self._clock = clock
         self._next = clock()
-        # For each of the last pictures, when it began and how many frames were simulated for it.
+        # Start [s] and number of simulated frames of each recent picture.
         self._pictures: deque[tuple[float, int]] = deque()
 
-    def wait(self) -> float:
-        """Tell how long it is until the next frame is due [s]."""
+    def delay_s(self) -> float:
+        """Return the time until the next frame is due [s]."""
         return max(0.0, self._next - self._clock())
 
-    def due(self) -> Iterator[int]:
-        """Count the frames that are due; ends when no more are due, or when the picture must not wait any longer."""
+    def due_frames(self) -> Iterator[int]:
+        """Yield a number for each due frame, until no frame is due or the picture cannot wait any longer."""
         begun = self._clock()
-        self._next = max(self._next, begun - LONGEST)
+        self._next = max(self._next, begun - MAX_DELAY_S)
         count = 0
-        while self._next <= self._clock() and (count == 0 or self._clock() < begun + LONGEST):
+        while self._next <= self._clock() and (count == 0 or self._clock() < begun + MAX_DELAY_S):
             self._next += 1 / self._rate
             yield count
             count += 1
         self._pictures.append((begun, count))
-        while begun - self._pictures[0][0] > OBSERVED:
+        # The speed is averaged over 1 s.
+        while begun - self._pictures[0][0] > 1.0:
             self._pictures.popleft()
 
-    def said(self) -> str:
-        """Say how many pictures are shown per second, and, if simulated time is too slow, how fast it goes."""
+    def status(self) -> str:
+        """Return the pictures per second as text, and the speed of simulated time if it is below 95 % of real time."""
         if len(self._pictures) < 2:
             return ""
         seconds = self._pictures[-1][0] - self._pictures[0][0]
-        shown = f"{(len(self._pictures) - 1) / seconds:.0f} pictures/s"
-        # The last picture is not counted, as its time is not over.
+        rate = f"{(len(self._pictures) - 1) / seconds:.0f} pictures/s"
+        # The last picture is excluded, as its duration is not known yet.
         speed = sum(count for _, count in list(self._pictures)[:-1]) / self._rate / seconds
-        return shown if speed >= SLOW else f"{shown}  ·  too slow: {speed:.2f} x real time"
+        return rate if speed >= 0.95 else f"{rate}  ·  too slow: {speed:.2f} x real time"
 
 
-def show(session: Session, window: Window, pause: Pause) -> None:
-    """Show a session in a window until the person quits; `pause` is called before every picture."""
-    pacing = Pacing(session.rate, time.perf_counter)
-    session.say("h: the keys")
+def run_session(session: Session, window: Window, pause: Pause) -> None:
+    """Run a session in a window until the user quits.
+
+    Args:
+        session: the session.
+        window: shows the pictures, and has the input.
+        pause: called before every picture.
+    """
+    pacing = Pacing(session.frame_rate, time.perf_counter)
+    session.show_notice("h: the keys")
     while True:
         pause()
-        time.sleep(pacing.wait())
+        time.sleep(pacing.delay_s())
         for event in window.events():
             if event == QUIT:
                 return
-            if event == SWITCH:
-                window.say(COMPILING)
+            if event == SWITCH_TOOL:
+                window.announce(COMPILING)
             try:
                 session.handle(event)
             except FilesError as error:
-                # The session goes on, so that a full disk does not lose what was done so far.
-                session.say(str(error))
-        for _ in pacing.due():
+                # The session continues, so that a full disk does not discard it.
+                session.show_notice(str(error))
+        for _ in pacing.due_frames():
             session.advance()
-        if not session.viewport.compiled:
-            window.say(COMPILING)
-        window.show(session.picture(pacing.said()))
+        if not session.viewport.is_compiled:
+            window.announce(COMPILING)
+        window.show(session.picture(pacing.status()))

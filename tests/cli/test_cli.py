@@ -20,7 +20,7 @@ from PIL import Image
 from taichi_msm.cli import console
 from taichi_msm.cli.main import main
 from taichi_msm.load.scene_file import load_scene
-from taichi_msm.system.compiler import chosen
+from taichi_msm.system.compiler import active_compiler
 from tests import reference
 from tests.conftest import Program
 from tests.outputs import files
@@ -323,15 +323,15 @@ def test_a_signal_before_the_first_frame_changes_nothing(
 
 def test_without_a_place_for_compiled_kernels(small: Path) -> None:
     (small / "file").touch()
-    environment = {**os.environ, chosen().folder_variable: str(small / "file" / "below")}
+    environment = {**os.environ, active_compiler().folder_variable: str(small / "file" / "below")}
     settings = ["--set", "output=[]", "--set", "springs={structural: 20}", "--set", "probes=[]"]
     done = own_process("run", "small.yaml", *settings, env=environment)
     assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_a_stale_lock_does_not_cost_the_cache(small: Path) -> None:
-    environment = {**os.environ, chosen().folder_variable: str(small / "cache")}
-    lock = small / "cache" / chosen().lock
+    environment = {**os.environ, active_compiler().folder_variable: str(small / "cache")}
+    lock = small / "cache" / active_compiler().lock
     lock.parent.mkdir(parents=True)
 
     def kernels() -> list[Path]:
@@ -476,7 +476,7 @@ def test_a_log_shows_what_is_done_and_left(capsys: pytest.CaptureFixture[str], m
     """Of a run that goes on with frame 40: 5 s for the frames that were finished, then 3 s for each."""
     now = 100.0
     monkeypatch.setattr(time, "monotonic", lambda: now)
-    with console.Progress(quiet=False) as progress, console.Progress(quiet=True) as silent:
+    with console.ProgressDisplay(quiet=False) as progress, console.ProgressDisplay(quiet=True) as silent:
         for shown in (progress, silent):
             now = 100.0
             for frame in range(40):
@@ -513,7 +513,7 @@ def test_a_frame_that_is_being_stepped_counts_as_time(
 ) -> None:
     now = 0.0
     monkeypatch.setattr(time, "monotonic", lambda: now)
-    with console.Progress(quiet=False) as progress:
+    with console.ProgressDisplay(quiet=False) as progress:
         for now, frame in ((0, 1), (11, 1), (50, 2), (51, 2), (61, 2), (250, 2)):  # noqa: B007
             progress.update("frames", frame, 4)
         # A pilot begins again from its first frame.

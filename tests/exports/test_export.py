@@ -433,7 +433,7 @@ def test_an_interrupted_export_changes_nothing(name: str, results: Path) -> None
 def test_the_command_says_that_it_was_interrupted(
     results: Path, program: Program, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("taichi_msm.system.process.Interruption.grant", raise_interrupt)
+    monkeypatch.setattr("taichi_msm.system.process.Interruption.raise_if_requested", raise_interrupt)
     done = program("export", str(results), "--format", "obj", "--json")
     assert (done.returncode, done.stderr) == (130, "interrupted; nothing was written\n")
     assert json.loads(done.stdout)["status"] == "interrupted"
@@ -444,6 +444,6 @@ def raise_interrupt(_: object) -> None:
 
 
 def test_a_long_export_says_how_far_it_is(results: Path, program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(console, "LINE_EVERY", 0.0)
+    monkeypatch.setattr(console, "LINE_INTERVAL_S", 0.0)
     assert "exporting: 3 of 5 done, about " in program("export", str(results), "--format", "obj").stderr
     assert program("export", str(results), "--format", "obj", "--quiet").stderr == ""

@@ -100,8 +100,8 @@ def test_on_a_gpu_the_same_points_are_found(shape: Any, device: Device, monkeypa
     assert locate_points(made, coordinates[:0], position, view(made), placed).pixels.shape == (0, 2)
     found = [locate_points(made, coordinates, position, view(made), placed)]
     # Two cells in a launch.
-    monkeypatch.setattr(launches, "MOST_ROUNDS", launches.SPARE + 2 * (1 + 2 * 3**2))
-    monkeypatch.setattr(launches, "THREADS", 100)
+    monkeypatch.setattr(launches, "MAX_ROUNDS", launches.RESERVED_ROUNDS + 2 * (1 + 2 * 3**2))
+    monkeypatch.setattr(launches, "VULKAN_THREADS", 100)
     found.append(locate_points(made, coordinates, position, view(made), placed))
     for sight in found:
         np.testing.assert_array_equal(sight.pixels, expected.pixels)

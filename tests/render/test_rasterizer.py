@@ -176,18 +176,18 @@ def test_launches_do_not_change_the_bits(parts: int, device: Device, monkeypatch
 
     def shuffled(of: launches.Launches, *arguments: Any) -> bins.Bins:
         found = bins.build_bins(of, *arguments)
-        entries, starts = of.take(found.entries), of.take(found.starts)
+        entries, starts = of.download(found.entries), of.download(found.starts)
         for first, end in pairwise(starts):
             rng.shuffle(entries[first:end])
-        return found._replace(entries=of.give(entries))
+        return found._replace(entries=of.upload(entries))
 
     monkeypatch.setattr(launches.Launches, "launch", counted)
     monkeypatch.setattr(gpu, "build_bins", shuffled)
     pictures = [Rasterizer(made, texture, config).draw(position, rods=placed)]
     few = len(begun)
-    monkeypatch.setattr(launches, "MOST_ROUNDS", launches.SPARE + 250)
-    monkeypatch.setattr(launches, "THREADS", 700)
-    monkeypatch.setattr(gpu, "THREADS", 700)
+    monkeypatch.setattr(launches, "MAX_ROUNDS", launches.RESERVED_ROUNDS + 250)
+    monkeypatch.setattr(launches, "VULKAN_THREADS", 700)
+    monkeypatch.setattr(gpu, "VULKAN_THREADS", 700)
     monkeypatch.setattr(gpu, "MAX_PARTS", parts)
     pictures += [Rasterizer(made, texture, config).draw(position, rods=placed) for _ in range(3)]
     assert len(begun) > 30 * few
@@ -204,7 +204,7 @@ def test_the_bound_of_a_thread_is_asserted(device: Device, monkeypatch: pytest.M
     drawing = Rasterizer(made, speckle(8, 8), drawing_config(made)._replace(lanes=1))
     monkeypatch.setattr(gpu, "MAX_PARTS", 1)
     drawing.draw(position, rods=place_capsules(made, position, 0))
-    monkeypatch.setattr(launches, "MOST_ROUNDS", launches.SPARE + 3 * 2 * 65**2)
+    monkeypatch.setattr(launches, "MAX_ROUNDS", launches.RESERVED_ROUNDS + 3 * 2 * 65**2)
     with pytest.raises(AssertionError):
         drawing.draw(position, rods=place_capsules(made, position, 0))
 

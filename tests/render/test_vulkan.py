@@ -164,7 +164,7 @@ CUT_SHORT = """
 import sys
 from taichi_msm.cli.main import main
 from taichi_msm.system import launches
-launches.MOST_ROUNDS = 1 << 30
+launches.MAX_ROUNDS = 1 << 30
 sys.exit(main(sys.argv[1:]))
 """
 

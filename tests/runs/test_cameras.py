@@ -227,14 +227,14 @@ def test_a_session_follows_the_main_camera_and_keeps_the_others(small: Path, dev
     made = seen_by(SWAYING_STEREO, "[png]", "time.frames_per_second=25")
     with Session(made, Captures(Path("captures"), "small.yaml"), threads=device.threads, play=True) as session:
         session.advance()
-        np.testing.assert_allclose(session.viewport.view.matrix, view(made, 1 / session.rate).matrix, rtol=1e-6)
-        assert session.recorded().render == made.render
+        np.testing.assert_allclose(session.viewport.view.matrix, view(made, 1 / session.frame_rate).matrix, rtol=1e-6)
+        assert session.recorded_scene().render == made.render
         session.viewport.turn(20, 5)
-        left, right = session.recorded().render.all_cameras.items()
+        left, right = session.recorded_scene().render.all_cameras.items()
         assert left[1] != made.render.main_camera
         assert right == ("right", made.render.all_cameras["right"])
-        session.viewport.look("top")
-        assert session.recorded().render.all_cameras["left"] == "top"
+        session.viewport.set_camera("top")
+        assert session.recorded_scene().render.all_cameras["left"] == "top"
 
 
 def fails_with(cameras: str, *overrides: str) -> list[str]:

@@ -16,7 +16,7 @@ import pytest
 from numpy.typing import NDArray
 
 from taichi_msm import DivergedError, Simulation, run
-from taichi_msm.cli.console import summary
+from taichi_msm.cli.console import run_summary
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.surface import surface_point
 from taichi_msm.model.tool_force import control_point, probe_records
@@ -151,7 +151,7 @@ def test_a_run_writes_the_forces_of_all_frames(device: Device, tmp_path: Path) -
         (greatest, row) = max((math.hypot(*row[5:]), row) for row in expected if row[1] == probe)
         assert found["greatest_force"] == greatest
         assert [found["greatest_force_time"], *found["greatest_force_vector"]] == [row[0], *row[5:]]
-    said = summary(record, tmp_path)
+    said = run_summary(record, tmp_path)
     assert re.search(r"^probes\.0: [\d.]+ N in all, at most [\d.]+ kPa$", said, re.MULTILINE)
     assert re.search(r"^probes\.1: at most [\d.]+ N, at 0\.\d+ s$", said, re.MULTILINE)
 

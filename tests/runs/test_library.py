@@ -33,7 +33,7 @@ from taichi_msm import (
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.render.camera import view
 from taichi_msm.solver.planning import with_time
-from taichi_msm.system.process import processor
+from taichi_msm.system.process import processor_name
 from taichi_msm.system.runtime import Device
 from tests import reference
 from tests.scenes import PRESS, SHEET, plan_of, scene, speckle
@@ -248,7 +248,7 @@ def test_a_record_says_where_its_picture_and_its_device_are(
     monkeypatch.chdir("/")
     image = Path(record["working_directory"]) / record["scene"]["image"]
     assert image.samefile(small / "speckle.png")
-    assert record["device"] == device.name == processor()
+    assert record["device"] == device.name == processor_name()
 
 
 def test_in_a_notebook_nothing_is_said() -> None:

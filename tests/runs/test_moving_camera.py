@@ -94,7 +94,7 @@ def test_a_session_that_plays_follows_the_camera(small: Path, device: Device) ->
         with Session(made, Captures(Path("captures"), "small.yaml"), threads=device.threads, play=play) as session:
             for _ in range(5):
                 session.advance()
-            at = session.frame / session.rate if play else 0.0
+            at = session.frame / session.frame_rate if play else 0.0
             np.testing.assert_allclose(session.viewport.view.matrix, view(made, at).matrix, rtol=1e-6, atol=1e-9)
             session.viewport.turn(3, 0)
             turned = session.viewport.view

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import pytest
 
 from taichi_msm.system import runtime
-from taichi_msm.system.compiler import chosen
+from taichi_msm.system.compiler import active_compiler
 from tests.scenes import SMALL
 from tests.telling import Telling
 
@@ -95,7 +95,7 @@ def test_results_into_a_pipe_that_nobody_reads(here: Path) -> None:
     assert (here / "output" / "small" / "run.json").exists()
 
 
-@pytest.mark.parametrize("environment", [{"HOME": ""}, {"HOME": "/proc/none"}, {chosen().folder_variable: ""}])
+@pytest.mark.parametrize("environment", [{"HOME": ""}, {"HOME": "/proc/none"}, {active_compiler().folder_variable: ""}])
 def test_without_a_home(environment: dict[str, str], here: Path) -> None:
     done = shell(f"{'unset HOME; ' if environment.get('HOME') == '' else ''}msm {RUN}", **environment)
     assert (done.returncode, done.stderr) == (0, "")
@@ -106,7 +106,7 @@ def test_too_little_address_space_is_one_clear_line(here: Path) -> None:
     done = shell(f"ulimit -v 1200000; msm {RUN}")
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == (
-        f"{chosen().title} needs 1900 MiB of address space, and this process may have 1171 MiB; "
+        f"{active_compiler().title} needs 1900 MiB of address space, and this process may have 1171 MiB; "
         "raise its limit (ulimit -v)\n"
     )
 
@@ -134,5 +134,5 @@ def test_a_cache_that_has_no_room_is_not_used(
     """Taichi would abort the process at its end. Some file systems do not count files."""
     room = SimpleNamespace(f_files=files, f_favail=left, f_bavail=blocks, f_frsize=4096)
     monkeypatch.setattr(os, "statvfs", lambda folder: room, raising=False)
-    monkeypatch.setenv(chosen().folder_variable, str(tmp_path))
+    monkeypatch.setenv(active_compiler().folder_variable, str(tmp_path))
     assert (runtime._cache() == {}) == kept

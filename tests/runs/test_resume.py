@@ -27,7 +27,7 @@ from taichi_msm.runs.writer import RunRecord
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver import dynamics, planning
 from taichi_msm.solver.state import TipForce
-from taichi_msm.system.compiler import COMPILERS, chosen, versions
+from taichi_msm.system.compiler import COMPILERS, active_compiler, versions
 from taichi_msm.system.runtime import Device
 from tests.outputs import files, results
 from tests.scenes import speckle
@@ -269,9 +269,9 @@ def test_a_run_begins_anew_unless_its_compiler_has_the_same_bits(
     small: Path, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made, mine = dragged("time.duration=0.2", "output=[trajectory]"), versions()
-    other = next(one for one in COMPILERS.values() if one is not chosen())
-    rest = {name: version for name, version in mine.items() if name != chosen().name}
-    for there, goes_on in (({other.name: other.tested}, True), ({chosen().name: "0.0.1"}, False)):
+    other = next(one for one in COMPILERS.values() if one is not active_compiler())
+    rest = {name: version for name, version in mine.items() if name != active_compiler().name}
+    for there, goes_on in (({other.name: other.tested_version}, True), ({active_compiler().name: "0.0.1"}, False)):
         interrupted(made, "parts", device)
         with monkeypatch.context() as patch:
             patch.setattr(run_module, "versions", lambda there=there: {**rest, **there})
@@ -285,12 +285,12 @@ def test_another_picture_or_version_is_not_gone_on_with(
 ) -> None:
     interrupted(dragged("time.duration=0.2"), "parts", device)
     before = files(small / "parts")
-    others = {**versions(), chosen().name: "1.7.99"}
+    others = {**versions(), active_compiler().name: "1.7.99"}
     with monkeypatch.context() as patch:
         patch.setattr(run_module, "versions", lambda: others)
+        compiler = active_compiler()
         with pytest.raises(
-            FilesError,
-            match=rf"^the run began with {chosen().name} {chosen().version}; use these versions, or run",
+            FilesError, match=rf"^the run began with {compiler.name} {compiler.version}; use these versions, or run"
         ):
             resume("parts", threads=device.threads)
     Image.fromarray(speckle(30, 40, 1)).save(small / "speckle.png")

@@ -12,7 +12,7 @@ from taichi_msm import DivergedError, Simulation
 from taichi_msm.render.labels import FrameOutputs
 from taichi_msm.runs import run
 from taichi_msm.system import process
-from taichi_msm.system.compiler import chosen
+from taichi_msm.system.compiler import active_compiler
 from taichi_msm.system.runtime import Device
 from tests import reference
 from tests.scenes import plan_of, scene, speckle
@@ -88,7 +88,7 @@ def test_a_sheet_that_nothing_holds_may_fly_away(device: Device) -> None:
 
 
 def test_one_device_a_process(device: Device) -> None:
-    with pytest.raises(taichi_msm.DeviceError, match=f"{chosen().title} already runs on cpu with 2 threads"):
+    with pytest.raises(taichi_msm.DeviceError, match=f"{active_compiler().title} already runs on cpu with 2 threads"):
         Simulation(scene(), threads=device.threads + 1)
 
 

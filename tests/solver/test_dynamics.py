@@ -21,7 +21,7 @@ from taichi_msm.solver import kernel_cpu, kernel_gpu
 from taichi_msm.solver.arrays import SheetLayout
 from taichi_msm.solver.dynamics import POINTS_PER_WORKER
 from taichi_msm.system import process
-from taichi_msm.system.launches import MOST_ROUNDS, THREADS
+from taichi_msm.system.launches import MAX_ROUNDS, VULKAN_THREADS
 from taichi_msm.system.process import available_threads
 from taichi_msm.system.runtime import Device, lanes
 from taichi_msm.terms.damping import DampingTerm
@@ -165,7 +165,7 @@ def test_the_depth_of_a_pass_is_chosen_from_the_size(device: Device) -> None:
 
 def test_no_thread_of_a_gpu_takes_long() -> None:
     """It steps points without a loop, and reads a row; threads share what are more points than threads."""
-    assert MAX_POINTS + MAX_POINTS**2 // THREADS < MOST_ROUNDS
+    assert MAX_POINTS + MAX_POINTS**2 // VULKAN_THREADS < MAX_ROUNDS
 
 
 @pytest.mark.parametrize("widths", [(16, 2), pytest.param((16, 8, 4, 2), marks=pytest.mark.fuzz)])
@@ -518,11 +518,11 @@ def test_rests_grow_while_workers_give_up_and_are_forgotten_when_they_do_not(
     monkeypatch.setattr("time.perf_counter", lambda: now)
     monkeypatch.setattr("time.process_time", lambda: next(had))
     # As long as nobody wants our cores, a worker that gives up is an accident, and rests stay the shortest.
-    monkeypatch.setattr(process, "waited_for_cores", lambda: 0.0)
+    monkeypatch.setattr(process, "core_wait_s", lambda: 0.0)
     scatter.advance(10_000, np.empty(0))
     assert taken[1] > 1000
     taken = [0, 0]
-    monkeypatch.setattr(process, "waited_for_cores", wait_as_long_as_we_run)
+    monkeypatch.setattr(process, "core_wait_s", wait_as_long_as_we_run)
     scatter.advance(10_000, np.empty(0))
     assert sum(taken) == 10_000
     assert taken[1] < 100
@@ -530,7 +530,7 @@ def test_rests_grow_while_workers_give_up_and_are_forgotten_when_they_do_not(
     taken = [0, 0]
     with monkeypatch.context() as patch:
         patch.setattr("time.process_time", lambda: now)
-        patch.setattr(process, "waited_for_cores", lambda: 0.001 * taken[1])
+        patch.setattr(process, "core_wait_s", lambda: 0.001 * taken[1])
         scatter.advance(10_000, np.empty(0))
     assert taken[1] < 200
     # Undisturbed for minutes, and then disturbed once: the rest is the shortest again.

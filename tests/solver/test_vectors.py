@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm.system.runtime import Device, our_compilation, ti
+from taichi_msm.system.runtime import Device, compilation_options, ti
 
 NUMBERS, WHOLE = 28, 7
 
@@ -104,7 +104,7 @@ def test_vectors_give_the_bits_of_scalars(precision: str, lanes: int, device: De
     def results(scalarised: bool) -> tuple[NDArray[Any], NDArray[Any]]:
         apply, config = operations(precision, lanes), ti.lang.impl.current_cfg()
         numbers, whole = aligned((count * NUMBERS, lanes), real), aligned((count * WHOLE, lanes), np.int32)
-        with our_compilation():
+        with compilation_options():
             config.real_matrix_scalarize = scalarised
             apply(a, b, table, 0.75, numbers, whole)
         return numbers.reshape(count, NUMBERS, lanes), whole

@@ -17,7 +17,7 @@ import pytest
 
 from taichi_msm import sweep
 from taichi_msm.errors import MsmError
-from taichi_msm.sweeps.runs import values_in
+from taichi_msm.sweeps.runs import register_sweep
 from taichi_msm.sweeps.spec import load_sweep
 from tests.conftest import Program
 
@@ -123,10 +123,10 @@ def test_workers_need_no_inputs_and_one_may_die(lab: Path, machines: Machines, p
     wait_for(lambda: "plugin taichi-msm" in machines.log(machines.scheduler))
     # Before there is any worker, all is gone that one could read besides what it is sent.
     (lab / "here").rename(lab / "away")
-    alone = machines.work(address)
+    report_lock = machines.work(address)
     machines.work(address, "--nthreads", "1")
     wait_for(lambda: list(lab.glob("far/runs/*/run.json")))
-    alone.kill()
+    report_lock.kill()
     assert len(list(lab.glob("far/runs/*/run.json"))) < 6
     printed, said = command.communicate(timeout=SOON)
     assert (command.returncode, json.loads(printed)["complete"], said) == (0, 6, "")
@@ -225,7 +225,7 @@ def test_a_worker_that_would_lose_results_or_change_them_is_refused(lab: Path) -
 
 
 def test_no_scheduler(lab: Path, program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("taichi_msm.sweeps.cluster.PATIENCE", 0.5)
+    monkeypatch.setattr("taichi_msm.sweeps.cluster.MAX_WAIT_S", 0.5)
     tried = program("sweep", "here/sweep.yaml", "--out", "far", "--json", "--dask", "tcp://127.0.0.1:1")
     assert tried.returncode == 2
     assert json.loads(tried.stdout)["errors"] == [
@@ -250,12 +250,15 @@ def test_a_transport_whose_requirements_are_missing(address: str, said: str, lab
 
 
 def test_a_command_whose_inputs_another_one_has_removed_ends_well(lab: Path, machines: Machines) -> None:
-    from taichi_msm.sweeps.cluster import connected
+    from taichi_msm.sweeps.cluster import cluster_connection
 
     address, described = machines.schedule(), load_sweep("here/sweep.yaml")
     machines.work(address)
-    values_in(lab / "out", described)
-    with connected(address, described, lab / "out", quiet), connected(address, described, lab / "out", quiet):
+    register_sweep(lab / "out", described)
+    with (
+        cluster_connection(address, described, lab / "out", quiet),
+        cluster_connection(address, described, lab / "out", quiet),
+    ):
         pass
 
 

@@ -19,7 +19,7 @@ from taichi_msm.errors import SceneError
 from taichi_msm.load.scene_file import ANY, CAMERA_FILES, PICTURES, load_plan
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_PATH
-from taichi_msm.sweeps.spec import Distribution, cell, load_sweep, values_of_runs, values_of_some
+from taichi_msm.sweeps.spec import Distribution, format_value, load_sweep, run_values, sample_run_values
 from tests.scenes import speckle
 
 
@@ -31,7 +31,7 @@ def shares(dimensions: int, samples: int, seed: int) -> Any:
 
 
 def values(samples: int | None, **vary: dict[str, Any]) -> list[list[Any]]:
-    return values_of_runs({name: Distribution(**one) for name, one in vary.items()}, samples, 3)
+    return run_values({name: Distribution(**one) for name, one in vary.items()}, samples, 3)
 
 
 def test_every_number_and_every_choice_takes_a_dimension_in_the_order_of_the_keys() -> None:
@@ -71,10 +71,10 @@ def test_a_lists_numbers_keep_their_shape() -> None:
 
 def test_some_runs_are_spread_over_all() -> None:
     vary = {"a": Distribution(grid=list(range(10))), "b": Distribution(grid=list(range(1000)))}
-    every = values_of_runs(vary, None, 3)
+    every = run_values(vary, None, 3)
     assert every[1234] == [1, 234]
-    assert [every.index(row) for row in values_of_some(vary, None, 3, 4)] == [1250, 3750, 6250, 8750]
-    assert values_of_some({"a": vary["a"]}, None, 3, 100) == [[n] for n in range(10)]
+    assert [every.index(row) for row in sample_run_values(vary, None, 3, 4)] == [1250, 3750, 6250, 8750]
+    assert sample_run_values({"a": vary["a"]}, None, 3, 100) == [[n] for n in range(10)]
 
 
 def test_grids_give_every_combination_the_last_key_fastest() -> None:
@@ -105,7 +105,7 @@ def test_grids_give_every_combination_the_last_key_fastest() -> None:
 def test_a_cell_is_what_set_takes(value: Any) -> None:
     from taichi_msm.load.scene_file import parse_override
 
-    assert parse_override(f"key={cell(value)}").value == value
+    assert parse_override(f"key={format_value(value)}").value == value
 
 
 @pytest.fixture

@@ -26,10 +26,10 @@ from taichi_msm.errors import ArgumentError, MsmError, SceneError
 from taichi_msm.images import file_sha256
 from taichi_msm.load import cost as cost_module
 from taichi_msm.sweeps import tables
-from taichi_msm.sweeps.pool import ORPHANED, DiedError, Pool
-from taichi_msm.sweeps.runs import Outcome, Task, UnderWay, begin_sweep, outcomes, values_in
+from taichi_msm.sweeps.pool import PARENT_POLL_S, DiedError, Pool
+from taichi_msm.sweeps.runs import Outcome, RunTask, SweepState, begin_sweep, execute_tasks, register_sweep
 from taichi_msm.sweeps.spec import load_sweep, make_sweep
-from taichi_msm.sweeps.sweep import finish, go_on
+from taichi_msm.sweeps.sweep import finish_sweep, run_missing
 from tests.conftest import Program
 from tests.outputs import files, results
 from tests.scenes import SMALL
@@ -79,10 +79,10 @@ def pool() -> Iterator[Pool]:
 
 def go(executor: Executor, directory: str, part: tuple[int, int] = (1, 1)) -> None:
     """Take the runs of many.yaml, as the command does."""
-    under_way = begin_sweep(load_sweep("many.yaml"), Path(directory), part)
-    assert len(list(go_on(under_way, executor, quiet))) == len(under_way.missing)
+    state = begin_sweep(load_sweep("many.yaml"), Path(directory), part)
+    assert len(list(run_missing(state, executor, quiet))) == len(state.missing)
     if part == (1, 1):
-        finish(under_way, executor, quiet)
+        finish_sweep(state, executor, quiet)
 
 
 def quiet(stage: str, done: int, total: int) -> None:
@@ -159,7 +159,7 @@ def test_a_kill_changes_nothing(many: Path, pool: Pool) -> None:
         process.until("runs", 2)
         process.kill()
     # Its worker, which is in the middle of the last run, ends by itself.
-    time.sleep(2 * ORPHANED)
+    time.sleep(2 * PARENT_POLL_S)
     assert not Path("killed/runs/000003/run.json").exists()
     go(pool, "killed")
     assert (table("killed"), runs("killed")) == (table("whole"), runs("whole"))
@@ -177,7 +177,7 @@ def test_a_signal_ends_it_and_says_how_to_go_on(many: Path) -> None:
 
 
 def test_another_sweep_in_the_folder_is_refused(many: Path, program: Program) -> None:
-    values_in(Path("out"), load_sweep("many.yaml"))
+    register_sweep(Path("out"), load_sweep("many.yaml"))
     before = files(Path("out"))
 
     def refusal() -> str:
@@ -216,7 +216,7 @@ def test_a_sweep_with_another_calibration_is_another_one(many: Path, program: Pr
 
 @pytest.mark.parametrize("content", ["", "[" * 4000, "3", "{}"])
 def test_a_damaged_record_is_told(many: Path, program: Program, content: str) -> None:
-    values_in(Path("out"), load_sweep("many.yaml"))
+    register_sweep(Path("out"), load_sweep("many.yaml"))
     Path("out/sweep.json").write_text(content)
     done = program("sweep", "many.yaml", "--out", "out")
     assert (done.returncode, done.stderr) == (4, "out/sweep.json: damaged; choose another --out\n")
@@ -238,7 +238,7 @@ def with_value(run: int, value: Any) -> Callable[[Any], Any]:
 def test_values_that_are_not_those_of_the_sweep_file_are_refused(
     many: Path, program: Program, change: Callable[[Any], Any]
 ) -> None:
-    values_in(Path("out"), load_sweep("many.yaml"))
+    register_sweep(Path("out"), load_sweep("many.yaml"))
     record = json.loads(Path("out/sweep.json").read_text())
     Path("out/sweep.json").write_text(json.dumps({**record, "values": change(record["values"])}))
     done = program("sweep", "many.yaml", "--out", "out")
@@ -255,7 +255,7 @@ def test_nothing_is_written_through_a_link(many: Path, program: Program, name: s
     link = many / "out" / name
     link.parent.mkdir(parents=True)
     if name == "runs/000002":
-        values_in(Path("out2"), load_sweep("many.yaml"))
+        register_sweep(Path("out2"), load_sweep("many.yaml"))
         shutil.copy("out2/sweep.json", "out")
     link.symlink_to(many / "far")
     done = program("sweep", "many.yaml", "--out", "out")
@@ -265,18 +265,18 @@ def test_nothing_is_written_through_a_link(many: Path, program: Program, name: s
 
 
 @pytest.fixture
-def one_ended(many: Path) -> Callable[..., UnderWay]:
+def one_ended(many: Path) -> Callable[..., SweepState]:
     """Begin a sweep whose run 2 has diverged, with changes of its record."""
     record = {"status": "diverged", "error": "at 0.1 s", "max_displacement": 1.0, "shortest_spring": 0.5}
     rest: dict[str, Any] = {"error_estimate": None, "notes": ["not known"], "timings": {"total": 2.0}}
     rest["probes"] = [{"greatest_force": 3.0}]
     described = load_sweep("many.yaml")
-    values = values_in(Path("out"), described)
+    values = register_sweep(Path("out"), described)
     rest |= {"overrides": list(described.overrides(values[2])), "sha256": {"image": file_sha256("speckle.png")}}
     Path("out/runs/000002").mkdir(parents=True)
     file = Path("out/runs/000002/run.json")
 
-    def begin(**changes: Any) -> UnderWay:
+    def begin(**changes: Any) -> SweepState:
         if not file.exists():
             file.write_text(json.dumps({**record, **rest, **changes}))
         return begin_sweep(load_sweep("many.yaml"), Path("out"))
@@ -284,11 +284,11 @@ def one_ended(many: Path) -> Callable[..., UnderWay]:
     return begin
 
 
-def test_a_run_that_diverged_is_not_taken_again(one_ended: Callable[..., UnderWay]) -> None:
-    under_way = one_ended()
-    assert under_way.done == [Outcome(2, "diverged", "at 0.1 s", 1.0, 0.5, forces=(3.0,))]
-    assert [task.run for task in under_way.missing] == [0, 1, 3]
-    assert under_way.total == 4
+def test_a_run_that_diverged_is_not_taken_again(one_ended: Callable[..., SweepState]) -> None:
+    state = one_ended()
+    assert state.done == [Outcome(2, "diverged", "at 0.1 s", 1.0, 0.5, forces=(3.0,))]
+    assert [task.run for task in state.missing] == [0, 1, 3]
+    assert state.total == 4
 
 
 @pytest.mark.parametrize(
@@ -303,11 +303,11 @@ def test_a_run_that_diverged_is_not_taken_again(one_ended: Callable[..., UnderWa
     ],
     ids=str,
 )
-def test_a_record_of_another_run_does_not_count(changes: Any, one_ended: Callable[..., UnderWay]) -> None:
+def test_a_record_of_another_run_does_not_count(changes: Any, one_ended: Callable[..., SweepState]) -> None:
     assert len(one_ended(**changes).missing) == 4
 
 
-def test_a_record_that_is_a_link_or_damaged_does_not_count(one_ended: Callable[..., UnderWay]) -> None:
+def test_a_record_that_is_a_link_or_damaged_does_not_count(one_ended: Callable[..., SweepState]) -> None:
     file = Path("out/runs/000002/run.json")
     assert len(one_ended().missing) == 3
     file.rename("record.json")
@@ -400,14 +400,14 @@ def test_a_run_that_cannot_be_is_refused_and_one_that_fails_is_tried_again(many:
     (many / "torn.png").write_bytes(whole[: len(whole) // 2])
     settings = {"vary": {"image": {"grid": ["speckle.png", "torn.png"]}}, "set": {"time.duration": 0.1}}
     described = make_sweep("small.yaml", settings)
-    values_in(Path("out"), described)
+    register_sweep(Path("out"), described)
     (many / "out/runs/000000").mkdir(parents=True)
     (many / "out/runs/000000/frames").write_text("in the way")
 
     def take_all() -> list[Outcome]:
-        under_way = begin_sweep(described, Path("out"))
-        list(go_on(under_way, pool, quiet))
-        return sorted(under_way.done, key=number)
+        state = begin_sweep(described, Path("out"))
+        list(run_missing(state, pool, quiet))
+        return sorted(state.done, key=number)
 
     first, second = take_all()
     assert (first.status, first.error) == (
@@ -476,8 +476,8 @@ class Dying(Executor):
 
 @pytest.mark.parametrize(("times", "status"), [(1, "complete"), (2, "died")])
 def test_a_run_whose_worker_died_is_taken_once_more(times: int, status: str) -> None:
-    tasks = [Task(run, None, (), Path(), Path()) for run in range(3)]  # type: ignore[arg-type]
-    ends = {row.run: row for row in outcomes(tasks, Dying(times), lambda: None)}
+    tasks = [RunTask(run, None, (), Path(), Path()) for run in range(3)]  # type: ignore[arg-type]
+    ends = {row.run: row for row in execute_tasks(tasks, Dying(times), lambda: None)}
     assert [ends[run].status for run in range(3)] == ["complete", status, "complete"]
     assert ends[1].error == ("its process was ended by SIGKILL, twice" if times == 2 else "")
 
@@ -487,16 +487,16 @@ def test_an_executor_that_takes_no_more_runs_is_an_error() -> None:
     with pytest.raises(Exception, match="terminated abruptly"):
         executor.submit(end_at_once).result()
     with pytest.raises(MsmError, match=r"^ProcessPoolExecutor takes no more runs: .*; start the sweep again$"):
-        list(outcomes([Task(0, None, (), Path(), Path())], executor, lambda: None))  # type: ignore[arg-type]
+        list(execute_tasks([RunTask(0, None, (), Path(), Path())], executor, lambda: None))  # type: ignore[arg-type]
 
 
 def test_there_is_a_process_for_each_core_as_far_as_memory_goes(monkeypatch: pytest.MonkeyPatch) -> None:
-    need = tables.Cost(1.0, 0, 1 << 30, 1, 0, "")
+    need = tables.SweepCost(1.0, 0, 1 << 30, 1, 0, "")
     monkeypatch.setattr(tables, "available_threads", lambda: 8)
     for free, runs_, number in ((100 << 30, 1000, 8), (3 << 30, 1000, 3), (1 << 20, 1000, 1), (100 << 30, 5, 5)):
         monkeypatch.setattr(tables, "available_memory", lambda free=free: free)
-        assert tables.choose_workers(need, runs_).number == number
-    assert tables.choose_workers(need, 1, asked=7).number == 7
+        assert tables.choose_worker_count(need, runs_).number == number
+    assert tables.choose_worker_count(need, 1, requested=7).number == 7
 
 
 def test_the_cost_is_that_of_all_runs(many: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -506,8 +506,8 @@ def test_the_cost_is_that_of_all_runs(many: Path, monkeypatch: pytest.MonkeyPatc
         (many / "many.yaml").write_text(
             SWEEP.replace("[0.01, auto]", "[auto]").replace("samples: 4", f"samples: {samples}")
         )
-        estimate = tables.estimate(load_sweep("many.yaml"))
+        estimate = tables.estimate_cost(load_sweep("many.yaml"))
         # A start, and of each run its work and what it takes besides, which two processes share: 3 frames.
-        each = 5 - 3 + (tables.RUN_SECONDS + 3 * tables.FRAME_SECONDS) / 2
+        each = 5 - 3 + (tables.RUN_OVERHEAD_S + 3 * tables.FRAME_OVERHEAD_S) / 2
         assert estimate.seconds == pytest.approx(3 + samples * each)
         assert (estimate.looked_at, estimate.refused) == (64, 0)

@@ -22,18 +22,18 @@ from taichi_msm.errors import ForeignError
 from taichi_msm.plot_style import STYLE
 from taichi_msm.sweeps.plots import (
     WITHOUT_PICTURES,
-    first_order,
-    last_picture,
-    parameters,
-    results,
-    sensitivity,
-    short_names,
-    short_value,
+    abbreviate_keys,
+    estimate_sensitivity,
+    first_order_index,
+    format_short,
+    read_last_frame,
+    varied_parameters,
+    varied_results,
 )
 from taichi_msm.sweeps.pool import Pool
-from taichi_msm.sweeps.runs import CONTACT, FILES, Outcome, SweepResult, values_in
-from taichi_msm.sweeps.spec import make_sweep, values_of_runs
-from taichi_msm.sweeps.tables import WITHOUT_MATPLOTLIB, WITHOUT_SALIB, split, write_reports
+from taichi_msm.sweeps.runs import CONTACT, REPORT_FILES, Outcome, SweepResult, register_sweep
+from taichi_msm.sweeps.spec import make_sweep, run_values
+from taichi_msm.sweeps.tables import WITHOUT_MATPLOTLIB, WITHOUT_SALIB, assign_splits, write_reports
 
 VARY = {
     "damping": {"log_uniform": [1e-3, 1e-1]},
@@ -53,7 +53,7 @@ def make(small: Path, ran: Path) -> Make:
 
     def made(samples: int = 8, vary: dict[str, Any] = VARY, **settings: Any) -> SweepResult:
         described = make_sweep("small.yaml", {"vary": vary, "samples": samples, "seed": 1, **settings})
-        values = values_of_runs(described.settings.vary, samples, 1)
+        values = run_values(described.settings.vary, samples, 1)
         outcomes = [
             Outcome(run, "diverged", "why", 9.0)
             if run % 7 == 3
@@ -83,31 +83,31 @@ def copy_runs(ran: Path, result: SweepResult) -> None:
 
 def test_captions_are_short() -> None:
     keys = ["tissue.young", "probes.0.at", "probes.1.at", "probes.0.total.2", "render.light", "light"]
-    assert short_names(keys) == ["young", "probes.0.at", "probes.1.at", "total.2", "render.light", "light"]
+    assert abbreviate_keys(keys) == ["young", "probes.0.at", "probes.1.at", "total.2", "render.light", "light"]
     values = [23412.5, 1.2345e-5, 7, "textures/a.png", [0.51234, [1, 2.0]], {"eye": [0.1]}, True, None]
     written = ["23400", "1.23e-05", "7", "a.png", "[0.512, [1, 2]]", "eye [0.1]", "true", "null"]
-    assert list(map(short_value, values)) == written
+    assert list(map(format_short, values)) == written
 
 
 def test_the_split_follows_from_seed_and_number_alone() -> None:
     # Pinned: data sets must keep their parts for ever.
-    assert [run for run, part in enumerate(split(20, 1)) if part == "test"] == [1, 16]
-    assert [run for run, part in enumerate(split(20, 1)) if part == "val"] == [11, 19]
+    assert [run for run, part in enumerate(assign_splits(20, 1)) if part == "test"] == [1, 16]
+    assert [run for run, part in enumerate(assign_splits(20, 1)) if part == "val"] == [11, 19]
     for runs, tenth in ((64, 6), (65, 7), (100, 10), (4, 0), (5, 1)):
-        parts = split(runs, 1)
+        parts = assign_splits(runs, 1)
         assert [parts.count(part) for part in ("train", "val", "test")] == [runs - 2 * tenth, tenth, tenth]
-    assert split(64, 1) != split(64, 2)
+    assert assign_splits(64, 1) != assign_splits(64, 2)
 
 
 def test_parameters_are_the_numbers_that_vary(make: Make) -> None:
     result = make()
-    damping, place, image = parameters(result, range(8))
+    damping, place, image = varied_parameters(result, range(8))
     assert (damping.name, damping.is_logarithmic) == ("damping", True)
     # The second component does not vary.
     assert (place.name, place.numbers.tolist()) == ("at[0]", [row[1][0] for row in result.values])
     assert (image.name, image.labels) == ("image", ["speckle.png", "other.png"])
     assert image.numbers.tolist() == [float(row[2] == "other.png") for row in result.values]
-    columns = results(result, range(8))
+    columns = varied_results(result, range(8))
     assert list(columns) == ["max_displacement"]
     assert np.isnan(columns["max_displacement"]).tolist() == [run == 3 for run in range(8)]
 
@@ -117,7 +117,7 @@ def test_sensitivity_of_a_linear_function(seed: int) -> None:
     # The variances of 3 x and y are as 9 to 1. The largest error with the first 40 seeds is 0.09.
     points = qmc.Sobol(2, seed=np.random.default_rng(seed)).random(64)
     for column, share in enumerate((0.9, 0.1)):
-        index, confidence = first_order(points[:, column], 3 * points[:, 0] + points[:, 1])
+        index, confidence = first_order_index(points[:, column], 3 * points[:, 0] + points[:, 1])
         assert index == pytest.approx(share, abs=0.12)
         assert abs(index - share) < confidence
 
@@ -125,7 +125,7 @@ def test_sensitivity_of_a_linear_function(seed: int) -> None:
 def test_sensitivity_in_a_grid() -> None:
     # The runs of a grid go through one key for each value of the other.
     grid = np.array(list(itertools.product(range(8), range(8))), dtype=float)
-    indices = [first_order(column, 3 * grid[:, 0] + grid[:, 1])[0] for column in grid.T]
+    indices = [first_order_index(column, 3 * grid[:, 0] + grid[:, 1])[0] for column in grid.T]
     assert indices == pytest.approx([0.9, 0.1], abs=0.1)
 
 
@@ -201,7 +201,7 @@ def test_the_last_frame_comes_from_any_output(make: Make, ran: Path, kept: str, 
 def test_of_an_animation_the_last_picture_is_taken(tmp_path: Path) -> None:
     red, blue = (Image.new("RGB", (40, 30), colour) for colour in ("red", "blue"))
     red.save(tmp_path / "a.gif", save_all=True, append_images=[blue])
-    assert last_picture(tmp_path / "a.gif").getcolors() == [(40 * 30, (0, 0, 255))]
+    assert read_last_frame(tmp_path / "a.gif").getcolors() == [(40 * 30, (0, 0, 255))]
 
 
 def test_without_pictures_there_is_a_note_and_no_earlier_picture(make: Make) -> None:
@@ -224,16 +224,16 @@ def test_without_libraries_there_are_notes(make: Make, monkeypatch: pytest.Monke
 
 def test_of_many_parameters_those_of_largest_sensitivity_are_plotted(make: Make) -> None:
     style = pytest.importorskip("matplotlib.style")
-    from taichi_msm.sweeps.plots import Content, _figure
+    from taichi_msm.sweeps.plots import PlotData, _figure
 
     keys = ["springs.shear", "springs.structural", "springs.virtual", "sheet.mass", "probes.0.falloff"]
     vary = {key: {"uniform": [1, 2]} for key in keys} | {"probes.0.force": {"uniform": [[0, 0, 1], [1, 1, 2]]}}
     result = make(128, {"damping": {"uniform": [0.1, 1]}, **vary})
-    varied, columns = parameters(result, range(128)), results(result, range(128))
-    indices = sensitivity(varied, columns)
+    varied, columns = varied_parameters(result, range(128)), varied_results(result, range(128))
+    indices = estimate_sensitivity(varied, columns)
     failed = np.isnan(columns["max_displacement"])
     with style.context(STYLE, after_reset=True):
-        figure = _figure(Content("title", varied, columns, failed, indices))
+        figure = _figure(PlotData("title", varied, columns, failed, indices))
     names = [axes.get_xlabel() for axes in figure.axes]
     assert len(varied) == 9
     assert len(names) == 8
@@ -323,11 +323,11 @@ def test_runs_of_a_data_set_have_their_own_size(small: Path) -> None:
     }
 
 
-@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("name", REPORT_FILES)
 def test_what_is_no_file_of_a_sweep_stays(make: Make, name: str) -> None:
     result = make()
     shutil.rmtree(result.directory / "runs")
     (result.directory / name).write_text("mine")
     with pytest.raises(ForeignError, match=name):
-        values_in(result.directory, result.sweep)
+        register_sweep(result.directory, result.sweep)
     assert (result.directory / name).read_text() == "mine"

@@ -17,7 +17,7 @@ from taichi_msm import load_scene, run
 from taichi_msm.cli.main import main
 from taichi_msm.errors import DeviceError, NotInstalledError
 from taichi_msm.system import runtime
-from taichi_msm.system.compiler import COMPILERS, Compiler, chosen, named, what_decides_bits
+from taichi_msm.system.compiler import COMPILERS, Compiler, active_compiler, compiler_label, result_versions
 from tests.outputs import results
 
 # Run kernels with an error: one of a user, after one of ours was read; and one in the place of ours.
@@ -37,11 +37,11 @@ def wrong(out: ti.types.ndarray(dtype=ti.f32, ndim=1)):
         out[n] = nowhere
 
 array = np.zeros(2, np.float32)
-with runtime.our_compilation():
+with runtime.compilation_options():
     good(array)
 try:
     if sys.argv[1] == "ours":
-        with runtime.our_compilation():
+        with runtime.compilation_options():
             wrong(array)
     else:
         wrong(array)
@@ -54,25 +54,25 @@ except Exception as error:
 def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[set[str]]:
     """The compilers that can be found; those of this environment are not looked for."""
     found = {"taichi", "quadrants"}
-    monkeypatch.setattr(Compiler, "version", property(lambda one: one.tested if one.name in found else ""))
+    monkeypatch.setattr(Compiler, "version", property(lambda one: one.tested_version if one.name in found else ""))
     monkeypatch.delenv("TAICHI_MSM_COMPILER", raising=False)
-    chosen.cache_clear()
+    active_compiler.cache_clear()
     yield found
-    chosen.cache_clear()
+    active_compiler.cache_clear()
 
 
 def test_taichi_is_taken_where_both_are_there(installed: set[str]) -> None:
-    assert chosen().name == "taichi"
+    assert active_compiler().name == "taichi"
 
 
 def test_quadrants_is_taken_where_it_is_alone(installed: set[str]) -> None:
     installed.remove("taichi")
-    assert chosen().name == "quadrants"
+    assert active_compiler().name == "quadrants"
 
 
 def test_the_environment_decides(installed: set[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TAICHI_MSM_COMPILER", "quadrants")
-    assert chosen().name == "quadrants"
+    assert active_compiler().name == "quadrants"
 
 
 @pytest.mark.parametrize(
@@ -103,7 +103,7 @@ def test_a_compiler_that_is_not_there(
     installed.intersection_update(there)
     monkeypatch.setenv("TAICHI_MSM_COMPILER", wanted)
     with pytest.raises((DeviceError, NotInstalledError)) as caught:
-        chosen()
+        active_compiler()
     assert str(caught.value).startswith(said)
 
 
@@ -123,8 +123,8 @@ def test_the_command_line_says_so_in_a_line_where_it_needs_one(command: str, cod
 
 
 def test_a_compiler_that_cannot_be_imported(tmp_path: Path, root: Path) -> None:
-    (tmp_path / chosen().name).mkdir()
-    (tmp_path / chosen().name / "__init__.py").write_text("raise ImportError('libfoo.so is missing')")
+    (tmp_path / active_compiler().name).mkdir()
+    (tmp_path / active_compiler().name / "__init__.py").write_text("raise ImportError('libfoo.so is missing')")
     done = subprocess.run(
         [sys.executable, "-m", "taichi_msm", "run", root / "scenes" / "press.yaml"],
         cwd=tmp_path,
@@ -132,7 +132,7 @@ def test_a_compiler_that_cannot_be_imported(tmp_path: Path, root: Path) -> None:
         capture_output=True,
         text=True,
     )
-    said = f"{chosen().title} cannot be imported: libfoo.so is missing; {chosen().remedy}\n"
+    said = f"{active_compiler().title} cannot be imported: libfoo.so is missing; {active_compiler().remedy}\n"
     assert (done.returncode, done.stdout, done.stderr) == (2, "", said)
 
 
@@ -147,63 +147,63 @@ def test_a_folder_with_its_name_is_no_compiler(tmp_path: Path, root: Path) -> No
         text=True,
         check=True,
     )
-    assert done.stdout.endswith(f"\n{chosen().title} {chosen().version}\n")
+    assert done.stdout.endswith(f"\n{active_compiler().title} {active_compiler().version}\n")
 
 
 def test_the_version_names_the_compiler(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--version"]) == 0
     version = ".".join(str(part) for part in runtime.ti.__version__)
-    assert capsys.readouterr().out == f"taichi-msm 0.1.0\n{chosen().title} {version}\n"
+    assert capsys.readouterr().out == f"taichi-msm 0.1.0\n{active_compiler().title} {version}\n"
 
 
 def test_a_record_names_its_compiler() -> None:
-    assert named({"taichi-msm": "0.1.0", "quadrants": "1.4.0", "python": "3.14.0"}) == "Quadrants 1.4.0"
+    assert compiler_label({"taichi-msm": "0.1.0", "quadrants": "1.4.0", "python": "3.14.0"}) == "Quadrants 1.4.0"
 
 
 def test_compilers_with_the_same_bits_on_a_cpu() -> None:
     one, other, older = (
         {"python": "3.13.0", **pair} for pair in ({"taichi": "1.7.4"}, {"quadrants": "1.4.0"}, {"taichi": "1.7.3"})
     )
-    assert what_decides_bits(one, "cpu") == what_decides_bits(other, "cpu") != what_decides_bits(older, "cpu")
-    assert what_decides_bits(one, "vulkan") == one
+    assert result_versions(one, "cpu") == result_versions(other, "cpu") != result_versions(older, "cpu")
+    assert result_versions(one, "vulkan") == one
 
 
 def test_compilers_are_those_that_the_package_installs(root: Path) -> None:
     project = (root / "pyproject.toml").read_text()
     for one in COMPILERS.values():
-        assert f'"{one.name}=={one.tested}' in project
+        assert f'"{one.name}=={one.tested_version}' in project
 
 
 # Prints the folder of compiled kernels that we know of, and the one that the compiler knows of.
 FOLDERS = """
-from taichi_msm.system.compiler import chosen
-ti = chosen().load()
+from taichi_msm.system.compiler import active_compiler
+ti = active_compiler().load()
 ti.init(log_level=ti.ERROR)
-print(chosen().folder(), ti.lang.impl.current_cfg().offline_cache_file_path, sep="|")
+print(active_compiler().folder(), ti.lang.impl.current_cfg().offline_cache_file_path, sep="|")
 """
 
 
 @pytest.mark.parametrize("named", [True, False])
 def test_the_folder_of_compiled_kernels(named: bool, tmp_path: Path) -> None:
     environment = {**os.environ, "HOME": str(tmp_path)}
-    del environment[chosen().folder_variable]
+    del environment[active_compiler().folder_variable]
     if named:
-        environment[chosen().folder_variable] = str(tmp_path / "kernels")
+        environment[active_compiler().folder_variable] = str(tmp_path / "kernels")
     done = subprocess.run(
         [sys.executable, "-c", FOLDERS], env=environment, capture_output=True, text=True, check=True, cwd=tmp_path
     )
     ours, its = done.stdout.split("\n")[-2].split("|")
-    assert ours == its == str(tmp_path / "kernels" if named else tmp_path / chosen().cache)
+    assert ours == its == str(tmp_path / "kernels" if named else tmp_path / active_compiler().cache)
 
 
 def test_replacements_are_in_place_for_a_while(device: runtime.Device) -> None:
-    shortcuts = chosen().shortcuts
+    patches = active_compiler().patches
 
     def parts() -> list[object]:
-        return [getattr(owner, name) for owner, name, _ in shortcuts]
+        return [getattr(owner, name) for owner, name, _ in patches]
 
     def interrupted() -> None:
-        with runtime.our_compilation():
+        with runtime.compilation_options():
             assert not any(now is then for now, then in zip(parts(), before, strict=True))
             raise KeyboardInterrupt
 
@@ -214,7 +214,7 @@ def test_replacements_are_in_place_for_a_while(device: runtime.Device) -> None:
 
 
 def test_nothing_is_replaced_in_a_version_that_was_not_tested() -> None:
-    assert replace(chosen(), tested="0.0.1").shortcuts == []
+    assert replace(active_compiler(), tested_version="0.0.1").patches == []
 
 
 @pytest.mark.parametrize(
@@ -236,7 +236,7 @@ def test_an_error_names_its_line_where_somebody_changes_kernels(
     assert ("kernels.py" in done.stdout and "^^^^" in done.stdout) == told
 
 
-OTHER = next(one for one in COMPILERS.values() if one is not chosen())
+OTHER = next(one for one in COMPILERS.values() if one is not active_compiler())
 
 both = pytest.mark.skipif(find_spec(OTHER.name) is None, reason="needs both compilers")
 
@@ -286,4 +286,4 @@ def test_the_other_compiler_continues_a_run_with_the_same_bytes(small: Path, dev
     by_other("run", "--resume", "parts", "--threads", str(device.threads))
     assert results(small / "parts") == results(small / "whole")
     record = json.loads((small / "parts" / "run.json").read_text())
-    assert {chosen().name, OTHER.name} <= set(record["versions"])
+    assert {active_compiler().name, OTHER.name} <= set(record["versions"])

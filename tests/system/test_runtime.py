@@ -15,7 +15,7 @@ from taichi_msm.model.sheet import rest_positions
 from taichi_msm.render.rasterizer import Rasterizer
 from taichi_msm.system import process as process_module
 from taichi_msm.system import runtime
-from taichi_msm.system.compiler import chosen
+from taichi_msm.system.compiler import active_compiler
 from tests.motion import dynamics_of
 from tests.scenes import SHEET, scene, speckle
 
@@ -95,19 +95,19 @@ def test_a_process_may_have_many_sheets_and_gets_their_memory_back(device: runti
 # Two of these at once on one core, from a line on stdin on: each waits while the other works.
 BESIDE = """
 import os, time
-from taichi_msm.system.process import waited_for_cores
+from taichi_msm.system.process import core_wait_s
 
 os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 print("ready", flush=True)
 input()
-before, end = waited_for_cores(), time.perf_counter() + 1
+before, end = core_wait_s(), time.perf_counter() + 1
 while time.perf_counter() < end:
     pass
-print(waited_for_cores() - before)
+print(core_wait_s() - before)
 """
 
 
-@pytest.mark.skipif(process_module.waited_for_cores() is None, reason="the system does not tell")
+@pytest.mark.skipif(process_module.core_wait_s() is None, reason="the system does not tell")
 def test_waiting_for_a_core_is_noticed(root: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": str(root)}
     both = [
@@ -128,12 +128,12 @@ def test_waiting_for_a_core_is_noticed(root: Path) -> None:
 
 
 def test_where_the_system_does_not_tell_of_waiting(tmp_path: Path) -> None:
-    assert process_module.waited_for_cores(tmp_path / "missing") is None
+    assert process_module.core_wait_s(tmp_path / "missing") is None
     (tmp_path / "1").mkdir()
     (tmp_path / "1" / "schedstat").write_text("5 2000000000 7\n")
-    assert process_module.waited_for_cores(tmp_path) == 2.0
+    assert process_module.core_wait_s(tmp_path) == 2.0
     (tmp_path / "2").mkdir()
-    assert process_module.waited_for_cores(tmp_path) is None
+    assert process_module.core_wait_s(tmp_path) is None
 
 
 # One simulation in another thread and another process.
@@ -176,9 +176,9 @@ def test_other_threads_and_forked_processes_are_refused(tmp_path: Path, root: Pa
     done = subprocess.run(
         [sys.executable, str(script)], capture_output=True, text=True, timeout=60, check=True, env=environment
     )
-    thread = f"{chosen().title} works in the thread that started it; simulate and draw there"
-    fork = f"{chosen().title} was started before this process was forked from another, and would hang here; start "
-    fork += "processes by multiprocessing's 'spawn' or 'forkserver'"
+    thread = f"{active_compiler().title} works in the thread that started it; simulate and draw there"
+    fork = f"{active_compiler().title} was started before this process was forked from another, and would hang here; "
+    fork += "start processes by multiprocessing's 'spawn' or 'forkserver'"
     assert done.stdout.splitlines() == [*4 * [thread], *2 * [fork], "2"]
     assert done.stderr == ""
 
@@ -215,14 +215,14 @@ print(*results, runtime.ti.lang.impl.current_cfg().debug, sorted(os.environ.item
 
 def test_environment_and_other_threads_change_nothing_at_the_start(tmp_path: Path, root: Path) -> None:
     """The compiler's variables for its arch, its threads and its types would come before our arguments."""
-    script, prefix = tmp_path / "at_once.py", chosen().prefix
+    script, prefix = tmp_path / "at_once.py", active_compiler().prefix
     settings = {"ARCH": "opengl", "DEBUG": "1", "CPU_MAX_NUM_THREADS": "1", "LOG_LEVEL": "loud", "OFFLINE_CACHE": "no"}
     given = {f"{prefix}_{name}": value for name, value in settings.items()}
     script.write_text(f"given = {given}\n{AT_ONCE}")
     environment = {**os.environ, **given, "PYTHONPATH": str(root)}
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=60, env=environment)
     *lines, last = done.stdout.splitlines()
-    refused = f"{chosen().title} works in the thread that started it; simulate and draw there"
+    refused = f"{active_compiler().title} works in the thread that started it; simulate and draw there"
     assert last == f"2; {refused}; False; {sorted(given.items())}"
     assert lines == [*map(str, range(len(lines) - 1)), f"end {len(lines) - 1}"]
     assert (done.returncode, done.stderr) == (0, "")

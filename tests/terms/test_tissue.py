@@ -14,7 +14,7 @@ from PIL import Image
 
 from taichi_msm.accuracy.mesh import FEWEST, CubicSampling, MeshEstimate, MeshPilot, choose_points, coarser
 from taichi_msm.accuracy.time_step import longest
-from taichi_msm.cli.console import summary
+from taichi_msm.cli.console import run_summary
 from taichi_msm.errors import ArgumentError, FilesError, SceneError
 from taichi_msm.load.check import checked
 from taichi_msm.load.scene_file import load_scene
@@ -484,7 +484,7 @@ def test_a_run_says_what_its_tool_and_its_points_do(load: Any, device: Device, t
     assert re.search(r", mesh [\d.]+ % of [\d.]+ mm \([\d.]+ mm(, [\d.]+ px)?\)$", record["notes"][0])
     assert (
         f"probes.0: {probe['total_force']:.3g} N in all, 0.4 N of it under the flat end, at most 1.27 kPa"
-        in summary(record, tmp_path)
+        in run_summary(record, tmp_path)
     )
 
 

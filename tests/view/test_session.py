@@ -21,11 +21,11 @@ from taichi_msm.model.sheet import rest_positions
 from taichi_msm.system.runtime import Device
 from taichi_msm.view import overlay, recording
 from taichi_msm.view import session as live_session
-from taichi_msm.view.events import KEYS, Drag, Event, Harder, Hover, Key, Percent, Press, Release, Turn
+from taichi_msm.view.events import KEYS, Drag, Event, Hover, Key, Press, Release, Strength, StrengthChange, Turn
 from taichi_msm.view.recording import Captures
-from taichi_msm.view.script import film
-from taichi_msm.view.session import Session, with_live_frames
-from taichi_msm.view.tools import MovedTool
+from taichi_msm.view.script import record_film
+from taichi_msm.view.session import Session, divide_frames
+from taichi_msm.view.tools import PositionControlledTool
 from tests.outputs import duration
 from tests.scenes import plan_of
 
@@ -98,7 +98,7 @@ def test_a_press_at_a_pixel_dimples_what_is_seen_there(begin: Begin) -> None:
         pixel = pixel_of(session, row, col)
         session.handle(Press(*pixel))
         advance(session, 12)
-        cell = np.array(session.tool.place) * [cols - 1, rows - 1]
+        cell = np.array(session.tool.position) * [cols - 1, rows - 1]
         assert cell == pytest.approx([col, row], abs=0.25), "a pixel is a fifth of a cell wide"
         assert (-session.positions()[..., 2]).argmax() == row * cols + col
         assert session.displacement() == pytest.approx(displacement(session)[row, col], rel=0.1)
@@ -117,7 +117,7 @@ def test_a_camera_that_moves_takes_nothing_of_a_drag(begin: Begin) -> None:
             session.handle(Turn(turn, 0))
         session.paused = False
         advance(session, 2)
-        places.append(session.tool.place)
+        places.append(session.tool.position)
     assert places[1] == pytest.approx(places[0], abs=2e-5)
 
 
@@ -128,19 +128,19 @@ def test_a_drag_moves_the_control_point_with_the_pointer(begin: Begin) -> None:
     advance(session, 10)
     session.handle(Drag(*there))
     session.advance()
-    assert np.array(session.tool.place) * 24 == pytest.approx([16, 10], abs=0.4)
+    assert np.array(session.tool.position) * 24 == pytest.approx([16, 10], abs=0.4)
     session.handle(Turn(12, 4))
     session.handle(Drag(there[0], there[1]))
     session.handle(Turn(-6, 4))
     session.handle(Drag(there[0], there[1]))
     session.advance()
-    assert np.array(session.tool.place) * 24 == pytest.approx([16, 10], abs=0.4), (
+    assert np.array(session.tool.position) * 24 == pytest.approx([16, 10], abs=0.4), (
         "the camera moved, and not the pointer"
     )
     session.handle(Release())
     session.handle(Drag(10, 10))
     session.advance()
-    assert np.array(session.tool.place) * 24 == pytest.approx([16, 10], abs=0.4), "the tool is not there any more"
+    assert np.array(session.tool.position) * 24 == pytest.approx([16, 10], abs=0.4), "the tool is not there any more"
 
 
 @pytest.mark.parametrize(
@@ -159,13 +159,13 @@ def test_run_repeats_a_session_to_the_bit(overrides: dict[str, Any], play: bool,
     events: dict[int, list[Event]] = {
         2: [Press(20, 12)],
         9: [Drag(23, 14)],
-        11: [Drag(25, 15), Percent(40)],
+        11: [Drag(25, 15), Strength(40)],
         16: [Release(), Press(14, 16, pull=True)],
         17: [Turn(5, -3)],
         30: [Release()],
         33: [Press(22, 11), Release()],
         36: [Press(22, 18), Key("space"), Key("m")],
-        38: [Key("space"), Harder(15)],
+        38: [Key("space"), StrengthChange(15)],
     }
     for position in played(session, events, 50):
         found.append(position)
@@ -183,7 +183,7 @@ def test_run_repeats_a_session_to_the_bit(overrides: dict[str, Any], play: bool,
     np.testing.assert_array_equal(again, np.array(found))
     # Seen as it was seen at the end.
     assert load_scene(written).render.wireframe
-    assert load_scene(written).render.camera.eye == session.recorded().render.camera.eye  # type: ignore[union-attr]
+    assert load_scene(written).render.camera.eye == session.recorded_scene().render.camera.eye  # type: ignore[union-attr]
 
 
 def test_pulling_lifts_what_pushing_presses_down(begin: Begin) -> None:
@@ -201,7 +201,7 @@ def test_virtual_springs_vanish_when_the_tool_is_released(begin: Begin) -> None:
     advance(session, 15)
     session.handle(Release())
     advance(session, 1)
-    recorded = session.recorded()
+    recorded = session.recorded_scene()
     count = plan_of(recorded).grid.steps_per_frame
     active = average_loads(plan_of(recorded), 0, 16 * count).active
     assert (active[: 15 * count] == 1).all()
@@ -230,22 +230,22 @@ def test_reset_begins_anew(begin: Begin) -> None:
     first = advance(session, 5)
     session.handle(Key("r"))
     session.handle(Drag(70, 50))
-    assert session.tool.goal == (0.5, 0.5), "nothing is held any more"
+    assert session.tool.target == (0.5, 0.5), "nothing is held any more"
     assert (displacement(session) < AT_REST).all()
     assert (session.frame, session.tool.percent) == (0, 0)
     session.handle(Press(60, 50))
     np.testing.assert_array_equal(advance(session, 5), first)
-    assert session.recorded().time.duration == pytest.approx(5 / session.rate)
+    assert session.recorded_scene().time.duration == pytest.approx(5 / session.frame_rate)
 
 
 def test_percent_by_wheel_and_keys_stays_between_nothing_and_all(begin: Begin) -> None:
     session = begin()
     events: list[tuple[Event, float]] = [
-        (Harder(5), 100),
-        (Harder(-30), 70),
+        (StrengthChange(5), 100),
+        (StrengthChange(-30), 70),
         (Key("up"), 75),
         (Key("down"), 70),
-        (Percent(3), 3),
+        (Strength(3), 3),
         (Key("down"), 0),
     ]
     for event, expected in events:
@@ -292,7 +292,7 @@ def test_a_press_beside_the_sheet_says_so(begin: Begin) -> None:
     assert session.notice == "no tissue at pixel 2, 2"
     advance(session, 4)
     assert (displacement(session) < AT_REST).all()
-    assert not session.tool.held
+    assert not session.tool.engaged
     session.handle(Press(60, 50))
     assert session.notice == "", "what was said is no longer so"
     session.handle(Press(2, 2))
@@ -317,7 +317,7 @@ def test_what_is_kept_has_a_name_of_its_own(begin: Begin) -> None:
     ]
     with Image.open("captures/picture-1.png") as image:
         assert image.size == (120, 100)
-    assert load_scene("captures/session-2.yaml").time.duration == pytest.approx(10 / session.rate)
+    assert load_scene("captures/session-2.yaml").time.duration == pytest.approx(10 / session.frame_rate)
 
 
 def test_another_picture_of_the_same_name_stays(begin: Begin) -> None:
@@ -331,13 +331,13 @@ def test_another_picture_of_the_same_name_stays(begin: Begin) -> None:
 
 def test_a_film_shows_as_much_time_as_went_by(begin: Begin) -> None:
     session = begin({**TILTED, "time.frames_per_second": 10})
-    assert (session.rate, session.parts) == (60, 6)
+    assert (session.frame_rate, session.subframes) == (60, 6)
     session.handle(Key("g"))
     for _ in range(6):
         # Slower than the film: every picture is of two of its frames.
         for _ in range(12):
             session.advance()
-        session.handle(Harder(-5))
+        session.handle(StrengthChange(-5))
         session.picture()
     session.close()
     assert duration("captures/film-1.gif") == 1300, (
@@ -413,14 +413,14 @@ def test_a_session_too_long_for_a_file_says_so_before(begin: Begin, monkeypatch:
     assert list(Path("captures").iterdir()) == [Path("captures/speckle.png")]
     session.handle(Key("r"))
     session.handle(Key("w"))
-    assert load_scene("captures/session-1.yaml").time.duration == pytest.approx(1 / session.rate)
+    assert load_scene("captures/session-1.yaml").time.duration == pytest.approx(1 / session.frame_rate)
 
 
 def test_a_film_ends_where_the_session_diverges(begin: Begin) -> None:
     session = begin({**TILTED, "probes.0.force": [0, 0, -1e12]})
     said: list[str] = []
-    film(session, Path("a.gif"), 2.0, [(2, Press(60, 50)), (90, Key("w"))], say=said.append)
-    assert said[0] == session.fault
+    record_film(session, Path("a.gif"), 2.0, [(2, Press(60, 50)), (90, Key("w"))], notify=said.append)
+    assert said[0] == session.divergence_error
     assert re.fullmatch(r"the film ends at 0\.\d+ s, before some of the script's events", said[1])
     assert duration("a.gif") < 500
 
@@ -445,11 +445,11 @@ def test_a_sheet_that_nothing_holds_may_fly_after_a_press(begin: Begin) -> None:
     session = begin({**TILTED, "sheet.fixed": "none", "springs.virtual": 0.0, "probes.0.falloff": 0.0, "damping": 0.0})
     session.handle(Press(60, 50))
     advance(session, 15)
-    session.handle(Percent(1))
+    session.handle(Strength(1))
     advance(session, 20)
     session.handle(Release())
     advance(session, 400)
-    assert session.fault == ""
+    assert session.divergence_error == ""
     assert displacement(session).max() > 10 * 0.3
 
 
@@ -470,8 +470,8 @@ def test_a_session_that_diverged_says_so_and_can_be_reset(begin: Begin) -> None:
     session = begin({**TILTED, "probes.0.force": [0, 0, -3e6]})
     session.handle(Press(60, 50))
     advance(session, 10)
-    assert session.fault.startswith("diverged before ")
-    assert session.notice == session.fault
+    assert session.divergence_error.startswith("diverged before ")
+    assert session.notice == session.divergence_error
     frame = session.frame
     advance(session, 3)
     assert session.frame == frame
@@ -480,7 +480,7 @@ def test_a_session_that_diverged_says_so_and_can_be_reset(begin: Begin) -> None:
     again = run(load_scene("captures/session-1.yaml", {"output": []}), "again", threads=2)
     assert again["status"] == "diverged", "what goes wrong goes wrong again"
     session.handle(Key("r"))
-    assert session.fault == ""
+    assert session.divergence_error == ""
     assert np.isfinite(advance(session, 3)).all()
 
 
@@ -490,13 +490,13 @@ def test_a_session_that_diverged_says_so_and_can_be_reset(begin: Begin) -> None:
 )
 def test_a_session_has_as_many_frames_as_a_screen_shows(rate: float, step: Any, parts: int, small: Path) -> None:
     scene = load_scene("small.yaml", {"time.frames_per_second": rate, "time.duration": 1, "time.step": step})
-    live, found = with_live_frames(plan_of(scene))
+    live, found = divide_frames(plan_of(scene))
     assert (live.scene.time.frames_per_second, found) == (rate * parts, parts)
 
 
 def test_a_given_step_stays(small: Path) -> None:
     scene = load_scene("small.yaml", {"time.frames_per_second": 20, "time.duration": 1, "time.step": 0.002})
-    live, parts = with_live_frames(plan_of(scene))
+    live, parts = divide_frames(plan_of(scene))
     assert parts == 1, "25 steps a frame cannot be cut into three frames, nor two"
     assert live.grid.steps_per_frame == 25
 
@@ -583,20 +583,20 @@ BY_HAND = {**TILTED, "probes.0.instrument": WIDE}
 EVENTS: dict[int, list[Event]] = {
     1: [Hover(15, 14)],
     4: [Press(18, 14)],
-    14: [Drag(22, 16), Harder(10)],
+    14: [Drag(22, 16), StrengthChange(10)],
     16: [Drag(25, 15)],
     20: [Release(), Hover(20, 17)],
     24: [Press(20, 17, pull=True)],
-    36: [Percent(-30)],
+    36: [Strength(-30)],
     46: [Turn(5, -3), Release()],
     50: [Press(22, 11), Key("space")],
     52: [Key("space"), Key("m")],
 }
 
 
-def moved(session: Session) -> MovedTool:
+def moved(session: Session) -> PositionControlledTool:
     """The tool, which is held by position."""
-    assert isinstance(session.tool, MovedTool)
+    assert isinstance(session.tool, PositionControlledTool)
     return session.tool
 
 
@@ -614,12 +614,12 @@ def test_run_repeats_a_session_by_position_to_the_bit(overrides: dict[str, Any],
     session.handle(Press(20, 15))
     advance(session, 3)
     session.handle(Key("f"))
-    assert (session.frame, session.tool.held) == (0, False), "what was done by force is no part of the record"
+    assert (session.frame, session.tool.engaged) == (0, False), "what was done by force is no part of the record"
     found: list[np.ndarray] = []
     gripped, felt = False, 0.0
     for position in played(session, EVENTS, 62):
         found.append(position)
-        gripped, felt = gripped or moved(session).grips, max(felt, session.felt())
+        gripped, felt = gripped or moved(session).gripping, max(felt, session.felt_force())
     assert gripped
     assert felt > 0
     session.handle(Key("w"))
@@ -638,26 +638,26 @@ def test_by_position_the_tip_follows_the_pointer_and_feels_what_it_touches(begin
     session.handle(Key("f"))
     session.handle(Hover(*pixel_of(session, 8, 6)))
     advance(session, 5)
-    assert np.array(moved(session).place) * 24 == pytest.approx([6, 8], abs=0.25)
+    assert np.array(moved(session).position) * 24 == pytest.approx([6, 8], abs=0.25)
     assert (displacement(session) < AT_REST).all()
-    assert session.felt() == 0
+    assert session.felt_force() == 0
     session.handle(Press(*pixel_of(session, 8, 6)))
     advance(session, 20)
-    pressed = session.felt()
+    pressed = session.felt_force()
     assert pressed > 0
     assert session.positions()[8, 6, 2] == pytest.approx(-0.03, abs=0.002), "a press is a radius deep"
-    session.handle(Harder(20))
+    session.handle(StrengthChange(20))
     advance(session, 20)
-    assert session.felt() > 1.2 * pressed
+    assert session.felt_force() > 1.2 * pressed
     beside = session.positions()[8, 8, 0]
     for _ in range(10):
-        x, y = session.viewport.pixel(np.array([*session._rest_point(session.tool.goal), 0])) or (0, 0)
+        x, y = session.viewport.project(np.array([*session._rest_point(session.tool.target), 0])) or (0, 0)
         session.handle(Drag(x + 1, y))
         advance(session, 1)
     assert session.positions()[8, 8, 0] > beside + 0.001, "friction drags the tissue along"
     session.handle(Release())
     advance(session, 20)
-    assert session.felt() == 0
+    assert session.felt_force() == 0
 
 
 def test_by_position_shift_grips_and_the_wheel_lifts(begin: Begin) -> None:
@@ -665,7 +665,7 @@ def test_by_position_shift_grips_and_the_wheel_lifts(begin: Begin) -> None:
     session.handle(Key("f"))
     session.handle(Press(*pixel_of(session, 12, 12), pull=True))
     advance(session, 20)
-    assert moved(session).grips
+    assert moved(session).gripping
     for _ in range(20):
         session.handle(Key("down"))
         advance(session, 1)
@@ -673,21 +673,21 @@ def test_by_position_shift_grips_and_the_wheel_lifts(begin: Begin) -> None:
     assert session.positions()[12, 12, 2] > 0.02
     session.handle(Release())
     advance(session, 2)
-    assert not moved(session).grips
+    assert not moved(session).gripping
 
 
 def test_a_tool_that_the_scene_moves_is_held_by_position_from_the_start(begin: Begin) -> None:
     path = {"path": [[0, 0.5, 0.5, 0.05]], "instrument": WIDE, "friction": 0.1}
     force = {"force": [0, 0, -2000], "falloff": 60}
     session = begin({**TILTED, "probes": [path, force]})
-    assert moved(session).recorded(0).friction == 0.1
+    assert moved(session).recorded_probe(0).friction == 0.1
     session.handle(Key("f"))
-    assert not isinstance(session.tool, MovedTool)
+    assert not isinstance(session.tool, PositionControlledTool)
     session.handle(Press(60, 50))
     advance(session, 10)
     assert session.tool.percent == 100
     session.handle(Key("f"))
-    assert moved(session).place == (0.5, 0.5)
+    assert moved(session).position == (0.5, 0.5)
     assert (displacement(session) < AT_REST).all()
 
 
@@ -724,10 +724,10 @@ def test_a_tool_too_thin_for_the_points_says_so(begin: Begin) -> None:
 
 def bar_of(picture: np.ndarray) -> float:
     """How much of the bar under the two lines of figures is filled."""
-    lines = [row[:, 0] for row in picture[:80] if (row[:70] == overlay.OUTLINE).all(axis=-1).any()]
+    lines = [row[:, 0] for row in picture[:80] if (row[:70] == overlay.OUTLINE_GREY).all(axis=-1).any()]
     row = lines[len(lines) // 2]
-    right = int(np.flatnonzero(row == overlay.OUTLINE)[-1])
-    return float((row[: right + 1] == 255).sum() / (overlay.BAR * 11))
+    right = int(np.flatnonzero(row == overlay.OUTLINE_GREY)[-1])
+    return float((row[: right + 1] == 255).sum() / (overlay.BAR_LETTERS * 11))
 
 
 def test_the_force_felt_is_shown_with_a_bar(begin: Begin) -> None:
@@ -736,17 +736,17 @@ def test_the_force_felt_is_shown_with_a_bar(begin: Begin) -> None:
     bare = session.picture()
     session.handle(Press(*pixel_of(session, 12, 12)))
     advance(session, 20)
-    hardest = session.felt()
+    hardest = session.felt_force()
     for percent in (100, 60):
-        session.handle(Percent(percent))
+        session.handle(Strength(percent))
         advance(session, 20)
-        hardest = max(hardest, session.felt())
+        hardest = max(hardest, session.felt_force())
     said = session._figure_lines("")[0]
-    assert said == f"press 45 mm deep  ·  {live_session.newtons(session.felt())}"
-    bar = overlay.Bar(session.felt(), hardest, "N")
-    assert bar_of(session.picture()) == pytest.approx(session.felt() / bar.end, abs=0.02)
+    assert said == f"press 45 mm deep  ·  {live_session.newtons(session.felt_force())}"
+    bar = overlay.ValueBar(session.felt_force(), hardest, "N")
+    assert bar_of(session.picture()) == pytest.approx(session.felt_force() / bar.end, abs=0.02)
     session.handle(Key("r"))
-    session.handle(Percent(40))
+    session.handle(Strength(40))
     assert session._figure_lines("")[0] == "next press 30 mm deep  ·  0 N"
     session.handle(Key("i"))
     session.handle(Key("i"))
@@ -757,7 +757,7 @@ def test_the_force_felt_is_shown_with_a_bar(begin: Begin) -> None:
     ("largest", "end"), [(0.5, 0.5), (0.51, 1), (1, 1), (1.01, 2), (2.4, 5), (7, 10), (0.3, 0.5), (3e-4, 5e-4)]
 )
 def test_a_bar_ends_at_a_round_number(largest: float, end: float) -> None:
-    assert overlay.Bar(0.1, largest, "N").end == pytest.approx(end)
+    assert overlay.ValueBar(0.1, largest, "N").end == pytest.approx(end)
 
 
 @pytest.mark.parametrize(("force", "said"), [(0.0, "0 N"), (0.514, "0.51 N"), (9.63, "9.6 N"), (123.4, "123 N")])

@@ -13,7 +13,7 @@ from taichi_msm.model.tools import path_problems
 from taichi_msm.scene.tools import Probe
 from taichi_msm.solver.planning import steer_plan
 from taichi_msm.terms.contact import ContactTerm
-from taichi_msm.view.tools import DEEPEST, FRICTION, HOVER, RISE, MovedTool
+from taichi_msm.view.tools import DEFAULT_FRICTION, HOVER_RADII, MAX_DEPTH_RADII, RISE_TIME_S, PositionControlledTool
 from tests.scenes import plan_of, scene
 
 RATE = 30.0
@@ -32,15 +32,15 @@ def plan(probe: dict[str, Any] | None = None, **time: Any) -> Plan:
     return plan_of(scene(probes=[probe or force], springs=springs, time={"frames_per_second": RATE, **time}))
 
 
-def tool(made: Plan, probe: dict[str, Any] | None = None) -> MovedTool:
-    return MovedTool(Probe(**probe) if probe else made.scene.probes[0], made)
+def tool(made: Plan, probe: dict[str, Any] | None = None) -> PositionControlledTool:
+    return PositionControlledTool(Probe(**probe) if probe else made.scene.probes[0], made)
 
 
-def follow(hand: MovedTool, first: int, count: int) -> list[float]:
+def follow(hand: PositionControlledTool, first: int, count: int) -> list[float]:
     """The heights after some frames, in radii."""
     found = []
     for frame in range(first, first + count):
-        hand.follow(frame)
+        hand.advance(frame)
         found.append(hand.height / RADIUS)
     return found
 
@@ -59,7 +59,7 @@ def tables(held: Plan, frame: int) -> tuple[bytes, ...]:
 def test_every_frame_is_what_the_record_says(seed: int, rate: float) -> None:
     made, rng = plan(frames_per_second=rate, duration=12 / rate), np.random.default_rng(seed)
     hand, frames = tool(made), 240
-    live, seen, gripped = made.with_probes((hand.recorded(0),)), [], 0
+    live, seen, gripped = made.with_probes((hand.recorded_probe(0),)), [], 0
     for frame in range(frames):
         for _ in range(int(rng.integers(0, 3) // 2)):
             place = (float(rng.uniform(-0.2, 1.2)), float(rng.uniform(-0.2, 1.2)))
@@ -69,13 +69,13 @@ def test_every_frame_is_what_the_record_says(seed: int, rate: float) -> None:
                 case 1:
                     hand.release()
                 case 2:
-                    hand.ask(hand.strength + float(rng.integers(-40, 41)))
+                    hand.set_strength(hand.strength + float(rng.integers(-40, 41)))
                 case _:
                     hand.move(place)
-        live = steer_plan(live, [hand.follow(frame)], made.grid.time(frame * made.grid.steps_per_frame))
+        live = steer_plan(live, [hand.advance(frame)], made.grid.time(frame * made.grid.steps_per_frame))
         seen.append(tables(live, frame))
-        gripped += hand.grips
-    record = made.with_probes((hand.recorded(frames),))
+        gripped += hand.gripping
+    record = made.with_probes((hand.recorded_probe(frames),))
     assert gripped > 5
     assert len(record.scene.probes[0].grip) > 1
     assert not list(path_problems(record.scene, record.tools, record.grid))
@@ -84,62 +84,62 @@ def test_every_frame_is_what_the_record_says(seed: int, rate: float) -> None:
 
 def test_a_press_goes_down_in_a_fifth_of_a_second_at_most_and_a_release_up() -> None:
     hand = tool(plan())
-    assert follow(hand, 0, 2) == [HOVER, HOVER]
+    assert follow(hand, 0, 2) == [HOVER_RADII, HOVER_RADII]
     hand.press((0.4, 0.6), 1)
-    hand.ask(100)
+    hand.set_strength(100)
     down = follow(hand, 2, 8)
-    stride = (HOVER + DEEPEST) / (RISE * RATE)
-    assert down[:6] == pytest.approx([HOVER - stride * (n + 1) for n in range(6)], abs=1e-6)
-    assert down[5:] == pytest.approx([-DEEPEST] * 3)
+    stride = (HOVER_RADII + MAX_DEPTH_RADII) / (RISE_TIME_S * RATE)
+    assert down[:6] == pytest.approx([HOVER_RADII - stride * (n + 1) for n in range(6)], abs=1e-6)
+    assert down[5:] == pytest.approx([-MAX_DEPTH_RADII] * 3)
     hand.release()
-    assert follow(hand, 10, 8)[5:] == pytest.approx([HOVER] * 3)
-    assert hand.place == (0.4, 0.6)
+    assert follow(hand, 10, 8)[5:] == pytest.approx([HOVER_RADII] * 3)
+    assert hand.position == (0.4, 0.6)
 
 
 def test_it_goes_no_farther_in_a_step_than_a_run_allows() -> None:
     made = plan(step=1 / RATE / 5)
     hand = tool(made)
     hand.move((1.0, 0.5))
-    hand.follow(0)
-    way = (hand.place[0] - 0.5) * made.scene.sheet.size[1]
+    hand.advance(0)
+    way = (hand.position[0] - 0.5) * made.scene.sheet.size[1]
     assert 0.95 < way / (5 * RADIUS / 2) < 1
     follow(hand, 1, 20)
-    assert hand.place == (1.0, 0.5)
+    assert hand.position == (1.0, 0.5)
 
 
 def test_a_grip_begins_where_the_tip_stops_and_ends_with_the_press() -> None:
     hand = tool(plan())
     usual = hand.strength
-    hand.ask(-50)
+    hand.set_strength(-50)
     assert hand.strength == 0, "nothing is held that could be lifted"
-    hand.ask(usual)
+    hand.set_strength(usual)
     hand.press((0.4, 0.6), -1)
     grips = []
     for frame in range(8):
-        hand.follow(frame)
-        grips.append(hand.grips)
+        hand.advance(frame)
+        grips.append(hand.gripping)
     assert grips == [False, False, True, True, True, True, True, True]
-    hand.ask(-60)
-    assert follow(hand, 8, 10)[-1] == pytest.approx(0.6 * DEEPEST)
+    hand.set_strength(-60)
+    assert follow(hand, 8, 10)[-1] == pytest.approx(0.6 * MAX_DEPTH_RADII)
     hand.release()
     assert hand.strength == usual, "the next press is no lift"
     follow(hand, 18, 1)
-    assert hand.recorded(19).grip == ((2 / RATE, 18 / RATE),)
+    assert hand.recorded_probe(19).grip == ((2 / RATE, 18 / RATE),)
 
 
 def test_a_grip_that_is_on_lasts_as_long_as_the_record() -> None:
     hand = tool(plan())
     hand.press((0.4, 0.6), -1)
     follow(hand, 0, 9)
-    assert hand.recorded(9).grip == ((2 / RATE, 9 / RATE),)
+    assert hand.recorded_probe(9).grip == ((2 / RATE, 9 / RATE),)
 
 
 def test_a_click_shorter_than_a_frame_touches_nothing() -> None:
     hand = tool(plan())
     hand.press((0.4, 0.6), -1)
     hand.release()
-    assert follow(hand, 0, 3) == [HOVER] * 3
-    assert not hand.grips
+    assert follow(hand, 0, 3) == [HOVER_RADII] * 3
+    assert not hand.gripping
 
 
 def test_it_is_no_deeper_than_the_sheet_bears() -> None:
@@ -152,27 +152,27 @@ def test_it_is_no_deeper_than_the_sheet_bears() -> None:
 def test_what_stays_as_it_is_needs_no_keys() -> None:
     hand = tool(plan())
     follow(hand, 0, 50)
-    assert len(hand.recorded(50).path or ()) == 2
+    assert len(hand.recorded_probe(50).path or ()) == 2
 
 
 def test_the_friction_is_that_of_the_scene_if_it_gives_any() -> None:
     made = plan()
     path = {"path": [[0, 0.5, 0.5, 0.01]], **ROD}
-    assert tool(made).recorded(0).friction == FRICTION
-    assert tool(made, path).recorded(0).friction == FRICTION
-    assert tool(made, {**path, "friction": 0.1}).recorded(0).friction == 0.1
+    assert tool(made).recorded_probe(0).friction == DEFAULT_FRICTION
+    assert tool(made, path).recorded_probe(0).friction == DEFAULT_FRICTION
+    assert tool(made, {**path, "friction": 0.1}).recorded_probe(0).friction == 0.1
 
 
 def test_what_was_done_is_forgotten_at_rest() -> None:
     hand = tool(plan())
-    beginning = hand.recorded(0)
+    beginning = hand.recorded_probe(0)
     hand.press((0.4, 0.6), -1)
     follow(hand, 0, 9)
-    hand.rest()
-    assert not hand.held
-    assert not hand.grips
-    assert hand.recorded(0) == beginning
+    hand.reset()
+    assert not hand.engaged
+    assert not hand.gripping
+    assert hand.recorded_probe(0) == beginning
 
 
 def test_at_rest_nothing_rubs() -> None:
-    assert tool(plan(motion="quasistatic")).recorded(0).friction == 0
+    assert tool(plan(motion="quasistatic")).recorded_probe(0).friction == 0

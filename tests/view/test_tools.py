@@ -8,14 +8,14 @@ import pytest
 from taichi_msm.model.loads import Schedule, average_loads
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.tools import Probe
-from taichi_msm.view.tools import RISE, HeldTool
+from taichi_msm.view.tools import RISE_TIME_S, ForceControlledTool
 from tests.scenes import plan_of, scene
 
 RATE = 50.0
 
 
-def tool() -> HeldTool:
-    return HeldTool(scene().probes[0], RATE)
+def tool() -> ForceControlledTool:
+    return ForceControlledTool(scene().probes[0], RATE)
 
 
 def with_probe(probe: Probe, frames: int) -> Scene:
@@ -30,10 +30,10 @@ def loads(probe: Probe, frame: int) -> Schedule:
     return average_loads(plan, frame * count, count)
 
 
-def percents(hand: HeldTool, first: int, count: int) -> list[float]:
+def percents(hand: ForceControlledTool, first: int, count: int) -> list[float]:
     found = []
     for frame in range(first, first + count):
-        hand.follow(frame)
+        hand.advance(frame)
         found.append(hand.percent)
     return found
 
@@ -55,8 +55,8 @@ def test_every_frame_has_the_loads_of_the_record(seed: int) -> None:
                 hand.strength = float(rng.integers(0, 101))
             else:
                 hand.move(place)
-        seen.append(hand.follow(frame) or seen[-1])
-    record = hand.recorded(frames)
+        seen.append(hand.advance(frame) or seen[-1])
+    record = hand.recorded_probe(frames)
     for frame, probe in enumerate(seen):
         now, then = loads(probe, frame), loads(record, frame)
         np.testing.assert_array_equal(now.strength, then.strength)
@@ -70,11 +70,11 @@ def test_a_hand_takes_time_to_press_and_none_to_let_go() -> None:
     hand = tool()
     hand.press((0.4, 0.6), 1)
     rise = percents(hand, 0, 12)
-    assert rise[:10] == pytest.approx(list(np.arange(1, 11) * 100 / (RISE * RATE)))
+    assert rise[:10] == pytest.approx(list(np.arange(1, 11) * 100 / (RISE_TIME_S * RATE)))
     assert rise[10:] == [100.0, 100.0]
     hand.release()
     assert percents(hand, 12, 2) == [0.0, 0.0]
-    load = hand.recorded(14).load
+    load = hand.recorded_probe(14).load
     assert (12 / RATE, 100.0) in load
     assert (12 / RATE, 0.0) in load
     assert len(load) == 1 + 10 + 3, "what does not change needs no keys"
@@ -99,9 +99,9 @@ def test_pressing_elsewhere_at_once_lets_go_for_a_frame() -> None:
     percents(hand, 0, 5)
     hand.press((0.8, 0.8), 1)
     assert percents(hand, 5, 2) == pytest.approx([0, 10])
-    at = np.array(hand.recorded(7).at)
+    at = np.array(hand.recorded_probe(7).at)
     assert (np.diff(at[:, 0]) > 0).all(), "a control point that jumps would need a kernel of its own"
-    assert hand.place == (0.8, 0.8)
+    assert hand.position == (0.8, 0.8)
 
 
 def test_clicks_while_time_stands_still_are_one() -> None:
@@ -109,37 +109,37 @@ def test_clicks_while_time_stands_still_are_one() -> None:
     for n in range(50):
         hand.press((n / 100, 0.123456), 1)
         hand.release()
-    assert hand.goal == (0.49, 0.123456)
+    assert hand.target == (0.49, 0.123456)
     assert percents(hand, 0, 4) == pytest.approx([10, 0, 0, 0])
-    assert hand.place == (0.49, 0.123456)
+    assert hand.position == (0.49, 0.123456)
 
 
 def test_what_it_is_asked_for_last_is_its_goal() -> None:
     hand = tool()
     hand.press((0.2, 0.2), 1)
-    assert hand.goal == (0.2, 0.2)
-    hand.follow(0)
+    assert hand.target == (0.2, 0.2)
+    hand.advance(0)
     hand.move((0.3, 0.2))
-    assert (hand.goal, hand.place) == ((0.3, 0.2), (0.2, 0.2))
+    assert (hand.target, hand.position) == ((0.3, 0.2), (0.2, 0.2))
     hand.press((0.7, 0.2), 1)
-    assert hand.goal == (0.7, 0.2)
+    assert hand.target == (0.7, 0.2)
     hand.move((0.8, 0.2))
-    assert hand.goal == (0.8, 0.2)
+    assert hand.target == (0.8, 0.2)
 
 
 def test_the_control_point_stays_on_the_sheet() -> None:
     hand = tool()
     hand.press((-0.5, 1.5), 1)
-    hand.follow(0)
-    assert hand.place == (0.0, 1.0)
+    hand.advance(0)
+    assert hand.position == (0.0, 1.0)
 
 
 def test_it_moves_along_a_line_within_a_frame() -> None:
     hand = tool()
     hand.press((0.2, 0.2), 1)
-    hand.follow(0)
+    hand.advance(0)
     hand.move((0.4, 0.2))
-    probe = hand.follow(1)
+    probe = hand.advance(1)
     assert probe is not None
     points = loads(probe, 1).point[:, 0, 0]
     width = 0.4
@@ -151,19 +151,19 @@ def test_it_moves_along_a_line_within_a_frame() -> None:
 def test_what_was_asked_for_is_forgotten_at_rest() -> None:
     hand = tool()
     hand.press((0.2, 0.2), 1)
-    hand.follow(0)
-    hand.rest()
-    assert not hand.held
+    hand.advance(0)
+    hand.reset()
+    assert not hand.engaged
     assert percents(hand, 0, 2) == [0, 0]
-    assert hand.recorded(2).load == ((0.0, 0.0), (2 / RATE, 0.0))
+    assert hand.recorded_probe(2).load == ((0.0, 0.0), (2 / RATE, 0.0))
 
 
 def test_what_stays_as_it_is_is_not_told_again() -> None:
     hand = tool()
-    assert hand.follow(0) is not None, "the one who is told may have an older probe"
-    assert hand.follow(1) is None
+    assert hand.advance(0) is not None, "the one who is told may have an older probe"
+    assert hand.advance(1) is None
     hand.press((0.2, 0.2), 1)
-    told = [hand.follow(frame) is not None for frame in range(2, 20)]
+    told = [hand.advance(frame) is not None for frame in range(2, 20)]
     assert told == [True] * 10 + [False] * 8
-    hand.rest()
-    assert hand.follow(0) is not None
+    hand.reset()
+    assert hand.advance(0) is not None

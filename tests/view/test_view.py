@@ -23,9 +23,9 @@ from taichi_msm import load_scene
 from taichi_msm.cli.main import main
 from taichi_msm.errors import SceneError
 from taichi_msm.scene.scene import Scene
-from taichi_msm.view.events import Drag, Harder, Hover, Key, Percent, Press, Release, Turn
-from taichi_msm.view.script import load_script, timed
-from taichi_msm.view.window import LONGEST, QUIT, Hand, Pacing, opening, placed
+from taichi_msm.view.events import Drag, Hover, Key, Press, Release, Strength, StrengthChange, Turn
+from taichi_msm.view.script import load_script, schedule_events
+from taichi_msm.view.window import MAX_DELAY_S, QUIT, InputReader, Pacing, fit_picture, initial_window_size
 from tests.conftest import Program
 from tests.outputs import duration
 from tests.telling import Telling
@@ -181,14 +181,14 @@ events:
   - {t: 0.7, do: key, name: m}
 """
     )
-    assert list(timed(load_script(tmp_path / "s.yaml", (200, 100)), 10.0, (200, 100))) == [
+    assert list(schedule_events(load_script(tmp_path / "s.yaml", (200, 100)), 10.0, (200, 100))) == [
         (1, Press(19.5, 39.5, pull=True)),
         (2, Drag(39.5, 59.5)),
         (3, Drag(59.5, 79.5)),
         (4, Release()),
         (5, Turn(10.0, 4.0)),
         (6, Turn(10.0, 4.0)),
-        (7, Percent(40)),
+        (7, Strength(40)),
         (7, Key("m")),
     ]
 
@@ -222,7 +222,7 @@ def test_a_script_is_taken_event_by_event(tmp_path: Path) -> None:
     """An hour at a million frames a second has 3.6e9 of them."""
     text = "events: [{t: 0, do: press, at: [1, 1]}, {t: 1, do: drag, at: [9, 9], seconds: 3599}]"
     (tmp_path / "s.yaml").write_text(text)
-    events = timed(load_script(tmp_path / "s.yaml", (20, 20)), 1e6, (20, 20))
+    events = schedule_events(load_script(tmp_path / "s.yaml", (20, 20)), 1e6, (20, 20))
     assert [frame for frame, _ in islice(events, 3)] == [0, 1_000_000, 1_000_001]
 
 
@@ -284,7 +284,7 @@ def key_up(code: int) -> pygame.Event:
 
 
 def test_what_the_hand_does() -> None:
-    hand = Hand((400, 300))
+    hand = InputReader((400, 300))
 
     def understood(*told: pygame.Event) -> list[Any]:
         return list(hand.events(told, AREA))
@@ -303,8 +303,9 @@ def test_what_the_hand_does() -> None:
     ]
     assert understood(button(2, 1, 1), motion(2, 2), let_go(2, 2, 2)) == [Hover(2, 2)]
     # The wheel is reported as buttons 4 and 5, too.
-    assert understood(button(4, 0, 0), let_go(4, 0, 0), pygame.Event(pygame.MOUSEWHEEL, x=0, y=1)) == [Harder(5)]
-    assert understood(pygame.Event(pygame.MOUSEWHEEL, x=1, y=-2)) == [Harder(-10)]
+    wheel = button(4, 0, 0), let_go(4, 0, 0), pygame.Event(pygame.MOUSEWHEEL, x=0, y=1)
+    assert understood(*wheel) == [StrengthChange(5)]
+    assert understood(pygame.Event(pygame.MOUSEWHEEL, x=1, y=-2)) == [StrengthChange(-10)]
     assert understood(pygame.Event(pygame.MOUSEWHEEL, x=1, y=0)) == []
     assert understood(pygame.Event(pygame.QUIT)) == [QUIT]
 
@@ -335,7 +336,7 @@ def test_what_the_hand_does() -> None:
     ],
 )
 def test_keys_are_what_they_type(event: pygame.Event, name: str | None) -> None:
-    hand = Hand((400, 300))
+    hand = InputReader((400, 300))
     expected = [Key(name)] if name else []
     assert list(hand.events([event, key_up(event.key)], AREA)) == expected
     assert list(hand.events([event] * 3, AREA)) == expected * (3 if name in ("up", "down") else 1), "held down"
@@ -343,19 +344,19 @@ def test_keys_are_what_they_type(event: pygame.Event, name: str | None) -> None:
 
 def test_a_hand_lets_go_where_another_window_gets_the_release() -> None:
     lost = pygame.Event(pygame.WINDOWFOCUSLOST)
-    pressing, turning = Hand((400, 300)), Hand((400, 300))
+    pressing, turning = InputReader((400, 300)), InputReader((400, 300))
     told = [button(1, 9, 9), lost, motion(5, 5), let_go(1, 5, 5)]
     assert list(pressing.events(told, AREA)) == [Press(9, 9), Release(), Hover(5, 5)]
     assert list(turning.events([button(3, 9, 9), lost, motion(5, 5)], AREA)) == [Hover(5, 5)]
 
 
 def test_a_picture_fills_its_window_and_pixels_are_found_in_it() -> None:
-    assert placed((400, 300), (400, 300)) == AREA
-    assert placed((400, 300), (1000, 600)) == pygame.Rect(100, 0, 800, 600)
-    assert placed((400, 300), (200, 800)) == pygame.Rect(0, 325, 200, 150)
-    assert placed((400, 300), (1, 1)).size == (1, 1)
+    assert fit_picture((400, 300), (400, 300)) == AREA
+    assert fit_picture((400, 300), (1000, 600)) == pygame.Rect(100, 0, 800, 600)
+    assert fit_picture((400, 300), (200, 800)) == pygame.Rect(0, 325, 200, 150)
+    assert fit_picture((400, 300), (1, 1)).size == (1, 1)
     told = [motion(100, 0), motion(101, 1), motion(899, 599), motion(99, 600)]
-    assert list(Hand((400, 300)).events(told, placed((400, 300), (1000, 600)))) == [
+    assert list(InputReader((400, 300)).events(told, fit_picture((400, 300), (1000, 600)))) == [
         # Every pixel takes 2 x 2; the first of them is a quarter of a pixel from its centre.
         Hover(-0.25, -0.25),
         Hover(0.25, 0.25),
@@ -369,7 +370,7 @@ def test_a_picture_fills_its_window_and_pixels_are_found_in_it() -> None:
     [((1920, 1080), (512, 512)), ((3840, 2160), (1024, 1024)), ((1100, 3840), (512, 512)), ((640, 480), (480, 480))],
 )
 def test_a_window_opens_as_large_as_its_screen_asks_for(screen: tuple[int, int], size: tuple[int, int]) -> None:
-    assert opening((512, 512), screen) == size
+    assert initial_window_size((512, 512), screen) == size
 
 
 class Clock:
@@ -386,12 +387,12 @@ def shown(clock: Clock, stepping: float, drawing: float, seconds: float) -> tupl
     """Let a machine that needs so long for a frame and a picture work for some time; the frames, and what is said."""
     pacing, frames = Pacing(50.0, clock), 0
     while clock.now < seconds:
-        clock.now += pacing.wait()
-        for _ in pacing.due():
+        clock.now += pacing.delay_s()
+        for _ in pacing.due_frames():
             clock.now += stepping
             frames += 1
         clock.now += drawing
-    return frames, pacing.said()
+    return frames, pacing.status()
 
 
 @pytest.mark.parametrize(
@@ -415,7 +416,7 @@ def test_what_was_missed_is_not_made_up_for() -> None:
     clock = Clock()
     pacing = Pacing(50.0, clock)
     clock.now = 60.0
-    assert len(list(pacing.due())) <= LONGEST * 50 + 1
+    assert len(list(pacing.due_frames())) <= MAX_DELAY_S * 50 + 1
 
 
 class Screen:
