@@ -154,7 +154,7 @@ def as_array(values: Any, name: str) -> NDArray[Any]:
         raise ArgumentError(f"{name}: {error}; take an array") from None
 
 
-def are_numbers(array: NDArray[Any], shape: tuple[int, ...]) -> bool:
+def is_real_array(array: NDArray[Any], shape: tuple[int, ...]) -> bool:
     """Tell whether an array holds real numbers and has a shape."""
     return array.dtype.kind in "fiu" and array.shape == shape
 
@@ -175,7 +175,7 @@ def require_path(path: str | Path, name: str = "directory", remedy: str = "take 
 Pause = Callable[[], None]
 
 # Called with how much is done and how much there is in all.
-Count = Callable[[int, int], None]
+ProgressCallback = Callable[[int, int], None]
 
 # Called with the stage of the work, then the same two.
-Progress = Callable[[str, int, int], None]
+StageProgressCallback = Callable[[str, int, int], None]

@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from PIL import Image
 
 PICTURE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
-SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
 # The kinds of pixels, by Pillow's names, whose colours are defined; 32-bit and floating-point greys can have any range.
 _MODES_16_BIT = ("I;16", "I;16L", "I;16B", "I;16N")
 _MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCbCr", *_MODES_16_BIT)
 
 # The longest side of a picture. Pillow needs memory and time for every row, and a picture of one column has many.
-MAX_SIDE = 65535
+MAX_SIDE_PX = 65535
 
 # The largest file: as many pixels as Pillow takes, with 16 bits of four channels, are smaller.
 MAX_BYTES = 2**31
@@ -50,7 +50,7 @@ class PictureError(Exception):
 
 
 @contextmanager
-def copied(copies: Mapping[str, Path]) -> Iterator[None]:
+def use_copies(copies: Mapping[str, Path]) -> Iterator[None]:
     """In a block, read copies of some files, by the paths by which they are known."""
     global _copies
     around, _copies = _copies, copies
@@ -110,7 +110,7 @@ def file_sha256(path: str) -> str:
     """Compute the SHA-256 of a file, in hexadecimal."""
     _require_file(path)
     try:
-        with location(path).open("rb") as file:
+        with actual_path(path).open("rb") as file:
             return _sha256(file)
     except OSError as error:
         raise _unreadable(path, error) from None
@@ -132,8 +132,8 @@ def _open(path: str, sha256: str | None = None) -> Iterator[Image.Image]:
         warnings.simplefilter("error", Image.DecompressionBombWarning)
         try:
             with _file(path, sha256) as file, Image.open(file, formats=PICTURE_FORMATS) as image:
-                if max(image.size) > MAX_SIDE:
-                    said = f"has {image.width} x {image.height} pixels; a side may have at most {MAX_SIDE}, cut it"
+                if max(image.size) > MAX_SIDE_PX:
+                    said = f"has {image.width} x {image.height} pixels; a side may have at most {MAX_SIDE_PX}, cut it"
                     raise PictureError(f"{path} {said}")
                 if image.format in ("JPEG", "MPO"):
                     scans = _scans(file)
@@ -159,7 +159,7 @@ def _open(path: str, sha256: str | None = None) -> Iterator[Image.Image]:
 @contextmanager
 def _file(path: str, sha256: str | None) -> Iterator[BinaryIO]:
     """Open a file, which must have a SHA-256 if one is given; raises PictureError."""
-    with location(path).open("rb") as file:
+    with actual_path(path).open("rb") as file:
         if sha256 is not None:
             if _sha256(file) != sha256:
                 raise PictureError(f"{path} is not the file that was run, as its SHA-256 tells; put that one back")
@@ -188,7 +188,7 @@ def _scans(file: BinaryIO) -> int:
     return scans
 
 
-def irregular(path: Path) -> str:
+def irregular_kind(path: Path) -> str:
     """Say what a path is instead of a regular file, without opening it: opening a pipe would wait for its other end."""
     mode = path.stat().st_mode
     if stat.S_ISREG(mode):
@@ -196,21 +196,21 @@ def irregular(path: Path) -> str:
     return "a directory" if stat.S_ISDIR(mode) else "not a regular file"
 
 
-def location(path: str) -> Path:
+def actual_path(path: str) -> Path:
     """Find where a file is that is known by a path: there, or its copy."""
     return _copies.get(path) or Path(path)
 
 
 def _require_file(path: str) -> None:
     try:
-        kind = irregular(location(path))
+        kind = irregular_kind(actual_path(path))
     except ValueError:
         raise PictureError(f"{path} is not a path; name a picture") from None
     except OSError as error:
         raise _unreadable(path, error) from None
     if kind:
         raise PictureError(f"{path} is {kind}; name a picture")
-    if location(path).stat().st_size > MAX_BYTES:
+    if actual_path(path).stat().st_size > MAX_BYTES:
         raise PictureError(f"{path} is larger than {MAX_BYTES >> 30} GiB; scale it down")
 
 

@@ -33,4 +33,4 @@ STYLE = {
 }
 
 DPI = 200
-WIDE, NARROW = 9.0, 6.0  # [in]: with two columns, with one
+TWO_COLUMN_WIDTH, ONE_COLUMN_WIDTH = 9.0, 6.0  # [in]: with two columns, with one

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.accuracy.companions import fine_steps
 from taichi_msm.accuracy.divergence import farthest_displacement
-from taichi_msm.errors import Count, Pause, SceneError
+from taichi_msm.errors import Pause, ProgressCallback, SceneError
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.tools import overlap
@@ -74,12 +74,14 @@ def order(plan: Plan) -> int:
     return 1 if backward or plan.tools else 2
 
 
-def estimate_error(plan: Plan, device: Device, progress: Count = lambda done, total: None) -> Estimate:
+def estimate_error(plan: Plan, device: Device, progress: ProgressCallback = lambda done, total: None) -> Estimate:
     """Estimate the error of a run; progress counts frames."""
     return Trials(plan, device).estimate(plan.grid.steps_per_frame, progress)
 
 
-def choose_step(plan: Plan, device: Device, progress: Count = lambda done, total: None) -> tuple[Plan, Estimate]:
+def choose_step(
+    plan: Plan, device: Device, progress: ProgressCallback = lambda done, total: None
+) -> tuple[Plan, Estimate]:
     """Find the largest stable step whose estimated error is within the scene's tolerance, and this error.
 
     No fewer steps than the plan's are tried; progress counts the frames of each pilot run.
@@ -224,7 +226,7 @@ class Trials:
         self._pilot = Pilot(plan, fine_steps(plan), device)
         self._own = Dynamics(plan, device)
 
-    def estimate(self, steps: int, progress: Count) -> Estimate:
+    def estimate(self, steps: int, progress: ProgressCallback) -> Estimate:
         """Run the scene with so many steps per frame, and estimate its error; progress counts frames."""
         plan = self._plan.with_grid(steps_per_frame=steps)
         fine, frames = fine_steps(plan), plan.grid.frames

@@ -16,7 +16,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from taichi_msm.errors import ArgumentError, Count, FilesError, SceneError, did_you_mean, require_path, writing
+from taichi_msm.errors import (
+    ArgumentError,
+    FilesError,
+    ProgressCallback,
+    SceneError,
+    did_you_mean,
+    require_path,
+    writing,
+)
 from taichi_msm.exports.formats import ANY, FORMATS, Source, Write, read_runs
 from taichi_msm.runs.directory import Contents, Listed, Publication, add, create, files, without_link
 from taichi_msm.runs.finished import PUT_BACK, FinishedRun
@@ -52,7 +60,7 @@ def export(
     runs: str | Path | Sequence[str | Path],
     format: str,  # noqa: A002
     out: str | Path | None = None,
-    progress: Count = lambda done, total: None,
+    progress: ProgressCallback = lambda done, total: None,
     camera: str | None = None,
 ) -> Exported:
     """Convert the results of runs for another program, whole or not at all.
@@ -128,7 +136,9 @@ def _views(run: FinishedRun, name: str, camera: str | None) -> list[FinishedRun]
     raise FilesError(f"{run.directory}: {said}")
 
 
-def _convert(views: Sequence[Sequence[FinishedRun]], name: str, directory: Path, progress: Count) -> Exported:
+def _convert(
+    views: Sequence[Sequence[FinishedRun]], name: str, directory: Path, progress: ProgressCallback
+) -> Exported:
     """Convert runs, one or more, as the cameras have seen them that the format shows."""
     runs = [run for run, *_ in views]
     wanted, total, done = FORMATS[name], sum(run.frames for run in runs), 0
@@ -159,7 +169,7 @@ def _convert(views: Sequence[Sequence[FinishedRun]], name: str, directory: Path,
     return Exported(directory, written, [*(_told(note, of) if len(runs) > 1 else note for note, of in notes.items())])
 
 
-def _count(progress: Count, before: int, frames: int, total: int, done: int, parts: int) -> None:
+def _count(progress: ProgressCallback, before: int, frames: int, total: int, done: int, parts: int) -> None:
     """Report the progress of a run as that of all runs."""
     progress(before + frames * done // parts, total)
 

@@ -11,7 +11,7 @@ from functools import wraps
 from pathlib import Path
 from typing import NamedTuple
 
-from taichi_msm.errors import Count, FilesError
+from taichi_msm.errors import FilesError, ProgressCallback
 from taichi_msm.runs.directory import MAX_RECORD, files
 from taichi_msm.runs.finished import FinishedRun, read_run, reading
 from taichi_msm.scene.outputs import NUMBERED, RECORD, RUNS, SWEEP
@@ -89,7 +89,7 @@ class Source(NamedTuple):
 
     run: FinishedRun  # as the first camera that the format shows has seen it
     name: str  # its number among the runs; empty if it is the only one
-    progress: Count  # of this run
+    progress: ProgressCallback  # of this run
 
 
 # Writes the files of all runs into an empty folder. It is a generator: after each run it gives what the user should
@@ -97,7 +97,7 @@ class Source(NamedTuple):
 Write = Callable[[Sequence[Source], Path], Iterator[list[str]]]
 
 
-def in_folders(write: Callable[[FinishedRun, Path, Count], list[str]]) -> Write:
+def in_folders(write: Callable[[FinishedRun, Path, ProgressCallback], list[str]]) -> Write:
     """Make a format of what writes one run into an empty folder."""
 
     @wraps(write)

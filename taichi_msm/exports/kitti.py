@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import Count, FilesError
+from taichi_msm.errors import FilesError, ProgressCallback
 from taichi_msm.exports.formats import Source
 from taichi_msm.runs.arrays import read_flo
 from taichi_msm.runs.directory import MAX_RECORD, add
@@ -58,7 +58,7 @@ def write(sources: Sequence[Source], folder: Path) -> Iterator[list[str]]:
         first += source.run.frames - 1
 
 
-def _write_run(run: FinishedRun, training: Path, first: int, progress: Count) -> list[str]:
+def _write_run(run: FinishedRun, training: Path, first: int, progress: ProgressCallback) -> list[str]:
     """Write the pairs of a run, numbered from the first on."""
     pairs = run.frames - 1
     if pairs == 0:

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from taichi_msm.errors import Count
+from taichi_msm.errors import ProgressCallback
 from taichi_msm.exports.formats import Source
 from taichi_msm.exports.inputs import read_pinhole, read_places, read_tracks
 from taichi_msm.runs.arrays import write_arrays
@@ -46,7 +46,7 @@ def write(sources: Sequence[Source], folder: Path) -> Iterator[list[str]]:
         yield _write_run(run, folder / f"{name or numbered(0)}.npz", progress)
 
 
-def _write_run(run: FinishedRun, path: Path, progress: Count) -> list[str]:
+def _write_run(run: FinishedRun, path: Path, progress: ProgressCallback) -> list[str]:
     camera, (points, occluded), (_, position) = read_pinhole(run, NAME), read_tracks(run), read_places(run)
     images = []
     for frame in range(run.frames):

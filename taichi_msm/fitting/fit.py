@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from typing_extensions import Unpack
 
 from taichi_msm.accuracy.mesh import WITH_CONTACT
-from taichi_msm.errors import Progress, SceneError, writing
+from taichi_msm.errors import SceneError, StageProgressCallback, writing
 from taichi_msm.fitting import rejection
 from taichi_msm.fitting import result as result_module
 from taichi_msm.fitting.checks import faults, faults_beside, faults_of_best, moved
@@ -68,7 +68,7 @@ def fit(
     forces: tuple[str | Path, float] | None = None,
     directory: str | Path | None = None,
     workers: int | None = None,
-    progress: Progress = lambda stage, done, total: None,
+    progress: StageProgressCallback = lambda stage, done, total: None,
     **method: Unpack[Method],
 ) -> FitResult:
     """Find the numbers of a scene with which it moves as was seen, and how well they are known.

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.accuracy.mesh import coarser, estimate_points
-from taichi_msm.errors import DivergedError, ExecutorError, Pause, Progress, SceneError
+from taichi_msm.errors import DivergedError, ExecutorError, Pause, SceneError, StageProgressCallback
 from taichi_msm.fitting.observations import Observations, Sight, between, in_frames
 from taichi_msm.fitting.parameters import Parameter, as_data, with_values
 from taichi_msm.load import cost
@@ -217,7 +217,7 @@ class Runs:
         progress: called often, with the stage, the runs done and those that are expected; what it raises stops.
     """
 
-    def __init__(self, job: Job, workers: int | None, progress: Progress) -> None:
+    def __init__(self, job: Job, workers: int | None, progress: StageProgressCallback) -> None:
         self.job, self.count, self.expected = job, 0, 0
         self._workers, self._progress = workers, progress
         self._predictor = Predictor(job, threads=None)

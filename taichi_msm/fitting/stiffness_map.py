@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.accuracy.mesh import coarser
-from taichi_msm.errors import Progress, SceneError
+from taichi_msm.errors import SceneError, StageProgressCallback
 from taichi_msm.fitting.checks import faults, faults_beside
 from taichi_msm.fitting.observations import Observations, Sight
 from taichi_msm.fitting.parameters import Bounds, rounded
@@ -93,7 +93,7 @@ def map_task(scene: Scene, free: Sequence[str], bounds: Mapping[str, Bounds], re
     return MapTask(resolution, (low, high))
 
 
-def fit_map(given: Scene, seen: Observations, task: MapTask, image: str, progress: Progress) -> FitResult:
+def fit_map(given: Scene, seen: Observations, task: MapTask, image: str, progress: StageProgressCallback) -> FitResult:
     """Find a map; image: the path of its picture in the scene that is given back.
 
     Raises:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from taichi_msm.accuracy.mesh import MeshEstimate, choose_points
 from taichi_msm.accuracy.time_step import Estimate, choose_step
-from taichi_msm.errors import Count
+from taichi_msm.errors import ProgressCallback
 from taichi_msm.load.check import checked
 from taichi_msm.model.plan import Plan
 from taichi_msm.solver import planning
@@ -22,7 +22,7 @@ class Resolved(NamedTuple):
     mesh: MeshEstimate | None  # the error of the points, if a tolerance of the sheet required it
 
 
-def resolve(plan: Plan, device: Device, progress: Count = lambda done, total: None) -> Resolved:
+def resolve(plan: Plan, device: Device, progress: ProgressCallback = lambda done, total: None) -> Resolved:
     """Choose what a checked scene leaves open, by pilot runs where it has tolerances; SceneError: none meet them."""
     estimate = mesh = None
     plan = planning.on(plan, device.arch)

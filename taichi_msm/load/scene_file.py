@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from taichi_msm.errors import ArgumentError, Key, Problem, SceneError
-from taichi_msm.images import SUFFIXES, file_sha256, irregular
+from taichi_msm.images import PICTURE_SUFFIXES, file_sha256, irregular_kind
 from taichi_msm.load.check import validate
 from taichi_msm.load.yaml_reader import MAX_DEPTH, Document, Mark, UnreadableError, mark_at, read
 from taichi_msm.model.plan import Plan
@@ -327,7 +327,7 @@ def read_file(name: str, kind: Kind) -> File:
 def _read_text(name: str, kind: Kind) -> str:
     path = Path(name)
     try:
-        if what := irregular(path):
+        if what := irregular_kind(path):
             raise SceneError([f"{name}: {what}; name a {kind.name} file"])
         with path.open("rb") as file:
             raw = file.read(MAX_BYTES + 1).removeprefix(codecs.BOM_UTF8)
@@ -340,7 +340,7 @@ def _read_text(name: str, kind: Kind) -> str:
     try:
         return raw.decode()
     except UnicodeDecodeError as error:
-        if path.suffix.lower() in SUFFIXES:
+        if path.suffix.lower() in PICTURE_SUFFIXES:
             by = ", and the picture by --image" if kind is SCENE else ""
             raise SceneError([f"{name}: a picture; name a {kind.name}{by}"]) from None
         before = raw[: error.start].decode()

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from taichi_msm.images import irregular, location
+from taichi_msm.images import actual_path, irregular_kind
 from taichi_msm.scene.section import LARGEST as MOST
 from taichi_msm.scene.section import cut
 
@@ -379,9 +379,9 @@ def pose_fault(row: Sequence[float], before: Sequence[float] | None) -> str:
 
 
 def _read(name: str) -> str:
-    path = location(name)
+    path = actual_path(name)
     try:
-        if what := irregular(path):
+        if what := irregular_kind(path):
             raise CameraFileError(f"{name}: {what}; name a file")
         with path.open("rb") as file:
             raw = file.read(MAX_BYTES + 1)

@@ -24,8 +24,8 @@ from distributed.client import ClosedClientError
 from distributed.comm import connect
 from distributed.utils import LoopRunner, silence_logging_cmgr
 
-from taichi_msm.errors import ExecutorError, LostExecutorError, MsmError, Progress
-from taichi_msm.images import copied
+from taichi_msm.errors import ExecutorError, LostExecutorError, MsmError, StageProgressCallback
+from taichi_msm.images import use_copies
 from taichi_msm.scene.outputs import SWEEP
 from taichi_msm.sweeps.runs import Outcome, Task, take
 from taichi_msm.sweeps.spec import Sweep
@@ -144,7 +144,7 @@ def _cancel(answer: Future[Any]) -> None:
 
 def _call(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
     """Call a function in a worker, where the files are those that it was sent."""
-    with copied(_inputs(name).copies):
+    with use_copies(_inputs(name).copies):
         return function(*arguments)
 
 
@@ -171,7 +171,7 @@ def _inputs(name: str) -> Inputs:
 
 
 @contextmanager
-def connected(address: str, described: Sweep, directory: Path, progress: Progress) -> Iterator[Cluster]:
+def connected(address: str, described: Sweep, directory: Path, progress: StageProgressCallback) -> Iterator[Cluster]:
     """Use the workers of a scheduler for a sweep, once there is one; at the end they forget it.
 
     Raises:
@@ -235,7 +235,7 @@ def _bring(inputs: Inputs, name: str, client: Any) -> None:
         raise ExecutorError(f"a worker cannot take runs: {error}; install there what is here") from None
 
 
-def _wait(client: Any, progress: Progress) -> None:
+def _wait(client: Any, progress: StageProgressCallback) -> None:
     """Wait for the first worker."""
     try:
         while not client.nthreads():

@@ -38,8 +38,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
-from taichi_msm.errors import FilesError, Progress, printable
-from taichi_msm.plot_style import BLUE, DPI, GREY, INK, NARROW, ORANGE, PALE, STYLE, VERMILION
+from taichi_msm.errors import FilesError, StageProgressCallback, printable
+from taichi_msm.plot_style import BLUE, DPI, GREY, INK, ONE_COLUMN_WIDTH, ORANGE, PALE, STYLE, VERMILION
 from taichi_msm.runs.directory import replacing
 from taichi_msm.runs.finished import read_run, reading
 from taichi_msm.sweeps.runs import CONTACT, POLL_INTERVAL_S, SweepResult
@@ -87,7 +87,7 @@ def plot(content: Content, file: BinaryIO) -> None:
 def _figure(content: Content) -> Figure:
     indices = {(index.result, index.parameter): index for index in content.indices}
     parameters = _most_sensitive(content)
-    size = max(BESIDE + WIDTH * len(parameters), NARROW), AROUND + HEIGHT * len(content.results)
+    size = max(BESIDE + WIDTH * len(parameters), ONE_COLUMN_WIDTH), AROUND + HEIGHT * len(content.results)
     figure = Figure(figsize=size, dpi=DPI, layout=ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.06))
     FigureCanvasAgg(figure)
     figure.suptitle(printable(content.title), x=0.01, ha="left", parse_math=False)
@@ -219,7 +219,9 @@ class Tile(NamedTuple):
     caption: list[str]  # parts between which lines may break
 
 
-def write_contact(result: SweepResult, executor: Executor, progress: Progress) -> tuple[list[str], list[str]]:
+def write_contact(
+    result: SweepResult, executor: Executor, progress: StageProgressCallback
+) -> tuple[list[str], list[str]]:
     """Write the picture, if any run has one; returns its name, and what the user should know.
 
     The executor draws the runs that have a trajectory, but no pictures.
@@ -257,7 +259,7 @@ def draw_last(directory: Path) -> NDArray[np.uint8]:
 
 
 def _last_frames(
-    directories: dict[int, Path], executor: Executor, progress: Progress
+    directories: dict[int, Path], executor: Executor, progress: StageProgressCallback
 ) -> tuple[dict[int, Image.Image], list[str]]:
     """Get the last frames of runs that are complete, and why some that should be there are not."""
     frames: dict[int, Image.Image] = {}

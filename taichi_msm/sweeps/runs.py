@@ -32,8 +32,8 @@ from taichi_msm.errors import (
     LostExecutorError,
     MsmError,
     Pause,
-    Progress,
     SceneError,
+    StageProgressCallback,
     writing,
 )
 from taichi_msm.load.scene_file import File, plan_file
@@ -250,7 +250,7 @@ class Task(NamedTuple):
         return self.folder / RUNS / numbered(self.run)
 
 
-def take(task: Task, progress: Progress = lambda stage, done, total: None) -> Outcome:
+def take(task: Task, progress: StageProgressCallback = lambda stage, done, total: None) -> Outcome:
     """Run a scene with its overrides on one thread, as `run --set` does; whatever fails is in the outcome.
 
     `progress` is called some times a second; it may raise a KeyboardInterrupt, as from `runs.run.run`.

@@ -23,7 +23,7 @@ from pydantic import ConfigDict, Field, field_validator, model_validator
 from typing_extensions import Self
 
 from taichi_msm.errors import ArgumentError, Key, Problem, SceneError
-from taichi_msm.images import SUFFIXES, PictureError, file_sha256
+from taichi_msm.images import PICTURE_SUFFIXES, PictureError, file_sha256
 from taichi_msm.load.check import parse
 from taichi_msm.load.scene_file import (
     PICTURES,
@@ -272,7 +272,7 @@ def _relocated(name: str, value: Any, folder: Path, home: Path) -> tuple[Any, li
 
 def _kind_of_file(key: Key) -> tuple[str, tuple[str, ...]]:
     """Return the noun for the file that a key names, and the ends that its name may have."""
-    return ("picture", SUFFIXES) if key in PICTURES else ("file", ("",))
+    return ("picture", PICTURE_SUFFIXES) if key in PICTURES else ("file", ("",))
 
 
 def _with_files(path: Key, value: Any, change: Callable[[Key, str], str]) -> Any:

@@ -8,7 +8,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from taichi_msm.errors import MAX_WORKERS, ArgumentError, NotInstalledError, Progress, require_path, writing
+from taichi_msm.errors import (
+    MAX_WORKERS,
+    ArgumentError,
+    NotInstalledError,
+    StageProgressCallback,
+    require_path,
+    writing,
+)
 from taichi_msm.sweeps.pool import Pool
 from taichi_msm.sweeps.runs import ENDED, Outcome, SweepResult, UnderWay, alone, begin_sweep, ended, outcomes
 from taichi_msm.sweeps.spec import make_sweep
@@ -25,7 +32,7 @@ def sweep(
     overrides: Mapping[str, Any] | None = None,
     executor: Executor | str | None = None,
     workers: int | None = None,
-    progress: Progress = lambda stage, done, total: None,
+    progress: StageProgressCallback = lambda stage, done, total: None,
 ) -> Iterator[Outcome]:
     """Run a scene many times with varied values.
 
@@ -85,7 +92,7 @@ def sweep(
 
 @contextmanager
 def opened(
-    executor: Executor | str | None, workers: int, under_way: UnderWay, progress: Progress
+    executor: Executor | str | None, workers: int, under_way: UnderWay, progress: StageProgressCallback
 ) -> Iterator[Executor]:
     """Use an executor, a cluster, or else a pool of processes here, which end with the block, at once if it raises."""
     if isinstance(executor, str):
@@ -109,7 +116,7 @@ def opened(
     pool.shutdown()
 
 
-def go_on(under_way: UnderWay, executor: Executor, progress: Progress) -> Iterator[Outcome]:
+def go_on(under_way: UnderWay, executor: Executor, progress: StageProgressCallback) -> Iterator[Outcome]:
     """Take the runs that are missing, and give their outcomes as they come; errors as for `outcomes`."""
     done = under_way.done
     for outcome in outcomes(under_way.missing, executor, lambda: progress("runs", len(done), under_way.total)):
@@ -117,7 +124,7 @@ def go_on(under_way: UnderWay, executor: Executor, progress: Progress) -> Iterat
         yield outcome
 
 
-def finish(under_way: UnderWay, executor: Executor, progress: Progress) -> tuple[list[str], list[str]]:
+def finish(under_way: UnderWay, executor: Executor, progress: StageProgressCallback) -> tuple[list[str], list[str]]:
     """Write the table and the other files of a sweep; gives their names, and what the user should know."""
     directory, total, sweep = under_way.directory, under_way.total, under_way.sweep
     with writing(directory), alone(directory, lambda: progress("runs", total, total)):

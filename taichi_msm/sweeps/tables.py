@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from taichi_msm.errors import Progress, SceneError, writing
+from taichi_msm.errors import SceneError, StageProgressCallback, writing
 from taichi_msm.load import cost as cost_module
 from taichi_msm.load.cost import rough_time
 from taichi_msm.load.scene_file import plan_file
@@ -68,7 +68,7 @@ MOST_RUNS = 4096
 Written = tuple[list[str], list[str]]
 
 
-def write_reports(result: SweepResult, executor: Executor, progress: Progress) -> Written:
+def write_reports(result: SweepResult, executor: Executor, progress: StageProgressCallback) -> Written:
     """Write them, each whole or not at all; the executor draws what the runs have not drawn.
 
     Files of an earlier call that cannot be made any more are removed.
