@@ -28,7 +28,7 @@ from taichi_msm.errors import Pause, ProgressCallback, SceneError
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.tools import overlap
-from taichi_msm.scene.section import LARGEST_TOLERANCE
+from taichi_msm.scene.section import MAX_TOLERANCE
 from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.system.runtime import Device
 
@@ -204,7 +204,7 @@ class Pilot:
         if not self._same:
             rounding, in_f64 = 0.0 if self._parted else error, error
         steps, contact = self._plan.grid.steps_per_frame, bool(self._plan.tools)
-        at_least = contact and (self._overlap or error > LARGEST_TOLERANCE)
+        at_least = contact and (self._overlap or error > MAX_TOLERANCE)
         return Estimate(steps, error, rounding, in_f64, self._order, self._parted, at_least, contact)
 
 
@@ -297,7 +297,7 @@ def _out_of_reach(tolerance: float, failures: list[Estimate]) -> str:
         )
     weaker = "move the tools less deep, or take" if last.at_most else "take a weaker load or"
     remedy = f"{weaker} a shorter time"
-    if best.error < LARGEST_TOLERANCE / 2:
+    if best.error < MAX_TOLERANCE / 2:
         remedy += f", or a tolerance of {_above(best.error):g}"
     return (
         f"time.tolerance: {tolerance:g} is out of reach: with {last.steps_per_frame} steps a frame the error is still "

@@ -28,7 +28,7 @@ from taichi_msm.errors import (
 from taichi_msm.exports.formats import ANY, FORMATS, Source, Write, read_runs
 from taichi_msm.runs.directory import Contents, Listed, Publication, add, create, files, without_link
 from taichi_msm.runs.finished import PUT_BACK, FinishedRun
-from taichi_msm.scene.outputs import OUTPUTS, numbered
+from taichi_msm.scene.outputs import OUTPUTS, zero_padded
 
 # The file that lists the others, and that which leads from numbers to runs.
 RECORD, INDEX = "export.json", "index.csv"
@@ -123,7 +123,7 @@ def _views(run: FinishedRun, name: str, camera: str | None) -> list[FinishedRun]
     shown = wanted.cameras
     if shown == ANY and camera is not None and camera in known:
         return [replace(run, camera=camera)]
-    seen = [key for key in (*wanted.needs, *wanted.uses) if OUTPUTS[key].is_seen and key in run.scene.output]
+    seen = [key for key in (*wanted.needs, *wanted.uses) if OUTPUTS[key].is_camera_output and key in run.scene.output]
     if not shown or (shown == ANY and not (known and seen)):
         return [run]
     said = f"its cameras are {', '.join(known)}" if known else "it has one camera, without a name"
@@ -146,7 +146,7 @@ def _convert(
     sources = []
     for number, run in enumerate(runs):
         own = partial(_count, progress, done, run.frames, total)
-        sources.append(Source(run, numbered(number) if len(runs) > 1 else "", own))
+        sources.append(Source(run, zero_padded(number) if len(runs) > 1 else "", own))
         done += run.frames
     progress(0, total)
     notes: dict[str, list[Path]] = {}
@@ -203,4 +203,4 @@ def _write_index(runs: Sequence[FinishedRun], pairs: bool, path: Path) -> None:
     with io.TextIOWrapper(create(path), "utf-8", "surrogateescape", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["number", "run", *(["frame"] if pairs else [])])
-        writer.writerows([numbered(number), *row] for number, row in enumerate(rows))
+        writer.writerows([zero_padded(number), *row] for number, row in enumerate(rows))

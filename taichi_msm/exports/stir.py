@@ -40,7 +40,7 @@ from taichi_msm.runs import media
 from taichi_msm.runs.directory import add, create
 from taichi_msm.runs.finished import FinishedRun
 from taichi_msm.scene import outputs
-from taichi_msm.scene.outputs import numbered
+from taichi_msm.scene.outputs import zero_padded
 
 NAME, SIDES = "stir", ("left", "right")
 
@@ -66,7 +66,7 @@ def write(sources: Sequence[Source], folder: Path) -> Iterator[list[str]]:
     if not outputs.is_pyav_installed():
         raise NotInstalledError(f"--format {outputs.PYAV_NOT_INSTALLED.replace('mp4', NAME, 1)}")
     for run, name, progress in sources:
-        yield _write_run(run, folder / (name or numbered(0)), progress)
+        yield _write_run(run, folder / (name or zero_padded(0)), progress)
 
 
 def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:

@@ -32,7 +32,7 @@ from taichi_msm.exports.inputs import read_pinhole, read_places, read_tracks
 from taichi_msm.runs.arrays import write_arrays
 from taichi_msm.runs.directory import create
 from taichi_msm.runs.finished import FinishedRun
-from taichi_msm.scene.outputs import numbered
+from taichi_msm.scene.outputs import zero_padded
 
 NAME = "tapvid3d"
 
@@ -43,7 +43,7 @@ QUALITY, SUBSAMPLING = 95, 0
 def write(sources: Sequence[Source], folder: Path) -> Iterator[list[str]]:
     """Write the tracks of runs and their frames; raises what `read_pinhole` does."""
     for run, name, progress in sources:
-        yield _write_run(run, folder / f"{name or numbered(0)}.npz", progress)
+        yield _write_run(run, folder / f"{name or zero_padded(0)}.npz", progress)
 
 
 def _write_run(run: FinishedRun, path: Path, progress: ProgressCallback) -> list[str]:

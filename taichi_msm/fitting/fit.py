@@ -49,7 +49,7 @@ from taichi_msm.fitting.predict import Job, Predicted, Runs, runnable
 from taichi_msm.fitting.report import publication, write_report
 from taichi_msm.fitting.result import Estimate, FitResult, FittedMap
 from taichi_msm.fitting.stiffness_map import KEY, fit_map, map_task
-from taichi_msm.load.check import checked
+from taichi_msm.load.check import check_scene
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.scene.scene import Scene
 
@@ -110,7 +110,7 @@ def fit(
     """
     begun = time.perf_counter()
     require_types(observed, free, method, bounds=bounds, forces=forces, directory=directory, workers=workers)
-    given = load_scene(scene) if isinstance(scene, (str, Path)) else checked(scene).scene
+    given = load_scene(scene) if isinstance(scene, (str, Path)) else check_scene(scene).scene
     for section in ("sheet", "time"):
         if (tolerance := getattr(given, section).tolerance) is not None:
             said = "is for one run, and a fit compares many; remove it, and take what `run` chose for it"

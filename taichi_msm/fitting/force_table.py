@@ -15,7 +15,7 @@ import numpy as np
 from taichi_msm.errors import SceneError
 from taichi_msm.fitting.observations import Forces
 from taichi_msm.images import irregular_kind
-from taichi_msm.scene.section import LARGEST
+from taichi_msm.scene.section import MAX_MAGNITUDE
 
 COLUMNS = {"time": "s", "probe": "", "force_x": "N", "force_y": "N", "force_z": "N"}
 EXPECTED = f"name a forces.csv, with the columns {', '.join(COLUMNS)}"
@@ -132,7 +132,7 @@ class _Reader:
             plain = plain.replace(",", ".", 1)
         if "," in plain:
             said = "with decimal commas, separate cells by ;"
-        if not (NUMBER.fullmatch(plain) and abs(value := float(plain)) <= LARGEST):
+        if not (NUMBER.fullmatch(plain) and abs(value := float(plain)) <= MAX_MAGNITUDE):
             raise SceneError([f"{where}: {key}: {cell[:40]!r}; take a number, or {said}"])
         return value
 

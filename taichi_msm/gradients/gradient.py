@@ -17,7 +17,7 @@ from taichi_msm.errors import ArgumentError, MsmError, Pause, SceneError, as_arr
 from taichi_msm.gradients.chain_rule import Derivatives, derivatives
 from taichi_msm.gradients.motion import MotionAdjoint, motion_bytes
 from taichi_msm.gradients.rest import RestAdjoint
-from taichi_msm.load.check import checked
+from taichi_msm.load.check import check_scene
 from taichi_msm.load.resolve import resolve
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
@@ -203,7 +203,7 @@ def gradient(scene: Scene | Mapping[str, Any], loss: Loss, threads: int | None =
     """
     if not callable(loss):
         raise ArgumentError(f"loss: {loss!r}; take a function of the positions of every frame")
-    plan = checked(scene)
+    plan = check_scene(scene)
     require_differentiable(plan)
     device = runtime.start("cpu", threads)
     adjoint = Adjoint(resolve(plan, device).plan, device)

@@ -43,7 +43,7 @@ def validate(data: dict[str, Any]) -> tuple[Plan | None, list[Problem]]:
     # Pydantic checks the scene as a whole once its sections are valid, and several keys are checked once that finds
     # nothing either.
     for _ in range(3):
-        scene, wrong = parse(Scene, data)
+        scene, wrong = parse_model(Scene, data)
         problems += wrong
         if scene is not None:
             plan, wrong = _joint_check(scene)
@@ -66,7 +66,7 @@ def _joint_check(scene: Scene, maps: Maps | None = None, *, picture: bool = True
     return plan, problems
 
 
-def checked(scene: Plan | Scene | Mapping[str, Any], maps: Maps | None = None) -> Plan:
+def check_scene(scene: Plan | Scene | Mapping[str, Any], maps: Maps | None = None) -> Plan:
     """Check a scene but for its picture, or a mapping of its keys, and plan it for a CPU; a plan was checked before.
 
     Raises:
@@ -93,8 +93,9 @@ def _spare(data: dict[str, Any], problems: list[Problem]) -> dict[str, Any]:
         faulty.add("output")
     output = data.get("output")
     if "render" in faulty and isinstance(output, list):
-        # Which cameras there are is not known.
-        data = {**data, "output": [name for name in output if name not in OUTPUTS or not OUTPUTS[name].of_pair]}
+        # Without the cameras, an output of a stereo pair cannot be checked.
+        stereo = {name for name, row in OUTPUTS.items() if row.needs_stereo_pair}
+        data = {**data, "output": [name for name in output if name not in stereo]}
     spared = {name: value for name, value in data.items() if name not in faulty} | {
         name: value for name, value in _STAND_INS.items() if name in faulty
     }
@@ -106,7 +107,7 @@ def _spare(data: dict[str, Any], problems: list[Problem]) -> dict[str, Any]:
     return spared
 
 
-def parse(model: type[Model], data: dict[str, Any]) -> tuple[Model | None, list[Problem]]:
+def parse_model(model: type[Model], data: dict[str, Any]) -> tuple[Model | None, list[Problem]]:
     """Check each key by itself; returns the model, or None if there is any problem, and the problems."""
     try:
         return model.model_validate(data), []

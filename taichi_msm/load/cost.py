@@ -228,21 +228,21 @@ def _in_words(size: int) -> str:
 
 
 # Time of a unit of work [s], and of the calibration, on two cores of an AMD EPYC of 2024.
-UNIT, CALIBRATION = 1.5e-9, 1e-4
+WORK_UNIT_S, CALIBRATION_S = 1.5e-9, 1e-4
 
 
-class Duration(NamedTuple):
+class DurationEstimate(NamedTuple):
     """How long a run will take."""
 
     seconds: float  # from start to end [s]
     start: float  # the part of it before the first step [s]
 
 
-def estimate_duration(plan: Plan) -> Duration:
+def estimate_duration(plan: Plan) -> DurationEstimate:
     """Estimate how long a run takes on a CPU, with every core; computing it takes milliseconds."""
     parts = work(plan, choose_pilots(plan).cost)
-    unit = UNIT * _calibrate() / CALIBRATION
-    return Duration(unit * sum(parts), unit * parts.start)
+    unit = WORK_UNIT_S * _calibrate() / CALIBRATION_S
+    return DurationEstimate(unit * sum(parts), unit * parts.start)
 
 
 @cache

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from taichi_msm.accuracy.mesh import MeshEstimate, choose_points
 from taichi_msm.accuracy.time_step import Estimate, choose_step
 from taichi_msm.errors import ProgressCallback
-from taichi_msm.load.check import checked
+from taichi_msm.load.check import check_scene
 from taichi_msm.model.plan import Plan
 from taichi_msm.solver import planning
 from taichi_msm.solver.planning import with_chosen_grid
@@ -27,7 +27,7 @@ def resolve(plan: Plan, device: Device, progress: ProgressCallback = lambda done
     estimate = mesh = None
     plan = planning.on(plan, device.arch)
     if plan.scene.sheet.tolerance is not None:
-        plan, mesh = choose_points(plan, device, checked, progress)
+        plan, mesh = choose_points(plan, device, check_scene, progress)
     if plan.scene.time.tolerance is not None:
         plan, estimate = choose_step(plan, device, progress)
     return Resolved(with_chosen_grid(plan), estimate, mesh)

@@ -18,33 +18,37 @@ from taichi_msm.load.check import validate
 from taichi_msm.load.yaml_reader import MAX_DEPTH, Document, Mark, UnreadableError, mark_at, read
 from taichi_msm.model.plan import Plan
 from taichi_msm.scene.scene import Scene
-from taichi_msm.scene.section import MAX_PATH, cut, flow
+from taichi_msm.scene.section import MAX_PATH, format_value, truncate
 
 MAX_BYTES = 2**20
 
 # The keys that name pictures.
-IMAGE: Key = ("image",)
-MAPS: tuple[Key, ...] = (("tissue", "map", "image"), ("tissue", "foundation_map", "image"), ("springs", "map", "image"))
-PICTURES = (IMAGE, *MAPS)
+IMAGE_KEY: Key = ("image",)
+MAP_KEYS: tuple[Key, ...] = (
+    ("tissue", "map", "image"),
+    ("tissue", "foundation_map", "image"),
+    ("springs", "map", "image"),
+)
+PICTURE_KEYS = (IMAGE_KEY, *MAP_KEYS)
 
 # The keys that name other files; ANY is the name of a camera.
-ANY = "*"
-CAMERA_FILES: tuple[Key, ...] = tuple(
-    ("render", *camera, key) for camera in (("camera",), ("cameras", ANY)) for key in ("calibration", "poses")
+ANY_CAMERA = "*"
+CAMERA_FILE_KEYS: tuple[Key, ...] = tuple(
+    ("render", *camera, key) for camera in (("camera",), ("cameras", ANY_CAMERA)) for key in ("calibration", "poses")
 )
 
 # The largest number of lines in an error: nobody reads more, and a broken file may have tens of thousands of problems.
 MAX_LINES = 100
 
 
-class Kind(NamedTuple):
+class FileKind(NamedTuple):
     """What a file should be."""
 
     name: str  # what it is called
     needs: str  # the keys that it must have
 
 
-class File(NamedTuple):
+class ParsedFile(NamedTuple):
     """A YAML file that was read, whose keys are not checked."""
 
     name: str  # in messages
@@ -52,7 +56,7 @@ class File(NamedTuple):
     document: Document
 
 
-SCENE = Kind("scene", "sheet, tissue or springs, and time")
+SCENE_KIND = FileKind("scene", "sheet, tissue or springs, and time")
 
 _NO_KEY = Problem((), "expected KEY=VALUE, such as sheet.points=[61,61]")
 _NO_PATH = Problem((), "expected a key such as sheet.points")
@@ -94,10 +98,12 @@ def load_plan(
     """Read and check a scene as `load_scene` does, and plan it for a CPU."""
     if isinstance(path, Mapping):
         raise ArgumentError("path: a mapping; Scene(**mapping) is its scene, and load_scene reads a file")
-    return plan_file(read_file(str(path), SCENE), overrides, image)
+    return plan_file(read_file(str(path), SCENE_KIND), overrides, image)
 
 
-def plan_file(file: File, overrides: Sequence[str] | Mapping[str, Any] = (), image: str | Path | None = None) -> Plan:
+def plan_file(
+    file: ParsedFile, overrides: Sequence[str] | Mapping[str, Any] = (), image: str | Path | None = None
+) -> Plan:
     """Check a scene file that was read before, and plan its scene; as `load_plan`."""
     if isinstance(overrides, str) or not (
         isinstance(overrides, (Sequence, Mapping)) and all(isinstance(one, str) for one in overrides)
@@ -111,10 +117,10 @@ def plan_file(file: File, overrides: Sequence[str] | Mapping[str, Any] = (), ima
     )
     for override in parsed:
         draft.override(override)
-    for key in (*(PICTURES if image is None else MAPS), *(key for key, _ in camera_files(draft.data))):
+    for key in (*(PICTURE_KEYS if image is None else MAP_KEYS), *(key for key, _ in camera_files(draft.data))):
         draft.find_file(key, file.folder)
     if image is not None:
-        draft.override(_Override(f"--image {cut(str(image))}", IMAGE, str(image)))
+        draft.override(_Override(f"--image {truncate(str(image))}", IMAGE_KEY, str(image)))
     plan, problems = validate(draft.data)
     draft.report(problems)
     if plan is None or draft.problems:
@@ -125,8 +131,8 @@ def plan_file(file: File, overrides: Sequence[str] | Mapping[str, Any] = (), ima
 def names_file(key: Key) -> bool:
     """Return whether a key of a scene, whose value is a text, names a file."""
     return any(
-        len(key) == len(pattern) and all(part in (str(one), ANY) for one, part in zip(key, pattern, strict=True))
-        for pattern in (*PICTURES, *CAMERA_FILES)
+        len(key) == len(pattern) and all(part in (str(one), ANY_CAMERA) for one, part in zip(key, pattern, strict=True))
+        for pattern in (*PICTURE_KEYS, *CAMERA_FILE_KEYS)
     )
 
 
@@ -136,9 +142,9 @@ def camera_files(data: Mapping[str, Any]) -> list[tuple[Key, str]]:
     cameras = render.get("cameras") if isinstance(render, dict) else None
     names = list(cameras) if isinstance(cameras, dict) else []
     keys = [
-        tuple(name if part == ANY else part for part in pattern)
-        for pattern in CAMERA_FILES
-        for name in (names if ANY in pattern else [ANY])
+        tuple(name if part == ANY_CAMERA else part for part in pattern)
+        for pattern in CAMERA_FILE_KEYS
+        for name in (names if ANY_CAMERA in pattern else [ANY_CAMERA])
     ]
     return [(key, path) for key in keys if isinstance(path := _value(data, key), str)]
 
@@ -167,7 +173,7 @@ class _Override(NamedTuple):
 def parse_override(text: str) -> _Override:
     """Read "KEY=VALUE"."""
     key, equals, value = text.partition("=")
-    name = f"--set {cut(key)}{equals}{cut(value)}"
+    name = f"--set {truncate(key)}{equals}{truncate(value)}"
     path = parse_key(key.strip())
     if not equals or not path:
         return _Override(name, (), problems=[_NO_KEY])
@@ -181,7 +187,7 @@ def parse_override(text: str) -> _Override:
 
 def _parse_value(key: str, value: Any) -> _Override:
     path = parse_key(key)
-    name = f"override {cut(key)}"
+    name = f"override {truncate(key)}"
     if not path:
         return _Override(name, (), problems=[_NO_PATH])
     try:
@@ -189,7 +195,7 @@ def _parse_value(key: str, value: Any) -> _Override:
     except (TypeError, ValueError, RecursionError):
         problem = Problem(path, f"a file cannot hold this {type(value).__name__}; use numbers, text, lists, dicts")
         return _Override(name, path, problems=[problem])
-    return _Override(f"{name}={flow(plain)}", path, plain)
+    return _Override(f"{name}={format_value(plain)}", path, plain)
 
 
 def parse_key(key: str) -> Key:
@@ -216,7 +222,7 @@ class Draft:
         problems: found so far, each with its place.
     """
 
-    def __init__(self, file: File) -> None:
+    def __init__(self, file: ParsedFile) -> None:
         document = file.document
         self._name, self._marks = file.name, document.marks
         self._overrides = 0
@@ -242,8 +248,10 @@ class Draft:
         # A scene may come from anybody, so it may only read files that came with it.
         given = any(key[:n] in self._overridden for n in range(1, len(key) + 1))
         if not given and not is_below(folder / image, folder):
-            remedy = ", or name it with --image" if key == IMAGE else ""
-            said = f"{image} is not below the scene's folder; put {'the picture' if key in PICTURES else 'it'} there"
+            remedy = ", or name it with --image" if key == IMAGE_KEY else ""
+            said = (
+                f"{image} is not below the scene's folder; put {'the picture' if key in PICTURE_KEYS else 'it'} there"
+            )
             self.problems.append((self._place(key), Problem(key, said + remedy)))
             del holder[key[-1]]
 
@@ -259,7 +267,7 @@ class Draft:
         """Format the problems in the order of their places."""
         ordered = sorted(self.problems, key=lambda item: item[0][:2])
         shown = [
-            f"{place.name}: {Problem(tuple(cut(str(part)) for part in problem.path), problem.message)}"
+            f"{place.name}: {Problem(tuple(truncate(str(part)) for part in problem.path), problem.message)}"
             for place, problem in ordered[:MAX_LINES]
         ]
         return shown if len(shown) == len(ordered) else [*shown, "and more"]
@@ -282,7 +290,7 @@ class Draft:
             if isinstance(holder, dict):
                 part = str(part)
             elif not isinstance(holder, list):
-                return Problem(here, f"{flow(holder)} has no keys to set one of; set it as a whole")
+                return Problem(here, f"{format_value(holder)} has no keys to set one of; set it as a whole")
             elif not (isinstance(part, int) and part < len(holder)):
                 example = ".".join(str(one) for one in (*here, 0, *path[n:][isinstance(part, int) :]))
                 said = f"no such item; the list has {len(holder)}, numbered from 0, as in {example}"
@@ -310,7 +318,7 @@ def is_below(path: Path, folder: Path) -> bool:
         return True
 
 
-def read_file(name: str, kind: Kind) -> File:
+def read_file(name: str, kind: FileKind) -> ParsedFile:
     """Read a file that should be of a kind; SceneError: it contains no mapping, or cannot be read."""
     try:
         document = read(_read_text(name, kind))
@@ -319,12 +327,12 @@ def read_file(name: str, kind: Kind) -> File:
     if document.data is None:
         raise SceneError([f"{name}:1:1: no keys; a {kind.name} needs at least {kind.needs}"])
     if not isinstance(document.data, dict):
-        said = f"{flow(document.data)} is not a {kind.name}; expected keys such as {kind.needs}"
+        said = f"{format_value(document.data)} is not a {kind.name}; expected keys such as {kind.needs}"
         raise SceneError([f"{name}:1:1: {said}"])
-    return File(name, Path(name).parent, document)
+    return ParsedFile(name, Path(name).parent, document)
 
 
-def _read_text(name: str, kind: Kind) -> str:
+def _read_text(name: str, kind: FileKind) -> str:
     path = Path(name)
     try:
         if what := irregular_kind(path):
@@ -341,7 +349,7 @@ def _read_text(name: str, kind: Kind) -> str:
         return raw.decode()
     except UnicodeDecodeError as error:
         if path.suffix.lower() in PICTURE_SUFFIXES:
-            by = ", and the picture by --image" if kind is SCENE else ""
+            by = ", and the picture by --image" if kind is SCENE_KIND else ""
             raise SceneError([f"{name}: a picture; name a {kind.name}{by}"]) from None
         before = raw[: error.start].decode()
         mark = mark_at(before, len(before))

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from taichi_msm.errors import Key, Problem
-from taichi_msm.scene.section import cut
+from taichi_msm.scene.section import truncate
 
 MAX_DEPTH = 20
 MAX_NODES = 100_000
@@ -97,7 +97,7 @@ def _syntax_error(text: str, error: yaml.MarkedYAMLError) -> UnreadableError:
     if error.problem == "could not find expected ':'" and error.context_mark:
         # It is missed only in the next line, or at the end.
         line = text[error.context_mark.index :].partition("\n")[0]
-        return UnreadableError(_mark(error.context_mark), f'no ":" in "{cut(line.strip())}"; expected KEY: VALUE')
+        return UnreadableError(_mark(error.context_mark), f'no ":" in "{truncate(line.strip())}"; expected KEY: VALUE')
     mark = error.problem_mark or error.context_mark
     if mark and "nesting depth" in f"{error.problem} {error.context}":
         # libyaml may reach its own limit before it gives the first event.

@@ -22,7 +22,7 @@ from taichi_msm.model.plan import EDGE, Plan, ProbeSegment, ProbeSlot, probe_slo
 from taichi_msm.model.sheet import area_shares, axes
 from taichi_msm.model.tool_force import control_points, point_at, probe_force
 from taichi_msm.scene.scene import Scene
-from taichi_msm.scene.section import WHOLE
+from taichi_msm.scene.section import FRAME_TOLERANCE
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Probe
 
@@ -113,19 +113,21 @@ class FrameLoad:
         """Give the percent, and the control point, x and y at rest [m], at a frame; at a jump, those after it."""
         time = frame / rate
         # A key that is as good as at the frame counts as at it.
-        key = float(self._keys[max(0, self._keys.searchsorted(time + WHOLE / rate, "right") - 1)])
-        time = key if abs(time - key) <= WHOLE / rate else time
+        key = float(self._keys[max(0, self._keys.searchsorted(time + FRAME_TOLERANCE / rate, "right") - 1)])
+        time = key if abs(time - key) <= FRAME_TOLERANCE / rate else time
         return float(self._line.values(np.array([time]))[0]), point_at(self._times, self._points, time)
 
 
 def frame_loads(plan: Plan, frame: int) -> Schedule:
-    """Evaluate the loads at a frame; at a jump the later value counts, and a key within WHOLE of a frame is at it.
+    """Evaluate the loads at a frame; at a jump the later value counts.
+
+    A key within FRAME_TOLERANCE of a frame is at it.
 
     Foundations that are `loaded` act where the percent of any probe is not 0, and from a path's first key to its last.
     """
     scene, rate = plan.scene, plan.grid.frames_per_second
     time = frame / rate
-    near = [key for key in _every_key(scene) if abs(key - time) <= WHOLE / rate]
+    near = [key for key in _every_key(scene) if abs(key - time) <= FRAME_TOLERANCE / rate]
     t = np.array([max(near, default=time)])
     loads = loads_at(plan, t)
     pressed = any(

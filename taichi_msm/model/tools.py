@@ -18,7 +18,7 @@ from taichi_msm.errors import Problem
 from taichi_msm.model.sheet import spacing
 from taichi_msm.model.time_grid import TimeGrid
 from taichi_msm.scene.scene import Scene
-from taichi_msm.scene.section import WHOLE
+from taichi_msm.scene.section import FRAME_TOLERANCE
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Probe
 
@@ -120,7 +120,7 @@ def unit(shaft: Sequence[float]) -> Array:
 def grip_frames(grip: tuple[float, float], rate: float) -> range:
     """List the frames at rest that a grip holds: from the first at or after its begin to before that of its end."""
     # But for rounding.
-    begin, end = (max(0, math.ceil(time * rate - WHOLE)) for time in grip)
+    begin, end = (max(0, math.ceil(time * rate - FRAME_TOLERANCE)) for time in grip)
     return range(begin, end)
 
 

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from taichi_msm.errors import Key, Problem, SceneError
 from taichi_msm.scene.camera import Camera
 from taichi_msm.scene.scene import Scene
-from taichi_msm.scene.section import MAX_SUPERSAMPLE, SMALLEST, WHOLE
+from taichi_msm.scene.section import FRAME_TOLERANCE, MAX_SUPERSAMPLE, MIN_MAGNITUDE
 
 Array = NDArray[np.float64]
 
@@ -406,7 +406,7 @@ def _place_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
             return
     if camera.poses is not None:
         begin, end, last = camera.poses[0][0], camera.poses[-1][0], scene.time.duration
-        slack = WHOLE / scene.time.frames_per_second
+        slack = FRAME_TOLERANCE / scene.time.frames_per_second
         gap = camera.poses[min(1, len(camera.poses) - 1)][0] - max(begin, 0.0)  # type: ignore[operator]
         if gap > LONGEST_GAP or (len(camera.poses) > 2 and gap > SPARSEST * last):
             said = f"its first poses are {gap:.6g} s apart, and the scene lasts {last:g} s; write times in seconds"
@@ -421,7 +421,7 @@ def _place_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
                 remedy = "shorten time.duration or give the poses of all of it"
             yield Problem(("poses",), f"{said}; {remedy}")
             return
-    if camera.eye is None and placed(camera, 0.0).distance < SMALLEST:
+    if camera.eye is None and placed(camera, 0.0).distance < MIN_MAGNITUDE:
         said = "puts the eye on the middle of the sheet, which the light's strength depends on; move it away"
         yield Problem((_place_key(camera),), said)
         return
@@ -431,7 +431,7 @@ def _place_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
         if camera.eye is not None:
             eye, target, up = (list(at_time(value, time)) for value in (camera.eye, camera.target, camera.up))
             sight = unit(np.subtract(eye, target))
-            if math.dist(eye, target) < SMALLEST:
+            if math.dist(eye, target) < MIN_MAGNITUDE:
                 yield Problem(("eye",), f"{eye} is also the target{when}; move one of them")
                 return
             if not np.linalg.norm(np.cross(sight, unit(np.array(up)))) > 1e-9:

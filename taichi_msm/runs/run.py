@@ -29,7 +29,7 @@ from taichi_msm.errors import (
     writing,
 )
 from taichi_msm.load import cost
-from taichi_msm.load.check import checked
+from taichi_msm.load.check import check_scene
 from taichi_msm.load.resolve import resolve
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
@@ -133,7 +133,7 @@ def run(
         ('complete', 31, 'f64')
     """
     watch = Stopwatch(started)
-    plan = checked(scene)
+    plan = check_scene(scene)
     require_path(directory)
     folder = Path(directory)
     cost.require_disk(plan, folder)

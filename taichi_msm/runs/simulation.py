@@ -30,7 +30,7 @@ from taichi_msm.errors import (
     is_real_array,
     require_frame_count,
 )
-from taichi_msm.load.check import checked
+from taichi_msm.load.check import check_scene
 from taichi_msm.load.resolve import resolve
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.surface import Surface, rods, surface, to_positions
@@ -93,7 +93,7 @@ class Simulation:
         texture: NDArray[np.uint8] | None = None,
         cores: int | None = None,
     ) -> None:
-        plan = checked(scene)
+        plan = check_scene(scene)
         texture = None if texture is None else require_texture(texture)
         self.device = runtime.start(arch, threads)
         self._plan = resolve(plan, self.device).plan
@@ -203,7 +203,7 @@ class Simulation:
         self._require_open()
         motion = self.scene.time.motion
         if scene is not None:
-            self._plan = resolve(checked(scene), self.device).plan
+            self._plan = resolve(check_scene(scene), self.device).plan
             self._probes = self.scene.probes
             self.renderer.restart(self.scene)
         else:

@@ -18,8 +18,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from taichi_msm.images import actual_path, irregular_kind
-from taichi_msm.scene.section import LARGEST as MOST
-from taichi_msm.scene.section import cut
+from taichi_msm.scene.section import MAX_MAGNITUDE, truncate
 
 MAX_BYTES = 2**22
 
@@ -132,12 +131,12 @@ def _is_fisheye(keys: _Keys, values: Sequence[float] | None) -> bool:
             keys.has_no_distortion = True
         elif model not in MODELS:
             known = "plumb_bob, radtan, rational_polynomial, equidistant, fisheye, or none without coefficients"
-            raise CameraFileError(f"{keys.path}: {name}: {cut(str(value))} is not known; expected one of: {known}")
+            raise CameraFileError(f"{keys.path}: {name}: {truncate(str(value))} is not known; expected one of: {known}")
         elif (fisheye := MODELS[model]) is not None:
             said[fisheye] = name
     for name, value in keys.named(FISHEYE).items():
         if (flag := _folded(value)) not in FLAGS:
-            raise CameraFileError(f"{keys.path}: {name}: {cut(str(value))} is neither true nor false")
+            raise CameraFileError(f"{keys.path}: {name}: {truncate(str(value))} is neither true nor false")
         said[FLAGS[flag]] = name
     if len(said) > 1:
         raise CameraFileError(f"{keys.path}: {said[True]} is a fisheye's, {said[False]} is not; keep the right one")
@@ -226,7 +225,7 @@ def _folded(name: object) -> str:
 def _listed(names: Sequence[str] | Mapping[str, Any]) -> str:
     """List names, the first ones of many."""
     more = f" and {len(names) - SHOWN_NAMES} more" if len(names) > SHOWN_NAMES else ""
-    return ", ".join(cut(str(name)) for name in list(names)[:SHOWN_NAMES]) + more
+    return ", ".join(truncate(str(name)) for name in list(names)[:SHOWN_NAMES]) + more
 
 
 def _foreign(data: Mapping[str, Any]) -> str:
@@ -259,7 +258,7 @@ def read_poses(path: str) -> tuple[tuple[float, ...], ...]:
         elif header and _columns(f"{path}:{n}", header) != (columns or TUM):
             raise CameraFileError(f"{path}:{n}: other columns than before; write a file of one order")
         elif not words and not header and (found := OTHER_ORDER.search(comment)):
-            said = f"a comment has {cut(found[0])}, which is not understood"
+            said = f"a comment has {truncate(found[0])}, which is not understood"
             raise CameraFileError(f"{path}:{n}: {said}; name the columns in the first line: # {', '.join(ROLES)}")
         elif words:
             row = _row(f"{path}:{n}", words, columns, separated="," in text)
@@ -344,10 +343,10 @@ def _row(place: str, words: Sequence[str], columns: _Columns | None, *, separate
         numbers = [math.nan if "_" in word else float(word) for word in words]
     except ValueError:
         numbers = []
-    if len(numbers) != expected.width or not all(abs(number) <= MOST for number in numbers):
-        said = f"eight numbers up to {MOST:g}: {' '.join(ROLES)}"
+    if len(numbers) != expected.width or not all(abs(number) <= MAX_MAGNITUDE for number in numbers):
+        said = f"eight numbers up to {MAX_MAGNITUDE:g}: {' '.join(ROLES)}"
         if expected.width != len(TUM.places):
-            said = f"{expected.width} numbers up to {MOST:g}, one a column of the header"
+            said = f"{expected.width} numbers up to {MAX_MAGNITUDE:g}, one a column of the header"
         shape = SHAPES.get(len(words), "") if columns is None else ""
         if columns is None and separated and len(words) != EUROC_WIDTH:
             shape = "; numbers with decimal commas need ; between them"
@@ -400,7 +399,7 @@ def _parse(path: str, text: str) -> Mapping[str, Any]:
     try:
         data = _xml(text) if text.lstrip().startswith("<") else _yaml(text)
     except RepeatedError as error:
-        raise CameraFileError(f"{path}: {cut(str(error))} is given twice; keep the right one") from None
+        raise CameraFileError(f"{path}: {truncate(str(error))} is given twice; keep the right one") from None
     except (
         ArithmeticError,
         AttributeError,
@@ -418,7 +417,9 @@ def _parse(path: str, text: str) -> Mapping[str, Any]:
             where = f":{mark.line + 1}" if mark else ""
             said = "neither YAML, XML nor JSON; name a calibration"
             if isinstance(error, yaml.constructor.ConstructorError) and str(error.problem).startswith("could not det"):
-                said = f"{cut(str(error.problem)).partition(' for the ')[2]}: not plain YAML; write numbers and lists"
+                said = (
+                    f"{truncate(str(error.problem)).partition(' for the ')[2]}: not plain YAML; write numbers and lists"
+                )
             raise CameraFileError(f"{path}{where}: {said}") from None
     if not isinstance(data, dict):
         what = "a list" if isinstance(data, list) else "no keys"
@@ -508,7 +509,7 @@ def _numbers(path: str, name: str, value: Any) -> list[float]:
         numbers = [math.nan]
     # Written so that NaN is found too.
     if not all(abs(number) <= LARGEST for number in numbers):
-        said = f"{cut(str(value))} is not a list of numbers up to {LARGEST:g}; write it as OpenCV does"
+        said = f"{truncate(str(value))} is not a list of numbers up to {LARGEST:g}; write it as OpenCV does"
         raise CameraFileError(f"{path}: {name}: {said}")
     return numbers
 

@@ -19,14 +19,14 @@ from typing_extensions import Self
 from taichi_msm.scene.calibration import CameraFileError, pose_fault, read_calibration, read_poses
 from taichi_msm.scene.section import (
     MIN_FOV,
-    SMALLEST,
+    MIN_MAGNITUDE,
     FilePath,
     Number,
     Positive,
     Section,
     Vector,
     key,
-    refused,
+    scene_fault,
 )
 
 # The coefficients of OpenCV's models of distortion, in its order.
@@ -73,7 +73,7 @@ class Distortion(Section):
     def _of_its_model(self) -> Self:
         for name in sorted(self.model_fields_set - {"model", *COEFFICIENTS[self.model]}):
             if getattr(self, name):
-                raise refused("goes with model: pinhole; a fisheye has k1, k2, k3 and k4", name)
+                raise scene_fault("goes with model: pinhole; a fisheye has k1, k2, k3 and k4", name)
         return self
 
 
@@ -168,24 +168,24 @@ class Camera(Section):
         if not isinstance(poses, str):
             for n, row in enumerate(poses or ()):
                 if fault := pose_fault(row, poses[n - 1] if n else None):  # type: ignore[index]
-                    raise refused(fault, n)
+                    raise scene_fault(fault, n)
             return poses
         try:
             return read_poses(poses)  # type: ignore[return-value]
         except CameraFileError as error:
-            raise refused(str(error)) from None
+            raise scene_fault(str(error)) from None
 
     @field_validator("eye", "target", "up", mode="after")
     @classmethod
     def _in_order(cls, keys: Any, info: ValidationInfo) -> Any:
         if info.field_name == "eye" and keys is None and not {"beside", "pose", "poses"} & _given(info):
-            raise refused("missing; expected " + cls.model_fields["eye"].json_schema_extra["expects"])  # type: ignore
+            raise scene_fault("missing; expected " + cls.model_fields["eye"].json_schema_extra["expects"])  # type: ignore
         if keys is None or not isinstance(keys[0], tuple):
             return keys
         for n in range(1, len(keys)):
             if keys[n][0] <= keys[n - 1][0]:
                 said = f"is at {keys[n][0]:g} s, and the key before it at {keys[n - 1][0]:g} s"
-                raise refused(f"{said}; sort the keys, each later than the last", n)
+                raise scene_fault(f"{said}; sort the keys, each later than the last", n)
         return keys
 
     @model_validator(mode="after")
@@ -193,23 +193,23 @@ class Camera(Section):
         given = {name for name in self.model_fields_set if getattr(self, name) is not None}
         if self.beside is not None:
             for name in sorted(given - {"beside", "baseline"}):
-                raise refused(
+                raise scene_fault(
                     "is given together with beside, and a camera beside another is like that; remove it", name
                 )
-            if self.baseline is None or abs(self.baseline) < SMALLEST:
+            if self.baseline is None or abs(self.baseline) < MIN_MAGNITUDE:
                 what = "missing" if self.baseline is None else f"{self.baseline:g} puts it where {self.beside} is"
-                raise refused(f"{what}; expected a number but 0, in metres", "baseline")
+                raise scene_fault(f"{what}; expected a number but 0, in metres", "baseline")
         elif self.baseline is not None:
-            raise refused("goes with beside, the name of another camera; add it or remove this", "baseline")
+            raise scene_fault("goes with beside, the name of another camera; add it or remove this", "baseline")
         if self.scale and self.calibration is None:
-            raise refused("goes with calibration; remove it", "scale")
+            raise scene_fault("goes with calibration; remove it", "scale")
         if self.outside == "background" and self.distortion is None and self.calibration is None:
-            raise refused("goes with distortion; remove it", "outside")
+            raise scene_fault("goes with distortion; remove it", "outside")
         for ways in (("calibration", "intrinsics", "fov"), ("pose", "poses", "eye"), ("calibration", "distortion")):
             if len(both := [name for name in ways if name in given]) > 1:
-                raise refused(f"is given together with {both[0]}; remove one of them", both[1])
+                raise scene_fault(f"is given together with {both[0]}; remove one of them", both[1])
         for name in {"target", "up"} & given if {"pose", "poses"} & given else ():
-            raise refused("goes with eye; a pose has a direction of its own", name)
+            raise scene_fault("goes with eye; a pose has a direction of its own", name)
         return self
 
     @model_serializer(mode="wrap")
@@ -229,14 +229,14 @@ class Camera(Section):
         try:
             found = read_calibration(self.calibration)
         except CameraFileError as error:
-            raise refused(str(error), "calibration") from None
+            raise scene_fault(str(error), "calibration") from None
         if self.scale and found.size is None:
             said = "tells no size of its pictures, so it cannot be scaled; add image_width and image_height"
-            raise refused(f"{self.calibration}: {said}, or remove scale", "calibration")
+            raise scene_fault(f"{self.calibration}: {said}, or remove scale", "calibration")
         across, down = (new / old for new, old in zip(size, found.size or size, strict=True))
         if (across, down) != (1, 1) and not self.scale:
             assert found.size is not None
-            raise refused(
+            raise scene_fault(
                 f"{self.calibration}: of pictures of {found.size[0]} x {found.size[1]} pixels, not of {size[0]} x "
                 f"{size[1]}; set render.size to these, or scale: true",
                 "calibration",
@@ -259,7 +259,7 @@ class Camera(Section):
             return self.model_validate(kept | update)
         except ValidationError:
             said = f"{', '.join(f'{name} = {value:g}' for name, value in intrinsics.items())} for pictures of this size"
-            raise refused(
+            raise scene_fault(
                 f"{self.calibration}: {said} are out of range; calibrate at a size near it", "scale"
             ) from None
 

@@ -16,21 +16,21 @@ def is_pyav_installed() -> bool:
 
 
 # Of a run's files these two belong to no entry of `output`: the record, and the matrices of the camera.
-RECORD, CAMERA = "run.json", "camera.json"
+RUN_RECORD, CAMERA_FILE = "run.json", "camera.json"
 
 # In the folder of a sweep: its record, and the folder with a folder for each run, as `run` writes it, by its number.
-SWEEP, RUNS = "sweep.json", "runs"
-NUMBERED = r"[0-9]{6,}"
+SWEEP_RECORD, RUNS_FOLDER = "sweep.json", "runs"
+NUMBER_PATTERN = r"[0-9]{6,}"
 
 # What the names of folders begin with that exports go to by default.
-EXPORTS = "export-"
+EXPORT_PREFIX = "export-"
 
 # The names of cameras, of which each has a folder.
 MAX_NAME = 64
 CAMERA_NAME = rf"[a-z0-9_-]{{1,{MAX_NAME}}}"
 
 # The number in the name of a frame's file.
-FIRST, NUMBER = "0000", r"(?:[0-9]{4}|[1-9][0-9]{4,14})"
+FIRST_FRAME, FRAME_PATTERN = "0000", r"(?:[0-9]{4}|[1-9][0-9]{4,14})"
 
 
 # The columns of the table of forces.
@@ -48,10 +48,10 @@ class Output(NamedTuple):
     file: str  # with a folder, that of the first frame of a series
     # Field of `Observed`; positions and forces: none.
     source: Literal["picture", "labels", "flow", "stereo", "tracks", "positions", "forces"]
-    means: str  # what the file holds, for users
+    description: str  # what the file holds, for users
     pixel_bytes: float = 0  # the most that a pixel takes in a file, as one of noise; 0: the size is not by pixels
     needs_camera: bool = False  # whether it can be used only with the camera's matrices
-    of_pair: bool = False  # whether only a camera that others are beside has it
+    needs_stereo_pair: bool = False  # whether only a camera that others are beside has it
 
     @property
     def result(self) -> str:
@@ -64,27 +64,27 @@ class Output(NamedTuple):
         return "/" in self.file
 
     @property
-    def is_seen(self) -> bool:
+    def is_camera_output(self) -> bool:
         """Whether it depends on what a camera sees; in a run with several cameras each has its own."""
         return self.source not in ("positions", "forces")
 
     @property
-    def until_next(self) -> bool:
+    def is_frame_pair(self) -> bool:
         """Whether it tells of a frame what happens until the next one; then there is none of the last frame."""
         return self.source == "flow"
 
     @property
     def pattern(self) -> str:
         """A regular expression for the names of its files."""
-        return re.escape(self.file).replace(FIRST, NUMBER) if self.is_series else re.escape(self.file)
+        return re.escape(self.file).replace(FIRST_FRAME, FRAME_PATTERN) if self.is_series else re.escape(self.file)
 
     def path(self, frame: int = 0) -> str:
         """Name the file, of a frame if there is one for each."""
-        return self.file.replace(FIRST, f"{frame:04}")
+        return self.file.replace(FIRST_FRAME, f"{frame:04}")
 
     def count(self, frames: int) -> int:
         """Count the files of a series in a run with this many frames."""
-        return max(0, frames - self.until_next)
+        return max(0, frames - self.is_frame_pair)
 
 
 def _rows() -> Iterator[Output]:
@@ -95,56 +95,64 @@ def _rows() -> Iterator[Output]:
     """
     yield Output("png", "frames/0000.png", "picture", "the picture", pixel_bytes=3.01)
     yield Output("gif", "animation.gif", "picture", "the pictures as an animation", pixel_bytes=1.51)
-    means = (
+    description = (
         "the pictures as a film, H.264 in yuv420p; an odd last row or column is repeated; needs PyAV (`pip install av`)"
     )
-    yield Output("mp4", "animation.mp4", "picture", means, pixel_bytes=1.6)
-    means = "`time` [s], shape (frames,), and `position` of the mass points [m], shape (frames, rows, cols, 3)"
-    yield Output("trajectory", "trajectory.npz", "positions", means)
-    means = (
+    yield Output("mp4", "animation.mp4", "picture", description, pixel_bytes=1.6)
+    description = "`time` [s], shape (frames,), and `position` of the mass points [m], shape (frames, rows, cols, 3)"
+    yield Output("trajectory", "trajectory.npz", "positions", description)
+    description = (
         "a row for each frame and probe: `time` [s], `probe`, `tip_x`, `tip_y`, `tip_z` [m], of the lowest point of a "
         "tool that is moved, or of the control point on the deformed sheet, and `force_x`, `force_y`, `force_z` [N] on "
         "the points that are not fixed; of a tool that is moved the mean since the frame before"
     )
-    yield Output("forces", "forces.csv", "forces", means)
-    means = (
+    yield Output("forces", "forces.csv", "forces", description)
+    description = (
         "float32 (height, width, 2): the material point at the pixel's centre, as fractions of the sheet's width from "
         "its left and of its height from its top; NaN where no sheet is seen"
     )
-    yield Output("coordinates", "coordinates/0000.npy", "labels", means, pixel_bytes=8, needs_camera=True)
-    means = (
+    yield Output("coordinates", "coordinates/0000.npy", "labels", description, pixel_bytes=8, needs_camera=True)
+    description = (
         "float32 [m] along the direction of view, from the eye; with `camera: top` from as far above the sheet at rest "
         "as its larger side is long; 0: background"
     )
-    yield Output("depth", "depth/0000.tiff", "labels", means, pixel_bytes=4, needs_camera=True)
-    means = (
+    yield Output("depth", "depth/0000.tiff", "labels", description, pixel_bytes=4, needs_camera=True)
+    description = (
         "float32 (height, width, 3): the unit normal of what is seen, of the drawn triangle without relief or of the "
         "instrument, toward the camera, in its axes (x right, y down, z forward); NaN: background"
     )
-    yield Output("normals", "normals/0000.npy", "labels", means, pixel_bytes=12, needs_camera=True)
-    means = (
+    yield Output("normals", "normals/0000.npy", "labels", description, pixel_bytes=12, needs_camera=True)
+    description = (
         "Middlebury's format: how far what is seen moves until the next frame, right and down [px], hidden there or "
         "not; 1e10: no sheet, or it goes behind the eye or beyond the lens's limit"
     )
-    yield Output("flow", "flow/0000.flo", "flow", means, pixel_bytes=8, needs_camera=True)
-    means = "255 where what is seen is hidden or outside the picture in the next frame, else 0"
-    yield Output("occlusion", "occlusion/0000.png", "flow", means, pixel_bytes=0.5)
-    means = (
+    yield Output("flow", "flow/0000.flo", "flow", description, pixel_bytes=8, needs_camera=True)
+    description = "255 where what is seen is hidden or outside the picture in the next frame, else 0"
+    yield Output("occlusion", "occlusion/0000.png", "flow", description, pixel_bytes=0.5)
+    description = (
         "of a camera that another one is beside: float32, how far to the left what is seen is in the picture of the "
         "first of those [px], fx × baseline / depth; 0: background"
     )
-    yield Output("disparity", "disparity/0000.tiff", "stereo", means, pixel_bytes=4, needs_camera=True, of_pair=True)
-    means = "255 where an instrument is seen, else 0"
-    yield Output("instrument", "instrument/0000.png", "labels", means, pixel_bytes=0.5)
-    means = (
+    yield Output(
+        "disparity",
+        "disparity/0000.tiff",
+        "stereo",
+        description,
+        pixel_bytes=4,
+        needs_camera=True,
+        needs_stereo_pair=True,
+    )
+    description = "255 where an instrument is seen, else 0"
+    yield Output("instrument", "instrument/0000.png", "labels", description, pixel_bytes=0.5)
+    description = (
         "of `render.tracks` × `render.tracks` points in the middle of equal fields of the sheet: `coordinates` (N, 2), "
         "`points` (N, frames, 2) [px] from the picture's upper left corner, NaN behind the eye, `occluded` (N, frames) "
         "and `position` (N, frames, 3) [m] in the world, on the drawn surface"
     )
-    yield Output("tracks", "tracks.npz", "tracks", means, needs_camera=True)
+    yield Output("tracks", "tracks.npz", "tracks", description, needs_camera=True)
 
 
-def numbered(number: int) -> str:
+def zero_padded(number: int) -> str:
     """Name a run by its number in a sweep or an export, or a pair of frames by its number in an export."""
     return f"{number:06}"
 
@@ -152,19 +160,19 @@ def numbered(number: int) -> str:
 OUTPUTS = {output.name: output for output in _rows()}
 
 # The folders with a file for every frame, each with its output.
-FOLDERS = {output.result: output for output in OUTPUTS.values() if output.is_series}
+SERIES_FOLDERS = {output.result: output for output in OUTPUTS.values() if output.is_series}
 
 # The names of all files that a run writes, as regular expressions. What a camera with a name sees is in its folder.
-_SEEN = [*(output.pattern for output in OUTPUTS.values() if output.is_seen), re.escape(CAMERA)]
-PATTERNS = (
+_SEEN = [*(output.pattern for output in OUTPUTS.values() if output.is_camera_output), re.escape(CAMERA_FILE)]
+RESULT_PATTERNS = (
     *_SEEN,
     *(f"{CAMERA_NAME}/{pattern}" for pattern in _SEEN),
-    *(output.pattern for output in OUTPUTS.values() if not output.is_seen),
-    re.escape(RECORD),
+    *(output.pattern for output in OUTPUTS.values() if not output.is_camera_output),
+    re.escape(RUN_RECORD),
 )
 
 
-def results(folders: Mapping[str, Collection[str]]) -> list[str]:
+def result_names(folders: Mapping[str, Collection[str]]) -> list[str]:
     """Name the results of a run, whose outputs go to these folders, as run.json does.
 
     They are: folders with a file for every frame; files; those of the cameras; the record.
@@ -172,8 +180,8 @@ def results(folders: Mapping[str, Collection[str]]) -> list[str]:
     chosen = [(folder, output) for output in OUTPUTS.values() for folder in folders if output.name in folders[folder]]
     chosen.sort(key=lambda each: not each[1].is_series)
     described = dict.fromkeys(folder for folder, output in chosen if output.needs_camera)
-    names = [*((folder, output.result) for folder, output in chosen), *((folder, CAMERA) for folder in described)]
-    return [*(f"{folder}/{name}" if folder else name for folder, name in names), RECORD]
+    names = [*((folder, output.result) for folder, output in chosen), *((folder, CAMERA_FILE) for folder in described)]
+    return [*(f"{folder}/{name}" if folder else name for folder, name in names), RUN_RECORD]
 
 
 def file_names(results: Iterable[str], frames: int) -> list[str]:
@@ -181,15 +189,15 @@ def file_names(results: Iterable[str], frames: int) -> list[str]:
     names: list[str] = []
     for result in results:
         folder, slash, name = result.rpartition("/")
-        output = FOLDERS.get(name)
+        output = SERIES_FOLDERS.get(name)
         names += [f"{folder}{slash}{output.path(n)}" for n in range(output.count(frames))] if output else [result]
     return names
 
 
-def listed(results: Collection[str], frames: int, name: str) -> bool:
+def is_result(results: Collection[str], frames: int, name: str) -> bool:
     """Tell whether a file is one of a run with these results and so many frames."""
     folder, _, file = name.rpartition("/")
-    output, number = FOLDERS.get(folder.rpartition("/")[2]), file.partition(".")[0]
+    output, number = SERIES_FOLDERS.get(folder.rpartition("/")[2]), file.partition(".")[0]
     if output is None or not number.isdecimal():
         return name in results
     return folder in results and int(number) < output.count(frames)

@@ -20,7 +20,7 @@ from typing_extensions import Self
 
 from taichi_msm.errors import did_you_mean
 from taichi_msm.scene.camera import Camera
-from taichi_msm.scene.outputs import CAMERA_NAME, EXPORTS, FOLDERS, MAX_NAME
+from taichi_msm.scene.outputs import CAMERA_NAME, EXPORT_PREFIX, MAX_NAME, SERIES_FOLDERS
 from taichi_msm.scene.section import (
     MAX_PIXELS,
     MAX_REFINE,
@@ -28,13 +28,13 @@ from taichi_msm.scene.section import (
     MAX_SUPERSAMPLE,
     MAX_TRACKS,
     Byte,
+    Integer,
     Number,
     Pixels,
     Section,
-    Share,
-    Whole,
+    UnitInterval,
     key,
-    refused,
+    scene_fault,
 )
 
 # A camera as a scene has it.
@@ -45,14 +45,14 @@ PRESETS = ("top", "oblique")
 class Light(Section):
     """How shading: tissue lights the sheet, from beside the camera."""
 
-    ambient: Share = key(0.2, "share of the light that comes from everywhere", "a number, 0 to 1")
-    gloss: Share = key(0.4, "brightness of the wet highlight, as a fraction of white", "a number, 0 to 1")
+    ambient: UnitInterval = key(0.2, "share of the light that comes from everywhere", "a number, 0 to 1")
+    gloss: UnitInterval = key(0.4, "brightness of the wet highlight, as a fraction of white", "a number, 0 to 1")
     relief: Annotated[Number, Field(ge=-MAX_RELIEF, le=MAX_RELIEF)] = key(
         0.0,
         "height of white in the picture above black, in percent of the sheet's larger side",
         f"a number, -{MAX_RELIEF} to {MAX_RELIEF}",
     )
-    vignette: Share = key(0.0, "how much darker the picture's corners are", "a number, 0 to 1")
+    vignette: UnitInterval = key(0.0, "how much darker the picture's corners are", "a number, 0 to 1")
 
 
 class Render(Section):
@@ -61,7 +61,7 @@ class Render(Section):
     size: tuple[Pixels, Pixels] = key(
         (512, 512), "width, height of a frame [px]", f"two whole numbers, 1 to {MAX_PIXELS}: [width, height] in pixels"
     )
-    refine: Annotated[Whole, Field(ge=0, le=MAX_REFINE)] = key(
+    refine: Annotated[Integer, Field(ge=0, le=MAX_REFINE)] = key(
         10, "points inserted between two neighbours when drawing", f"a whole number, 0 to {MAX_REFINE}"
     )
     camera: AnyCamera = key(
@@ -84,17 +84,17 @@ class Render(Section):
     )
     light: Light = key(Light(), "the light, with shading: tissue", "a mapping")
     wireframe: StrictBool = key(False, "draw the mass-point mesh over the surface", "true or false")
-    supersample: Annotated[Whole, Field(ge=1, le=MAX_SUPERSAMPLE)] = key(
+    supersample: Annotated[Integer, Field(ge=1, le=MAX_SUPERSAMPLE)] = key(
         1, "samples per pixel along each axis", f"a whole number, 1 to {MAX_SUPERSAMPLE}"
     )
     background: tuple[Byte, Byte, Byte] = key(
         (0, 0, 0), "colour where no surface is", "three whole numbers, 0 to 255: [red, green, blue]"
     )
     # Of grasp.yaml, 512 x 512 pixels, 65 % takes 2.5 kB a frame at 40 dB, where a GIF takes 35 kB.
-    quality: Annotated[Whole, Field(ge=1, le=100)] = key(
+    quality: Annotated[Integer, Field(ge=1, le=100)] = key(
         65, "quality of the film, with output: mp4 [%]", "a whole number, 1 to 100"
     )
-    tracks: Annotated[Whole, Field(ge=1, le=MAX_TRACKS)] = key(
+    tracks: Annotated[Integer, Field(ge=1, le=MAX_TRACKS)] = key(
         16, "material points along each side of the grid of tracks", f"a whole number, 1 to {MAX_TRACKS}"
     )
 
@@ -102,7 +102,7 @@ class Render(Section):
     @classmethod
     def _calibrated(cls, camera: AnyCamera, info: ValidationInfo) -> AnyCamera:
         if isinstance(camera, Camera) and camera.beside is not None:
-            raise refused("goes with render.cameras, where the other camera has its name", "beside")
+            raise scene_fault("goes with render.cameras, where the other camera has its name", "beside")
         # A size at fault is reported by itself.
         return camera.calibrated(info.data["size"]) if isinstance(camera, Camera) and "size" in info.data else camera
 
@@ -112,14 +112,14 @@ class Render(Section):
         if cameras is None:
             return None
         if not cameras:
-            raise refused("has no camera; add one by its name")
+            raise scene_fault("has no camera; add one by its name")
         for name, camera in cameras.items():
             if not re.fullmatch(CAMERA_NAME, name):
-                raise refused(f"is no name of a camera; take up to {MAX_NAME} of a-z, 0-9, _ and -", name)
-            if name in FOLDERS or name.startswith(EXPORTS):
-                raise refused("is the name of a folder that is not a camera's; take another name", name)
+                raise scene_fault(f"is no name of a camera; take up to {MAX_NAME} of a-z, 0-9, _ and -", name)
+            if name in SERIES_FOLDERS or name.startswith(EXPORT_PREFIX):
+                raise scene_fault("is the name of a folder that is not a camera's; take another name", name)
             if name in PRESETS and camera != name:
-                raise refused("is the name of a camera that any scene has; take another name", name)
+                raise scene_fault("is the name of a camera that any scene has; take another name", name)
             if isinstance(camera, Camera) and camera.beside is not None:
                 _require_beside(name, cameras)
         if "size" not in info.data:
@@ -129,7 +129,7 @@ class Render(Section):
             try:
                 calibrated[name] = camera.calibrated(info.data["size"]) if isinstance(camera, Camera) else camera
             except PydanticCustomError as error:
-                raise refused(error.message(), name, *(error.context or {}).get("below", ())) from None
+                raise scene_fault(error.message(), name, *(error.context or {}).get("below", ())) from None
         return calibrated
 
     @model_validator(mode="before")
@@ -143,7 +143,7 @@ class Render(Section):
     @model_validator(mode="after")
     def _one_way_to_the_cameras(self) -> Self:
         if self.cameras is not None and "camera" in self.model_fields_set:
-            raise refused("is given together with cameras; remove one of them, or set it to null", "camera")
+            raise scene_fault("is given together with cameras; remove one of them, or set it to null", "camera")
         return self
 
     @model_serializer(mode="wrap")
@@ -192,19 +192,19 @@ class Render(Section):
 def _require_beside(name: str, cameras: Mapping[str, AnyCamera]) -> None:
     """Make sure that a camera is beside another one that has a place."""
     if name == next(iter(cameras)):
-        raise refused("the first camera is the main one, beside no other; put another one first", name, "beside")
+        raise scene_fault("the first camera is the main one, beside no other; put another one first", name, "beside")
     way, camera = [name], cameras[name]
     while isinstance(camera, Camera) and camera.beside is not None:
         other = camera.beside
         if other in way:
             if len(way) == 1:
-                raise refused(f"{other} is this camera itself; name another one", name, "beside")
-            raise refused(f"goes round, {', '.join([*way, other])}; give one of them an eye", name, "beside")
+                raise scene_fault(f"{other} is this camera itself; name another one", name, "beside")
+            raise scene_fault(f"goes round, {', '.join([*way, other])}; give one of them an eye", name, "beside")
         if other not in cameras:
             if len(way) > 1:
                 return  # It is reported where it is named.
             others = [one for one in cameras if one != name]
             near = did_you_mean(other, others) or f"; the others are {', '.join(others)}"
-            raise refused(f"{other}: no camera has this name{near}", name, "beside")
+            raise scene_fault(f"{other}: no camera has this name{near}", name, "beside")
         way.append(other)
         camera = cameras[other]

@@ -14,19 +14,19 @@ from pydantic import (
 from taichi_msm.scene.outputs import OUTPUTS
 from taichi_msm.scene.render import Render
 from taichi_msm.scene.section import (
-    LARGEST_TOLERANCE,
+    FRAME_TOLERANCE,
     MAX_PROBES,
-    SMALLEST_TOLERANCE,
-    WHOLE,
+    MAX_TOLERANCE,
+    MIN_TOLERANCE,
     FilePath,
+    Integer,
     NotNegative,
     OutputName,
     Positive,
     Section,
     Tolerance,
-    Whole,
     key,
-    refused,
+    scene_fault,
 )
 from taichi_msm.scene.sheet import Sheet, Springs, StiffnessMap, Tissue
 from taichi_msm.scene.tools import Probe
@@ -54,7 +54,7 @@ class Time(Section):
         None,
         "with step: auto, largest allowed error of any frame due to the step, as a fraction of the largest "
         "displacement; pilot runs find the step",
-        f"a number, {SMALLEST_TOLERANCE:g} to {LARGEST_TOLERANCE:g}",
+        f"a number, {MIN_TOLERANCE:g} to {MAX_TOLERANCE:g}",
     )
     damping_difference: Literal["central", "backward"] = key(
         "central",
@@ -81,9 +81,9 @@ class Time(Section):
     @model_validator(mode="after")
     def _whole_frames(self) -> Time:
         frames = self.duration * self.frames_per_second
-        if not 0.5 < frames <= 1e9 or abs(frames - round(frames)) > WHOLE:
+        if not 0.5 < frames <= 1e9 or abs(frames - round(frames)) > FRAME_TOLERANCE:
             nearest = max(1, round(min(frames, 1e9))) / self.frames_per_second
-            raise refused(
+            raise scene_fault(
                 f"{self.duration:.12g} s x {self.frames_per_second:.12g} frames per second = {frames:.12g} frames, "
                 f"not a whole number up to 1e9; try {nearest:.12g}",
                 "duration",
@@ -94,15 +94,17 @@ class Time(Section):
     def _one_way_to_the_step(self) -> Time:
         if self.tolerance is not None and self.step != "auto":
             said = f"a tolerance chooses the step, but step is {self.step:.12g}"
-            raise refused(f"{said}; set step: auto or remove the tolerance", "tolerance")
+            raise scene_fault(f"{said}; set step: auto or remove the tolerance", "tolerance")
         return self
 
     @model_validator(mode="after")
     def _fits_rest(self) -> Time:
         if self.at_rest and self.tolerance is not None:
-            raise refused("is for the time step, and motion: quasistatic takes none; remove the tolerance", "tolerance")
+            raise scene_fault(
+                "is for the time step, and motion: quasistatic takes none; remove the tolerance", "tolerance"
+            )
         if self.at_rest and self.precision == "f32":
-            raise refused("f32 is too coarse for motion: quasistatic; take auto or f64", "precision")
+            raise scene_fault("f32 is too coarse for motion: quasistatic; take auto or f64", "precision")
         return self
 
 
@@ -126,7 +128,7 @@ class Scene(Section):
         "in its folder or below; required to draw",
         "the path of a picture",
     )
-    region: tuple[Whole, Whole, Whole, Whole] | None = key(
+    region: tuple[Integer, Integer, Integer, Integer] | None = key(
         None,
         "x, y, width, height [px] of the part of the image that the sheet carries; default: all of it",
         "four whole numbers: [x, y, width, height] in pixels",
@@ -152,10 +154,14 @@ class Scene(Section):
     def folders(self) -> dict[str, tuple[str, ...]]:
         """The entries of output by their folders: what a camera sees goes to its own, the rest to that of the run."""
         wanted = [output for name, output in OUTPUTS.items() if name in self.output]
-        folders = {"": tuple(output.name for output in wanted if not output.is_seen)}
+        folders = {"": tuple(output.name for output in wanted if not output.is_camera_output)}
         for camera in self.render.all_cameras:
             has_pair = bool(self.render.baseline(camera))
-            seen = (output.name for output in wanted if output.is_seen and (has_pair or not output.of_pair))
+            seen = (
+                output.name
+                for output in wanted
+                if output.is_camera_output and (has_pair or not output.needs_stereo_pair)
+            )
             folders[camera] = (*folders.get(camera, ()), *seen)
         return folders
 
@@ -176,7 +182,7 @@ class Scene(Section):
     @property
     def renders(self) -> bool:
         """Whether any output depends on what the camera sees."""
-        return any(OUTPUTS[name].is_seen for name in self.output)
+        return any(OUTPUTS[name].is_camera_output for name in self.output)
 
     @property
     def has_instruments(self) -> bool:
@@ -215,7 +221,7 @@ class Scene(Section):
     @model_validator(mode="after")
     def _picture_given(self) -> Scene:
         if self.draws and self.image is None:
-            raise refused(
+            raise scene_fault(
                 "a picture is needed to draw png, gif or mp4; name one, or set output to [trajectory] or []", "image"
             )
         return self

@@ -23,11 +23,11 @@ from taichi_msm.scene import section
 from taichi_msm.scene.outputs import OUTPUTS
 
 # Beyond these limits, squares and quotients of two numbers overflow or underflow.
-LARGEST = 1e30
-SMALLEST = 1e-30
+MAX_MAGNITUDE = 1e30
+MIN_MAGNITUDE = 1e-30
 
 # The type of the errors that validators raise.
-REFUSED = "refused"
+SCENE_FAULT = "refused"
 
 MAX_SHOWN = 60
 
@@ -35,17 +35,17 @@ MAX_SHOWN = 60
 MAX_FAULTS = 1000
 
 
-def refused(message: str, *below: str | int) -> PydanticCustomError:
+def scene_fault(message: str, *below: str | int) -> PydanticCustomError:
     """Make the error that a validator raises: the user reads this message, at the value or a key or item below it."""
-    return PydanticCustomError(REFUSED, message, {"below": below})
+    return PydanticCustomError(SCENE_FAULT, message, {"below": below})
 
 
-def flow(value: Any) -> str:
+def format_value(value: Any) -> str:
     """Show a value as it could be written in the file, cut to a length that fits a line."""
-    return cut(json.dumps(value, ensure_ascii=False, default=repr))
+    return truncate(json.dumps(value, ensure_ascii=False, default=repr))
 
 
-def cut(text: str) -> str:
+def truncate(text: str) -> str:
     """Keep the beginning of a long text."""
     return text if len(text) <= MAX_SHOWN else text[:MAX_SHOWN] + "..."
 
@@ -170,7 +170,7 @@ def _drop_short(faults: Iterable[_Fault]) -> Iterator[_Fault]:
 
 def _message(fault: _Fault, data: Any) -> str:
     """Say what is wrong and what is expected."""
-    if fault.kind == REFUSED:
+    if fault.kind == SCENE_FAULT:
         return fault.text
     if fault.kind == "missing":
         return f"missing; expected {fault.expects}"
@@ -179,10 +179,10 @@ def _message(fault: _Fault, data: Any) -> str:
     for part in fault.path:
         data = data[part]
     limit = fault.context.get("ge", fault.context.get("le"))
-    if limit in (LARGEST, -LARGEST) or (limit == SMALLEST and data > 0):
-        return f"{flow(data)} is out of range; numbers are from {SMALLEST:g} to {LARGEST:g} in size"
+    if limit in (MAX_MAGNITUDE, -MAX_MAGNITUDE) or (limit == MIN_MAGNITUDE and data > 0):
+        return f"{format_value(data)} is out of range; numbers are from {MIN_MAGNITUDE:g} to {MAX_MAGNITUDE:g} in size"
     near = did_you_mean(data, fault.words) if isinstance(data, str) else ""
-    return f"{flow(data)} is not allowed; expected {fault.expects}{near}"
+    return f"{format_value(data)} is not allowed; expected {fault.expects}{near}"
 
 
 def _unknown(name: str, known: Sequence[str]) -> str:
@@ -208,31 +208,31 @@ MAX_PATH = 4096
 DEFAULT_OFFSET = 10.0
 
 # Times that differ by less than this fraction of a frame are one instant: 0.1 s x 30 /s is 3 frames.
-WHOLE = 1e-6
+FRAME_TOLERANCE = 1e-6
 
 # Below the first, rounding in f64 is no longer small beside the error; above the second, the result means nothing.
-SMALLEST_TOLERANCE = 1e-10
-LARGEST_TOLERANCE = 0.5
+MIN_TOLERANCE = 1e-10
+MAX_TOLERANCE = 0.5
 
-Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-LARGEST, le=LARGEST)]
-Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=SMALLEST, le=LARGEST)]
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_MAGNITUDE, le=MAX_MAGNITUDE)]
+Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=MIN_MAGNITUDE, le=MAX_MAGNITUDE)]
 NotNegative = Annotated[Number, Field(ge=0)]
-Whole = Annotated[int, Field(strict=True)]
-Tolerance = Annotated[Number, Field(ge=SMALLEST_TOLERANCE, le=LARGEST_TOLERANCE)]
-Count = Annotated[Whole, Field(ge=2, le=MAX_POINTS)]
-Pixels = Annotated[Whole, Field(ge=1, le=MAX_PIXELS)]
-Byte = Annotated[Whole, Field(ge=0, le=255)]
+Integer = Annotated[int, Field(strict=True)]
+Tolerance = Annotated[Number, Field(ge=MIN_TOLERANCE, le=MAX_TOLERANCE)]
+NodeCount = Annotated[Integer, Field(ge=2, le=MAX_POINTS)]
+Pixels = Annotated[Integer, Field(ge=1, le=MAX_PIXELS)]
+Byte = Annotated[Integer, Field(ge=0, le=255)]
 FilePath = Annotated[str, Field(strict=True, min_length=1, max_length=MAX_PATH)]
-Share = Annotated[Number, Field(ge=0, le=1)]
+UnitInterval = Annotated[Number, Field(ge=0, le=1)]
 Side = Literal["top", "bottom", "left", "right"]
 Vector = tuple[Number, Number, Number]
 # A tool may come from beyond the edge; larger numbers are taken for pixels given by mistake, and refused.
-Fraction = Annotated[Number, Field(ge=-1, le=2)]
+SheetFraction = Annotated[Number, Field(ge=-1, le=2)]
 
 
-def key(default: Any, means: str, expects: str) -> Any:
+def key(default: Any, description: str, expects: str) -> Any:
     """Describe one key: its default (... where it is required), what it means, and what errors say that it may hold."""
-    return Field(default, description=means, json_schema_extra={"expects": expects})
+    return Field(default, description=description, json_schema_extra={"expects": expects})
 
 
 if TYPE_CHECKING:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Literal
 
 from taichi_msm.scene.section import (
-    LARGEST_TOLERANCE,
     MAX_POINTS,
-    SMALLEST_TOLERANCE,
-    Count,
+    MAX_TOLERANCE,
+    MIN_TOLERANCE,
     FilePath,
+    NodeCount,
     NotNegative,
     Positive,
     Section,
@@ -22,7 +22,7 @@ from taichi_msm.scene.section import (
 class Sheet(Section):
     """The sheet of mass points."""
 
-    points: tuple[Count, Count] = key(
+    points: tuple[NodeCount, NodeCount] = key(
         ..., "rows, columns of mass points", f"two whole numbers, 2 to {MAX_POINTS}: [rows, cols]"
     )
     size: tuple[Positive, Positive] = key(
@@ -40,7 +40,7 @@ class Sheet(Section):
         None,
         "with tissue: largest allowed error due to the number of points, as a fraction of the largest "
         "displacement; pilot runs find how many more points are needed",
-        f"a number, {SMALLEST_TOLERANCE:g} to {LARGEST_TOLERANCE:g}",
+        f"a number, {MIN_TOLERANCE:g} to {MAX_TOLERANCE:g}",
     )
 
 

@@ -17,15 +17,15 @@ from typing_extensions import Self
 
 from taichi_msm.scene.section import (
     DEFAULT_OFFSET,
-    SMALLEST,
-    Fraction,
+    MIN_MAGNITUDE,
     NotNegative,
     Number,
     Positive,
     Section,
+    SheetFraction,
     Vector,
     key,
-    refused,
+    scene_fault,
 )
 
 
@@ -39,8 +39,8 @@ class Instrument(Section):
     @field_validator("shaft", mode="after")
     @classmethod
     def _leads_somewhere(cls, shaft: Vector) -> Vector:
-        if not any(abs(number) >= SMALLEST for number in shaft):
-            raise refused("has no direction; take one such as [0.3, -0.5, 1]")
+        if not any(abs(number) >= MIN_MAGNITUDE for number in shaft):
+            raise scene_fault("has no direction; take one such as [0.3, -0.5, 1]")
         return shaft
 
 
@@ -58,13 +58,16 @@ class Probe(Section):
         }
     )
 
-    path: Annotated[tuple[tuple[Number, Fraction, Fraction, Number], ...], Field(min_length=1)] | None = key(
+    path: Annotated[tuple[tuple[Number, SheetFraction, SheetFraction, Number], ...], Field(min_length=1)] | None = key(
         None,
         "in place of a force: where the instrument is; keys [[t, across, down, height], ...], linear between, held "
         "outside; height: of the lowest point of its round tip above the sheet at rest [m]",
         "keys [[t, across, down, height], ...], t in seconds, across and down from -1 to 2, height in metres",
     )
-    at: tuple[Fraction, Fraction] | Annotated[tuple[tuple[Number, Fraction, Fraction], ...], Field(min_length=1)] = key(
+    at: (
+        tuple[SheetFraction, SheetFraction]
+        | Annotated[tuple[tuple[Number, SheetFraction, SheetFraction], ...], Field(min_length=1)]
+    ) = key(
         (0.5, 0.5),
         "control point: fraction of the width from the left, of the height from the top; "
         "or keys [[t, across, down], ...], linear between, held outside",
@@ -123,22 +126,22 @@ class Probe(Section):
             return force  # A fault of its own.
         total = info.data["total"]
         if force is None and total is None and info.data["path"] is None:
-            raise refused(
+            raise scene_fault(
                 "missing; expected total (whole tool) or, with springs, force (one point): [x, y, z] in newtons; or "
                 "path, for a tool that is moved"
             )
         if force is not None and total is not None:
-            raise refused("is given together with total; remove one of them")
+            raise scene_fault("is given together with total; remove one of them")
         return force
 
     @field_validator("falloff", "offset", mode="after")
     @classmethod
     def _fit_total(cls, value: float, info: ValidationInfo) -> float:
         if info.data.get("total") is not None:
-            if info.field_name == "falloff" and value < SMALLEST:
-                raise refused(f"{value:g} would spread total over an infinite area; take a number above 0, in 1/m")
+            if info.field_name == "falloff" and value < MIN_MAGNITUDE:
+                raise scene_fault(f"{value:g} would spread total over an infinite area; take a number above 0, in 1/m")
             if info.field_name == "offset" and value != DEFAULT_OFFSET:
-                raise refused("goes with force, not with total; remove offset")
+                raise scene_fault("goes with force, not with total; remove offset")
         return value
 
     @field_validator("at", "load", mode="after")
@@ -149,9 +152,11 @@ class Probe(Section):
         times = [entry[0] for entry in keys]
         for n in range(1, len(times)):
             if times[n] < times[n - 1]:
-                raise refused(f"goes back in time, from {times[n - 1]:g} s to {times[n]:g} s; sort the keys by time", n)
+                raise scene_fault(
+                    f"goes back in time, from {times[n - 1]:g} s to {times[n]:g} s; sort the keys by time", n
+                )
             if n > 1 and times[n] == times[n - 2]:
-                raise refused(
+                raise scene_fault(
                     f"third key at {times[n]:g} s; a jump is two keys at one time, so remove the middle one", n
                 )
         return keys
@@ -163,7 +168,7 @@ class Probe(Section):
             assert path is not None
             before, now = path[n - 1][0], path[n][0]
             if now <= before:
-                raise refused(
+                raise scene_fault(
                     f"is at {now:g} s, and the key before it at {before:g} s; sort the keys, each later than the last",
                     n,
                 )
@@ -174,9 +179,11 @@ class Probe(Section):
     def _one_grip_at_a_time(cls, grip: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
         for n, (begin, end) in enumerate(grip):
             if end <= begin:
-                raise refused(f"ends at {end:g} s, and begins at {begin:g} s; give [from, to] in this order", n)
+                raise scene_fault(f"ends at {end:g} s, and begins at {begin:g} s; give [from, to] in this order", n)
             if n and begin < grip[n - 1][1]:
-                raise refused(f"begins at {begin:g} s, before the grip before it ends; sort them, without overlap", n)
+                raise scene_fault(
+                    f"begins at {begin:g} s, before the grip before it ends; sort them, without overlap", n
+                )
         return grip
 
     @model_validator(mode="after")
@@ -185,13 +192,13 @@ class Probe(Section):
         if self.path is None:
             for name in _OF_PATH & given:
                 if getattr(self, name):
-                    raise refused("goes with path; a tool with a force has none", name)
+                    raise scene_fault("goes with path; a tool with a force has none", name)
             return self
         for name in sorted(_OF_FORCE & given):
             if getattr(self, name) is not None:
-                raise refused("goes with a force, and path gives the place; remove one of them", name)
+                raise scene_fault("goes with a force, and path gives the place; remove one of them", name)
         if self.instrument is None:
-            raise refused("missing; with path expected a mapping with radius, shaft and length", "instrument")
+            raise scene_fault("missing; with path expected a mapping with radius, shaft and length", "instrument")
         return self
 
     @model_serializer(mode="wrap")

@@ -31,7 +31,7 @@ from taichi_msm.model.loads import frame_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.tools import GRASP, Tool, grip_frames
-from taichi_msm.scene.section import SMALLEST
+from taichi_msm.scene.section import MIN_MAGNITUDE
 from taichi_msm.solver.arrays import SheetLayout, Start
 from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.solver.kernel_rest import Relaxation
@@ -126,7 +126,7 @@ class Rest(Dynamics):
     def _started(self, start: Start) -> Any:
         self._astray = False
         # A point without any stiffness has no place to rest either.
-        self._masses = np.maximum(inertia(self.plan), SMALLEST)
+        self._masses = np.maximum(inertia(self.plan), MIN_MAGNITUDE)
         return Relaxation(self.structure, start, self._masses)
 
     @property

@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from taichi_msm.errors import SceneError, StageProgressCallback
-from taichi_msm.load.check import checked
+from taichi_msm.load.check import check_scene
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.render.texture import load_texture
@@ -72,7 +72,7 @@ def study(
         SceneError: when the picture cannot be decoded, or the trajectories do not fit in memory.
         DeviceError: when the arch is not there.
     """
-    given, device = checked(scene), runtime.start(arch, threads)
+    given, device = check_scene(scene), runtime.start(arch, threads)
     scene = given.scene
     if scene.time.at_rest:
         raise SceneError(["time.motion: quasistatic takes no steps, which a study compares; set time.motion: dynamic"])

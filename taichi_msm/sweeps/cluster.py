@@ -26,7 +26,7 @@ from distributed.utils import LoopRunner, silence_logging_cmgr
 
 from taichi_msm.errors import ExecutorError, LostExecutorError, MsmError, StageProgressCallback
 from taichi_msm.images import use_copies
-from taichi_msm.scene.outputs import SWEEP
+from taichi_msm.scene.outputs import SWEEP_RECORD
 from taichi_msm.sweeps.runs import Outcome, Task, take
 from taichi_msm.sweeps.spec import Sweep
 from taichi_msm.system.compiler import versions, what_decides_bits
@@ -91,7 +91,7 @@ class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
         if (threads := worker.state.nthreads) != 1:
             return f"worker {worker.address} has {threads} threads; start it with one: dask worker --nthreads 1"
         # What a worker wrote into a folder of its own would be lost.
-        if not (self.directory / SWEEP).is_file():
+        if not (self.directory / SWEEP_RECORD).is_file():
             return f"worker {worker.address} does not see {self.directory}; choose an --out that all machines share"
         here = versions()
         if others := [f"{name} {version}" for name, version in self.versions.items() if here.get(name) != version]:

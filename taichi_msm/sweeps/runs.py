@@ -36,9 +36,9 @@ from taichi_msm.errors import (
     StageProgressCallback,
     writing,
 )
-from taichi_msm.load.scene_file import File, plan_file
+from taichi_msm.load.scene_file import ParsedFile, plan_file
 from taichi_msm.runs.directory import FILE, FOLDER, MAX_RECORD, give_name, kind, lock, require, staged
-from taichi_msm.scene.outputs import RECORD, RUNS, SWEEP, numbered
+from taichi_msm.scene.outputs import RUN_RECORD, RUNS_FOLDER, SWEEP_RECORD, zero_padded
 from taichi_msm.sweeps.pool import DiedError
 from taichi_msm.sweeps.spec import Sweep
 from taichi_msm.system.compiler import versions, what_decides_bits
@@ -64,11 +64,11 @@ def values_in(directory: Path, sweep: Sweep) -> list[list[Any]]:
         SceneError: when the folder holds another sweep, or the same of versions that give other bits.
         FilesError: when it cannot be read or written, something is in the way, or it keeps other values.
     """
-    record = require(directory / SWEEP, FILE)
-    require(directory / RUNS, FOLDER)
+    record = require(directory / SWEEP_RECORD, FILE)
+    require(directory / RUNS_FOLDER, FOLDER)
     description, values = sweep.description(), sweep.values()
     if not record.exists():
-        for name in (RUNS, *FILES, RECORD):
+        for name in (RUNS_FOLDER, *FILES, RUN_RECORD):
             if (directory / name).exists():
                 raise ForeignError.at(directory / name, "something")
         content = {
@@ -79,8 +79,8 @@ def values_in(directory: Path, sweep: Sweep) -> list[list[Any]]:
             "values": values,
         }
         with writing(directory), staged(directory) as hidden:
-            (hidden / SWEEP).write_text(json.dumps(content) + "\n", encoding="utf-8", errors="backslashreplace")
-            give_name(hidden / SWEEP, record)  # unless another shard has just done so
+            (hidden / SWEEP_RECORD).write_text(json.dumps(content) + "\n", encoding="utf-8", errors="backslashreplace")
+            give_name(hidden / SWEEP_RECORD, record)  # unless another shard has just done so
     # As a text, in which no number equals another one, and NaN itself.
     own_values = json.dumps(values)
     try:
@@ -143,8 +143,8 @@ def ended(task: Task, sweep: Sweep) -> Outcome | None:
     """Find the outcome of a run that has ended; None: it is missing, was interrupted, or is another task's."""
     # A record that no run has written is as none.
     with suppress(OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        if kind(task.directory / RECORD) == FILE:
-            with (task.directory / RECORD).open("rb") as file:
+        if kind(task.directory / RUN_RECORD) == FILE:
+            with (task.directory / RUN_RECORD).open("rb") as file:
                 record = json.loads(file.read(MAX_RECORD))
             is_own = tuple(record["overrides"]) == task.overrides
             has_same_files = sweep.digests.issuperset(record["sha256"].values())
@@ -159,7 +159,7 @@ def alone(directory: Path, pause: Pause) -> Iterator[None]:
     with ExitStack() as opened:
         while True:
             try:
-                opened.enter_context(lock(directory / SWEEP))
+                opened.enter_context(lock(directory / SWEEP_RECORD))
                 break
             except BlockingIOError:
                 pause()
@@ -239,7 +239,7 @@ class Task(NamedTuple):
     """A run that is to be taken."""
 
     run: int  # its number
-    scene: File
+    scene: ParsedFile
     overrides: tuple[str, ...]
     folder: Path  # of the sweep
     home: Path  # from which its paths start
@@ -247,7 +247,7 @@ class Task(NamedTuple):
     @property
     def directory(self) -> Path:
         """Where its results go."""
-        return self.folder / RUNS / numbered(self.run)
+        return self.folder / RUNS_FOLDER / zero_padded(self.run)
 
 
 def take(task: Task, progress: StageProgressCallback = lambda stage, done, total: None) -> Outcome:
@@ -371,7 +371,7 @@ class SweepResult:
 
     def run_directory(self, run: int) -> Path:
         """Name the folder of a run."""
-        return self.directory / RUNS / numbered(run)
+        return self.directory / RUNS_FOLDER / zero_padded(run)
 
     def some(self, most: int) -> list[int]:
         """Give the numbers of at most so many runs, evenly spread over all."""

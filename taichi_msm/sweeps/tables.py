@@ -36,7 +36,7 @@ from taichi_msm.load.cost import rough_time
 from taichi_msm.load.scene_file import plan_file
 from taichi_msm.model.plan import Plan
 from taichi_msm.runs.directory import MAX_RECORD, replacing
-from taichi_msm.scene.outputs import RECORD
+from taichi_msm.scene.outputs import RUN_RECORD
 from taichi_msm.sweeps.plots import parameters, results, sensitivity, write_contact
 from taichi_msm.sweeps.runs import (
     CONTACT,
@@ -217,7 +217,7 @@ def split(runs: int, seed: int) -> list[str]:
 
 def _facts(directory: Path) -> dict[str, Any]:
     """Give what a loader needs to know of a run: its outputs, the frames, their size [px] and how many a second."""
-    record = json.loads(read_regular(directory / RECORD, MAX_RECORD))
+    record = json.loads(read_regular(directory / RUN_RECORD, MAX_RECORD))
     scene = record["scene"]
     return {
         "outputs": record["outputs"],

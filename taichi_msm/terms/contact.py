@@ -26,7 +26,7 @@ from typing_extensions import Self
 from taichi_msm.model.loads import Schedule
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.tools import GRASP
-from taichi_msm.scene.section import WHOLE
+from taichi_msm.scene.section import FRAME_TOLERANCE
 from taichi_msm.scene.tools import Probe
 from taichi_msm.terms.base import ACROSS, DY, MOVES, TOP, StepCode, Term
 from taichi_msm.terms.damping import coefficients
@@ -92,7 +92,9 @@ class ContactTerm(Term):
             own[:, AXIS:] = *tool.axis, tool.length, tool.radius, tool.friction, *inverse
             for begin, end in tool.grips:
                 # The first steps at or after these times, but for rounding.
-                taken, left = (max(0, math.ceil((at - WHOLE * frame) * grid.steps_per_second)) for at in (begin, end))
+                taken, left = (
+                    max(0, math.ceil((at - FRAME_TOLERANCE * frame) * grid.steps_per_second)) for at in (begin, end)
+                )
                 held = (steps[:-1] >= taken) & (steps[:-1] < left)
                 own[held, GRIP] = np.where(steps[:-1] == taken, BEGINS, GOES_ON)[held]
                 own[held, SINCE:AXIS] = (places[1:] - tool.middle(np.array([taken / grid.steps_per_second])))[held]
