@@ -20,7 +20,7 @@ from typing_extensions import Self
 
 from taichi_msm.errors import did_you_mean
 from taichi_msm.scene.camera import Camera
-from taichi_msm.scene.outputs import CAMERA_NAME, EXPORT_PREFIX, MAX_NAME, SERIES_FOLDERS
+from taichi_msm.scene.outputs import CAMERA_NAME, EXPORT_PREFIX, MAX_CAMERA_NAME, SERIES_FOLDERS
 from taichi_msm.scene.section import (
     MAX_PIXELS,
     MAX_REFINE,
@@ -115,7 +115,7 @@ class Render(Section):
             raise scene_fault("has no camera; add one by its name")
         for name, camera in cameras.items():
             if not re.fullmatch(CAMERA_NAME, name):
-                raise scene_fault(f"is no name of a camera; take up to {MAX_NAME} of a-z, 0-9, _ and -", name)
+                raise scene_fault(f"is no name of a camera; take up to {MAX_CAMERA_NAME} of a-z, 0-9, _ and -", name)
             if name in SERIES_FOLDERS or name.startswith(EXPORT_PREFIX):
                 raise scene_fault("is the name of a folder that is not a camera's; take another name", name)
             if name in PRESETS and camera != name:

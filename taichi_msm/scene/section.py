@@ -250,8 +250,8 @@ FilePath = Annotated[str, Field(strict=True, min_length=1, max_length=MAX_PATH)]
 UnitInterval = Annotated[Number, Field(ge=0, le=1)]
 Side = Literal["top", "bottom", "left", "right"]
 Vector = tuple[Number, Number, Number]
-# Position on the sheet as a fraction of its width or height. A tool may come from beyond the edge, but larger numbers are
-# probably pixels.
+# Position on the sheet as a fraction of its width or height. A tool may come from beyond the edge, but much larger
+# numbers are probably pixels.
 SheetFraction = Annotated[Number, Field(ge=-1, le=2)]
 
 
