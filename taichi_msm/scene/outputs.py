@@ -140,8 +140,8 @@ def _rows() -> Iterator[Output]:
     description = "255 where the visible material point is hidden or outside the picture in the next frame, else 0"
     yield Output("occlusion", "occlusion/0000.png", "flow", description, pixel_bytes=0.5)
     description = (
-        "of the reference camera of a stereo pair: float32 [px], fx × baseline / depth, the distance to the left in the "
-        "picture of the first camera that is `beside` it; 0: background"
+        "of the reference camera of a stereo pair: float32 [px], fx × baseline / depth, the distance to the left in "
+        "the picture of the first camera that is `beside` it; 0: background"
     )
     yield Output(
         "disparity",
