@@ -144,8 +144,8 @@ class Camera(Section):
     )
     eye: Vector | Times | None = key(
         None,
-        "position of the camera [m], or its keyframes, linear between, constant outside; required without pose, poses "
-        "and beside",
+        "position of the camera [m], or its keyframes, linear between, constant outside; required without pose, "
+        "poses and beside",
         "three numbers: [x, y, z] in metres," + _KEYS,
     )
     target: Vector | Times = key(

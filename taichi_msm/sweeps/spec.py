@@ -37,7 +37,7 @@ from taichi_msm.load.scene_file import (
     parse_override,
     read_file,
 )
-from taichi_msm.load.yaml_reader import UnreadableError, read
+from taichi_msm.load.yaml_reader import UnreadableError, read_yaml
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import (
     MAX_MAGNITUDE,
@@ -231,7 +231,7 @@ def cell(value: Any) -> str:
     """Write a value as `--set` takes it."""
     if isinstance(value, str):
         with suppress(UnreadableError):
-            document = read(value)
+            document = read_yaml(value)
             if document.data == value and not document.faults:
                 return value
     return json.dumps(value, ensure_ascii=False)
