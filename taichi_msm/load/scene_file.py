@@ -20,6 +20,7 @@ from taichi_msm.model.plan import Plan
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_PATH, format_value, truncate
 
+# Limit of the size of a file.
 MAX_BYTES = 2**20
 
 # Keys whose values are paths of pictures.
@@ -68,10 +69,6 @@ class ParsedFile(NamedTuple):
 
 
 SCENE_KIND = FileKind("scene", "sheet, tissue or springs, and time")
-
-_NO_KEY = Problem((), "expected KEY=VALUE, such as sheet.points=[61,61]")
-_NO_PATH = Problem((), "expected a key such as sheet.points")
-_INDEX = re.compile("[0-9]{1,9}")
 
 
 def load_scene(
@@ -141,7 +138,7 @@ def plan_file(
     for key in (*(PICTURE_KEYS if image is None else MAP_KEYS), *(key for key, _ in camera_files(draft.data))):
         draft.resolve_path(key, file.folder)
     if image is not None:
-        draft.override(_Override(f"--image {truncate(str(image))}", IMAGE_KEY, str(image)))
+        draft.override(Override(f"--image {truncate(str(image))}", IMAGE_KEY, str(image)))
     plan, problems = validate(draft.data)
     draft.report(problems)
     if plan is None or draft.problems:
@@ -183,7 +180,7 @@ def schema() -> dict[str, Any]:
     return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | Scene.model_json_schema()
 
 
-class _Override(NamedTuple):
+class Override(NamedTuple):
     """A value that replaces one of the file.
 
     Attributes:
@@ -199,32 +196,32 @@ class _Override(NamedTuple):
     problems: Sequence[Problem] = ()
 
 
-def parse_override(text: str) -> _Override:
+def parse_override(text: str) -> Override:
     """Parse an override "KEY=VALUE"."""
     key, equals, value = text.partition("=")
     name = f"--set {truncate(key)}{equals}{truncate(value)}"
     path = parse_key(key.strip())
     if not equals or not path:
-        return _Override(name, (), problems=[_NO_KEY])
+        return Override(name, (), problems=[Problem((), "expected KEY=VALUE, such as sheet.points=[61,61]")])
     try:
         document = read_yaml(value)
     except UnreadableError as error:
-        return _Override(name, path, problems=[Problem(path, str(error))])
+        return Override(name, path, problems=[Problem(path, str(error))])
     faults = [Problem(path + fault.path, fault.message) for _, fault in document.faults]
-    return _Override(name, path, document.data, faults)
+    return Override(name, path, document.data, faults)
 
 
-def _parse_value(key: str, value: Any) -> _Override:
+def _parse_value(key: str, value: Any) -> Override:
     path = parse_key(key)
     name = f"override {truncate(key)}"
     if not path:
-        return _Override(name, (), problems=[_NO_PATH])
+        return Override(name, (), problems=[Problem((), "expected a key such as sheet.points")])
     try:
         plain = json.loads(json.dumps(value))
     except (TypeError, ValueError, RecursionError):
         problem = Problem(path, f"a file cannot hold this {type(value).__name__}; use numbers, text, lists, dicts")
-        return _Override(name, path, problems=[problem])
-    return _Override(f"{name}={format_value(plain)}", path, plain)
+        return Override(name, path, problems=[problem])
+    return Override(f"{name}={format_value(plain)}", path, plain)
 
 
 def parse_key(key: str) -> Key:
@@ -232,7 +229,7 @@ def parse_key(key: str) -> Key:
     parts = key.split(".")
     if len(parts) > MAX_DEPTH or not all(part and part.isprintable() for part in parts):
         return ()
-    return tuple(int(part) if _INDEX.fullmatch(part) else part for part in parts)
+    return tuple(int(part) if re.fullmatch("[0-9]{1,9}", part) else part for part in parts)
 
 
 class _Origin(NamedTuple):
@@ -265,7 +262,7 @@ class Draft:
         self.data: dict[str, Any] = deepcopy(document.data)
         self.problems = [(self._in_file(mark), problem) for mark, problem in document.faults]
 
-    def override(self, override: _Override) -> None:
+    def override(self, override: Override) -> None:
         """Apply an override."""
         self._overrides += 1
         origin = _Origin(self._overrides, Mark(1, 1), override.name)

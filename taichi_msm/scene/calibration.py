@@ -22,6 +22,7 @@ import yaml
 from taichi_msm.images import actual_path, irregular_kind
 from taichi_msm.scene.section import MAX_MAGNITUDE, truncate
 
+# Limit of the size of a file.
 MAX_BYTES = 2**22
 
 # Spellings of a key, reduced to lower-case letters and digits.

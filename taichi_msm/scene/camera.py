@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -86,12 +87,13 @@ class Pose(Section):
     translation: Vector = key(..., "world's origin in the camera's axes [m]", "three numbers: [x, y, z] in metres")
 
 
-Times = Annotated[tuple[tuple[Number, Number, Number, Number], ...], Field(min_length=1)]
-Quaternions = Annotated[
+# Keyframes of a vector: t [s], x, y, z; and of a pose: t [s], position [m], quaternion x, y, z, w.
+VectorKeyframes = Annotated[tuple[tuple[Number, Number, Number, Number], ...], Field(min_length=1)]
+PoseRows = Annotated[
     tuple[tuple[Number, Number, Number, Number, Number, Number, Number, Number], ...], Field(min_length=1)
 ]
 
-_KEYS = " or keys [[t, x, y, z], ...], t in seconds"
+_OR_KEYFRAMES = " or keys [[t, x, y, z], ...], t in seconds"
 
 
 class Camera(Section):
@@ -125,7 +127,7 @@ class Camera(Section):
         "in place of eye, target and up: transform from the world to the camera",
         "a mapping with rotation and translation",
     )
-    poses: FilePath | Quaternions | None = key(
+    poses: FilePath | PoseRows | None = key(
         None,
         "in place of eye, target and up: trajectory of the camera, a file in TUM's format, relative to the scene file, "
         "or its rows [t, tx, ty, tz, qx, qy, qz, qw], from the camera to the world",
@@ -142,21 +144,21 @@ class Camera(Section):
         "distance from the camera named by beside, along the x axis of that camera [m]",
         "a number but 0, in metres",
     )
-    eye: Vector | Times | None = key(
+    eye: Vector | VectorKeyframes | None = key(
         None,
         "position of the camera [m], or its keyframes, linear between, constant outside; required without pose, "
         "poses and beside",
-        "three numbers: [x, y, z] in metres," + _KEYS,
+        "three numbers: [x, y, z] in metres," + _OR_KEYFRAMES,
     )
-    target: Vector | Times = key(
+    target: Vector | VectorKeyframes = key(
         (0.0, 0.0, 0.0),
         "point on the optical axis [m], or its keyframes",
-        "three numbers: [x, y, z] in metres," + _KEYS,
+        "three numbers: [x, y, z] in metres," + _OR_KEYFRAMES,
     )
-    up: Vector | Times = key(
+    up: Vector | VectorKeyframes = key(
         (0.0, 1.0, 0.0),
         "direction that is up in the picture, or its keyframes",
-        "three numbers: [x, y, z]," + _KEYS,
+        "three numbers: [x, y, z]," + _OR_KEYFRAMES,
     )
     fov: Annotated[Number, Field(ge=MIN_FOV, lt=180)] = key(
         40.0,
@@ -171,7 +173,7 @@ class Camera(Section):
 
     @field_validator("poses", mode="after")
     @classmethod
-    def _read_poses(cls, poses: str | Quaternions | None) -> Quaternions | None:
+    def _read_poses(cls, poses: str | PoseRows | None) -> PoseRows | None:
         if not isinstance(poses, str):
             for n, row in enumerate(poses or ()):
                 if fault := pose_fault(row, poses[n - 1] if n else None):  # type: ignore[index]
@@ -184,16 +186,16 @@ class Camera(Section):
 
     @field_validator("eye", "target", "up", mode="after")
     @classmethod
-    def _check_order(cls, keys: Any, info: ValidationInfo) -> Any:
-        if info.field_name == "eye" and keys is None and not {"beside", "pose", "poses"} & _given(info):
+    def _check_order(cls, keyframes: Any, info: ValidationInfo) -> Any:
+        if info.field_name == "eye" and keyframes is None and not {"beside", "pose", "poses"} & _given(info):
             raise scene_fault("missing; expected " + cls.model_fields["eye"].json_schema_extra["expects"])  # type: ignore
-        if keys is None or not isinstance(keys[0], tuple):
-            return keys
-        for n in range(1, len(keys)):
-            if keys[n][0] <= keys[n - 1][0]:
-                times = f"is at {keys[n][0]:g} s, and the key before it at {keys[n - 1][0]:g} s"
+        if keyframes is None or not isinstance(keyframes[0], tuple):
+            return keyframes  # A constant vector.
+        for n, ((previous, *_), (time, *_)) in enumerate(pairwise(keyframes), 1):
+            if time <= previous:
+                times = f"is at {time:g} s, and the key before it at {previous:g} s"
                 raise scene_fault(f"{times}; sort the keys, each later than the last", n)
-        return keys
+        return keyframes
 
     @model_validator(mode="after")
     def _check_combination(self) -> Self:

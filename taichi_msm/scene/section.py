@@ -103,7 +103,7 @@ def _fault(error: Any, section: type[BaseModel]) -> _Fault:
     for part in parts:
         path += (part,)
         if part in section.model_fields:
-            section, expects, is_mapping, is_union, words = _describe(section, part)
+            section, expects, is_mapping, is_union, words = _key_info(section, part)
             path += (name,) if is_mapping and (name := next(parts, None)) is not None else ()
             if is_union:
                 branches += ((path, next(parts, "")),)
@@ -113,17 +113,26 @@ def _fault(error: Any, section: type[BaseModel]) -> _Fault:
     return _Fault(path, error["type"], error["msg"], context, section, expects, branches, words[in_list])
 
 
-@cache
-def _describe(
-    section: type[BaseModel], name: str
-) -> tuple[type[BaseModel], str, bool, bool, tuple[tuple[str, ...], ...]]:
-    """Describe a key.
+class _KeyInfo(NamedTuple):
+    """Properties of a key.
 
-    Returns:
-        The section of the keys below it, or else its own; the allowed values, for the message; whether the value is a
-        mapping from names; whether the value, or each value of the mapping, is of several kinds; the texts that the
-        value, and the items of a list, may be.
+    Attributes:
+        section: section of the keys below it, or else the section that it belongs to.
+        expects: allowed values, for the message.
+        is_mapping: whether the value is a mapping from names.
+        is_union: whether the value, or each value of the mapping, may be of several kinds.
+        words: texts that the value, and the items of a list, may be.
     """
+
+    section: type[BaseModel]
+    expects: str
+    is_mapping: bool
+    is_union: bool
+    words: tuple[tuple[str, ...], ...]
+
+
+@cache
+def _key_info(section: type[BaseModel], name: str) -> _KeyInfo:
     field = section.model_fields[name]
     extra = field.json_schema_extra
     assert isinstance(extra, dict)
@@ -131,7 +140,8 @@ def _describe(
     if is_mapping := get_origin(kinds[0]) is dict:
         kinds = _kinds(get_args(kinds[0])[1])
     words = tuple(tuple(_words(field.annotation, depth)) for depth in (0, 1))
-    return next(_sections(field.annotation), section), str(extra["expects"]), is_mapping, len(kinds) > 1, words
+    inner = next(_sections(field.annotation), section)
+    return _KeyInfo(inner, str(extra["expects"]), is_mapping, len(kinds) > 1, words)
 
 
 def _kinds(annotation: Any) -> list[Any]:
@@ -212,12 +222,13 @@ def _unknown(name: str, known: Sequence[str]) -> str:
     return "unknown key" + (did_you_mean(name, known) or f"; allowed: {', '.join(known)}")
 
 
-MAX_POINTS = 4096
+# Limits of the scene's numbers.
+MAX_POINTS = 4096  # rows or columns of mass points
 MAX_PROBES = 16
-MAX_PIXELS = 8192
+MAX_PIXELS = 8192  # width or height of a frame
 MAX_REFINE = 64
 MAX_TRACKS = 256
-MAX_RELIEF = 10
+MAX_RELIEF = 10  # [%]
 MAX_SUPERSAMPLE = 4
 
 # Minimum field of view [degrees]. In f32, directions are resolved to 2^-24, which is 3.4e-6 degrees; a narrower picture

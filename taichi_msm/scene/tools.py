@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Annotated, Any
 
 from pydantic import (
@@ -147,10 +148,10 @@ class Probe(Section):
 
     @field_validator("at", "load", mode="after")
     @classmethod
-    def _check_order(cls, keys: tuple[Any, ...]) -> tuple[Any, ...]:
-        if not isinstance(keys[0], tuple):
-            return keys
-        times = [entry[0] for entry in keys]
+    def _check_order(cls, keyframes: tuple[Any, ...]) -> tuple[Any, ...]:
+        if not isinstance(keyframes[0], tuple):
+            return keyframes  # A constant control point.
+        times = [keyframe[0] for keyframe in keyframes]
         for n in range(1, len(times)):
             if times[n] < times[n - 1]:
                 raise scene_fault(
@@ -160,14 +161,12 @@ class Probe(Section):
                 raise scene_fault(
                     f"third key at {times[n]:g} s; a jump is two keys at one time, so remove the middle one", n
                 )
-        return keys
+        return keyframes
 
     @field_validator("path", mode="after")
     @classmethod
     def _check_times_increase(cls, path: tuple[tuple[float, ...], ...] | None) -> tuple[tuple[float, ...], ...] | None:
-        for n in range(1, len(path or ())):
-            assert path is not None
-            previous, time = path[n - 1][0], path[n][0]
+        for n, ((previous, *_), (time, *_)) in enumerate(pairwise(path or ()), 1):
             if time <= previous:
                 raise scene_fault(
                     f"is at {time:g} s, and the key before it at {previous:g} s; "
