@@ -103,7 +103,18 @@ def load_scene(
 def load_plan(
     path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = (), image: str | Path | None = None
 ) -> Plan:
-    """Read and validate a scene file, and plan the scene for a CPU; arguments and errors as in `load_scene`."""
+    """Read and validate a scene file, and plan the scene for a CPU.
+
+    Args:
+        path: path of the scene file.
+        overrides: values that replace those of the file, as in `load_scene`.
+        image: path of another image for the sheet, relative to the current directory.
+
+    Raises:
+        ArgumentError: when the path is a mapping, or the overrides are neither a sequence of texts nor a mapping from
+            texts.
+        SceneError: when the scene is invalid.
+    """
     if isinstance(path, Mapping):
         raise ArgumentError("path: a mapping; Scene(**mapping) is its scene, and load_scene reads a file")
     return plan_file(read_file(str(path), SCENE_KIND), overrides, image)

@@ -157,12 +157,9 @@ class Scene(Section):
         folders = {"": tuple(output.name for output in selected if not output.is_camera_output)}
         for camera in self.render.all_cameras:
             has_pair = bool(self.render.baseline(camera))
-            seen = (
-                output.name
-                for output in selected
-                if output.is_camera_output and (has_pair or not output.needs_stereo_pair)
-            )
-            folders[camera] = (*folders.get(camera, ()), *seen)
+            possible = (output for output in selected if has_pair or not output.needs_stereo_pair)
+            names = (output.name for output in possible if output.is_camera_output)
+            folders[camera] = (*folders.get(camera, ()), *names)
         return folders
 
     def asks_for(self, *sources: str) -> bool:
