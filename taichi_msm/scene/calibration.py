@@ -307,12 +307,12 @@ class _Columns(NamedTuple):
 
     Attributes:
         indices: columns of t, tx, ty, tz, qx, qy, qz, qw.
-        count: number of all columns.
+        column_count: number of all columns.
         units_per_second: a second in the unit of t.
     """
 
     indices: tuple[int, ...]
-    count: int
+    column_count: int
     units_per_second: float
 
 
@@ -381,10 +381,10 @@ def _row(line: str, words: Sequence[str], columns: _Columns | None, *, separated
         numbers = [math.nan if "_" in word else float(word) for word in words]
     except ValueError:
         numbers = []
-    if len(numbers) != expected.count or not all(abs(number) <= MAX_MAGNITUDE for number in numbers):
+    if len(numbers) != expected.column_count or not all(abs(number) <= MAX_MAGNITUDE for number in numbers):
         needed = f"eight numbers up to {MAX_MAGNITUDE:g}: {' '.join(ROLES)}"
-        if expected.count != TUM.count:
-            needed = f"{expected.count} numbers up to {MAX_MAGNITUDE:g}, one a column of the header"
+        if expected.column_count != TUM.column_count:
+            needed = f"{expected.column_count} numbers up to {MAX_MAGNITUDE:g}, one a column of the header"
         origin = ORIGINS.get(len(words), "") if columns is None else ""
         if columns is None and separated and len(words) != EUROC_COLUMNS:
             origin = "; numbers with decimal commas need ; between them"
