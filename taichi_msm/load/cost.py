@@ -118,14 +118,14 @@ def estimate_memory(plan: Plan) -> Budget:
     frames, (width, height) = grid.frames + 1, scene.render.size
     pixel_bytes = [OUTPUTS[name].pixel_bytes for folder in scene.folders.values() for name in folder]
     cameras = len(scene.render.all_cameras)
-    pictures = sum(width * height * size + height + FILE_BYTES for size in pixel_bytes if size)
-    positions = frames * points * 3 * number_bytes
-    tracks = scene.render.tracks**2 * (frames * TRACK_BYTES + 16) + FILE_BYTES if "tracks" in scene.output else 0
-    tracks *= cameras
-    forces = frames * len(scene.probes) if "forces" in scene.output else 0
-    contact = contact_fields(scene.probes)
-    loads = sum(not probe.moved for probe in scene.probes)
-    numbers = STATE_NUMBERS + OUTPUT_NUMBERS + loads + contact + sum(MAP_NUMBERS[name] for name in scene.maps)
+    frame_bytes = sum(width * height * size + height + FILE_BYTES for size in pixel_bytes if size)
+    position_bytes = frames * points * 3 * number_bytes
+    track_bytes = scene.render.tracks**2 * (frames * TRACK_BYTES + 16) + FILE_BYTES if "tracks" in scene.output else 0
+    track_bytes *= cameras
+    force_rows = frames * len(scene.probes) if "forces" in scene.output else 0
+    contact_numbers = contact_fields(scene.probes)
+    numbers = STATE_NUMBERS + OUTPUT_NUMBERS + contact_numbers + sum(MAP_NUMBERS[name] for name in scene.maps)
+    numbers += sum(not probe.moved for probe in scene.probes)  # the load of each force-controlled tool
     # Companion runs add up to two sheets in f64, and with tissue two smaller ones.
     has_companions = scene.time.tolerance is not None or choose_pilots(plan).some
     bytes_per_number = number_bytes + (8 * (2 + (scene.tissue is not None) * 5 / 16) if has_companions else 0)
@@ -135,15 +135,15 @@ def estimate_memory(plan: Plan) -> Budget:
         frames=frames,
         simulation_bytes=round(points * bytes_per_number * numbers),
         drawing_bytes=drawing_bytes(scene) if scene.renders else 0,
-        track_bytes=tracks,
-        picture_bytes=math.ceil(frames * pictures),
-        trajectory_bytes=positions + 8 * frames + FILE_BYTES if "trajectory" in scene.output else 0,
-        force_bytes=forces * FORCE_ROW_BYTES + FILE_BYTES if "forces" in scene.output else 0,
+        track_bytes=track_bytes,
+        picture_bytes=math.ceil(frames * frame_bytes),
+        trajectory_bytes=position_bytes + 8 * frames + FILE_BYTES if "trajectory" in scene.output else 0,
+        force_bytes=force_rows * FORCE_ROW_BYTES + FILE_BYTES if "forces" in scene.output else 0,
         record_bytes=2 * len(scene.model_dump_json(indent=2)) + RECORD_BYTES,
         # Two checkpoints, and all positions and forces so far.
-        working_bytes=2 * points * (STATE_NUMBERS + contact) * number_bytes
-        + (positions if scene.output else 0)
-        + forces * FORCE_BYTES,
+        working_bytes=2 * points * (STATE_NUMBERS + contact_numbers) * number_bytes
+        + (position_bytes if scene.output else 0)
+        + force_rows * FORCE_BYTES,
     )
 
 

@@ -14,7 +14,7 @@ from taichi_msm.solver.planning import with_chosen_grid
 from taichi_msm.system.runtime import Device
 
 
-class Resolved(NamedTuple):
+class ResolvedPlan(NamedTuple):
     """Plan with all settings chosen.
 
     Attributes:
@@ -28,7 +28,7 @@ class Resolved(NamedTuple):
     mesh: MeshEstimate | None
 
 
-def resolve(plan: Plan, device: Device, progress: ProgressCallback = lambda done, total: None) -> Resolved:
+def resolve(plan: Plan, device: Device, progress: ProgressCallback = lambda done, total: None) -> ResolvedPlan:
     """Choose the settings that a valid scene leaves open, by companion runs if it has tolerances.
 
     Args:
@@ -45,4 +45,4 @@ def resolve(plan: Plan, device: Device, progress: ProgressCallback = lambda done
         plan, mesh = choose_points(plan, device, check_scene, progress)
     if plan.scene.time.tolerance is not None:
         plan, estimate = choose_step(plan, device, progress)
-    return Resolved(with_chosen_grid(plan), estimate, mesh)
+    return ResolvedPlan(with_chosen_grid(plan), estimate, mesh)

@@ -91,7 +91,7 @@ def read_yaml(text: str) -> Document:
     if match := _NOT_ALLOWED.search(text):
         message = f"character U+{ord(match[0]):04X} is not allowed; remove it"
         raise UnreadableError(mark_at(text, match.start()), message)
-    reader = _Reader(yaml.parse(text, Loader=_LOADER))
+    reader = _DocumentBuilder(yaml.parse(text, Loader=_LOADER))
     try:
         return Document(reader.document(), reader.marks, reader.faults)
     except yaml.MarkedYAMLError as error:
@@ -144,7 +144,7 @@ def _resolve(text: str) -> Any:
     return text
 
 
-class _Reader:
+class _DocumentBuilder:
     """Builder of data from the events of a parser.
 
     Attributes:
