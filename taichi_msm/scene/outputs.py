@@ -105,7 +105,10 @@ def _rows() -> Iterator[Output]:
     """
     yield Output("png", "frames/0000.png", "picture", "the picture", pixel_bytes=3.01)
     yield Output("gif", "animation.gif", "picture", "the pictures as an animation", pixel_bytes=1.51)
-    description = "the pictures as a video, H.264 in yuv420p; an odd last row or column is repeated; needs PyAV (`pip install av`)"
+    description = (
+        "the pictures as a video, H.264 in yuv420p; an odd last row or column is repeated; needs PyAV "
+        "(`pip install av`)"
+    )
     yield Output("mp4", "animation.mp4", "picture", description, pixel_bytes=1.6)
     description = "`time` [s], shape (frames,), and `position` of the mass points [m], shape (frames, rows, cols, 3)"
     yield Output("trajectory", "trajectory.npz", "positions", description)
