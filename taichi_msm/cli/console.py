@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from taichi_msm.errors import printable
-from taichi_msm.load.cost import rough_time
+from taichi_msm.load.cost import format_rough_time
 from taichi_msm.model.tool_force import in_words
 from taichi_msm.system.process import tell
 
@@ -61,7 +61,7 @@ class Progress:
         if stage != self._pace.stage or done < self._pace.done:
             self._pace = _Pace(stage, done, now)
         left = self._pace.left(done, total, now)
-        said = "" if left is None else f"{rough_time(left)} left"
+        said = "" if left is None else f"{format_rough_time(left)} left"
         if self._bar is not None:
             self._bar.update(self._task, description=STAGES[stage], completed=done, total=total, left=said)
         elif now >= self._next_line:

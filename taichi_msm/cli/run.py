@@ -160,7 +160,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     }
     if loaded.time.at_rest:
         steps |= dict.fromkeys(("step", "stable_step", "steps_per_frame", "steps"))
-    need, takes = cost_module.estimate_memory(plan), cost_module.estimate_duration(plan)
+    need, takes = cost_module.estimate_budget(plan), cost_module.estimate_duration(plan)
     facts: dict[str, Any] = {
         "scene": loaded.model_dump(mode="json"),
         **steps,
@@ -177,7 +177,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         return DONE
     import yaml
 
-    from taichi_msm.load.cost import rough_time
+    from taichi_msm.load.cost import format_rough_time
 
     asking = [f"{name}.tolerance" for name in ("sheet", "time") if getattr(loaded, name).tolerance is not None]
     more, longer = (", or more", f", or longer, as {' and '.join(asking)} may ask for more") if asking else ("", "")
@@ -190,7 +190,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     )
     click.echo(
         f"\n{need.points} points, {need.frames} frames, {stepped}\n"
-        f"about {rough_time(takes.seconds)} to run{longer} (estimated from its work)\n"
+        f"about {format_rough_time(takes.seconds)} to run{longer} (estimated from its work)\n"
         f"about {need.memory_bytes / 2**20:.0f} MiB of memory, at most {need.disk_bytes / 2**20:.1f} MiB on disk, "
         f"{need.working_bytes / 2**20:.1f} MiB more while it runs"
     )

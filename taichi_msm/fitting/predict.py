@@ -262,7 +262,7 @@ class Runs:
         parameters = len(self.job.parameters)
         if RUNS_EACH * parameters * self._seconds < WORTHWHILE:
             return 1
-        needed = PROCESS_BYTES + cost.estimate_memory(check_scene(self.job.scene)).memory_bytes
+        needed = PROCESS_BYTES + cost.estimate_budget(check_scene(self.job.scene)).memory_bytes
         return max(1, min(available_threads(), available_memory() // needed, 2 * parameters))
 
     def _side_by_side(self, pool: Pool, places: Sequence[Array], steps: int | None) -> list[Predicted | None]:

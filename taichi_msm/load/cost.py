@@ -31,7 +31,7 @@ from taichi_msm.system.process import available_memory
 from taichi_msm.terms.contact import contact_fields
 
 
-def rough_time(seconds: float) -> str:
+def format_rough_time(seconds: float) -> str:
     """Format an approximate time: 40 s, 3 min, 2.5 h."""
     if seconds < 100:
         return f"{seconds:.0f} s" if seconds >= 1 else "1 s"
@@ -110,7 +110,7 @@ class Budget:
         return self.picture_bytes + self.track_bytes + self.trajectory_bytes + self.force_bytes + self.record_bytes
 
 
-def estimate_memory(plan: Plan) -> Budget:
+def estimate_budget(plan: Plan) -> Budget:
     """Estimate the memory and disk space of a run."""
     scene, grid = plan.scene, plan.grid
     rows, cols = scene.sheet.points
@@ -149,7 +149,7 @@ def estimate_memory(plan: Plan) -> Budget:
 
 def size_problems(plan: Plan) -> Iterator[Problem]:
     """Check the number of steps and the memory of a run; each problem is at the key to change."""
-    scene, grid, budget, available = plan.scene, plan.grid, estimate_memory(plan), available_memory()
+    scene, grid, budget, available = plan.scene, plan.grid, estimate_budget(plan), available_memory()
     if grid.steps > MAX_STEPS:
         count = f"{scene.time.duration:g} s in steps of {grid.step:.6g} s is {grid.steps:.3g} steps"
         key, remedy = "step", "take a longer step or a shorter time"
@@ -182,7 +182,7 @@ def require_disk(plan: Plan, directory: Path) -> None:
     Raises:
         SceneError: when there is not enough disk space.
     """
-    scene, budget, free = plan.scene, estimate_memory(plan), _free_disk(directory)
+    scene, budget, free = plan.scene, estimate_budget(plan), _free_disk(directory)
     needed = budget.disk_bytes + budget.working_bytes
     if needed <= free:
         return

@@ -32,7 +32,7 @@ import numpy as np
 
 from taichi_msm.errors import SceneError, StageProgressCallback, writing
 from taichi_msm.load import cost as cost_module
-from taichi_msm.load.cost import rough_time
+from taichi_msm.load.cost import format_rough_time
 from taichi_msm.load.scene_file import plan_file
 from taichi_msm.model.plan import Plan
 from taichi_msm.runs.directory import MAX_RECORD, replacing
@@ -249,7 +249,7 @@ def cost_line(runs: int, cost: Cost, workers: Workers | None) -> str:
         where = f"in {processes} ({workers.cores} cores; memory for {workers.fitting})"
     disk = f"at most {cost.disk_bytes / 2**20:.1f} MiB on disk"
     refused = f"; of {cost.looked_at} that were checked, {cost.refused} will be refused, for example: {cost.example}"
-    return f"{_runs(runs)}: about {rough_time(cost.seconds)} {where}, {disk}{refused if cost.refused else ''}"
+    return f"{_runs(runs)}: about {format_rough_time(cost.seconds)} {where}, {disk}{refused if cost.refused else ''}"
 
 
 def summary_lines(
@@ -336,7 +336,7 @@ def estimate(sweep: Sweep) -> Cost:
             plans.append(plan_file(sweep.scene, sweep.overrides(values)))
         except SceneError as error:
             reasons.append(error.lines[0])
-    times, needs = list(map(cost_module.estimate_duration, plans)), list(map(cost_module.estimate_memory, plans))
+    times, needs = list(map(cost_module.estimate_duration, plans)), list(map(cost_module.estimate_budget, plans))
     looked_at = len(plans) + len(reasons)
     share, cores = sweep.runs / looked_at, available_threads()
     seconds = sum(one.seconds - one.start for one in times)
