@@ -31,7 +31,7 @@ from taichi_msm.scene.section import (
 
 
 class Instrument(Section):
-    """Metal capsule that touches the sheet, if the tool has a path, or is only drawn, if the tool has a force."""
+    """Metal capsule, which touches the sheet if the tool is position-controlled, and is only drawn otherwise."""
 
     radius: Positive = key(..., "radius of the capsule [m]", "a number above 0, in metres")
     shaft: Vector = key(..., "direction from the tip along the capsule", "three numbers, not all 0: [x, y, z]")
@@ -55,7 +55,7 @@ PointKeyframe = tuple[Number, SheetFraction, SheetFraction]
 
 
 class Probe(Section):
-    """Tool: force-controlled, by a force with its location and its times (eq. 5), or position-controlled, by a path."""
+    """Tool, either force-controlled (eq. 5) or position-controlled along a path."""
 
     model_config = ConfigDict(
         json_schema_extra={
