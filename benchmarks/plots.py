@@ -14,7 +14,19 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
 
 from benchmarks.drawing.problem import POINTS
-from taichi_msm.plot_style import BLUE, DPI, GREEN, GREY, INK, NARROW, ORANGE, PURPLE, STYLE, VERMILION, WIDE
+from taichi_msm.plot_style import (
+    BLUE,
+    DPI,
+    GREEN,
+    GREY,
+    INK,
+    ONE_COLUMN_WIDTH,
+    ORANGE,
+    PURPLE,
+    STYLE,
+    TWO_COLUMN_WIDTH,
+    VERMILION,
+)
 from taichi_msm.study.result import Timing
 
 COLOURS = {"taichi_msm": BLUE, "C++, OpenMP": VERMILION, "Numba": GREEN}
@@ -30,9 +42,9 @@ def draw(results: Results, folder: Path) -> list[Path]:
     """Draw what was measured; gives the pictures."""
     made = []
     for name, width, panels in (
-        ("size", WIDE, (_per_step, _per_point)),
-        ("drawing", WIDE, (_refine, _resolution)),
-        ("threads", NARROW, (_threads,)),
+        ("size", TWO_COLUMN_WIDTH, (_per_step, _per_point)),
+        ("drawing", TWO_COLUMN_WIDTH, (_refine, _resolution)),
+        ("threads", ONE_COLUMN_WIDTH, (_threads,)),
     ):
         parts = ("refine", "resolution") if name == "drawing" else (name,)
         if all(part in results for part in parts):

@@ -27,7 +27,7 @@ from taichi_msm.model.loads import decay, evaluate_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import fixed_points, rest_positions, spacing
 from taichi_msm.model.time_grid import Precision
-from taichi_msm.plot_style import BLUE, DPI, GREY, STYLE, VERMILION, WIDE
+from taichi_msm.plot_style import BLUE, DPI, GREY, STYLE, TWO_COLUMN_WIDTH, VERMILION
 from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.solver.planning import make_plan
 from taichi_msm.solver.rest import QuasiStatics
@@ -191,7 +191,7 @@ def buckling() -> dict[str, Any]:
     along = modes[worst][row, :, component]
 
     with style.context(STYLE, after_reset=True):
-        figure = Figure(figsize=(WIDE, 3.2), dpi=DPI, layout="constrained")
+        figure = Figure(figsize=(TWO_COLUMN_WIDTH, 3.2), dpi=DPI, layout="constrained")
         FigureCanvasAgg(figure)
         left, middle, right = figure.subplots(1, 3, width_ratios=(1.4, 1, 1))
         left.axhline(0, color=GREY, linewidth=0.8)
@@ -230,7 +230,7 @@ def energy() -> dict[str, Any]:
     time = {"duration": ENERGY_STEPS // every / rate, "frames_per_second": rate, "step": h, "tolerance": None}
     made = made.model_copy(update={"time": made.time.model_copy(update=time)})
     with style.context(STYLE, after_reset=True):
-        figure = Figure(figsize=(WIDE, 2.8), dpi=DPI, layout="constrained")
+        figure = Figure(figsize=(TWO_COLUMN_WIDTH, 2.8), dpi=DPI, layout="constrained")
         FigureCanvasAgg(figure)
         axes = figure.subplots()
         colours: dict[Precision, str] = {"f32": VERMILION, "f64": BLUE}

@@ -1,6 +1,6 @@
-"""Deform an image as tissue deforms.
+"""Deformation of images by a mass-spring model of soft tissue.
 
-The names of the API are imported when they are first used, so that `import taichi_msm` does not start the compiler.
+The public names are imported at their first use, so that `import taichi_msm` does not start the compiler.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ if TYPE_CHECKING:
     from taichi_msm.sweeps.sweep import sweep
 
 
-# The module of each name.
-_HOMES = {
+# Module of each public name.
+_MODULES = {
     **dict.fromkeys(
         ("ArgumentError", "DeviceError", "DivergedError", "FilesError", "MsmError", "NotInstalledError", "SceneError"),
         "errors",
@@ -114,4 +114,4 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
 
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

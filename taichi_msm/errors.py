@@ -1,8 +1,6 @@
-"""The errors that the user is told of. Only the command line prints them or turns them into exit codes.
+"""Errors for the user, checks of the arguments of library calls, and the types of progress callbacks.
 
-Checks of the arguments that a caller gives to the library.
-
-Functions by which work reports its progress; an exception from one stops the work at that point.
+Only the command line prints errors or turns them into exit codes.
 """
 
 from __future__ import annotations
@@ -18,23 +16,25 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-# The way to a value of a scene: ("probes", 0, "load").
+# Path to a value of a scene, such as ("probes", 0, "load").
 Key = tuple[str | int, ...]
-
-# So many letters of a name are compared with those that are known.
-MAX_NAME = 60
 
 
 @dataclass(frozen=True)
 class Problem:
-    """One fault of a scene."""
+    """A fault of a scene.
 
-    path: Key  # of the key at fault
-    message: str  # the value, what is wrong with it, and the remedy; without the key
+    Attributes:
+        path: path to the key at fault; empty for the whole scene.
+        message: the value, its fault and the remedy, without the key.
+    """
+
+    path: Key
+    message: str
 
     @property
     def key(self) -> str:
-        """The key as the user writes it: probes.0.load."""
+        """The key in dotted form, as users write it: probes.0.load."""
         return ".".join(str(part) for part in self.path)
 
     def __str__(self) -> str:
@@ -42,11 +42,15 @@ class Problem:
 
 
 class MsmError(Exception):
-    """Any error of this package that is meant for the user."""
+    """Base class of all errors of this package that are meant for the user."""
 
 
 class SceneError(MsmError):
-    """A scene cannot be run; `lines` holds one printable line for each fault, whatever characters the names have."""
+    """A scene is invalid or cannot be run.
+
+    Attributes:
+        lines: one line for each fault, with control characters escaped.
+    """
 
     def __init__(self, lines: Sequence[str]) -> None:
         # Two checks may report the same fault of a value.
@@ -58,32 +62,32 @@ class SceneError(MsmError):
 
 
 class DeviceError(MsmError):
-    """The requested arch, number of threads or compiler is not available, or the device left out part of its work."""
+    """The requested arch, thread count or compiler is not available, or the device skipped part of its work."""
 
 
 class NotInstalledError(MsmError):
-    """A package that the request needs is not installed; the message says how to install it."""
+    """A required package is not installed; the message contains the command to install it."""
 
 
 class ExecutorError(MsmError):
-    """What should take the runs of a sweep cannot be reached, or is not fit for them."""
+    """The executor of the runs of a sweep cannot be reached, or is not suitable."""
 
 
 class LostExecutorError(ExecutorError):
-    """What takes the runs of a sweep takes no more."""
+    """The executor of the runs of a sweep stopped accepting runs."""
 
 
 class ArgumentError(MsmError, ValueError):
-    """An argument of a call is wrong; the message names it, its value, and which values are allowed."""
+    """An argument of a call is invalid; the message contains its name, its value and the allowed values."""
 
 
 class DivergedError(MsmError):
-    """The simulation diverged; the message names the time, the point and the remedy.
+    """The simulation diverged; the message contains the time, the mass point and the remedy.
 
     Attributes:
-        step: number of steps taken so far.
-        time: simulated time so far [s].
-        point: row and column of the point that is farthest from its rest position.
+        step: number of completed steps.
+        time: simulated time [s].
+        point: row and column of the mass point with the largest displacement.
     """
 
     def __init__(self, message: str, step: int, time: float, point: tuple[int, int]) -> None:
@@ -95,39 +99,61 @@ class DivergedError(MsmError):
 
 
 class FilesError(MsmError):
-    """Reading or writing failed; the message names the path and the remedy."""
+    """Reading or writing failed; the message contains the path and the remedy."""
 
 
 class ForeignError(FilesError):
-    """Something that no run has put there is in the way; it was not touched."""
+    """A file or folder that no run has written is at the path of a result; it was not changed."""
 
     @classmethod
-    def at(cls, path: object, found: str) -> ForeignError:
-        """Make the error for what was found at a path."""
-        return cls(f"{path}: {found} that no run has put there; move it away or choose another folder")
+    def at(cls, path: object, kind: str) -> ForeignError:
+        """Return the error for a file or folder.
+
+        Args:
+            path: path of the file or folder.
+            kind: its kind for the message, such as "a file".
+        """
+        return cls(f"{path}: {kind} that no run has put there; move it away or choose another folder")
 
 
 class DamagedError(FilesError):
-    """The files of an unfinished run cannot be used."""
+    """The files of an unfinished run are damaged, so it cannot be resumed."""
 
 
 def printable(text: str) -> str:
-    """Escape line breaks, control characters for terminals, and what is not a character."""
+    """Escape line breaks, control characters and surrogates of a text."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Ask whether the nearest of the known names was meant, in words that go after a message; empty if none is near."""
+    """Return a hint to append to the message of an unknown name.
+
+    Args:
+        name: the unknown name.
+        known: valid names.
+
+    Returns:
+        A question with the most similar valid name, or an empty text if none is similar.
+    """
     # Imported here, as it is needed only for a message.
     from difflib import get_close_matches
 
-    near = get_close_matches(name[:MAX_NAME].lower(), list(known), n=1)
-    return f"; did you mean '{near[0]}'?" if near and near[0] != name else ""
+    # Matching takes time in proportion to the length, and a name of a file may be of any length.
+    matches = get_close_matches(name[:60].lower(), list(known), n=1)
+    return f"; did you mean '{matches[0]}'?" if matches and matches[0] != name else ""
 
 
 @contextmanager
 def writing(place: object, option: str = "--out") -> Iterator[None]:
-    """Raise a FilesError instead of an OSError: `place` cannot be written, and `option` chooses another."""
+    """Convert an OSError of the block to a FilesError.
+
+    Args:
+        place: path that the block writes to, for the message.
+        option: command-line option that selects another path, for the remedy.
+
+    Raises:
+        FilesError: when the block raises an OSError.
+    """
     try:
         yield
     except OSError as error:
@@ -136,15 +162,20 @@ def writing(place: object, option: str = "--out") -> Iterator[None]:
         raise FilesError(f"{place}: cannot write: {error.strerror or error}; {remedy}") from error
 
 
-pass  # REMOVED
-
-
-# More processes or threads than this are refused.
+# Limit of processes and threads.
 MAX_WORKERS = 1024
 
 
 def as_array(values: Any, name: str) -> NDArray[Any]:
-    """Turn an argument into an array; ArgumentError: it is impossible, such as for rows of different lengths."""
+    """Convert an argument to an array.
+
+    Args:
+        values: array or nested sequences.
+        name: name of the argument, for the message.
+
+    Raises:
+        ArgumentError: when conversion fails, such as for rows of different lengths.
+    """
     # Imported here, so that a scene can be checked without importing NumPy.
     import numpy as np
 
@@ -154,28 +185,44 @@ def as_array(values: Any, name: str) -> NDArray[Any]:
         raise ArgumentError(f"{name}: {error}; take an array") from None
 
 
-def are_numbers(array: NDArray[Any], shape: tuple[int, ...]) -> bool:
-    """Tell whether an array holds real numbers and has a shape."""
+def is_real_array(array: NDArray[Any], shape: tuple[int, ...]) -> bool:
+    """Return whether an array has a real dtype and a given shape.
+
+    Args:
+        array: array of any dtype.
+        shape: required shape.
+    """
     return array.dtype.kind in "fiu" and array.shape == shape
 
 
 def require_frame_count(frames: int) -> None:
-    """Make sure that a number of frames is a whole number, 0 or more; ArgumentError: it is not."""
+    """Check that a number of frames is a whole number, 0 or more; raise an ArgumentError otherwise."""
     if isinstance(frames, bool) or not isinstance(frames, Integral) or frames < 0:
         raise ArgumentError(f"{frames!r} frames cannot be simulated; take a whole number, 0 or more")
 
 
 def require_path(path: str | Path, name: str = "directory", remedy: str = "take a path") -> None:
-    """Check that an argument can be a path; ArgumentError: it cannot, with the remedy."""
+    """Check that an argument can be a path.
+
+    Args:
+        path: value of the argument.
+        name: name of the argument, for the message.
+        remedy: remedy, for the message.
+
+    Raises:
+        ArgumentError: when it is neither a text nor a Path, or contains a null character.
+    """
     if not isinstance(path, (str, Path)) or "\0" in str(path):
         raise ArgumentError(f"{name}: {path!r}; {remedy}")
 
 
-# Called some times a second.
+# Callbacks of long computations. An exception that a callback raises stops the computation.
+
+# Called several times a second, to let the caller interrupt.
 Pause = Callable[[], None]
 
-# Called with how much is done and how much there is in all.
-Count = Callable[[int, int], None]
+# Called with the completed and the total amount of work.
+ProgressCallback = Callable[[int, int], None]
 
-# Called with the stage of the work, then the same two.
-Progress = Callable[[str, int, int], None]
+# Called with the name of the stage, and the completed and the total amount of its work.
+StageProgressCallback = Callable[[str, int, int], None]

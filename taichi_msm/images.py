@@ -1,4 +1,4 @@
-"""Read the size or the pixels of a picture's file, whatever is in it."""
+"""Picture files, which may be broken or malicious: their size, pixels and checksum."""
 
 from __future__ import annotations
 
@@ -18,53 +18,67 @@ if TYPE_CHECKING:
     from PIL import Image
 
 PICTURE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
-SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
-# The kinds of pixels, by Pillow's names, whose colours are defined; 32-bit and floating-point greys can have any range.
+# Pillow's modes of pixels. Modes with 32-bit and floating-point greys are excluded, as their range is not defined.
 _MODES_16_BIT = ("I;16", "I;16L", "I;16B", "I;16N")
 _MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCbCr", *_MODES_16_BIT)
 
-# The longest side of a picture. Pillow needs memory and time for every row, and a picture of one column has many.
-MAX_SIDE = 65535
+# Limit of a side, as Pillow needs memory and time for every row, even of a picture with a single column.
+MAX_SIDE_PX = 65535
 
-# The largest file: as many pixels as Pillow takes, with 16 bits of four channels, are smaller.
+# Limit of a file's size, above that of Pillow's largest picture with four channels of 16 bits.
 MAX_BYTES = 2**31
 
-# Colour profiles that change no 8-bit colour by more than this are sRGB, and pictures keep their bits.
-SRGB_ROUNDING = 2
+# A colour profile that changes no 8-bit colour by more than this is treated as sRGB.
+SRGB_TOLERANCE = 2
 
-# Every scan of a JPEG goes over all pixels. Encoders make about ten; more are allowed up to a few seconds of decoding.
+# Every scan of a JPEG visits all pixels, and encoders write about ten. A small picture may have more scans, up to a
+# number of visited pixels that takes a few seconds.
 USUAL_SCANS = 16
-SCANNED_PIXELS = 2 * 10**8
+MAX_SCANNED_PIXELS = 2 * 10**8
 
+# EXIF's tag of the orientation, and its values for pictures rotated by 90 degrees.
 _ORIENTATION = 0x0112
-_LYING = (5, 6, 7, 8)
+_ROTATED = (5, 6, 7, 8)
 
 
-# Where files are read instead of at the paths by which they are known.
+# Copies that are read instead of the original files, by the paths of the originals.
 _copies: Mapping[str, Path] = {}
 
 
 class PictureError(Exception):
-    """The file cannot be used as a picture; the message says why and what to do."""
+    """The file cannot be used as a picture; the message contains the reason and the remedy."""
 
 
 @contextmanager
-def copied(copies: Mapping[str, Path]) -> Iterator[None]:
-    """In a block, read copies of some files, by the paths by which they are known."""
+def use_copies(copies: Mapping[str, Path]) -> Iterator[None]:
+    """Read copies instead of the original files within the block.
+
+    Args:
+        copies: paths of the copies, by the paths of the originals.
+    """
     global _copies
-    around, _copies = _copies, copies
+    previous, _copies = _copies, copies
     try:
         yield
     finally:
-        _copies = around
+        _copies = previous
 
 
 def read_rgb(path: str, background: tuple[int, int, int], sha256: str | None = None) -> Image.Image:
-    """Read a picture, upright, in 8-bit RGB; a transparent one is laid over the background.
+    """Read the first picture of a file as 8-bit sRGB, in its upright orientation.
 
-    Colours are converted from the file's colour profile to sRGB. If a file has several pictures, the first is taken.
-    PictureError: it cannot be used, or has not this SHA-256, in hexadecimal.
+    Args:
+        path: path of the file.
+        background: colour behind transparent pixels.
+        sha256: required SHA-256 of the file, in hexadecimal; any if None.
+
+    Returns:
+        The picture. Its colours are converted from the file's colour profile.
+
+    Raises:
+        PictureError: when the file cannot be used or has another SHA-256.
     """
     from PIL import ImageOps
 
@@ -74,9 +88,19 @@ def read_rgb(path: str, background: tuple[int, int, int], sha256: str | None = N
 
 
 def read_grey(path: str, sha256: str | None = None) -> NDArray[Any]:
-    """Read the greys of a picture, upright, shape (height, width): of 16 bits where it has them, else of 8.
+    """Read the grey values of a picture, in its upright orientation.
 
-    They are numbers, so they are read as stored, whatever the colour profile. Otherwise as `read_rgb`, over black.
+    The values are numbers rather than colours, so the colour profile is ignored. Transparent pixels are black.
+
+    Args:
+        path: path of the file.
+        sha256: required SHA-256 of the file, in hexadecimal; any if None.
+
+    Returns:
+        uint16 where the file has 16 bits, else uint8, shape (height, width).
+
+    Raises:
+        PictureError: when the file cannot be used or has another SHA-256.
     """
     import numpy as np
     from PIL import ImageOps
@@ -89,19 +113,19 @@ def read_grey(path: str, sha256: str | None = None) -> NDArray[Any]:
 
 
 def picture_size(path: str) -> tuple[int, int]:
-    """Read the width and height of the upright picture [px] from the file's header."""
+    """Return the width and height of the upright picture [px], from the file's header."""
     from PIL import Image
 
     with _open(path) as image:
-        # For a TIFF, Pillow already gives the size of the upright picture. The base class's getexif() reads only the
-        # header; that of PNG would decode the picture to look behind it.
-        if image.format != "TIFF" and Image.Image.getexif(image).get(_ORIENTATION) in _LYING:
+        # Of a TIFF, Pillow returns the upright size. The base class's getexif() reads only the header, whereas PNG's
+        # decodes the whole picture.
+        if image.format != "TIFF" and Image.Image.getexif(image).get(_ORIENTATION) in _ROTATED:
             return image.height, image.width
         return image.size
 
 
 def has_transparency(path: str) -> bool:
-    """Tell whether any pixel of a picture lets the background through."""
+    """Return whether any pixel of a picture is transparent, even in part."""
     with _open(path) as image:
         return image.has_transparency_data and image.convert("RGBA").getchannel("A").getextrema() != (255, 255)
 
@@ -110,7 +134,7 @@ def file_sha256(path: str) -> str:
     """Compute the SHA-256 of a file, in hexadecimal."""
     _require_file(path)
     try:
-        with location(path).open("rb") as file:
+        with actual_path(path).open("rb") as file:
             return _sha256(file)
     except OSError as error:
         raise _unreadable(path, error) from None
@@ -118,28 +142,24 @@ def file_sha256(path: str) -> str:
 
 @contextmanager
 def _open(path: str, sha256: str | None = None) -> Iterator[Image.Image]:
-    """Open a picture for a block that decodes it.
-
-    Raises:
-        PictureError: instead of any error of Pillow, here or in the block; broken pictures raise many types.
-    """
+    """Open a picture, and convert all errors of Pillow, also those raised in the block, to a PictureError."""
     from PIL import Image, UnidentifiedImageError
 
     _require_file(path)
-    # The output of libtiff and of Pillow's log is silenced: the error that is raised says the same.
+    # libtiff and Pillow also print their errors, which would repeat the exception.
     with discarded_output(2), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.simplefilter("error", Image.DecompressionBombWarning)
         try:
             with _file(path, sha256) as file, Image.open(file, formats=PICTURE_FORMATS) as image:
-                if max(image.size) > MAX_SIDE:
-                    said = f"has {image.width} x {image.height} pixels; a side may have at most {MAX_SIDE}, cut it"
-                    raise PictureError(f"{path} {said}")
+                if max(image.size) > MAX_SIDE_PX:
+                    reason = f"has {image.width} x {image.height} pixels; a side may have at most {MAX_SIDE_PX}, cut it"
+                    raise PictureError(f"{path} {reason}")
                 if image.format in ("JPEG", "MPO"):
                     scans = _scans(file)
-                    most = max(USUAL_SCANS, SCANNED_PIXELS // (image.width * image.height))
-                    if scans > most:
-                        raise PictureError(f"{path} has {scans} scans, and {most} are allowed; save it again")
+                    limit = max(USUAL_SCANS, MAX_SCANNED_PIXELS // (image.width * image.height))
+                    if scans > limit:
+                        raise PictureError(f"{path} has {scans} scans, and {limit} are allowed; save it again")
                 if image.mode not in _MODES:
                     raise PictureError(f"{path} has pixels of kind {image.mode}; save it as 8-bit RGB")
                 yield image
@@ -158,8 +178,8 @@ def _open(path: str, sha256: str | None = None) -> Iterator[Image.Image]:
 
 @contextmanager
 def _file(path: str, sha256: str | None) -> Iterator[BinaryIO]:
-    """Open a file, which must have a SHA-256 if one is given; raises PictureError."""
-    with location(path).open("rb") as file:
+    """Open a file, and check its SHA-256 if one is given."""
+    with actual_path(path).open("rb") as file:
         if sha256 is not None:
             if _sha256(file) != sha256:
                 raise PictureError(f"{path} is not the file that was run, as its SHA-256 tells; put that one back")
@@ -176,41 +196,47 @@ def _sha256(file: BinaryIO) -> str:
 
 def _scans(file: BinaryIO) -> int:
     """Count the scans of a JPEG, which may be broken."""
-    at, scans = 2, 0
+    offset, scans = 2, 0
     with mmap(file.fileno(), 0, access=ACCESS_READ) as data:
-        while (at := data.find(b"\xff", at)) >= 0 and (marker := data[at + 1 : at + 2]) not in (b"", b"\xd9"):
-            # Stuffed and padding bytes and restarts have no length; they occur within the data of a scan.
+        while (offset := data.find(b"\xff", offset)) >= 0 and (marker := data[offset + 1 : offset + 2]) not in (
+            b"",
+            b"\xd9",
+        ):
+            # Stuffed and padding bytes and restarts have no length field; they occur within the data of a scan.
             if marker in b"\x00\x01\xff" or b"\xd0" <= marker <= b"\xd8":
-                at += 1 if marker == b"\xff" else 2
+                offset += 1 if marker == b"\xff" else 2
                 continue
             scans += marker == b"\xda"
-            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+            offset += 2 + int.from_bytes(data[offset + 2 : offset + 4], "big")
     return scans
 
 
-def irregular(path: Path) -> str:
-    """Say what a path is instead of a regular file, without opening it: opening a pipe would wait for its other end."""
+def irregular_kind(path: Path) -> str:
+    """Return the kind of a path that is not a regular file, or an empty text for a regular file.
+
+    The path is not opened, as opening a pipe would block.
+    """
     mode = path.stat().st_mode
     if stat.S_ISREG(mode):
         return ""
     return "a directory" if stat.S_ISDIR(mode) else "not a regular file"
 
 
-def location(path: str) -> Path:
-    """Find where a file is that is known by a path: there, or its copy."""
+def actual_path(path: str) -> Path:
+    """Return the path of a file's copy (see `use_copies`), or its own path."""
     return _copies.get(path) or Path(path)
 
 
 def _require_file(path: str) -> None:
     try:
-        kind = irregular(location(path))
+        kind = irregular_kind(actual_path(path))
     except ValueError:
         raise PictureError(f"{path} is not a path; name a picture") from None
     except OSError as error:
         raise _unreadable(path, error) from None
     if kind:
         raise PictureError(f"{path} is {kind}; name a picture")
-    if location(path).stat().st_size > MAX_BYTES:
+    if actual_path(path).stat().st_size > MAX_BYTES:
         raise PictureError(f"{path} is larger than {MAX_BYTES >> 30} GiB; scale it down")
 
 
@@ -219,7 +245,7 @@ def _unreadable(path: str, error: OSError) -> PictureError:
 
 
 def _to_8_bit(image: Image.Image) -> Image.Image:
-    """Convert 16-bit greys, 65535 to 255, rounded to the nearest; Pillow's own conversion clips at 255."""
+    """Scale 16-bit greys to 8 bits, rounded to the nearest; Pillow's conversion clips at 255."""
     if image.mode not in _MODES_16_BIT:
         return image
     import numpy as np
@@ -230,7 +256,7 @@ def _to_8_bit(image: Image.Image) -> Image.Image:
 
 
 def _to_srgb(path: str, image: Image.Image, profile: bytes | None) -> Image.Image:
-    """Convert 8-bit colours from a colour profile, perceptually, to RGB or RGBA; raises PictureError."""
+    """Convert 8-bit colours from a colour profile to sRGB, with the perceptual intent."""
     if not profile:
         return image
     import io
@@ -240,39 +266,39 @@ def _to_srgb(path: str, image: Image.Image, profile: bytes | None) -> Image.Imag
     try:
         source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
         space = source.profile.xcolor_space.strip()
-        # Greys are kept as those of the profile where it is of greys; all else that is no CMYK is red, green and blue.
+        # A profile of another space than grey and CMYK is one of RGB.
         mode = {"GRAY": "L", "CMYK": "CMYK"}.get(space, "RGB")
         pixels = {"L": ("1", "L", "LA"), "CMYK": ("CMYK",)}.get(mode, tuple(m for m in _MODES if m != "CMYK"))
         if image.mode not in pixels:
             raise PictureError(
                 f"{path} has pixels of kind {image.mode} and a colour profile of {space}; save it as sRGB"
             )
-        change = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), mode, "RGB")
+        transform = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), mode, "RGB")
     except (OSError, ImageCms.PyCMSError) as error:
-        said = str(error).strip() or "unknown"
-        raise PictureError(f"{path} has a colour profile that cannot be used ({said}); save it as sRGB") from None
-    if mode == "RGB" and _is_srgb(change):
+        reason = str(error).strip() or "unknown"
+        raise PictureError(f"{path} has a colour profile that cannot be used ({reason}); save it as sRGB") from None
+    if mode == "RGB" and _is_identity(transform):
         return image
-    clear = image.convert("RGBA") if image.has_transparency_data else None
-    found = ImageCms.applyTransform((clear or image).convert(mode), change)
-    assert found is not None
-    if clear is not None:
-        found.putalpha(clear.getchannel("A"))
-    return found
+    transparent = image.convert("RGBA") if image.has_transparency_data else None
+    converted = ImageCms.applyTransform((transparent or image).convert(mode), transform)
+    assert converted is not None
+    if transparent is not None:
+        converted.putalpha(transparent.getchannel("A"))
+    return converted
 
 
-def _is_srgb(change: Any) -> bool:
-    """Return whether a transform from RGB to sRGB keeps every colour, by 16 values of each channel."""
+def _is_identity(transform: Any) -> bool:
+    """Return whether a transform from RGB to sRGB keeps all combinations of 16 values of each channel."""
     import numpy as np
     from PIL import Image, ImageCms
 
     colours = np.stack(np.meshgrid(*3 * [np.arange(0, 256, 17, dtype=np.uint8)]), axis=-1).reshape(1, -1, 3)
-    changed = np.asarray(ImageCms.applyTransform(Image.fromarray(colours), change))
-    return int(np.abs(changed.astype(int) - colours).max()) <= SRGB_ROUNDING
+    converted = np.asarray(ImageCms.applyTransform(Image.fromarray(colours), transform))
+    return int(np.abs(converted.astype(int) - colours).max()) <= SRGB_TOLERANCE
 
 
 def _to_rgb(image: Image.Image, background: tuple[int, int, int]) -> Image.Image:
-    """Convert pixels of any kind in `_MODES` but those of 16 bits."""
+    """Convert pixels of any mode in `_MODES`, except those of 16 bits, to RGB."""
     from PIL import Image
 
     if not image.has_transparency_data:

@@ -1,8 +1,8 @@
-"""How plots look: colours, and settings of Matplotlib."""
+"""Style of plots: colours, widths of figures and settings of Matplotlib."""
 
 from __future__ import annotations
 
-# The colours of Okabe and Ito, which the colour-blind can tell apart too.
+# The palette of Okabe and Ito, which colour-blind readers can distinguish.
 BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9"
 INK, GREY, SILVER, PALE = "#222222", "#767676", "#A0A0A0", "#E6E6E6"
 
@@ -33,4 +33,6 @@ STYLE = {
 }
 
 DPI = 200
-WIDE, NARROW = 9.0, 6.0  # [in]: with two columns, with one
+
+# Widths of figures [in].
+TWO_COLUMN_WIDTH, ONE_COLUMN_WIDTH = 9.0, 6.0

@@ -39,7 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.accuracy.time_step import longest
-from taichi_msm.errors import Count, DivergedError, Pause, SceneError
+from taichi_msm.errors import DivergedError, Pause, ProgressCallback, SceneError
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import MAX_CELL_ASPECT, Maps, cell_aspect_ratio, spacing
 from taichi_msm.model.tool_force import sum_probe_forces
@@ -282,7 +282,7 @@ def choose_points(
     plan: Plan,
     device: Device,
     check: Callable[[Scene, Maps | None], Plan],
-    progress: Count = lambda done, total: None,
+    progress: ProgressCallback = lambda done, total: None,
 ) -> tuple[Plan, MeshEstimate]:
     """Find the fewest points, approximately, whose error is within the sheet's tolerance, and this error.
 
@@ -322,7 +322,7 @@ def choose_points(
     )
 
 
-def estimate_points(plan: Plan, device: Device, progress: Count) -> MeshEstimate:
+def estimate_points(plan: Plan, device: Device, progress: ProgressCallback) -> MeshEstimate:
     """Run a scene for which there is a `companion`, and its pilot, in f64; give the error that the pilot shows."""
     exact, coarse, grid = plan.with_grid(precision="f64"), companion(plan), plan.grid
     assert coarse is not None

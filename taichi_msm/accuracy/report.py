@@ -28,7 +28,7 @@ from taichi_msm.accuracy.mesh import (
     with_points,
 )
 from taichi_msm.accuracy.time_step import Estimate, Pilot, reconcile
-from taichi_msm.errors import Count, Pause
+from taichi_msm.errors import Pause, ProgressCallback
 from taichi_msm.model import tool_force
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import has_fixed_border
@@ -118,7 +118,7 @@ class RunError:
             self._touched += forces.any(axis=1) | coarse.any(axis=1)
             self._greatest = np.maximum(self._greatest, np.linalg.norm(forces, axis=1))
 
-    def finish(self, displacements: Iterator[NDArray[Any]] | None, progress: Count) -> None:
+    def finish(self, displacements: Iterator[NDArray[Any]] | None, progress: ProgressCallback) -> None:
         """After the last frame, take pilots again where the first ones show an error that matters.
 
         displacements: of the run at all frames but the first [m]; None: not kept, and the run is repeated.

@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 
 from taichi_msm.accuracy.companions import fine_steps
 from taichi_msm.accuracy.divergence import farthest_displacement
-from taichi_msm.errors import Count, Pause, SceneError
+from taichi_msm.errors import Pause, ProgressCallback, SceneError
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.tools import overlap
-from taichi_msm.scene.section import LARGEST_TOLERANCE
+from taichi_msm.scene.section import MAX_TOLERANCE
 from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.system.runtime import Device
 
@@ -74,12 +74,14 @@ def order(plan: Plan) -> int:
     return 1 if backward or plan.tools else 2
 
 
-def estimate_error(plan: Plan, device: Device, progress: Count = lambda done, total: None) -> Estimate:
+def estimate_error(plan: Plan, device: Device, progress: ProgressCallback = lambda done, total: None) -> Estimate:
     """Estimate the error of a run; progress counts frames."""
     return Trials(plan, device).estimate(plan.grid.steps_per_frame, progress)
 
 
-def choose_step(plan: Plan, device: Device, progress: Count = lambda done, total: None) -> tuple[Plan, Estimate]:
+def choose_step(
+    plan: Plan, device: Device, progress: ProgressCallback = lambda done, total: None
+) -> tuple[Plan, Estimate]:
     """Find the largest stable step whose estimated error is within the scene's tolerance, and this error.
 
     No fewer steps than the plan's are tried; progress counts the frames of each pilot run.
@@ -202,7 +204,7 @@ class Pilot:
         if not self._same:
             rounding, in_f64 = 0.0 if self._parted else error, error
         steps, contact = self._plan.grid.steps_per_frame, bool(self._plan.tools)
-        at_least = contact and (self._overlap or error > LARGEST_TOLERANCE)
+        at_least = contact and (self._overlap or error > MAX_TOLERANCE)
         return Estimate(steps, error, rounding, in_f64, self._order, self._parted, at_least, contact)
 
 
@@ -224,7 +226,7 @@ class Trials:
         self._pilot = Pilot(plan, fine_steps(plan), device)
         self._own = Dynamics(plan, device)
 
-    def estimate(self, steps: int, progress: Count) -> Estimate:
+    def estimate(self, steps: int, progress: ProgressCallback) -> Estimate:
         """Run the scene with so many steps per frame, and estimate its error; progress counts frames."""
         plan = self._plan.with_grid(steps_per_frame=steps)
         fine, frames = fine_steps(plan), plan.grid.frames
@@ -295,7 +297,7 @@ def _out_of_reach(tolerance: float, failures: list[Estimate]) -> str:
         )
     weaker = "move the tools less deep, or take" if last.at_most else "take a weaker load or"
     remedy = f"{weaker} a shorter time"
-    if best.error < LARGEST_TOLERANCE / 2:
+    if best.error < MAX_TOLERANCE / 2:
         remedy += f", or a tolerance of {_above(best.error):g}"
     return (
         f"time.tolerance: {tolerance:g} is out of reach: with {last.steps_per_frame} steps a frame the error is still "

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from taichi_msm.errors import printable
-from taichi_msm.load.cost import rough_time
+from taichi_msm.load.cost import format_rough_time
 from taichi_msm.model.tool_force import describe_forces
 from taichi_msm.system.process import write_stderr
 
@@ -71,7 +71,7 @@ class ProgressDisplay:
         if stage != self._pace.stage or done < self._pace.done:
             self._pace = _Pace(stage, done, now)
         remaining_s = self._pace.remaining_s(done, total, now)
-        remaining = "" if remaining_s is None else f"{rough_time(remaining_s)} left"
+        remaining = "" if remaining_s is None else f"{format_rough_time(remaining_s)} left"
         if self._bar is not None:
             self._bar.update(self._task, description=STAGES[stage], completed=done, total=total, left=remaining)
         elif now >= self._next_line:

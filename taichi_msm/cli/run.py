@@ -158,7 +158,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     }
     if loaded.time.at_rest:
         steps |= dict.fromkeys(("step", "stable_step", "steps_per_frame", "steps"))
-    need, duration = cost_module.estimate_memory(plan), cost_module.estimate_duration(plan)
+    need, duration = cost_module.estimate_budget(plan), cost_module.estimate_duration(plan)
     facts: dict[str, Any] = {
         "scene": loaded.model_dump(mode="json"),
         **steps,
@@ -179,7 +179,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         return DONE
     import yaml
 
-    from taichi_msm.load.cost import rough_time
+    from taichi_msm.load.cost import format_rough_time
 
     tolerances = [f"{name}.tolerance" for name in ("sheet", "time") if getattr(loaded, name).tolerance is not None]
     # Pilot runs may refine a scene with a tolerance.
@@ -194,7 +194,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     )
     click.echo(
         f"\n{need.points} points, {need.frames} frames, {stepping}\n"
-        f"about {rough_time(duration.seconds)} to run{longer} (estimated from its work)\n"
+        f"about {format_rough_time(duration.seconds)} to run{longer} (estimated from its work)\n"
         f"about {need.memory_bytes / 2**20:.0f} MiB of memory, at most {need.disk_bytes / 2**20:.1f} MiB on disk, "
         f"{need.working_bytes / 2**20:.1f} MiB more while it runs"
     )

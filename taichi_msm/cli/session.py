@@ -27,12 +27,12 @@ EXIT_CODES = {"complete": DONE, "diverged": DIVERGED}
 
 def plan_repetition(directory: str) -> tuple[Plan, list[str]]:
     """Return the plan of an earlier run, whose pictures are read again, and the overrides of that run."""
-    from taichi_msm.load.check import checked
+    from taichi_msm.load.check import check_scene
     from taichi_msm.runs.finished import read_run
 
     earlier = read_run(result_directory(directory, option="--again"))
     earlier.require_pictures(drawn=earlier.scene.draws or "image" in earlier.sha256)
-    return checked(earlier.scene), earlier.overrides
+    return check_scene(earlier.scene), earlier.overrides
 
 
 def result_directory(out: str | None, default: str = "", option: str = "--out") -> Path:

@@ -62,12 +62,12 @@ def study(
 ) -> int:
     """Measure how fast and how wrong every setting of SCENE is, and recommend one."""
     from taichi_msm.load.scene_file import load_scene
-    from taichi_msm.scene.section import LARGEST_TOLERANCE, SMALLEST_TOLERANCE
+    from taichi_msm.scene.section import MAX_TOLERANCE, MIN_TOLERANCE
 
     loaded = load_scene(scene, overrides, image)
     directory = result_directory(out, f"{Path(scene).stem}-study")
-    if tolerance is not None and not SMALLEST_TOLERANCE <= tolerance <= LARGEST_TOLERANCE:
-        expected = f"expected a number, {SMALLEST_TOLERANCE:g} to {LARGEST_TOLERANCE:g}"
+    if tolerance is not None and not MIN_TOLERANCE <= tolerance <= MAX_TOLERANCE:
+        expected = f"expected a number, {MIN_TOLERANCE:g} to {MAX_TOLERANCE:g}"
         raise click.BadParameter(f"{tolerance:g} is not allowed; {expected}", param_hint="--tolerance")
 
     from taichi_msm.cli.console import ProgressDisplay

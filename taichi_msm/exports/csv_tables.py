@@ -22,7 +22,7 @@ from taichi_msm.exports.formats import Source
 from taichi_msm.exports.inputs import read_places, read_tracks
 from taichi_msm.runs.directory import create
 from taichi_msm.runs.finished import FinishedRun, damaged, reading
-from taichi_msm.scene.outputs import FORCES_HEADER, numbered
+from taichi_msm.scene.outputs import FORCES_HEADER, zero_padded
 
 TRACKS_HEADER = ("time", "point", "across", "down", "x", "y", "occluded", "position_x", "position_y", "position_z")
 
@@ -49,7 +49,7 @@ def write(sources: Sequence[Source], folder: Path) -> Iterator[list[str]]:
                     file = io.TextIOWrapper(create(folder / f"{key}.csv"), "ascii", newline="")
                     tables[key] = opened.enter_context(file)
                     tables[key].write(f"run,{','.join(header)}\n")
-                write_rows(run, name or numbered(0), tables[key])
+                write_rows(run, name or zero_padded(0), tables[key])
             lacking = [key for key in writers if key not in written]
             yield [f"without {key}, which are not among the results; {run.remedy(key)}" for key in lacking]
 

@@ -16,11 +16,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from taichi_msm.errors import ArgumentError, Count, FilesError, SceneError, did_you_mean, require_path, writing
+from taichi_msm.errors import (
+    ArgumentError,
+    FilesError,
+    ProgressCallback,
+    SceneError,
+    did_you_mean,
+    require_path,
+    writing,
+)
 from taichi_msm.exports.formats import ANY, FORMATS, Source, Write, read_runs
 from taichi_msm.runs.directory import Contents, Listed, Publication, add, create, files, without_link
 from taichi_msm.runs.finished import PUT_BACK, FinishedRun
-from taichi_msm.scene.outputs import OUTPUTS, numbered
+from taichi_msm.scene.outputs import OUTPUTS, zero_padded
 
 # The file that lists the others, and that which leads from numbers to runs.
 RECORD, INDEX = "export.json", "index.csv"
@@ -52,7 +60,7 @@ def export(
     runs: str | Path | Sequence[str | Path],
     format: str,  # noqa: A002
     out: str | Path | None = None,
-    progress: Count = lambda done, total: None,
+    progress: ProgressCallback = lambda done, total: None,
     camera: str | None = None,
 ) -> Exported:
     """Convert the results of runs for another program, whole or not at all.
@@ -115,7 +123,7 @@ def _views(run: FinishedRun, name: str, camera: str | None) -> list[FinishedRun]
     shown = wanted.cameras
     if shown == ANY and camera is not None and camera in known:
         return [replace(run, camera=camera)]
-    seen = [key for key in (*wanted.needs, *wanted.uses) if OUTPUTS[key].is_seen and key in run.scene.output]
+    seen = [key for key in (*wanted.needs, *wanted.uses) if OUTPUTS[key].is_camera_output and key in run.scene.output]
     if not shown or (shown == ANY and not (known and seen)):
         return [run]
     said = f"its cameras are {', '.join(known)}" if known else "it has one camera, without a name"
@@ -128,7 +136,9 @@ def _views(run: FinishedRun, name: str, camera: str | None) -> list[FinishedRun]
     raise FilesError(f"{run.directory}: {said}")
 
 
-def _convert(views: Sequence[Sequence[FinishedRun]], name: str, directory: Path, progress: Count) -> Exported:
+def _convert(
+    views: Sequence[Sequence[FinishedRun]], name: str, directory: Path, progress: ProgressCallback
+) -> Exported:
     """Convert runs, one or more, as the cameras have seen them that the format shows."""
     runs = [run for run, *_ in views]
     wanted, total, done = FORMATS[name], sum(run.frames for run in runs), 0
@@ -136,7 +146,7 @@ def _convert(views: Sequence[Sequence[FinishedRun]], name: str, directory: Path,
     sources = []
     for number, run in enumerate(runs):
         own = partial(_count, progress, done, run.frames, total)
-        sources.append(Source(run, numbered(number) if len(runs) > 1 else "", own))
+        sources.append(Source(run, zero_padded(number) if len(runs) > 1 else "", own))
         done += run.frames
     progress(0, total)
     notes: dict[str, list[Path]] = {}
@@ -159,7 +169,7 @@ def _convert(views: Sequence[Sequence[FinishedRun]], name: str, directory: Path,
     return Exported(directory, written, [*(_told(note, of) if len(runs) > 1 else note for note, of in notes.items())])
 
 
-def _count(progress: Count, before: int, frames: int, total: int, done: int, parts: int) -> None:
+def _count(progress: ProgressCallback, before: int, frames: int, total: int, done: int, parts: int) -> None:
     """Report the progress of a run as that of all runs."""
     progress(before + frames * done // parts, total)
 
@@ -193,4 +203,4 @@ def _write_index(runs: Sequence[FinishedRun], pairs: bool, path: Path) -> None:
     with io.TextIOWrapper(create(path), "utf-8", "surrogateescape", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["number", "run", *(["frame"] if pairs else [])])
-        writer.writerows([numbered(number), *row] for number, row in enumerate(rows))
+        writer.writerows([zero_padded(number), *row] for number, row in enumerate(rows))

@@ -11,10 +11,10 @@ from functools import wraps
 from pathlib import Path
 from typing import NamedTuple
 
-from taichi_msm.errors import Count, FilesError
+from taichi_msm.errors import FilesError, ProgressCallback
 from taichi_msm.runs.directory import MAX_RECORD, files
 from taichi_msm.runs.finished import FinishedRun, read_run, reading
-from taichi_msm.scene.outputs import NUMBERED, RECORD, RUNS, SWEEP
+from taichi_msm.scene.outputs import NUMBER_PATTERN, RUN_RECORD, RUNS_FOLDER, SWEEP_RECORD
 from taichi_msm.system.files import read_regular
 
 
@@ -32,7 +32,7 @@ class Format(NamedTuple):
 
 def _each(*patterns: str) -> tuple[str, ...]:
     """Give the patterns of files that are there for each run: in a folder of its own, or of the only run in none."""
-    return (*patterns, *(f"{NUMBERED}/{pattern}" for pattern in patterns))
+    return (*patterns, *(f"{NUMBER_PATTERN}/{pattern}" for pattern in patterns))
 
 
 # A camera that is chosen, or the only one.
@@ -44,23 +44,25 @@ FORMATS = {
         needs=("flow",),
         uses=("occlusion", "png"),
         files=(
-            rf"training/image_2/{NUMBERED}_1[01]\.png",
-            rf"training/flow_occ/{NUMBERED}_10\.png",
-            rf"training/flow_noc/{NUMBERED}_10\.png",
+            rf"training/image_2/{NUMBER_PATTERN}_1[01]\.png",
+            rf"training/flow_occ/{NUMBER_PATTERN}_10\.png",
+            rf"training/flow_noc/{NUMBER_PATTERN}_10\.png",
         ),
         pairs=True,
         cameras=ANY,
     ),
     "tapvid": Format("tracks of points", needs=("tracks", "png"), files=(r"tapvid\.pkl",), cameras=ANY),
-    "tapvid3d": Format("tracks of points in space", needs=("tracks", "png"), files=(rf"{NUMBERED}\.npz",), cameras=ANY),
+    "tapvid3d": Format(
+        "tracks of points in space", needs=("tracks", "png"), files=(rf"{NUMBER_PATTERN}\.npz",), cameras=ANY
+    ),
     "stir": Format(
         "tracks of points in stereo",
         needs=("tracks", "png"),
         files=(
-            rf"{NUMBERED}/calib\.json",
-            rf"{NUMBERED}/(?:left|right)/seq00/frames/0ms-[0-9]+ms-visible\.mp4",
-            rf"{NUMBERED}/(?:left|right)/seq00/[0-9]+ms_icg(?:start|end)\.png",
-            rf"{NUMBERED}/(?:left|right)/seq00/segmentation/icg(?:start|end)seg\.png",
+            rf"{NUMBER_PATTERN}/calib\.json",
+            rf"{NUMBER_PATTERN}/(?:left|right)/seq00/frames/0ms-[0-9]+ms-visible\.mp4",
+            rf"{NUMBER_PATTERN}/(?:left|right)/seq00/[0-9]+ms_icg(?:start|end)\.png",
+            rf"{NUMBER_PATTERN}/(?:left|right)/seq00/segmentation/icg(?:start|end)seg\.png",
         ),
         cameras=("left", "right"),
     ),
@@ -89,7 +91,7 @@ class Source(NamedTuple):
 
     run: FinishedRun  # as the first camera that the format shows has seen it
     name: str  # its number among the runs; empty if it is the only one
-    progress: Count  # of this run
+    progress: ProgressCallback  # of this run
 
 
 # Writes the files of all runs into an empty folder. It is a generator: after each run it gives what the user should
@@ -97,7 +99,7 @@ class Source(NamedTuple):
 Write = Callable[[Sequence[Source], Path], Iterator[list[str]]]
 
 
-def in_folders(write: Callable[[FinishedRun, Path, Count], list[str]]) -> Write:
+def in_folders(write: Callable[[FinishedRun, Path, ProgressCallback], list[str]]) -> Write:
     """Make a format of what writes one run into an empty folder."""
 
     @wraps(write)
@@ -120,14 +122,14 @@ def read_runs(directories: Sequence[str | Path]) -> tuple[list[FinishedRun], int
     """
     runs, left_out = [], 0
     for directory in map(Path, directories):
-        record = directory / SWEEP
+        record = directory / SWEEP_RECORD
         with reading(record):
-            is_sweep = record.is_file() and not (directory / RECORD).is_file()
+            is_sweep = record.is_file() and not (directory / RUN_RECORD).is_file()
         if not is_sweep:
             runs.append(read_run(directory))
             continue
         with reading(record):
-            names = files(directory, (rf"{RUNS}/{NUMBERED}/{RECORD}",), strict=False)
+            names = files(directory, (rf"{RUNS_FOLDER}/{NUMBER_PATTERN}/{RUN_RECORD}",), strict=False)
             folders = sorted(((directory / name).parent for name in names), key=lambda folder: int(folder.name))
             count = len(json.loads(read_regular(record, MAX_RECORD))["values"])
         complete = [run for run in map(read_run, folders) if run.status == "complete"]

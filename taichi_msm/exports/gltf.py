@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import Count
+from taichi_msm.errors import ProgressCallback
 from taichi_msm.exports.formats import in_folders
 from taichi_msm.exports.inputs import REFINE, picture_png, unit_normals
 from taichi_msm.model.surface import refine_surface
@@ -57,7 +57,7 @@ ALIGNMENT = 4
 
 
 @in_folders
-def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
+def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
     """Write the surface of a run, with its picture; raises what `FinishedRun.positions` and `picture_png` do."""
     positions, picture, binary = run.positions(), picture_png(run), Binary()
     most = max(1, min(MOST_TARGETS, MOST_BYTES // (VERTEX_BYTES * positions[0, ..., 0].size)))
@@ -153,7 +153,9 @@ class KeyFrames(NamedTuple):
     error: float  # the largest distance between a point in any frame and where the key frames beside it place it [m]
 
 
-def key_frames(position: NDArray[np.floating], most: int, progress: Count = lambda done, total: None) -> KeyFrames:
+def key_frames(
+    position: NDArray[np.floating], most: int, progress: ProgressCallback = lambda done, total: None
+) -> KeyFrames:
     """Choose the key frames of a motion: all frames, unless they are too many.
 
     If they are, the first and the last frame are key frames to begin with. Then the frame that the key frames represent

@@ -21,7 +21,7 @@ from taichi_msm.exports.formats import ANY, FORMATS
 from taichi_msm.render.texture import load_texture
 from taichi_msm.runs.arrays import read_rows
 from taichi_msm.runs.finished import FinishedRun, damaged, reading
-from taichi_msm.scene.outputs import CAMERA
+from taichi_msm.scene.outputs import CAMERA_FILE
 from taichi_msm.system.files import read_regular
 
 # The vertices are the mass points, and cells are cut as in the picture. The surface between mass points is bilinear, so
@@ -110,7 +110,7 @@ def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
         FilesError: when there is none.
         ArgumentError: when the format cannot describe it.
     """
-    path = run.directory / run.camera / CAMERA
+    path = run.directory / run.camera / CAMERA_FILE
     another = "choose another camera by --camera, or " if FORMATS[name].cameras == ANY else ""
     with reading(path):
         described = json.loads(read_regular(run.own(path, "tracks"), MAX_BYTES))

@@ -23,12 +23,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import Count, FilesError
+from taichi_msm.errors import FilesError, ProgressCallback
 from taichi_msm.exports.formats import Source
 from taichi_msm.runs.arrays import read_flo
 from taichi_msm.runs.directory import MAX_RECORD, add
 from taichi_msm.runs.finished import FinishedRun, reading
-from taichi_msm.scene.outputs import OUTPUTS, numbered
+from taichi_msm.scene.outputs import OUTPUTS, zero_padded
 from taichi_msm.system.files import read_regular
 
 SCALE, ZERO, LARGEST = 64.0, 32768.0, 65535.0
@@ -58,7 +58,7 @@ def write(sources: Sequence[Source], folder: Path) -> Iterator[list[str]]:
         first += source.run.frames - 1
 
 
-def _write_run(run: FinishedRun, training: Path, first: int, progress: Count) -> list[str]:
+def _write_run(run: FinishedRun, training: Path, first: int, progress: ProgressCallback) -> list[str]:
     """Write the pairs of a run, numbered from the first on."""
     pairs = run.frames - 1
     if pairs == 0:
@@ -66,7 +66,7 @@ def _write_run(run: FinishedRun, training: Path, first: int, progress: Count) ->
     flow_occ, flow_noc, image_2 = (training / name for name in MADE_FROM)
     for pair in range(pairs):
         progress(pair, pairs)
-        source, name = run.result("flow", pair), numbered(first + pair)
+        source, name = run.result("flow", pair), zero_padded(first + pair)
         with reading(source):
             flow = read_flo(source, run.scene.render.size)
         add(flow_occ / f"{name}_10.png", png16(encode(flow)))

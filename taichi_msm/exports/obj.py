@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import Count
+from taichi_msm.errors import ProgressCallback
 from taichi_msm.exports.formats import in_folders
 from taichi_msm.exports.inputs import PICTURE, REFINE, picture_png, unit_normals
 from taichi_msm.model.surface import refine_surface
@@ -29,7 +29,7 @@ EXACT = "%.9g"
 
 
 @in_folders
-def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
+def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
     """Write the surface of every frame, its material and the picture; raises as `gltf.write` does."""
     positions, picture = run.positions(), picture_png(run)
     if picture is not None:

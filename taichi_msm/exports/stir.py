@@ -33,14 +33,14 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from taichi_msm.errors import Count, FilesError, NotInstalledError
+from taichi_msm.errors import FilesError, NotInstalledError, ProgressCallback
 from taichi_msm.exports.formats import Source
 from taichi_msm.exports.inputs import FIRST_CENTRE, Pinhole, read_pinhole, read_tracks
 from taichi_msm.runs import media
 from taichi_msm.runs.directory import add, create
 from taichi_msm.runs.finished import FinishedRun
 from taichi_msm.scene import outputs
-from taichi_msm.scene.outputs import numbered
+from taichi_msm.scene.outputs import zero_padded
 
 NAME, SIDES = "stir", ("left", "right")
 
@@ -66,10 +66,10 @@ def write(sources: Sequence[Source], folder: Path) -> Iterator[list[str]]:
     if not outputs.is_pyav_installed():
         raise NotInstalledError(f"--format {outputs.PYAV_NOT_INSTALLED.replace('mp4', NAME, 1)}")
     for run, name, progress in sources:
-        yield _write_run(run, folder / (name or numbered(0)), progress)
+        yield _write_run(run, folder / (name or zero_padded(0)), progress)
 
 
-def _write_run(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
+def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
     runs = [replace(run, camera=side) for side in SIDES]
     folder.mkdir()
     left, right = (read_pinhole(each, NAME) for each in runs)
@@ -111,7 +111,7 @@ def _calibration(left: Pinhole, right: Pinhole, baseline: float) -> dict[str, An
     return {**matrices, "rotation": np.eye(3).tolist(), "translation": [-baseline, 0.0, 0.0]}
 
 
-def _of_both(progress: Count, before: int, done: int, total: int) -> None:
+def _of_both(progress: ProgressCallback, before: int, done: int, total: int) -> None:
     """Report the progress of a camera, after so many others, as that of both."""
     progress(before * total + done, len(SIDES) * total)
 
@@ -142,7 +142,7 @@ def _discs(pixels: Pixels, size: tuple[int, int], radius: int) -> NDArray[np.uin
     return mask
 
 
-def _write_frames(run: FinishedRun, folder: Path, progress: Count) -> None:
+def _write_frames(run: FinishedRun, folder: Path, progress: ProgressCallback) -> None:
     """Write the film of a camera, and its first and last frame."""
     render = run.scene.render
     end = round(1000 * run.time[-1])

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import Count, FilesError
+from taichi_msm.errors import FilesError, ProgressCallback
 from taichi_msm.exports.formats import Source
 from taichi_msm.exports.inputs import read_tracks
 from taichi_msm.runs.directory import create
@@ -66,7 +66,7 @@ def _require_memory(runs: Sequence[FinishedRun]) -> None:
         raise FilesError(f"{whose} {need / 2**30:.1f} GiB of memory, and {free / 2**30:.1f} are free; {remedy}")
 
 
-def _video(run: FinishedRun, progress: Count) -> dict[str, NDArray[Any]]:
+def _video(run: FinishedRun, progress: ProgressCallback) -> dict[str, NDArray[Any]]:
     """Read the frames and tracks of a run."""
     width, height = run.scene.render.size
     points, occluded = read_tracks(run)

@@ -26,13 +26,13 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from taichi_msm.errors import Count
+from taichi_msm.errors import ProgressCallback
 from taichi_msm.exports.formats import Source
 from taichi_msm.exports.inputs import read_pinhole, read_places, read_tracks
 from taichi_msm.runs.arrays import write_arrays
 from taichi_msm.runs.directory import create
 from taichi_msm.runs.finished import FinishedRun
-from taichi_msm.scene.outputs import numbered
+from taichi_msm.scene.outputs import zero_padded
 
 NAME = "tapvid3d"
 
@@ -43,10 +43,10 @@ QUALITY, SUBSAMPLING = 95, 0
 def write(sources: Sequence[Source], folder: Path) -> Iterator[list[str]]:
     """Write the tracks of runs and their frames; raises what `read_pinhole` does."""
     for run, name, progress in sources:
-        yield _write_run(run, folder / f"{name or numbered(0)}.npz", progress)
+        yield _write_run(run, folder / f"{name or zero_padded(0)}.npz", progress)
 
 
-def _write_run(run: FinishedRun, path: Path, progress: Count) -> list[str]:
+def _write_run(run: FinishedRun, path: Path, progress: ProgressCallback) -> list[str]:
     camera, (points, occluded), (_, position) = read_pinhole(run, NAME), read_tracks(run), read_places(run)
     images = []
     for frame in range(run.frames):

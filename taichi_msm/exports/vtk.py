@@ -21,7 +21,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import Count, NotInstalledError
+from taichi_msm.errors import NotInstalledError, ProgressCallback
 from taichi_msm.exports.formats import in_folders
 from taichi_msm.exports.inputs import PICTURE, REFINE, picture_png
 from taichi_msm.model.sheet import rest_positions
@@ -40,7 +40,7 @@ Array = NDArray[np.floating]
 
 
 @in_folders
-def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
+def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
     """Write the surface of every frame, their times and the picture.
 
     Raises as `gltf.write` does; and a NotInstalledError when VTK is not installed.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import SceneError
-from taichi_msm.images import irregular
+from taichi_msm.images import irregular_kind
 from taichi_msm.system.process import available_memory
 
 NEEDS = "time (T,), coordinates (N, 2) and position (N, T, 3) or pixel (N, T, 2)"
@@ -40,7 +40,7 @@ def read_archive(name: str) -> dict[str, NDArray[Any]]:
     path, remedy = Path(name), f"name an .npz with {NEEDS}, or a run's trajectory.npz or tracks.npz"
     reason = "not an .npz"
     try:
-        if kind := irregular(path):
+        if kind := irregular_kind(path):
             raise SceneError([f"{name}: {'a folder' if path.is_dir() else kind}; {remedy}"])
         with path.open("rb") as file:
             begin = file.read(6)

@@ -12,7 +12,7 @@ from taichi_msm.fitting.conventions import force_unit, half_pixel, mirrored, opp
 from taichi_msm.fitting.observations import Observations, places_at_rest, seen_at_rest
 from taichi_msm.fitting.predict import Predicted
 from taichi_msm.scene.scene import Scene
-from taichi_msm.scene.section import WHOLE
+from taichi_msm.scene.section import FRAME_TOLERANCE
 
 Array = NDArray[np.float64]
 
@@ -138,10 +138,10 @@ def _is_still(seen: Observations, scene: Scene) -> bool:
 
 def _times(time: Array, name: str, scene: Scene) -> Iterator[str]:
     duration = scene.time.duration
-    slack = WHOLE / scene.time.frames_per_second
+    slack = FRAME_TOLERANCE / scene.time.frames_per_second
     low, high = float(time.min()), float(time.max())
     if high > duration + slack:
-        thousand = duration / 30 < high / 1000 <= duration * (1 + WHOLE)
+        thousand = duration / 30 < high / 1000 <= duration * (1 + FRAME_TOLERANCE)
         rate = scene.time.frames_per_second
         numbers = bool((time == np.round(time)).all()) and high / rate <= duration + 1 / rate + slack
         remedy = "cut them off, or --set time.duration=..."

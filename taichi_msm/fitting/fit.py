@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from typing_extensions import Unpack
 
 from taichi_msm.accuracy.mesh import WITH_CONTACT
-from taichi_msm.errors import Progress, SceneError, writing
+from taichi_msm.errors import SceneError, StageProgressCallback, writing
 from taichi_msm.fitting import rejection
 from taichi_msm.fitting import result as result_module
 from taichi_msm.fitting.checks import faults, faults_beside, faults_of_best, moved
@@ -49,7 +49,7 @@ from taichi_msm.fitting.predict import Job, Predicted, Runs, runnable
 from taichi_msm.fitting.report import publication, write_report
 from taichi_msm.fitting.result import Estimate, FitResult, FittedMap
 from taichi_msm.fitting.stiffness_map import KEY, fit_map, map_task
-from taichi_msm.load.check import checked
+from taichi_msm.load.check import check_scene
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.scene.scene import Scene
 
@@ -68,7 +68,7 @@ def fit(
     forces: tuple[str | Path, float] | None = None,
     directory: str | Path | None = None,
     workers: int | None = None,
-    progress: Progress = lambda stage, done, total: None,
+    progress: StageProgressCallback = lambda stage, done, total: None,
     **method: Unpack[Method],
 ) -> FitResult:
     """Find the numbers of a scene with which it moves as was seen, and how well they are known.
@@ -110,7 +110,7 @@ def fit(
     """
     begun = time.perf_counter()
     require_types(observed, free, method, bounds=bounds, forces=forces, directory=directory, workers=workers)
-    given = load_scene(scene) if isinstance(scene, (str, Path)) else checked(scene).scene
+    given = load_scene(scene) if isinstance(scene, (str, Path)) else check_scene(scene).scene
     for section in ("sheet", "time"):
         if (tolerance := getattr(given, section).tolerance) is not None:
             said = "is for one run, and a fit compares many; remove it, and take what `run` chose for it"

@@ -14,8 +14,8 @@ import numpy as np
 
 from taichi_msm.errors import SceneError
 from taichi_msm.fitting.observations import Forces
-from taichi_msm.images import irregular
-from taichi_msm.scene.section import LARGEST
+from taichi_msm.images import irregular_kind
+from taichi_msm.scene.section import MAX_MAGNITUDE
 
 COLUMNS = {"time": "s", "probe": "", "force_x": "N", "force_y": "N", "force_z": "N"}
 EXPECTED = f"name a forces.csv, with the columns {', '.join(COLUMNS)}"
@@ -61,7 +61,7 @@ def read_forces(path: str | Path, sigma: float, probes: int) -> Forces:
 def _text(name: str) -> str:
     """Return the text of a regular file of bounded size."""
     try:
-        if not (reason := irregular(Path(name))):
+        if not (reason := irregular_kind(Path(name))):
             if (size := Path(name).stat().st_size) <= MOST_BYTES:
                 data = Path(name).read_bytes()
                 if data.startswith(b"PK") or (b"\0" in data and data[:2] not in MARKS):
@@ -132,7 +132,7 @@ class _Reader:
             plain = plain.replace(",", ".", 1)
         if "," in plain:
             said = "with decimal commas, separate cells by ;"
-        if not (NUMBER.fullmatch(plain) and abs(value := float(plain)) <= LARGEST):
+        if not (NUMBER.fullmatch(plain) and abs(value := float(plain)) <= MAX_MAGNITUDE):
             raise SceneError([f"{where}: {key}: {cell[:40]!r}; take a number, or {said}"])
         return value
 

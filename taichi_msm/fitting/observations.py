@@ -26,7 +26,7 @@ from taichi_msm.fitting.archive import NEEDS, read_archive, require_understood
 from taichi_msm.model.surface import surface_weights
 from taichi_msm.render.camera import view
 from taichi_msm.scene.scene import Scene
-from taichi_msm.scene.section import LARGEST, SMALLEST
+from taichi_msm.scene.section import MAX_MAGNITUDE, MIN_MAGNITUDE
 
 pass  # REMOVED
 
@@ -199,7 +199,7 @@ def with_sigma(seen: Observations, sigma: Any) -> Observations:
         return seen
     array = np.asarray(sigma)
     is_number = array.dtype.kind in "fiu" and array.size == 1
-    if not (is_number and SMALLEST <= (value := float(array.ravel()[0])) <= LARGEST):
+    if not (is_number and MIN_MAGNITUDE <= (value := float(array.ravel()[0])) <= MAX_MAGNITUDE):
         shown = f"{value:g}" if is_number else f"{array.dtype} of shape {array.shape}"
         said = f"take one number above 0, the standard deviation of the errors [{seen.unit}], or leave it out"
         raise SceneError([f"{seen.name}: sigma: {shown}; {said}"])
@@ -239,7 +239,7 @@ def _checked(name: str, arrays: dict[str, NDArray[Any]], rate: float) -> Observa
     if not np.isfinite(values).any():
         why = "is NaN or occluded"
         raise SceneError([f"{name}: every one of the {points} points {why} at all {times} times; nothing was seen"])
-    if (most := np.nanmax(np.abs(values))) > LARGEST:
+    if (most := np.nanmax(np.abs(values))) > MAX_MAGNITUDE:
         raise SceneError([f"{name}: {kind}: {most:g}; take NaN for what was not seen"])
     return with_sigma(Observations(name, kind, time, coordinates, values, None), arrays.get("sigma"))
 

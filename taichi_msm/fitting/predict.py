@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.accuracy.mesh import coarser, estimate_points
-from taichi_msm.errors import DivergedError, ExecutorError, Pause, Progress, SceneError
+from taichi_msm.errors import DivergedError, ExecutorError, Pause, SceneError, StageProgressCallback
 from taichi_msm.fitting.observations import Observations, Sight, between, in_frames
 from taichi_msm.fitting.parameters import Parameter, as_data, with_values
 from taichi_msm.load import cost
-from taichi_msm.load.check import checked
+from taichi_msm.load.check import check_scene
 from taichi_msm.model.plan import Plan
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
@@ -71,7 +71,7 @@ class Predictor:
 
     def __init__(self, job: Job, threads: int | None) -> None:
         self.job, self._data = job, as_data(job.scene)
-        plan = checked(job.scene)
+        plan = check_scene(job.scene)
         self._maps, self._threads = plan.maps, threads
         self._simulation: Simulation | None = None
         seen = job.observations
@@ -133,7 +133,7 @@ class Predictor:
         if not np.isfinite(values).all():
             raise SceneError(["the values are out of range"])
         data = with_values(self._data, self.job.parameters, values)
-        return checked(Scene(**data), self._maps)
+        return check_scene(Scene(**data), self._maps)
 
     def _run(self, simulation: Simulation, plan: Plan, whole: bool, pause: Pause) -> Predicted:
         seen, scene = self.job.observations, plan.scene
@@ -217,7 +217,7 @@ class Runs:
         progress: called often, with the stage, the runs done and those that are expected; what it raises stops.
     """
 
-    def __init__(self, job: Job, workers: int | None, progress: Progress) -> None:
+    def __init__(self, job: Job, workers: int | None, progress: StageProgressCallback) -> None:
         self.job, self.count, self.expected = job, 0, 0
         self._workers, self._progress = workers, progress
         self._predictor = Predictor(job, threads=None)
@@ -262,7 +262,7 @@ class Runs:
         parameters = len(self.job.parameters)
         if RUNS_EACH * parameters * self._seconds < WORTHWHILE:
             return 1
-        needed = PROCESS_BYTES + cost.estimate_memory(checked(self.job.scene)).memory_bytes
+        needed = PROCESS_BYTES + cost.estimate_budget(check_scene(self.job.scene)).memory_bytes
         return max(1, min(available_threads(), available_memory() // needed, 2 * parameters))
 
     def _side_by_side(self, pool: Pool, places: Sequence[Array], steps: int | None) -> list[Predicted | None]:

@@ -31,7 +31,7 @@ from PIL import Image
 from taichi_msm.errors import printable
 from taichi_msm.fitting.result import FitResult, FittedMap, sixteen_bits
 from taichi_msm.fitting.tikhonov import Choice
-from taichi_msm.plot_style import BLUE, DPI, GREY, ORANGE, SILVER, STYLE, VERMILION, WIDE
+from taichi_msm.plot_style import BLUE, DPI, GREY, ORANGE, SILVER, STYLE, TWO_COLUMN_WIDTH, VERMILION
 from taichi_msm.runs.directory import Contents, Listed, Publication, add, create, files
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.system.compiler import versions
@@ -135,7 +135,7 @@ def _figure(result: FitResult) -> Figure:
     count = len(drawn) + len(result.parameters) + 3 * (result.map is not None)
     rows = math.ceil(count / COLUMNS)
     engine = ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1)
-    figure = Figure(figsize=(WIDE, HEIGHT * rows + 0.5), dpi=DPI, layout=engine)
+    figure = Figure(figsize=(TWO_COLUMN_WIDTH, HEIGHT * rows + 0.5), dpi=DPI, layout=engine)
     FigureCanvasAgg(figure)
     figure.suptitle(f"Fit to {printable(result.observations.name)}", x=0.01, ha="left", parse_math=False)
     panels = list(figure.subplots(rows, COLUMNS, squeeze=False).ravel())

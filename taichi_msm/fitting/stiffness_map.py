@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.accuracy.mesh import coarser
-from taichi_msm.errors import Progress, SceneError
+from taichi_msm.errors import SceneError, StageProgressCallback
 from taichi_msm.fitting.checks import faults, faults_beside
 from taichi_msm.fitting.observations import Observations, Sight
 from taichi_msm.fitting.parameters import Bounds, rounded
@@ -19,7 +19,7 @@ from taichi_msm.fitting.rejection import by_chi_square
 from taichi_msm.fitting.result import FitResult, FittedMap
 from taichi_msm.fitting.tikhonov import Fields, Search, Solution, centres
 from taichi_msm.gradients.gradient import Adjoint, require_differentiable
-from taichi_msm.load.check import checked
+from taichi_msm.load.check import check_scene
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import MapImage, map_factors
 from taichi_msm.scene.scene import Scene
@@ -93,14 +93,14 @@ def map_task(scene: Scene, free: Sequence[str], bounds: Mapping[str, Bounds], re
     return MapTask(resolution, (low, high))
 
 
-def fit_map(given: Scene, seen: Observations, task: MapTask, image: str, progress: Progress) -> FitResult:
+def fit_map(given: Scene, seen: Observations, task: MapTask, image: str, progress: StageProgressCallback) -> FitResult:
     """Find a map; image: the path of its picture in the scene that is given back.
 
     Raises:
         SceneError: when the scene or what was seen cannot be used.
         DivergedError: when a run diverges.
     """
-    plan = _for_factors(checked(runnable(given)), task.limits[1])
+    plan = _for_factors(check_scene(runnable(given)), task.limits[1])
     require_differentiable(plan)
     if wrong := list(_unusable(seen, given, task)):
         raise SceneError(wrong)
@@ -141,7 +141,7 @@ def fit_map(given: Scene, seen: Observations, task: MapTask, image: str, progres
     assert given.tissue is not None
     drawn = {"map": StiffnessMap(image=image, range=found.range)}
     scene = given.model_copy(update={"tissue": given.tissue.model_copy(update=drawn)})
-    mapped = checked(runnable(scene), {**plan.maps, "map": MapImage(found.grey, "")})
+    mapped = check_scene(runnable(scene), {**plan.maps, "map": MapImage(found.grey, "")})
     chi_square = float(np.sum((left / seen.sigma) ** 2))
     return FitResult(
         residual=float(np.sqrt(np.mean(left**2))),

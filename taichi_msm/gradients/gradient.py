@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import ArgumentError, MsmError, Pause, SceneError, are_numbers, as_array
+from taichi_msm.errors import ArgumentError, MsmError, Pause, SceneError, as_array, is_real_array
 from taichi_msm.gradients.chain_rule import Derivatives, derivatives
 from taichi_msm.gradients.motion import MotionAdjoint, motion_bytes
 from taichi_msm.gradients.rest import RestAdjoint
-from taichi_msm.load.check import checked
+from taichi_msm.load.check import check_scene
 from taichi_msm.load.resolve import resolve
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
@@ -122,7 +122,7 @@ class Adjoint:
             raise MsmError("nothing has run yet that could be differentiated; call run first")
         plan, slope = self._sheet.plan, as_array(slope, "slope")
         shape = plan.grid.frames + 1, *plan.scene.sheet.points, 3
-        if not are_numbers(slope, shape) or not np.isfinite(slope).all():
+        if not is_real_array(slope, shape) or not np.isfinite(slope).all():
             raise ArgumentError(
                 f"the loss's derivative: {slope.dtype} of shape {slope.shape}; take finite numbers of shape {shape}, "
                 "that of the positions"
@@ -134,7 +134,7 @@ class Adjoint:
         plan, factors = self._plan, as_array(factors, "factors")
         assert plan.material.factors is not None
         shape, least = plan.material.factors.shape, plan.material.tension
-        if not are_numbers(factors, shape) or not (np.isfinite(factors) & (factors > least)).all():
+        if not is_real_array(factors, shape) or not (np.isfinite(factors) & (factors > least)).all():
             raise ArgumentError(f"factors: take numbers above {least:g}, of shape {shape}")
         material = replace(plan.material, factors=np.asarray(factors, float))
         limit = stable_step(material, plan.scene.sheet, plan.scene.time.damping_difference)
@@ -203,7 +203,7 @@ def gradient(scene: Scene | Mapping[str, Any], loss: Loss, threads: int | None =
     """
     if not callable(loss):
         raise ArgumentError(f"loss: {loss!r}; take a function of the positions of every frame")
-    plan = checked(scene)
+    plan = check_scene(scene)
     require_differentiable(plan)
     device = runtime.start("cpu", threads)
     adjoint = Adjoint(resolve(plan, device).plan, device)
@@ -215,7 +215,7 @@ def gradient(scene: Scene | Mapping[str, Any], loss: Loss, threads: int | None =
         raise ArgumentError(f"loss: {said}")
     value, slope = returned
     given = as_array(value, "loss")
-    if not are_numbers(given, ()) or not np.isfinite(given):
+    if not is_real_array(given, ()) or not np.isfinite(given):
         said = f"an array of shape {given.shape}" if given.ndim else repr(value)
         raise ArgumentError(f"loss: its value is {said}; return a finite number")
     found = adjoint.backward(slope)

@@ -1,1 +1,1 @@
-"""From a scene file to a checked plan."""
+"""Reading of scene files, validation, and estimates of the cost of a run."""

@@ -1,4 +1,4 @@
-"""Plain data -> Scene and its plan, or everything that is wrong with it: a list of problems, each with its key."""
+"""Validation of a scene, which reports all problems at once, each with its key."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from taichi_msm.solver.planning import try_plan
 
 Model = TypeVar("Model", bound=Section)
 
-# Valid sections that replace faulty ones; no check finds anything in them.
-_STAND_INS: dict[str, Any] = {
+# Valid sections that replace faulty ones.
+_REPLACEMENTS: dict[str, Any] = {
     "image": None,
     "sheet": {"points": [2, 2], "size": [1, 1]},
     "tissue": {"young": 1e-20, "thickness": 1, "density": 1},
@@ -33,50 +33,59 @@ _STAND_INS: dict[str, Any] = {
 
 
 def validate(data: dict[str, Any]) -> tuple[Plan | None, list[Problem]]:
-    """Check a scene: first each key by itself, then several keys together.
+    """Validate the keys of a scene separately, then combinations of keys.
 
-    If some sections are faulty, the checks of several keys still run on the others, so that all problems are reported
-    at once. Returns the scene's plan, or None if there is any problem; and the problems.
+    Faulty sections are replaced by valid ones before combinations are checked, so that all problems are reported at
+    once.
+
+    Returns:
+        The plan, or None if there are problems; the problems.
     """
     problems: list[Problem] = []
     plan = None
-    # Pydantic checks the scene as a whole once its sections are valid, and several keys are checked once that finds
-    # nothing either.
+    # Pydantic validates the whole scene only when all sections are valid, and combinations are checked only when that
+    # finds no problems, so there are up to three passes.
     for _ in range(3):
-        scene, wrong = parse(Scene, data)
-        problems += wrong
+        scene, new_problems = parse_model(Scene, data)
+        problems += new_problems
         if scene is not None:
-            plan, wrong = _joint_check(scene)
-            problems += wrong
+            plan, new_problems = _check_combinations(scene)
+            problems += new_problems
             break
-        data = _spare(data, wrong)
+        data = _replace_faulty(data, new_problems)
     return (None if problems else plan), problems
 
 
-def _joint_check(scene: Scene, maps: Maps | None = None, *, picture: bool = True) -> tuple[Plan | None, list[Problem]]:
-    """Plan a scene whose keys are valid each by itself, and find what is wrong with several keys together."""
+def _check_combinations(
+    scene: Scene, maps: Maps | None = None, *, with_image: bool = True
+) -> tuple[Plan | None, list[Problem]]:
+    """Plan a scene, and check combinations of its keys; `with_image` also checks the image file."""
     plan, problems = try_plan(scene, maps)
     problems += camera_problems(scene)
     if "mp4" in scene.output and not outputs.is_pyav_installed():
         problems.append(Problem(("output",), outputs.PYAV_NOT_INSTALLED))
-    if picture:
+    if with_image:
         problems += image_problems(scene)
     if plan is not None:
         problems += cost.size_problems(plan)
     return plan, problems
 
 
-def checked(scene: Plan | Scene | Mapping[str, Any], maps: Maps | None = None) -> Plan:
-    """Check a scene but for its picture, or a mapping of its keys, and plan it for a CPU; a plan was checked before.
+def check_scene(scene: Plan | Scene | Mapping[str, Any], maps: Maps | None = None) -> Plan:
+    """Validate a scene, and plan it for a CPU.
+
+    Args:
+        scene: a scene, whose image file is not checked; a mapping of its keys; or a plan, which is returned as it is.
+        maps: images of the scene's maps, by key; they are read from their files if None.
 
     Raises:
-        ArgumentError: when it is none of these.
-        SceneError: with everything that is wrong with it.
+        ArgumentError: when `scene` has another type.
+        SceneError: when the scene is invalid; contains all problems.
     """
     if isinstance(scene, Plan):
         return scene
     if isinstance(scene, Scene):
-        plan, problems = _joint_check(scene, maps, picture=False)
+        plan, problems = _check_combinations(scene, maps, with_image=False)
     elif isinstance(scene, Mapping):
         plan, problems = validate(dict(scene))
     else:
@@ -86,28 +95,37 @@ def checked(scene: Plan | Scene | Mapping[str, Any], maps: Maps | None = None) -
     return plan
 
 
-def _spare(data: dict[str, Any], problems: list[Problem]) -> dict[str, Any]:
-    """Replace the faulty sections; without a picture, output that draws it is removed too."""
+def _replace_faulty(data: dict[str, Any], problems: list[Problem]) -> dict[str, Any]:
+    """Replace faulty sections by valid ones, and remove outputs that depend on them."""
     faulty = {problem.path[0] for problem in problems}
     if "image" in faulty:
         faulty.add("output")
     output = data.get("output")
     if "render" in faulty and isinstance(output, list):
-        # Which cameras there are is not known.
-        data = {**data, "output": [name for name in output if name not in OUTPUTS or not OUTPUTS[name].of_pair]}
-    spared = {name: value for name, value in data.items() if name not in faulty} | {
-        name: value for name, value in _STAND_INS.items() if name in faulty
+        # Without the cameras, an output of a stereo pair cannot be checked.
+        stereo = {name for name, row in OUTPUTS.items() if row.needs_stereo_pair}
+        data = {**data, "output": [name for name in output if name not in stereo]}
+    valid = {name: value for name, value in data.items() if name not in faulty} | {
+        name: value for name, value in _REPLACEMENTS.items() if name in faulty
     }
     time = data.get("time")
     if "time" in faulty and isinstance(time, Mapping) and time.get("motion", "dynamic") != "dynamic":
-        spared["time"] = {**spared["time"], "motion": "quasistatic"}
-    if "sheet" in faulty and "tissue" not in spared:
-        spared["sheet"] = {**spared["sheet"], "mass": 1}
-    return spared
+        valid["time"] = {**valid["time"], "motion": "quasistatic"}
+    if "sheet" in faulty and "tissue" not in valid:
+        valid["sheet"] = {**valid["sheet"], "mass": 1}
+    return valid
 
 
-def parse(model: type[Model], data: dict[str, Any]) -> tuple[Model | None, list[Problem]]:
-    """Check each key by itself; returns the model, or None if there is any problem, and the problems."""
+def parse_model(model: type[Model], data: dict[str, Any]) -> tuple[Model | None, list[Problem]]:
+    """Validate the keys of a section separately.
+
+    Args:
+        model: type of the section.
+        data: plain data.
+
+    Returns:
+        The section, or None if there are problems; the problems.
+    """
     try:
         return model.model_validate(data), []
     except ValidationError as error:

@@ -1,6 +1,6 @@
-"""The steps, memory and disk space that a scene needs, estimated before anything is computed.
+"""Estimates of the memory, disk space and duration of a run, before it starts.
 
-Estimated duration of a run: its work, times the time that this machine takes for a unit of work.
+The duration is the work of the run times the time of a unit of work on this machine.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,12 +30,9 @@ from taichi_msm.solver.planning import count_work
 from taichi_msm.system.process import available_memory
 from taichi_msm.terms.contact import contact_fields
 
-if TYPE_CHECKING:
-    pass
 
-
-def rough_time(seconds: float) -> str:
-    """Write a time that is known only about: 40 s, 3 min, 2.5 h."""
+def format_rough_time(seconds: float) -> str:
+    """Format an approximate time: 40 s, 3 min, 2.5 h."""
     if seconds < 100:
         return f"{seconds:.0f} s" if seconds >= 1 else "1 s"
     if seconds < 6000:
@@ -47,33 +44,26 @@ MAX_STEPS = 10**12
 
 # Memory for drawing [bytes].
 POINT_BYTES = 36  # per mass point: its projection and its normal
-SAMPLE_BYTES = 48  # per sample, at most
-BAND_ROWS = 16  # rows of samples that a thread holds at a time
-PIXEL_BYTES = 3 * 12  # per pixel of the frame: its colours, from sums to bytes
-PICTURE_PIXEL_BYTES = 20  # per pixel of the picture's file, while it is decoded and converted; its texture takes less
+SAMPLE_BYTES = 48  # per sample, upper bound
+BAND_ROWS = 16  # rows of samples that a thread processes at a time
+PIXEL_BYTES = 3 * 12  # per pixel of the frame: its colours, as sums, averages and bytes
+IMAGE_PIXEL_BYTES = 20  # per pixel of the image file, while it is decoded and converted; its texture takes less
+DISTORTION_BYTES = 100  # per sample with lens distortion, while the undistortion map is computed and copied
+VIDEO_PIXEL_BYTES = 80  # per pixel of a video, mostly in the frames of the encoder's look-ahead
+LABEL_PIXEL_BYTES = 60  # per pixel with labels
+NORMAL_PIXEL_BYTES = 24  # per pixel with a normal
+TRACK_BYTES = 21  # per tracked point and frame, until the run ends
 
-# Bytes of a sample's place where a lens bends lines, while these are found and copied.
-PLACE_BYTES = 100
-
-# Bytes of a pixel while a film is encoded, most of them in the frames that the encoder looks ahead.
-FILM_PIXEL_BYTES = 80
-
-# The most that a file takes besides [bytes], but for a byte for every row of a PNG; and run.json besides its scene.
+# Upper bounds of the overhead of a file, except for a byte per row of a PNG, and of run.json without its scene [bytes].
 FILE_BYTES = 1024
 RECORD_BYTES = 1 << 16
 
-# Bytes of a pixel while its labels are found and written, and its normal; and of a tracked point in a frame, held until
-# the end.
-LABEL_PIXEL_BYTES = 60
-NORMAL_PIXEL_BYTES = 24
-TRACK_BYTES = 21
-
-# Bytes of a row of the table of forces, at most, and of what is kept of one until the run ends.
+# Upper bound of a row of the table of forces, and size of its values until the run ends [bytes].
 FORCE_ROW_BYTES = 180
 FORCE_BYTES = 6 * 8
 
-# Numbers per mass point: displacement and difference; with a map of the stiffness, that of three springs, with one of
-# the foundation its factor, and what these are made from; and the copies made at the start and for output.
+# Numbers per mass point: displacement and its difference in the state; with maps, the stiffness of three springs or the
+# factor of the foundation, with temporary arrays; and the copies at the start and for output.
 STATE_NUMBERS = 6
 MAP_NUMBERS = {"map": 6, "foundation_map": 4}
 OUTPUT_NUMBERS = 15
@@ -81,72 +71,85 @@ OUTPUT_NUMBERS = 15
 
 @dataclass(frozen=True)
 class Budget:
-    """What a scene needs."""
+    """Memory and disk space of a run.
 
-    # points, steps, frames: numbers of mass points, of time steps, and of frames including that at rest
+    Attributes:
+        points: number of mass points.
+        steps: number of time steps.
+        frames: number of frames, including the initial one.
+        simulation_bytes: memory for the state of the sheet and its output.
+        drawing_bytes: memory for a frame and the texture; 0 if nothing is drawn.
+        track_bytes: memory for the tracks until the run ends, and size of their file.
+        picture_bytes: upper bound of the size of the files with pictures and labels.
+        trajectory_bytes: size of the file of positions.
+        force_bytes: upper bound of the size of the table of forces.
+        record_bytes: upper bound of the size of run.json and camera.json.
+        working_bytes: additional disk space until the run ends.
+    """
+
     points: int
     steps: int
     frames: int
-    simulation_bytes: int  # memory for the state of the sheet and its output
-    drawing_bytes: int  # memory for a frame and the texture; 0 if nothing is drawn
-    track_bytes: int  # memory for the tracks, which are held until the run ends, and size of their file
-    picture_bytes: int  # size of the files with pictures and labels, at most
-    trajectory_bytes: int  # size of the trajectory
-    force_bytes: int  # size of the table of forces, at most
-    record_bytes: int  # size of the record and of the camera, at most
-    working_bytes: int  # additional disk space that is used until the run ends
+    simulation_bytes: int
+    drawing_bytes: int
+    track_bytes: int
+    picture_bytes: int
+    trajectory_bytes: int
+    force_bytes: int
+    record_bytes: int
+    working_bytes: int
 
     @property
     def memory_bytes(self) -> int:
-        """Memory in use at one time. Trajectories do not count, because they are streamed to disk."""
+        """Peak memory; positions are not included, as they are streamed to disk."""
         return self.simulation_bytes + self.drawing_bytes + self.track_bytes
 
     @property
     def disk_bytes(self) -> int:
-        """Size of all files, at most."""
+        """Upper bound of the size of all files."""
         return self.picture_bytes + self.track_bytes + self.trajectory_bytes + self.force_bytes + self.record_bytes
 
 
-def estimate_memory(plan: Plan) -> Budget:
-    """Estimate what a run needs."""
+def estimate_budget(plan: Plan) -> Budget:
+    """Estimate the memory and disk space of a run."""
     scene, grid = plan.scene, plan.grid
     rows, cols = scene.sheet.points
     points, number_bytes = rows * cols, 4 if grid.precision == "f32" else 8
     frames, (width, height) = grid.frames + 1, scene.render.size
     pixel_bytes = [OUTPUTS[name].pixel_bytes for folder in scene.folders.values() for name in folder]
     cameras = len(scene.render.all_cameras)
-    picture = sum(width * height * each + height + FILE_BYTES for each in pixel_bytes if each)
-    positions = frames * points * 3 * number_bytes
-    tracks = scene.render.tracks**2 * (frames * TRACK_BYTES + 16) + FILE_BYTES if "tracks" in scene.output else 0
-    tracks *= cameras
-    forces = frames * len(scene.probes) if "forces" in scene.output else 0
-    contact = contact_fields(scene.probes)
-    loads = sum(not probe.moved for probe in scene.probes)
-    numbers = STATE_NUMBERS + OUTPUT_NUMBERS + loads + contact + sum(MAP_NUMBERS[name] for name in scene.maps)
-    # Pilots are up to two more sheets in f64; with tissue also two smaller ones.
-    pilot = scene.time.tolerance is not None or choose_pilots(plan).some
-    sheets = number_bytes + (8 * (2 + (scene.tissue is not None) * 5 / 16) if pilot else 0)
+    frame_bytes = sum(width * height * size + height + FILE_BYTES for size in pixel_bytes if size)
+    position_bytes = frames * points * 3 * number_bytes
+    track_bytes = scene.render.tracks**2 * (frames * TRACK_BYTES + 16) + FILE_BYTES if "tracks" in scene.output else 0
+    track_bytes *= cameras
+    force_rows = frames * len(scene.probes) if "forces" in scene.output else 0
+    contact_numbers = contact_fields(scene.probes)
+    numbers = STATE_NUMBERS + OUTPUT_NUMBERS + contact_numbers + sum(MAP_NUMBERS[name] for name in scene.maps)
+    numbers += sum(not probe.moved for probe in scene.probes)  # the load of each force-controlled tool
+    # Companion runs add up to two sheets in f64, and with tissue two smaller ones.
+    has_companions = scene.time.tolerance is not None or choose_pilots(plan).some
+    bytes_per_number = number_bytes + (8 * (2 + (scene.tissue is not None) * 5 / 16) if has_companions else 0)
     return Budget(
         points=points,
         steps=grid.steps,
         frames=frames,
-        simulation_bytes=round(points * sheets * numbers),
+        simulation_bytes=round(points * bytes_per_number * numbers),
         drawing_bytes=drawing_bytes(scene) if scene.renders else 0,
-        track_bytes=tracks,
-        picture_bytes=math.ceil(frames * picture),
-        trajectory_bytes=positions + 8 * frames + FILE_BYTES if "trajectory" in scene.output else 0,
-        force_bytes=forces * FORCE_ROW_BYTES + FILE_BYTES if "forces" in scene.output else 0,
+        track_bytes=track_bytes,
+        picture_bytes=math.ceil(frames * frame_bytes),
+        trajectory_bytes=position_bytes + 8 * frames + FILE_BYTES if "trajectory" in scene.output else 0,
+        force_bytes=force_rows * FORCE_ROW_BYTES + FILE_BYTES if "forces" in scene.output else 0,
         record_bytes=2 * len(scene.model_dump_json(indent=2)) + RECORD_BYTES,
-        # Two saved states from which the run could continue, and all positions and forces so far.
-        working_bytes=2 * points * (STATE_NUMBERS + contact) * number_bytes
-        + (positions if scene.output else 0)
-        + forces * FORCE_BYTES,
+        # Two checkpoints, and all positions and forces so far.
+        working_bytes=2 * points * (STATE_NUMBERS + contact_numbers) * number_bytes
+        + (position_bytes if scene.output else 0)
+        + force_rows * FORCE_BYTES,
     )
 
 
 def size_problems(plan: Plan) -> Iterator[Problem]:
-    """Find what makes a scene too large, with the numbers and the key to change."""
-    scene, grid, budget, available = plan.scene, plan.grid, estimate_memory(plan), available_memory()
+    """Check the number of steps and the memory of a run; each problem is at the key to change."""
+    scene, grid, budget, available = plan.scene, plan.grid, estimate_budget(plan), available_memory()
     if grid.steps > MAX_STEPS:
         count = f"{scene.time.duration:g} s in steps of {grid.step:.6g} s is {grid.steps:.3g} steps"
         key, remedy = "step", "take a longer step or a shorter time"
@@ -164,17 +167,22 @@ def size_problems(plan: Plan) -> Iterator[Problem]:
     )
     yield Problem(
         (section, key),
-        f"the scene needs {_in_words(budget.memory_bytes)} of memory, {_in_words(size)} of it for {name}, "
-        f"but {_in_words(available)} is free; reduce it",
+        f"the scene needs {_format_bytes(budget.memory_bytes)} of memory, {_format_bytes(size)} of it for {name}, "
+        f"but {_format_bytes(available)} is free; reduce it",
     )
 
 
 def require_disk(plan: Plan, directory: Path) -> None:
-    """Raise SceneError, with the numbers and the key to change, where the disk has too little room for the results.
+    """Check the free disk space for the results of a run.
 
-    The directory need not exist yet.
+    Args:
+        plan: plan of the run.
+        directory: folder of the results, which need not exist.
+
+    Raises:
+        SceneError: when there is not enough disk space.
     """
-    scene, budget, free = plan.scene, estimate_memory(plan), _free_disk(directory)
+    scene, budget, free = plan.scene, estimate_budget(plan), _free_disk(directory)
     needed = budget.disk_bytes + budget.working_bytes
     if needed <= free:
         return
@@ -185,73 +193,78 @@ def require_disk(plan: Plan, directory: Path) -> None:
         (budget.track_bytes, "render.tracks", f"tracks of {tracks} x {tracks} points"),
         (budget.picture_bytes, "render.size", f"pictures of {width} x {height} pixels"),
     )
-    said = (
-        f"{budget.frames} frames may need {_in_words(needed)} on disk, {_in_words(size)} of it for {name}, but "
-        f"{_in_words(free)} is free for {directory}; reduce it, time.frames_per_second or output, or choose "
+    message = (
+        f"{budget.frames} frames may need {_format_bytes(needed)} on disk, {_format_bytes(size)} of it for {name}, but "
+        f"{_format_bytes(free)} is free for {directory}; reduce it, time.frames_per_second or output, or choose "
         "another --out"
     )
-    raise SceneError([f"{key}: {said}"])
+    raise SceneError([f"{key}: {message}"])
 
 
 def drawing_bytes(scene: Scene) -> int:
-    """Estimate the memory for drawing a frame [bytes], even if the scene's output has no pictures."""
+    """Estimate the memory for drawing a frame [bytes], also of a scene whose output has no pictures."""
     rows, cols = scene.sheet.points
     width, height = scene.render.size
-    # The whole picture is decoded, even if only a region of it is used.
-    picture = math.prod(texture.image_size(scene) or (0,))
+    # The whole image is decoded, even if only a region of it is used.
+    image_pixels = math.prod(texture.image_size(scene) or (0,))
     factor = scene.render.supersample
     band_rows = min(height * factor, BAND_ROWS * (os.cpu_count() or 1))
-    samples = band_rows * width * factor * SAMPLE_BYTES
+    sample_bytes = band_rows * width * factor * SAMPLE_BYTES
     cameras = scene.render.all_cameras.values()
-    bent = sum(isinstance(camera, Camera) and camera.distortion is not None for camera in cameras)
-    samples += width * height * factor**2 * PLACE_BYTES * bent
-    pixel = PIXEL_BYTES + (LABEL_PIXEL_BYTES if scene.labels_pixels else 0)
-    pixel += NORMAL_PIXEL_BYTES if "normals" in scene.output else 0
-    pixel += FILM_PIXEL_BYTES if "mp4" in scene.output else 0
+    distorted = sum(isinstance(camera, Camera) and camera.distortion is not None for camera in cameras)
+    sample_bytes += width * height * factor**2 * DISTORTION_BYTES * distorted
+    pixel_bytes = PIXEL_BYTES + (LABEL_PIXEL_BYTES if scene.labels_pixels else 0)
+    pixel_bytes += NORMAL_PIXEL_BYTES if "normals" in scene.output else 0
+    pixel_bytes += VIDEO_PIXEL_BYTES if "mp4" in scene.output else 0
     pixels = width * height * len(cameras)
-    return rows * cols * POINT_BYTES + samples + pixels * pixel + picture * PICTURE_PIXEL_BYTES
+    return rows * cols * POINT_BYTES + sample_bytes + pixels * pixel_bytes + image_pixels * IMAGE_PIXEL_BYTES
 
 
 def _free_disk(directory: Path) -> int:
-    """Give the free disk space for a directory [bytes]; sys.maxsize if the system does not report it."""
+    """Return the free disk space for a directory [bytes], or sys.maxsize if the system does not report it."""
     for path in (directory, *directory.absolute().parents):
         with suppress(OSError):
             usage = shutil.disk_usage(path)
-            # A file system that is not on a disk, such as /proc, has no size.
+            # A virtual file system, such as /proc, has size 0.
             return usage.free if usage.total else sys.maxsize
     return sys.maxsize
 
 
-def _in_words(size: int) -> str:
+def _format_bytes(size: int) -> str:
     unit, name = next(((unit, name) for unit, name in ((2**30, "GiB"), (2**20, "MiB")) if size >= unit), (2**10, "KiB"))
     return f"{size / unit:.3g} {name}"
 
 
-# Time of a unit of work [s], and of the calibration, on two cores of an AMD EPYC of 2024.
-UNIT, CALIBRATION = 1.5e-9, 1e-4
+# Times of a unit of work and of the calibration on two cores of an AMD EPYC of 2024 [s].
+WORK_UNIT_S, CALIBRATION_S = 1.5e-9, 1e-4
 
 
-class Duration(NamedTuple):
-    """How long a run will take."""
+class DurationEstimate(NamedTuple):
+    """Estimated duration of a run.
 
-    seconds: float  # from start to end [s]
-    start: float  # the part of it before the first step [s]
+    Attributes:
+        seconds: total duration [s].
+        start: part of the duration before the first step [s].
+    """
+
+    seconds: float
+    start: float
 
 
-def estimate_duration(plan: Plan) -> Duration:
-    """Estimate how long a run takes on a CPU, with every core; computing it takes milliseconds."""
-    parts = count_work(plan, choose_pilots(plan).cost)
-    unit = UNIT * _calibrate() / CALIBRATION
-    return Duration(unit * sum(parts), unit * parts.start)
+def estimate_duration(plan: Plan) -> DurationEstimate:
+    """Estimate the duration of a run on all cores of the CPU; the calibration takes milliseconds."""
+    units = count_work(plan, choose_pilots(plan).cost)
+    unit_s = WORK_UNIT_S * _calibrate() / CALIBRATION_S
+    return DurationEstimate(unit_s * sum(units), unit_s * units.start)
 
 
 @cache
 def _calibrate() -> float:
-    """Time a step of a small sheet in NumPy [s]: the fastest of some, which other programs disturb least."""
+    """Time a step of a small sheet in NumPy [s]; the minimum of 20 runs is least disturbed by other programs."""
     field, fastest = np.zeros((256, 256), np.float32), math.inf
     for _ in range(20):
         start = time.perf_counter()
-        around = field[:-2, 1:-1] + field[2:, 1:-1] + field[1:-1, :-2] + field[1:-1, 2:]
-        field[1:-1, 1:-1] += 0.1 * (around - 4 * field[1:-1, 1:-1])
+        neighbours = field[:-2, 1:-1] + field[2:, 1:-1] + field[1:-1, :-2] + field[1:-1, 2:]
+        field[1:-1, 1:-1] += 0.1 * (neighbours - 4 * field[1:-1, 1:-1])
         fastest = min(fastest, time.perf_counter() - start)
     return fastest

@@ -1,4 +1,4 @@
-"""Choose what a scene leaves open: the points and the step for its tolerances, and the precision."""
+"""Choice of the settings that a scene leaves open: mass points, time step and precision."""
 
 from __future__ import annotations
 
@@ -6,28 +6,43 @@ from typing import NamedTuple
 
 from taichi_msm.accuracy.mesh import MeshEstimate, choose_points
 from taichi_msm.accuracy.time_step import Estimate, choose_step
-from taichi_msm.errors import Count
-from taichi_msm.load.check import checked
+from taichi_msm.errors import ProgressCallback
+from taichi_msm.load.check import check_scene
 from taichi_msm.model.plan import Plan
 from taichi_msm.solver import planning
 from taichi_msm.solver.planning import freeze_grid
 from taichi_msm.system.runtime import Device
 
 
-class Resolved(NamedTuple):
-    """A plan in which nothing is left open: its scene has the points, the step and the precision that were chosen."""
+class ResolvedPlan(NamedTuple):
+    """Plan with all settings chosen.
+
+    Attributes:
+        plan: plan whose scene contains the chosen numbers of mass points, time step and precision.
+        estimate: estimate of the error due to the time step; None without `time.tolerance`.
+        mesh: estimate of the discretisation error (mesh); None without `sheet.tolerance`.
+    """
 
     plan: Plan
-    estimate: Estimate | None  # of the error, if a tolerance of the time required it
-    mesh: MeshEstimate | None  # the error of the points, if a tolerance of the sheet required it
+    estimate: Estimate | None
+    mesh: MeshEstimate | None
 
 
-def resolve(plan: Plan, device: Device, progress: Count = lambda done, total: None) -> Resolved:
-    """Choose what a checked scene leaves open, by pilot runs where it has tolerances; SceneError: none meet them."""
+def resolve(plan: Plan, device: Device, progress: ProgressCallback = lambda done, total: None) -> ResolvedPlan:
+    """Choose the settings that a valid scene leaves open, by companion runs if it has tolerances.
+
+    Args:
+        plan: plan of the scene.
+        device: device of the run and of the companion runs.
+        progress: callback of the companion runs.
+
+    Raises:
+        SceneError: when a tolerance cannot be met.
+    """
     estimate = mesh = None
     plan = planning.choose_precision(plan, device.arch)
     if plan.scene.sheet.tolerance is not None:
-        plan, mesh = choose_points(plan, device, checked, progress)
+        plan, mesh = choose_points(plan, device, check_scene, progress)
     if plan.scene.time.tolerance is not None:
         plan, estimate = choose_step(plan, device, progress)
-    return Resolved(freeze_grid(plan), estimate, mesh)
+    return ResolvedPlan(freeze_grid(plan), estimate, mesh)

@@ -1,4 +1,4 @@
-"""Scene file and overrides -> Scene, with file, line and column in every error; and the schema for editors."""
+"""Reading of scene files with overrides, with file, line and column in every error; and the schema for editors."""
 
 from __future__ import annotations
 
@@ -13,71 +13,83 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from taichi_msm.errors import ArgumentError, Key, Problem, SceneError
-from taichi_msm.images import SUFFIXES, file_sha256, irregular
+from taichi_msm.images import PICTURE_SUFFIXES, file_sha256, irregular_kind
 from taichi_msm.load.check import validate
-from taichi_msm.load.yaml_reader import MAX_DEPTH, Document, Mark, UnreadableError, mark_at, read
+from taichi_msm.load.yaml_reader import MAX_DEPTH, Document, Mark, UnreadableError, mark_at, read_yaml
 from taichi_msm.model.plan import Plan
 from taichi_msm.scene.scene import Scene
-from taichi_msm.scene.section import MAX_PATH, cut, flow
+from taichi_msm.scene.section import MAX_PATH, format_value, truncate
 
+# Limit of the size of a file.
 MAX_BYTES = 2**20
 
-# The keys that name pictures.
-IMAGE: Key = ("image",)
-MAPS: tuple[Key, ...] = (("tissue", "map", "image"), ("tissue", "foundation_map", "image"), ("springs", "map", "image"))
-PICTURES = (IMAGE, *MAPS)
+# Keys whose values are paths of pictures.
+IMAGE_KEY: Key = ("image",)
+MAP_KEYS: tuple[Key, ...] = (
+    ("tissue", "map", "image"),
+    ("tissue", "foundation_map", "image"),
+    ("springs", "map", "image"),
+)
+PICTURE_KEYS = (IMAGE_KEY, *MAP_KEYS)
 
-# The keys that name other files; ANY is the name of a camera.
-ANY = "*"
-CAMERA_FILES: tuple[Key, ...] = tuple(
-    ("render", *camera, key) for camera in (("camera",), ("cameras", ANY)) for key in ("calibration", "poses")
+# Keys whose values are paths of other files; ANY_CAMERA stands for the name of any camera.
+ANY_CAMERA = "*"
+CAMERA_FILE_KEYS: tuple[Key, ...] = tuple(
+    ("render", *camera, key) for camera in (("camera",), ("cameras", ANY_CAMERA)) for key in ("calibration", "poses")
 )
 
-# The largest number of lines in an error: nobody reads more, and a broken file may have tens of thousands of problems.
+# Limit of the lines of an error, as a broken file may have tens of thousands of problems.
 MAX_LINES = 100
 
 
-class Kind(NamedTuple):
-    """What a file should be."""
+class FileKind(NamedTuple):
+    """Kind of a YAML file.
 
-    name: str  # what it is called
-    needs: str  # the keys that it must have
+    Attributes:
+        name: name of the kind, for messages.
+        needs: required keys, for messages.
+    """
+
+    name: str
+    needs: str
 
 
-class File(NamedTuple):
-    """A YAML file that was read, whose keys are not checked."""
+class ParsedFile(NamedTuple):
+    """Parsed YAML file, whose keys are not validated.
 
-    name: str  # in messages
-    folder: Path  # where it is
+    Attributes:
+        name: path of the file, for messages.
+        folder: folder of the file, to which its paths are relative.
+        document: content, a mapping.
+    """
+
+    name: str
+    folder: Path
     document: Document
 
 
-SCENE = Kind("scene", "sheet, tissue or springs, and time")
-
-_NO_KEY = Problem((), "expected KEY=VALUE, such as sheet.points=[61,61]")
-_NO_PATH = Problem((), "expected a key such as sheet.points")
-_INDEX = re.compile("[0-9]{1,9}")
+SCENE_KIND = FileKind("scene", "sheet, tissue or springs, and time")
 
 
 def load_scene(
     path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = (), image: str | Path | None = None
 ) -> Scene:
-    """Read a scene and check all that can be checked before computing.
+    """Read and validate a scene file.
 
     Args:
-        path: of the scene file. The image that it names is relative to its folder, and must be in it or below. An
-            override may name an image elsewhere, also relative to this folder.
-        overrides: values that replace those of the file: texts "KEY=VALUE" with a dotted key (items of a list by
-            number: probes.0.load) and a value in YAML, which errors call --set; or a mapping from dotted keys to
-            values, which errors call override.
-        image: another picture for the sheet, relative to the current directory.
+        path: path of the scene file. Paths in the file are relative to its folder, and must be in this folder or below
+            it. Paths in overrides are also relative to this folder, but may be outside it.
+        overrides: values that replace those of the file: texts "KEY=VALUE" with a dotted key, with indices for items
+            of lists (probes.0.load), and a value in YAML, called --set in messages; or a mapping from dotted keys to
+            values, called override in messages.
+        image: path of another image for the sheet, relative to the current directory.
 
     Returns:
-        The scene; its image is relative to the current directory.
+        The scene, whose paths are relative to the current directory.
 
     Raises:
         ArgumentError: when the overrides are neither a sequence of texts nor a mapping from texts.
-        SceneError: with all problems of the scene, one line each, in the order of their places in the file.
+        SceneError: when the scene is invalid; contains all problems, one per line, in the order of the file.
 
     Example:
         >>> from taichi_msm import load_scene
@@ -91,16 +103,39 @@ def load_scene(
 def load_plan(
     path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = (), image: str | Path | None = None
 ) -> Plan:
-    """Read and check a scene as `load_scene` does, and plan it for a CPU."""
+    """Read and validate a scene file, and plan the scene for a CPU.
+
+    Args:
+        path: path of the scene file.
+        overrides: values that replace those of the file, as in `load_scene`.
+        image: path of another image for the sheet, relative to the current directory.
+
+    Raises:
+        ArgumentError: when the path is a mapping, or the overrides are neither a sequence of texts nor a mapping from
+            texts.
+        SceneError: when the scene is invalid.
+    """
     if isinstance(path, Mapping):
         raise ArgumentError("path: a mapping; Scene(**mapping) is its scene, and load_scene reads a file")
-    return plan_file(read_file(str(path), SCENE), overrides, image)
+    return plan_file(read_file(str(path), SCENE_KIND), overrides, image)
 
 
-def plan_file(file: File, overrides: Sequence[str] | Mapping[str, Any] = (), image: str | Path | None = None) -> Plan:
-    """Check a scene file that was read before, and plan its scene; as `load_plan`."""
+def plan_file(
+    file: ParsedFile, overrides: Sequence[str] | Mapping[str, Any] = (), image: str | Path | None = None
+) -> Plan:
+    """Validate a parsed scene file, and plan the scene for a CPU.
+
+    Args:
+        file: parsed file.
+        overrides: values that replace those of the file, as in `load_scene`.
+        image: path of another image for the sheet, relative to the current directory.
+
+    Raises:
+        ArgumentError: when the overrides are neither a sequence of texts nor a mapping from texts.
+        SceneError: when the scene is invalid.
+    """
     if isinstance(overrides, str) or not (
-        isinstance(overrides, (Sequence, Mapping)) and all(isinstance(one, str) for one in overrides)
+        isinstance(overrides, (Sequence, Mapping)) and all(isinstance(item, str) for item in overrides)
     ):
         raise ArgumentError(f'overrides: {overrides!r}; take ["sheet.points=[61,61]"] or {{"sheet.points": [61, 61]}}')
     draft = Draft(file)
@@ -111,10 +146,10 @@ def plan_file(file: File, overrides: Sequence[str] | Mapping[str, Any] = (), ima
     )
     for override in parsed:
         draft.override(override)
-    for key in (*(PICTURES if image is None else MAPS), *(key for key, _ in camera_files(draft.data))):
-        draft.find_file(key, file.folder)
+    for key in (*(PICTURE_KEYS if image is None else MAP_KEYS), *(key for key, _ in camera_files(draft.data))):
+        draft.resolve_path(key, file.folder)
     if image is not None:
-        draft.override(_Override(f"--image {cut(str(image))}", IMAGE, str(image)))
+        draft.override(Override(f"--image {truncate(str(image))}", IMAGE_KEY, str(image)))
     plan, problems = validate(draft.data)
     draft.report(problems)
     if plan is None or draft.problems:
@@ -123,40 +158,48 @@ def plan_file(file: File, overrides: Sequence[str] | Mapping[str, Any] = (), ima
 
 
 def names_file(key: Key) -> bool:
-    """Return whether a key of a scene, whose value is a text, names a file."""
+    """Return whether the value of a key, if it is a text, is the path of a file."""
     return any(
-        len(key) == len(pattern) and all(part in (str(one), ANY) for one, part in zip(key, pattern, strict=True))
-        for pattern in (*PICTURES, *CAMERA_FILES)
+        len(key) == len(pattern)
+        and all(expected in (str(part), ANY_CAMERA) for part, expected in zip(key, pattern, strict=True))
+        for pattern in (*PICTURE_KEYS, *CAMERA_FILE_KEYS)
     )
 
 
 def camera_files(data: Mapping[str, Any]) -> list[tuple[Key, str]]:
-    """List the keys of the cameras of a scene that name files, with their values."""
+    """List the keys of cameras whose values are paths of files, with these paths."""
     render = data.get("render")
     cameras = render.get("cameras") if isinstance(render, dict) else None
     names = list(cameras) if isinstance(cameras, dict) else []
     keys = [
-        tuple(name if part == ANY else part for part in pattern)
-        for pattern in CAMERA_FILES
-        for name in (names if ANY in pattern else [ANY])
+        tuple(name if part == ANY_CAMERA else part for part in pattern)
+        for pattern in CAMERA_FILE_KEYS
+        for name in (names if ANY_CAMERA in pattern else [ANY_CAMERA])
     ]
     return [(key, path) for key in keys if isinstance(path := _value(data, key), str)]
 
 
 def _value(data: Any, key: Key) -> Any:
-    """Find the value of a key; None: there is none."""
+    """Return the value of a key, or None if it is missing."""
     for part in key:
         data = data.get(part) if isinstance(data, dict) else None
     return data
 
 
 def schema() -> dict[str, Any]:
-    """Describe the scene for editors, as JSON Schema (draft 2020-12): the rules for single keys."""
+    """Return the JSON Schema (draft 2020-12) of a scene, which has the rules for single keys, not for combinations."""
     return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | Scene.model_json_schema()
 
 
-class _Override(NamedTuple):
-    """A value that replaces one of the file; `problems` says why it cannot be read."""
+class Override(NamedTuple):
+    """A value that replaces one of the file.
+
+    Attributes:
+        name: the override as in messages.
+        path: path to the key.
+        value: new value.
+        problems: problems of reading the override; if there are any, it is not applied.
+    """
 
     name: str
     path: Key
@@ -164,171 +207,198 @@ class _Override(NamedTuple):
     problems: Sequence[Problem] = ()
 
 
-def parse_override(text: str) -> _Override:
-    """Read "KEY=VALUE"."""
+def parse_override(text: str) -> Override:
+    """Parse an override "KEY=VALUE"."""
     key, equals, value = text.partition("=")
-    name = f"--set {cut(key)}{equals}{cut(value)}"
+    name = f"--set {truncate(key)}{equals}{truncate(value)}"
     path = parse_key(key.strip())
     if not equals or not path:
-        return _Override(name, (), problems=[_NO_KEY])
+        return Override(name, (), problems=[Problem((), "expected KEY=VALUE, such as sheet.points=[61,61]")])
     try:
-        document = read(value)
+        document = read_yaml(value)
     except UnreadableError as error:
-        return _Override(name, path, problems=[Problem(path, str(error))])
+        return Override(name, path, problems=[Problem(path, str(error))])
     faults = [Problem(path + fault.path, fault.message) for _, fault in document.faults]
-    return _Override(name, path, document.data, faults)
+    return Override(name, path, document.data, faults)
 
 
-def _parse_value(key: str, value: Any) -> _Override:
+def _parse_value(key: str, value: Any) -> Override:
     path = parse_key(key)
-    name = f"override {cut(key)}"
+    name = f"override {truncate(key)}"
     if not path:
-        return _Override(name, (), problems=[_NO_PATH])
+        return Override(name, (), problems=[Problem((), "expected a key such as sheet.points")])
     try:
         plain = json.loads(json.dumps(value))
     except (TypeError, ValueError, RecursionError):
         problem = Problem(path, f"a file cannot hold this {type(value).__name__}; use numbers, text, lists, dicts")
-        return _Override(name, path, problems=[problem])
-    return _Override(f"{name}={flow(plain)}", path, plain)
+        return Override(name, path, problems=[problem])
+    return Override(f"{name}={format_value(plain)}", path, plain)
 
 
 def parse_key(key: str) -> Key:
-    """Split a dotted key; returns an empty key if it is not valid."""
+    """Split a dotted key; return an empty key if it is invalid."""
     parts = key.split(".")
     if len(parts) > MAX_DEPTH or not all(part and part.isprintable() for part in parts):
         return ()
-    return tuple(int(part) if _INDEX.fullmatch(part) else part for part in parts)
+    return tuple(int(part) if re.fullmatch("[0-9]{1,9}", part) else part for part in parts)
 
 
-class _Place(NamedTuple):
-    """Where a key was given; places are sorted in the order of reading: the file, then the overrides."""
+class _Origin(NamedTuple):
+    """Location of a key in the file or the overrides, which sorts in the order of reading.
 
-    source: int  # 0 for the file; 1, 2, ... for the overrides
-    mark: Mark  # in the file
-    name: str  # of the place in messages, such as press.yaml:7:3
+    Attributes:
+        source: 0 for the file, or the number of the override.
+        mark: line and column in the file.
+        name: location as in messages, such as press.yaml:7:3.
+    """
+
+    source: int
+    mark: Mark
+    name: str
 
 
 class Draft:
-    """The content of a file, a mapping whose keys are not checked, while overrides are applied to it.
+    """Content of a parsed file with overrides, before validation.
 
     Attributes:
-        data: its content, with the overrides applied so far.
-        problems: found so far, each with its place.
+        data: content with the overrides that were applied.
+        problems: problems, each with its origin.
     """
 
-    def __init__(self, file: File) -> None:
+    def __init__(self, file: ParsedFile) -> None:
         document = file.document
         self._name, self._marks = file.name, document.marks
         self._overrides = 0
-        self._overridden: dict[Key, _Place] = {}
+        self._overridden: dict[Key, _Origin] = {}
         self.data: dict[str, Any] = deepcopy(document.data)
         self.problems = [(self._in_file(mark), problem) for mark, problem in document.faults]
 
-    def override(self, override: _Override) -> None:
+    def override(self, override: Override) -> None:
         """Apply an override."""
         self._overrides += 1
-        place = _Place(self._overrides, Mark(1, 1), override.name)
+        origin = _Origin(self._overrides, Mark(1, 1), override.name)
         if override.problems:
-            self.problems += [(place, problem) for problem in override.problems]
-        elif problem := self._put(override.path, override.value, place):
-            self.problems.append((place, problem))
+            self.problems += [(origin, problem) for problem in override.problems]
+        elif problem := self._put(override.path, override.value, origin):
+            self.problems.append((origin, problem))
 
-    def find_file(self, key: Key, folder: Path) -> None:
-        """Change the path of a file, given relative to a folder, to one from the current directory."""
-        holder, image = _value(self.data, key[:-1]), _value(self.data, key)
-        if not (isinstance(image, str) and 0 < len(image) <= MAX_PATH):
+    def resolve_path(self, key: Key, folder: Path) -> None:
+        """Make the path of a file relative to the current directory.
+
+        A path that is neither in the folder nor in an override is a problem.
+
+        Args:
+            key: key of the path; other values than paths are ignored.
+            folder: folder to which the path is relative.
+        """
+        section, path = _value(self.data, key[:-1]), _value(self.data, key)
+        if not (isinstance(path, str) and 0 < len(path) <= MAX_PATH):
             return
-        holder[key[-1]] = str(folder / image)
-        # A scene may come from anybody, so it may only read files that came with it.
-        given = any(key[:n] in self._overridden for n in range(1, len(key) + 1))
-        if not given and not is_below(folder / image, folder):
-            remedy = ", or name it with --image" if key == IMAGE else ""
-            said = f"{image} is not below the scene's folder; put {'the picture' if key in PICTURES else 'it'} there"
-            self.problems.append((self._place(key), Problem(key, said + remedy)))
-            del holder[key[-1]]
+        section[key[-1]] = str(folder / path)
+        # A scene may be from an untrusted source, so it may only read files that came with it.
+        is_overridden = any(key[:n] in self._overridden for n in range(1, len(key) + 1))
+        if not is_overridden and not is_below(folder / path, folder):
+            remedy = ", or name it with --image" if key == IMAGE_KEY else ""
+            noun = "the picture" if key in PICTURE_KEYS else "it"
+            message = f"{path} is not below the scene's folder; put {noun} there{remedy}"
+            self.problems.append((self._origin(key), Problem(key, message)))
+            del section[key[-1]]
 
     def report(self, problems: Iterable[Problem]) -> None:
-        """Add problems with their places, except those of keys that already have a problem."""
+        """Add problems with their origins, except those of keys that already have a problem."""
         keys = {problem.path for _, problem in self.problems}
         for problem in problems:
             if problem.path not in keys:
                 keys.add(problem.path)
-                self.problems.append((self._place(problem.path), problem))
+                self.problems.append((self._origin(problem.path), problem))
 
     def lines(self) -> list[str]:
-        """Format the problems in the order of their places."""
+        """Format the problems in the order of their origins."""
         ordered = sorted(self.problems, key=lambda item: item[0][:2])
         shown = [
-            f"{place.name}: {Problem(tuple(cut(str(part)) for part in problem.path), problem.message)}"
-            for place, problem in ordered[:MAX_LINES]
+            f"{origin.name}: {Problem(tuple(truncate(str(part)) for part in problem.path), problem.message)}"
+            for origin, problem in ordered[:MAX_LINES]
         ]
         return shown if len(shown) == len(ordered) else [*shown, "and more"]
 
-    def _in_file(self, mark: Mark) -> _Place:
-        return _Place(0, mark, f"{self._name}:{mark.line}:{mark.column}")
+    def _in_file(self, mark: Mark) -> _Origin:
+        return _Origin(0, mark, f"{self._name}:{mark.line}:{mark.column}")
 
-    def _place(self, path: Key) -> _Place:
-        """Find where a key was given, or else the innermost section or list around it that was."""
-        around = [path[:n] for n in range(len(path), -1, -1)]
-        overridden = (self._overridden[key] for key in around if key in self._overridden)
-        given = (self._in_file(self._marks[key]) for key in around if key in self._marks)
-        return next(chain(overridden, given))
+    def _origin(self, path: Key) -> _Origin:
+        """Return the origin of a key, or that of the innermost section or list that contains it."""
+        containers = [path[:n] for n in range(len(path), -1, -1)]
+        overridden = (self._overridden[key] for key in containers if key in self._overridden)
+        in_file = (self._in_file(self._marks[key]) for key in containers if key in self._marks)
+        return next(chain(overridden, in_file))
 
-    def _put(self, path: Key, value: Any, place: _Place) -> Problem | None:
-        """Set a key, creating the sections above it that do not exist yet."""
-        holder: Any = self.data
-        here: Key = ()
+    def _put(self, path: Key, value: Any, origin: _Origin) -> Problem | None:
+        """Set a key, and create missing sections above it."""
+        container: Any = self.data
+        key: Key = ()
         for n, part in enumerate(path):
-            if isinstance(holder, dict):
+            if isinstance(container, dict):
                 part = str(part)
-            elif not isinstance(holder, list):
-                return Problem(here, f"{flow(holder)} has no keys to set one of; set it as a whole")
-            elif not (isinstance(part, int) and part < len(holder)):
-                example = ".".join(str(one) for one in (*here, 0, *path[n:][isinstance(part, int) :]))
-                said = f"no such item; the list has {len(holder)}, numbered from 0, as in {example}"
-                if not holder:
-                    said = "no such item; the list is empty, so set it as a whole"
-                return Problem((*here, part), said)
-            here = (*here, part)
+            elif not isinstance(container, list):
+                return Problem(key, f"{format_value(container)} has no keys to set one of; set it as a whole")
+            elif not (isinstance(part, int) and part < len(container)):
+                example = ".".join(map(str, (*key, 0, *path[n:][isinstance(part, int) :])))
+                message = f"no such item; the list has {len(container)}, numbered from 0, as in {example}"
+                if not container:
+                    message = "no such item; the list is empty, so set it as a whole"
+                return Problem((*key, part), message)
+            key = (*key, part)
             if n == len(path) - 1:
-                holder[part] = value
-                self._overridden = {key: at for key, at in self._overridden.items() if key[: len(here)] != here}
-                self._overridden[here] = place
-            elif isinstance(holder, dict) and part not in holder:
-                holder[part] = [] if isinstance(path[n + 1], int) else {}
-                self._overridden[here] = place
-            holder = holder[part]
+                container[part] = value
+                self._overridden = {other: at for other, at in self._overridden.items() if other[: len(key)] != key}
+                self._overridden[key] = origin
+            elif isinstance(container, dict) and part not in container:
+                container[part] = [] if isinstance(path[n + 1], int) else {}
+                self._overridden[key] = origin
+            container = container[part]
         return None
 
 
 def is_below(path: Path, folder: Path) -> bool:
-    """Tell whether a path is in a folder or below it, with symbolic links resolved."""
+    """Return whether a path is that of a folder or below it, with symbolic links resolved.
+
+    Args:
+        path: path, which need not exist.
+        folder: path of the folder.
+    """
     try:
         return path.resolve().is_relative_to(folder.resolve())
     except (OSError, RuntimeError, ValueError):
-        # A loop of links, or not a valid path: reading it will say so.
+        # For a loop of links or an invalid path, reading the file raises an error.
         return True
 
 
-def read_file(name: str, kind: Kind) -> File:
-    """Read a file that should be of a kind; SceneError: it contains no mapping, or cannot be read."""
+def read_file(name: str, kind: FileKind) -> ParsedFile:
+    """Read and parse a YAML file.
+
+    Args:
+        name: path of the file.
+        kind: expected kind of the file, for messages.
+
+    Raises:
+        SceneError: when the file cannot be read or does not contain a mapping.
+    """
     try:
-        document = read(_read_text(name, kind))
+        document = read_yaml(_read_text(name, kind))
     except UnreadableError as error:
         raise SceneError([f"{name}:{error.mark.line}:{error.mark.column}: {error}"]) from None
     if document.data is None:
         raise SceneError([f"{name}:1:1: no keys; a {kind.name} needs at least {kind.needs}"])
     if not isinstance(document.data, dict):
-        said = f"{flow(document.data)} is not a {kind.name}; expected keys such as {kind.needs}"
-        raise SceneError([f"{name}:1:1: {said}"])
-    return File(name, Path(name).parent, document)
+        message = f"{format_value(document.data)} is not a {kind.name}; expected keys such as {kind.needs}"
+        raise SceneError([f"{name}:1:1: {message}"])
+    return ParsedFile(name, Path(name).parent, document)
 
 
-def _read_text(name: str, kind: Kind) -> str:
+def _read_text(name: str, kind: FileKind) -> str:
     path = Path(name)
     try:
-        if what := irregular(path):
-            raise SceneError([f"{name}: {what}; name a {kind.name} file"])
+        if irregular := irregular_kind(path):
+            raise SceneError([f"{name}: {irregular}; name a {kind.name} file"])
         with path.open("rb") as file:
             raw = file.read(MAX_BYTES + 1).removeprefix(codecs.BOM_UTF8)
     except ValueError:
@@ -340,9 +410,9 @@ def _read_text(name: str, kind: Kind) -> str:
     try:
         return raw.decode()
     except UnicodeDecodeError as error:
-        if path.suffix.lower() in SUFFIXES:
-            by = ", and the picture by --image" if kind is SCENE else ""
-            raise SceneError([f"{name}: a picture; name a {kind.name}{by}"]) from None
-        before = raw[: error.start].decode()
-        mark = mark_at(before, len(before))
+        if path.suffix.lower() in PICTURE_SUFFIXES:
+            hint = ", and the picture by --image" if kind is SCENE_KIND else ""
+            raise SceneError([f"{name}: a picture; name a {kind.name}{hint}"]) from None
+        valid = raw[: error.start].decode()
+        mark = mark_at(valid, len(valid))
         raise SceneError([f"{name}:{mark.line}:{mark.column}: not UTF-8; save the file as UTF-8"]) from None

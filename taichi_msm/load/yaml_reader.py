@@ -1,8 +1,8 @@
-"""YAML text -> plain data with the place of each key; a safe, small subset of YAML 1.2.
+"""Parser of a safe subset of YAML 1.2, which records the line and column of each key.
 
-The data is built directly from the parser's events. What a scene does not need (anchors, aliases, tags, several
-documents, deep nesting) is refused as soon as its event arrives, so that no text can make the reader recurse, expand
-aliases or load anything. Scalars follow the core schema of YAML 1.2: 1e4 is a number, 010 is ten, `yes` is text.
+The data is built directly from the events of PyYAML. Anchors, aliases, tags, further documents and deep nesting, which
+no scene needs, are rejected at their events, so a text cannot cause unlimited recursion or expansion of aliases, or
+load anything. Scalars follow the core schema of YAML 1.2: 1e4 is a number, 010 is ten, `yes` is a text.
 """
 
 from __future__ import annotations
@@ -14,23 +14,22 @@ from typing import Any, NamedTuple
 import yaml
 
 from taichi_msm.errors import Key, Problem
-from taichi_msm.scene.section import cut
+from taichi_msm.scene.section import truncate
 
 MAX_DEPTH = 20
 MAX_NODES = 100_000
 _TOO_DEEP = f"nested more than {MAX_DEPTH} deep; write it flatter"
 
-# The largest number of faults to collect; a broken file may have tens of thousands.
+# Limit of the recorded faults, as a broken file may have tens of thousands.
 MAX_FAULTS = 1000
 
-# Longer plain scalars are text even if they look like numbers: no number of a scene is so long, and Python refuses to
-# read integers of several thousand digits.
+# Longer plain scalars are texts, as Python cannot convert integers of several thousand digits.
 MAX_NUMBER_LENGTH = 100
 
-# The C parser is twenty times faster; without it, PyYAML's own parser gives the same data.
+# The C parser is twenty times faster than the one in Python, and returns the same data.
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
-# Characters that YAML excludes, and line breaks of YAML that editors do not count, which would make line numbers wrong.
+# Characters that YAML excludes, and line breaks of YAML that editors do not count, so that line numbers would differ.
 _NOT_ALLOWED = re.compile("[^\t\n\r\x20-\x7e\xa0-\u2027\u202a-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 _SURROGATE = re.compile("[\ud800-\udfff]")
@@ -50,64 +49,84 @@ _WORDS: dict[str, bool | None] = {
 
 
 class Mark(NamedTuple):
-    """A place in the text; lines and columns are counted from 1."""
+    """Position in a text.
+
+    Attributes:
+        line: number of the line, from 1.
+        column: number of the column, from 1.
+    """
 
     line: int
     column: int
 
 
 class Document(NamedTuple):
-    """The content of a text."""
+    """Content of a YAML document.
 
-    data: Any  # None, bool, int, float, str, and lists and dicts of these; None for an empty text
-    marks: dict[Key, Mark]  # of all keys and of all items of lists
-    faults: list[tuple[Mark, Problem]]  # the first MAX_FAULTS of those that did not stop the reading
+    Attributes:
+        data: None, bool, int, float, str, and lists and dicts of these; None for an empty text.
+        marks: positions of all keys and of all items of lists.
+        faults: the first MAX_FAULTS faults that did not stop parsing, with their positions.
+    """
+
+    data: Any
+    marks: dict[Key, Mark]
+    faults: list[tuple[Mark, Problem]]
 
 
 class UnreadableError(Exception):
-    """The text is not YAML, or too long or too deeply nested for a scene."""
+    """The text is not YAML, or has too many values or too deep nesting.
+
+    Attributes:
+        mark: position of the fault.
+    """
 
     def __init__(self, mark: Mark, message: str) -> None:
         super().__init__(message)
         self.mark = mark
 
 
-def read(text: str) -> Document:
-    """Read one YAML document; UnreadableError: it is none, nests too deeply or is too long."""
-    if bad := _NOT_ALLOWED.search(text):
-        said = f"character U+{ord(bad[0]):04X} is not allowed; remove it"
-        raise UnreadableError(mark_at(text, bad.start()), said)
-    reader = _Reader(yaml.parse(text, Loader=_LOADER))
+def read_yaml(text: str) -> Document:
+    """Parse a YAML document; raise an UnreadableError if it is invalid, too long or too deeply nested."""
+    if match := _NOT_ALLOWED.search(text):
+        message = f"character U+{ord(match[0]):04X} is not allowed; remove it"
+        raise UnreadableError(mark_at(text, match.start()), message)
+    reader = _DocumentBuilder(yaml.parse(text, Loader=_LOADER))
     try:
         return Document(reader.document(), reader.marks, reader.faults)
     except yaml.MarkedYAMLError as error:
         raise _syntax_error(text, error) from None
     except (yaml.YAMLError, ValueError) as error:
-        # PyYAML's own parser passes some invalid escapes of a quoted text on to chr().
+        # PyYAML's Python parser passes invalid escapes to chr(), which raises a ValueError.
         raise UnreadableError(Mark(1, 1), f"not valid YAML: {error}") from None
 
 
 def mark_at(text: str, index: int) -> Mark:
-    """Find line and column of a character."""
+    """Return the line and column of a character.
+
+    Args:
+        text: text whose lines end with line feeds.
+        index: index of the character.
+    """
     before = text[:index]
     return Mark(before.count("\n") + 1, index - before.rfind("\n"))
 
 
 def _syntax_error(text: str, error: yaml.MarkedYAMLError) -> UnreadableError:
     if error.problem == "could not find expected ':'" and error.context_mark:
-        # It is missed only in the next line, or at the end.
+        # The parser reports the next line, or the end of the text.
         line = text[error.context_mark.index :].partition("\n")[0]
-        return UnreadableError(_mark(error.context_mark), f'no ":" in "{cut(line.strip())}"; expected KEY: VALUE')
+        return UnreadableError(_mark(error.context_mark), f'no ":" in "{truncate(line.strip())}"; expected KEY: VALUE')
     mark = error.problem_mark or error.context_mark
     if mark and "nesting depth" in f"{error.problem} {error.context}":
-        # libyaml may reach its own limit before it gives the first event.
+        # libyaml may reach its own limit before the first event.
         return UnreadableError(_mark(mark), _TOO_DEEP)
-    at = mark.index if mark else 0
-    hint = "; indent with spaces, not tabs" if text[at : at + 1] == "\t" else ""
+    index = mark.index if mark else 0
+    hint = "; indent with spaces, not tabs" if text[index : index + 1] == "\t" else ""
     if error.problem == "mapping values are not allowed in this context":
         hint = "; write one KEY: VALUE a line, also in the line before"
-    said = " ".join(part for part in (error.problem, error.context) if part)
-    return UnreadableError(_mark(mark) if mark else Mark(1, 1), f"not valid YAML: {said}{hint}")
+    reason = " ".join(part for part in (error.problem, error.context) if part)
+    return UnreadableError(_mark(mark) if mark else Mark(1, 1), f"not valid YAML: {reason}{hint}")
 
 
 def _mark(mark: Any) -> Mark:
@@ -119,14 +138,19 @@ def _resolve(text: str) -> Any:
     if text in _WORDS:
         return _WORDS[text]
     if text[0] in "+-.0123456789" and len(text) <= MAX_NUMBER_LENGTH:
-        for pattern, number in _NUMBERS:
+        for pattern, convert in _NUMBERS:
             if pattern.fullmatch(text):
-                return number(text)
+                return convert(text)
     return text
 
 
-class _Reader:
-    """Builds data from a stream of events."""
+class _DocumentBuilder:
+    """Builder of data from the events of a parser.
+
+    Attributes:
+        marks: positions of the keys and items so far.
+        faults: faults so far, with their positions.
+    """
 
     def __init__(self, events: Iterator[Any]) -> None:
         self.marks: dict[Key, Mark] = {(): Mark(1, 1)}
@@ -135,19 +159,19 @@ class _Reader:
         self._nodes = 0
 
     def document(self) -> Any:
-        """Build the first document, and refuse a second."""
+        """Build the first document, and reject a second one."""
         next(self._events)
         if isinstance(next(self._events), yaml.StreamEndEvent):
             return None
         data = self._node(next(self._events), ())
         next(self._events)
-        after = next(self._events)
-        if not isinstance(after, yaml.StreamEndEvent):
-            self._refuse(after, (), "a second document begins here; keep one")
+        end = next(self._events)
+        if not isinstance(end, yaml.StreamEndEvent):
+            self._add_fault(end, (), "a second document begins here; keep one")
         return data
 
     def _node(self, event: Any, path: Key) -> Any:
-        self._admit(event, path)
+        self._check_allowed(event, path)
         if isinstance(event, yaml.AliasEvent):
             return None
         if isinstance(event, yaml.ScalarEvent):
@@ -156,35 +180,35 @@ class _Reader:
             return self._items(path)
         return self._mapping(path)
 
-    def _admit(self, event: Any, path: Key) -> None:
-        """Refuse what a scene does not need."""
+    def _check_allowed(self, event: Any, path: Key) -> None:
+        """Reject events that are outside the subset of YAML."""
         self._nodes += 1
         if self._nodes > MAX_NODES:
             raise UnreadableError(_mark(event.start_mark), f"more than {MAX_NODES} values; write fewer")
         if len(path) > MAX_DEPTH:
             raise UnreadableError(_mark(event.start_mark), _TOO_DEEP)
         if isinstance(event, yaml.AliasEvent):
-            self._refuse(event, path, f"alias *{event.anchor} is not allowed; write the value out")
+            self._add_fault(event, path, f"alias *{event.anchor} is not allowed; write the value out")
             return
         if isinstance(event, yaml.ScalarEvent) and event.style == '"' and _SURROGATE.search(event.value):
-            # The C parser says so itself.
+            # The C parser already rejects surrogates.
             raise UnreadableError(_mark(event.start_mark), "not valid YAML: invalid Unicode escape")
         if event.anchor is not None:
-            self._refuse(event, path, f"anchor &{event.anchor} is not allowed; remove it")
+            self._add_fault(event, path, f"anchor &{event.anchor} is not allowed; remove it")
         if event.tag is not None:
             tag = event.tag.replace("tag:yaml.org,2002:", "!!")
-            self._refuse(event, path, f"tag {tag} is not allowed; remove it")
+            self._add_fault(event, path, f"tag {tag} is not allowed; remove it")
 
-    def _refuse(self, event: Any, path: Key, message: str) -> None:
+    def _add_fault(self, event: Any, path: Key, message: str) -> None:
         if len(self.faults) < MAX_FAULTS:
             self.faults.append((_mark(event.start_mark), Problem(path, message)))
 
     def _items(self, path: Key) -> list[Any]:
         items: list[Any] = []
         while not isinstance(event := next(self._events), yaml.SequenceEndEvent):
-            here = (*path, len(items))
-            self.marks.setdefault(here, _mark(event.start_mark))
-            items.append(self._node(event, here))
+            item = (*path, len(items))
+            self.marks.setdefault(item, _mark(event.start_mark))
+            items.append(self._node(event, item))
         return items
 
     def _mapping(self, path: Key) -> dict[str, Any]:
@@ -192,15 +216,15 @@ class _Reader:
         while not isinstance(event := next(self._events), yaml.MappingEndEvent):
             if not isinstance(event, yaml.ScalarEvent):
                 raise UnreadableError(_mark(event.start_mark), "a key must be text; put it in quotes")
-            here = (*path, event.value)
-            self.marks.setdefault(here, _mark(event.start_mark))
-            key = self._node(event, here)
-            value = self._node(next(self._events), here)
+            key_path = (*path, event.value)
+            self.marks.setdefault(key_path, _mark(event.start_mark))
+            key = self._node(event, key_path)
+            value = self._node(next(self._events), key_path)
             if not isinstance(key, str):
-                self._refuse(event, here, "a key must be text; put it in quotes")
+                self._add_fault(event, key_path, "a key must be text; put it in quotes")
             elif key in mapping:
-                first = self.marks[here].line
-                self._refuse(event, here, f"given twice, first in line {first}; keep one")
+                first = self.marks[key_path].line
+                self._add_fault(event, key_path, f"given twice, first in line {first}; keep one")
             else:
                 mapping[key] = value
         return mapping

@@ -22,7 +22,7 @@ from taichi_msm.model.plan import HAT_TOLERANCE, Plan, ProbeSegment, ProbeSlot, 
 from taichi_msm.model.sheet import area_shares, axes
 from taichi_msm.model.tool_force import control_points, point_at, probe_force
 from taichi_msm.scene.scene import Scene
-from taichi_msm.scene.section import WHOLE
+from taichi_msm.scene.section import FRAME_TOLERANCE
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Probe
 
@@ -155,15 +155,17 @@ class FrameLoad:
         """
         time = frame / rate
         # Frame times are rounded, so a keyframe very close to the frame counts as at the frame.
-        key = float(self._keys[max(0, self._keys.searchsorted(time + WHOLE / rate, "right") - 1)])
-        time = key if abs(time - key) <= WHOLE / rate else time
+        key = float(self._keys[max(0, self._keys.searchsorted(time + FRAME_TOLERANCE / rate, "right") - 1)])
+        time = key if abs(time - key) <= FRAME_TOLERANCE / rate else time
         return float(self._line.values(np.array([time]))[0]), point_at(self._times, self._points, time)
 
 
 def evaluate_frame_loads(plan: Plan, frame: int) -> Schedule:
     """Evaluate the loads at a frame.
 
-    At a jump the later value counts, and a keyframe within WHOLE frames of the frame counts as at the frame. A
+    At a jump the later value counts.
+
+    A keyframe within FRAME_TOLERANCE frames of the frame counts as at the frame. A
     foundation that is active only under load is active while the percent of any probe differs from 0, and from the
     first to the last keyframe of any path.
 
@@ -176,7 +178,7 @@ def evaluate_frame_loads(plan: Plan, frame: int) -> Schedule:
     """
     scene, rate = plan.scene, plan.grid.frames_per_second
     time = frame / rate
-    keys_at_frame = [key for key in _all_key_times(scene) if abs(key - time) <= WHOLE / rate]
+    keys_at_frame = [key for key in _all_key_times(scene) if abs(key - time) <= FRAME_TOLERANCE / rate]
     t = np.array([max(keys_at_frame, default=time)])
     loads = evaluate_loads(plan, t)
     pressed = any(

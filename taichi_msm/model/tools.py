@@ -18,7 +18,7 @@ from taichi_msm.errors import Problem
 from taichi_msm.model.sheet import spacing
 from taichi_msm.model.time_grid import TimeGrid
 from taichi_msm.scene.scene import Scene
-from taichi_msm.scene.section import WHOLE
+from taichi_msm.scene.section import FRAME_TOLERANCE
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Probe
 
@@ -152,7 +152,7 @@ def grip_frames(grip: tuple[float, float], rate: float) -> range:
     Returns:
         The frames at or after the start, up to rounding, and before the end.
     """
-    begin, end = (max(0, math.ceil(time * rate - WHOLE)) for time in grip)
+    begin, end = (max(0, math.ceil(time * rate - FRAME_TOLERANCE)) for time in grip)
     return range(begin, end)
 
 

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from taichi_msm.errors import Key, Problem, SceneError
 from taichi_msm.scene.camera import Camera
 from taichi_msm.scene.scene import Scene
-from taichi_msm.scene.section import MAX_SUPERSAMPLE, SMALLEST, WHOLE
+from taichi_msm.scene.section import FRAME_TOLERANCE, MAX_SUPERSAMPLE, MIN_MAGNITUDE
 
 Array = NDArray[np.float64]
 
@@ -465,7 +465,7 @@ def _place_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
             return
     if camera.poses is not None:
         begin, end, duration = camera.poses[0][0], camera.poses[-1][0], scene.time.duration
-        tolerance = WHOLE / scene.time.frames_per_second
+        tolerance = FRAME_TOLERANCE / scene.time.frames_per_second
         gap = camera.poses[min(1, len(camera.poses) - 1)][0] - max(begin, 0.0)  # type: ignore[operator]
         if gap > MAX_GAP_S or (len(camera.poses) > 2 and gap > MAX_GAP_RATIO * duration):
             message = (
@@ -482,7 +482,7 @@ def _place_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
                 remedy = "shorten time.duration or give the poses of all of it"
             yield Problem(("poses",), f"{message}; {remedy}")
             return
-    if camera.eye is None and extrinsics(camera, 0.0).distance < SMALLEST:
+    if camera.eye is None and extrinsics(camera, 0.0).distance < MIN_MAGNITUDE:
         message = "puts the eye on the middle of the sheet, which the light's strength depends on; move it away"
         yield Problem((_place_key(camera),), message)
         return
@@ -494,7 +494,7 @@ def _place_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
                 list(interpolate_keyframes(value, time)) for value in (camera.eye, camera.target, camera.up)
             )
             toward = normalised(np.subtract(eye, target))
-            if math.dist(eye, target) < SMALLEST:
+            if math.dist(eye, target) < MIN_MAGNITUDE:
                 yield Problem(("eye",), f"{eye} is also the target{when}; move one of them")
                 return
             if not np.linalg.norm(np.cross(toward, normalised(np.array(up)))) > 1e-9:

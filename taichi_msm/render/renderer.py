@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import ArgumentError, are_numbers, as_array, did_you_mean
+from taichi_msm.errors import ArgumentError, as_array, did_you_mean, is_real_array
 from taichi_msm.model.surface import Capsule
 from taichi_msm.render.camera import View, is_moving, view, view_at
 from taichi_msm.render.labels import Flow, FrameOutputs, Labels, Sight, Stereo, track_grid
@@ -166,7 +166,7 @@ class Renderer:
             ArgumentError: if the coordinates are invalid.
         """
         points = as_array(coordinates, "coordinates")
-        if not (are_numbers(points, (*points.shape[:1], 2)) and ((points >= 0) & (points <= 1)).all()):
+        if not (is_real_array(points, (*points.shape[:1], 2)) and ((points >= 0) & (points <= 1)).all()):
             raise ArgumentError(
                 f"coordinates: {points.dtype} of shape {points.shape}; take numbers from 0 to 1 of shape (n, 2)"
             )

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from taichi_msm.errors import ArgumentError, Problem, SceneError, as_array
-from taichi_msm.images import MAX_SIDE, PictureError, has_transparency, picture_size, read_rgb
+from taichi_msm.images import MAX_SIDE_PX, PictureError, has_transparency, picture_size, read_rgb
 from taichi_msm.scene.scene import Scene
 
 if TYPE_CHECKING:
@@ -60,10 +60,10 @@ def require_texture(texture: Any) -> NDArray[np.uint8]:
 
     picture = as_array(texture, "texture")
     is_picture = picture.dtype == np.uint8 and picture.ndim == 3 and picture.shape[2] == 3
-    if not (is_picture and min(picture.shape) > 0 and max(picture.shape) <= MAX_SIDE):
+    if not (is_picture and min(picture.shape) > 0 and max(picture.shape) <= MAX_SIDE_PX):
         raise ArgumentError(
             f"texture: {picture.dtype} of shape {picture.shape} is not a picture; take uint8 of shape "
-            f"(height, width, 3), up to {MAX_SIDE} a side, such as numpy.asarray(image.convert('RGB'))"
+            f"(height, width, 3), up to {MAX_SIDE_PX} a side, such as numpy.asarray(image.convert('RGB'))"
         )
     return picture
 

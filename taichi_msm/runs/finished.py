@@ -20,7 +20,7 @@ from taichi_msm.model.sheet import rest_positions
 from taichi_msm.render.camera import camera_problems
 from taichi_msm.runs.arrays import map_array
 from taichi_msm.runs.directory import FILE, FOLDER, MAX_RECORD, kind
-from taichi_msm.scene.outputs import OUTPUTS, RECORD, SWEEP
+from taichi_msm.scene.outputs import OUTPUTS, RUN_RECORD, SWEEP_RECORD
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.planning import try_plan
 from taichi_msm.system.files import read_regular
@@ -101,7 +101,7 @@ class FinishedRun:
         # A run removes this file before it moves any other.
         data = b""
         with suppress(OSError):
-            data = read_regular(self.directory / RECORD, MAX_RECORD)
+            data = read_regular(self.directory / RUN_RECORD, MAX_RECORD)
         if data != self._record:
             raise FilesError(f"{self.directory}: another run replaced these results while they were read; try again")
 
@@ -130,12 +130,12 @@ class FinishedRun:
 
     def _folder(self, key: str) -> Path:
         """Give the folder of what was written for an entry of `output`."""
-        return self.directory / self.camera if OUTPUTS[key].is_seen else self.directory
+        return self.directory / self.camera if OUTPUTS[key].is_camera_output else self.directory
 
     def remedy(self, *keys: str) -> str:
         """Say how to get the results of further entries of a scene's `output`."""
         outputs = ",".join(dict.fromkeys([*self.scene.output, *keys]))
-        if (self.directory / ".." / ".." / SWEEP).is_file():
+        if (self.directory / ".." / ".." / SWEEP_RECORD).is_file():
             return f"run the sweep into a new folder with `set: {{output: [{outputs}]}}` in its file"
         return f'run the scene again with --set "output=[{outputs}]"'
 
@@ -185,7 +185,7 @@ def read_run(directory: str | Path) -> FinishedRun:
         FilesError: when there is no record of a run, or one that no run has written.
     """
     require_path(directory)
-    path = Path(directory) / RECORD
+    path = Path(directory) / RUN_RECORD
     with reading(path):
         if not path.is_file():
             raise FilesError(f"{path.parent}: no results of a run; name the folder that `run --out` wrote")

@@ -23,13 +23,13 @@ from taichi_msm.errors import (
     DeviceError,
     DivergedError,
     FilesError,
-    Progress,
     SceneError,
+    StageProgressCallback,
     require_path,
     writing,
 )
 from taichi_msm.load import cost
-from taichi_msm.load.check import checked
+from taichi_msm.load.check import check_scene
 from taichi_msm.load.resolve import resolve
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
@@ -93,7 +93,7 @@ def run(
     overrides: Sequence[str] = (),
     estimate_error: bool | None = None,
     started: float | None = None,
-    progress: Progress = lambda stage, done, total: None,
+    progress: StageProgressCallback = lambda stage, done, total: None,
 ) -> RunRecord:
     """Simulate a scene and write its results, whole or not at all.
 
@@ -133,7 +133,7 @@ def run(
         ('complete', 31, 'f64')
     """
     watch = Stopwatch(started)
-    plan = checked(scene)
+    plan = check_scene(scene)
     require_path(directory)
     folder = Path(directory)
     cost.require_disk(plan, folder)
@@ -163,7 +163,7 @@ def resume(
     *,
     threads: int | None = None,
     started: float | None = None,
-    progress: Progress = lambda stage, done, total: None,
+    progress: StageProgressCallback = lambda stage, done, total: None,
 ) -> RunRecord:
     """Continue a run that was interrupted or killed, ran out of disk space, or diverged; to the same bits.
 
@@ -221,7 +221,7 @@ class _Task(NamedTuple):
     directory: Path  # where the results go
 
 
-def _carry_out(task: _Task, watch: Stopwatch, progress: Progress, *, resumes: bool) -> RunRecord:
+def _carry_out(task: _Task, watch: Stopwatch, progress: StageProgressCallback, *, resumes: bool) -> RunRecord:
     """Simulate and draw all frames, or those that the unfinished run in the directory lacks."""
     with ExitStack() as opened:
         run = _Run(task, watch, progress, opened, resumes=resumes)
@@ -241,7 +241,9 @@ def _carry_out(task: _Task, watch: Stopwatch, progress: Progress, *, resumes: bo
 class _Run:
     """A run under way: a simulation, the pilots beside it, and the results as they grow; all opened in a stack."""
 
-    def __init__(self, task: _Task, watch: Stopwatch, progress: Progress, opened: ExitStack, *, resumes: bool) -> None:
+    def __init__(
+        self, task: _Task, watch: Stopwatch, progress: StageProgressCallback, opened: ExitStack, *, resumes: bool
+    ) -> None:
         self._task, self._watch, self._progress = task, watch, progress
         plan, device, manifest = task.plan, task.device, task.manifest
         self._frames = plan.grid.frames + 1

@@ -21,8 +21,16 @@ from PIL import Image
 from taichi_msm.accuracy import divergence
 from taichi_msm.accuracy.diagnosis import Diagnosis, diagnose
 from taichi_msm.accuracy.divergence import Watch
-from taichi_msm.errors import ArgumentError, DivergedError, MsmError, Pause, are_numbers, as_array, require_frame_count
-from taichi_msm.load.check import checked
+from taichi_msm.errors import (
+    ArgumentError,
+    DivergedError,
+    MsmError,
+    Pause,
+    as_array,
+    is_real_array,
+    require_frame_count,
+)
+from taichi_msm.load.check import check_scene
 from taichi_msm.load.resolve import resolve
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.surface import Surface, place_capsules, refine_surface, to_positions
@@ -85,7 +93,7 @@ class Simulation:
         texture: NDArray[np.uint8] | None = None,
         cores: int | None = None,
     ) -> None:
-        plan = checked(scene)
+        plan = check_scene(scene)
         texture = None if texture is None else require_texture(texture)
         self.device = runtime.start(arch, threads)
         self._plan = resolve(plan, self.device).plan
@@ -195,7 +203,7 @@ class Simulation:
         self._require_open()
         motion = self.scene.time.motion
         if scene is not None:
-            self._plan = resolve(checked(scene), self.device).plan
+            self._plan = resolve(check_scene(scene), self.device).plan
             self._probes = self.scene.probes
             self.renderer.restart(self.scene)
         else:
@@ -353,7 +361,7 @@ class Simulation:
             None if no surface is there.
         """
         point = as_array(pixel, "pixel")
-        if not (are_numbers(point, (2,)) and np.isfinite(point).all()):
+        if not (is_real_array(point, (2,)) and np.isfinite(point).all()):
             raise ArgumentError(f"pixel: {pixel!r}; take two numbers, x to the right and y down")
         x, y = point.tolist()
         return pick(self._position, self.scene.render.refine, self.renderer.resolve_camera(camera, self.time), (x, y))
@@ -461,13 +469,13 @@ class Simulation:
             positions = self._position
         else:
             positions, shape = as_array(positions, "positions"), self._position.shape
-            if not are_numbers(positions, shape):
+            if not is_real_array(positions, shape):
                 raise ArgumentError(
                     f"positions: {positions.dtype} of shape {positions.shape}; take numbers of shape {shape}"
                 )
         if time is None:
             time = self.time
-        elif not (are_numbers(as_array(time, "time"), ()) and math.isfinite(time)):
+        elif not (is_real_array(as_array(time, "time"), ()) and math.isfinite(time)):
             raise ArgumentError(f"time: {time!r}; take a number, in seconds, or None for now")
         return Shot(positions, self.renderer.resolve_camera(camera, time), place_capsules(self.scene, positions, time))
 

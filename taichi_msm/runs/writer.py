@@ -33,7 +33,7 @@ from taichi_msm.runs.directory import Contents, Listed, Publication, add, create
 from taichi_msm.runs.encoder import Encoder
 from taichi_msm.runs.media import Job, PictureWriter
 from taichi_msm.scene import outputs
-from taichi_msm.scene.outputs import CAMERA, OUTPUTS
+from taichi_msm.scene.outputs import CAMERA_FILE, OUTPUTS
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.state import Snapshot, TipForce
 
@@ -42,11 +42,11 @@ pass  # REMOVED
 
 def _listed(record: Mapping[str, Any]) -> Listed:
     """Tell of a file whether it is one of the run with this record."""
-    return partial(outputs.listed, set(record["outputs"]), int(record["frames"]))
+    return partial(outputs.is_result, set(record["outputs"]), int(record["frames"]))
 
 
 # The results of a run, and beside them the checkpoint from which it can go on.
-RUN = Contents("run", outputs.RECORD, outputs.PATTERNS, _listed, beside=(CHECKPOINT, PATTERNS))
+RUN = Contents("run", outputs.RUN_RECORD, outputs.RESULT_PATTERNS, _listed, beside=(CHECKPOINT, PATTERNS))
 
 
 class ResultWriter:
@@ -85,7 +85,7 @@ class ResultWriter:
         self._manifest = manifest
         self._resumes = resumes
         self._beside = beside
-        names = outputs.file_names(outputs.results(scene.folders), scene.time.frames + 1)
+        names = outputs.file_names(outputs.result_names(scene.folders), scene.time.frames + 1)
         self._publication = Publication(directory, RUN, names)
         folder = self._publication.staging / CHECKPOINT
         self._checkpoint = Checkpoint(folder, scene, grid)
@@ -172,12 +172,12 @@ class ResultWriter:
         """
         self.finish()
         with writing(self._directory):
-            results = outputs.results(self._scene.folders if self.frames else {})
+            results = outputs.result_names(self._scene.folders if self.frames else {})
             # By these names the next run into the directory recognises our files.
             facts = {**record, "frames": self.frames, "outputs": results}
             text = json.dumps(facts, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
             # A file name that is not UTF-8 has surrogates; escaped with a backslash they are valid JSON.
-            add(self._publication.staged / outputs.RECORD, text.encode("utf-8", "backslashreplace"))
+            add(self._publication.staged / outputs.RUN_RECORD, text.encode("utf-8", "backslashreplace"))
             self._publication.publish(outputs.file_names(results, self.frames))
             if record.get("status") == "complete":
                 self._checkpoint.forget()
@@ -261,7 +261,7 @@ class LabelWriter:
         """Write the labels of a frame, whose points are at `position` [m], and the flow from the frame before."""
         self._added = frame + 1
         for output in self._series:
-            number = frame - 1 if output.until_next else frame
+            number = frame - 1 if output.is_frame_pair else frame
             if number >= 0:
                 path = self._folder / output.path(number)
                 path.parent.mkdir(exist_ok=True)
@@ -284,7 +284,7 @@ class LabelWriter:
             if is_moving(scene, name):
                 rate = scene.time.frames_per_second
                 matrices["poses"] = [pose(view_at(scene, frame / rate, name)) for frame in range(frames)]
-            add(self._folder / CAMERA, (json.dumps(matrices, indent=2) + "\n").encode())
+            add(self._folder / CAMERA_FILE, (json.dumps(matrices, indent=2) + "\n").encode())
         if self._scene.asks_for("tracks"):
             tracks = {"points": self._points, "occluded": self._occluded, "position": self._position}
             tracks = {name: values[:, :frames] for name, values in tracks.items()}

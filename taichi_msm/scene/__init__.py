@@ -1,1 +1,1 @@
-"""The scene: one frozen pydantic model for each section of the YAML file."""
+"""The scene, with a frozen pydantic model for each section of the YAML file."""

@@ -1,7 +1,8 @@
-"""taichi_msm.scene.scene.camera."""
+"""Sections of a pinhole camera: intrinsics, lens distortion and pose."""
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -19,46 +20,46 @@ from typing_extensions import Self
 from taichi_msm.scene.calibration import CameraFileError, pose_fault, read_calibration, read_poses
 from taichi_msm.scene.section import (
     MIN_FOV,
-    SMALLEST,
+    MIN_MAGNITUDE,
     FilePath,
     Number,
     Positive,
     Section,
     Vector,
     key,
-    refused,
+    scene_fault,
 )
 
-# The coefficients of OpenCV's models of distortion, in its order.
+# Coefficients of OpenCV's models of lens distortion, in its order.
 COEFFICIENTS = {
     "pinhole": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "fisheye": ("k1", "k2", "k3", "k4"),
 }
 
-_MOST = 1e6
-_COEFFICIENT = f"a number, {-_MOST:g} to {_MOST:g}"
-Coefficient = Annotated[Number, Field(ge=-_MOST, le=_MOST)]
+_MAX_COEFFICIENT = 1e6
+_COEFFICIENT = f"a number, {-_MAX_COEFFICIENT:g} to {_MAX_COEFFICIENT:g}"
+Coefficient = Annotated[Number, Field(ge=-_MAX_COEFFICIENT, le=_MAX_COEFFICIENT)]
 
 
 class Intrinsics(Section):
-    """The focal lengths and the principal point of a calibrated camera, in OpenCV's pixels."""
+    """Focal lengths and principal point of a calibrated camera, in OpenCV's pixels."""
 
-    fx: Positive = key(..., "focal length across [px]", "a number above 0, in pixels")
-    fy: Positive = key(..., "focal length down [px]", "a number above 0, in pixels")
-    cx: Coefficient = key(..., "principal point across [px]; the centre of the first pixel is 0", _COEFFICIENT)
-    cy: Coefficient = key(..., "principal point down [px]; the centre of the first pixel is 0", _COEFFICIENT)
+    fx: Positive = key(..., "horizontal focal length [px]", "a number above 0, in pixels")
+    fy: Positive = key(..., "vertical focal length [px]", "a number above 0, in pixels")
+    cx: Coefficient = key(..., "horizontal principal point [px]; the centre of the first pixel is 0", _COEFFICIENT)
+    cy: Coefficient = key(..., "vertical principal point [px]; the centre of the first pixel is 0", _COEFFICIENT)
 
 
 class Distortion(Section):
-    """How a lens bends lines: OpenCV's rational model, or its fisheye."""
+    """Lens distortion: OpenCV's rational model or its fisheye model."""
 
     model: Literal["pinhole", "fisheye"] = key(
-        "pinhole", "pinhole: OpenCV's rational model; fisheye: its fisheye, with k1 to k4", "pinhole or fisheye"
+        "pinhole", "pinhole: OpenCV's rational model; fisheye: its fisheye model, with k1 to k4", "pinhole or fisheye"
     )
     k1: Coefficient = key(0.0, "radial coefficient", _COEFFICIENT)
     k2: Coefficient = key(0.0, "radial coefficient", _COEFFICIENT)
     k3: Coefficient = key(0.0, "radial coefficient", _COEFFICIENT)
-    k4: Coefficient = key(0.0, "radial coefficient; of a pinhole in the denominator", _COEFFICIENT)
+    k4: Coefficient = key(0.0, "radial coefficient; of the rational model in the denominator", _COEFFICIENT)
     k5: Coefficient = key(0.0, "radial coefficient in the denominator", _COEFFICIENT)
     k6: Coefficient = key(0.0, "radial coefficient in the denominator", _COEFFICIENT)
     p1: Coefficient = key(0.0, "tangential coefficient", _COEFFICIENT)
@@ -66,155 +67,164 @@ class Distortion(Section):
 
     @property
     def coefficients(self) -> tuple[float, ...]:
-        """The coefficients of the model, in OpenCV's order."""
+        """Coefficients of the model, in OpenCV's order."""
         return tuple(getattr(self, name) for name in COEFFICIENTS[self.model])
 
     @model_validator(mode="after")
-    def _of_its_model(self) -> Self:
+    def _check_coefficients_of_model(self) -> Self:
         for name in sorted(self.model_fields_set - {"model", *COEFFICIENTS[self.model]}):
             if getattr(self, name):
-                raise refused("goes with model: pinhole; a fisheye has k1, k2, k3 and k4", name)
+                raise scene_fault("goes with model: pinhole; a fisheye has k1, k2, k3 and k4", name)
         return self
 
 
 class Pose(Section):
-    """Where a camera is, in OpenCV's axes: x right, y down, z forward."""
+    """Extrinsics of a camera, in OpenCV's axes: x right, y down, z forward."""
 
     rotation: tuple[Vector, Vector, Vector] = key(
-        ..., "from the world's axes to the camera's", "three rows of three numbers: an orthonormal matrix"
+        ..., "rotation from the world's axes to the camera's", "three rows of three numbers: an orthonormal matrix"
     )
-    translation: Vector = key(..., "the world's origin in the camera's axes [m]", "three numbers: [x, y, z] in metres")
+    translation: Vector = key(..., "world's origin in the camera's axes [m]", "three numbers: [x, y, z] in metres")
 
 
-Times = Annotated[tuple[tuple[Number, Number, Number, Number], ...], Field(min_length=1)]
-Quaternions = Annotated[
+# Keyframes of a vector: t [s], x, y, z; and of a pose: t [s], position [m], quaternion x, y, z, w.
+VectorKeyframes = Annotated[tuple[tuple[Number, Number, Number, Number], ...], Field(min_length=1)]
+PoseRows = Annotated[
     tuple[tuple[Number, Number, Number, Number, Number, Number, Number, Number], ...], Field(min_length=1)
 ]
 
-_KEYS = " or keys [[t, x, y, z], ...], t in seconds"
+_OR_KEYFRAMES = " or keys [[t, x, y, z], ...], t in seconds"
 
 
 class Camera(Section):
-    """A pinhole camera, which may be calibrated, have a lens that bends lines, and move."""
+    """Pinhole camera, with optional calibration, lens distortion and motion."""
 
     calibration: FilePath | None = key(
         None,
-        "in place of fov and distortion: a calibration of OpenCV, ROS or STIR, relative to the scene file",
+        "in place of fov and distortion: calibration file of OpenCV, ROS or STIR, relative to the scene file",
         "the path of a file",
     )
     scale: StrictBool = key(
-        False, "whether a calibration of pictures of another size is scaled to this one", "true or false"
+        False, "whether a calibration for another picture size is scaled to this one", "true or false"
     )
     intrinsics: Intrinsics | None = key(
-        None, "in place of fov: as calibrated, in OpenCV's pixels", "a mapping with fx, fy, cx and cy"
+        None,
+        "in place of fov: focal lengths and principal point, in OpenCV's pixels",
+        "a mapping with fx, fy, cx and cy",
     )
     distortion: Distortion | None = key(
         None,
-        "how the lens bends lines, in OpenCV's terms",
+        "lens distortion, in OpenCV's terms",
         "a mapping with k1, k2, p1, p2, k3 to k6, or with model: fisheye and k1 to k4",
     )
     outside: Literal["refuse", "background"] = key(
         "refuse",
-        "what to do where the distortion folds back within the picture: refuse the scene, or draw the background there",
+        "treatment of pixels where the distortion is not invertible: refuse the scene, or draw the background",
         "refuse or background",
     )
     pose: Pose | None = key(
-        None, "in place of eye, target and up: from the world to the camera", "a mapping with rotation and translation"
-    )
-    poses: FilePath | Quaternions | None = key(
         None,
-        "in place of eye, target and up: the camera's place over time, a file in TUM's format, relative to the scene "
-        "file, or its rows [t, tx, ty, tz, qx, qy, qz, qw], from the camera to the world",
+        "in place of eye, target and up: transform from the world to the camera",
+        "a mapping with rotation and translation",
+    )
+    poses: FilePath | PoseRows | None = key(
+        None,
+        "in place of eye, target and up: trajectory of the camera, a file in TUM's format, relative to the scene file, "
+        "or its rows [t, tx, ty, tz, qx, qy, qz, qw], from the camera to the world",
         "the path of a file, or rows [[t, tx, ty, tz, qx, qy, qz, qw], ...]",
     )
     beside: Annotated[str, Field(strict=True, min_length=1)] | None = key(
         None,
-        "in `cameras`, in place of all else but baseline: the name of another camera, which this one is like",
+        "in `cameras`, in place of all other keys except baseline: name of the reference camera of a stereo pair, of "
+        "which this camera is a translated copy",
         "the name of another camera",
     )
     baseline: Number | None = key(
         None,
-        "how far it is from the camera that it is beside, along the x axis of that [m]",
+        "distance from the camera named by beside, along the x axis of that camera [m]",
         "a number but 0, in metres",
     )
-    eye: Vector | Times | None = key(
+    eye: Vector | VectorKeyframes | None = key(
         None,
-        "where the camera is [m], or keys of it, linear between, held outside; required unless there is pose, poses or "
-        "beside",
-        "three numbers: [x, y, z] in metres," + _KEYS,
+        "position of the camera [m], or its keyframes, linear between, constant outside; required without pose, "
+        "poses and beside",
+        "three numbers: [x, y, z] in metres," + _OR_KEYFRAMES,
     )
-    target: Vector | Times = key(
-        (0.0, 0.0, 0.0), "the point it looks at [m], or keys of it", "three numbers: [x, y, z] in metres," + _KEYS
+    target: Vector | VectorKeyframes = key(
+        (0.0, 0.0, 0.0),
+        "point on the optical axis [m], or its keyframes",
+        "three numbers: [x, y, z] in metres," + _OR_KEYFRAMES,
     )
-    up: Vector | Times = key(
+    up: Vector | VectorKeyframes = key(
         (0.0, 1.0, 0.0),
-        "the direction that is up in the picture, or keys of it",
-        "three numbers: [x, y, z]," + _KEYS,
+        "direction that is up in the picture, or its keyframes",
+        "three numbers: [x, y, z]," + _OR_KEYFRAMES,
     )
     fov: Annotated[Number, Field(ge=MIN_FOV, lt=180)] = key(
         40.0,
-        "angle from the picture's bottom to its top, without distortion [degrees]",
+        "vertical field of view, without distortion [degrees]",
         f"a number from {MIN_FOV:g} to below 180, in degrees",
     )
 
     @property
     def moves(self) -> bool:
-        """Whether the camera is not in the same place at all times."""
+        """Whether the pose of the camera depends on time."""
         return any(isinstance(value[0], tuple) for value in (self.poses, self.eye, self.target, self.up) if value)
 
     @field_validator("poses", mode="after")
     @classmethod
-    def _read_poses(cls, poses: str | Quaternions | None) -> Quaternions | None:
+    def _read_poses(cls, poses: str | PoseRows | None) -> PoseRows | None:
         if not isinstance(poses, str):
             for n, row in enumerate(poses or ()):
                 if fault := pose_fault(row, poses[n - 1] if n else None):  # type: ignore[index]
-                    raise refused(fault, n)
+                    raise scene_fault(fault, n)
             return poses
         try:
             return read_poses(poses)  # type: ignore[return-value]
         except CameraFileError as error:
-            raise refused(str(error)) from None
+            raise scene_fault(str(error)) from None
 
     @field_validator("eye", "target", "up", mode="after")
     @classmethod
-    def _in_order(cls, keys: Any, info: ValidationInfo) -> Any:
-        if info.field_name == "eye" and keys is None and not {"beside", "pose", "poses"} & _given(info):
-            raise refused("missing; expected " + cls.model_fields["eye"].json_schema_extra["expects"])  # type: ignore
-        if keys is None or not isinstance(keys[0], tuple):
-            return keys
-        for n in range(1, len(keys)):
-            if keys[n][0] <= keys[n - 1][0]:
-                said = f"is at {keys[n][0]:g} s, and the key before it at {keys[n - 1][0]:g} s"
-                raise refused(f"{said}; sort the keys, each later than the last", n)
-        return keys
+    def _check_order(cls, keyframes: Any, info: ValidationInfo) -> Any:
+        if info.field_name == "eye" and keyframes is None and not {"beside", "pose", "poses"} & _given(info):
+            raise scene_fault("missing; expected " + cls.model_fields["eye"].json_schema_extra["expects"])  # type: ignore
+        if keyframes is None or not isinstance(keyframes[0], tuple):
+            return keyframes  # A constant vector.
+        for n, ((previous, *_), (time, *_)) in enumerate(pairwise(keyframes), 1):
+            if time <= previous:
+                times = f"is at {time:g} s, and the key before it at {previous:g} s"
+                raise scene_fault(f"{times}; sort the keys, each later than the last", n)
+        return keyframes
 
     @model_validator(mode="after")
-    def _said_once(self) -> Self:
+    def _check_combination(self) -> Self:
         given = {name for name in self.model_fields_set if getattr(self, name) is not None}
         if self.beside is not None:
             for name in sorted(given - {"beside", "baseline"}):
-                raise refused(
+                raise scene_fault(
                     "is given together with beside, and a camera beside another is like that; remove it", name
                 )
-            if self.baseline is None or abs(self.baseline) < SMALLEST:
-                what = "missing" if self.baseline is None else f"{self.baseline:g} puts it where {self.beside} is"
-                raise refused(f"{what}; expected a number but 0, in metres", "baseline")
+            if self.baseline is None or abs(self.baseline) < MIN_MAGNITUDE:
+                fault = "missing" if self.baseline is None else f"{self.baseline:g} puts it where {self.beside} is"
+                raise scene_fault(f"{fault}; expected a number but 0, in metres", "baseline")
         elif self.baseline is not None:
-            raise refused("goes with beside, the name of another camera; add it or remove this", "baseline")
+            raise scene_fault("goes with beside, the name of another camera; add it or remove this", "baseline")
         if self.scale and self.calibration is None:
-            raise refused("goes with calibration; remove it", "scale")
+            raise scene_fault("goes with calibration; remove it", "scale")
         if self.outside == "background" and self.distortion is None and self.calibration is None:
-            raise refused("goes with distortion; remove it", "outside")
-        for ways in (("calibration", "intrinsics", "fov"), ("pose", "poses", "eye"), ("calibration", "distortion")):
-            if len(both := [name for name in ways if name in given]) > 1:
-                raise refused(f"is given together with {both[0]}; remove one of them", both[1])
+            raise scene_fault("goes with distortion; remove it", "outside")
+        exclusive = (("calibration", "intrinsics", "fov"), ("pose", "poses", "eye"), ("calibration", "distortion"))
+        for names in exclusive:
+            if len(both := [name for name in names if name in given]) > 1:
+                raise scene_fault(f"is given together with {both[0]}; remove one of them", both[1])
         for name in {"target", "up"} & given if {"pose", "poses"} & given else ():
-            raise refused("goes with eye; a pose has a direction of its own", name)
+            raise scene_fault("goes with eye; a pose has a direction of its own", name)
         return self
 
     @model_serializer(mode="wrap")
-    def _own_keys(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out what was not given and has no meaning beside what was."""
+    def _dump_used_keys(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Omit the keys that the given keys replace, whose defaults would be invalid when the scene is read again."""
         if self.beside is not None:
             return {name: value for name, value in dump(self).items() if name in ("beside", "baseline")}
         needed = {"eye", "target", "up"} if self.eye is not None else {"pose", "poses"} & self.model_fields_set
@@ -223,49 +233,58 @@ class Camera(Section):
         return {name: value for name, value in dump(self).items() if name in needed}
 
     def calibrated(self, size: tuple[int, int]) -> Self:
-        """Read the calibration for pictures of a width and height [px]; raises pydantic's error of a key."""
+        """Return a copy with the intrinsics and the distortion of the calibration file, if there is one.
+
+        Args:
+            size: width and height of the pictures [px].
+
+        Raises:
+            PydanticCustomError: when the file cannot be used, or its size differs from `size` without `scale`.
+        """
         if self.calibration is None:
             return self
         try:
-            found = read_calibration(self.calibration)
+            calibration = read_calibration(self.calibration)
         except CameraFileError as error:
-            raise refused(str(error), "calibration") from None
-        if self.scale and found.size is None:
-            said = "tells no size of its pictures, so it cannot be scaled; add image_width and image_height"
-            raise refused(f"{self.calibration}: {said}, or remove scale", "calibration")
-        across, down = (new / old for new, old in zip(size, found.size or size, strict=True))
-        if (across, down) != (1, 1) and not self.scale:
-            assert found.size is not None
-            raise refused(
-                f"{self.calibration}: of pictures of {found.size[0]} x {found.size[1]} pixels, not of {size[0]} x "
-                f"{size[1]}; set render.size to these, or scale: true",
+            raise scene_fault(str(error), "calibration") from None
+        if self.scale and calibration.size is None:
+            fault = "tells no size of its pictures, so it cannot be scaled; add image_width and image_height"
+            raise scene_fault(f"{self.calibration}: {fault}, or remove scale", "calibration")
+        scale_x, scale_y = (new / old for new, old in zip(size, calibration.size or size, strict=True))
+        if (scale_x, scale_y) != (1, 1) and not self.scale:
+            assert calibration.size is not None
+            raise scene_fault(
+                f"{self.calibration}: of pictures of {calibration.size[0]} x {calibration.size[1]} pixels, not of "
+                f"{size[0]} x {size[1]}; set render.size to these, or scale: true",
                 "calibration",
             )
-        # Edges of pictures are scaled to edges; they are half a pixel from the centres of pixels.
-        (fx, fy), (cx, cy) = found.focal, found.centre
-        intrinsics = {"fx": fx * across, "fy": fy * down}
-        intrinsics |= {"cx": (cx + 0.5) * across - 0.5, "cy": (cy + 0.5) * down - 0.5}
+        # The edges of a picture are scaled to edges, half a pixel from the centres of the outer pixels.
+        (fx, fy), (cx, cy) = calibration.focal, calibration.centre
+        intrinsics = {"fx": fx * scale_x, "fy": fy * scale_y}
+        intrinsics |= {"cx": (cx + 0.5) * scale_x - 0.5, "cy": (cy + 0.5) * scale_y - 0.5}
         update: dict[str, Any] = {"calibration": None, "scale": False, "intrinsics": intrinsics}
-        if any(found.coefficients):
-            model = "fisheye" if found.fisheye else "pinhole"
-            # OpenCV lets the last ones of a pinhole out.
-            names = zip(COEFFICIENTS[model], found.coefficients, strict=False)
-            update["distortion"] = {"model": model, **dict(names)}
-        elif found.fisheye:
+        if any(calibration.coefficients):
+            model = "fisheye" if calibration.fisheye else "pinhole"
+            # OpenCV omits trailing coefficients of the rational model.
+            coefficients = zip(COEFFICIENTS[model], calibration.coefficients, strict=False)
+            update["distortion"] = {"model": model, **dict(coefficients)}
+        elif calibration.fisheye:
             update["distortion"] = {"model": "fisheye"}
         unused = {"calibration", "scale"} if "distortion" in update else {"calibration", "scale", "outside"}
         kept = {name: getattr(self, name) for name in self.model_fields_set - unused}
         try:
             return self.model_validate(kept | update)
         except ValidationError:
-            said = f"{', '.join(f'{name} = {value:g}' for name, value in intrinsics.items())} for pictures of this size"
-            raise refused(
-                f"{self.calibration}: {said} are out of range; calibrate at a size near it", "scale"
+            values = ", ".join(f"{name} = {value:g}" for name, value in intrinsics.items())
+            raise scene_fault(
+                f"{self.calibration}: {values} for pictures of this size are out of range; calibrate at a size near it",
+                "scale",
             ) from None
 
 
 def _given(info: ValidationInfo) -> set[str]:
-    """Give the names of the keys before this one that have a value, or one at fault."""
-    before = list(Camera.model_fields)
-    names = before[: before.index(str(info.field_name))]
-    return {name for name in names if info.data.get(name, name) is not None}
+    """Return the keys before the validated one that have a value, valid or not."""
+    fields = list(Camera.model_fields)
+    previous = fields[: fields.index(str(info.field_name))]
+    # The data lacks keys with an invalid value.
+    return {name for name in previous if info.data.get(name, name) is not None}

@@ -1,4 +1,4 @@
-"""The scene: one frozen model per section of the YAML file, with every default and limit, and nothing else."""
+"""The scene and its section of times; the other sections are in the modules next to this one."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from pydantic import (
 from taichi_msm.scene.outputs import OUTPUTS
 from taichi_msm.scene.render import Render
 from taichi_msm.scene.section import (
-    LARGEST_TOLERANCE,
+    FRAME_TOLERANCE,
     MAX_PROBES,
-    SMALLEST_TOLERANCE,
-    WHOLE,
+    MAX_TOLERANCE,
+    MIN_TOLERANCE,
     FilePath,
+    Integer,
     NotNegative,
     OutputName,
     Positive,
     Section,
     Tolerance,
-    Whole,
     key,
-    refused,
+    scene_fault,
 )
 from taichi_msm.scene.sheet import Sheet, Springs, StiffnessMap, Tissue
 from taichi_msm.scene.tools import Probe
 
 
 class Time(Section):
-    """The time span, the frames and the steps."""
+    """Duration, frames and time steps."""
 
     duration: Positive = key(
         ..., "simulated time [s]; duration x frames_per_second is a whole number", "a number above 0, in seconds"
@@ -41,20 +41,20 @@ class Time(Section):
     frames_per_second: Positive = key(25.0, "frames per simulated second", "a number above 0")
     motion: Literal["dynamic", "quasistatic"] = key(
         "dynamic",
-        "dynamic: the sheet moves; quasistatic: every frame is the sheet at rest under its loads, and mass, density, "
-        "damping and step do not matter",
+        "dynamic: time integration; quasistatic: every frame is the equilibrium of the sheet under its loads, and "
+        "mass, density, damping and step are ignored",
         "dynamic or quasistatic",
     )
     step: Literal["auto"] | Positive = key(
         "auto",
-        "time step [s], a whole fraction of a frame; auto: half the stability limit or less",
+        "time step [s], of which a frame is a multiple; auto: half the stability limit or less",
         "auto, or a number above 0, in seconds",
     )
     tolerance: Tolerance | None = key(
         None,
         "with step: auto, largest allowed error of any frame due to the step, as a fraction of the largest "
-        "displacement; pilot runs find the step",
-        f"a number, {SMALLEST_TOLERANCE:g} to {LARGEST_TOLERANCE:g}",
+        "displacement; companion runs find the step",
+        f"a number, {MIN_TOLERANCE:g} to {MAX_TOLERANCE:g}",
     )
     damping_difference: Literal["central", "backward"] = key(
         "central",
@@ -64,26 +64,26 @@ class Time(Section):
     )
     precision: Literal["auto", "f32", "f64"] = key(
         "auto",
-        "floating-point precision; auto: f64 if stepping is a small part of the run, else f32",
+        "floating-point precision; auto: f64 if time integration is a small part of the run, else f32",
         "auto, f32 or f64",
     )
 
     @property
     def at_rest(self) -> bool:
-        """Whether every frame is the sheet at rest."""
+        """Whether every frame is an equilibrium of the sheet."""
         return self.motion == "quasistatic"
 
     @property
     def frames(self) -> int:
-        """F, the number of frame intervals; F + 1 frames are drawn."""
+        """Number of frame intervals, F; F + 1 frames are drawn."""
         return round(self.duration * self.frames_per_second)
 
     @model_validator(mode="after")
-    def _whole_frames(self) -> Time:
+    def _check_frame_count(self) -> Time:
         frames = self.duration * self.frames_per_second
-        if not 0.5 < frames <= 1e9 or abs(frames - round(frames)) > WHOLE:
+        if not 0.5 < frames <= 1e9 or abs(frames - round(frames)) > FRAME_TOLERANCE:
             nearest = max(1, round(min(frames, 1e9))) / self.frames_per_second
-            raise refused(
+            raise scene_fault(
                 f"{self.duration:.12g} s x {self.frames_per_second:.12g} frames per second = {frames:.12g} frames, "
                 f"not a whole number up to 1e9; try {nearest:.12g}",
                 "duration",
@@ -91,23 +91,25 @@ class Time(Section):
         return self
 
     @model_validator(mode="after")
-    def _one_way_to_the_step(self) -> Time:
+    def _check_one_step(self) -> Time:
         if self.tolerance is not None and self.step != "auto":
-            said = f"a tolerance chooses the step, but step is {self.step:.12g}"
-            raise refused(f"{said}; set step: auto or remove the tolerance", "tolerance")
+            message = f"a tolerance chooses the step, but step is {self.step:.12g}"
+            raise scene_fault(f"{message}; set step: auto or remove the tolerance", "tolerance")
         return self
 
     @model_validator(mode="after")
-    def _fits_rest(self) -> Time:
+    def _check_fits_motion(self) -> Time:
         if self.at_rest and self.tolerance is not None:
-            raise refused("is for the time step, and motion: quasistatic takes none; remove the tolerance", "tolerance")
+            raise scene_fault(
+                "is for the time step, and motion: quasistatic takes none; remove the tolerance", "tolerance"
+            )
         if self.at_rest and self.precision == "f32":
-            raise refused("f32 is too coarse for motion: quasistatic; take auto or f64", "precision")
+            raise scene_fault("f32 is too coarse for motion: quasistatic; take auto or f64", "precision")
         return self
 
 
 class Scene(Section):
-    """Everything a run needs; what the YAML file says, checked and with its defaults filled in.
+    """Scene: the complete, validated input of a run, as in the YAML file, with defaults.
 
     Example:
         >>> from taichi_msm import Scene
@@ -126,13 +128,13 @@ class Scene(Section):
         "in its folder or below; required to draw",
         "the path of a picture",
     )
-    region: tuple[Whole, Whole, Whole, Whole] | None = key(
+    region: tuple[Integer, Integer, Integer, Integer] | None = key(
         None,
-        "x, y, width, height [px] of the part of the image that the sheet carries; default: all of it",
+        "x, y, width, height [px] of the part of the image that is mapped to the sheet; default: all of it",
         "four whole numbers: [x, y, width, height] in pixels",
     )
     sheet: Sheet = key(..., "the sheet of mass points", "a mapping with points and size")
-    tissue: Tissue | None = key(None, "what the sheet is made of", "a mapping with young, thickness and density")
+    tissue: Tissue | None = key(None, "material of the sheet", "a mapping with young, thickness and density")
     springs: Springs | None = key(None, "instead of tissue: the springs", "a mapping with structural, shear, virtual")
     damping: NotNegative = key(0.0, "with springs: C, force per velocity [N s/m]", "a number, 0 or more, in N s/m")
     probes: Annotated[tuple[Probe, ...], Field(max_length=MAX_PROBES)] = key(
@@ -140,27 +142,28 @@ class Scene(Section):
         "the tools",
         f"a list of at most {MAX_PROBES} mappings with at, total or force, load, or with path and instrument",
     )
-    time: Time = key(..., "time span, frames and steps", "a mapping with at least duration")
-    render: Render = key(Render(), "how a frame is drawn", "a mapping")
+    time: Time = key(..., "duration, frames and time steps", "a mapping with at least duration")
+    render: Render = key(Render(), "drawing of the frames", "a mapping")
     output: tuple[OutputName, ...] = key(
         ("png", "gif", "trajectory"),
-        "what is written besides run.json; [] simulates only",
+        "results in addition to run.json; [] simulates only",
         f"a list of {', '.join(OUTPUTS)}",
     )
 
     @property
     def folders(self) -> dict[str, tuple[str, ...]]:
-        """The entries of output by their folders: what a camera sees goes to its own, the rest to that of the run."""
-        wanted = [output for name, output in OUTPUTS.items() if name in self.output]
-        folders = {"": tuple(output.name for output in wanted if not output.is_seen)}
+        """Names of the outputs by folder: those of a camera in its own folder, the others in that of the run, ""."""
+        selected = [output for name, output in OUTPUTS.items() if name in self.output]
+        folders = {"": tuple(output.name for output in selected if not output.is_camera_output)}
         for camera in self.render.all_cameras:
             has_pair = bool(self.render.baseline(camera))
-            seen = (output.name for output in wanted if output.is_seen and (has_pair or not output.of_pair))
-            folders[camera] = (*folders.get(camera, ()), *seen)
+            possible = (output for output in selected if has_pair or not output.needs_stereo_pair)
+            names = (output.name for output in possible if output.is_camera_output)
+            folders[camera] = (*folders.get(camera, ()), *names)
         return folders
 
     def asks_for(self, *sources: str) -> bool:
-        """Tell whether the values of any output are in one of these fields of `FrameOutputs`."""
+        """Return whether any output has one of these sources (see `Output.source`)."""
         return any(OUTPUTS[name].source in sources for name in self.output)
 
     @property
@@ -170,52 +173,56 @@ class Scene(Section):
 
     @property
     def labels_pixels(self) -> bool:
-        """Whether any output is a label of every pixel."""
+        """Whether any output consists of ground-truth labels of the pixels."""
         return self.asks_for("labels", "flow", "stereo")
 
     @property
     def renders(self) -> bool:
-        """Whether any output depends on what the camera sees."""
-        return any(OUTPUTS[name].is_seen for name in self.output)
+        """Whether any output depends on the camera."""
+        return any(OUTPUTS[name].is_camera_output for name in self.output)
 
     @property
     def has_instruments(self) -> bool:
-        """Whether any probe has an instrument, which is drawn."""
+        """Whether any probe has an instrument."""
         return any(probe.instrument is not None for probe in self.probes)
 
     @property
     def kind(self) -> Literal["tissue", "springs"]:
-        """The section that says what the sheet is made of."""
+        """Name of the section with the material of the sheet."""
         return "springs" if self.tissue is None else "tissue"
 
     @property
     def stiffness_map(self) -> StiffnessMap | None:
-        """The map of the springs or the tissue."""
+        """Map of the stiffness of the springs or the tissue."""
         return self.maps.get("map")
 
     @property
     def maps(self) -> dict[str, StiffnessMap]:
-        """The maps of the springs or the tissue, by the keys that name them: map, foundation_map."""
+        """Maps of the springs or the tissue, by key: map, foundation_map."""
         return {name: value for name, value in (self.tissue or self.springs or ()) if isinstance(value, StiffnessMap)}
 
     @property
     def pictures(self) -> dict[str, str]:
-        """The paths of the picture and the maps, by the keys that name them, such as image and tissue.map.image."""
+        """Paths of the image and the maps, by dotted key, such as image and tissue.map.image."""
         image = {} if self.image is None else {"image": self.image}
-        return image | {f"{self.kind}.{name}.image": each.image for name, each in self.maps.items()}
+        return image | {f"{self.kind}.{name}.image": value.image for name, value in self.maps.items()}
 
     def with_pictures(self, path: Callable[[str], str]) -> Scene:
-        """Give the picture and the maps other paths, each by its present one."""
-        maps = {name: each.model_copy(update={"image": path(each.image)}) for name, each in self.maps.items()}
+        """Return a copy of the scene with other paths of the image and the maps.
+
+        Args:
+            path: function from a present path to the new one.
+        """
+        maps = {name: value.model_copy(update={"image": path(value.image)}) for name, value in self.maps.items()}
         image = None if self.image is None else path(self.image)
-        sheet = self.tissue or self.springs
-        material = None if sheet is None else sheet.model_copy(update=maps)
-        return self.model_copy(update={"image": image, self.kind: material})
+        material = self.tissue or self.springs
+        changed = None if material is None else material.model_copy(update=maps)
+        return self.model_copy(update={"image": image, self.kind: changed})
 
     @model_validator(mode="after")
-    def _picture_given(self) -> Scene:
+    def _check_image_given(self) -> Scene:
         if self.draws and self.image is None:
-            raise refused(
+            raise scene_fault(
                 "a picture is needed to draw png, gif or mp4; name one, or set output to [trajectory] or []", "image"
             )
         return self

@@ -1,4 +1,7 @@
-"""Translate pydantic's errors into the user's terms: each problem at its key, with the values that it may have."""
+"""Base class, types and limits of the scene's sections, and the translation of pydantic's errors.
+
+Every error is reported at its key, with the values that the key may have.
+"""
 
 from __future__ import annotations
 
@@ -19,106 +22,137 @@ from pydantic_core import PydanticCustomError
 from typing_extensions import Self
 
 from taichi_msm.errors import ArgumentError, Key, Problem, SceneError, did_you_mean
-from taichi_msm.scene import section
 from taichi_msm.scene.outputs import OUTPUTS
 
-# Beyond these limits, squares and quotients of two numbers overflow or underflow.
-LARGEST = 1e30
-SMALLEST = 1e-30
+# Limits of a number's magnitude, beyond which the product or quotient of two numbers could overflow or underflow.
+MAX_MAGNITUDE = 1e30
+MIN_MAGNITUDE = 1e-30
 
-# The type of the errors that validators raise.
-REFUSED = "refused"
+# Pydantic's type of the errors that our validators raise.
+SCENE_FAULT = "refused"
 
-MAX_SHOWN = 60
-
-# The most faults that are reported; a broken file of the largest size can have tens of thousands.
-MAX_FAULTS = 1000
+# Limit of the length of a value in a message.
+MAX_VALUE_LENGTH = 60
 
 
-def refused(message: str, *below: str | int) -> PydanticCustomError:
-    """Make the error that a validator raises: the user reads this message, at the value or a key or item below it."""
-    return PydanticCustomError(REFUSED, message, {"below": below})
+def scene_fault(message: str, *below: str | int) -> PydanticCustomError:
+    """Return the error that a validator raises for a fault of its value.
+
+    Args:
+        message: message for the user, without the key.
+        below: keys and indices from the validated value to the value at fault.
+    """
+    return PydanticCustomError(SCENE_FAULT, message, {"below": below})
 
 
-def flow(value: Any) -> str:
-    """Show a value as it could be written in the file, cut to a length that fits a line."""
-    return cut(json.dumps(value, ensure_ascii=False, default=repr))
+def format_value(value: Any) -> str:
+    """Format a value as in a scene file, truncated to the length of a message."""
+    return truncate(json.dumps(value, ensure_ascii=False, default=repr))
 
 
-def cut(text: str) -> str:
-    """Keep the beginning of a long text."""
-    return text if len(text) <= MAX_SHOWN else text[:MAX_SHOWN] + "..."
+def truncate(text: str) -> str:
+    """Truncate a text to the length of a value in a message."""
+    return text if len(text) <= MAX_VALUE_LENGTH else text[:MAX_VALUE_LENGTH] + "..."
 
 
 def key_problems(error: ValidationError, section: type[BaseModel], data: Any) -> list[Problem]:
-    """Say what pydantic found wrong with plain data that a model should match."""
-    faults = [_fault(one, section) for one in error.errors(include_url=False, include_input=False)[:MAX_FAULTS]]
+    """Translate pydantic's errors to problems at the keys of a scene.
+
+    Args:
+        error: error of the validation.
+        section: model that the data was validated against.
+        data: plain data, as passed to the validation.
+    """
+    # A broken file of the largest size could have tens of thousands of faults.
+    errors = error.errors(include_url=False, include_input=False)[:1000]
+    faults = [_fault(details, section) for details in errors]
     return [Problem(fault.path, _message(fault, data)) for fault in _drop_short(_choose_kinds(faults))]
 
 
 class _Fault(NamedTuple):
-    """One of pydantic's errors, in terms of the document."""
+    """An error of pydantic, in terms of the scene.
 
-    path: Key  # of the key at fault
-    kind: str  # pydantic's type of the error
+    Attributes:
+        path: path to the key at fault.
+        error_type: pydantic's type of the error.
+        text: pydantic's message.
+        context: pydantic's numbers and names of the message.
+        section: section that the key belongs to.
+        expects: allowed values, for the message.
+        branches: keys above the fault that allow several kinds of value, each with the name of the validated kind.
+        words: allowed texts.
+    """
+
+    path: Key
+    error_type: str
     text: str
-    context: dict[str, Any]  # the numbers and names in the text
-    section: type[BaseModel]  # that the key belongs to
-    expects: str  # what the key may hold
-    # The keys above it that may hold several kinds of value, each with the kind that was tried.
-    choices: tuple[tuple[Key, str], ...]
-    words: tuple[str, ...]  # those that the value may be
+    context: dict[str, Any]
+    section: type[BaseModel]
+    expects: str
+    branches: tuple[tuple[Key, str], ...]
+    words: tuple[str, ...]
 
 
 def _fault(error: Any, section: type[BaseModel]) -> _Fault:
-    """Follow an error's location through the models, skipping pydantic's names for the kinds of a value."""
+    """Translate an error: follow its location through the models, without pydantic's names of the kinds of a value."""
     path: Key = ()
     expects = ""
-    choices: tuple[tuple[Key, str], ...] = ()
+    branches: tuple[tuple[Key, str], ...] = ()
     words: tuple[tuple[str, ...], ...] = (), ()
     parts = iter(error["loc"])
     for part in parts:
         path += (part,)
         if part in section.model_fields:
-            section, expects, has_names, has_choice, words = _describe(section, part)
-            path += (name,) if has_names and (name := next(parts, None)) is not None else ()
-            if has_choice:
-                choices += ((path, next(parts, "")),)
+            section, expects, is_mapping, is_union, words = _key_info(section, part)
+            path += (name,) if is_mapping and (name := next(parts, None)) is not None else ()
+            if is_union:
+                branches += ((path, next(parts, "")),)
     context = error.get("ctx", {})
     path += context.get("below", ())
     in_list = bool(path) and isinstance(path[-1], int)
-    return _Fault(path, error["type"], error["msg"], context, section, expects, choices, words[in_list])
+    return _Fault(path, error["type"], error["msg"], context, section, expects, branches, words[in_list])
+
+
+class _KeyInfo(NamedTuple):
+    """Properties of a key.
+
+    Attributes:
+        section: section of the keys below it, or else the section that it belongs to.
+        expects: allowed values, for the message.
+        is_mapping: whether the value is a mapping from names.
+        is_union: whether the value, or each value of the mapping, may be of several kinds.
+        words: texts that the value, and the items of a list, may be.
+    """
+
+    section: type[BaseModel]
+    expects: str
+    is_mapping: bool
+    is_union: bool
+    words: tuple[tuple[str, ...], ...]
 
 
 @cache
-def _describe(
-    section: type[BaseModel], name: str
-) -> tuple[type[BaseModel], str, bool, bool, tuple[tuple[str, ...], ...]]:
-    """Describe a key.
-
-    Returns:
-        Its section, or the one below it; what it may hold; whether that has values by names; whether it, or such a
-        value, may be of several kinds; the words that it may be, and those that the items of its list may be.
-    """
+def _key_info(section: type[BaseModel], name: str) -> _KeyInfo:
     field = section.model_fields[name]
     extra = field.json_schema_extra
     assert isinstance(extra, dict)
     kinds = _kinds(field.annotation)
-    if has_names := get_origin(kinds[0]) is dict:
+    if is_mapping := get_origin(kinds[0]) is dict:
         kinds = _kinds(get_args(kinds[0])[1])
     words = tuple(tuple(_words(field.annotation, depth)) for depth in (0, 1))
-    return next(_sections(field.annotation), section), str(extra["expects"]), has_names, len(kinds) > 1, words
+    inner = next(_sections(field.annotation), section)
+    return _KeyInfo(inner, str(extra["expects"]), is_mapping, len(kinds) > 1, words)
 
 
 def _kinds(annotation: Any) -> list[Any]:
-    """List the kinds of value that an annotation allows, but for None."""
+    """List the types of a union without None, or the only type."""
     if get_origin(annotation) not in (Union, UnionType):
         return [annotation]
     return [kind for kind in get_args(annotation) if kind is not type(None)]
 
 
 def _words(annotation: Any, depth: int) -> Iterator[str]:
-    """Find the words that an annotation allows inside so many lists."""
+    """Iterate over the texts that an annotation allows within lists nested to a depth."""
     if get_origin(annotation) is Literal:
         yield from (word for word in get_args(annotation) if depth == 0)
         return
@@ -127,7 +161,7 @@ def _words(annotation: Any, depth: int) -> Iterator[str]:
 
 
 def _sections(annotation: Any) -> Iterator[type[BaseModel]]:
-    """Find the sections in an annotation such as tuple[Probe, ...]."""
+    """Iterate over the sections of an annotation such as tuple[Probe, ...]."""
     if get_origin(annotation) is None and isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for argument in get_args(annotation):
@@ -135,104 +169,112 @@ def _sections(annotation: Any) -> Iterator[type[BaseModel]]:
 
 
 def _choose_kinds(faults: Sequence[_Fault]) -> Iterator[_Fault]:
-    """For a key that may hold several kinds of value, report only the faults of the kind that was meant.
+    """Of the faults of a value that may be of several kinds, keep those of the most probable kind.
 
-    That is the kind whose check got furthest into the value; if two got equally far, the whole value is at fault.
+    That is the kind with the deepest fault; if two kinds are equally deep, the value as a whole is at fault.
     """
-    reached: dict[Key, dict[str, int]] = defaultdict(dict)
+    depths: dict[Key, dict[str, int]] = defaultdict(dict)
     for fault in faults:
-        for choice, branch in fault.choices:
-            reached[choice][branch] = max(reached[choice].get(branch, 0), len(fault.path))
+        for key, kind in fault.branches:
+            depths[key][kind] = max(depths[key].get(kind, 0), len(fault.path))
     for fault in faults:
-        for choice, branch in fault.choices:
-            branches = reached[choice]
-            furthest = max(branches.values())
-            if list(branches.values()).count(furthest) > 1:
-                yield fault._replace(path=choice, kind="choice")
+        for key, kind in fault.branches:
+            deepest = max(depths[key].values())
+            if list(depths[key].values()).count(deepest) > 1:
+                yield fault._replace(path=key, error_type="choice")
                 break
-            if branches[branch] != furthest:
+            if depths[key][kind] != deepest:
                 break
         else:
             yield fault
 
 
 def _drop_short(faults: Iterable[_Fault]) -> Iterator[_Fault]:
-    """Report a list that lacks items as one fault, or not at all if one of its items is at fault."""
+    """Merge the faults of missing items into a fault of their list; drop it if an item of the list is at fault."""
     merged = [
-        fault._replace(path=fault.path[:-1], kind="too_short")
-        if fault.kind == "missing" and isinstance(fault.path[-1], int)
+        fault._replace(path=fault.path[:-1], error_type="too_short")
+        if fault.error_type == "missing" and isinstance(fault.path[-1], int)
         else fault
         for fault in faults
     ]
     parents = {fault.path[:n] for fault in merged for n in range(len(fault.path))}
-    return (fault for fault in merged if fault.kind != "too_short" or fault.path not in parents)
+    return (fault for fault in merged if fault.error_type != "too_short" or fault.path not in parents)
 
 
 def _message(fault: _Fault, data: Any) -> str:
-    """Say what is wrong and what is expected."""
-    if fault.kind == REFUSED:
+    """Format a fault with the allowed values."""
+    if fault.error_type == SCENE_FAULT:
         return fault.text
-    if fault.kind == "missing":
+    if fault.error_type == "missing":
         return f"missing; expected {fault.expects}"
-    if fault.kind == "extra_forbidden":
+    if fault.error_type == "extra_forbidden":
         return _unknown(str(fault.path[-1]), list(fault.section.model_fields))
     for part in fault.path:
         data = data[part]
     limit = fault.context.get("ge", fault.context.get("le"))
-    if limit in (LARGEST, -LARGEST) or (limit == SMALLEST and data > 0):
-        return f"{flow(data)} is out of range; numbers are from {SMALLEST:g} to {LARGEST:g} in size"
-    near = did_you_mean(data, fault.words) if isinstance(data, str) else ""
-    return f"{flow(data)} is not allowed; expected {fault.expects}{near}"
+    if limit in (MAX_MAGNITUDE, -MAX_MAGNITUDE) or (limit == MIN_MAGNITUDE and data > 0):
+        return f"{format_value(data)} is out of range; numbers are from {MIN_MAGNITUDE:g} to {MAX_MAGNITUDE:g} in size"
+    hint = did_you_mean(data, fault.words) if isinstance(data, str) else ""
+    return f"{format_value(data)} is not allowed; expected {fault.expects}{hint}"
 
 
 def _unknown(name: str, known: Sequence[str]) -> str:
     return "unknown key" + (did_you_mean(name, known) or f"; allowed: {', '.join(known)}")
 
 
-MAX_POINTS = 4096
+# Limits of the scene's numbers.
+MAX_POINTS = 4096  # rows or columns of mass points
 MAX_PROBES = 16
-MAX_PIXELS = 8192
+MAX_PIXELS = 8192  # width or height of a frame
 MAX_REFINE = 64
 MAX_TRACKS = 256
-MAX_RELIEF = 10
+MAX_RELIEF = 10  # [%]
 MAX_SUPERSAMPLE = 4
 
-# The smallest field of view [degrees]. Directions that differ by less than 2^-24, 3.4e-6 degrees, are one in f32; so a
-# narrower picture would have fewer than about 300 distinct rows.
+# Minimum field of view [degrees]. In f32, directions are resolved to 2^-24, which is 3.4e-6 degrees; a narrower picture
+# would have fewer than about 300 distinct rows.
 MIN_FOV = 1e-3
 
-# Operating systems limit the length of a path to about this.
+# Approximate limit of operating systems for the length of a path.
 MAX_PATH = 4096
 
-# The offset of a probe in the paper (eq. 5).
+# Offset of a probe in the paper (eq. 5).
 DEFAULT_OFFSET = 10.0
 
-# Times that differ by less than this fraction of a frame are one instant: 0.1 s x 30 /s is 3 frames.
-WHOLE = 1e-6
+# Times that differ by less than this fraction of a frame are equal, so that 0.1 s at 30 frames/s is 3 frames.
+FRAME_TOLERANCE = 1e-6
 
-# Below the first, rounding in f64 is no longer small beside the error; above the second, the result means nothing.
-SMALLEST_TOLERANCE = 1e-10
-LARGEST_TOLERANCE = 0.5
+# Below the minimum, the error is no longer large compared with rounding in f64; above the maximum, the result is
+# meaningless.
+MIN_TOLERANCE = 1e-10
+MAX_TOLERANCE = 0.5
 
-Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-LARGEST, le=LARGEST)]
-Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=SMALLEST, le=LARGEST)]
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_MAGNITUDE, le=MAX_MAGNITUDE)]
+Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=MIN_MAGNITUDE, le=MAX_MAGNITUDE)]
 NotNegative = Annotated[Number, Field(ge=0)]
-Whole = Annotated[int, Field(strict=True)]
-Tolerance = Annotated[Number, Field(ge=SMALLEST_TOLERANCE, le=LARGEST_TOLERANCE)]
-Count = Annotated[Whole, Field(ge=2, le=MAX_POINTS)]
-Pixels = Annotated[Whole, Field(ge=1, le=MAX_PIXELS)]
-Byte = Annotated[Whole, Field(ge=0, le=255)]
+Integer = Annotated[int, Field(strict=True)]
+Tolerance = Annotated[Number, Field(ge=MIN_TOLERANCE, le=MAX_TOLERANCE)]
+NodeCount = Annotated[Integer, Field(ge=2, le=MAX_POINTS)]
+Pixels = Annotated[Integer, Field(ge=1, le=MAX_PIXELS)]
+Byte = Annotated[Integer, Field(ge=0, le=255)]
 FilePath = Annotated[str, Field(strict=True, min_length=1, max_length=MAX_PATH)]
-Share = Annotated[Number, Field(ge=0, le=1)]
+UnitInterval = Annotated[Number, Field(ge=0, le=1)]
 Side = Literal["top", "bottom", "left", "right"]
 Vector = tuple[Number, Number, Number]
-# A tool may come from beyond the edge; larger numbers are taken for pixels given by mistake, and refused.
-Fraction = Annotated[Number, Field(ge=-1, le=2)]
+# Position on the sheet as a fraction of its width or height. A tool may come from beyond the edge, but much larger
+# numbers are probably pixels.
+SheetFraction = Annotated[Number, Field(ge=-1, le=2)]
 
 
-def key(default: Any, means: str, expects: str) -> Any:
-    """Describe one key: its default (... where it is required), what it means, and what errors say that it may hold."""
-    return Field(default, description=means, json_schema_extra={"expects": expects})
+def key(default: Any, description: str, expects: str) -> Any:
+    """Declare a key of a section.
+
+    Args:
+        default: default value; ... for a required key.
+        description: meaning with the unit, for the documentation and the schema.
+        expects: allowed values, for messages after "expected".
+    """
+    return Field(default, description=description, json_schema_extra={"expects": expects})
 
 
 if TYPE_CHECKING:
@@ -244,8 +286,11 @@ else:
     OutputName = Literal[tuple(OUTPUTS)]
 
 
-class _Checked(ModelMetaclass):
-    """Makes the sections that a caller asks for; pydantic makes those inside them, and collects their faults."""
+class _SectionMeta(ModelMetaclass):
+    """Metaclass that converts pydantic's errors of a constructor call to a SceneError.
+
+    Pydantic does not call it for nested sections, and collects their errors in that of the outer section.
+    """
 
     def __call__(cls: type[BaseModel], /, *values: Any, **keys: Any) -> Any:  # type: ignore[misc]  # noqa: N805
         if values:
@@ -253,21 +298,31 @@ class _Checked(ModelMetaclass):
         try:
             return super().__call__(**keys)  # type: ignore[misc]
         except ValidationError as error:
-            raise SceneError([str(problem) for problem in section.key_problems(error, cls, keys)]) from None
+            raise SceneError([str(problem) for problem in key_problems(error, cls, keys)]) from None
 
 
-class Section(BaseModel, metaclass=_Checked):
-    """A section of the scene: immutable, and strict about its keys.
+class Section(BaseModel, metaclass=_SectionMeta):
+    """Base class of the sections of a scene, which are immutable.
 
     Raises:
-        SceneError: when a key is unknown, missing or wrong, here and in `model_copy`; when a key is assigned to.
+        SceneError: when a key is unknown, missing or invalid, in the constructor and in `model_copy`, and when a key
+            is assigned to.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """Copy the section, with other values for some keys."""
-        del deep  # The values are immutable, so a shallow copy is as good.
+        """Return a copy of the section with some keys replaced.
+
+        Args:
+            update: new values by keys.
+            deep: ignored, as the values are immutable.
+
+        Raises:
+            ArgumentError: when `update` is not a mapping from texts.
+            SceneError: when a key is unknown or a value is invalid.
+        """
+        del deep
         if not (update is None or (isinstance(update, Mapping) and all(isinstance(name, str) for name in update))):
             raise ArgumentError(f"update: {update!r}; take a mapping from keys to values")
         return type(self)(**{**{name: getattr(self, name) for name in self.model_fields_set}, **(update or {})})

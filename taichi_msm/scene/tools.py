@@ -1,7 +1,8 @@
-"""taichi_msm.scene.scene.tools."""
+"""Sections of the tools."""
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Annotated, Any
 
 from pydantic import (
@@ -17,40 +18,44 @@ from typing_extensions import Self
 
 from taichi_msm.scene.section import (
     DEFAULT_OFFSET,
-    SMALLEST,
-    Fraction,
+    MIN_MAGNITUDE,
     NotNegative,
     Number,
     Positive,
     Section,
+    SheetFraction,
     Vector,
     key,
-    refused,
+    scene_fault,
 )
 
 
 class Instrument(Section):
-    """A metal rod with a rounded tip: what touches the sheet along a path; of a force what is drawn at its place."""
+    """Metal capsule, which touches the sheet if the tool is position-controlled, and is only drawn otherwise."""
 
-    radius: Positive = key(..., "radius of the rod [m]", "a number above 0, in metres")
-    shaft: Vector = key(..., "direction from the tip along the rod", "three numbers, not all 0: [x, y, z]")
-    length: Positive = key(..., "length of the rod [m]", "a number above 0, in metres")
+    radius: Positive = key(..., "radius of the capsule [m]", "a number above 0, in metres")
+    shaft: Vector = key(..., "direction from the tip along the capsule", "three numbers, not all 0: [x, y, z]")
+    length: Positive = key(..., "length of the capsule [m]", "a number above 0, in metres")
 
     @field_validator("shaft", mode="after")
     @classmethod
-    def _leads_somewhere(cls, shaft: Vector) -> Vector:
-        if not any(abs(number) >= SMALLEST for number in shaft):
-            raise refused("has no direction; take one such as [0.3, -0.5, 1]")
+    def _check_not_zero(cls, shaft: Vector) -> Vector:
+        if not any(abs(number) >= MIN_MAGNITUDE for number in shaft):
+            raise scene_fault("has no direction; take one such as [0.3, -0.5, 1]")
         return shaft
 
 
-# The keys of a probe that only a tool with a force has, and only one with a path.
-_OF_FORCE = {"at", "total", "force", "load", "falloff", "radius", "offset"}
-_OF_PATH = {"friction", "grip"}
+# Keys that only a force-controlled tool has, and those that only a position-controlled tool has.
+_FORCE_KEYS = {"at", "total", "force", "load", "falloff", "radius", "offset"}
+_PATH_KEYS = {"friction", "grip"}
+
+# Keyframes of a path: t [s], across, down, height [m]; and of a control point: t [s], across, down.
+PathKeyframe = tuple[Number, SheetFraction, SheetFraction, Number]
+PointKeyframe = tuple[Number, SheetFraction, SheetFraction]
 
 
 class Probe(Section):
-    """A tool: a force and where and when it acts (eq. 5), or the path of a rod that touches the sheet."""
+    """Tool, either force-controlled (eq. 5) or position-controlled along a path."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -58,30 +63,30 @@ class Probe(Section):
         }
     )
 
-    path: Annotated[tuple[tuple[Number, Fraction, Fraction, Number], ...], Field(min_length=1)] | None = key(
+    path: Annotated[tuple[PathKeyframe, ...], Field(min_length=1)] | None = key(
         None,
-        "in place of a force: where the instrument is; keys [[t, across, down, height], ...], linear between, held "
-        "outside; height: of the lowest point of its round tip above the sheet at rest [m]",
+        "in place of a force: position of the instrument; keyframes [[t, across, down, height], ...], linear between, "
+        "constant outside; height: of the lowest point of its round tip above the sheet at rest [m]",
         "keys [[t, across, down, height], ...], t in seconds, across and down from -1 to 2, height in metres",
     )
-    at: tuple[Fraction, Fraction] | Annotated[tuple[tuple[Number, Fraction, Fraction], ...], Field(min_length=1)] = key(
+    at: tuple[SheetFraction, SheetFraction] | Annotated[tuple[PointKeyframe, ...], Field(min_length=1)] = key(
         (0.5, 0.5),
         "control point: fraction of the width from the left, of the height from the top; "
-        "or keys [[t, across, down], ...], linear between, held outside",
+        "or keyframes [[t, across, down], ...], linear between, constant outside",
         "[across, down], fractions from -1 to 2, or keys [[t, across, down], ...]",
     )
     total: Vector | None = key(
-        None, "force of the whole tool on a wide sheet at 100 % [N]", "three numbers: [x, y, z] in newtons"
+        None, "total force of the tool on a wide sheet at 100 % [N]", "three numbers: [x, y, z] in newtons"
     )
     force: Vector | None = key(
         None,
-        "with springs, instead of total: force on one point at 100 %, before decay and offset [N]",
+        "with springs, instead of total: force on a mass point at 100 %, before decay and offset [N]",
         "three numbers: [x, y, z] in newtons",
     )
     load: Annotated[tuple[tuple[Number, Number], ...], Field(min_length=1)] = key(
         ((0.0, 100.0),),
-        "keys [t, percent], linear between; 0 before the first, the last value after the last; "
-        "two keys at one time are a jump",
+        "keyframes [t, percent], linear between; 0 before the first, the last value after the last; "
+        "two keyframes at the same time are a jump",
         "keys [[t, percent], ...], t in seconds",
     )
     falloff: NotNegative = key(
@@ -99,7 +104,7 @@ class Probe(Section):
     )
     instrument: Instrument | None = key(
         None,
-        "the rod that is drawn for the tool; with path it is what touches the sheet, and required",
+        "capsule that is drawn for the tool; with path it touches the sheet, and is required",
         "a mapping with radius, shaft and length",
     )
     friction: NotNegative = key(
@@ -107,95 +112,98 @@ class Probe(Section):
     )
     grip: tuple[tuple[Number, Number], ...] = key(
         (),
-        "with path: times [[from, to], ...] [s] between which the tip holds the tissue that it is at",
+        "with path: times [[from, to], ...] [s] between which the tip holds the tissue below it",
         "pairs of times [[from, to], ...], in seconds",
     )
 
     @property
     def moved(self) -> bool:
-        """Whether the tool is moved along a path; else it exerts a force."""
+        """Whether the tool is position-controlled, by a path, rather than force-controlled."""
         return self.path is not None
 
     @field_validator("force", mode="after")
     @classmethod
-    def _one_force(cls, force: Vector | None, info: ValidationInfo) -> Vector | None:
+    def _check_one_force(cls, force: Vector | None, info: ValidationInfo) -> Vector | None:
         if not {"path", "total"} <= info.data.keys():
-            return force  # A fault of its own.
+            return force  # A fault of these keys is reported separately.
         total = info.data["total"]
         if force is None and total is None and info.data["path"] is None:
-            raise refused(
+            raise scene_fault(
                 "missing; expected total (whole tool) or, with springs, force (one point): [x, y, z] in newtons; or "
                 "path, for a tool that is moved"
             )
         if force is not None and total is not None:
-            raise refused("is given together with total; remove one of them")
+            raise scene_fault("is given together with total; remove one of them")
         return force
 
     @field_validator("falloff", "offset", mode="after")
     @classmethod
-    def _fit_total(cls, value: float, info: ValidationInfo) -> float:
+    def _check_fits_total(cls, value: float, info: ValidationInfo) -> float:
         if info.data.get("total") is not None:
-            if info.field_name == "falloff" and value < SMALLEST:
-                raise refused(f"{value:g} would spread total over an infinite area; take a number above 0, in 1/m")
+            if info.field_name == "falloff" and value < MIN_MAGNITUDE:
+                raise scene_fault(f"{value:g} would spread total over an infinite area; take a number above 0, in 1/m")
             if info.field_name == "offset" and value != DEFAULT_OFFSET:
-                raise refused("goes with force, not with total; remove offset")
+                raise scene_fault("goes with force, not with total; remove offset")
         return value
 
     @field_validator("at", "load", mode="after")
     @classmethod
-    def _in_order(cls, keys: tuple[Any, ...]) -> tuple[Any, ...]:
-        if not isinstance(keys[0], tuple):
-            return keys
-        times = [entry[0] for entry in keys]
+    def _check_order(cls, keyframes: tuple[Any, ...]) -> tuple[Any, ...]:
+        if not isinstance(keyframes[0], tuple):
+            return keyframes  # A constant control point.
+        times = [keyframe[0] for keyframe in keyframes]
         for n in range(1, len(times)):
             if times[n] < times[n - 1]:
-                raise refused(f"goes back in time, from {times[n - 1]:g} s to {times[n]:g} s; sort the keys by time", n)
+                raise scene_fault(
+                    f"goes back in time, from {times[n - 1]:g} s to {times[n]:g} s; sort the keys by time", n
+                )
             if n > 1 and times[n] == times[n - 2]:
-                raise refused(
+                raise scene_fault(
                     f"third key at {times[n]:g} s; a jump is two keys at one time, so remove the middle one", n
                 )
-        return keys
+        return keyframes
 
     @field_validator("path", mode="after")
     @classmethod
-    def _goes_forward(cls, path: tuple[tuple[float, ...], ...] | None) -> tuple[tuple[float, ...], ...] | None:
-        for n in range(1, len(path or ())):
-            assert path is not None
-            before, now = path[n - 1][0], path[n][0]
-            if now <= before:
-                raise refused(
-                    f"is at {now:g} s, and the key before it at {before:g} s; sort the keys, each later than the last",
+    def _check_times_increase(cls, path: tuple[tuple[float, ...], ...] | None) -> tuple[tuple[float, ...], ...] | None:
+        for n, ((previous, *_), (time, *_)) in enumerate(pairwise(path or ()), 1):
+            if time <= previous:
+                raise scene_fault(
+                    f"is at {time:g} s, and the key before it at {previous:g} s; "
+                    "sort the keys, each later than the last",
                     n,
                 )
         return path
 
     @field_validator("grip", mode="after")
     @classmethod
-    def _one_grip_at_a_time(cls, grip: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+    def _check_grips_are_separate(cls, grip: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
         for n, (begin, end) in enumerate(grip):
             if end <= begin:
-                raise refused(f"ends at {end:g} s, and begins at {begin:g} s; give [from, to] in this order", n)
+                raise scene_fault(f"ends at {end:g} s, and begins at {begin:g} s; give [from, to] in this order", n)
             if n and begin < grip[n - 1][1]:
-                raise refused(f"begins at {begin:g} s, before the grip before it ends; sort them, without overlap", n)
+                raise scene_fault(
+                    f"begins at {begin:g} s, before the grip before it ends; sort them, without overlap", n
+                )
         return grip
 
     @model_validator(mode="after")
-    def _one_kind(self) -> Self:
+    def _check_kind(self) -> Self:
         given = self.model_fields_set
         if self.path is None:
-            for name in _OF_PATH & given:
+            for name in _PATH_KEYS & given:
                 if getattr(self, name):
-                    raise refused("goes with path; a tool with a force has none", name)
+                    raise scene_fault("goes with path; a tool with a force has none", name)
             return self
-        for name in sorted(_OF_FORCE & given):
+        for name in sorted(_FORCE_KEYS & given):
             if getattr(self, name) is not None:
-                raise refused("goes with a force, and path gives the place; remove one of them", name)
+                raise scene_fault("goes with a force, and path gives the place; remove one of them", name)
         if self.instrument is None:
-            raise refused("missing; with path expected a mapping with radius, shaft and length", "instrument")
+            raise scene_fault("missing; with path expected a mapping with radius, shaft and length", "instrument")
         return self
 
     @model_serializer(mode="wrap")
-    def _own_keys(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out the keys of the other kind of tool, which would be refused when they are read again."""
-        others = (_OF_PATH | {"path"}) if self.path is None else _OF_FORCE
-        return {name: value for name, value in dump(self).items() if name not in others}
+    def _dump_kind(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Omit the keys of the other kind of tool, which would be invalid when the scene is read again."""
+        omitted = (_PATH_KEYS | {"path"}) if self.path is None else _FORCE_KEYS
+        return {name: value for name, value in dump(self).items() if name not in omitted}

@@ -34,7 +34,7 @@ from taichi_msm.model.sheet import (
 from taichi_msm.model.time_grid import TimeGrid
 from taichi_msm.model.tools import MAX_STRIDE_RADII, Tool, build_tools, path_problems, too_fast
 from taichi_msm.scene.scene import Scene, Time
-from taichi_msm.scene.section import WHOLE
+from taichi_msm.scene.section import FRAME_TOLERANCE
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Probe
 from taichi_msm.terms import derive_material, highest_frequency
@@ -290,7 +290,7 @@ def _step_problems(plan: Plan) -> Iterator[Problem]:
         below = frame / math.ceil(frame / limit)
         text = f"{given:g} s is above the stability limit {limit:.6g} s; try {below:.9g}, or auto"
         yield Problem(("time", "step"), text)
-    elif abs(frame / given - round(frame / given)) > WHOLE * max(1.0, frame / given):
+    elif abs(frame / given - round(frame / given)) > FRAME_TOLERANCE * max(1.0, frame / given):
         text = f"{given:g} s does not divide a frame of {frame:.9g} s; try {frame / math.ceil(frame / given):.9g}"
         yield Problem(("time", "step"), text)
     if plan.grid.precision == "f64":
@@ -385,7 +385,7 @@ class _PathChange:
     def __init__(self, plan: Plan, index: int, before: Probe, given: Probe, now: float) -> None:
         self.index, self._plan, self._before, self._given, self._now = index, plan, before, given, now
         # Times that differ by less are equal up to rounding [s].
-        self._time_tolerance = WHOLE / plan.grid.frames_per_second
+        self._time_tolerance = FRAME_TOLERANCE / plan.grid.frames_per_second
         assert before.path is not None
         assert given.path is not None
         self._past, h = _past(before.path, now, self._time_tolerance), plan.grid.step

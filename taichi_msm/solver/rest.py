@@ -31,7 +31,7 @@ from taichi_msm.model.loads import evaluate_frame_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.tools import GRIP_RADII, Tool, grip_frames
-from taichi_msm.scene.section import SMALLEST
+from taichi_msm.scene.section import MIN_MAGNITUDE
 from taichi_msm.solver.arrays import InitialData, SheetLayout
 from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.solver.kernel_rest import Relaxation
@@ -139,7 +139,7 @@ class QuasiStatics(Dynamics):
     def _started(self, start: InitialData) -> Any:
         self._interrupted = False
         # A mass point without stiffness would have mass 0.
-        self._masses = np.maximum(fictitious_masses(self.plan), SMALLEST)
+        self._masses = np.maximum(fictitious_masses(self.plan), MIN_MAGNITUDE)
         return Relaxation(self.layout, start, self._masses)
 
     @property

@@ -26,7 +26,7 @@ from pydantic import BaseModel
 from taichi_msm.accuracy.divergence import farthest_displacement
 from taichi_msm.accuracy.mesh import FEWEST, CubicSampling, MeshPilot, companion, with_points
 from taichi_msm.accuracy.time_step import longest
-from taichi_msm.errors import Count
+from taichi_msm.errors import ProgressCallback
 from taichi_msm.load import cost
 from taichi_msm.model.loads import Schedule, evaluate_loads, keyframe_times
 from taichi_msm.model.plan import Plan
@@ -68,7 +68,9 @@ class SteppingStudy:
         frames: displacements of the reference at every frame but the first [m], shape (F, rows, cols, 3).
     """
 
-    def __init__(self, plan: Plan, device: Device, longest_run: float, study: Study, progress: Count) -> None:
+    def __init__(
+        self, plan: Plan, device: Device, longest_run: float, study: Study, progress: ProgressCallback
+    ) -> None:
         self.plan = plan
         self._plans = {
             difference: plan_variant(plan, with_time(plan.scene, damping_difference=difference, step="auto"))
@@ -215,7 +217,9 @@ class PointStudy:
     raise KeyboardInterrupt: they stay.
     """
 
-    def __init__(self, plan: Plan, device: Device, longest_run: float, study: Study, progress: Count) -> None:
+    def __init__(
+        self, plan: Plan, device: Device, longest_run: float, study: Study, progress: ProgressCallback
+    ) -> None:
         scene = with_time(plan.scene, step="auto", tolerance=None, precision="f64")
         self._plan = plan_variant(plan, with_points(scene, scene.sheet.points))
         self._device, self._longest_run, self._study, self._progress = device, longest_run, study, progress
@@ -406,7 +410,7 @@ Picture = NDArray[np.uint8]
 
 
 def measure_pictures(
-    scene: Scene, position: NDArray[Any], texture: Picture, quick: bool, study: Study, progress: Count
+    scene: Scene, position: NDArray[Any], texture: Picture, quick: bool, study: Study, progress: ProgressCallback
 ) -> None:
     """Draw the reference picture, then every setting, taking turns; `quick` varies the settings one at a time.
 
@@ -470,7 +474,7 @@ TISSUE_TERMS: dict[str, float | None] = {
 }
 
 
-def measure_terms(plan: Plan, device: Device, sample: float, study: Study, progress: Count) -> None:
+def measure_terms(plan: Plan, device: Device, sample: float, study: Study, progress: ProgressCallback) -> None:
     """Measure the time of a step with each term left out in turn, in samples of about so many seconds."""
     # All variants have the steps of the whole scene: without a spring the automatic step would be another.
     grid = {"steps_per_frame": plan.grid.steps_per_frame, "precision": plan.grid.precision}

@@ -26,14 +26,14 @@ from taichi_msm.plot_style import (
     GREEN,
     GREY,
     INK,
-    NARROW,
+    ONE_COLUMN_WIDTH,
     ORANGE,
     PURPLE,
     SILVER,
     SKY,
     STYLE,
+    TWO_COLUMN_WIDTH,
     VERMILION,
-    WIDE,
 )
 from taichi_msm.study.format import mostly_rounding, number, unit, where
 from taichi_msm.study.result import Drawn, Peer, Points, Stepping, Study
@@ -89,7 +89,7 @@ def _drawable(value: float | None) -> bool:
 def _figure(study: Study) -> Figure:
     every = list(panels(study))
     layout = LAYOUTS[len(every)]
-    size = (WIDE if len(every) > 1 else NARROW, 4.2 * (layout.count(";") + 1) + 0.5)
+    size = (TWO_COLUMN_WIDTH if len(every) > 1 else ONE_COLUMN_WIDTH, 4.2 * (layout.count(";") + 1) + 0.5)
     figure = Figure(figsize=size, dpi=DPI, layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1, wspace=0.05))
     FigureCanvasAgg(figure)
     versions = study.machine["versions"]

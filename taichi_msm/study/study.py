@@ -8,8 +8,8 @@ from contextlib import closing
 from functools import partial
 from typing import Any, NamedTuple
 
-from taichi_msm.errors import Progress, SceneError
-from taichi_msm.load.check import checked
+from taichi_msm.errors import SceneError, StageProgressCallback
+from taichi_msm.load.check import check_scene
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.render.texture import load_texture
@@ -60,7 +60,7 @@ def study(
     quick: bool = False,
     arch: str = "cpu",
     threads: int | None = None,
-    progress: Progress = lambda stage, done, total: None,
+    progress: StageProgressCallback = lambda stage, done, total: None,
 ) -> Study:
     """Measure the cost and the error of the settings of a scene on this machine, under a name for the report.
 
@@ -72,7 +72,7 @@ def study(
         SceneError: when the picture cannot be decoded, or the trajectories do not fit in memory.
         DeviceError: when the arch is not there.
     """
-    given, device = checked(scene), runtime.start(arch, threads)
+    given, device = check_scene(scene), runtime.start(arch, threads)
     scene = given.scene
     if scene.time.at_rest:
         raise SceneError(["time.motion: quasistatic takes no steps, which a study compares; set time.motion: dynamic"])
@@ -134,7 +134,9 @@ def _require_memory(scene: Scene) -> None:
         raise SceneError([said])
 
 
-def _measure_peer(plan: Plan, stepping: SteppingStudy, effort: Effort, results: Study, progress: Progress) -> None:
+def _measure_peer(
+    plan: Plan, stepping: SteppingStudy, effort: Effort, results: Study, progress: StageProgressCallback
+) -> None:
     """Solve by DOP853 at several tolerances, each as many times as time allows, up to 5."""
     assert results.reference is not None
     if plan.tools:

@@ -24,9 +24,9 @@ from distributed.client import ClosedClientError
 from distributed.comm import connect
 from distributed.utils import LoopRunner, silence_logging_cmgr
 
-from taichi_msm.errors import ExecutorError, LostExecutorError, MsmError, Progress
-from taichi_msm.images import copied
-from taichi_msm.scene.outputs import SWEEP
+from taichi_msm.errors import ExecutorError, LostExecutorError, MsmError, StageProgressCallback
+from taichi_msm.images import use_copies
+from taichi_msm.scene.outputs import SWEEP_RECORD
 from taichi_msm.sweeps.runs import Outcome, RunTask, execute_run
 from taichi_msm.sweeps.spec import Sweep
 from taichi_msm.system.compiler import result_versions, versions
@@ -101,7 +101,7 @@ class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
         if (threads := worker.state.nthreads) != 1:
             return f"worker {worker.address} has {threads} threads; start it with one: dask worker --nthreads 1"
         # Results that a worker writes into a local directory would be lost.
-        if not (self.directory / SWEEP).is_file():
+        if not (self.directory / SWEEP_RECORD).is_file():
             return f"worker {worker.address} does not see {self.directory}; choose an --out that all machines share"
         installed = versions()
         if missing := [
@@ -166,7 +166,7 @@ def _cancel(result: Future[Any]) -> None:
 
 def _call(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
     """Call a function in a worker, which reads its local copies of the files."""
-    with copied(_inputs(name).copies):
+    with use_copies(_inputs(name).copies):
         return function(*arguments)
 
 
@@ -192,7 +192,7 @@ def _inputs(name: str) -> Inputs:
 
 
 @contextmanager
-def cluster_connection(address: str, sweep: Sweep, directory: Path, progress: Progress) -> Iterator[Cluster]:
+def cluster_connection(address: str, sweep: Sweep, directory: Path, progress: StageProgressCallback) -> Iterator[Cluster]:
     """Connect to a scheduler, and provide its workers with the inputs of a sweep until the block ends.
 
     Args:
@@ -262,7 +262,7 @@ def _register_inputs(inputs: Inputs, name: str, client: Any) -> None:
         raise ExecutorError(f"a worker cannot take runs: {error}; install there what is here") from None
 
 
-def _wait_for_worker(client: Any, progress: Progress) -> None:
+def _wait_for_worker(client: Any, progress: StageProgressCallback) -> None:
     try:
         while not client.nthreads():
             progress("workers", 0, 0)

@@ -28,8 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
-from taichi_msm.errors import FilesError, Progress, printable
-from taichi_msm.plot_style import BLUE, DPI, GREY, INK, NARROW, ORANGE, PALE, STYLE, VERMILION
+from taichi_msm.errors import FilesError, StageProgressCallback, printable
+from taichi_msm.plot_style import BLUE, DPI, GREY, INK, ONE_COLUMN_WIDTH, ORANGE, PALE, STYLE, VERMILION
 from taichi_msm.runs.directory import replacing
 from taichi_msm.runs.finished import read_run, reading
 from taichi_msm.sweeps.runs import CONTACT, POLL_INTERVAL_S, SweepResult
@@ -91,7 +91,7 @@ def _figure(data: PlotData) -> Figure:
 
     indices = {(index.result, index.parameter): index for index in data.indices}
     parameters = _most_sensitive(data)
-    width = max(LEFT_MARGIN_IN + PANEL_WIDTH_IN * len(parameters), NARROW)
+    width = max(LEFT_MARGIN_IN + PANEL_WIDTH_IN * len(parameters), ONE_COLUMN_WIDTH)
     height = TOP_MARGIN_IN + PANEL_HEIGHT_IN * len(data.results)
     figure = Figure(figsize=(width, height), dpi=DPI, layout=ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.06))
     FigureCanvasAgg(figure)
@@ -219,7 +219,9 @@ class Tile(NamedTuple):
     caption: list[str]  # parts between which lines may break
 
 
-def write_contact_sheet(result: SweepResult, executor: Executor, progress: Progress) -> tuple[list[str], list[str]]:
+def write_contact_sheet(
+    result: SweepResult, executor: Executor, progress: StageProgressCallback
+) -> tuple[list[str], list[str]]:
     """Write the contact sheet, if any run has a frame.
 
     Args:
@@ -263,7 +265,7 @@ def draw_last_frame(directory: Path) -> NDArray[np.uint8]:
 
 
 def _last_frames(
-    directories: dict[int, Path], executor: Executor, progress: Progress
+    directories: dict[int, Path], executor: Executor, progress: StageProgressCallback
 ) -> tuple[dict[int, Image.Image], list[str]]:
     """Read or draw the last frames of complete runs; returns them by run, and the errors."""
     frames: dict[int, Image.Image] = {}

@@ -23,13 +23,13 @@ from taichi_msm.errors import (
     LostExecutorError,
     MsmError,
     Pause,
-    Progress,
     SceneError,
+    StageProgressCallback,
     writing,
 )
-from taichi_msm.load.scene_file import File, plan_file
+from taichi_msm.load.scene_file import ParsedFile, plan_file
 from taichi_msm.runs.directory import FILE, FOLDER, MAX_RECORD, give_name, kind, lock, require, staged
-from taichi_msm.scene.outputs import RECORD, RUNS, SWEEP, numbered
+from taichi_msm.scene.outputs import RUN_RECORD, RUNS_FOLDER, SWEEP_RECORD, zero_padded
 from taichi_msm.sweeps.pool import DiedError
 from taichi_msm.sweeps.spec import Sweep
 from taichi_msm.system.compiler import result_versions, versions
@@ -52,11 +52,11 @@ def register_sweep(directory: Path, sweep: Sweep) -> list[list[Any]]:
         SceneError: when the directory holds another sweep, or the same sweep of versions with other results.
         FilesError: when the directory cannot be read or written, contains other files, or is damaged.
     """
-    record = require(directory / SWEEP, FILE)
-    require(directory / RUNS, FOLDER)
+    record = require(directory / SWEEP_RECORD, FILE)
+    require(directory / RUNS_FOLDER, FOLDER)
     description, values = sweep.description(), sweep.values()
     if not record.exists():
-        for name in (RUNS, *REPORT_FILES, RECORD):
+        for name in (RUNS_FOLDER, *REPORT_FILES, RUN_RECORD):
             if (directory / name).exists():
                 raise ForeignError.at(directory / name, "something")
         content = {
@@ -67,8 +67,8 @@ def register_sweep(directory: Path, sweep: Sweep) -> list[list[Any]]:
             "values": values,
         }
         with writing(directory), staged(directory) as hidden:
-            (hidden / SWEEP).write_text(json.dumps(content) + "\n", encoding="utf-8", errors="backslashreplace")
-            give_name(hidden / SWEEP, record)  # unless another shard has just done so
+            (hidden / SWEEP_RECORD).write_text(json.dumps(content) + "\n", encoding="utf-8", errors="backslashreplace")
+            give_name(hidden / SWEEP_RECORD, record)  # unless another shard has just done so
     # Values are compared as text: 1 differs from 1.0, and NaN equals itself.
     expected_values = json.dumps(values)
     try:
@@ -160,8 +160,8 @@ def read_outcome(task: RunTask, sweep: Sweep) -> Outcome | None:
     """
     # A damaged record counts as missing, so the run is repeated.
     with suppress(OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        if kind(task.directory / RECORD) == FILE:
-            with (task.directory / RECORD).open("rb") as file:
+        if kind(task.directory / RUN_RECORD) == FILE:
+            with (task.directory / RUN_RECORD).open("rb") as file:
                 record = json.loads(file.read(MAX_RECORD))
             has_same_overrides = tuple(record["overrides"]) == task.overrides
             has_same_files = sweep.digests.issuperset(record["sha256"].values())
@@ -181,7 +181,7 @@ def report_lock(directory: Path, pause: Pause) -> Iterator[None]:
     with ExitStack() as stack:
         while True:
             try:
-                stack.enter_context(lock(directory / SWEEP))
+                stack.enter_context(lock(directory / SWEEP_RECORD))
                 break
             except BlockingIOError:
                 pause()
@@ -257,7 +257,7 @@ class RunTask(NamedTuple):
     """A run of a sweep that is to be executed."""
 
     run: int  # number of the run, from 0
-    scene: File
+    scene: ParsedFile
     overrides: tuple[str, ...]
     folder: Path  # directory of the sweep
     home: Path  # current directory for relative paths
@@ -265,10 +265,10 @@ class RunTask(NamedTuple):
     @property
     def directory(self) -> Path:
         """The directory of the run's results."""
-        return self.folder / RUNS / numbered(self.run)
+        return self.folder / RUNS_FOLDER / zero_padded(self.run)
 
 
-def execute_run(task: RunTask, progress: Progress = lambda stage, done, total: None) -> Outcome:
+def execute_run(task: RunTask, progress: StageProgressCallback = lambda stage, done, total: None) -> Outcome:
     """Run a scene with its overrides on one thread, as `run --set` does.
 
     Args:
@@ -400,7 +400,7 @@ class SweepResult:
 
     def run_directory(self, run: int) -> Path:
         """Return the directory of a run."""
-        return self.directory / RUNS / numbered(run)
+        return self.directory / RUNS_FOLDER / zero_padded(run)
 
     def sample_runs(self, limit: int) -> list[int]:
         """Return the numbers of at most `limit` runs, evenly spread over all runs."""

@@ -21,23 +21,33 @@ from pydantic import ConfigDict, Field, field_validator, model_validator
 from typing_extensions import Self
 
 from taichi_msm.errors import ArgumentError, Key, Problem, SceneError
-from taichi_msm.images import SUFFIXES, PictureError, file_sha256
-from taichi_msm.load.check import parse
+from taichi_msm.images import PICTURE_SUFFIXES, PictureError, file_sha256
+from taichi_msm.load.check import parse_model
 from taichi_msm.load.scene_file import (
-    PICTURES,
-    SCENE,
+    PICTURE_KEYS,
+    SCENE_KIND,
     Draft,
-    File,
-    Kind,
+    FileKind,
+    ParsedFile,
     is_below,
     names_file,
     parse_key,
     parse_override,
     read_file,
 )
-from taichi_msm.load.yaml_reader import UnreadableError, read
+from taichi_msm.load.yaml_reader import UnreadableError, read_yaml
 from taichi_msm.scene.scene import Scene
-from taichi_msm.scene.section import LARGEST, MAX_PATH, FilePath, Section, Whole, cut, flow, key, refused
+from taichi_msm.scene.section import (
+    MAX_MAGNITUDE,
+    MAX_PATH,
+    FilePath,
+    Integer,
+    Section,
+    format_value,
+    key,
+    scene_fault,
+    truncate,
+)
 
 MAX_RUNS = 10**7
 
@@ -49,12 +59,12 @@ class SweepSettings(Section):
     """Content of a sweep file."""
 
     scene: FilePath = key(..., "the scene file; relative to the sweep file", "the path of a scene file")
-    samples: Annotated[Whole, Field(ge=1, le=MAX_RUNS)] | None = key(
+    samples: Annotated[Integer, Field(ge=1, le=MAX_RUNS)] | None = key(
         None,
         "number of runs, whose values are taken from a scrambled Sobol sequence; not with grids",
         f"a whole number, 1 to {MAX_RUNS}",
     )
-    seed: Annotated[Whole, Field(ge=0)] = key(
+    seed: Annotated[Integer, Field(ge=0)] = key(
         1, "what the samples, and the parts of a data set, are chosen by", "a whole number, 0 or more"
     )
     vary: dict[str, Distribution] = key(
@@ -68,29 +78,31 @@ class SweepSettings(Section):
     @classmethod
     def _has_keys(cls, vary: dict[str, Distribution]) -> dict[str, Distribution]:
         if not vary:
-            raise refused("no keys; name at least one, such as tissue.young: {uniform: [1e4, 3e4]}")
+            raise scene_fault("no keys; name at least one, such as tissue.young: {uniform: [1e4, 3e4]}")
         return vary
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
         grids = [name for name, distribution in self.vary.items() if distribution.kind == "grid"]
         if self.samples is not None and grids:
-            raise refused(
+            raise scene_fault(
                 f"{grids[0]} is a grid, which gives every combination; take choice, or leave out samples", "samples"
             )
         if self.samples is None and len(grids) < len(self.vary):
-            raise refused("missing; expected the number of runs, as not every key is a grid", "samples")
+            raise scene_fault("missing; expected the number of runs, as not every key is a grid", "samples")
         if (runs := count_runs(self.vary, self.samples)) > MAX_RUNS:
-            raise refused(f"{runs} combinations, more than the {MAX_RUNS} that can be run; take smaller grids", "vary")
+            raise scene_fault(
+                f"{runs} combinations, more than the {MAX_RUNS} that can be run; take smaller grids", "vary"
+            )
         if (numbers := sum(distribution.dimensions for distribution in self.vary.values())) > MAX_DIMENSIONS:
-            raise refused(f"{numbers} numbers, more than the {MAX_DIMENSIONS} that can vary; take fewer", "vary")
+            raise scene_fault(f"{numbers} numbers, more than the {MAX_DIMENSIONS} that can vary; take fewer", "vary")
         keys = [_split_key(name) for name in (*self.set, *self.vary)]
         for number, later in enumerate(keys):
             if replaced := [earlier for earlier in keys[:number] if earlier[: len(later)] == later]:
                 name, earlier_name = (".".join(map(str, key)) for key in (later, replaced[0]))
                 remedy = "keep one" if later == replaced[0] else f"keep one, or give {name} first"
                 section = "vary" if number >= len(self.set) else "set"
-                raise refused(f"{name} replaces {earlier_name}, which comes before it; {remedy}", section)
+                raise scene_fault(f"{name} replaces {earlier_name}, which comes before it; {remedy}", section)
         return self
 
 
@@ -98,7 +110,7 @@ class SweepSettings(Section):
 class Sweep:
     """A scene file and the variation of its keys. Paths of pictures in the values are relative to the scene file."""
 
-    scene: File
+    scene: ParsedFile
     settings: SweepSettings
 
     @property
@@ -168,7 +180,7 @@ def load_sweep(path: str | Path) -> Sweep:
     Raises:
         SceneError: with a line for each error of the file, in the order of the file.
     """
-    draft = Draft(read_file(str(path), Kind("sweep", "scene and vary")))
+    draft = Draft(read_file(str(path), FileKind("sweep", "scene and vary")))
     if "sheet" in draft.data and "vary" not in draft.data:
         raise SceneError([f"{path}:1:1: a scene; use `taichi-msm run`, or name it by `scene:` in a sweep file"])
     sweep, problems = _checked(draft.data, Path(path).parent)
@@ -208,11 +220,11 @@ def _checked(data: dict[str, Any], folder: Path) -> tuple[Sweep | None, list[Pro
         problems += _relocate(data, folder, path.parent)
         try:
             # Errors of runs must not depend on the current directory, so the name of the scene has no folder.
-            file = read_file(_normalised(path), SCENE)._replace(name=path.name)
+            file = read_file(_normalised(path), SCENE_KIND)._replace(name=path.name)
             problems += _unknown_keys(file, data)
         except SceneError as error:
             problems.append(Problem(("scene",), error.lines[0]))
-    settings, setting_problems = parse(SweepSettings, data)
+    settings, setting_problems = parse_model(SweepSettings, data)
     return (None if settings is None or file is None else Sweep(file, settings)), [*problems, *setting_problems]
 
 
@@ -229,7 +241,7 @@ def format_value(value: Any) -> str:
     """Format a value for `--set`."""
     if isinstance(value, str):
         with suppress(UnreadableError):
-            document = read(value)
+            document = read_yaml(value)
             if document.data == value and not document.faults:
                 return value
     return json.dumps(value, ensure_ascii=False)
@@ -248,7 +260,7 @@ def _relocate(data: dict[str, Any], folder: Path, home: Path) -> Iterator[Proble
                     text for text in names if text.lower().endswith(suffixes) and (folder / text).is_file()
                 ]
                 if not distribution[kind]:
-                    message = f"{flow(pattern)} matches no {noun}; give a pattern relative to the sweep file"
+                    message = f"{format_value(pattern)} matches no {noun}; give a pattern relative to the sweep file"
                     yield Problem(path, message)
             if isinstance(distribution[kind], list):
                 for index, value in enumerate(distribution[kind]):
@@ -275,7 +287,7 @@ def _relocated(name: str, value: Any, folder: Path, home: Path) -> tuple[Any, li
                 f"{text} is neither below the sweep file's folder nor below the scene's; put the {noun} there"
             )
         elif not is_file:
-            errors.append(f"{cut(text)}: no such file; name a {noun} relative to the sweep file")
+            errors.append(f"{truncate(text)}: no such file; name a {noun} relative to the sweep file")
         # The folder is resolved first, as .. after a symbolic link leads to the parent of its target.
         return Path(os.path.relpath(path.parent.resolve() / path.name, home.resolve())).as_posix()
 
@@ -284,7 +296,7 @@ def _relocated(name: str, value: Any, folder: Path, home: Path) -> tuple[Any, li
 
 def _kind_of_file(key: Key) -> tuple[str, tuple[str, ...]]:
     """Return the noun for the file of a key in messages, and the allowed suffixes."""
-    return ("picture", SUFFIXES) if key in PICTURES else ("file", ("",))
+    return ("picture", PICTURE_SUFFIXES) if key in PICTURE_KEYS else ("file", ("",))
 
 
 def _map_files(path: Key, value: Any, change: Callable[[Key, str], str]) -> Any:
@@ -301,7 +313,7 @@ def _split_key(name: str) -> Key:
     return parse_key(name.strip()) if "=" not in name else ()
 
 
-def _unknown_keys(scene: File, data: dict[str, Any]) -> Iterator[Problem]:
+def _unknown_keys(scene: ParsedFile, data: dict[str, Any]) -> Iterator[Problem]:
     """Check that a scene has the keys, by setting each to one of its values."""
     vary, fixed = _mappings(data)
     trials: dict[Key, Any] = {("set", name): value for name, value in fixed.items()}
@@ -316,7 +328,7 @@ def _unknown_keys(scene: File, data: dict[str, Any]) -> Iterator[Problem]:
         known = len(draft.problems)
         draft.override(parse_override(f"{path[1]}={format_value(value)}"))
         yield from (Problem(path, problem.message) for _, problem in draft.problems[known:])
-    for problem in parse(Scene, draft.data)[1]:
+    for problem in parse_model(Scene, draft.data)[1]:
         if not problem.message.startswith("unknown key"):
             continue
         # The unknown key may be above a tried key, below one whose value is a whole section, or in the scene file.
@@ -422,20 +434,24 @@ class Distribution(Section):
     @classmethod
     def _is_flat(cls, data: Any) -> Any:
         if not isinstance(data, dict):
-            raise refused(
-                f"{flow(data)} is no way to vary; take one, such as {{uniform: [1, 2]}} or {{choice: [1, 2]}}"
+            raise scene_fault(
+                f"{format_value(data)} is no way to vary; take one, such as {{uniform: [1, 2]}} or {{choice: [1, 2]}}"
             )
         if data.keys().isdisjoint(cls.model_fields) and any(isinstance(value, dict) for value in data.values()):
-            raise refused("give each key by its dotted path, such as tissue.young: {uniform: [1e4, 3e4]}")
+            raise scene_fault("give each key by its dotted path, such as tissue.young: {uniform: [1e4, 3e4]}")
         return data
 
     @field_validator("uniform", "log_uniform", "normal")
     @classmethod
     def _is_pair(cls, value: Any) -> Any:
         if not (isinstance(value, list) and len(value) == 2 and all(map(_numbers, value))):
-            raise refused(f"{flow(value)} is not allowed; expected two numbers, or two lists of numbers of one shape")
+            raise scene_fault(
+                f"{format_value(value)} is not allowed; expected two numbers, or two lists of numbers of one shape"
+            )
         if _shape(value[0]) != _shape(value[1]):
-            raise refused(f"{flow(value[0])} and {flow(value[1])} differ in shape; give both as many numbers")
+            raise scene_fault(
+                f"{format_value(value[0])} and {format_value(value[1])} differ in shape; give both as many numbers"
+            )
         return value
 
     @field_validator("uniform", "log_uniform")
@@ -443,36 +459,36 @@ class Distribution(Section):
     def _is_ordered(cls, value: Any) -> Any:
         for low, high in zip(_numbers(value[0]), _numbers(value[1]), strict=True):
             if low > high:
-                raise refused(f"{low:g} is above {high:g}; give the lower number first")
+                raise scene_fault(f"{low:g} is above {high:g}; give the lower number first")
         return value
 
     @field_validator("log_uniform")
     @classmethod
     def _is_positive(cls, value: Any) -> Any:
         if (low := min(_numbers(value[0]))) <= 0:
-            raise refused(f"{low:g} has no logarithm; take numbers above 0, or uniform")
+            raise scene_fault(f"{low:g} has no logarithm; take numbers above 0, or uniform")
         return value
 
     @field_validator("normal")
     @classmethod
     def _has_deviation(cls, value: Any) -> Any:
         if (deviation := min(_numbers(value[1]))) < 0:
-            raise refused(f"a standard deviation of {deviation:g} is not possible; take 0 or more")
+            raise scene_fault(f"a standard deviation of {deviation:g} is not possible; take 0 or more")
         return value
 
     @field_validator("choice", "grid")
     @classmethod
     def _is_list(cls, value: Any) -> Any:
         if not isinstance(value, list) or not value:
-            raise refused(f"{flow(value)} is not allowed; expected {LIST}")
+            raise scene_fault(f"{format_value(value)} is not allowed; expected {LIST}")
         if not _is_finite(value):
-            raise refused(f"{flow(value)} has a number that is not finite; take others")
+            raise scene_fault(f"{format_value(value)} has a number that is not finite; take others")
         return value
 
     @model_validator(mode="after")
     def _is_one(self) -> Self:
         if len(self.model_fields_set) != 1:
-            raise refused(f"expected one of {', '.join(type(self).model_fields)}")
+            raise scene_fault(f"expected one of {', '.join(type(self).model_fields)}")
         return self
 
     @property
@@ -535,7 +551,7 @@ def _numbers(value: Any) -> list[float]:
     if isinstance(value, list):
         parts = [_numbers(item) for item in value]
         return [number for part in parts for number in part] if all(parts) else []
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= LARGEST
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= MAX_MAGNITUDE
     return [value] if is_number else []
 
 

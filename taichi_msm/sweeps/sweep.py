@@ -8,7 +8,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from taichi_msm.errors import MAX_WORKERS, ArgumentError, NotInstalledError, Progress, require_path, writing
+from taichi_msm.errors import (
+    MAX_WORKERS,
+    ArgumentError,
+    NotInstalledError,
+    StageProgressCallback,
+    require_path,
+    writing,
+)
 from taichi_msm.sweeps.pool import Pool
 from taichi_msm.sweeps.runs import (
     FINAL_STATUSES,
@@ -34,7 +41,7 @@ def sweep(
     overrides: Mapping[str, Any] | None = None,
     executor: Executor | str | None = None,
     workers: int | None = None,
-    progress: Progress = lambda stage, done, total: None,
+    progress: StageProgressCallback = lambda stage, done, total: None,
 ) -> Iterator[Outcome]:
     """Run a scene many times with varied values.
 
@@ -95,7 +102,7 @@ def sweep(
 
 @contextmanager
 def open_executor(
-    executor: Executor | str | None, workers: int, state: SweepState, progress: Progress
+    executor: Executor | str | None, workers: int, state: SweepState, progress: StageProgressCallback
 ) -> Iterator[Executor]:
     """Open the executor of a sweep; processes that it starts end with the block.
 
@@ -130,7 +137,7 @@ def open_executor(
     pool.shutdown()
 
 
-def run_missing(state: SweepState, executor: Executor, progress: Progress) -> Iterator[Outcome]:
+def run_missing(state: SweepState, executor: Executor, progress: StageProgressCallback) -> Iterator[Outcome]:
     """Execute the missing runs of a sweep, and yield their outcomes in the order in which they end.
 
     Args:
@@ -147,7 +154,7 @@ def run_missing(state: SweepState, executor: Executor, progress: Progress) -> It
         yield outcome
 
 
-def finish_sweep(state: SweepState, executor: Executor, progress: Progress) -> tuple[list[str], list[str]]:
+def finish_sweep(state: SweepState, executor: Executor, progress: StageProgressCallback) -> tuple[list[str], list[str]]:
     """Write the table and the other reports of a sweep.
 
     Args:

@@ -22,13 +22,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from taichi_msm.errors import Progress, SceneError, writing
+from taichi_msm.errors import SceneError, StageProgressCallback, writing
 from taichi_msm.load import cost as cost_module
-from taichi_msm.load.cost import rough_time
+from taichi_msm.load.cost import format_rough_time
 from taichi_msm.load.scene_file import plan_file
 from taichi_msm.model.plan import Plan
 from taichi_msm.runs.directory import MAX_RECORD, replacing
-from taichi_msm.scene.outputs import RECORD
+from taichi_msm.scene.outputs import RUN_RECORD
 from taichi_msm.sweeps.plots import (
     PlotData,
     estimate_sensitivity,
@@ -61,7 +61,7 @@ WITHOUT_SALIB = f"{SENSITIVITY} needs SALib: pip install SALib"
 WrittenFiles = tuple[list[str], list[str]]
 
 
-def write_reports(result: SweepResult, executor: Executor, progress: Progress) -> WrittenFiles:
+def write_reports(result: SweepResult, executor: Executor, progress: StageProgressCallback) -> WrittenFiles:
     """Write the reports of a sweep, each atomically, and remove outdated ones of an earlier call.
 
     Args:
@@ -222,7 +222,7 @@ def assign_splits(runs: int, seed: int) -> list[str]:
 
 def _output_format(directory: Path) -> dict[str, Any]:
     """Read the outputs, number of frames, frame size [px] and frame rate of a run, which a data loader needs."""
-    record = json.loads(read_regular(directory / RECORD, MAX_RECORD))
+    record = json.loads(read_regular(directory / RUN_RECORD, MAX_RECORD))
     scene = record["scene"]
     return {
         "outputs": record["outputs"],
@@ -251,7 +251,7 @@ def cost_line(runs: int, cost: SweepCost, workers: WorkerCount | None) -> str:
         location = f"in {processes} ({workers.cores} cores; memory for {workers.memory_limit})"
     disk = f"at most {cost.disk_bytes / 2**20:.1f} MiB on disk"
     refused = f"; of {cost.looked_at} that were checked, {cost.refused} will be refused, for example: {cost.example}"
-    return f"{_runs(runs)}: about {rough_time(cost.seconds)} {location}, {disk}{refused if cost.refused else ''}"
+    return f"{_runs(runs)}: about {format_rough_time(cost.seconds)} {location}, {disk}{refused if cost.refused else ''}"
 
 
 def summary_lines(
@@ -343,7 +343,7 @@ def estimate_cost(sweep: Sweep) -> SweepCost:
         except SceneError as error:
             errors.append(error.lines[0])
     durations = list(map(cost_module.estimate_duration, plans))
-    needs = list(map(cost_module.estimate_memory, plans))
+    needs = list(map(cost_module.estimate_budget, plans))
     looked_at = len(plans) + len(errors)
     scale, cores = sweep.runs / looked_at, available_threads()
     seconds = sum(duration.seconds - duration.start for duration in durations)

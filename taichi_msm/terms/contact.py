@@ -27,7 +27,7 @@ from typing_extensions import Self
 from taichi_msm.model.loads import Schedule
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.tools import GRIP_RADII
-from taichi_msm.scene.section import WHOLE
+from taichi_msm.scene.section import FRAME_TOLERANCE
 from taichi_msm.scene.tools import Probe
 from taichi_msm.terms.base import DY, MOBILITY, REST_X, TOP_Y, KernelConfig, Term
 from taichi_msm.terms.damping import coefficients
@@ -105,7 +105,7 @@ class ContactTerm(Term):
             for begin, end in tool.grips:
                 # The first steps at or after these times, up to rounding.
                 start, stop = (
-                    max(0, math.ceil((time - WHOLE * frame) * grid.steps_per_second)) for time in (begin, end)
+                    max(0, math.ceil((time - FRAME_TOLERANCE * frame) * grid.steps_per_second)) for time in (begin, end)
                 )
                 held = (steps[:-1] >= start) & (steps[:-1] < stop)
                 of_tool[held, GRIP_STATE] = np.where(steps[:-1] == start, GRIP_BEGINS, GRIP_CONTINUES)[held]

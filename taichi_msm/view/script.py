@@ -12,9 +12,9 @@ from pydantic import Field, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
 from taichi_msm.errors import FilesError, Problem, SceneError, writing
-from taichi_msm.load.check import parse
-from taichi_msm.load.scene_file import Draft, Kind, read_file
-from taichi_msm.scene.section import MAX_PIXELS, REFUSED, NotNegative, Number, Pixels, Section, key
+from taichi_msm.load.check import parse_model
+from taichi_msm.load.scene_file import Draft, FileKind, read_file
+from taichi_msm.scene.section import MAX_PIXELS, SCENE_FAULT, NotNegative, Number, Pixels, Section, key
 from taichi_msm.view.events import KEYS, Drag, Event, Key, Press, Release, Strength, Turn
 from taichi_msm.view.recording import Film
 
@@ -36,27 +36,27 @@ REQUIRED_KEYS = {"press": "at", "pull": "at", "drag": "at", "release": "", "turn
 # A script cannot quit, as the duration of a film is given.
 SCRIPT_KEYS = tuple(name for name in KEYS if name != "q")
 
-_SCRIPT = Kind("script", "events")
+_SCRIPT = FileKind("script", "events")
 
 
 class ScriptEvent(Section):
     """An event of a script."""
 
-    t: Seconds = key(..., means="when, or when it begins [s]", expects=SECONDS)
+    t: Seconds = key(..., description="when, or when it begins [s]", expects=SECONDS)
     do: Literal["press", "pull", "drag", "release", "turn", "percent", "key"] = key(
-        ..., means="what is done", expects=f"{', '.join(KINDS)} or {LAST_KIND}"
+        ..., description="what is done", expects=f"{', '.join(KINDS)} or {LAST_KIND}"
     )
     at: Pair | None = key(
-        None, means="the pixel", expects="for press, pull and drag [x, y] in pixels from the top left"
+        None, description="the pixel", expects="for press, pull and drag [x, y] in pixels from the top left"
     )
-    by: Pair | None = key(None, means="how far the picture is turned", expects="for turn [right, down] in pixels")
+    by: Pair | None = key(None, description="how far the picture is turned", expects="for turn [right, down] in pixels")
     to: Annotated[Number, Field(ge=-100, le=100)] | None = key(
         None,
-        means="percent of the full force, or of the greatest depth",
+        description="percent of the full force, or of the greatest depth",
         expects="for percent a number from -100 to 100",
     )
-    name: str | None = key(None, means="a key of the window", expects="for key the name of one")
-    seconds: Seconds = key(0.0, means="how long it takes [s]", expects=SECONDS)
+    name: str | None = key(None, description="a key of the window", expects="for key the name of one")
+    seconds: Seconds = key(0.0, description="how long it takes [s]", expects=SECONDS)
 
     @model_validator(mode="after")
     def _complete(self) -> ScriptEvent:
@@ -78,11 +78,13 @@ class Script(Section):
 
     size: tuple[Pixels, Pixels] | None = key(
         None,
-        means="width, height of the picture that the pixels are of [px]; others are scaled; default: the session's",
+        description=(
+            "width, height of the picture that the pixels are of [px]; others are scaled; default: the session's"
+        ),
         expects=f"two whole numbers, 1 to {MAX_PIXELS}: [width, height] in pixels",
     )
     events: tuple[ScriptEvent, ...] = key(
-        ..., means="what is done, in order", expects="a list of mappings with t and do"
+        ..., description="what is done, in order", expects="a list of mappings with t and do"
     )
 
     @field_validator("events", mode="after")
@@ -100,7 +102,7 @@ class Script(Section):
 
 
 def _refused(key: str | int, message: str, **values: str) -> PydanticCustomError:
-    return PydanticCustomError(REFUSED, message, {"below": (key,), **values})
+    return PydanticCustomError(SCENE_FAULT, message, {"below": (key,), **values})
 
 
 def load_script(path: str | Path, size: tuple[int, int]) -> Script:
@@ -114,7 +116,7 @@ def load_script(path: str | Path, size: tuple[int, int]) -> Script:
         SceneError: with a line for each error of the file, in the order of the file.
     """
     draft = Draft(read_file(str(path), _SCRIPT))
-    script, problems = parse(Script, draft.data)
+    script, problems = parse_model(Script, draft.data)
     draft.report(problems)
     draft.report(_outside(script, script.size or size) if script is not None else ())
     if script is None or draft.problems:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import DivergedError, FilesError, SceneError
-from taichi_msm.load.check import checked
+from taichi_msm.load.check import check_scene
 from taichi_msm.load.resolve import resolve
 from taichi_msm.load.yaml_reader import MAX_NODES
 from taichi_msm.model.plan import Plan
@@ -96,7 +96,7 @@ class Session:
         progress("start")
         device = runtime.start(arch, threads)
         texture = load_texture(scene)
-        live, self.subframes = divide_frames(checked(scene))
+        live, self.subframes = divide_frames(check_scene(scene))
         plan = resolve(live, device, lambda done, total: progress("pilot")).plan
         scene = plan.scene
         self._captures = captures

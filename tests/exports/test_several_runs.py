@@ -81,8 +81,8 @@ def test_pairs_of_frames_are_numbered_through(pair: list[str]) -> None:
     alone = {run: contents(export(run, "kitti").directory) for run in pair}
     expected: dict[str, bytes] = {}
     for number, (run, frame) in enumerate(pairs):
-        of_pair = {path: data for path, data in alone[run].items() if f"/{frame:06}_1" in path}
-        expected |= {path.replace(f"/{frame:06}", f"/{number:06}"): data for path, data in of_pair.items()}
+        needs_stereo_pair = {path: data for path, data in alone[run].items() if f"/{frame:06}_1" in path}
+        expected |= {path.replace(f"/{frame:06}", f"/{number:06}"): data for path, data in needs_stereo_pair.items()}
     assert contents(Path("all")) == expected
 
 

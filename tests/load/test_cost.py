@@ -43,7 +43,7 @@ def scene(**keys: Any) -> Scene:
 
 
 def estimate(scene: Scene) -> Budget:
-    return cost.estimate_memory(plan_of(scene))
+    return cost.estimate_budget(plan_of(scene))
 
 
 def faults(scene: Scene) -> list[str]:

@@ -9,7 +9,7 @@ import pytest
 
 from taichi_msm.accuracy.companions import choose_pilots
 from taichi_msm.load import cost
-from taichi_msm.load.cost import CALIBRATION, UNIT
+from taichi_msm.load.cost import CALIBRATION_S, WORK_UNIT_S
 from taichi_msm.solver.planning import START, count_work
 from taichi_msm.system import process
 from tests.conftest import Program
@@ -24,12 +24,12 @@ def test_the_calibration_is_soon_done() -> None:
 
 @pytest.mark.parametrize("cores", [1, 64])
 def test_the_estimate_is_the_work_at_the_speed_of_the_machine(cores: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cost, "_calibrate", lambda: 2 * CALIBRATION)
+    monkeypatch.setattr(cost, "_calibrate", lambda: 2 * CALIBRATION_S)
     monkeypatch.setattr(process, "available_threads", lambda: cores)
     plan = plan_of(small_scene(image="none.png", output=["gif"]))
     parts = count_work(plan, choose_pilots(plan).cost)
     assert min(parts) > 0
-    assert cost.estimate_duration(plan) == pytest.approx((2 * UNIT * sum(parts), 2 * UNIT * START))
+    assert cost.estimate_duration(plan) == pytest.approx((2 * WORK_UNIT_S * sum(parts), 2 * WORK_UNIT_S * START))
 
 
 def test_check_says_how_long_a_run_takes(small: Path, program: Program) -> None:

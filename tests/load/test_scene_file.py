@@ -522,7 +522,7 @@ def test_what_yaml_has_and_scenes_do_not(load: Load) -> None:
 
 
 def test_the_first_thousand_faults_are_enough() -> None:
-    assert len(yaml_reader.read("- *a\n" * 2000).faults) == yaml_reader.MAX_FAULTS
+    assert len(yaml_reader.read_yaml("- *a\n" * 2000).faults) == yaml_reader.MAX_FAULTS
 
 
 @pytest.mark.usefixtures("load")

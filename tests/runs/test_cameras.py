@@ -215,7 +215,7 @@ def test_two_lenses_find_their_places_once_each(small: Path, device: Device, mon
 def test_the_budget_counts_every_camera(small: Path) -> None:
     def need(cameras: Cameras) -> cost.Budget:
         of_three = [f"render.cameras={json.dumps(cameras)}", "output=[png, tracks, trajectory]"]
-        return cost.estimate_memory(load_plan("small.yaml", of_three))
+        return cost.estimate_budget(load_plan("small.yaml", of_three))
 
     one, three = need({"a": LEFT}), need(dict.fromkeys("abc", LEFT))
     assert three.picture_bytes == 3 * one.picture_bytes

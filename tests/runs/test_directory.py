@@ -15,7 +15,7 @@ import pytest
 from taichi_msm.errors import FilesError, ForeignError
 from taichi_msm.runs.directory import Publication, lock
 from taichi_msm.runs.writer import RUN
-from taichi_msm.scene.outputs import PATTERNS
+from taichi_msm.scene.outputs import RESULT_PATTERNS
 
 OLD = ["frames/0000.png", "frames/0001.png", "frames/0002.png", "flow/0000.flo", "animation.gif", "run.json"]
 NEW = ["frames/0000.png", "frames/0001.png", "trajectory.npz", "run.json"]
@@ -74,7 +74,7 @@ def publish(directory: Path, names: Collection[str]) -> None:
 def contents(directory: Path) -> dict[str, str]:
     """The results, the record by its text."""
     paths = {str(path.relative_to(directory)): path for path in sorted(directory.rglob("*"))}
-    texts = {name: path.read_text() for name, path in paths.items() if re.fullmatch("|".join(PATTERNS), name)}
+    texts = {name: path.read_text() for name, path in paths.items() if re.fullmatch("|".join(RESULT_PATTERNS), name)}
     return {name: json.loads(text)["text"] if name == "run.json" else text for name, text in texts.items()}
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from taichi_msm.accuracy.path_dependence import PathDependence, second_solution
 from taichi_msm.errors import DeviceError, DivergedError, SceneError
-from taichi_msm.load.check import checked
+from taichi_msm.load.check import check_scene
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.runs.finished import read_run
@@ -210,7 +210,7 @@ def test_mass_and_density_are_missed_only_in_motion(small: Path) -> None:
 
 
 def at_rest_checked(**sections: Any) -> None:
-    checked(at_rest([PUSH], **sections))
+    check_scene(at_rest([PUSH], **sections))
 
 
 def test_friction_and_gpus_and_studies_are_refused(device: Device) -> None:

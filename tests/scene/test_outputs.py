@@ -9,7 +9,7 @@ import pytest
 
 from taichi_msm.render.labels import Flow, FrameOutputs, Labels, Stereo
 from taichi_msm.runs.writer import _WRITERS
-from taichi_msm.scene.outputs import OUTPUTS, PATTERNS, file_names, results
+from taichi_msm.scene.outputs import OUTPUTS, RESULT_PATTERNS, file_names, result_names
 
 FIELDS = {"labels": Labels._fields, "flow": Flow._fields, "stereo": Stereo._fields}
 
@@ -25,10 +25,10 @@ def test_every_label_has_its_field_and_a_format() -> None:
 
 
 def test_the_files_of_a_run_in_the_order_of_its_record() -> None:
-    assert results({"": ["tracks", "flow", "gif", "png"]}) == [
+    assert result_names({"": ["tracks", "flow", "gif", "png"]}) == [
         *("frames", "flow", "animation.gif", "tracks.npz", "camera.json", "run.json")
     ]
-    assert results({"": ["forces"], "left": ["flow", "gif"], "right": ["gif"]}) == [
+    assert result_names({"": ["forces"], "left": ["flow", "gif"], "right": ["gif"]}) == [
         *("left/flow", "left/animation.gif", "right/animation.gif", "forces.csv", "left/camera.json", "run.json")
     ]
     assert file_names(["left/flow", "left/camera.json"], 2) == ["left/flow/0000.flo", "left/camera.json"]
@@ -53,7 +53,7 @@ def test_the_files_of_a_run_in_the_order_of_its_record() -> None:
     ],
 )
 def test_no_other_file_is_taken_for_one_of_a_run(name: str) -> None:
-    seen = [output.name for output in OUTPUTS.values() if output.is_seen]
-    every = file_names(results({"": OUTPUTS, "left": seen}), 3)
-    assert all(re.fullmatch("|".join(PATTERNS), file) for file in every)
-    assert not re.fullmatch("|".join(PATTERNS), name)
+    seen = [output.name for output in OUTPUTS.values() if output.is_camera_output]
+    every = file_names(result_names({"": OUTPUTS, "left": seen}), 3)
+    assert all(re.fullmatch("|".join(RESULT_PATTERNS), file) for file in every)
+    assert not re.fullmatch("|".join(RESULT_PATTERNS), name)

@@ -16,7 +16,7 @@ from scipy.special import ndtri
 from scipy.stats import qmc
 
 from taichi_msm.errors import SceneError
-from taichi_msm.load.scene_file import ANY, CAMERA_FILES, PICTURES, load_plan
+from taichi_msm.load.scene_file import ANY_CAMERA, CAMERA_FILE_KEYS, PICTURE_KEYS, load_plan
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_PATH
 from taichi_msm.sweeps.spec import Distribution, format_value, load_sweep, run_values, sample_run_values
@@ -184,14 +184,14 @@ def test_every_key_of_a_scene_that_names_a_file_is_known() -> None:
             walk(inner, (*key, name))
         for inner in (part.get("additionalProperties"), part.get("items")):
             if isinstance(inner, dict):
-                walk(inner, (*key, ANY))
+                walk(inner, (*key, ANY_CAMERA))
         for inner in part.get("anyOf", []):
             walk(inner, key)
         if "$ref" in part:
             walk(schema["$defs"][part["$ref"].rpartition("/")[2]], key)
 
     walk(schema, ())
-    assert found == {*PICTURES, *CAMERA_FILES}
+    assert found == {*PICTURE_KEYS, *CAMERA_FILE_KEYS}
 
 
 GOOD = {"scene": "small.yaml", "samples": 2, "vary": {"damping": {"uniform": [0.01, 0.02]}}}

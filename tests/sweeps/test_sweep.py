@@ -501,7 +501,7 @@ def test_there_is_a_process_for_each_core_as_far_as_memory_goes(monkeypatch: pyt
 
 def test_the_cost_is_that_of_all_runs(many: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tables, "available_threads", lambda: 2)
-    monkeypatch.setattr(cost_module, "estimate_duration", lambda plan: cost_module.Duration(5.0, 3.0))
+    monkeypatch.setattr(cost_module, "estimate_duration", lambda plan: cost_module.DurationEstimate(5.0, 3.0))
     for samples in (64, 6400):
         (many / "many.yaml").write_text(
             SWEEP.replace("[0.01, auto]", "[auto]").replace("samples: 4", f"samples: {samples}")

@@ -10,7 +10,7 @@ import pytest
 
 from taichi_msm import Simulation
 from taichi_msm.errors import SceneError
-from taichi_msm.load.check import checked
+from taichi_msm.load.check import check_scene
 from taichi_msm.model.tools import build_tools, min_steps_per_frame, path_warnings
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.arrays import SheetLayout
@@ -203,7 +203,7 @@ def test_what_a_tool_cannot_be_is_refused_with_the_remedy(case: str) -> None:
         "output": [],
     }
     with pytest.raises(SceneError) as refused:
-        checked({**given, "probes": [probe]})
+        check_scene({**given, "probes": [probe]})
     assert list(refused.value.lines) == [f"probes.0.{said}"]
 
 

@@ -16,7 +16,7 @@ from taichi_msm.accuracy.mesh import FEWEST, CubicSampling, MeshEstimate, MeshPi
 from taichi_msm.accuracy.time_step import longest
 from taichi_msm.cli.console import run_summary
 from taichi_msm.errors import ArgumentError, FilesError, SceneError
-from taichi_msm.load.check import checked
+from taichi_msm.load.check import check_scene
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.model import tool_force
 from taichi_msm.model.plan import Plan
@@ -83,7 +83,7 @@ SEEDS = [0, 1, 2, 7, 9, 10]
     "seed", [pytest.param(seed, marks=() if seed in SEEDS else pytest.mark.slow) for seed in range(24)]
 )
 def test_a_random_tissue_is_like_the_twin(seed: int, image: str, device: Device) -> None:
-    made = checked(random_tissue(seed, image)).scene
+    made = check_scene(random_tissue(seed, image)).scene
     twin = reference.simulate(made) - rest_positions(made.sheet)
     np.testing.assert_allclose(simulate(made, device), twin, rtol=0, atol=1e-12 * np.abs(twin).max())
 
@@ -100,7 +100,7 @@ def test_a_free_tissue_of_two_rows_is_like_the_twin(points: tuple[int, int], loa
     "seed", [0, 7, pytest.param(4, marks=pytest.mark.fuzz), pytest.param(9, marks=pytest.mark.fuzz)]
 )
 def test_in_f32_it_is_like_the_twin_but_for_rounding(seed: int, image: str, device: Device) -> None:
-    made = checked(random_tissue(seed, image, "f32")).scene
+    made = check_scene(random_tissue(seed, image, "f32")).scene
     twin = reference.simulate(made) - rest_positions(made.sheet)
     np.testing.assert_allclose(simulate(made, device), twin, rtol=0, atol=2e-4 * np.abs(twin).max())
 
@@ -414,7 +414,7 @@ def test_a_tolerance_of_the_points_chooses_them(load: Any, device: Device, tmp_p
     assert record["scene"]["sheet"]["points"] == record["points"]
     assert record["asked"]["sheet.tolerance"] == 0.02
     assert record["asked"]["sheet.points"] == made.sheet.points
-    assert record["points"] == list(choose_points(plan_of(made), device, checked)[0].scene.sheet.points)
+    assert record["points"] == list(choose_points(plan_of(made), device, check_scene)[0].scene.sheet.points)
     assert record["points"] > [13, 15]
     with Simulation(made, threads=device.threads) as simulation:
         assert simulation.positions().shape[:2] == tuple(record["points"])
@@ -423,12 +423,12 @@ def test_a_tolerance_of_the_points_chooses_them(load: Any, device: Device, tmp_p
 def test_a_tolerance_that_no_points_meet_is_refused(load: Any, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("taichi_msm.accuracy.mesh.MAX_POINTS", 40)
     with pytest.raises(SceneError, match=r"sheet.tolerance: 0.0001 is out of reach: with \d+ x \d+ points the error"):
-        choose_points(plan_of(load("sheet.tolerance=0.0001")), device, checked)
+        choose_points(plan_of(load("sheet.tolerance=0.0001")), device, check_scene)
 
 
 def test_a_tolerance_keeps_the_shape_of_the_cells(load: Any, device: Device) -> None:
     made = load("sheet.tolerance=0.2", *SMOOTH, "sheet.size=[0.1, 0.2]", "sheet.points=[3, 5]")
-    found, _ = choose_points(plan_of(made), device, checked)
+    found, _ = choose_points(plan_of(made), device, check_scene)
     rows, cols = found.scene.sheet.points
     assert (cols - 1) / (rows - 1) == pytest.approx(2, rel=0.1)
 
@@ -440,7 +440,7 @@ def test_a_tolerance_far_out_of_reach_is_refused_after_one_run(
 
     def check(scene: Scene, maps: Maps | None) -> Plan:
         tried.append(scene.sheet.points)
-        return checked(scene, maps)
+        return check_scene(scene, maps)
 
     with pytest.raises(
         SceneError, match=r"1e-10 is out of reach: with 13 x 15 points the error is 0\.\d+, and no sheet"
@@ -525,7 +525,7 @@ def test_a_run_does_not_go_on_with_another_map(load: Any, tmp_path: Path, device
 
 def test_the_cells_keep_their_shape_while_points_are_chosen(load: Any, device: Device) -> None:
     oblong = ("sheet.points=[5, 13]", "sheet.size=[0.04, 0.12]", "sheet.tolerance=0.05", *SMOOTH)
-    rows, cols = choose_points(plan_of(load(*oblong)), device, checked)[0].scene.sheet.points
+    rows, cols = choose_points(plan_of(load(*oblong)), device, check_scene)[0].scene.sheet.points
     assert (cols - 1) / (rows - 1) == pytest.approx(3, rel=0.1)
     assert cols > 13
 
@@ -536,7 +536,7 @@ def test_points_for_which_a_given_step_is_too_long_are_refused(load: Any, device
     with pytest.raises(
         SceneError, match=r"time.step: .* above the stability limit .* points that sheet.tolerance: 0.001"
     ):
-        choose_points(plan_of(made), device, checked)
+        choose_points(plan_of(made), device, check_scene)
 
 
 @pytest.mark.parametrize(
