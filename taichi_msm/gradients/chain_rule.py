@@ -30,11 +30,11 @@ from taichi_msm.terms.springs import stiffness
 Array = NDArray[np.float64]
 
 # The imaginary part of a complex step.
-STEP = 1e-60
+COMPLEX_STEP = 1e-60
 
 
 @dataclass
-class Slopes:
+class SheetGradient:
     """Derivatives by the numbers of a sheet."""
 
     # by k - tau of every spring: along rows, along columns, and of both diagonals of a cell; as in `springs.stiffness`
@@ -73,32 +73,32 @@ class Derivatives:
     maps: dict[str, Array]
 
 
-def derivatives(plan: Plan, slopes: Slopes, loads: LoadSlopes) -> Derivatives:
+def scene_derivatives(plan: Plan, slopes: SheetGradient, loads: LoadGradient) -> Derivatives:
     """Go from the numbers of a sheet to those of its scene."""
     material, kind = plan.material, plan.scene.kind
     assert material.factors is not None
-    by_number = _by_numbers(plan, slopes)
+    by_number = _gradient_by_numbers(plan, slopes)
     numbers: dict[str, float | Array] = {}
     for path in _paths(plan.scene):
         value = _value(plan.scene, path)
-        changed = _numbers(plan, _with(plan.scene, path, value + 1j * STEP))
-        numbers[".".join(path)] = float(by_number @ changed.imag) / STEP
-    maps = {f"{kind}.map": _by_factors(plan, slopes)}
+        changed = _sheet_numbers(plan, _with(plan.scene, path, value + 1j * COMPLEX_STEP))
+        numbers[".".join(path)] = float(by_number @ changed.imag) / COMPLEX_STEP
+    maps = {f"{kind}.map": _gradient_by_factors(plan, slopes)}
     if kind == "tissue" and material.virtual > 0:
         factors = material.virtual_factors
         maps["tissue.foundation_map"] = slopes.held / (1.0 if factors is None else factors)
     return Derivatives(numbers | loads.by_key, maps)
 
 
-def _numbers(plan: Plan, scene: Scene) -> NDArray[Any]:
-    """List the numbers of a sheet of which `_by_numbers` gives the derivatives; they may be complex."""
+def _sheet_numbers(plan: Plan, scene: Scene) -> NDArray[Any]:
+    """List the numbers of a sheet of which `_gradient_by_numbers` gives the derivatives; they may be complex."""
     one = material_of(scene, {})
     springs = [one.across, one.down, one.shear, one.tension]
     steps = () if scene.time.at_rest else coefficients(replace(plan, scene=scene, material=one))
     return np.array([*springs, one.virtual, one.bending, *steps])
 
 
-def _by_numbers(plan: Plan, slopes: Slopes) -> Array:
+def _gradient_by_numbers(plan: Plan, slopes: SheetGradient) -> Array:
     """List the derivatives by across, down, shear, tension, virtual, bending, keep, gain and the first gain."""
     material = plan.material
     assert material.factors is not None
@@ -121,7 +121,7 @@ def _by_log(slope: float, value: float) -> float:
     return slope / value if value else 0.0
 
 
-def _by_factors(plan: Plan, slopes: Slopes) -> Array:
+def _gradient_by_factors(plan: Plan, slopes: SheetGradient) -> Array:
     """Give the derivatives by the factors of the cells: `springs.stiffness` transposed."""
     material = plan.material
     along_rows, along_columns = slopes.springs[0].copy(), slopes.springs[1].copy()
@@ -163,7 +163,7 @@ def _with(section: Any, path: tuple[str, ...], value: complex) -> Any:
     return BaseModel.model_copy(section, update=changed)
 
 
-class LoadSlopes:
+class LoadGradient:
     """Derivatives by the loads of the probes, added up from some steps to the next.
 
     Attributes:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError, MsmError, Pause, SceneError, are_numbers, as_array
-from taichi_msm.gradients.chain_rule import Derivatives, derivatives
+from taichi_msm.gradients.chain_rule import Derivatives, scene_derivatives
 from taichi_msm.gradients.motion import MotionAdjoint, motion_bytes
 from taichi_msm.gradients.rest import RestAdjoint
 from taichi_msm.load.check import checked
@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 FRAME_COPIES = 4
 
 # Bytes per point of a sparse solution at rest: 10,400 were measured with 81 x 81 points, 13,600 with 161 x 161.
-SOLUTION_BYTES = 14_000
+SOLUTION_BYTES_PER_NODE = 14_000
 
 
 def require_differentiable(plan: Plan) -> None:
@@ -43,7 +43,7 @@ def require_differentiable(plan: Plan) -> None:
         raise SceneError([f"probes.{tool.probe}.path: {said}"])
 
 
-def mapped(plan: Plan) -> Plan:
+def with_stiffness_map(plan: Plan) -> Plan:
     """Give a plan a map of the stiffness, of factors 1 where it has none, and steps in f64."""
     material, (rows, cols) = plan.material, plan.scene.sheet.points
     factors = np.ones((rows - 1, cols - 1)) if material.factors is None else material.factors
@@ -54,7 +54,7 @@ def _require_memory(plan: Plan) -> None:
     """Raise SceneError unless the adjoint and the positions of every frame, of which there are some copies, fit."""
     frames, points = plan.grid.frames + 1, math.prod(plan.scene.sheet.points)
     needed = FRAME_COPIES * 3 * 8 * frames * points
-    needed += SOLUTION_BYTES * points if plan.scene.time.at_rest else motion_bytes(plan)
+    needed += SOLUTION_BYTES_PER_NODE * points if plan.scene.time.at_rest else motion_bytes(plan)
     if needed > (free := available_memory()):
         raise SceneError([
             f"a gradient by {points} points in {frames} frames and {plan.grid.steps} steps takes about "
@@ -77,7 +77,7 @@ class Adjoint:
 
     def __init__(self, plan: Plan, device: Device, cores: int | None = None) -> None:
         require_differentiable(plan)
-        self._plan = mapped(plan)
+        self._plan = with_stiffness_map(plan)
         _require_memory(self._plan)
         self._sheet: MotionAdjoint | RestAdjoint
         if plan.scene.time.at_rest:
@@ -127,7 +127,7 @@ class Adjoint:
                 f"the loss's derivative: {slope.dtype} of shape {slope.shape}; take finite numbers of shape {shape}, "
                 "that of the positions"
             )
-        return derivatives(plan, *self._sheet.backward(np.asarray(slope, float), pause))
+        return scene_derivatives(plan, *self._sheet.backward(np.asarray(slope, float), pause))
 
     def _with_factors(self, factors: Array) -> Plan:
         """Change the map of the stiffness."""
@@ -145,8 +145,6 @@ class Adjoint:
             )
         return replace(plan, material=material, stable_step=limit)
 
-
-pass  # REMOVED
 
 # Gives the value of a loss and its derivative by the positions, both of the positions of every frame.
 Loss = Callable[[Array], tuple[float, Array]]

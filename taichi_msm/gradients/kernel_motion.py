@@ -41,16 +41,16 @@ COUNT, WORKERS, ROWS, STRIP, SHAPE, MOMENT_ROW, CARRY, CARRIED_ROWS, PATIENCE, B
 STRIDE = 16
 
 # What the adjoint's arrays hold, by multiples of the sheet's rows: p in two buffers, q, and the derivative of the loss.
-BUFFERS, LAST, LOSS, ADJOINT_PARTS = 0, 2, 3, 4
+BUFFERS, ADJOINT_CHANGE, LOSS, ADJOINT_PARTS = 0, 2, 3, 4
 
 # What is added up, by multiples of the sheet's rows: the derivatives by k - tau of springs along rows, along columns
 # and of diagonals, and by the logarithm of K, for a share of 1; after them the slopes of the decays of standing slots;
 # and then sums of a row each: of q u, for the derivative by keep; by tau of each family; by the logarithm of D.
-FAMILIES, HELD, SUM_PARTS = 0, 3, 4
-KEPT, TENSE, BENT, ROW_SUMS = 0, 1, 4, 5
+SPRING_PARTS, FOUNDATION_PART, SUM_PARTS = 0, 3, 4
+KEEP_SUM, TENSION_SUMS, BENDING_SUM, ROW_SUMS = 0, 1, 4, 5
 
 # The derivatives by the force and by the control point of a slot, in every step and row.
-PUSHED = 5
+LOAD_DERIVATIVES = 5
 
 
 class AdjointSheet(NamedTuple):
@@ -67,7 +67,7 @@ class AdjointSheet(NamedTuple):
     found: Any  # what is added up
 
 
-class Strip(NamedTuple):
+class AdjointBand(NamedTuple):
     """A worker's band of rows at a step, within a kernel."""
 
     # low, high: its first row, and the row after its last
@@ -90,7 +90,7 @@ class Tables(NamedTuple):
 
 
 @cache
-def kernels(code: StepCode, *, parallel: bool) -> tuple[Callable[..., None], Callable[..., None]]:
+def adjoint_kernels(code: StepCode, *, parallel: bool) -> tuple[Callable[..., None], Callable[..., None]]:
     """Make the kernels that step forward and keep every shape, and that sweep backward."""
     return _recording(code, parallel=parallel), _sweeping(code, parallel=parallel)
 
@@ -187,7 +187,7 @@ def _recording(code: StepCode, *, parallel: bool) -> Callable[..., None]:
         shape = (ti.cast(sizes[SHAPE], ti.i32) + k) * sheet.rows
         carry = ti.cast(sizes[CARRY] + sizes[CARRIED_ROWS] * worker, ti.i32)
         moments = ti.cast(sizes[MOMENT_ROW], ti.i32) + MOMENTS * worker
-        band = ti.static(Strip(low, high, shape, shape, shape, carry, moments, k, 0))
+        band = ti.static(AdjointBand(low, high, shape, shape, shape, carry, moments, k, 0))
         if low == 0:
             clear(sheet, carry)
         for i in range(ti.max(low - 1, 0), high):
@@ -261,7 +261,7 @@ def _row_sweeping(code: StepCode) -> Callable[..., None]:
         here, below = (band.before + i) * width, (band.before + ti.min(i + 1, sheet.rows - 1)) * width
         ahead, carry = (band.shape - band.before) * width, band.carry * width
         sums = [vector(0) for _ in ti.static(range(ROW_SUMS))]
-        pushed = [vector(0) for _ in ti.static(range(PUSHED * slots))]
+        pushed = [vector(0) for _ in ti.static(range(LOAD_DERIVATIVES * slots))]
         now = [loads[band.n, c] for c in ti.static(range(columns))]
         # What the cell before an entry adds to it, and to the entry below it.
         beside, under = [vector(0) for _ in ti.static(range(3))], [vector(0) for _ in ti.static(range(3))]
@@ -301,7 +301,7 @@ def _row_sweeping(code: StepCode) -> Callable[..., None]:
                     for add_change in ti.static(tangents):
                         add_change(force, sheet, entry, now)
                     gain = now[GAIN] * sheet.by_column[(MOVES + kind) * width + b]
-                    q = [sheet.u[c][(LAST * sheet.rows + i) * width + b] for c in ti.static(range(3))]
+                    q = [sheet.u[c][(ADJOINT_CHANGE * sheet.rows + i) * width + b] for c in ti.static(range(3))]
                     # The sum of p_{n+1} (u_n - u_{n-1}) over all n, added up in another order: of u_n q_{n+1}.
                     kept = q[0] * u[0] + q[1] * u[1] + q[2] * u[2]
                     for reduce in ti.static(reducing):
@@ -311,7 +311,7 @@ def _row_sweeping(code: StepCode) -> Callable[..., None]:
                             force[c] += sheet.u[c][(LOSS * sheet.rows + i) * width + b]
                     for c in ti.static(range(3)):
                         q[c] += gain * force[c]
-                        sheet.u[c][(LAST * sheet.rows + i) * width + b] = q[c]
+                        sheet.u[c][(ADJOINT_CHANGE * sheet.rows + i) * width + b] = q[c]
                         sheet.u[c][(band.after + i) * width + b] = p[c] + q[c]
                     # The derivatives. A spring pulls its ends in opposite directions.
                     if ti.static(structural):
@@ -322,14 +322,14 @@ def _row_sweeping(code: StepCode) -> Callable[..., None]:
                         add(sheet.found, (DIAGONAL * sheet.rows + i) * width + b, both * (-1.0))
                     if ti.static(holds):
                         product = p[0] * u[0] + p[1] * u[1] + p[2] * u[2]
-                        add(sheet.found, (HELD * sheet.rows + i) * width + b, product * (0 - now[held]))
+                        add(sheet.found, (FOUNDATION_PART * sheet.rows + i) * width + b, product * (0 - now[held]))
                     if ti.static(tense):
-                        sums[TENSE + ALONG_ROW] = sums[TENSE + ALONG_ROW] - right[4]
-                        sums[TENSE + ALONG_COLUMN] = sums[TENSE + ALONG_COLUMN] - down[4]
-                        sums[TENSE + DIAGONAL] = sums[TENSE + DIAGONAL] - (to_right[4] + to_left[4])
+                        sums[TENSION_SUMS + ALONG_ROW] = sums[TENSION_SUMS + ALONG_ROW] - right[4]
+                        sums[TENSION_SUMS + ALONG_COLUMN] = sums[TENSION_SUMS + ALONG_COLUMN] - down[4]
+                        sums[TENSION_SUMS + DIAGONAL] = sums[TENSION_SUMS + DIAGONAL] - (to_right[4] + to_left[4])
                     if ti.static(code.by_area):
                         kept *= sheet.by_column[(AREA + kind) * width + b]
-                    sums[KEPT] += kept
+                    sums[KEEP_SUM] += kept
                     sense(pushed, sheet, entry, now)
                     for laplacian in ti.static(curving):
                         if kind == 1:
@@ -340,7 +340,7 @@ def _row_sweeping(code: StepCode) -> Callable[..., None]:
                                     sheet.shapes[c], width, shape - 1, shape, shape + 1, b,
                                     1 / (dx * dx), 1 / (dy * dy),
                                 )  # fmt: skip
-                                sums[BENT] = sums[BENT] - curved * sheet.u[c][at * width + b]
+                                sums[BENDING_SUM] = sums[BENDING_SUM] - curved * sheet.u[c][at * width + b]
             for c in ti.static(range(3)):
                 beside[c] = right[c] - to_left[c]
                 under[c] = to_right[c]
@@ -348,7 +348,7 @@ def _row_sweeping(code: StepCode) -> Callable[..., None]:
             first = (SUM_PARTS + 2 * standing) * sheet.rows * width + ROW_SUMS * i
             for n in ti.static(range(ROW_SUMS)):
                 add(sheet.found, first + n, sums[n])
-            for n in ti.static(range(PUSHED * slots)):
+            for n in ti.static(range(LOAD_DERIVATIVES * slots)):
                 pushes[band.n, i, n] = pushed[n].sum()
 
     return sweep_row
@@ -372,7 +372,7 @@ def _sweeping(code: StepCode, *, parallel: bool) -> Callable[..., None]:
         moments = ti.cast(sizes[MOMENT_ROW], ti.i32) + MOMENTS * worker
         with_loss = n == 0 and sizes[WITH_LOSS] != 0
         before, after = buffer * sheet.rows, (1 - buffer) * sheet.rows
-        band = ti.static(Strip(low, high, before, after, shape, carry, moments, n, with_loss))
+        band = ti.static(AdjointBand(low, high, before, after, shape, carry, moments, n, with_loss))
         if low == 0:
             clear(sheet, carry)
         for i in range(ti.max(low - 1, 0), high):
@@ -410,7 +410,7 @@ def _sweeping(code: StepCode, *, parallel: bool) -> Callable[..., None]:
 
 
 @cache
-def copying(code: StepCode) -> Callable[..., None]:
+def copy_kernel(code: StepCode) -> Callable[..., None]:
     """Make the kernel that copies so many entries, from one entry of some arrays to one of others."""
     vectors = code.vectors
 

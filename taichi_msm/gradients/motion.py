@@ -14,24 +14,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.accuracy import divergence
-from taichi_msm.accuracy.divergence import Watch
+from taichi_msm.accuracy.divergence import DivergenceMonitor
 from taichi_msm.errors import DivergedError, Pause
-from taichi_msm.gradients.chain_rule import LoadSlopes, Slopes
+from taichi_msm.gradients.chain_rule import LoadGradient, SheetGradient
 from taichi_msm.gradients.kernel_motion import (
     ADJOINT_PARTS,
-    BENT,
+    BENDING_SUM,
     BUFFERS,
-    FAMILIES,
-    HELD,
-    KEPT,
+    FOUNDATION_PART,
+    KEEP_SUM,
+    LOAD_DERIVATIVES,
     LOSS,
-    PUSHED,
     ROW_SUMS,
+    SPRING_PARTS,
     STRIDE,
     SUM_PARTS,
-    TENSE,
-    copying,
-    kernels,
+    TENSION_SUMS,
+    adjoint_kernels,
+    copy_kernel,
 )
 from taichi_msm.model.loads import schedule
 from taichi_msm.model.plan import Plan
@@ -52,7 +52,7 @@ SEGMENT_BYTES = 64 * 2**20
 
 # How many times a worker looks for its neighbour before it gives up: longer than forward, as one alone takes all the
 # rest of the launch, and its kernel may have to be compiled.
-LONG_PATIENCE = 8 * PATIENCE
+MAX_WAIT_LOOKS = 8 * PATIENCE
 
 # A launch of the adjoint takes no more steps times points than this, about 0.1 s of one core.
 POINT_STEPS_PER_LAUNCH = 10_000_000
@@ -134,7 +134,7 @@ class MotionAdjoint(Dynamics):
             DivergedError: when the sheet diverges.
         """
         plan, grid = self.plan, self.plan.grid
-        watch, frames = Watch(plan), np.zeros((grid.frames + 1, *plan.scene.sheet.points, 3))
+        monitor, frames = DivergenceMonitor(plan), np.zeros((grid.frames + 1, *plan.scene.sheet.points, 3))
         marks = {*range(0, grid.steps + 1, grid.steps_per_frame), *range(0, grid.steps, self._segment)}
         for n in sorted(marks):
             self.advance(n - self.steps_done, pause)
@@ -142,14 +142,14 @@ class MotionAdjoint(Dynamics):
                 self._keep(n // self._segment)
             if n and n % grid.steps_per_frame == 0:
                 reading = self.read()
-                fault = watch.follow(reading)
+                fault = monitor.check_frame(reading)
                 if fault:
-                    said = divergence.message(grid.time(n), n, fault, exact=False)
+                    said = divergence.format_message(grid.time(n), n, fault, exact=False)
                     raise DivergedError(said, n, grid.time(n), farthest(reading.displacement)[:2])
                 frames[n // grid.steps_per_frame] = reading.displacement
         return frames
 
-    def backward(self, by_frame: Array, pause: Pause = lambda: None) -> tuple[Slopes, LoadSlopes]:
+    def backward(self, by_frame: Array, pause: Pause = lambda: None) -> tuple[SheetGradient, LoadGradient]:
         """Sweep the adjoint of the last `run`; by_frame: derivative of the loss by what that returned."""
         grid, layout, arrays = self.plan.grid, self.structure, self._arrays
         _, gain, _ = coefficients(self.plan)
@@ -162,16 +162,16 @@ class MotionAdjoint(Dynamics):
         none = np.zeros((SUM_PARTS * layout.rows, layout.cols))
         slopes = self._slopes.reshape(-1, layout.cols)
         write(arrays.found, in_lanes(layout, np.concatenate([none, slopes])))
-        loads, self._buffer, totals = LoadSlopes(self.plan), BUFFERS, np.zeros(2)
+        loads, self._buffer, totals = LoadGradient(self.plan), BUFFERS, np.zeros(2)
         block = max(1, STEPS_PER_TABLE // self._segment) * self._segment
         for first in reversed(range(0, grid.steps, block)):
             totals += self._sweep_block(first, min(first + block, grid.steps), by_frame, loads, pause)
         return self._collect(gain, totals), loads
 
-    def _sweep_block(self, first: int, end: int, by_frame: Array, loads: LoadSlopes, pause: Pause) -> Array:
+    def _sweep_block(self, first: int, end: int, by_frame: Array, loads: LoadGradient, pause: Pause) -> Array:
         """Sweep back over some segments; returns the work of the loads on the adjoint after step 0, and in step 0."""
         table, h = self._table(first, end - first), self.plan.grid.step
-        by_slot = np.zeros((end - first, len(self.plan.slots), PUSHED))
+        by_slot = np.zeros((end - first, len(self.plan.slots), LOAD_DERIVATIVES))
         at = end
         for begin in reversed(range(first, end, self._segment)):
             self._record(begin, table[begin - first : at - first], pause)
@@ -204,7 +204,7 @@ class MotionAdjoint(Dynamics):
     def _copy_entries(self, source: int, target: int, of: list[Any], to: list[Any]) -> None:
         """Copy a shape from one entry of three arrays to one of others."""
         with our_compilation():
-            copying(self.structure.code)(self._entries, source, target, *of, *to)
+            copy_kernel(self.structure.code)(self._entries, source, target, *of, *to)
 
     def _record(self, first: int, table: Array, pause: Pause) -> None:
         """Take the steps of a segment, from its first one on, and keep every shape; table: of its loads."""
@@ -235,10 +235,10 @@ class MotionAdjoint(Dynamics):
         if not beyond:
             self._put(by_frame[frame])
         sizes = self._sizes(count, end - first - 1, ADJOINT_PARTS * layout.rows, not beyond)
-        pushes = np.zeros((count, layout.rows, max(1, PUSHED * len(self.plan.slots))))
+        pushes = np.zeros((count, layout.rows, max(1, LOAD_DERIVATIVES * len(self.plan.slots))))
         self._launch(1, sizes, table, pushes, *arrays.adjoint, *arrays.shapes, *self._sheet_arrays, arrays.found)
         self._buffer = (self._buffer + count) % 2
-        return pushes[..., : PUSHED * len(self.plan.slots)].sum(axis=1).reshape(count, -1, PUSHED)
+        return pushes[..., : LOAD_DERIVATIVES * len(self.plan.slots)].sum(axis=1).reshape(count, -1, LOAD_DERIVATIVES)
 
     def _put(self, slopes: Array) -> None:
         """Put the derivative by the shape of a frame where the kernel adds it."""
@@ -246,7 +246,7 @@ class MotionAdjoint(Dynamics):
             write(self._arrays.loss[c], in_lanes(self.structure, slopes[..., c]))
         self._copy_entries(0, LOSS * self._entries, self._arrays.loss, self._arrays.adjoint)
 
-    def _collect(self, gain: float, totals: Array) -> Slopes:
+    def _collect(self, gain: float, totals: Array) -> SheetGradient:
         """Add up what was found."""
         layout = self.structure
         rows, cols, found = layout.rows, layout.cols, self._arrays.found.to_numpy()
@@ -254,9 +254,11 @@ class MotionAdjoint(Dynamics):
         first = (SUM_PARTS + 2 * len(self._slopes)) * rows * layout.width
         # Row by row, each in the order of its lanes.
         sums = found[first : first + ROW_SUMS * rows].reshape(rows, ROW_SUMS, -1).sum(axis=2).sum(axis=0)
-        springs = every[FAMILIES][:, :-1], every[FAMILIES + 1][:-1], every[FAMILIES + 2][:-1, :-1]
-        held = every[HELD] * point_shares(self.plan)
-        slopes = Slopes(springs, sums[TENSE:BENT], held, float(sums[BENT]), keep=float(sums[KEPT]) / gain)
+        springs = every[SPRING_PARTS][:, :-1], every[SPRING_PARTS + 1][:-1], every[SPRING_PARTS + 2][:-1, :-1]
+        held = every[FOUNDATION_PART] * point_shares(self.plan)
+        slopes = SheetGradient(
+            springs, sums[TENSION_SUMS:BENDING_SUM], held, float(sums[BENDING_SUM]), keep=float(sums[KEEP_SUM]) / gain
+        )
         slopes.gain = slopes.work(self.plan) + float(totals[0])
         slopes.first_gain = float(totals[1])
         return slopes
@@ -275,7 +277,7 @@ class MotionAdjoint(Dynamics):
         layout = self.structure
         carry = extra + MOMENTS * layout.workers
         return np.array([
-            count, layout.workers, layout.rows, layout.strip, shape, extra, carry, self._carried_rows, LONG_PATIENCE,
+            count, layout.workers, layout.rows, layout.strip, shape, extra, carry, self._carried_rows, MAX_WAIT_LOOKS,
             self._buffer if extra == ADJOINT_PARTS * layout.rows else 0, with_loss,
         ])  # fmt: skip
 
@@ -286,4 +288,4 @@ class MotionAdjoint(Dynamics):
         for parallel in (True, False) if workers > 1 else (False,):
             if (progress[::STRIDE] < sizes[0]).any():
                 with our_compilation():
-                    kernels(code, parallel=parallel)[which](sizes, progress, *arguments)
+                    adjoint_kernels(code, parallel=parallel)[which](sizes, progress, *arguments)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import MsmError, Pause
-from taichi_msm.gradients.chain_rule import LoadSlopes, Slopes
+from taichi_msm.gradients.chain_rule import LoadGradient, SheetGradient
 from taichi_msm.model.loads import Schedule, decay, decay_slope, frame_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import spacing
@@ -31,10 +31,10 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 # A solution with a larger error, of the size of the right side, is none.
-SOLVED = 1e-6
+RESIDUAL_TOLERANCE = 1e-6
 
 # Seconds between pauses while a solution is found.
-PATIENCE = 0.1
+PAUSE_INTERVAL_S = 0.1
 
 
 class RestAdjoint:
@@ -64,7 +64,7 @@ class RestAdjoint:
         self._displacements = np.array(frames)
         return self._displacements.copy()
 
-    def backward(self, by_frame: Array, pause: Pause) -> tuple[Slopes, LoadSlopes]:
+    def backward(self, by_frame: Array, pause: Pause) -> tuple[SheetGradient, LoadGradient]:
         """Differentiate at the last `run`; by_frame: derivative of the loss by what that returned.
 
         Raises:
@@ -72,11 +72,11 @@ class RestAdjoint:
         """
         plan, (rows, cols) = self.plan, self.plan.scene.sheet.points
         families, curvature = list(spring_families(plan)), _laplacian(plan)
-        slopes = Slopes(
+        slopes = SheetGradient(
             (np.zeros((rows, cols - 1)), np.zeros((rows - 1, cols)), np.zeros((rows - 1, cols - 1))),
             np.zeros(3), np.zeros((rows, cols)), 0.0,
         )  # fmt: skip
-        loads = LoadSlopes(plan)
+        loads = LoadGradient(plan)
         for n, slope in enumerate(by_frame):
             pause()
             u: Array = self._displacements[n]
@@ -84,7 +84,7 @@ class RestAdjoint:
                 continue
             at_frame = frame_loads(plan, n)
             held = plan.material.virtual * at_frame.active[0] * point_shares(plan)
-            p = _waited(partial(_solved, plan, _stiffness(plan, families, held, curvature, u), slope), pause)
+            p = _run_interruptibly(partial(_solve, plan, _stiffness(plan, families, held, curvature, u), slope), pause)
             if p is None and u.any():
                 raise MsmError(
                     f"frame {n} has no gradient: the sheet has no stiffness against some motion; give it a foundation, "
@@ -99,7 +99,7 @@ class RestAdjoint:
             self._add_loads(loads, n, at_frame, p)
         return slopes, loads
 
-    def _add_loads(self, loads: LoadSlopes, frame: int, at_frame: Schedule, p: Array) -> None:
+    def _add_loads(self, loads: LoadGradient, frame: int, at_frame: Schedule, p: Array) -> None:
         """Add the derivatives by the loads of a frame."""
         scene, pushes = self.plan.scene, np.zeros((1, len(at_frame.slots), 5))
         for n, slot in enumerate(at_frame.slots):
@@ -111,7 +111,7 @@ class RestAdjoint:
         loads.add(lambda plan: frame_loads(plan, frame), pushes, (time - nearly, time + nearly))
 
 
-def _add_springs(slopes: Slopes, families: Sequence[SpringFamily], u: Array, p: Array) -> None:
+def _add_springs(slopes: SheetGradient, families: Sequence[SpringFamily], u: Array, p: Array) -> None:
     """Add the derivatives by the springs."""
     for number, family in enumerate(families):
         between, length = family.apart(u)
@@ -156,7 +156,7 @@ def _laplacian(plan: Plan) -> Any:
     return (sparse.kron(inner_rows, across) + sparse.kron(down, inner_cols)).tocsr()
 
 
-def _waited(work: Callable[[], Array | None], pause: Pause) -> Array | None:
+def _run_interruptibly(work: Callable[[], Array | None], pause: Pause) -> Array | None:
     """Return what some work in SciPy returns, with pauses meanwhile; what one raises leaves the work behind."""
     future: Future[Array | None] = Future()
 
@@ -167,12 +167,12 @@ def _waited(work: Callable[[], Array | None], pause: Pause) -> Array | None:
             future.set_exception(error)
 
     Thread(target=finish, daemon=True).start()
-    while wait([future], PATIENCE).not_done:
+    while wait([future], PAUSE_INTERVAL_S).not_done:
         pause()
     return future.result()
 
 
-def _solved(plan: Plan, stiffness: csc_matrix, slope: Array) -> Array | None:
+def _solve(plan: Plan, stiffness: csc_matrix, slope: Array) -> Array | None:
     """Solve K p = slope where points move, p = 0 elsewhere; None: K is singular."""
     from scipy.sparse.linalg import splu
 
@@ -183,7 +183,7 @@ def _solved(plan: Plan, stiffness: csc_matrix, slope: Array) -> Array | None:
         found = factors.solve(right)
     except RuntimeError:
         return None
-    if not np.abs(inner @ found - right).max() <= SOLVED * np.abs(right).max():
+    if not np.abs(inner @ found - right).max() <= RESIDUAL_TOLERANCE * np.abs(right).max():
         return None
     p[moves] = found
     return p.reshape(slope.shape)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from taichi_msm.accuracy.companions import choose_pilots
+from taichi_msm.accuracy.companions import choose_companion_runs
 from taichi_msm.errors import Problem, SceneError
 from taichi_msm.model.plan import Plan
 from taichi_msm.render import texture
@@ -124,7 +124,7 @@ def estimate_memory(plan: Plan) -> Budget:
     loads = sum(not probe.moved for probe in scene.probes)
     numbers = STATE_NUMBERS + OUTPUT_NUMBERS + loads + contact + sum(MAP_NUMBERS[name] for name in scene.maps)
     # Pilots are up to two more sheets in f64; with tissue also two smaller ones.
-    pilot = scene.time.tolerance is not None or choose_pilots(plan).some
+    pilot = scene.time.tolerance is not None or choose_companion_runs(plan).planned
     sheets = number_bytes + (8 * (2 + (scene.tissue is not None) * 5 / 16) if pilot else 0)
     return Budget(
         points=points,
@@ -240,7 +240,7 @@ class Duration(NamedTuple):
 
 def estimate_duration(plan: Plan) -> Duration:
     """Estimate how long a run takes on a CPU, with every core; computing it takes milliseconds."""
-    parts = work(plan, choose_pilots(plan).cost)
+    parts = work(plan, choose_companion_runs(plan).cost)
     unit = UNIT * _calibrate() / CALIBRATION
     return Duration(unit * sum(parts), unit * parts.start)
 

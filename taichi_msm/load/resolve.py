@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from taichi_msm.accuracy.mesh import MeshEstimate, choose_points
-from taichi_msm.accuracy.time_step import Estimate, choose_step
+from taichi_msm.accuracy.time_step import TimeStepEstimate, choose_step
 from taichi_msm.errors import Count
 from taichi_msm.load.check import checked
 from taichi_msm.model.plan import Plan
@@ -18,7 +18,7 @@ class Resolved(NamedTuple):
     """A plan in which nothing is left open: its scene has the points, the step and the precision that were chosen."""
 
     plan: Plan
-    estimate: Estimate | None  # of the error, if a tolerance of the time required it
+    estimate: TimeStepEstimate | None  # of the error, if a tolerance of the time required it
     mesh: MeshEstimate | None  # the error of the points, if a tolerance of the sheet required it
 
 

@@ -6,59 +6,67 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from taichi_msm.study.result import Peer, Points, Stepping, Study, Timing
+from taichi_msm.study.result import MeshMeasurement, PeerMeasurement, SteppingMeasurement, Study, Timing
 
 UNITS = ((1, "s"), (1e3, "ms"), (1e6, "us"))
 
 Columns = Mapping[str, Callable[[Any], str]]
 
 
-def number(value: float) -> str:
+def format_number(value: float) -> str:
     """Write a measured value with three significant digits."""
     return f"{value:.0f}" if 999.5 <= abs(value) < 1e6 else f"{value:#.3g}".rstrip(".")
 
 
-def unit(seconds: float) -> tuple[float, str]:
+def time_unit(seconds: float) -> tuple[float, str]:
     """Choose a readable unit for a time; returns how many of it make a second, and its name."""
     return next(((scale, name) for scale, name in UNITS if seconds * scale >= 0.9995), UNITS[-1])
 
 
-def duration(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """Write a time with its unit."""
-    scale, name = unit(seconds)
-    return f"{number(seconds * scale)} {name}"
+    scale, name = time_unit(seconds)
+    return f"{format_number(seconds * scale)} {name}"
 
 
-def timing(seconds: Timing) -> str:
+def format_timing(seconds: Timing) -> str:
     """Write a median and, in the same unit, the range."""
-    scale, _ = unit(seconds.median)
-    spread = f"{number(seconds.fastest * scale)} to {number(seconds.slowest * scale)}" if seconds.runs > 1 else "once"
-    return f"{duration(seconds.median)} ({spread})"
+    scale, _ = time_unit(seconds.median)
+    spread = (
+        f"{format_number(seconds.fastest * scale)} to {format_number(seconds.slowest * scale)}"
+        if seconds.runs > 1
+        else "once"
+    )
+    return f"{format_duration(seconds.median)} ({spread})"
 
 
-def size(point: Stepping | Peer | Points) -> float:
+def comparable_error(point: SteppingMeasurement | PeerMeasurement | MeshMeasurement) -> float:
     """Give an error, infinite where the simulation diverged."""
     return math.inf if point.error is None or math.isnan(point.error) else point.error
 
 
-def wrong(point: Stepping | Peer | Points) -> str:
+def format_error(point: SteppingMeasurement | PeerMeasurement | MeshMeasurement) -> str:
     """Write an error; if it is not known exactly, its bound."""
-    return f"{'' if point.known else '< '}{number(size(point))}" if size(point) < math.inf else "diverged"
+    return (
+        f"{'' if point.known else '< '}{format_number(comparable_error(point))}"
+        if comparable_error(point) < math.inf
+        else "diverged"
+    )
 
 
-def mostly_rounding(point: Stepping | Peer | Points) -> bool:
+def is_mostly_rounding(point: SteppingMeasurement | PeerMeasurement | MeshMeasurement) -> bool:
     """Tell whether most of an error comes from f32."""
-    return isinstance(point, Stepping) and (point.rounding or 0) > (point.error or 0) / 2
+    return isinstance(point, SteppingMeasurement) and (point.rounding or 0) > (point.error or 0) / 2
 
 
-def where(study: Study) -> str:
+def machine_summary(study: Study) -> str:
     """Name the machine."""
     threads = study.machine["threads"]
     used = f"{threads} thread{'' if threads == 1 else 's'}, vectors of {study.machine['vectors']} bits"
     return f"{study.machine['cpu']}, {used if study.machine['arch'] == 'cpu' else study.machine['arch']}"
 
 
-def markdown(head: Sequence[str], rows: Sequence[Sequence[str]], left: Sequence[int] = ()) -> str:
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], left: Sequence[int] = ()) -> str:
     """Write a Markdown table; columns are aligned right, but those in `left`, of words, left."""
     widths = [max(len(row[column]) for row in [head, *rows]) for column in range(len(head))]
     rule = ["-" * width if column in left else "-" * (width - 1) + ":" for column, width in enumerate(widths)]
@@ -76,9 +84,9 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[str]], left: Sequence[
 WORDS = ("method", "without")
 
 
-def table(measured: Sequence[Any], columns: Columns, mark: Callable[[Any], str] | None = None) -> str:
+def format_table(measured: Sequence[Any], columns: Columns, mark: Callable[[Any], str] | None = None) -> str:
     """Write measurements as a table, one in a row; `mark` may give more for a last column without a name."""
     if mark and any(map(mark, measured)):
         columns = {**columns, "": mark}
     rows = [[cell(one) for cell in columns.values()] for one in measured]
-    return markdown(list(columns), rows, [n for n, name in enumerate(columns) if name in WORDS or not name])
+    return markdown_table(list(columns), rows, [n for n, name in enumerate(columns) if name in WORDS or not name])

@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
-from taichi_msm.accuracy.divergence import farthest_displacement
-from taichi_msm.accuracy.mesh import FEWEST, CubicSampling, MeshPilot, companion, with_points
-from taichi_msm.accuracy.time_step import longest
+from taichi_msm.accuracy.divergence import displacement_bound
+from taichi_msm.accuracy.mesh import MIN_POINTS, CubicInterpolation, MeshCompanion, mesh_companion_plan, with_points
+from taichi_msm.accuracy.time_step import max_norm
 from taichi_msm.errors import Count
 from taichi_msm.load import cost
 from taichi_msm.model.loads import Schedule, key_times, loads_at
@@ -39,7 +39,14 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_POINTS
 from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.solver.planning import stable_steps, try_plan, variant, with_time
-from taichi_msm.study.result import Drawn, Points, Reference, Stepping, Study, TimedTerm
+from taichi_msm.study.result import (
+    DrawingMeasurement,
+    MeshMeasurement,
+    Reference,
+    SteppingMeasurement,
+    Study,
+    TermMeasurement,
+)
 from taichi_msm.system import process
 from taichi_msm.system.runtime import Device
 from taichi_msm.terms.elasticity import elastic_force, spring_families
@@ -48,13 +55,13 @@ PRECISIONS: tuple[Precision, ...] = ("f64", "f32")
 DIFFERENCES = ("central", "backward")
 
 # How many times every setting is timed; all settings take turns.
-ROUNDS = 5
+STEPPING_ROUNDS = 5
 
 # An error counts as known if it is at least this many times that of the reference.
-MARGIN = 20
+REFERENCE_MARGIN = 20
 
 # How many times the largest stable step is halved at least, whatever it costs.
-LEAST_HALVINGS = 2
+MIN_HALVINGS = 2
 
 Frames = NDArray[Any]
 
@@ -88,12 +95,12 @@ class SteppingStudy:
             dynamics.compile()
         series = {difference: list(self._series(difference)) for difference in DIFFERENCES}
         finest = max(steps for counts in series.values() for steps in counts)
-        self._to_do = 3 + ROUNDS * len(PRECISIONS) * sum(len(counts) for counts in series.values())
+        self._to_do = 3 + STEPPING_ROUNDS * len(PRECISIONS) * sum(len(counts) for counts in series.values())
         self._make_reference(finest)
         for difference, counts in series.items():
             self._measure_errors(difference, counts)
-        self._to_do = self._done + (ROUNDS - 1) * len(self.study.stepping)
-        for _ in range(ROUNDS - 1):
+        self._to_do = self._done + (STEPPING_ROUNDS - 1) * len(self.study.stepping)
+        for _ in range(STEPPING_ROUNDS - 1):
             for one in self.study.stepping:
                 self._run(one.precision, one.damping_difference, one.steps_per_frame, one.samples)
 
@@ -101,11 +108,11 @@ class SteppingStudy:
         """Give the largest error of frames relative to the reference, as a fraction of the largest displacement."""
         assert self.frames is not None
         largest = self._reference.largest
-        return longest(frames - self.frames) / largest if largest > 0 else 0.0
+        return max_norm(frames - self.frames) / largest if largest > 0 else 0.0
 
     def known(self, error: float) -> bool:
         """Tell whether the reference is exact enough to know an error."""
-        return error >= MARGIN * self._reference.error
+        return error >= REFERENCE_MARGIN * self._reference.error
 
     def close(self) -> None:
         """Free the memory."""
@@ -124,7 +131,7 @@ class SteppingStudy:
         self._run("f64", difference, steps, samples)
         yield steps
         for halving in range(1, 64):
-            if halving > LEAST_HALVINGS and samples[0] * 2**halving > self._longest_run:
+            if halving > MIN_HALVINGS and samples[0] * 2**halving > self._longest_run:
                 return
             yield steps * 2**halving
 
@@ -138,25 +145,27 @@ class SteppingStudy:
         before, self.frames = middle + (middle - coarse) / 3, fine + (fine - middle) / 3
         if self.plan.tools:
             before, self.frames = middle, fine
-        largest = longest(self.frames)
-        error = longest(self.frames - before) / largest if largest > 0 else 0.0
+        largest = max_norm(self.frames)
+        error = max_norm(self.frames - before) / largest if largest > 0 else 0.0
         self.study.reference = Reference(4 * finest, error, largest)
 
     def _measure_errors(self, difference: str, counts: list[int]) -> None:
         """Run every step once: in f32 until rounding dominates, in f64 until the reference is not exact enough."""
-        going, farthest = set(PRECISIONS), farthest_displacement(self.plan, self.plan.scene.time.duration)
+        going, farthest = set(PRECISIONS), displacement_bound(self.plan, self.plan.scene.time.duration)
         for steps in counts:
             exact: Frames | None = None
             for precision in (one for one in PRECISIONS if one in going):
-                point = Stepping(precision, difference, steps, replace(self.plan.grid, steps_per_frame=steps).step)
+                point = SteppingMeasurement(
+                    precision, difference, steps, replace(self.plan.grid, steps_per_frame=steps).step
+                )
                 frames = self._run(precision, difference, steps, point.samples)
                 error, rounding = self.relative(frames), None
                 if precision == "f64":
                     exact = frames
                 elif exact is not None and self._reference.largest > 0:
-                    rounding = longest(frames - exact) / self._reference.largest
+                    rounding = max_norm(frames - exact) / self._reference.largest
                 self.study.stepping.append(point)
-                if error < math.inf and longest(frames) <= farthest:
+                if error < math.inf and max_norm(frames) <= farthest:
                     point.error, point.rounding, point.known = error, rounding, self.known(error)
                     if not point.known or (rounding is not None and rounding > error / 2):
                         going.discard(precision)
@@ -180,14 +189,14 @@ class SteppingStudy:
 
 
 # Cells a side, relative to those of the scene.
-COARSER = (1 / 4, 1 / 2)
-FINER = 2
+COARSE_CELL_RATIOS = (1 / 4, 1 / 2)
+FINE_CELL_RATIO = 2
 
 # How many times every sheet is timed; all sheets take turns.
-POINT_ROUNDS = 5
+MESH_ROUNDS = 5
 
 # An error counts as known if it is at least this many times the bound of the reference's own error.
-POINT_MARGIN = 5
+MESH_REFERENCE_MARGIN = 5
 
 Field = NDArray[Any]
 Lattice = tuple[int, int]
@@ -198,10 +207,10 @@ class _Sheet(NamedTuple):
 
     plan: Plan
     dynamics: Dynamics
-    measured: Points
+    measured: MeshMeasurement
 
 
-class PointStudy:
+class MeshStudy:
     """Measures the error and the speed of a sheet of tissue with more or fewer points, in f64.
 
     Errors are measured with the same steps for all sheets, so that the errors of the step cancel. Times are measured
@@ -231,37 +240,37 @@ class PointStudy:
             return
         with ExitStack() as opened:
             seconds = 0.0
-            for plan in lattices(self._plan):
+            for plan in mesh_plans(self._plan):
                 seconds = self._try(plan, opened)
             if not self._sheets:
-                said = f"points were not measured: with fewer than {FEWEST} a side they cannot be compared"
+                said = f"points were not measured: with fewer than {MIN_POINTS} a side they cannot be compared"
                 self._study.notes.append(said)
                 return
             finer = self._finer(self._plan, seconds, self._longest_run)
             if finer is None:
-                rows, cols = _scaled(self._plan, FINER)
+                rows, cols = _scaled(self._plan, FINE_CELL_RATIO)
                 self._study.notes.append(f"{rows} x {cols} points were not measured: time or memory")
             else:
                 seconds = self._try(finer, opened)
-                finer = self._finer(finer, seconds, POINT_ROUNDS * self._longest_run)
+                finer = self._finer(finer, seconds, MESH_ROUNDS * self._longest_run)
             if len(self._sheets) < 2:
                 return
             self._measure_errors(finer)
-            for _ in range(POINT_ROUNDS):
+            for _ in range(MESH_ROUNDS):
                 for sheet in self._sheets:
                     sheet.measured.samples.append(self._step_through(sheet))
 
     def _try(self, plan: Plan, opened: ExitStack) -> float:
         """Run a sheet with its own step beside the pilot that `run` would have; returns the time of stepping [s]."""
         dynamics = opened.enter_context(closing(Dynamics(plan, self._device)))
-        sheet = _Sheet(plan, dynamics, Points(*plan.scene.sheet.points, plan.grid.steps_per_frame))
-        coarse = companion(plan)
+        sheet = _Sheet(plan, dynamics, MeshMeasurement(*plan.scene.sheet.points, plan.grid.steps_per_frame))
+        coarse = mesh_companion_plan(plan)
         assert coarse is not None
         self._sheets.append(sheet)
         self._study.points.append(sheet.measured)
         self._tick()
         dynamics.compile()
-        pilot = MeshPilot(plan, coarse, self._device)
+        pilot = MeshCompanion(plan, coarse, self._device)
         pilot.compile()
         first = self._step_through(sheet, pilot)
         # The faster of two runs: what disturbs one may not disturb the other.
@@ -276,7 +285,7 @@ class PointStudy:
         Returns:
             The plan; None if stepping through it would take longer than `longest_run` [s], or too much memory.
         """
-        points = _scaled(plan, FINER)
+        points = _scaled(plan, FINE_CELL_RATIO)
         if max(points) > MAX_POINTS:
             return None
         finer = variant(plan, with_points(plan.scene, points))
@@ -302,24 +311,24 @@ class PointStudy:
                 fields = [sheet.displacement() for sheet in sheets]
                 with np.errstate(all="ignore"):
                     exact, bound = _reference(fields, extrapolate=not finest.tools)
-                    apart = [longest(_sampled(one, exact) - exact) for one in fields[:-1]]
+                    apart = [max_norm(_sampled(one, exact) - exact) for one in fields[:-1]]
                     # Between the points of the finest sheet, its error is not known. But if its order is 1 or more, it
                     # is at most its distance from a sheet that is twice as coarse.
-                    apart.append(longest(_sampled(fields[-2], fields[-1]) - fields[-1]))
+                    apart.append(max_norm(_sampled(fields[-2], fields[-1]) - fields[-1]))
                 errors = [max(pair) for pair in zip(errors, apart, strict=True)]
-                own_error, largest = max(own_error, bound), max(largest, longest(exact))
+                own_error, largest = max(own_error, bound), max(largest, max_norm(exact))
             self._done += 1
-        farthest = farthest_displacement(finest, finest.scene.time.duration)
+        farthest = displacement_bound(finest, finest.scene.time.duration)
         if not largest <= farthest:
             return
         for (plan, _, measured), error in zip(self._sheets, errors, strict=False):
             if plan is not finest:
-                measured.known = error >= POINT_MARGIN * own_error
+                measured.known = error >= MESH_REFERENCE_MARGIN * own_error
                 error += 0.0 if measured.known else own_error
             share = error / largest if largest > 0 else 0.0
             measured.error = share if share < math.inf else None
 
-    def _step_through(self, sheet: _Sheet, pilot: MeshPilot | None = None) -> float:
+    def _step_through(self, sheet: _Sheet, pilot: MeshCompanion | None = None) -> float:
         """Step through the scene with the sheet's own step; returns the time of stepping alone [s]."""
         plan, dynamics, _ = sheet
         dynamics.restart(plan)
@@ -331,23 +340,23 @@ class PointStudy:
             seconds += time.perf_counter() - start
             displacement = dynamics.displacement()
             if pilot is not None:
-                pilot.follow(displacement, self._tick)
+                pilot.compare_frame(displacement, self._tick)
         self._done += 1
         return seconds
 
     def _tick(self) -> None:
         # For each sheet the estimate, another run and the rounds; for all of them together the errors.
-        self._progress(self._done, 1 + (2 + POINT_ROUNDS) * len(self._sheets))
+        self._progress(self._done, 1 + (2 + MESH_ROUNDS) * len(self._sheets))
 
 
-def lattices(plan: Plan) -> Iterator[Plan]:
+def mesh_plans(plan: Plan) -> Iterator[Plan]:
     """Plan the numbers of points to compare, as far as the scene allows them; its own come last."""
-    for share in COARSER:
+    for share in COARSE_CELL_RATIOS:
         points = _scaled(plan, share)
-        coarse, _ = try_plan(with_points(plan.scene, points), plan.maps) if min(points) >= FEWEST else (None, [])
+        coarse, _ = try_plan(with_points(plan.scene, points), plan.maps) if min(points) >= MIN_POINTS else (None, [])
         if coarse is not None:
             yield coarse
-    if min(plan.scene.sheet.points) >= FEWEST:
+    if min(plan.scene.sheet.points) >= MIN_POINTS:
         yield plan
 
 
@@ -372,13 +381,13 @@ def _reference(fields: list[Field], *, extrapolate: bool) -> tuple[Field, float]
         u* at the points of the finest field [m], and an approximate bound of its error [m].
     """
     if not extrapolate:
-        return fields[-1], longest(_sampled(fields[-1], fields[-2]) - fields[-2])
+        return fields[-1], max_norm(_sampled(fields[-1], fields[-2]) - fields[-2])
     exact = fields[-1] + _sampled(_correction(fields[-1], fields[-2]), fields[-1])
     if len(fields) > 2:
         before = fields[-2] + _sampled(_correction(fields[-2], fields[-3]), fields[-2])
     else:
         before = _sampled(fields[-1], fields[-2])
-    return exact, longest(_sampled(exact, before) - before)
+    return exact, max_norm(_sampled(exact, before) - before)
 
 
 def _correction(fine: Field, coarse: Field) -> Field:
@@ -391,14 +400,14 @@ def _correction(fine: Field, coarse: Field) -> Field:
 def _sampled(values: Field, like: Field) -> Field:
     """Interpolate a field at the points of another one."""
     (rows, cols), (to_rows, to_cols) = values.shape[:2], like.shape[:2]
-    return CubicSampling((rows, cols), (to_rows, to_cols)).at(values)
+    return CubicInterpolation((rows, cols), (to_rows, to_cols)).at(values)
 
 
 REFINES = (0, 1, 2, 5, 10, 20)
 SUPERSAMPLES = (1, 2, 3, 4)
 
 # Settings of the reference picture, if there is memory for it; they must be finer than all that are compared with it.
-FINEST = {"refine": 40, "supersample": 8}
+REFERENCE_RENDER = {"refine": 40, "supersample": 8}
 
 PICTURE_ROUNDS = 5
 
@@ -414,12 +423,12 @@ def measure_pictures(
     """
     position = np.ascontiguousarray(position, np.float32)
     memory = process.available_memory() // 2
-    finest = _with_render(scene, **FINEST)
+    finest = _with_render(scene, **REFERENCE_RENDER)
     if cost.drawing_bytes(finest) > memory:
         study.notes.append("drawing was not measured: there is no memory for a picture fine enough to compare with")
         return
     truth = Drawing(finest, texture).draw(position)
-    drawings, compared = [], list(settings(scene, quick))
+    drawings, compared = [], list(render_settings(scene, quick))
     for number, (refine, supersample) in enumerate(compared):
         progress(number, len(compared) * PICTURE_ROUNDS)
         changed = _with_render(scene, refine=refine, supersample=supersample)
@@ -431,7 +440,7 @@ def measure_pictures(
         drawings.append(drawing)
         picture = drawing.draw(position)
         apart = int(np.abs(picture.astype(np.int16) - truth).max())
-        study.drawing.append(Drawn(refine, supersample, psnr(picture, truth), apart))
+        study.drawing.append(DrawingMeasurement(refine, supersample, psnr(picture, truth), apart))
     for round_ in range(PICTURE_ROUNDS):
         for number, (drawing, drawn) in enumerate(zip(drawings, study.drawing, strict=True)):
             progress(round_ * len(drawings) + number, len(drawings) * PICTURE_ROUNDS)
@@ -440,7 +449,7 @@ def measure_pictures(
             drawn.samples.append(time.perf_counter() - start)
 
 
-def settings(scene: Scene, quick: bool) -> Iterator[tuple[int, int]]:
+def render_settings(scene: Scene, quick: bool) -> Iterator[tuple[int, int]]:
     """List refinements and supersamplings to compare; `quick`: with one of them as in the scene."""
     own = scene.render
     for supersample in sorted({*SUPERSAMPLES, own.supersample}):
@@ -474,8 +483,8 @@ def measure_terms(plan: Plan, device: Device, sample: float, study: Study, progr
     """Measure the time of a step with each term left out in turn, in samples of about so many seconds."""
     # All variants have the steps of the whole scene: without a spring the automatic step would be another.
     grid = {"steps_per_frame": plan.grid.steps_per_frame, "precision": plan.grid.precision}
-    plans = {without: variant(plan, scene).with_grid(**grid) for without, scene in variants(plan.scene)}
-    study.terms += map(TimedTerm, plans)
+    plans = {without: variant(plan, scene).with_grid(**grid) for without, scene in scene_variants(plan.scene)}
+    study.terms += map(TermMeasurement, plans)
     with ExitStack() as opened:
         sheets: list[Dynamics] = []
         for without in plans.values():
@@ -492,7 +501,7 @@ def measure_terms(plan: Plan, device: Device, sample: float, study: Study, progr
                 term.samples.append(_step_seconds(sheet, frames))
 
 
-def variants(scene: Scene) -> Iterator[tuple[str, Scene]]:
+def scene_variants(scene: Scene) -> Iterator[tuple[str, Scene]]:
     """Give the scene without each of its terms in turn, by the term's key; the first variant is the whole scene."""
     yield "", scene
     terms, sheet = (SPRING_TERMS, scene.springs) if scene.tissue is None else (TISSUE_TERMS, scene.tissue)
@@ -517,20 +526,22 @@ def _step_seconds(dynamics: Dynamics, frames: int) -> float:
 
 
 # Loads are evaluated this far inside an interval between two keys, as a fraction of it: at its ends they may jump.
-INSIDE = 1e-9
+KEY_MARGIN = 1e-9
 
 Array = NDArray[np.float64]
 
 
-class TooSlowError(Exception):
+class TimeLimitError(Exception):
     """The time limit is exceeded."""
 
 
-class FailedError(Exception):
+class IntegrationError(Exception):
     """The solver finds no step that is small enough; the message says when."""
 
 
-def solve(plan: Plan, rtol: float, atol: float, deadline: float, tick: Callable[[], None]) -> tuple[Array, int]:
+def solve_with_dop853(
+    plan: Plan, rtol: float, atol: float, deadline: float, tick: Callable[[], None]
+) -> tuple[Array, int]:
     """Integrate from key to key of the loads, between which they are smooth.
 
     The absolute tolerance is of displacements [m] and velocities [m/s]; `tick` is called now and then.
@@ -546,17 +557,17 @@ def solve(plan: Plan, rtol: float, atol: float, deadline: float, tick: Callable[
 
     scene = plan.scene
     shape = (*scene.sheet.points, 3)
-    accelerate, moves = acceleration(plan), ~plan.fixed[..., None]
+    accelerate, moves = acceleration_function(plan), ~plan.fixed[..., None]
     state = np.zeros(2 * int(np.prod(shape)))
     evaluations = 0
     displacements = []
     for start, end, frames in _pieces(scene):
-        margin = INSIDE * (end - start)
+        margin = KEY_MARGIN * (end - start)
         first = loads_at(plan, np.array([start + margin, end - margin]))
 
         def motion(t: float, y: Array, start: float = start, end: float = end, ends: Schedule = first) -> Array:
             if time.perf_counter() > deadline:
-                raise TooSlowError
+                raise TimeLimitError
             tick()
             share = (t - start) / (end - start)
             between = (each[:1] + share * (each[1:] - each[:1]) for each in ends[1:])
@@ -567,14 +578,14 @@ def solve(plan: Plan, rtol: float, atol: float, deadline: float, tick: Callable[
         times = np.union1d(frames, end)
         solved = solve_ivp(motion, (start, end), state, "DOP853", t_eval=times, rtol=rtol, atol=atol)
         if not solved.success:
-            raise FailedError(f"after {solved.t[-1] if solved.t.size else start:.3g} s")
+            raise IntegrationError(f"after {solved.t[-1] if solved.t.size else start:.3g} s")
         state = solved.y[:, -1]
         evaluations += solved.nfev
         displacements += [column[: state.size // 2].reshape(shape) for column in solved.y.T[: len(frames)]]
     return np.array(displacements), evaluations
 
 
-def acceleration(plan: Plan) -> Callable[[Array, Array, Schedule], Array]:
+def acceleration_function(plan: Plan) -> Callable[[Array, Array, Schedule], Array]:
     """Prepare the right side of eq. 1 over the mass: displacements [m] and velocities [m/s] to accelerations [m/s2].
 
     The arrays have the shape (rows, cols, 3), and the schedule one step.
@@ -612,5 +623,5 @@ def _pieces(scene: Scene) -> Iterator[tuple[float, float, Array]]:
     bounds = [0.0, *key_times(scene), float(frames[-1])]
     for start, end in pairwise(bounds):
         # A key that differs from the time of a frame only by rounding is at that frame.
-        near = frames[(frames > start * (1 + INSIDE)) & (frames <= end * (1 + INSIDE))]
+        near = frames[(frames > start * (1 + KEY_MARGIN)) & (frames <= end * (1 + KEY_MARGIN))]
         yield start, end, np.minimum(near, end)

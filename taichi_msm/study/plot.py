@@ -35,8 +35,8 @@ from taichi_msm.plot_style import (
     VERMILION,
     WIDE,
 )
-from taichi_msm.study.format import mostly_rounding, number, unit, where
-from taichi_msm.study.result import Drawn, Peer, Points, Stepping, Study
+from taichi_msm.study.format import format_number, is_mostly_rounding, machine_summary, time_unit
+from taichi_msm.study.result import DrawingMeasurement, MeshMeasurement, PeerMeasurement, SteppingMeasurement, Study
 from taichi_msm.system.compiler import named
 
 # Colour shows the damping difference, dashes and markers the precision.
@@ -58,7 +58,7 @@ MARKERS = "osD^vPX"
 LAYOUTS = {1: "A", 2: "AB", 3: "AB;AC", 4: "AB;CD"}
 
 Panel = Callable[[Axes, Study], None]
-Point = Stepping | Peer | Points
+Point = SteppingMeasurement | PeerMeasurement | MeshMeasurement
 
 
 def plot(study: Study, path: Path) -> None:
@@ -95,7 +95,7 @@ def _figure(study: Study) -> Figure:
     versions = study.machine["versions"]
     state = " (interrupted)" if study.status == "interrupted" else ""
     figure.suptitle(f"{printable(study.scene)}: speed against error{state}", x=0.01, ha="left", parse_math=False)
-    machine = f"{where(study)}; taichi-msm {versions['taichi-msm']}, {named(versions)}"
+    machine = f"{machine_summary(study)}; taichi-msm {versions['taichi-msm']}, {named(versions)}"
     figure.supxlabel(f"{_advice(study)}\n{machine}", x=0.01, ha="left", size=8, parse_math=False, wrap=True)
     axes = figure.subplot_mosaic(layout)
     for name, panel in zip("ABCD", every, strict=False):
@@ -106,13 +106,13 @@ def _figure(study: Study) -> Figure:
 def _advice(study: Study) -> str:
     """Say in a line what the study recommends."""
     settings = [line.strip() for line in study.recommendation() if not line.endswith(":")]
-    if study.more_points is None and study.best_stepping is None:
+    if study.recommended_points is None and study.best_stepping is None:
         settings.append(f"no step measured is within the tolerance of {study.tolerance:g}")
     return f"Recommended (ringed where measured): {'; '.join(settings)}" if study.stepping else ""
 
 
 def _plot_stepping(axes: Axes, study: Study) -> None:
-    largest = "" if study.reference is None else f" ({number(study.reference.largest)} m)"
+    largest = "" if study.reference is None else f" ({format_number(study.reference.largest)} m)"
     axes.set(title="Stepping", ylabel="time to step through the scene [s]")
     axes.set_xlabel(f"error, as a fraction of the largest displacement{largest}")
     handles = []
@@ -144,7 +144,7 @@ def _plot_line(axes: Axes, points: Sequence[Point], line: dict[str, Any], label:
     axes.plot(errors, [point.seconds.median for point in points], **line, zorder=3)
     _plot_spread(axes, errors, points, line["color"])
     for point, error in zip(points, errors, strict=True):
-        if not point.known or mostly_rounding(point):
+        if not point.known or is_mostly_rounding(point):
             axes.plot([error], [point.seconds.median], **line | (HALF if point.known else HOLLOW), zorder=4)
     return Line2D([], [], **line, label=label)
 
@@ -155,7 +155,7 @@ def _marks(study: Study) -> Iterator[Line2D]:
     yield Line2D([], [], **TOLERANCE_LINE, label="tolerance")
     if study.best_stepping is not None:
         yield Line2D([], [], **RING | {"ms": 8}, label="recommended")
-    if any(point.known and mostly_rounding(point) for point in points):
+    if any(point.known and is_mostly_rounding(point) for point in points):
         yield Line2D([], [], **DOT | HALF, label="mostly rounding")
     if any(_drawable(point.error) and not point.known for point in points):
         yield Line2D([], [], **DOT | HOLLOW, label="at most this error")
@@ -184,7 +184,7 @@ def _plot_drawing(axes: Axes, study: Study) -> None:
     _legend(axes, handles, 3)
 
 
-def _place(drawn: Drawn) -> tuple[float, float]:
+def _place(drawn: DrawingMeasurement) -> tuple[float, float]:
     return drawn.psnr or 0.0, 1e3 * drawn.seconds.median
 
 
@@ -196,21 +196,21 @@ def _plot_points(axes: Axes, study: Study) -> None:
     handles = []
     for one, marker in zip(points, cycle(MARKERS)):
         line = {"color": BLUE, "linestyle": "none", "marker": marker} | ({} if one.known else HOLLOW)
-        own, bound = " (the scene)" if one is study.own_points else "", "" if one.known else ", at most"
+        own, bound = " (the scene)" if one is study.scene_mesh else "", "" if one.known else ", at most"
         handles.append(_plot_line(axes, [one], line, f"{one.name}{own}{bound}"))
-        if (one.rows, one.cols) == study.more_points:
+        if (one.rows, one.cols) == study.recommended_points:
             axes.plot([one.error or 0.0], [one.seconds.median], **RING)
         if _drawable(one.estimate):
             axes.plot([one.error or 0.0, one.estimate or 0.0], [one.seconds.median] * 2, color=ORANGE, linewidth=0.7)
             axes.plot([one.estimate or 0.0], [one.seconds.median], color=ORANGE, marker=marker)
     if any(_drawable(one.estimate) for one in points):
         handles.append(Line2D([], [], color=ORANGE, marker="o", linestyle="none", label="estimated by run"))
-    _scale_errors(axes, points, study.points_tolerance, [one.estimate or 0.0 for one in points])
+    _scale_errors(axes, points, study.mesh_tolerance, [one.estimate or 0.0 for one in points])
     _legend(axes, [*handles, Line2D([], [], **TOLERANCE_LINE, label="tolerance")])
 
 
 def _plot_terms(axes: Axes, study: Study) -> None:
-    scale, name = unit(study.terms[0].seconds.median)
+    scale, name = time_unit(study.terms[0].seconds.median)
     rows = range(len(study.terms))
     times = [scale * term.seconds.median for term in study.terms]
     below = [scale * (term.seconds.median - term.seconds.fastest) for term in study.terms]
@@ -218,7 +218,7 @@ def _plot_terms(axes: Axes, study: Study) -> None:
     colours = [SKY if term.without else SILVER for term in study.terms]
     error_line = {"linewidth": 0.8, "ecolor": INK}
     bars = axes.barh(rows, times, height=0.6, color=colours, xerr=(below, above), error_kw=error_line)
-    axes.bar_label(bars, [number(time) for time in times], padding=3, size=7, color=GREY)
+    axes.bar_label(bars, [format_number(time) for time in times], padding=3, size=7, color=GREY)
     axes.axvline(times[0], **TOLERANCE_LINE, zorder=0)
     axes.set_yticks(rows, [f"without {term.without}" if term.without else "whole step" for term in study.terms])
     axes.set(title="Terms", xlabel=f"time of a step [{name.replace('us', 'µs')}]")
@@ -229,7 +229,7 @@ def _plot_terms(axes: Axes, study: Study) -> None:
 
 
 def _plot_spread(
-    axes: Axes, at: Sequence[float], points: Sequence[Point | Drawn], colour: str, scale: float = 1
+    axes: Axes, at: Sequence[float], points: Sequence[Point | DrawingMeasurement], colour: str, scale: float = 1
 ) -> None:
     """Draw a thin line from the fastest to the slowest run of every point."""
     fastest = [scale * point.seconds.fastest for point in points]
@@ -237,7 +237,7 @@ def _plot_spread(
     axes.vlines(at, fastest, slowest, color=colour, linewidth=0.7, alpha=0.6)
 
 
-def _extremes(points: Iterable[Point | Drawn]) -> Iterator[float]:
+def _extremes(points: Iterable[Point | DrawingMeasurement]) -> Iterator[float]:
     """List the fastest and slowest times [s]."""
     for point in points:
         yield from (point.seconds.fastest, point.seconds.slowest)

@@ -15,13 +15,28 @@ from typing import Any, TypeVar
 from taichi_msm.errors import printable, writing
 from taichi_msm.runs.directory import staged
 from taichi_msm.scene.section import MAX_POINTS
-from taichi_msm.study.format import Columns, duration, number, size, table, timing, where, wrong
-from taichi_msm.study.result import Drawn, Measured, Peer, Points, Reference, Stepping, Study
+from taichi_msm.study.format import (
+    Columns,
+    comparable_error,
+    format_duration,
+    format_error,
+    format_number,
+    format_table,
+    format_timing,
+    machine_summary,
+)
+from taichi_msm.study.result import (
+    DrawingMeasurement,
+    Measurement,
+    MeshMeasurement,
+    PeerMeasurement,
+    Reference,
+    SteppingMeasurement,
+    Study,
+)
 from taichi_msm.system.compiler import named
 
-pass  # REMOVED
-
-PICTURE, PAGE, RECORD = "study.png", "study.md", "study.json"
+PICTURE_FILE, PAGE_FILE, RECORD_FILE = "study.png", "study.md", "study.json"
 
 WITHOUT_MATPLOTLIB = "study.png needs matplotlib: pip install matplotlib"
 
@@ -45,26 +60,26 @@ def write_report(study: Study, directory: Path) -> list[str]:
         FilesError: when the directory cannot be written.
     """
     with writing(directory), staged(directory) as hidden:
-        outputs = [*([PICTURE] if _draw(study, hidden / PICTURE) else []), PAGE, RECORD]
-        record = json.dumps({**as_record(study), "outputs": outputs}, indent=2, ensure_ascii=False, allow_nan=False)
-        for file, text in ((PAGE, page(study)), (RECORD, record + "\n")):
+        outputs = [*([PICTURE_FILE] if _draw(study, hidden / PICTURE_FILE) else []), PAGE_FILE, RECORD_FILE]
+        record = json.dumps({**study_record(study), "outputs": outputs}, indent=2, ensure_ascii=False, allow_nan=False)
+        for file, text in ((PAGE_FILE, format_page(study)), (RECORD_FILE, record + "\n")):
             # A file name that is not UTF-8 has surrogates; written with backslashes they are valid in JSON too.
             (hidden / file).write_text(text, encoding="utf-8", errors="backslashreplace", newline="")
-        if PICTURE not in outputs:
-            (directory / PICTURE).unlink(missing_ok=True)
+        if PICTURE_FILE not in outputs:
+            (directory / PICTURE_FILE).unlink(missing_ok=True)
         for output in outputs:
             (hidden / output).replace(directory / output)
     return outputs
 
 
-def as_record(study: Study) -> dict[str, Any]:
+def study_record(study: Study) -> dict[str, Any]:
     """Give the whole study as data for JSON; numbers that are not finite become null."""
     return {**_as_data(vars(study)), "recommendation": study.recommendation()}
 
 
 def _as_data(value: Any) -> Any:
-    if isinstance(value, Measured):
-        method = {"method": value.method} if isinstance(value, Stepping) else {}
+    if isinstance(value, Measurement):
+        method = {"method": value.method} if isinstance(value, SteppingMeasurement) else {}
         return {**method, **{key: _as_data(inner) for key, inner in vars(value).items() if key != "samples"}} | {
             "seconds": asdict(value.seconds)
         }
@@ -98,49 +113,49 @@ def _draw(study: Study, path: Path) -> bool:
 
 METHODS: Columns = {
     "method": lambda point: point.method,
-    "step": lambda point: duration(point.step),
+    "step": lambda point: format_duration(point.step),
     "steps/frame": lambda point: str(point.steps_per_frame),
-    "error": wrong,
-    "of it rounding": lambda point: "" if point.rounding is None else number(point.rounding),
-    "time of the scene": lambda point: timing(point.seconds),
+    "error": format_error,
+    "of it rounding": lambda point: "" if point.rounding is None else format_number(point.rounding),
+    "time of the scene": lambda point: format_timing(point.seconds),
 }
 PEERS: Columns = {
     "rtol": lambda peer: f"{peer.rtol:g}",
-    "error": wrong,
+    "error": format_error,
     "evaluations": lambda peer: str(peer.evaluations),
-    "time of the scene": lambda peer: timing(peer.seconds),
+    "time of the scene": lambda peer: format_timing(peer.seconds),
 }
 DRAWINGS: Columns = {
     "refine": lambda drawn: str(drawn.refine),
     "supersample": lambda drawn: str(drawn.supersample),
     "PSNR": lambda drawn: "equal" if drawn.psnr is None else f"{drawn.psnr:.1f} dB",
     "largest error": lambda drawn: str(drawn.largest_error),
-    "time of a frame": lambda drawn: timing(drawn.seconds),
+    "time of a frame": lambda drawn: format_timing(drawn.seconds),
 }
 SHEETS: Columns = {
     "points": lambda points: points.name,
     "steps/frame": lambda points: str(points.steps_per_frame),
-    "error": wrong,
-    "estimate": lambda points: "not known" if points.estimate is None else number(points.estimate),
-    "time of the scene": lambda points: timing(points.seconds),
+    "error": format_error,
+    "estimate": lambda points: "not known" if points.estimate is None else format_number(points.estimate),
+    "time of the scene": lambda points: format_timing(points.seconds),
 }
 TERMS: Columns = {
     "without": lambda term: term.without or "nothing",
-    "time of a step": lambda term: timing(term.seconds),
+    "time of a step": lambda term: format_timing(term.seconds),
 }
 # The columns of stepping that the terminal shows.
 BRIEF = ("method", "step", "error", "time of the scene")
 
-Point = TypeVar("Point", Stepping, Peer)
+Point = TypeVar("Point", SteppingMeasurement, PeerMeasurement)
 
 
-def page(study: Study) -> str:
+def format_page(study: Study) -> str:
     """Write the page."""
     versions = study.machine["versions"]
     state = "" if study.status == "complete" else f" ({study.status})"
     blocks = [
         f"# {printable(study.scene)}: speed against error{state}",
-        f"Measured on {where(study)}, with taichi-msm {versions['taichi-msm']}, {named(versions)}, "
+        f"Measured on {machine_summary(study)}, with taichi-msm {versions['taichi-msm']}, {named(versions)}, "
         f"NumPy {versions['numpy']} and Python {versions['python']} ({versions['platform']}). "
         "Times are medians, with the fastest and the slowest in brackets.",
         *(_stepping(study) if study.stepping or study.peers else ()),
@@ -157,7 +172,7 @@ def page(study: Study) -> str:
     if study.terms:
         whole = study.terms[0].seconds.median
         share: Columns = {"of the whole step": lambda term: f"{100 * term.seconds.median / whole:.0f} %"}
-        blocks += ["## Terms", table(study.terms, {**TERMS, **share})]
+        blocks += ["## Terms", format_table(study.terms, {**TERMS, **share})]
     if study.notes:
         blocks += ["## Notes", "\n".join(f"- {note}" for note in study.notes)]
     blocks += ["## Recommendation", *remarks(study)]
@@ -166,12 +181,12 @@ def page(study: Study) -> str:
     return "\n\n".join(blocks) + "\n"
 
 
-def summary(study: Study) -> str:
+def format_summary(study: Study) -> str:
     """Write the most important results for the terminal, and last the lines to put in the scene."""
-    lines = [f"{printable(study.scene)} on {where(study)}"]
+    lines = [f"{printable(study.scene)} on {machine_summary(study)}"]
     if study.reference is not None:
         lines.append(
-            f"error: the largest of any point at any frame, as a fraction of {number(study.reference.largest)} m; "
+            f"error: the largest of any point at any frame, as a fraction of {format_number(study.reference.largest)} m; "
             f"tolerance {study.tolerance:g}"
         )
     methods = dict.fromkeys(point.method for point in study.stepping)
@@ -181,7 +196,9 @@ def summary(study: Study) -> str:
     if fastest:
         blocks.append(_methods_table(study, fastest, {name: METHODS[name] for name in BRIEF}))
     if peer := _best(study.peers, study.tolerance):
-        blocks.append(f"SciPy's DOP853 at rtol {peer.rtol:g}: error {wrong(peer)}, {timing(peer.seconds)}")
+        blocks.append(
+            f"SciPy's DOP853 at rtol {peer.rtol:g}: error {format_error(peer)}, {format_timing(peer.seconds)}"
+        )
     if study.drawing:
         blocks.append(_drawings_table(study, list(_drawings(study))))
     if study.points:
@@ -196,16 +213,16 @@ def summary(study: Study) -> str:
 
 def remarks(study: Study) -> Iterator[str]:
     """Say what the recommendation leaves open, and what the points make of the error."""
-    own, more = study.own_points, study.more_points
+    own, more = study.scene_mesh, study.recommended_points
     if more is None and study.best_stepping is None:
         yield _shortfall(study)
     if own is None:
         return
-    bound = f"{'' if own.known else 'at most about '}{number(own.error or 0.0)}"
+    bound = f"{'' if own.known else 'at most about '}{format_number(own.error or 0.0)}"
     if more is None:
         step = study.best_stepping
-        beside = "" if step is None else f", the recommended step one of {number(step.error or 0.0)}"
-        yield f"{own.name} points make an error of {bound}{beside}; the tolerance is {study.points_tolerance:g}."
+        beside = "" if step is None else f", the recommended step one of {format_number(step.error or 0.0)}"
+        yield f"{own.name} points make an error of {bound}{beside}; the tolerance is {study.mesh_tolerance:g}."
         return
     rows, cols = more
     points = f"{rows} x {cols}"
@@ -220,7 +237,7 @@ def remarks(study: Study) -> Iterator[str]:
         advice = f"{enough}; with time.tolerance a run finds the step for them."
     yield (
         f"{own.name} points make an error of {bound}, which no step can mend; the tolerance is "
-        f"{study.points_tolerance:g}. {advice}"
+        f"{study.mesh_tolerance:g}. {advice}"
     )
 
 
@@ -233,7 +250,7 @@ def _shortfall(study: Study) -> str:
     if closest.error is None:
         said += ": all diverged."
     else:
-        said += f"; the closest is {closest.method} at {duration(closest.step)}, with an error of {wrong(closest)}."
+        said += f"; the closest is {closest.method} at {format_duration(closest.step)}, with an error of {format_error(closest)}."
     return (
         f"{said} Set time.tolerance, with which a run searches for a finer step itself, and time.precision: f64; "
         "or allow a larger error with --tolerance."
@@ -243,11 +260,11 @@ def _shortfall(study: Study) -> str:
 def _stepping(study: Study) -> Iterator[str]:
     yield "## Stepping"
     if (reference := study.reference) is not None:
-        extrapolated = ", not extrapolated as contact is of order 1," if study.touches else ", extrapolated,"
+        extrapolated = ", not extrapolated as contact is of order 1," if study.has_contact else ", extrapolated,"
         yield (
             "An error is the largest of any point at any frame, as a fraction of the largest displacement, "
-            f"{number(reference.largest)} m. The reference is central differences in f64{extrapolated} with up to "
-            f"{reference.steps_per_frame} steps a frame; its own error is about {number(reference.error)}. "
+            f"{format_number(reference.largest)} m. The reference is central differences in f64{extrapolated} with up to "
+            f"{reference.steps_per_frame} steps a frame; its own error is about {format_number(reference.error)}. "
             f"The tolerance is {study.tolerance:g}."
         )
     yield _methods_table(study, study.stepping, METHODS)
@@ -256,13 +273,13 @@ def _stepping(study: Study) -> Iterator[str]:
         yield f"Observed orders: {', '.join(orders)}."
     if study.peers:
         yield "SciPy's DOP853 on the same equations:"
-        yield table(study.peers, PEERS)
+        yield format_table(study.peers, PEERS)
     yield from _bounds([*study.stepping, *study.peers])
 
 
 def _points(study: Study) -> Iterator[str]:
     yield "## Points"
-    reference = "the finest sheet" if study.touches else "the extrapolation, of order 2, of the two finest sheets"
+    reference = "the finest sheet" if study.has_contact else "the extrapolation, of order 2, of the two finest sheets"
     yield (
         "The error is that made by the number of points, at the points and between them, where the displacement is "
         "interpolated by cubics: the largest anywhere at any frame, as a fraction of the largest displacement. The "
@@ -274,28 +291,28 @@ def _points(study: Study) -> Iterator[str]:
     yield from _bounds(study.points)
 
 
-def _bounds(points: Sequence[Stepping | Peer | Points]) -> Iterator[str]:
+def _bounds(points: Sequence[SteppingMeasurement | PeerMeasurement | MeshMeasurement]) -> Iterator[str]:
     """Explain errors that are upper bounds, if there are any."""
-    if any(wrong(one).startswith("<") for one in points):
+    if any(format_error(one).startswith("<") for one in points):
         yield "An error with < is an approximate upper bound; the reference is not exact enough to know the error."
 
 
-def _methods_table(study: Study, points: Sequence[Stepping], columns: Columns) -> str:
+def _methods_table(study: Study, points: Sequence[SteppingMeasurement], columns: Columns) -> str:
     best = study.best_stepping
-    return table(points, columns, lambda one: "recommended" if one is best else "")
+    return format_table(points, columns, lambda one: "recommended" if one is best else "")
 
 
-def _drawings_table(study: Study, drawings: Sequence[Drawn]) -> str:
+def _drawings_table(study: Study, drawings: Sequence[DrawingMeasurement]) -> str:
     best = study.best_drawing
-    return table(drawings, DRAWINGS, lambda one: "recommended" if one is best else "")
+    return format_table(drawings, DRAWINGS, lambda one: "recommended" if one is best else "")
 
 
 def _sheets_table(study: Study) -> str:
-    roles = {tuple(study.settings["sheet"]["points"]): "of the scene", study.more_points: "recommended"}
-    return table(study.points, SHEETS, lambda one: roles.get((one.rows, one.cols), ""))
+    roles = {tuple(study.settings["sheet"]["points"]): "of the scene", study.recommended_points: "recommended"}
+    return format_table(study.points, SHEETS, lambda one: roles.get((one.rows, one.cols), ""))
 
 
-def _drawings(study: Study) -> Iterator[Drawn]:
+def _drawings(study: Study) -> Iterator[DrawingMeasurement]:
     """Choose for every supersampling the refinement that would be recommended if the scene had that supersampling."""
     for supersample in sorted({drawn.supersample for drawn in study.drawing}):
         render = {**study.settings["render"], "supersample": supersample}
@@ -306,7 +323,7 @@ def _drawings(study: Study) -> Iterator[Drawn]:
 
 def _best(points: Sequence[Point], tolerance: float) -> Point | None:
     """Find the fastest point within the tolerance, or else the most exact one."""
-    good = [point for point in points if size(point) <= tolerance]
+    good = [point for point in points if comparable_error(point) <= tolerance]
     if good:
         return min(good, key=lambda point: point.seconds.median)
-    return min(points, key=size, default=None)
+    return min(points, key=comparable_error, default=None)

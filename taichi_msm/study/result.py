@@ -13,10 +13,10 @@ import numpy as np
 from taichi_msm.scene.section import MAX_POINTS
 
 # A picture is refined enough if no other one of the same supersampling has a PSNR higher by more than this [dB].
-REFINED_ENOUGH = 0.1
+PSNR_TOLERANCE_DB = 0.1
 
 # Timings within 10 % count as equal.
-AS_FAST = 1.1
+TIMING_TOLERANCE = 1.1
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Reference:
 
 
 @dataclass
-class Measured:
+class Measurement:
     """What is known of one setting so far."""
 
     samples: list[float] = field(default_factory=list, kw_only=True)  # times of repeated, equal work [s]
@@ -56,7 +56,7 @@ class Measured:
 
 
 @dataclass
-class Stepping(Measured):
+class SteppingMeasurement(Measurement):
     """One way to step the scene; timed is stepping through the whole of it, compiled and warm.
 
     Attributes:
@@ -80,8 +80,8 @@ class Stepping(Measured):
 
 
 @dataclass
-class Peer(Measured):
-    """SciPy's DOP853 on the same equations, timed for the whole scene; error and known as for `Stepping`."""
+class PeerMeasurement(Measurement):
+    """SciPy's DOP853 on the same equations, timed for the whole scene; error and known as for `SteppingMeasurement`."""
 
     rtol: float  # relative tolerance; the absolute one is rtol x the largest displacement / 10
     error: float
@@ -90,7 +90,7 @@ class Peer(Measured):
 
 
 @dataclass
-class Drawn(Measured):
+class DrawingMeasurement(Measurement):
     """One way to draw the most deformed frame, timed for one frame."""
 
     refine: int
@@ -100,8 +100,8 @@ class Drawn(Measured):
 
 
 @dataclass
-class Points(Measured):
-    """A sheet of tissue with more or fewer points, in f64, timed like `Stepping`; error and known are as there.
+class MeshMeasurement(Measurement):
+    """A sheet of tissue with more or fewer points, in f64, timed like `SteppingMeasurement`; error and known are as there.
 
     The error is that which the number of points makes, at the points and between them.
     """
@@ -120,7 +120,7 @@ class Points(Measured):
 
 
 @dataclass
-class TimedTerm(Measured):
+class TermMeasurement(Measurement):
     """The cost of a step without one term of the model, timed for one step."""
 
     without: str  # key of the term that is left out; empty: none is
@@ -136,12 +136,14 @@ class Study:
     tolerance: float  # largest allowed error, as a fraction of the largest displacement
     machine: dict[str, Any]  # cpu, cores, arch, threads, bits of a vector and versions
     reference: Reference | None = None  # None: interrupted before there was one
-    stepping: list[Stepping] = field(default_factory=list)  # by method and, within a method, by falling step
+    stepping: list[SteppingMeasurement] = field(default_factory=list)  # by method and, within a method, by falling step
     orders: dict[str, float | None] = field(default_factory=dict)  # `observed_orders`
-    peers: list[Peer] = field(default_factory=list)
-    drawing: list[Drawn] = field(default_factory=list)  # by supersample and refine; empty without a picture
-    points: list[Points] = field(default_factory=list)  # from few to many; empty with springs
-    terms: list[TimedTerm] = field(default_factory=list)  # the first leaves nothing out
+    peers: list[PeerMeasurement] = field(default_factory=list)
+    drawing: list[DrawingMeasurement] = field(
+        default_factory=list
+    )  # by supersample and refine; empty without a picture
+    points: list[MeshMeasurement] = field(default_factory=list)  # from few to many; empty with springs
+    terms: list[TermMeasurement] = field(default_factory=list)  # the first leaves nothing out
     notes: list[str] = field(default_factory=list)  # what a reader must know, such as parts left out and why
 
     def finish(self) -> None:
@@ -156,29 +158,29 @@ class Study:
         self.terms = [one for one in self.terms if one.samples]
 
     @property
-    def touches(self) -> bool:
+    def has_contact(self) -> bool:
         """Whether tools that are moved touch the sheet."""
         return any(probe.get("path") for probe in self.settings["probes"])
 
     @property
-    def points_tolerance(self) -> float:
+    def mesh_tolerance(self) -> float:
         """Largest allowed error due to the number of points, as a fraction of the largest displacement."""
         return float(self.settings["sheet"]["tolerance"] or self.tolerance)
 
     @property
-    def own_points(self) -> Points | None:
+    def scene_mesh(self) -> MeshMeasurement | None:
         """Find the sheet with the scene's own points; None: it was not measured, or diverged."""
         own = list(self.settings["sheet"]["points"])
         return next((one for one in self.points if [one.rows, one.cols] == own and one.error is not None), None)
 
     @property
-    def more_points(self) -> tuple[int, int] | None:
+    def recommended_points(self) -> tuple[int, int] | None:
         """Tell how many points have an error within the tolerance, where the scene's own have not; None elsewhere.
 
         These are the fewest that were measured, or else an extrapolation: the error falls with the power of the cells'
         size that the two finest sheets show, at least the first and at most the second. They may be more than allowed.
         """
-        own, allowed = self.own_points, self.points_tolerance
+        own, allowed = self.scene_mesh, self.mesh_tolerance
         if own is None or own.error is None or own.error <= allowed:
             return None
         errors = [(one.rows, one.cols, one.error) for one in self.points if one.error is not None]
@@ -195,33 +197,33 @@ class Study:
         return math.ceil((rows - 1) * times) + 1, math.ceil((cols - 1) * times) + 1
 
     @property
-    def best_stepping(self) -> Stepping | None:
+    def best_stepping(self) -> SteppingMeasurement | None:
         """Find the fastest stepping within the tolerance, or one that is as fast and less wrong.
 
         None where there is none, or the scene needs other points, for which no step was measured. Of every method only
         its largest step counts, so that noise of the clock cannot prefer a smaller one.
         """
-        if self.more_points is not None:
+        if self.recommended_points is not None:
             return None
         good = [one for one in self.stepping if one.error is not None and one.error <= self.tolerance]
         largest = {one.method: one for one in sorted(good, key=lambda one: one.step)}
         fastest = min((one.seconds.median for one in largest.values()), default=0.0)
-        alike = [one for one in largest.values() if one.seconds.median <= AS_FAST * fastest]
+        alike = [one for one in largest.values() if one.seconds.median <= TIMING_TOLERANCE * fastest]
         return min(alike, key=lambda one: one.error or 0.0, default=None)
 
     @property
-    def best_drawing(self) -> Drawn | None:
+    def best_drawing(self) -> DrawingMeasurement | None:
         """Find the fastest sufficient refinement at the scene's own supersampling."""
         own = self.settings["render"]["supersample"]
         decibels = [(math.inf if one.psnr is None else one.psnr, one) for one in self.drawing if one.supersample == own]
-        enough = max((psnr for psnr, _ in decibels), default=0.0) - REFINED_ENOUGH
+        enough = max((psnr for psnr, _ in decibels), default=0.0) - PSNR_TOLERANCE_DB
         good = [one for psnr, one in decibels if psnr >= enough]
         return min(good, key=lambda one: one.seconds.median, default=None)
 
     def recommendation(self) -> list[str]:
         """Write the recommended settings as lines of a scene file."""
         lines = []
-        if (points := self.more_points) is not None and max(points) <= MAX_POINTS:
+        if (points := self.recommended_points) is not None and max(points) <= MAX_POINTS:
             # A run finds the step for these points.
             lines += [
                 "sheet:",
@@ -245,7 +247,7 @@ class Study:
         return lines
 
 
-def observed_orders(points: list[Stepping]) -> dict[str, float | None]:
+def observed_orders(points: list[SteppingMeasurement]) -> dict[str, float | None]:
     """Fit the order of every method over the points where the error comes from the step; None: too few of them."""
     orders: dict[str, float | None] = {}
     for method in dict.fromkeys(point.method for point in points):

@@ -16,15 +16,15 @@ from taichi_msm.render.texture import load_texture
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.planning import on, variant, with_time
 from taichi_msm.study.measurements import (
-    FailedError,
-    PointStudy,
+    IntegrationError,
+    MeshStudy,
     SteppingStudy,
-    TooSlowError,
+    TimeLimitError,
     measure_pictures,
     measure_terms,
-    solve,
+    solve_with_dop853,
 )
-from taichi_msm.study.result import Peer, Study
+from taichi_msm.study.result import PeerMeasurement, Study
 from taichi_msm.system import process, runtime
 from taichi_msm.system.compiler import versions
 from taichi_msm.system.runtime import Device
@@ -39,7 +39,7 @@ APART = "no other figure depends on it"
 TRAJECTORIES = 6
 
 
-class Effort(NamedTuple):
+class TimeBudget(NamedTuple):
     """How long the parts of a study may take."""
 
     longest_run: float  # of stepping through the whole scene once [s]
@@ -48,8 +48,8 @@ class Effort(NamedTuple):
     sample: float  # of one measurement of a step [s]
 
 
-QUICK = Effort(longest_run=0.25, peer=10.0, peer_rtols=(1e-4,), sample=0.02)
-FULL = Effort(longest_run=2.0, peer=30.0, peer_rtols=(1e-3, 1e-5, 1e-7), sample=0.1)
+QUICK = TimeBudget(longest_run=0.25, peer=10.0, peer_rtols=(1e-4,), sample=0.02)
+FULL = TimeBudget(longest_run=2.0, peer=30.0, peer_rtols=(1e-3, 1e-5, 1e-7), sample=0.1)
 
 
 def study(
@@ -83,7 +83,7 @@ def study(
         settings=scene.model_dump(mode="json"),
         status="complete",
         tolerance=tolerance or scene.time.tolerance or TOLERANCE,
-        machine=machine(device),
+        machine=machine_record(device),
     )
     effort = QUICK if quick else FULL
     # The study itself varies the step.
@@ -101,7 +101,7 @@ def study(
             deformed = max(stepping.frames, key=lambda frame: (frame**2).sum(axis=-1).max())
             position = rest_positions(scene.sheet) + deformed
             measure_pictures(scene, position, texture, quick, results, partial(progress, "drawing"))
-        PointStudy(plan, device, effort.longest_run, results, partial(progress, "points")).run()
+        MeshStudy(plan, device, effort.longest_run, results, partial(progress, "points")).run()
         measure_terms(plan, device, effort.sample, results, partial(progress, "terms"))
     except KeyboardInterrupt:
         results.status = "interrupted"
@@ -110,7 +110,7 @@ def study(
     return results
 
 
-def machine(device: Device) -> dict[str, Any]:
+def machine_record(device: Device) -> dict[str, Any]:
     """Describe the machine that the study ran on."""
     return {
         "cpu": process.processor(),
@@ -134,7 +134,7 @@ def _require_memory(scene: Scene) -> None:
         raise SceneError([said])
 
 
-def _measure_peer(plan: Plan, stepping: SteppingStudy, effort: Effort, results: Study, progress: Progress) -> None:
+def _measure_peer(plan: Plan, stepping: SteppingStudy, effort: TimeBudget, results: Study, progress: Progress) -> None:
     """Solve by DOP853 at several tolerances, each as many times as time allows, up to 5."""
     assert results.reference is not None
     if plan.tools:
@@ -148,14 +148,14 @@ def _measure_peer(plan: Plan, stepping: SteppingStudy, effort: Effort, results: 
         try:
             while len(samples) < 5:
                 start = time.perf_counter()
-                frames, evaluations = solve(plan, rtol, atol, deadline, tick)
+                frames, evaluations = solve_with_dop853(plan, rtol, atol, deadline, tick)
                 samples.append(time.perf_counter() - start)
-        except TooSlowError:
+        except TimeLimitError:
             if not samples:
                 said = f"takes more than {effort.peer:g} s at rtol {rtol:g} and was stopped"
                 results.notes.append(f"{DOP853} {said}; {APART}")
                 return
-        except FailedError as failure:
+        except IntegrationError as failure:
             said = (
                 f"finds no step small enough {failure}, at rtol {rtol:g}: forces change too suddenly for it there, as "
                 "where a spring is pressed to a point or the sheet runs away"
@@ -163,4 +163,4 @@ def _measure_peer(plan: Plan, stepping: SteppingStudy, effort: Effort, results: 
             results.notes.append(f"{DOP853} {said}; {APART}")
             return
         error = stepping.relative(frames)
-        results.peers.append(Peer(rtol, error, stepping.known(error), evaluations, samples=samples))
+        results.peers.append(PeerMeasurement(rtol, error, stepping.known(error), evaluations, samples=samples))

@@ -19,7 +19,7 @@ from taichi_msm import Scene, Simulation, gradient
 from taichi_msm.errors import ArgumentError, MsmError, SceneError
 from taichi_msm.gradients import motion, rest
 from taichi_msm.gradients.chain_rule import Derivatives
-from taichi_msm.gradients.gradient import Adjoint, mapped
+from taichi_msm.gradients.gradient import Adjoint, with_stiffness_map
 from taichi_msm.gradients.motion import MotionAdjoint
 from taichi_msm.model.loads import schedule
 from taichi_msm.model.plan import Plan
@@ -296,7 +296,7 @@ def test_the_bits_depend_neither_on_workers_nor_on_segments(
     made = described("tissue", image)
     # With bending a worker needs two rows that move.
     made["sheet"] |= {"points": [9, 11], "size": [0.16, 0.19]}
-    plan = mapped(plan_of(Scene.model_validate(made)))
+    plan = with_stiffness_map(plan_of(Scene.model_validate(made)))
 
     def bits(workers: int) -> bytes:
         sheet = MotionAdjoint(plan, device, layout=replace(layout_of(plan, device), workers=workers))
@@ -311,7 +311,7 @@ def test_the_bits_depend_neither_on_workers_nor_on_segments(
         patched.setattr(motion, "SEGMENT_BYTES", 2**20)
         assert bits(2) == alone
     # Workers that give up at once.
-    monkeypatch.setattr(motion, "LONG_PATIENCE", 0)
+    monkeypatch.setattr(motion, "MAX_WAIT_LOOKS", 0)
     assert bits(3) == alone
 
 
@@ -396,7 +396,7 @@ def test_a_shape_without_stiffness_is_named(device: Device, monkeypatch: pytest.
     adjoint = Adjoint(plan_of(Scene.model_validate(REST)), device)
     slope = 1 + 0 * adjoint.run()
     # As if no solution were one.
-    monkeypatch.setattr(rest, "SOLVED", -1)
+    monkeypatch.setattr(rest, "RESIDUAL_TOLERANCE", -1)
     with pytest.raises(MsmError, match=r"frame 1 has no gradient: .*give it a foundation, pretension or bending"):
         adjoint.backward(slope)
 
