@@ -136,7 +136,7 @@ class PathDependence:
 
 
 def second_solution(plan: Plan, frame: int, device: Device, cores: int | None, pause: Pause) -> Array | None:
-    """Solve a frame from rest: its loads act at once, then tools move straight from their first to their final position.
+    """Solve a frame from rest: its loads act at once, then tools move straight from their first position to its own.
 
     Args:
         plan: Plan of a quasi-static scene.

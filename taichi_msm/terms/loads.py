@@ -104,7 +104,7 @@ class ProbeTerm(Term):
         """Make the function that differentiates the work of all slots by their forces and their control points.
 
         An entry's work on it is the product of the force and `entry.u`; of a slot, three derivatives by the force and
-        two by the control point are added to a list. `slopes` are in `sheet.found`, from `first_slope` times the
+        two by the control point are added to a list. `slopes` are in `sheet.derivatives`, from `first_slope` times the
         sheet's rows on.
         """
         ti = code.ti
@@ -135,7 +135,7 @@ class ProbeTerm(Term):
                     share = sheet.fields[((first_field + standing[n]) * sheet.rows + i) * sheet.width + b]
                     for axis in ti.static(range(2)):
                         row = (first_slope + 2 * standing[n] + axis) * sheet.rows + i
-                        slope[axis] = sheet.found[row * sheet.width + b]
+                        slope[axis] = sheet.derivatives[row * sheet.width + b]
                 work = vector(0)
                 for c in ti.static(range(3)):
                     sums[5 * n + c] += share * entry.u[c]

@@ -301,8 +301,8 @@ def test_the_bits_depend_neither_on_workers_nor_on_segments(
     def bits(workers: int) -> bytes:
         sheet = MotionAdjoint(plan, device, layout=replace(layout_of(plan, device), workers=workers))
         slopes, loads = sheet.backward(loss(sheet.run())[1])
-        arrays = [*slopes.springs, slopes.tensions, slopes.held, *loads.by_key.values()]
-        arrays += [slopes.bent, slopes.keep, slopes.gain, slopes.first_gain]
+        arrays = [*slopes.springs, slopes.tensions, slopes.foundation, *loads.by_key.values()]
+        arrays += [slopes.bending, slopes.keep, slopes.gain, slopes.first_gain]
         return b"".join(np.asarray(array).tobytes() for array in arrays)
 
     alone = bits(1)
@@ -475,7 +475,7 @@ def test_a_pause_follows_every_launch(image: str, device: Device, monkeypatch: p
 def test_a_solution_that_takes_long_is_left_behind(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     adjoint, pauses = Adjoint(plan_of(Scene.model_validate(REST)), device), []
     slope = loss(adjoint.run())[1]
-    monkeypatch.setattr(rest, "_solved", lambda *_: time.sleep(20))
+    monkeypatch.setattr(rest, "_solve", lambda *_: time.sleep(20))
 
     def stop() -> None:
         pauses.append(1)
