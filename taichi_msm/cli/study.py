@@ -78,12 +78,12 @@ def study(
 
     from taichi_msm.cli.console import Progress
     from taichi_msm.study.report import RECORD_FILE, format_summary, require_writable, study_record, write_report
-    from taichi_msm.study.study import study as measure
+    from taichi_msm.study.study import run_study
 
     require_writable(directory)
     interruption = Interruption()
     with Progress(quiet=as_json) as bar, naming(scene):
-        results = measure(
+        results = run_study(
             loaded,
             Path(scene).stem,
             tolerance=tolerance,

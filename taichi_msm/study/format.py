@@ -1,4 +1,4 @@
-"""Tables of measurements, and how numbers, times and errors are written in them and in the picture."""
+"""Formatting of measurements: numbers, times, errors and tables, for the page, the terminal and the picture."""
 
 from __future__ import annotations
 
@@ -8,66 +8,74 @@ from typing import Any
 
 from taichi_msm.study.result import MeshMeasurement, PeerMeasurement, SteppingMeasurement, Study, Timing
 
-UNITS = ((1, "s"), (1e3, "ms"), (1e6, "us"))
+# Units of time, with their number in a second.
+TIME_UNITS = ((1, "s"), (1e3, "ms"), (1e6, "us"))
 
 Columns = Mapping[str, Callable[[Any], str]]
 
+# A measurement with an error.
+ErrorMeasurement = SteppingMeasurement | PeerMeasurement | MeshMeasurement
+
 
 def format_number(value: float) -> str:
-    """Write a measured value with three significant digits."""
+    """Format a measured value with three significant digits."""
     return f"{value:.0f}" if 999.5 <= abs(value) < 1e6 else f"{value:#.3g}".rstrip(".")
 
 
 def time_unit(seconds: float) -> tuple[float, str]:
-    """Choose a readable unit for a time; returns how many of it make a second, and its name."""
-    return next(((scale, name) for scale, name in UNITS if seconds * scale >= 0.9995), UNITS[-1])
+    """Choose a readable unit for a time; return the number of units in a second, and its name."""
+    return next(((scale, name) for scale, name in TIME_UNITS if seconds * scale >= 0.9995), TIME_UNITS[-1])
 
 
 def format_duration(seconds: float) -> str:
-    """Write a time with its unit."""
+    """Format a time with its unit."""
     scale, name = time_unit(seconds)
     return f"{format_number(seconds * scale)} {name}"
 
 
 def format_timing(seconds: Timing) -> str:
-    """Write a median and, in the same unit, the range."""
+    """Format a median and, in the same unit, the range."""
     scale, _ = time_unit(seconds.median)
-    spread = (
-        f"{format_number(seconds.fastest * scale)} to {format_number(seconds.slowest * scale)}"
-        if seconds.runs > 1
-        else "once"
-    )
+    spread = "once"
+    if seconds.runs > 1:
+        spread = f"{format_number(seconds.fastest * scale)} to {format_number(seconds.slowest * scale)}"
     return f"{format_duration(seconds.median)} ({spread})"
 
 
-def comparable_error(point: SteppingMeasurement | PeerMeasurement | MeshMeasurement) -> float:
-    """Give an error, infinite where the simulation diverged."""
+def comparable_error(point: ErrorMeasurement) -> float:
+    """Return an error, infinite where the simulation diverged."""
     return math.inf if point.error is None or math.isnan(point.error) else point.error
 
 
-def format_error(point: SteppingMeasurement | PeerMeasurement | MeshMeasurement) -> str:
-    """Write an error; if it is not known exactly, its bound."""
-    return (
-        f"{'' if point.known else '< '}{format_number(comparable_error(point))}"
-        if comparable_error(point) < math.inf
-        else "diverged"
-    )
+def format_error(point: ErrorMeasurement) -> str:
+    """Format an error, or its bound if it is not known exactly."""
+    error = comparable_error(point)
+    return f"{'' if point.known else '< '}{format_number(error)}" if error < math.inf else "diverged"
 
 
-def is_mostly_rounding(point: SteppingMeasurement | PeerMeasurement | MeshMeasurement) -> bool:
-    """Tell whether most of an error comes from f32."""
+def is_mostly_rounding(point: ErrorMeasurement) -> bool:
+    """Return whether most of an error comes from f32."""
     return isinstance(point, SteppingMeasurement) and (point.rounding or 0) > (point.error or 0) / 2
 
 
 def machine_summary(study: Study) -> str:
-    """Name the machine."""
+    """Describe the machine of a study in a line."""
     threads = study.machine["threads"]
-    used = f"{threads} thread{'' if threads == 1 else 's'}, vectors of {study.machine['vectors']} bits"
-    return f"{study.machine['cpu']}, {used if study.machine['arch'] == 'cpu' else study.machine['arch']}"
+    cpu_use = f"{threads} thread{'' if threads == 1 else 's'}, vectors of {study.machine['vectors']} bits"
+    return f"{study.machine['cpu']}, {cpu_use if study.machine['arch'] == 'cpu' else study.machine['arch']}"
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], left: Sequence[int] = ()) -> str:
-    """Write a Markdown table; columns are aligned right, but those in `left`, of words, left."""
+    """Format a Markdown table.
+
+    Args:
+        head: Names of the columns.
+        rows: Cells of every row.
+        left: Columns that are aligned left; all others are aligned right.
+
+    Returns:
+        The table, without a final line break.
+    """
     widths = [max(len(row[column]) for row in [head, *rows]) for column in range(len(head))]
     rule = ["-" * width if column in left else "-" * (width - 1) + ":" for column, width in enumerate(widths)]
 
@@ -81,12 +89,21 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], left: Seq
     return "\n".join([line(head), line(rule), *map(line, rows)])
 
 
-WORDS = ("method", "without")
+def format_table(measurements: Sequence[Any], columns: Columns, remark: Callable[[Any], str] | None = None) -> str:
+    """Format measurements as a Markdown table, one per row.
 
+    Args:
+        measurements: Measurements of one kind.
+        columns: Functions that format the cells of a measurement, by the names of the columns.
+        remark: Function that formats the remark on a measurement in a last column without a name; empty for none.
 
-def format_table(measured: Sequence[Any], columns: Columns, mark: Callable[[Any], str] | None = None) -> str:
-    """Write measurements as a table, one in a row; `mark` may give more for a last column without a name."""
-    if mark and any(map(mark, measured)):
-        columns = {**columns, "": mark}
-    rows = [[cell(one) for cell in columns.values()] for one in measured]
-    return markdown_table(list(columns), rows, [n for n, name in enumerate(columns) if name in WORDS or not name])
+    Returns:
+        The table.
+    """
+    if remark and any(map(remark, measurements)):
+        columns = {**columns, "": remark}
+    rows = [[cell(measurement) for cell in columns.values()] for measurement in measurements]
+    # Columns of text are aligned left.
+    return markdown_table(
+        list(columns), rows, [n for n, name in enumerate(columns) if name in ("method", "without", "")]
+    )

@@ -22,7 +22,7 @@ from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.dynamics import layout_of
 from taichi_msm.solver.rest import ENOUGH, sheet_of
-from taichi_msm.study.study import study
+from taichi_msm.study.study import run_study
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
 from tests.scenes import plan_of
@@ -221,7 +221,7 @@ def test_friction_and_gpus_and_studies_are_refused(device: Device) -> None:
     ):
         layout_of(plan_of(at_rest([PUSH])), Device("vulkan", 1))
     with pytest.raises(SceneError, match=r"time.motion: quasistatic takes no steps, which a study compares; set time"):
-        study(at_rest([PUSH]), "rest", threads=device.threads)
+        run_study(at_rest([PUSH]), "rest", threads=device.threads)
 
 
 def test_a_pilot_that_never_rests_leaves_the_error_unknown(

@@ -157,8 +157,8 @@ def test_a_timing_is_a_median_with_its_spread() -> None:
 
 def test_an_error_near_that_of_the_reference_is_not_known(stepping: SteppingStudy) -> None:
     assert stepping.study.reference is not None
-    assert stepping.known(21 * stepping.study.reference.error)
-    assert not stepping.known(19 * stepping.study.reference.error)
+    assert stepping.determines(21 * stepping.study.reference.error)
+    assert not stepping.determines(19 * stepping.study.reference.error)
 
 
 def test_dop853_gives_up_in_time() -> None:
