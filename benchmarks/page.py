@@ -34,7 +34,7 @@ Entry = dict[str, Any]
 
 def machine() -> Results:
     """Describe where the benchmarks run."""
-    found = study.machine(Device("cpu", available_threads()))
+    found = study.machine_record(Device("cpu", available_threads()))
     versions = {chosen().title: chosen().version, "NumPy": found["versions"]["numpy"]}
     for package in PACKAGES:
         try:

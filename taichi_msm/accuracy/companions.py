@@ -1,7 +1,7 @@
 """Choice of the companion runs that estimate the error of a run, made from the scene alone.
 
-A companion run repeats the scene with another time step or another mesh, next to the run. With half as many steps it
-costs half a run, with twice as many it costs two. Hence the first companion run is coarse, where twice the step is
+A companion run repeats the scene with another time step or another mesh, in parallel to the run. With half the steps
+it costs half a run, with twice the steps it costs two. Hence the first companion run is coarse, where twice the step is
 stable, and a finer one follows only if the first shows an error that is not negligible.
 """
 
@@ -35,12 +35,12 @@ class CompanionRuns(NamedTuple):
     """The companion runs of a run.
 
     Attributes:
-        concurrent_steps: steps per frame of the companion run that accompanies the run; 0 without one.
-        subsequent_steps: steps per frame of the companion run that follows if the first one shows too large an error; 0
+        concurrent_steps: Steps per frame of the companion run that accompanies the run; 0 without one.
+        subsequent_steps: Steps per frame of the companion run that follows if the first one shows too large an error; 0
             without one.
-        mesh: whether companion runs on coarser meshes accompany the run.
-        cost: cost of the accompanying runs per step of the run, in steps of the full sheet.
-        reason: why the time-step error is not estimated; empty if it is.
+        mesh: Whether companion runs on coarser meshes accompany the run.
+        cost: Cost of the accompanying runs per step of the run, in steps of the full sheet.
+        reason: Why the time-step error is not estimated; empty if it is.
     """
 
     concurrent_steps: int = 0

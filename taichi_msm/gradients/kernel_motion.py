@@ -131,11 +131,8 @@ def adjoint_kernels(code: StepCode, *, parallel: bool) -> tuple[Callable[..., No
     return _storing_kernel(code, parallel=parallel), _sweeping_kernel(code, parallel=parallel)
 
 
-def _banded(take: Callable[..., None], *, parallel: bool) -> Callable[..., None]:
-    """Build the function that runs the steps of a launch for a worker, or for all workers in a single one.
-
-    take(sheet, loads, sizes, worker, k) runs step k of a worker's band.
-    """
+def _banded(step_band: Callable[..., None], *, parallel: bool) -> Callable[..., None]:
+    """Build the function that runs the steps of a launch for a worker, or for all workers in a single one."""
 
     @ti.func
     def wait_for(progress: ti.template(), sizes: ti.template(), worker, k):
@@ -150,26 +147,26 @@ def _banded(take: Callable[..., None], *, parallel: bool) -> Callable[..., None]
         return finished
 
     @ti.func
-    def work(sheet: ti.template(), loads: ti.template(), sizes: ti.template(), progress: ti.template(), worker):
+    def run_worker(sheet: ti.template(), loads: ti.template(), sizes: ti.template(), progress: ti.template(), worker):
         if ti.static(parallel):
             k, ready = ti.cast(progress[STRIDE * worker], ti.i32), True
             while ready and k < sizes[COUNT]:
                 ready = wait_for(progress, sizes, worker - 1, k) and wait_for(progress, sizes, worker + 1, k)
                 if ready:
-                    take(sheet, loads, sizes, worker, k)
+                    step_band(sheet, loads, sizes, worker, k)
                     ti.atomic_add(progress[STRIDE * worker], 1)
                     k += 1
         else:
             for k in range(ti.cast(sizes[COUNT], ti.i32)):
                 for each in range(ti.cast(sizes[WORKERS], ti.i32)):
                     if progress[STRIDE * each] <= k:
-                        take(sheet, loads, sizes, each, k)
+                        step_band(sheet, loads, sizes, each, k)
                         progress[STRIDE * each] = k + 1
 
-    return work
+    return run_worker
 
 
-def _storing(code: StepCode) -> list[Callable[..., None]]:
+def _moment_storing(code: StepCode) -> list[Callable[..., None]]:
     """Build the function that stores the moments for row i of a band: first those of three rows, then of one more."""
     bending, join_strips = code.get(BendingTerm), joining(code)
     if bending is None:
@@ -190,7 +187,7 @@ def _storing(code: StepCode) -> list[Callable[..., None]]:
     return [store_moments]
 
 
-def _clearing(code: StepCode) -> Callable[..., None]:
+def _row_clearing(code: StepCode) -> Callable[..., None]:
     """Build the function that sets a row of u to 0."""
     vector = code.vector
 
@@ -207,7 +204,7 @@ def _storing_kernel(code: StepCode, *, parallel: bool) -> Callable[..., None]:
     """Build the kernel that steps forward and stores every shape."""
     real, vector, vectors = code.real, code.vector, code.vectors
     count_of_numbers, join_strips, step = code.first_number(None), joining(code), point_step(code)
-    clear, storing = _clearing(code), _storing(code)
+    clear, storing = _row_clearing(code), _moment_storing(code)
 
     @ti.func
     def move(sheet: ti.template(), entry: ti.template(), target, force: ti.template(), now: ti.template()):
@@ -216,7 +213,7 @@ def _storing_kernel(code: StepCode, *, parallel: bool) -> Callable[..., None]:
     pass_row = row_passing(code, move)
 
     @ti.func
-    def take(sheet: ti.template(), loads: ti.template(), sizes: ti.template(), worker, k):
+    def step_band(sheet: ti.template(), loads: ti.template(), sizes: ti.template(), worker, k):
         """Run step k of the launch for a band."""
         workers = ti.cast(sizes[WORKERS], ti.i32)
         low, high = sheet.rows * worker // workers, sheet.rows * (worker + 1) // workers
@@ -240,7 +237,7 @@ def _storing_kernel(code: StepCode, *, parallel: bool) -> Callable[..., None]:
             if i >= low:
                 join_strips(sheet.u, shape + sheet.rows + i, sheet.width)
 
-    work = _banded(take, parallel=parallel)
+    run_worker = _banded(step_band, parallel=parallel)
 
     @ti.kernel
     def store(
@@ -259,7 +256,7 @@ def _storing_kernel(code: StepCode, *, parallel: bool) -> Callable[..., None]:
                 numbers = [numbers_of[n][0] for n in ti.static(range(count_of_numbers))]
                 u, d = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z))
                 sheet = ti.static(KernelSheet(u, d, by_column, stiffness, fields, numbers, rows, width))
-                work(sheet, loads, sizes, progress, index // ITERATIONS_PER_THREAD)
+                run_worker(sheet, loads, sizes, progress, index // ITERATIONS_PER_THREAD)
 
     return store
 
@@ -268,7 +265,10 @@ def _row_sweeping(code: StepCode) -> Callable[..., None]:
     """Build the function that sweeps a row of the adjoint by a step."""
     vector, columns, springs = code.vector, code.first_column(None), code.require(SpringTerm)
     structural, shear, tension = springs.structural, springs.shear, springs.tense
-    differentiate, (*_, of_row, of_column, of_diagonal) = springs.tangent(code), springs.between(code)
+    differentiate, (*_, row_stiffness, column_stiffness, diagonal_stiffness) = (
+        springs.tangent(code),
+        springs.between(code),
+    )
     tangents = [add for term in code.terms for add in term.tangents(code)]
     reducing = [reduce for term in code.terms for reduce in term.reducing(code)]
     probes, has_foundation = code.require(ProbeTerm), code.get(FoundationTerm) is not None
@@ -278,7 +278,7 @@ def _row_sweeping(code: StepCode) -> Callable[..., None]:
     foundation = code.first_column(FoundationTerm) if has_foundation else 0
 
     @ti.func
-    def of_spring(sheet: ti.template(), offset, p, q, x0, y0, length, k, family: ti.template()):
+    def spring_tangent(sheet: ti.template(), offset, p, q, x0, y0, length, k, family: ti.template()):
         """Differentiate the force of entry p on entry q; their shapes are `offset` entries further on."""
         p_difference = [sheet.u[c][p] - sheet.u[c][q] for c in ti.static(range(3))]
         u_difference = [sheet.shapes[c][p + offset] - sheet.shapes[c][q + offset] for c in ti.static(range(3))]
@@ -309,21 +309,25 @@ def _row_sweeping(code: StepCode) -> Callable[..., None]:
             right = [vector(0) for _ in ti.static(range(5))]
             falling, rising = [vector(0) for _ in ti.static(range(5))], [vector(0) for _ in ti.static(range(5))]
             if ti.static(structural):
-                k = of_row(sheet, i, kind, b)
-                spring = of_spring(sheet, offset, entry_row + b, entry_row + b + 1, 0 - dx, 0 * dy, dx, k, ALONG_ROW)
+                k = row_stiffness(sheet, i, kind, b)
+                spring = spring_tangent(
+                    sheet, offset, entry_row + b, entry_row + b + 1, 0 - dx, 0 * dy, dx, k, ALONG_ROW
+                )
                 for c in ti.static(range(5)):
                     right[c] = spring[c]
             if ti.static(shear):
-                k = of_diagonal(sheet, i + 1, b)
-                down_right = of_spring(sheet, offset, entry_row + b, below + b + 1, 0 - dx, dy, diagonal, k, DIAGONAL)
-                down_left = of_spring(sheet, offset, entry_row + b + 1, below + b, dx, dy, diagonal, k, DIAGONAL)
+                k = diagonal_stiffness(sheet, i + 1, b)
+                down_right = spring_tangent(
+                    sheet, offset, entry_row + b, below + b + 1, 0 - dx, dy, diagonal, k, DIAGONAL
+                )
+                down_left = spring_tangent(sheet, offset, entry_row + b + 1, below + b, dx, dy, diagonal, k, DIAGONAL)
                 for c in ti.static(range(5)):
                     falling[c], rising[c] = down_right[c], down_left[c]
             if b > 0:
                 down = [vector(0) for _ in ti.static(range(5))]
                 if ti.static(structural):
-                    k = of_column(sheet, i + 1, b)
-                    spring = of_spring(sheet, offset, entry_row + b, below + b, 0 * dx, dy, dy, k, ALONG_COLUMN)
+                    k = column_stiffness(sheet, i + 1, b)
+                    spring = spring_tangent(sheet, offset, entry_row + b, below + b, 0 * dx, dy, dy, k, ALONG_COLUMN)
                     for c in ti.static(range(5)):
                         down[c] = spring[c]
                 force = [vector(0) for _ in ti.static(range(3))]
@@ -395,11 +399,11 @@ def _row_sweeping(code: StepCode) -> Callable[..., None]:
 def _sweeping_kernel(code: StepCode, *, parallel: bool) -> Callable[..., None]:
     """Build the kernel that sweeps the adjoint, from the last step to the first."""
     real, vector, vectors = code.real, code.vector, code.vectors
-    count_of_numbers, join_strips, storing = code.first_number(None), joining(code), _storing(code)
-    clear, sweep_row = _clearing(code), _row_sweeping(code)
+    count_of_numbers, join_strips, storing = code.first_number(None), joining(code), _moment_storing(code)
+    clear, sweep_row = _row_clearing(code), _row_sweeping(code)
 
     @ti.func
-    def take(sheet: ti.template(), tables: ti.template(), sizes: ti.template(), worker, k):
+    def step_band(sheet: ti.template(), tables: ti.template(), sizes: ti.template(), worker, k):
         """Run the k-th step of the launch for a band."""
         workers = ti.cast(sizes[WORKERS], ti.i32)
         low, high = sheet.rows * worker // workers, sheet.rows * (worker + 1) // workers
@@ -421,7 +425,7 @@ def _sweeping_kernel(code: StepCode, *, parallel: bool) -> Callable[..., None]:
             if i >= low:
                 join_strips(sheet.u, target + i, sheet.width)
 
-    work = _banded(take, parallel=parallel)
+    run_worker = _banded(step_band, parallel=parallel)
 
     @ti.kernel
     def sweep(
@@ -442,7 +446,7 @@ def _sweeping_kernel(code: StepCode, *, parallel: bool) -> Callable[..., None]:
                 p, u = ti.static((p_x, p_y, p_z), (u_x, u_y, u_z))
                 sheet = ti.static(AdjointSheet(p, by_column, stiffness, fields, numbers, rows, width, u, derivatives))
                 tables = ti.static(LoadTables(loads, by_load))
-                work(sheet, tables, sizes, progress, index // ITERATIONS_PER_THREAD)
+                run_worker(sheet, tables, sizes, progress, index // ITERATIONS_PER_THREAD)
 
     return sweep
 

@@ -256,11 +256,7 @@ class MotionAdjoint(Dynamics):
         return max(first, frame, end - self._max_launch_steps())
 
     def _sweep(self, first: int, end: int, by_frame: Array, table: Array) -> Array:
-        """Sweep backward from step `end` of the segment that begins with step `first`, over the steps of a table.
-
-        Returns:
-            Derivatives by the force and the control point of every slot in every step, shape (steps, slots, 5).
-        """
+        """Sweep a segment backward from step `end`; return the derivatives by its loads, shape (steps, slots, 5)."""
         layout, arrays, grid, count = self.structure, self._arrays, self.plan.grid, len(table)
         frame, steps_after_frame = divmod(end - count, grid.steps_per_frame)
         if not steps_after_frame:

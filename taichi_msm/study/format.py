@@ -103,7 +103,5 @@ def format_table(measurements: Sequence[Any], columns: Columns, remark: Callable
     if remark and any(map(remark, measurements)):
         columns = {**columns, "": remark}
     rows = [[cell(measurement) for cell in columns.values()] for measurement in measurements]
-    # Columns of text are aligned left.
-    return markdown_table(
-        list(columns), rows, [n for n, name in enumerate(columns) if name in ("method", "without", "")]
-    )
+    text_columns = [n for n, name in enumerate(columns) if name in ("method", "without", "")]
+    return markdown_table(list(columns), rows, text_columns)

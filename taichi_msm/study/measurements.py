@@ -87,7 +87,7 @@ class SteppingStudy:
         }
         self.frames: Frames | None = None
         self._longest_run, self.study, self._progress = longest_run, study, progress
-        self._done, self._to_do = 0, 1
+        self._done, self._total = 0, 1
         self._dynamics: dict[str, Dynamics] = {
             precision: Dynamics(plan.with_grid(precision=precision), device) for precision in PRECISIONS
         }
@@ -95,20 +95,20 @@ class SteppingStudy:
     def run(self) -> None:
         """Compute the reference and the errors, and then measure the times."""
         for dynamics in self._dynamics.values():
-            self._progress(0, self._to_do)
+            self._progress(0, self._total)
             dynamics.compile()
         series = {difference: list(self._series(difference)) for difference in DIFFERENCES}
         finest = max(steps for counts in series.values() for steps in counts)
-        self._to_do = 3 + STEPPING_ROUNDS * len(PRECISIONS) * sum(len(counts) for counts in series.values())
-        self._make_reference(finest)
+        self._total = 3 + STEPPING_ROUNDS * len(PRECISIONS) * sum(len(counts) for counts in series.values())
+        self._compute_reference(finest)
         for difference, counts in series.items():
             self._measure_errors(difference, counts)
-        self._to_do = self._done + (STEPPING_ROUNDS - 1) * len(self.study.stepping)
+        self._total = self._done + (STEPPING_ROUNDS - 1) * len(self.study.stepping)
         for _ in range(STEPPING_ROUNDS - 1):
             for point in self.study.stepping:
                 self._run(point.precision, point.damping_difference, point.steps_per_frame, point.samples)
 
-    def relative(self, frames: Frames) -> float:
+    def relative_error(self, frames: Frames) -> float:
         """Return the largest error of frames against the reference, as a fraction of the largest displacement."""
         assert self.frames is not None
         largest = self._reference.largest
@@ -139,12 +139,10 @@ class SteppingStudy:
                 return
             yield steps * 2**halving
 
-    def _make_reference(self, finest: int) -> None:
-        """Extrapolate central differences with steps well below the finest measured one.
-
-        u* = u_{h/2} + (u_{h/2} - u_h) / 3. Its error is at most about its distance from the same formula with 2 h for
-        h. With contact, where the order is about 1, nothing is extrapolated.
-        """
+    def _compute_reference(self, finest: int) -> None:
+        """Extrapolate central differences with steps well below the finest measured one."""
+        # u* = u_{h/2} + (u_{h/2} - u_h) / 3. Its error is at most about its distance from the same formula with 2 h for
+        # h. With contact, where the order is about 1, nothing is extrapolated.
         coarse, middle, fine = (self._run("f64", "central", finest * 2**halving, []) for halving in range(3))
         before, self.frames = middle + (middle - coarse) / 3, fine + (fine - middle) / 3
         if self.plan.tools:
@@ -162,7 +160,7 @@ class SteppingStudy:
                 step = replace(self.plan.grid, steps_per_frame=steps).step
                 point = SteppingMeasurement(precision, difference, steps, step)
                 frames = self._run(precision, difference, steps, point.samples)
-                error, rounding = self.relative(frames), None
+                error, rounding = self.relative_error(frames), None
                 if precision == "f64":
                     exact = frames
                 elif exact is not None and self._reference.largest > 0:
@@ -181,7 +179,7 @@ class SteppingStudy:
         frames = np.empty((plan.grid.frames, *plan.scene.sheet.points, 3), precision.replace("f", "float"))
         seconds = 0.0
         for frame in frames:
-            self._progress(self._done, self._to_do)
+            self._progress(self._done, self._total)
             start = time.perf_counter()
             dynamics.advance(steps)
             seconds += time.perf_counter() - start
@@ -220,8 +218,8 @@ class MeshStudy:
     the automatic step of each mesh, which is longer for coarser ones.
 
     The reference is a mesh finer than all measured ones, if there is time for it. Otherwise it is the finest measured
-    one, whose own error is then known only as a bound. It is run only once, and may take as long as all the runs by
-    which another mesh is timed.
+    one, whose own error is then known only as a bound. The reference is run only once, and may take as long as all the
+    timed runs of another mesh together.
 
     Args:
         plan: Plan of the scene.
@@ -242,25 +240,25 @@ class MeshStudy:
     def run(self) -> None:
         """Compute the estimates and the errors, and then measure the times.
 
-        Springs are not measured, because another mesh makes another sheet of them.
+        A sheet of springs is not measured, because it is a different sheet with another mesh.
         """
         if self._plan.scene.tissue is None:
             return
         with ExitStack() as opened:
             seconds = 0.0
             for plan in mesh_plans(self._plan):
-                seconds = self._try(plan, opened)
+                seconds = self._measure_mesh(plan, opened)
             if not self._sheets:
                 note = f"points were not measured: with fewer than {MIN_POINTS} a side they cannot be compared"
                 self._study.notes.append(note)
                 return
-            finer = self._finer(self._plan, seconds, self._longest_run)
+            finer = self._finer_plan(self._plan, seconds, self._longest_run)
             if finer is None:
                 rows, cols = _scaled(self._plan, FINE_CELL_RATIO)
                 self._study.notes.append(f"{rows} x {cols} points were not measured: time or memory")
             else:
-                seconds = self._try(finer, opened)
-                finer = self._finer(finer, seconds, MESH_ROUNDS * self._longest_run)
+                seconds = self._measure_mesh(finer, opened)
+                finer = self._finer_plan(finer, seconds, MESH_ROUNDS * self._longest_run)
             if len(self._sheets) < 2:
                 return
             self._measure_errors(finer)
@@ -268,7 +266,7 @@ class MeshStudy:
                 for sheet in self._sheets:
                     sheet.measurement.samples.append(self._step_through(sheet))
 
-    def _try(self, plan: Plan, opened: ExitStack) -> float:
+    def _measure_mesh(self, plan: Plan, opened: ExitStack) -> float:
         """Run a mesh with its automatic step and the companion runs of `run`; return the time of stepping [s]."""
         dynamics = opened.enter_context(closing(Dynamics(plan, self._device)))
         sheet = _MeshRun(plan, dynamics, MeshMeasurement(*plan.scene.sheet.points, plan.grid.steps_per_frame))
@@ -287,12 +285,8 @@ class MeshStudy:
         sheet.measurement.estimate = estimate if estimate < math.inf else None
         return seconds
 
-    def _finer(self, plan: Plan, seconds: float, longest_run: float) -> Plan | None:
-        """Plan a finer mesh than that of a plan whose stepping took `seconds`.
-
-        Returns:
-            The plan; None if its stepping would take longer than `longest_run` [s], or too much memory.
-        """
+    def _finer_plan(self, plan: Plan, seconds: float, longest_run: float) -> Plan | None:
+        """Plan a finer mesh than that of a run of `seconds`; return None if it takes too much time or memory."""
         points = _scaled(plan, FINE_CELL_RATIO)
         if max(points) > MAX_POINTS:
             return None
@@ -375,19 +369,10 @@ def _scaled(plan: Plan, ratio: float) -> Lattice:
 
 
 def _reference(fields: list[Field], *, extrapolate: bool) -> tuple[Field, float]:
-    """Apply Richardson's extrapolation of order 2 in the cell length to the two finest fields.
-
-    u* = u + (u - u_r) / (r^2 - 1), where u_r has cells r times as long. The correction is computed at the mass points
-    of u_r and interpolated at those of u. The error of u* is at most about its distance from the extrapolation of the
-    next two fields, or that of u from u_r if there are only two.
-
-    Args:
-        fields: Two or more fields of displacements [m], the coarsest first, each of shape (rows, cols, 3).
-        extrapolate: Whether to extrapolate. With contact, where the order is lower, u* is the finest field.
-
-    Returns:
-        u* at the mass points of the finest field [m], and an approximate bound of its error [m].
-    """
+    """Extrapolate the two finest displacement fields to order 2; return the result and a bound of its error [m]."""
+    # u* = u + (u - u_r) / (r^2 - 1), where u_r has cells r times as long. The correction is computed at the mass points
+    # of u_r and interpolated at those of u. The error of u* is at most about its distance from the extrapolation of the
+    # next two fields, or that of u from u_r if there are only two. With contact the order is lower.
     if not extrapolate:
         return fields[-1], max_norm(_sampled(fields[-1], fields[-2]) - fields[-2])
     exact = fields[-1] + _sampled(_correction(fields[-1], fields[-2]), fields[-1])
@@ -456,11 +441,11 @@ def measure_pictures(
         error = int(np.abs(picture.astype(np.int16) - reference).max())
         study.drawing.append(DrawingMeasurement(refine, supersample, psnr(picture, reference), error))
     for round_ in range(PICTURE_ROUNDS):
-        for number, (drawing, drawn) in enumerate(zip(drawings, study.drawing, strict=True)):
+        for number, (drawing, measurement) in enumerate(zip(drawings, study.drawing, strict=True)):
             progress(round_ * len(drawings) + number, len(drawings) * PICTURE_ROUNDS)
             start = time.perf_counter()
             drawing.draw(position)
-            drawn.samples.append(time.perf_counter() - start)
+            measurement.samples.append(time.perf_counter() - start)
 
 
 def render_settings(scene: Scene, quick: bool) -> Iterator[tuple[int, int]]:

@@ -146,15 +146,13 @@ def _plot_stepping(axes: Axes, study: Study) -> None:
 
 
 def _plot_line(axes: Axes, points: Sequence[ErrorMeasurement], line: dict[str, Any], label: str) -> Line2D:
-    """Draw a line through measurements, and return its entry in the legend.
-
-    Markers are hollow for upper bounds, and half filled where rounding dominates.
-    """
+    """Draw a line through measurements, and return its entry in the legend."""
     points = [point for point in points if _drawable(point.error)]
     errors = [point.error or 0.0 for point in points]
     axes.plot(errors, [point.seconds.median for point in points], **line, zorder=3)
     _plot_spread(axes, errors, points, line["color"])
     for point, error in zip(points, errors, strict=True):
+        # Markers are hollow for upper bounds, and half filled where rounding dominates.
         if not point.known or is_mostly_rounding(point):
             axes.plot([error], [point.seconds.median], **line | (HALF if point.known else HOLLOW), zorder=4)
     return Line2D([], [], **line, label=label)

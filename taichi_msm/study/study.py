@@ -175,5 +175,5 @@ def _measure_peer(plan: Plan, stepping: SteppingStudy, budget: TimeBudget, resul
             )
             results.notes.append(f"{DOP853_SUBJECT} {reason}; {DOP853_INDEPENDENCE}")
             return
-        error = stepping.relative(frames)
+        error = stepping.relative_error(frames)
         results.peers.append(PeerMeasurement(rtol, error, stepping.determines(error), evaluations, samples=samples))
