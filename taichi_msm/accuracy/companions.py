@@ -55,18 +55,18 @@ class CompanionRuns(NamedTuple):
         return self.mesh or not self.reason
 
 
-def choose_companion_runs(plan: Plan, *, asked: bool = False) -> CompanionRuns:
+def choose_companion_runs(plan: Plan, *, requested: bool = False) -> CompanionRuns:
     """Choose the companion runs of a run.
 
     Args:
         plan: Plan of the run.
-        asked: Whether the user requested an error estimate, whatever it costs.
+        requested: Whether the user requested an error estimate, whatever it costs.
 
     Returns:
         The companion runs. A quasi-static scene has none for the time step.
     """
     if plan.scene.time.at_rest:
-        mesh = plan.scene.tissue is not None and (asked or affords_pilots(plan, MESH_COST))
+        mesh = plan.scene.tissue is not None and (requested or affords_pilots(plan, MESH_COST))
         return CompanionRuns(mesh=mesh, cost=MESH_COST if mesh else 0.0, reason=QUASISTATIC_REASON)
     steps, coarse, fine = plan.grid.steps_per_frame, coarse_steps(plan), fine_steps(plan)
     mesh_cost = (CONTACT_MESH_COST if plan.tools else MESH_COST) if plan.scene.tissue is not None else 0.0
@@ -75,7 +75,7 @@ def choose_companion_runs(plan: Plan, *, asked: bool = False) -> CompanionRuns:
     cost = (1 + mesh_cost) * coarse / steps if coarse else fine_cost + mesh_cost
     if coarse and plan.tools:
         cost = coarse / steps + mesh_cost  # With contact the meshes are compared with the run, not with its companion.
-    if not asked and not affords_pilots(plan, cost):
+    if not requested and not affords_pilots(plan, cost):
         return CompanionRuns(
             reason="it would take more than two fifths of the run; to have it anyway, pass --estimate-error"
         )
@@ -83,7 +83,7 @@ def choose_companion_runs(plan: Plan, *, asked: bool = False) -> CompanionRuns:
         return CompanionRuns(fine, 0, mesh_cost > 0, cost)
     # Without stored positions, the run is repeated for the companion run that follows.
     repetition = 0.0 if plan.scene.output else 1.0
-    follows = asked or affords_pilots(plan, cost + fine_cost + repetition)
+    follows = requested or affords_pilots(plan, cost + fine_cost + repetition)
     return CompanionRuns(coarse, fine if follows else 0, mesh_cost > 0, cost)
 
 

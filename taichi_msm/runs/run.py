@@ -401,7 +401,7 @@ def _pilots(task: _Task, *, resumed: bool) -> CompanionRuns:
         return CompanionRuns(reason="not asked for")
     if asked is None and task.device.arch != "cpu":
         return CompanionRuns(reason="on a GPU, this needs --estimate-error")
-    pilots = choose_companion_runs(task.plan, asked=asked is True)
+    pilots = choose_companion_runs(task.plan, requested=asked is True)
     if pilots.planned and resumed and not task.plan.scene.output:
         return CompanionRuns(reason="the frames before the interruption were not kept")
     return pilots

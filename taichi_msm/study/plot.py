@@ -51,17 +51,17 @@ PRECISION_LINES: dict[str, dict[str, Any]] = {
     "f32": {"linestyle": "-", "marker": "o"},
     "f64": {"linestyle": (0, (3.5, 1.8)), "marker": "s"},
 }
-PEER_LINE: dict[str, Any] = {"color": INK, "linestyle": ":", "marker": "D"}
+DOP853_LINE: dict[str, Any] = {"color": INK, "linestyle": ":", "marker": "D"}
 TOLERANCE_LINE: dict[str, Any] = {"color": GREY, "linewidth": 0.8, "linestyle": (0, (6, 3))}
-RING: dict[str, Any] = {"ls": "none", "marker": "o", "ms": 11, "mfc": "none", "mec": INK, "zorder": 5}
-HOLLOW: dict[str, Any] = {"mfc": "white"}
-HALF: dict[str, Any] = {"fillstyle": "bottom", "markerfacecoloralt": "white"}
-DOT: dict[str, Any] = {"linestyle": "none", "marker": "o", "color": GREY}
+RECOMMENDED_MARKER: dict[str, Any] = {"ls": "none", "marker": "o", "ms": 11, "mfc": "none", "mec": INK, "zorder": 5}
+BOUND_MARKER: dict[str, Any] = {"mfc": "white"}
+ROUNDING_MARKER: dict[str, Any] = {"fillstyle": "bottom", "markerfacecoloralt": "white"}
+LEGEND_MARKER: dict[str, Any] = {"linestyle": "none", "marker": "o", "color": GREY}
 SUPERSAMPLE_COLOURS = (SKY, BLUE, GREEN, ORANGE, PURPLE, VERMILION)
 MARKERS = "osD^vPX"
 
 # Mosaic of the panels by their number; the first of three is as high as the others together.
-LAYOUTS = {1: "A", 2: "AB", 3: "AB;AC", 4: "AB;CD"}
+PANEL_MOSAICS = {1: "A", 2: "AB", 3: "AB;AC", 4: "AB;CD"}
 
 Panel = Callable[[Axes, Study], None]
 
@@ -98,7 +98,7 @@ def _drawable(value: float | None) -> bool:
 
 def _figure(study: Study) -> Figure:
     study_panels = list(panels(study))
-    layout = LAYOUTS[len(study_panels)]
+    layout = PANEL_MOSAICS[len(study_panels)]
     size = (WIDE if len(study_panels) > 1 else NARROW, 4.2 * (layout.count(";") + 1) + 0.5)
     figure = Figure(figsize=size, dpi=DPI, layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1, wspace=0.05))
     FigureCanvasAgg(figure)
@@ -137,10 +137,10 @@ def _plot_stepping(axes: Axes, study: Study) -> None:
         right = axes.get_yaxis_transform()
         axes.plot([0.985] * len(diverged), diverged, "x", color=line["color"], transform=right)
     if study.peers:
-        handles.append(_plot_line(axes, study.peers, PEER_LINE, "SciPy DOP853"))
+        handles.append(_plot_line(axes, study.peers, DOP853_LINE, "SciPy DOP853"))
     best = study.best_stepping
     if best is not None and _drawable(best.error):
-        axes.plot([best.error or 0.0], [best.seconds.median], **RING)
+        axes.plot([best.error or 0.0], [best.seconds.median], **RECOMMENDED_MARKER)
     _scale_errors(axes, [*study.stepping, *study.peers], study.tolerance)
     _legend(axes, [*handles, *_marker_legend(study)])
 
@@ -154,7 +154,9 @@ def _plot_line(axes: Axes, points: Sequence[ErrorMeasurement], line: dict[str, A
     for point, error in zip(points, errors, strict=True):
         # Markers are hollow for upper bounds, and half filled where rounding dominates.
         if not point.known or is_mostly_rounding(point):
-            axes.plot([error], [point.seconds.median], **line | (HALF if point.known else HOLLOW), zorder=4)
+            axes.plot(
+                [error], [point.seconds.median], **line | (ROUNDING_MARKER if point.known else BOUND_MARKER), zorder=4
+            )
     return Line2D([], [], **line, label=label)
 
 
@@ -163,13 +165,13 @@ def _marker_legend(study: Study) -> Iterator[Line2D]:
     points: list[ErrorMeasurement] = [*study.stepping, *study.peers]
     yield Line2D([], [], **TOLERANCE_LINE, label="tolerance")
     if study.best_stepping is not None:
-        yield Line2D([], [], **RING | {"ms": 8}, label="recommended")
+        yield Line2D([], [], **RECOMMENDED_MARKER | {"ms": 8}, label="recommended")
     if any(point.known and is_mostly_rounding(point) for point in points):
-        yield Line2D([], [], **DOT | HALF, label="mostly rounding")
+        yield Line2D([], [], **LEGEND_MARKER | ROUNDING_MARKER, label="mostly rounding")
     if any(_drawable(point.error) and not point.known for point in points):
-        yield Line2D([], [], **DOT | HOLLOW, label="at most this error")
+        yield Line2D([], [], **LEGEND_MARKER | BOUND_MARKER, label="at most this error")
     if any(point.error is None for point in study.stepping):
-        yield Line2D([], [], **DOT | {"marker": "x"}, label="diverged")
+        yield Line2D([], [], **LEGEND_MARKER | {"marker": "x"}, label="diverged")
 
 
 def _plot_drawing(axes: Axes, study: Study) -> None:
@@ -184,13 +186,15 @@ def _plot_drawing(axes: Axes, study: Study) -> None:
         _plot_spread(axes, [drawing.psnr or 0.0 for drawing in series], series, colour, 1e3)
     for drawing in drawings:
         colour, marker = colours[drawing.supersample], markers[drawing.refine]
-        axes.plot(*_coordinates(drawing), color=colour, marker=marker, **HOLLOW, zorder=3)
+        axes.plot(*_coordinates(drawing), color=colour, marker=marker, **BOUND_MARKER, zorder=3)
     best = study.best_drawing
     if best is not None and _drawable(best.psnr):
-        axes.plot(*_coordinates(best), **RING)
+        axes.plot(*_coordinates(best), **RECOMMENDED_MARKER)
     _scale(axes, "y", [1e3 * seconds for seconds in _extremes(drawings)], 0.8)
     handles = [Line2D([], [], color=colour, label=f"supersample {n}") for n, colour in colours.items()]
-    handles += [Line2D([], [], **DOT | HOLLOW | {"marker": m}, label=f"refine {n}") for n, m in markers.items()]
+    handles += [
+        Line2D([], [], **LEGEND_MARKER | BOUND_MARKER | {"marker": m}, label=f"refine {n}") for n, m in markers.items()
+    ]
     _legend(axes, handles, 3)
 
 
@@ -205,11 +209,11 @@ def _plot_meshes(axes: Axes, study: Study) -> None:
     axes.plot([mesh.error or 0.0 for mesh in meshes], [mesh.seconds.median for mesh in meshes], color=BLUE)
     handles = []
     for mesh, marker in zip(meshes, cycle(MARKERS)):
-        line = {"color": BLUE, "linestyle": "none", "marker": marker} | ({} if mesh.known else HOLLOW)
+        line = {"color": BLUE, "linestyle": "none", "marker": marker} | ({} if mesh.known else BOUND_MARKER)
         role, bound = " (the scene)" if mesh is study.scene_mesh else "", "" if mesh.known else ", at most"
         handles.append(_plot_line(axes, [mesh], line, f"{mesh.name}{role}{bound}"))
         if (mesh.rows, mesh.cols) == study.recommended_points:
-            axes.plot([mesh.error or 0.0], [mesh.seconds.median], **RING)
+            axes.plot([mesh.error or 0.0], [mesh.seconds.median], **RECOMMENDED_MARKER)
         if _drawable(mesh.estimate):
             axes.plot([mesh.error or 0.0, mesh.estimate or 0.0], [mesh.seconds.median] * 2, color=ORANGE, linewidth=0.7)
             axes.plot([mesh.estimate or 0.0], [mesh.seconds.median], color=ORANGE, marker=marker)

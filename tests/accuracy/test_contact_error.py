@@ -51,7 +51,7 @@ def image(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 def told(plan: Plan, device: Device) -> RunErrorEstimates:
     """What a run says of its error."""
-    companions = choose_companion_runs(plan, asked=True)
+    companions = choose_companion_runs(plan, requested=True)
     known = RunErrorEstimator(plan, companions, RunErrorEstimates(), device, device.threads)
     own, kept = Dynamics(plan, device), []
     for _ in range(plan.grid.frames):
@@ -238,7 +238,7 @@ def test_the_error_with_tools_in_one_place_may_be_larger(device: Device) -> None
 def test_the_pilot_of_the_points_is_compared_with_the_run(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """A coarse pilot, with steps twice as long, may press quite otherwise."""
     plan = plan_of(touching([PRESSED]))
-    known = RunErrorEstimator(plan, choose_companion_runs(plan, asked=True), RunErrorEstimates(), device, 1)
+    known = RunErrorEstimator(plan, choose_companion_runs(plan, requested=True), RunErrorEstimates(), device, 1)
     given: list[Any] = []
     assert known._mesh is not None
     monkeypatch.setattr(known._mesh, "compare_frame", lambda displacement, pause: given.append(displacement))
@@ -318,7 +318,7 @@ def test_large_differences_tell_little(
     """Above 0.4 of the displacement a nearer run is needed; above all of it, and of such steps, nothing is known."""
     plan = plan_of(moved_tissue())
     of_steps = TimeStepEstimate(10, steps, 0.0, steps, 1, at_most=True)
-    known = RunErrorEstimator(plan, choose_companion_runs(plan, asked=True), RunErrorEstimates(of_steps), device, 1)
+    known = RunErrorEstimator(plan, choose_companion_runs(plan, requested=True), RunErrorEstimates(of_steps), device, 1)
     mesh = known._mesh
     assert mesh is not None
     displacement = np.zeros((*plan.scene.sheet.points, 3))
