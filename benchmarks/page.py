@@ -140,7 +140,7 @@ def launch_share(results: Results) -> str:
 
 def table(head: list[str], rows: list[list[str]]) -> str:
     """Write a table, its first column of text and the others of numbers."""
-    return markdown_table(head, rows, left=(0,))
+    return markdown_table(head, rows, left_columns=(0,))
 
 
 def stepping_table(measured: dict[str, list[Entry]]) -> str:

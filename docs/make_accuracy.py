@@ -79,7 +79,7 @@ def significant(value: float | None, digits: int = 2) -> str:
 
 def table(head: list[str], rows: list[list[str]]) -> str:
     """Write a table, its first column of text and the others of numbers."""
-    return markdown_table(head, rows, left=(0,))
+    return markdown_table(head, rows, left_columns=(0,))
 
 
 def scene_table(studies: dict[str, Record]) -> str:

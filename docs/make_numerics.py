@@ -100,7 +100,9 @@ def silent_table() -> str:
         errors = [max_norm(motion(one) - exact) / largest for one in (plan.with_grid(precision="f32"), plan)]
         told = estimate_error(plan, runtime.started()).error
         rows.append([name, *(f"{error:.2g}" for error in errors), f"{told:.2g}", plan.grid.precision])
-    return markdown_table(["run", "error in f32", "error with auto", "error told", "auto takes"], rows, left=(0, 4))
+    return markdown_table(
+        ["run", "error in f32", "error with auto", "error told", "auto takes"], rows, left_columns=(0, 4)
+    )
 
 
 def stiffness(scene: Scene, displacement: Array, active: float) -> csc_matrix:
@@ -261,7 +263,9 @@ def energy() -> dict[str, Any]:
         "energy_steps": f"{ENERGY_STEPS:,}",
         "energy_share": f"{h / make_plan(made).stable_step:g}",
         "energy_table": markdown_table(
-            ["precision", "mean energy", "largest swing", "last tenth of the time, against the first"], rows, left=(0,)
+            ["precision", "mean energy", "largest swing", "last tenth of the time, against the first"],
+            rows,
+            left_columns=(0,),
         ),
     }
 

@@ -88,7 +88,7 @@ MAX_CELL_REFINEMENT, MIN_CELL_REFINEMENT = 2.0, 1.1
 TOLERANCE_TARGET = 0.8
 
 # The fewest mass points per side for which half the cells still make a comparable sheet.
-MIN_POINTS = 7
+MIN_POINTS_PER_SIDE = 7
 
 
 # Reasons for an unknown or underestimated error.
@@ -125,7 +125,7 @@ def coarser_plan(plan: Plan, ratio: float = 0.5) -> Plan | None:
         The plan; None without tissue, with too few mass points, or if the cells would be too long.
     """
     scene = plan.scene
-    if scene.tissue is None or min(scene.sheet.points) < MIN_POINTS:
+    if scene.tissue is None or min(scene.sheet.points) < MIN_POINTS_PER_SIDE:
         return None
     cells = [ratio * (count - 1) for count in scene.sheet.points]
     if ratio == SECOND_CELL_RATIO:
@@ -339,7 +339,7 @@ def choose_points(
     """
     tolerance, given = plan.scene.sheet.tolerance, plan.scene.sheet.points
     assert tolerance is not None
-    refinement = max(1.0, (MIN_POINTS - 1) / (min(given) - 1))
+    refinement = max(1.0, (MIN_POINTS_PER_SIDE - 1) / (min(given) - 1))
     max_refinement = (MAX_POINTS - 1) / (max(given) - 1)
     for _ in range(MAX_TRIALS):
         rows, cols = (round((count - 1) * refinement) + 1 for count in given)
@@ -418,5 +418,5 @@ def _cubic_weights(source: int, target: int) -> tuple[NDArray[np.intp], NDArray[
     position = np.arange(target + 1) * (source / target)
     first = np.clip(np.floor(position).astype(int) - 1, 0, source - 3)
     t, nodes = position - first, range(4)
-    weights = [math.prod((t - other) / (node - other) for other in nodes if other != node) for node in nodes]
+    weights = [math.prod((t - zero) / (node - zero) for zero in nodes if zero != node) for node in nodes]
     return first, np.stack(weights)

@@ -203,18 +203,18 @@ class TimeStepCompanion:
         self._dynamics.advance(self._steps, pause)
         if self._same_step:
             self._same_step.advance(self._plan.grid.steps_per_frame, pause)
-        other = self.displacement = self._dynamics.displacement()
-        same = self._same_step.displacement() if self._same_step else displacement
+        companion = self.displacement = self._dynamics.displacement()
+        same_step = self._same_step.displacement() if self._same_step else displacement
         with np.errstate(all="ignore"):
             ratio = self._steps / self._plan.grid.steps_per_frame
-            exact = other + (other - same) / (ratio**self._order - 1) if self._parted else other
+            exact = companion + (companion - same_step) / (ratio**self._order - 1) if self._parted else companion
             self._error = max(self._error, max_norm(displacement - exact))
             # With contact the extrapolated displacement may be far too large.
-            best = exact if not self._plan.tools else other if ratio > 1 else displacement
+            best = exact if not self._plan.tools else companion if ratio > 1 else displacement
             self._largest = max(self._largest, max_norm(best))
             if self._same_step:
-                self._in_f64 = max(self._in_f64, max_norm(same - exact))
-                self._rounding = max(self._rounding, max_norm(displacement - same))
+                self._in_f64 = max(self._in_f64, max_norm(same_step - exact))
+                self._rounding = max(self._rounding, max_norm(displacement - same_step))
 
     def force_error(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
         """Estimate the error of the mean forces since the previous frame [N], shape (tools, 3), at order 1."""

@@ -219,20 +219,20 @@ class LoadGradient:
         for index, slots in self._slots.items():
             probe, by_force, by_point = self._plan.scene.probes[index], by_slot[:, slots, :3], by_slot[:, slots, 3:]
             unit = schedule_of(self._with_probe(index, {_force_key(probe): (1.0, 1.0, 1.0)})).strength
-            self._by_key(index, _force_key(probe))[:] += (by_force * unit).sum(axis=(0, 1))
+            self._derivatives(index, _force_key(probe))[:] += (by_force * unit).sum(axis=(0, 1))
             keys = [time for time, _ in probe.load]
             for n in _active_keys(keys, times):
                 load = tuple((time, float(m == n)) for m, time in enumerate(keys))
                 unit = schedule_of(self._with_probe(index, {"load": load})).strength
-                self._by_key(index, "load")[n] += (by_force * unit).sum()
-            by_position = self._by_key(index, "at").reshape(-1, 2)
+                self._derivatives(index, "load")[n] += (by_force * unit).sum()
+            by_position = self._derivatives(index, "at").reshape(-1, 2)
             keys = control_points(probe, self._plan.scene.sheet)[0].tolist()
             # The first position also holds before its keyframe.
             for n in _active_keys(keys, times, before=True):
                 share = schedule_of(self._with_unit_position(index, n)).point
                 by_position[n] += (by_point * share).sum(axis=(0, 1)) * (width, -height)
 
-    def _by_key(self, index: int, name: str) -> Array:
+    def _derivatives(self, index: int, name: str) -> Array:
         derivatives = self.by_key[f"probes.{index}.{name}"]
         assert isinstance(derivatives, np.ndarray)
         return derivatives

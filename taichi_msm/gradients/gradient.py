@@ -202,10 +202,10 @@ def gradient(scene: Scene | Mapping[str, Any], loss: Loss, threads: int | None =
         ...     slope = 0 * position
         ...     slope[-1, 10, 10, 2] = -1
         ...     return -position[-1, 10, 10, 2], slope
-        >>> found = gradient(scene, depth)
-        >>> sorted(found.maps)
+        >>> result = gradient(scene, depth)
+        >>> sorted(result.maps)
         ['tissue.foundation_map', 'tissue.map']
-        >>> bool(found.numbers["tissue.young"] < 0 < found.numbers["probes.0.load"][1])
+        >>> bool(result.numbers["tissue.young"] < 0 < result.numbers["probes.0.load"][1])
         True
     """
     if not callable(loss):

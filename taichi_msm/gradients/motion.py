@@ -52,10 +52,10 @@ SEGMENT_BYTES = 64 * 2**20
 
 # Number of times that a worker checks its neighbour before it gives up. It is larger than forward in time, because the
 # rest of the launch then falls to a single worker, whose kernel may have to be compiled.
-MAX_WAIT_LOOKS = 8 * PATIENCE
+MAX_WAIT_CHECKS = 8 * PATIENCE
 
 # Largest number of steps times mass points in a launch of the adjoint, about 0.1 s of one core.
-POINT_STEPS_PER_LAUNCH = 10_000_000
+NODE_STEPS_PER_LAUNCH = 10_000_000
 
 Array = NDArray[np.float64]
 
@@ -298,7 +298,7 @@ class MotionAdjoint(Dynamics):
         return arrays.numbers, arrays.by_column, arrays.stiffness, arrays.fields
 
     def _max_launch_steps(self) -> int:
-        return max(1, POINT_STEPS_PER_LAUNCH // (self.structure.rows * self.structure.cols))
+        return max(1, NODE_STEPS_PER_LAUNCH // (self.structure.rows * self.structure.cols))
 
     def _sizes(self, count: int, shape: int, moment_row: int, with_loss: bool = False) -> NDArray[np.int64]:
         """Return the sizes of a launch in the order of `kernel_motion`."""
@@ -306,7 +306,7 @@ class MotionAdjoint(Dynamics):
         carry = moment_row + MOMENTS * layout.workers
         return np.array([
             count, layout.workers, layout.rows, layout.strip, shape, moment_row, carry, self._carried_rows,
-            MAX_WAIT_LOOKS, self._buffer if moment_row == ADJOINT_PARTS * layout.rows else 0, with_loss,
+            MAX_WAIT_CHECKS, self._buffer if moment_row == ADJOINT_PARTS * layout.rows else 0, with_loss,
         ])  # fmt: skip
 
     def _launch(self, which: int, sizes: NDArray[np.int64], *arguments: Any) -> None:

@@ -65,23 +65,23 @@ def machine_summary(study: Study) -> str:
     return f"{study.machine['cpu']}, {cpu_use if study.machine['arch'] == 'cpu' else study.machine['arch']}"
 
 
-def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], left: Sequence[int] = ()) -> str:
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], left_columns: Sequence[int] = ()) -> str:
     """Format a Markdown table.
 
     Args:
         head: Names of the columns.
         rows: Cells of every row.
-        left: Columns that are aligned left; all others are aligned right.
+        left_columns: Columns that are aligned left; all others are aligned right.
 
     Returns:
         The table, without a final line break.
     """
     widths = [max(len(row[column]) for row in [head, *rows]) for column in range(len(head))]
-    rule = ["-" * width if column in left else "-" * (width - 1) + ":" for column, width in enumerate(widths)]
+    rule = ["-" * width if column in left_columns else "-" * (width - 1) + ":" for column, width in enumerate(widths)]
 
     def line(cells: Sequence[str]) -> str:
         padded = [
-            cell.ljust(width) if column in left else cell.rjust(width)
+            cell.ljust(width) if column in left_columns else cell.rjust(width)
             for column, (cell, width) in enumerate(zip(cells, widths, strict=True))
         ]
         return f"| {' | '.join(padded)} |"

@@ -22,7 +22,13 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from taichi_msm.accuracy.divergence import displacement_bound
-from taichi_msm.accuracy.mesh import MIN_POINTS, CubicInterpolation, MeshCompanion, mesh_companion_plan, with_points
+from taichi_msm.accuracy.mesh import (
+    MIN_POINTS_PER_SIDE,
+    CubicInterpolation,
+    MeshCompanion,
+    mesh_companion_plan,
+    with_points,
+)
 from taichi_msm.accuracy.time_step import max_norm
 from taichi_msm.errors import Count
 from taichi_msm.load import cost
@@ -200,7 +206,6 @@ MESH_ROUNDS = 5
 MESH_REFERENCE_MARGIN = 5
 
 Field = NDArray[Any]
-Lattice = tuple[int, int]
 
 
 class _MeshRun(NamedTuple):
@@ -249,7 +254,7 @@ class MeshStudy:
             for plan in mesh_plans(self._plan):
                 seconds = self._measure_mesh(plan, opened)
             if not self._sheets:
-                note = f"points were not measured: with fewer than {MIN_POINTS} a side they cannot be compared"
+                note = f"points were not measured: with fewer than {MIN_POINTS_PER_SIDE} a side they cannot be compared"
                 self._study.notes.append(note)
                 return
             finer = self._finer_plan(self._plan, seconds, self._longest_run)
@@ -355,14 +360,16 @@ def mesh_plans(plan: Plan) -> Iterator[Plan]:
     """Plan the meshes to compare, as far as the scene allows them; its own is the last."""
     for ratio in COARSE_CELL_RATIOS:
         points = _scaled(plan, ratio)
-        coarse, _ = try_plan(with_points(plan.scene, points), plan.maps) if min(points) >= MIN_POINTS else (None, [])
+        coarse, _ = (
+            try_plan(with_points(plan.scene, points), plan.maps) if min(points) >= MIN_POINTS_PER_SIDE else (None, [])
+        )
         if coarse is not None:
             yield coarse
-    if min(plan.scene.sheet.points) >= MIN_POINTS:
+    if min(plan.scene.sheet.points) >= MIN_POINTS_PER_SIDE:
         yield plan
 
 
-def _scaled(plan: Plan, ratio: float) -> Lattice:
+def _scaled(plan: Plan, ratio: float) -> tuple[int, int]:
     """Return the rows and columns of mass points for `ratio` times the cells per side."""
     rows, cols = (round((count - 1) * ratio) + 1 for count in plan.scene.sheet.points)
     return rows, cols
@@ -536,8 +543,8 @@ def scene_variants(scene: Scene) -> Iterator[tuple[str, Scene]]:
     if scene.damping > 0:
         yield "damping", scene.model_copy(update={"damping": 0.0})
     for index in range(len(scene.probes)):
-        others = scene.probes[:index] + scene.probes[index + 1 :]
-        yield f"probes.{index}", scene.model_copy(update={"probes": others})
+        remaining = scene.probes[:index] + scene.probes[index + 1 :]
+        yield f"probes.{index}", scene.model_copy(update={"probes": remaining})
 
 
 def _step_seconds(dynamics: Dynamics, frames: int) -> float:

@@ -311,7 +311,7 @@ def test_the_bits_depend_neither_on_workers_nor_on_segments(
         patched.setattr(motion, "SEGMENT_BYTES", 2**20)
         assert bits(2) == alone
     # Workers that give up at once.
-    monkeypatch.setattr(motion, "MAX_WAIT_LOOKS", 0)
+    monkeypatch.setattr(motion, "MAX_WAIT_CHECKS", 0)
     assert bits(3) == alone
 
 

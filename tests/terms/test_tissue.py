@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from taichi_msm.accuracy.mesh import (
-    MIN_POINTS,
+    MIN_POINTS_PER_SIDE,
     CubicInterpolation,
     MeshCompanion,
     MeshEstimate,
@@ -407,8 +407,8 @@ def test_the_pilot_of_the_points_samples_cubics_exactly() -> None:
 
 
 def test_few_points_and_springs_have_no_mesh_error(load: Any, image: str) -> None:
-    assert coarser_plan(plan_of(load(f"sheet.points=[{MIN_POINTS}, 9]", "sheet.size=[0.1, 0.13]"))) is not None
-    assert coarser_plan(plan_of(load(f"sheet.points=[{MIN_POINTS - 1}, 7]", "sheet.size=[0.1, 0.13]"))) is None
+    assert coarser_plan(plan_of(load(f"sheet.points=[{MIN_POINTS_PER_SIDE}, 9]", "sheet.size=[0.1, 0.13]"))) is not None
+    assert coarser_plan(plan_of(load(f"sheet.points=[{MIN_POINTS_PER_SIDE - 1}, 7]", "sheet.size=[0.1, 0.13]"))) is None
     assert coarser_plan(plan_of(random_scene(1))) is None
 
 
