@@ -419,7 +419,7 @@ def test_an_interruption_leaves_the_points_that_were_timed(device: Device) -> No
 def test_pictures_are_judged_by_a_finer_one(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(measurements, "REFINES", (0, 3))
     monkeypatch.setattr(measurements, "SUPERSAMPLES", (1, 4))
-    monkeypatch.setattr(measurements, "FINEST", {"refine": 4, "supersample": 5})
+    monkeypatch.setattr(measurements, "REFERENCE_RENDER", {"refine": 4, "supersample": 5})
     made = scene(render={"size": [60, 45], "camera": "oblique", "refine": 3})
     position = rest_positions(made.sheet)
     position[4, 5, 2] += 0.05
