@@ -16,7 +16,7 @@ from benchmarks.stepping.measure import TOLERANCE
 from taichi_msm import load_scene
 from taichi_msm.solver.planning import make_plan
 from taichi_msm.study import study
-from taichi_msm.study.format import duration, markdown, number, timing
+from taichi_msm.study.format import format_duration, format_number, format_timing, markdown_table
 from taichi_msm.study.result import Timing
 from taichi_msm.system.compiler import COMPILERS, active_compiler
 from taichi_msm.system.process import available_threads
@@ -34,7 +34,7 @@ Entry = dict[str, Any]
 
 def machine() -> Results:
     """Describe where the benchmarks run."""
-    found = study.machine(Device("cpu", available_threads()))
+    found = study.machine_record(Device("cpu", available_threads()))
     versions = {active_compiler().title: active_compiler().version, "NumPy": found["versions"]["numpy"]}
     for package in PACKAGES:
         try:
@@ -135,12 +135,12 @@ def launch_share(results: Results) -> str:
     found = results.get("bounds", {})
     if "one_step" not in found:
         return NOT_MEASURED
-    return duration(found["one_step"] / make_plan(load_scene(ROOT / whole_run.SCENE)).grid.steps_per_frame)
+    return format_duration(found["one_step"] / make_plan(load_scene(ROOT / whole_run.SCENE)).grid.steps_per_frame)
 
 
 def table(head: list[str], rows: list[list[str]]) -> str:
     """Write a table, its first column of text and the others of numbers."""
-    return markdown(head, rows, left=(0,))
+    return markdown_table(head, rows, left_columns=(0,))
 
 
 def stepping_table(measured: dict[str, list[Entry]]) -> str:
@@ -243,7 +243,7 @@ def compilers_table(measured: dict[str, dict[str, list[float]]]) -> str:
     rows = []
     for work, samples in measured.items():
         times = [Timing.of(samples[name]) for name in names]
-        rows.append([work, *map(timing, times), f"{times[1].median / times[0].median:.2f}"])
+        rows.append([work, *map(format_timing, times), f"{times[1].median / times[0].median:.2f}"])
     return table(["time", *(COMPILERS[name].title for name in names), "ratio"], rows)
 
 
@@ -252,7 +252,7 @@ def terms_table(measured: dict[str, dict[str, list[float]]]) -> str:
     medians = {size: {name: Timing.of(times).median for name, times in own.items()} for size, own in measured.items()}
     names = next(iter(medians.values()))
     rows = [
-        [name, *(f"{duration(own[name])} ({own[name] / own[terms.SPRINGS]:.2f})" for own in medians.values())]
+        [name, *(f"{format_duration(own[name])} ({own[name] / own[terms.SPRINGS]:.2f})" for own in medians.values())]
         for name in names
     ]
     return table(["a step", *medians], rows)
@@ -265,7 +265,7 @@ def gradient_table(measured: dict[str, dict[str, dict[str, list[float]]]]) -> st
         run = Timing.of(peers[gradients.OURS]["forward"]).median
         for name, samples in peers.items():
             forward, whole = (Timing.of(samples[kind]) for kind in ("forward", "gradient"))
-            rows.append([f"{size}, {name}", timing(forward), timing(whole), f"{whole.median / run:.1f}"])
+            rows.append([f"{size}, {name}", format_timing(forward), format_timing(whole), f"{whole.median / run:.1f}"])
     return table(["a gradient", "forward run", "value and gradient", "in forward runs of taichi_msm"], rows)
 
 
@@ -274,7 +274,7 @@ def looks_table(measured: dict[str, dict[str, list[float]]]) -> str:
     medians = {size: {name: Timing.of(times).median for name, times in own.items()} for size, own in measured.items()}
     names = next(iter(medians.values()))
     rows = [
-        [name, *(f"{duration(own[name])} ({own[name] / own[looks.HEADLIGHT]:.2f})" for own in medians.values())]
+        [name, *(f"{format_duration(own[name])} ({own[name] / own[looks.HEADLIGHT]:.2f})" for own in medians.values())]
         for name in names
     ]
     return table(["a picture", *(f"{size} × {size}" for size in medians)], rows)
@@ -324,8 +324,8 @@ def machine_table(found: Results) -> str:
     ]
     for points, bandwidth in found["bandwidth"].items():
         rows.append([f"triad over the state of {points} × {points} points", f"{bandwidth / 1e9:.0f} GB/s"])
-    rows.append(["launch of an empty kernel", duration(found["launch"])])
-    rows.append([f"`advance(1)` of {bounds.SMALLEST} × {bounds.SMALLEST} points", duration(found["one_step"])])
+    rows.append(["launch of an empty kernel", format_duration(found["launch"])])
+    rows.append([f"`advance(1)` of {bounds.SMALLEST} × {bounds.SMALLEST} points", format_duration(found["one_step"])])
     return table(["what", "measured"], rows)
 
 
@@ -371,21 +371,22 @@ def drawing_bound_table(results: Results) -> str:
 def _against(seconds: float, least: dict[str, float]) -> list[str]:
     """Compare a time with the least times of each kind: the greatest of them is the bound."""
     binding = max(least, key=lambda kind: least[kind])
-    return [duration(seconds), *map(duration, least.values()), binding, f"{100 * least[binding] / seconds:.0f} %"]
+    times = map(format_duration, (seconds, *least.values()))
+    return [*times, binding, f"{100 * least[binding] / seconds:.0f} %"]
 
 
 def _cell(entry: Entry) -> str:
-    return timing(Timing.of(entry["samples"])) if entry["samples"] else str(entry["said"])
+    return format_timing(Timing.of(entry["samples"])) if entry["samples"] else str(entry["said"])
 
 
 def _ratio(entry: Entry, ours: Entry) -> str:
     if not (entry["samples"] and ours["samples"]):
         return "-"
-    return number(Timing.of(entry["samples"]).median / Timing.of(ours["samples"]).median)
+    return format_number(Timing.of(entry["samples"]).median / Timing.of(ours["samples"]).median)
 
 
 def _compile(entry: Entry) -> str:
-    return "-" if entry["compile"] is None else duration(entry["compile"])
+    return "-" if entry["compile"] is None else format_duration(entry["compile"])
 
 
 def _seconds(samples: list[float]) -> str:

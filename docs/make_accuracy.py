@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import stored_form
-from taichi_msm.study.format import markdown
-from taichi_msm.study.measurements import FINEST, MARGIN
-from taichi_msm.study.result import REFINED_ENOUGH
+from taichi_msm.study.format import markdown_table
+from taichi_msm.study.measurements import REFERENCE_MARGIN, REFERENCE_RENDER
+from taichi_msm.study.result import PSNR_TOLERANCE_DB
 from taichi_msm.system.compiler import compiler_label
 
 ROOT = Path(__file__).parent.parent
@@ -79,7 +79,7 @@ def significant(value: float | None, digits: int = 2) -> str:
 
 def table(head: list[str], rows: list[list[str]]) -> str:
     """Write a table, its first column of text and the others of numbers."""
-    return markdown(head, rows, left=(0,))
+    return markdown_table(head, rows, left_columns=(0,))
 
 
 def scene_table(studies: dict[str, Record]) -> str:
@@ -211,7 +211,7 @@ def enough(studies: dict[str, Record]) -> int:
     for found in studies.values():
         drawn = [one for one in found["drawing"] if one["supersample"] == 1]
         best = max(one["psnr"] for one in drawn)
-        needed.append(min(one["refine"] for one in drawn if one["psnr"] > best - REFINED_ENOUGH))
+        needed.append(min(one["refine"] for one in drawn if one["psnr"] > best - PSNR_TOLERANCE_DB))
     return max(needed)
 
 
@@ -255,7 +255,7 @@ def main() -> None:
             vectors=machine["vectors"],
             compiler=compiler_label(versions),
             python=versions["python"],
-            margin=MARGIN,
+            margin=REFERENCE_MARGIN,
             coarse_step=f"{1000 * first['step']:.3g} ms",
             coarse_error=significant(first["error"]),
             peer=peers(paper),
@@ -267,7 +267,7 @@ def main() -> None:
             double_cost=significant(price_of_double(press)),
             sensitive=f"{100 * soft:.0f} %",
             enough=enough(studies),
-            truth=f"refine {FINEST['refine']} and supersample {FINEST['supersample']}",
+            truth=f"refine {REFERENCE_RENDER['refine']} and supersample {REFERENCE_RENDER['supersample']}",
             refine_table=refine_table(studies),
             own_refine=press["settings"]["render"]["refine"],
             supersample_table=supersample_table(press),

@@ -22,7 +22,7 @@ from scipy.sparse.linalg import eigsh, spsolve
 from scipy.special import k0, k1
 
 from taichi_msm import Scene, load_scene
-from taichi_msm.accuracy.time_step import estimate_error, longest
+from taichi_msm.accuracy.time_step import estimate_error, max_norm
 from taichi_msm.model.loads import decay, evaluate_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import fixed_points, rest_positions, spacing
@@ -32,7 +32,7 @@ from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.solver.planning import make_plan
 from taichi_msm.solver.rest import QuasiStatics
 from taichi_msm.solver.state import State
-from taichi_msm.study.format import markdown
+from taichi_msm.study.format import markdown_table
 from taichi_msm.system import runtime
 
 ROOT = Path(__file__).parent.parent
@@ -96,11 +96,13 @@ def silent_table() -> str:
     for name, scene in cases.items():
         plan = make_plan(scene)
         exact = truth(plan)
-        largest = longest(exact)
-        errors = [longest(motion(one) - exact) / largest for one in (plan.with_grid(precision="f32"), plan)]
+        largest = max_norm(exact)
+        errors = [max_norm(motion(one) - exact) / largest for one in (plan.with_grid(precision="f32"), plan)]
         told = estimate_error(plan, runtime.current_device()).error
         rows.append([name, *(f"{error:.2g}" for error in errors), f"{told:.2g}", plan.grid.precision])
-    return markdown(["run", "error in f32", "error with auto", "error told", "auto takes"], rows, left=(0, 4))
+    return markdown_table(
+        ["run", "error in f32", "error with auto", "error told", "auto takes"], rows, left_columns=(0, 4)
+    )
 
 
 def stiffness(scene: Scene, displacement: Array, active: float) -> csc_matrix:
@@ -260,8 +262,10 @@ def energy() -> dict[str, Any]:
         "energy_press": press_time,
         "energy_steps": f"{ENERGY_STEPS:,}",
         "energy_share": f"{h / make_plan(made).stable_step:g}",
-        "energy_table": markdown(
-            ["precision", "mean energy", "largest swing", "last tenth of the time, against the first"], rows, left=(0,)
+        "energy_table": markdown_table(
+            ["precision", "mean energy", "largest swing", "last tenth of the time, against the first"],
+            rows,
+            left_columns=(0,),
         ),
     }
 
@@ -285,8 +289,8 @@ def static() -> dict[str, Any]:
         u[moves] += spsolve(stiffness(scene, u, 1.0), residual).reshape(-1, 3)
     return {
         "static_seconds": seconds,
-        "static_error": f"{longest(stepped - u) / longest(u):.1g}",
-        "static_depth": f"{1000 * longest(u):.1f}",
+        "static_error": f"{max_norm(stepped - u) / max_norm(u):.1g}",
+        "static_depth": f"{1000 * max_norm(u):.1f}",
         "static_residual": f"{np.abs(forces(scene, u, float(seconds))).max():.1g}",
     }
 
@@ -314,7 +318,7 @@ def at_rest() -> dict[str, Any]:
                     make_plan(load_scene(ROOT / press, [*held, points, "time.precision=f64"])), runtime.current_device()
                 )
                 wanted = still.displacement()
-                while longest(moving.displacement() - wanted) > CLOSE * longest(wanted):
+                while max_norm(moving.displacement() - wanted) > CLOSE * max_norm(wanted):
                     moving.advance(STRIDE)
                 counts[-1] += f" ({moving.steps_done} steps)"
                 moving.close()
@@ -323,7 +327,7 @@ def at_rest() -> dict[str, Any]:
             still.close()
         rows.append(counts)
     head = ["force evaluations for a frame", *(f"{side} × {side}" for side in sides)]
-    return {"rest_table": markdown(head, rows), "rest_close": f"{CLOSE:.0e}", "rest_lifted": f"{lifted:.1f}"}
+    return {"rest_table": markdown_table(head, rows), "rest_close": f"{CLOSE:.0e}", "rest_lifted": f"{lifted:.1f}"}
 
 
 def indentation() -> dict[str, Any]:
@@ -351,7 +355,7 @@ def indentation() -> dict[str, Any]:
     head = ["depth", "force", *(f"{side} × {side}" for side in INDENTED)]
     facts = {"tension": f"{tension:g}", "foundation": f"{foundation / 1e3:g}", "radius": f"{1000 * radius:g}"}
     facts["fades"] = f"{1000 * fades:.1f}"
-    return {f"tip_{name}": fact for name, fact in facts.items()} | {"tip_table": markdown(head, rows)}
+    return {f"tip_{name}": fact for name, fact in facts.items()} | {"tip_table": markdown_table(head, rows)}
 
 
 def resistance(depth: float, radius: float, tension: float, foundation: float) -> float:
@@ -390,7 +394,7 @@ def frequencies() -> dict[str, Any]:
         rows.append([f"{w / (2 * math.pi):.4f}", f"{expected:+.9f}", f"{found:+.9f}", f"{abs(found - expected):.0e}"])
     dynamics.close()
     head = ["frequency [Hz]", "cos(n theta)", "amplitude after n steps", "apart"]
-    return {"modes": MODES, "modes_table": markdown(head, rows)}
+    return {"modes": MODES, "modes_table": markdown_table(head, rows)}
 
 
 def main() -> None:

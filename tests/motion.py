@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.accuracy.report import run_notes
-from taichi_msm.accuracy.time_step import Estimate, longest
+from taichi_msm.accuracy.report import run_warnings
+from taichi_msm.accuracy.time_step import TimeStepEstimate, max_norm
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.tool_force import probe_records
 from taichi_msm.scene.scene import Scene
@@ -53,9 +53,9 @@ def true_error(plan: Plan, device: Device, fine: int) -> float:
     """
     finer = plan.with_grid(precision="f64", steps_per_frame=fine * plan.grid.steps_per_frame)
     reference = frames_on(finer, device)
-    return longest(frames_on(plan, device) - reference) / longest(reference)
+    return max_norm(frames_on(plan, device) - reference) / max_norm(reference)
 
 
-def notes_of(made: Scene, progress: RunProgress, estimate: Estimate | None, **more: Any) -> list[str]:
+def notes_of(made: Scene, progress: RunProgress, estimate: TimeStepEstimate | None, **more: Any) -> list[str]:
     """What is noted of a run of a scene."""
-    return list(run_notes(plan_of(made), probe_records(made), progress, estimate, **more))
+    return list(run_warnings(plan_of(made), probe_records(made), progress, estimate, **more))

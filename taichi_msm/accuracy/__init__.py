@@ -1,1 +1,1 @@
-"""Error estimates of a run, divergence, and warnings."""
+"""Error estimates, divergence checks and warnings of a run."""

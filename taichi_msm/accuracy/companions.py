@@ -1,7 +1,8 @@
-"""Which pilots estimate the error of a run: the cheapest that tell it, decided from the scene alone.
+"""Choice of the companion runs that estimate the error of a run, made from the scene alone.
 
-A pilot with half as many steps costs half a run, one with twice as many costs two. So the first pilot is coarse, where
-twice the step is stable, and a finer one follows only where the first one shows an error that matters.
+A companion run repeats the scene with another time step or another mesh, in parallel to the run. With half the steps
+it costs half a run, with twice the steps it costs two. Hence the first companion run is coarse, where twice the step is
+stable, and a finer one follows only if the first shows an error that is not negligible.
 """
 
 from __future__ import annotations
@@ -12,73 +13,98 @@ from typing import NamedTuple
 from taichi_msm.model.plan import Plan
 from taichi_msm.solver.planning import affords_companions, stable_steps
 
-# An error below this needs no finer pilot: nobody sees it, and twice as much or half of it would mean the same.
-ENOUGH = 1e-3
+# An error below this share of the largest displacement needs no finer companion run.
+NEGLIGIBLE_ERROR = 1e-3
 
-# A coarse pilot takes at most this share of the run's steps; else it saves too little.
-COARSEST = 0.6
+# The largest share of the run's steps that a coarse companion run may take; above it, it saves too little.
+MAX_COARSE_RATIO = 0.6
 
-# The largest refinement of a fine pilot; if it would have to be finer, the error is not known.
-FINEST = 64
+# The largest refinement of the step in a fine companion run. If it would have to be finer, the error is unknown.
+MAX_REFINEMENT = 64
 
-# Steps of the pilots for the points, for each step of what they are compared with, in steps of the whole sheet: half
-# and a quarter of the cells a side, and of the steps; with contact 1 / sqrt(2) of the cells a side and half the steps.
-POINTS, POINTS_IN_CONTACT = 1 / 4 / 2 + 1 / 16 / 4, 1 / 2 / 2
+# Cost of the companion runs on coarser meshes, per step of the run that they are compared with, in steps of the full
+# sheet. They have half and a quarter of the cells per side and of the steps; with contact 1 / sqrt(2) of the cells per
+# side and half the steps.
+MESH_COST, CONTACT_MESH_COST = 1 / 4 / 2 + 1 / 16 / 4, 1 / 2 / 2
+
+# Reason for the missing time-step error of a quasi-static scene.
+QUASISTATIC_REASON = "quasistatic"
 
 
-# Why there is no error of the step where the sheet is at rest.
-AT_REST = "quasistatic"
+class CompanionRuns(NamedTuple):
+    """The companion runs of a run.
 
+    Attributes:
+        concurrent_steps: Steps per frame of the companion run that accompanies the run; 0 without one.
+        subsequent_steps: Steps per frame of the companion run that follows if the first one shows too large an error; 0
+            without one.
+        mesh: Whether companion runs on coarser meshes accompany the run.
+        cost: Cost of the accompanying runs per step of the run, in steps of the full sheet.
+        reason: Why the time-step error is not estimated; empty if it is.
+    """
 
-class Pilots(NamedTuple):
-    """The pilots of a run."""
-
-    beside: int = 0  # steps per frame of the pilot that goes with the run; 0: there is none
-    after: int = 0  # steps per frame of the one that follows if the first one shows too large an error; 0: none
-    points: bool = False  # whether pilots with fewer points go with the run
-    cost: float = 0.0  # of those that go with the run: for each of its steps theirs, in steps of the whole sheet
-    reason: str = ""  # why there are none for the step
+    concurrent_steps: int = 0
+    subsequent_steps: int = 0
+    mesh: bool = False
+    cost: float = 0.0
+    reason: str = ""
 
     @property
-    def some(self) -> bool:
-        """Whether there are any."""
-        return self.points or not self.reason
+    def planned(self) -> bool:
+        """Whether any companion run is planned."""
+        return self.mesh or not self.reason
 
 
-def choose_pilots(plan: Plan, *, asked: bool = False) -> Pilots:
-    """Choose the pilots of a run; asked: whatever they cost. At rest there are none for a step."""
+def choose_companion_runs(plan: Plan, *, requested: bool = False) -> CompanionRuns:
+    """Choose the companion runs of a run.
+
+    Args:
+        plan: Plan of the run.
+        requested: Whether the user requested an error estimate, whatever it costs.
+
+    Returns:
+        The companion runs. A quasi-static scene has none for the time step.
+    """
     if plan.scene.time.at_rest:
-        tells = plan.scene.tissue is not None and (asked or affords_companions(plan, POINTS))
-        return Pilots(points=tells, cost=POINTS if tells else 0.0, reason=AT_REST)
-    own, coarse, fine = plan.grid.steps_per_frame, coarse_steps(plan), fine_steps(plan)
-    points = (POINTS_IN_CONTACT if plan.tools else POINTS) if plan.scene.tissue is not None else 0.0
-    # Beside a run in f32 a fine pilot has another one with the run's own steps.
-    fine_cost = fine / own + (plan.grid.precision == "f32")
-    first = (1 + points) * coarse / own if coarse else fine_cost + points
+        mesh = plan.scene.tissue is not None and (requested or affords_companions(plan, MESH_COST))
+        return CompanionRuns(mesh=mesh, cost=MESH_COST if mesh else 0.0, reason=QUASISTATIC_REASON)
+    steps, coarse, fine = plan.grid.steps_per_frame, coarse_steps(plan), fine_steps(plan)
+    mesh_cost = (CONTACT_MESH_COST if plan.tools else MESH_COST) if plan.scene.tissue is not None else 0.0
+    # For a run in f32, a fine companion run needs another one in f64 with the run's own steps.
+    fine_cost = fine / steps + (plan.grid.precision == "f32")
+    cost = (1 + mesh_cost) * coarse / steps if coarse else fine_cost + mesh_cost
     if coarse and plan.tools:
-        first = coarse / own + points  # Those for the points are compared with the run, not with the coarse pilot.
-    if not asked and not affords_companions(plan, first):
-        return Pilots(reason="it would take more than two fifths of the run; to have it anyway, pass --estimate-error")
+        cost = coarse / steps + mesh_cost  # With contact the meshes are compared with the run, not with its companion.
+    if not requested and not affords_companions(plan, cost):
+        return CompanionRuns(
+            reason="it would take more than two fifths of the run; to have it anyway, pass --estimate-error"
+        )
     if not coarse:
-        return Pilots(fine, 0, points > 0, first)
-    # Where no positions are kept, the run is repeated beside the pilot that follows.
-    again = 0.0 if plan.scene.output else 1.0
-    follows = asked or affords_companions(plan, first + fine_cost + again)
-    return Pilots(coarse, fine if follows else 0, points > 0, first)
+        return CompanionRuns(fine, 0, mesh_cost > 0, cost)
+    # Without stored positions, the run is repeated for the companion run that follows.
+    repetition = 0.0 if plan.scene.output else 1.0
+    follows = requested or affords_companions(plan, cost + fine_cost + repetition)
+    return CompanionRuns(coarse, fine if follows else 0, mesh_cost > 0, cost)
 
 
 def coarse_steps(plan: Plan) -> int:
-    """Count the steps per frame of the coarse pilot: half of the run's; 0: no such run is stable, or cheap enough."""
-    own = plan.grid.steps_per_frame
-    steps = max(math.ceil(own / 2), stable_steps(plan))
-    return steps if steps <= COARSEST * own else 0
+    """Return the steps per frame of the coarse companion run, half of the run's; 0 if unstable or too expensive."""
+    run_steps = plan.grid.steps_per_frame
+    steps = max(math.ceil(run_steps / 2), stable_steps(plan))
+    return steps if steps <= MAX_COARSE_RATIO * run_steps else 0
 
 
 def fine_steps(plan: Plan) -> int:
-    """Count the steps per frame of the fine pilot: twice the run's, or as many as resolve the damping; 0: too many.
+    """Return the steps per frame of the fine companion run: twice the run's, or more where the damping needs it.
 
-    If g h / r > 1, with g = C / m, central differences make velocities change their sign at every step, and the
-    difference between runs with steps h and h / r does not show all of it. A coarse pilot shows 2 to 4 times as much.
+    If g h / r > 1, with g = C / m, central differences reverse velocities at every step, and the difference between
+    runs with steps h and h / r underestimates the error. A coarse companion run overestimates it 2 to 4 times.
+
+    Args:
+        plan: Plan of the run.
+
+    Returns:
+        Steps per frame; 0 if the damping needs more than `MAX_REFINEMENT` times the run's.
     """
     refinement = max(2, math.ceil(plan.material.drag * plan.grid.step))
-    return refinement * plan.grid.steps_per_frame if refinement <= FINEST else 0
+    return refinement * plan.grid.steps_per_frame if refinement <= MAX_REFINEMENT else 0

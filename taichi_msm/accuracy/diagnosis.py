@@ -1,4 +1,4 @@
-"""Why a run diverged, and which step would not have: it is repeated, and then run with finer steps."""
+"""Diagnosis of a divergence: the run is repeated to locate it, and again with finer steps to find the cause."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from taichi_msm.accuracy import divergence
-from taichi_msm.accuracy.divergence import Watch
+from taichi_msm.accuracy.divergence import DivergenceMonitor
 from taichi_msm.errors import Pause
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import axes
@@ -18,107 +18,121 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.dynamics import Dynamics, ForceRecorder
 from taichi_msm.solver.state import RunProgress, Snapshot, largest_displacement
 
-# How many times finer the steps are that are tried, and how many steps of a point all trials together may take: some
-# ten seconds. Counted, so that the message is the same on every machine.
-CUTS = (2, 4, 8, 16, 32, 64)
-MOST_STEPS = 5e9
+# Refinements of the step that are tried in turn.
+STEP_REFINEMENTS = (2, 4, 8, 16, 32, 64)
+
+# Budget of all trials together, in steps times mass points, about ten seconds. It is counted rather than timed, so that
+# the message is the same on every machine.
+MAX_NODE_STEPS = 5e9
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found out about a divergence."""
+    """Diagnosis of a divergence.
 
-    message: str  # the time, the step, the point, the key that is the most likely cause, and the remedy
-    good: Snapshot | None  # the last sound state of the run; None: only the start is known to be sound
+    Attributes:
+        message: Time, step, mass point, the key that is the most likely cause, and the remedy.
+        last_sound_state: Last state of the run without a fault; None if only the start is known to be sound.
+    """
+
+    message: str
+    last_sound_state: Saved | None
 
 
 def diagnose(dynamics: Dynamics, start: Snapshot | None, pause: Pause) -> Diagnosis:
-    """Find out how a run diverged within the current frame, from a sound state on; None: from rest.
+    """Diagnose a divergence within the current frame.
 
-    The state of the dynamics afterwards is arbitrary.
+    Args:
+        dynamics: Sheet that diverged; its state afterwards is arbitrary.
+        start: Sound state to repeat the run from; None for the state of rest.
+        pause: Called several times a second; an exception from it ends the diagnosis.
+
+    Returns:
+        The diagnosis.
     """
-    plan, grid, bad = dynamics.plan, dynamics.plan.grid, dynamics.steps_done
+    plan, grid, bad_step = dynamics.plan, dynamics.plan.grid, dynamics.steps_done
     gauge = ForceRecorder(plan)
     state, progress, felt = (None, RunProgress(), gauge.at_rest()) if start is None else start[:3]
-    watch = Watch(plan, progress)
+    monitor = DivergenceMonitor(plan, progress)
     dynamics.restart(plan, state)
-    low, wrong = dynamics.state(), ""
-    while low.steps < bad:
-        dynamics.advance(min(bad, (watch.progress.frame + 1) * grid.steps_per_frame) - low.steps, pause)
+    sound, fault = dynamics.state(), ""
+    while sound.steps < bad_step:
+        dynamics.advance(min(bad_step, (monitor.progress.frame + 1) * grid.steps_per_frame) - sound.steps, pause)
         reading = dynamics.read()
-        wrong = watch.follow(reading)
-        if wrong:
+        fault = monitor.check_frame(reading)
+        if fault:
             break
-        if watch.progress.frame * grid.steps_per_frame == reading.steps:
+        if monitor.progress.frame * grid.steps_per_frame == reading.steps:
             position = to_positions(reading.displacement, plan.scene.sheet)
-            felt = gauge.follow(felt, watch.progress.frame, position, dynamics.tool_forces())
-        low = dynamics.state()
-    if not wrong:
-        said = "but not when it was repeated, so the machine has made an error; continue with --resume"
-        return Diagnosis(divergence.message(grid.time(bad), bad, said, exact=False), start)
-    high = dynamics.steps_done
-    while high - low.steps > 1:
-        dynamics.restart(plan, low)
-        dynamics.advance((high - low.steps) // 2, pause)
-        if watch.judge(dynamics.read()):
-            high = dynamics.steps_done
+            felt = gauge.follow(felt, monitor.progress.frame, position, dynamics.tool_forces())
+        sound = dynamics.state()
+    if not fault:
+        reason = "but not when it was repeated, so the machine has made an error; continue with --resume"
+        return Diagnosis(divergence.format_message(grid.time(bad_step), bad_step, reason, exact=False), start)
+    bad_step = dynamics.steps_done
+    while bad_step - sound.steps > 1:
+        dynamics.restart(plan, sound)
+        dynamics.advance((bad_step - sound.steps) // 2, pause)
+        if monitor.check(dynamics.read()):
+            bad_step = dynamics.steps_done
         else:
-            low = dynamics.state()
-    dynamics.restart(plan, low)
+            sound = dynamics.state()
+    dynamics.restart(plan, sound)
     dynamics.advance(1)
     reading = dynamics.read()
-    cause = _cause(dynamics, high, largest_displacement(reading.displacement)[:2], pause)
-    said = f"{watch.judge(reading)}; {cause}"
-    good = Snapshot(low, watch.progress, felt, plan.scene.probes)
-    return Diagnosis(divergence.message(grid.time(high), high, said, exact=True), good)
+    cause = _likely_cause(dynamics, bad_step, largest_displacement(reading.displacement)[:2], pause)
+    reason = f"{monitor.check(reading)}; {cause}"
+    last_sound_state = Snapshot(sound, monitor.progress, felt, plan.scene.probes)
+    message = divergence.format_message(grid.time(bad_step), bad_step, reason, exact=True)
+    return Diagnosis(message, last_sound_state)
 
 
-def _cause(dynamics: Dynamics, bad: int, point: tuple[int, int], pause: Pause) -> str:
-    """Name the key that is the most likely cause: the step, if a finer one does not diverge, or else a force."""
+def _likely_cause(dynamics: Dynamics, bad_step: int, point: tuple[int, int], pause: Pause) -> str:
+    """Name the most likely cause: the step if a finer one does not diverge, else a force or a path."""
     plan, grid = dynamics.plan, dynamics.plan.grid
-    frames, tried, left = -(-bad // grid.steps_per_frame), math.inf, MOST_STEPS
-    for cut in CUTS:
-        finer = plan.with_grid(steps_per_frame=cut * grid.steps_per_frame)
-        left -= frames * finer.grid.steps_per_frame * math.prod(plan.scene.sheet.points)
-        if left < 0:
+    frames, finest_step, budget = -(-bad_step // grid.steps_per_frame), math.inf, MAX_NODE_STEPS
+    for refinement in STEP_REFINEMENTS:
+        finer = plan.with_grid(steps_per_frame=refinement * grid.steps_per_frame)
+        budget -= frames * finer.grid.steps_per_frame * math.prod(plan.scene.sheet.points)
+        if budget < 0:
             break
-        if _goes_well(dynamics, finer, frames, pause):
+        if _is_stable(dynamics, finer, frames, pause):
             return f"likely cause: time.step, {grid.step:.6g} s; with {finer.grid.step:.9g} s it does not diverge here"
-        tried = finer.grid.step
+        finest_step = finer.grid.step
     if not plan.slots:
         speeds = [tool.max_stride(grid.step)[0] / grid.step for tool in plan.tools]
         tool, speed = max(zip(plan.tools, speeds, strict=True), key=lambda pair: pair[1])
-        said = f"likely cause: probes.{tool.probe}.path, at up to {speed:.3g} m/s"
-        return f"{said}; move the tool more slowly, or less far"
+        cause = f"likely cause: probes.{tool.probe}.path, at up to {speed:.3g} m/s"
+        return f"{cause}; move the tool more slowly, or less far"
     index, force = _strongest_probe(plan.scene, point)
     name = "force" if plan.scene.probes[index].total is None else "total"
-    said = f"likely cause: probes.{index}.{name}, which reaches {force:.3g} N at this point"
-    if tried < math.inf:
-        return f"{said}; take less, as it diverges with every time.step that was tried, down to {tried:.3g} s"
-    return f"{said}; take less, or a time.step below {grid.step:.6g} s; finer steps would take too long to try here"
+    cause = f"likely cause: probes.{index}.{name}, which reaches {force:.3g} N at this point"
+    if finest_step < math.inf:
+        return f"{cause}; take less, as it diverges with every time.step that was tried, down to {finest_step:.3g} s"
+    return f"{cause}; take less, or a time.step below {grid.step:.6g} s; finer steps would take too long to try here"
 
 
-def _goes_well(dynamics: Dynamics, plan: Plan, frames: int, pause: Pause) -> bool:
-    """Tell whether a number of frames from rest are sound."""
+def _is_stable(dynamics: Dynamics, plan: Plan, frames: int, pause: Pause) -> bool:
+    """Return whether the first frames from rest have no fault."""
     dynamics.restart(plan)
-    watch = Watch(plan)
+    monitor = DivergenceMonitor(plan)
     for _ in range(frames):
         dynamics.advance(plan.grid.steps_per_frame, pause)
-        if watch.follow(dynamics.read()):
+        if monitor.check_frame(dynamics.read()):
             return False
     return True
 
 
 def _strongest_probe(scene: Scene, point: tuple[int, int]) -> tuple[int, float]:
-    """Find the probe with the largest force on a point at any time, and this force [N]."""
+    """Return the probe with the largest force on a mass point at any time, and this force [N]."""
     x, y = axes(scene.sheet)
     rest = np.array([x[point[1]], y[point[0], 0]])
 
     def force(index: int) -> float:
         probe = scene.probes[index]
-        nearest = np.linalg.norm(control_points(probe, scene.sheet)[1] - rest, axis=1).min()
-        acts, most = probe_force(probe, scene.sheet), max(abs(percent) for _, percent in probe.load) / 100
-        return most * math.hypot(*acts.force) * float(acts.decay(nearest))
+        distance = np.linalg.norm(control_points(probe, scene.sheet)[1] - rest, axis=1).min()
+        profile, load = probe_force(probe, scene.sheet), max(abs(percent) for _, percent in probe.load) / 100
+        return load * math.hypot(*profile.force) * float(profile.decay(distance))
 
     strongest = max((index for index, probe in enumerate(scene.probes) if not probe.moved), key=force)
     return strongest, force(strongest)

@@ -1,9 +1,9 @@
-"""Energy that grows although nothing presses any more, as steps that are too long for compressed springs add it.
+"""Growth of the energy after the last load, a sign of steps that are too long for compressed springs.
 
-The energy is measured at x_n and at the velocity half a step before. For a mode of frequency w this differs from what
-Verlet's method keeps by a factor between 1 - w h / 2 and 1 + w h / 2, and w h / 2 is at most r = h / h_stable. So an
-energy that is more than (1 + r) / (1 - r) times as large as an earlier one has grown (Hairer, Lubich and Wanner 2003,
-Acta Numerica 12, 399-450, on the energy that is kept).
+The energy is measured at x_n and at the velocity half a step before. For a mode of frequency w it differs from the
+energy that Verlet's method conserves by a factor between 1 - w h / 2 and 1 + w h / 2, where w h / 2 is at most
+r = h / h_stable. Hence an energy more than (1 + r) / (1 - r) times an earlier one has grown (Hairer, Lubich and Wanner
+2003, Acta Numerica 12, 399-450, on the conserved energy).
 """
 
 from __future__ import annotations
@@ -17,12 +17,9 @@ from taichi_msm.model.plan import Plan
 from taichi_msm.solver.state import Reading, RunProgress
 from taichi_msm.terms.foundation import point_shares
 
-# Less than this share of the largest energy so far is not worth a warning, nor what rounding adds to it.
-NEGLIGIBLE = 1e-3
-
 
 class EnergyGrowth:
-    """Follows the energy of a plan's sheet, with that of a foundation, from the end of the last load and path on."""
+    """Monitor of the energy of a sheet and its foundation, from the end of the last load and path on."""
 
     def __init__(self, plan: Plan) -> None:
         self._released = release_time(plan) + plan.grid.step
@@ -30,29 +27,30 @@ class EnergyGrowth:
         if plan.material.always_active and plan.material.virtual > 0:
             self._stiffness = plan.material.virtual * point_shares(plan)
 
-    def follow(self, before: RunProgress, reading: Reading, frame: int) -> tuple[float, float]:
+    def update(self, before: RunProgress, reading: Reading, frame: int) -> tuple[float, float]:
         """Compare the energy of a frame with that of earlier ones.
 
         Args:
-            before: progress at the frame before.
-            reading: of this frame.
-            frame: its number.
+            before: Progress at the previous frame.
+            reading: Reading of this frame.
+            frame: Number of this frame.
 
         Returns:
-            The least energy at a frame since the release [J], 0 before it; the largest growth since, a factor.
+            The least energy of a frame since the release [J], 0 before it, and the largest growth factor since then.
         """
         least, growth = before.least_energy, before.energy_growth
         if frame / self._rate < self._released:
             return least, growth
         square = np.einsum("ijk,ijk->ij", reading.displacement, reading.displacement, dtype=np.float64)
         energy = reading.energy + float((self._stiffness * square).sum()) / 2
-        if least > 0 and energy > max(least, NEGLIGIBLE * before.peak):
+        # An energy below 1e-3 of the largest one deserves no warning, and rounding may add as much.
+        if least > 0 and energy > max(least, 1e-3 * before.peak):
             growth = max(growth, energy / least)
         return min(least or energy, energy), growth
 
 
 def release_time(plan: Plan) -> float:
-    """Return the time when the last load and the last path end [s]; infinite if a load never does."""
+    """Return the time at which the last load and the last path end [s], infinite for a load without end."""
     ends = [tool.times[-1] for tool in plan.tools]
     for probe in plan.scene.probes:
         if not probe.moved and any(percent for _, percent in probe.load):
@@ -60,8 +58,16 @@ def release_time(plan: Plan) -> float:
     return float(max(ends, default=0.0))
 
 
-def growth_notes(plan: Plan, progress: RunProgress) -> Iterator[str]:
-    """Warn of energy that has grown without a load by more than steps of this length let it oscillate."""
+def energy_growth_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
+    """Warn of energy that grew without a load by more than its oscillation at this step.
+
+    Args:
+        plan: Plan of the run.
+        progress: Progress of the run.
+
+    Returns:
+        The warning, if any.
+    """
     ratio = plan.grid.step / plan.stable_step
     if progress.energy_growth * (1 - ratio) > 1 + ratio:
         yield (

@@ -1,7 +1,4 @@
-"""The error of a run, by the pilots that were chosen for it: some go with the run, and one may follow it.
-
-What to know before trusting the result of a run.
-"""
+"""Error estimates of a run from its companion runs, and the warnings to read before trusting its result."""
 
 from __future__ import annotations
 
@@ -14,20 +11,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.accuracy.companions import AT_REST, ENOUGH, Pilots
-from taichi_msm.accuracy.contact_warnings import contact_notes
-from taichi_msm.accuracy.energy_growth import growth_notes
+from taichi_msm.accuracy.companions import NEGLIGIBLE_ERROR, QUASISTATIC_REASON, CompanionRuns
+from taichi_msm.accuracy.contact_warnings import tool_contact_warnings
+from taichi_msm.accuracy.energy_growth import energy_growth_warnings
 from taichi_msm.accuracy.mesh import (
-    APART,
-    LARGEST_DIFFERENCE,
-    STEPPED,
-    UNTOUCHED,
+    LARGE_STEP_ERROR,
+    MAX_DIFFERENCE,
+    NO_CONTACT,
+    NOT_CONVERGED,
+    MeshCompanion,
     MeshEstimate,
-    MeshPilot,
-    companion,
+    mesh_companion_plan,
     with_points,
 )
-from taichi_msm.accuracy.time_step import Estimate, Pilot, reconcile
+from taichi_msm.accuracy.time_step import TimeStepCompanion, TimeStepEstimate, combine_estimates
 from taichi_msm.errors import Pause, ProgressCallback
 from taichi_msm.model import tool_force
 from taichi_msm.model.plan import Plan
@@ -41,129 +38,158 @@ from taichi_msm.solver.planning import plan_variant
 from taichi_msm.solver.state import RunProgress
 from taichi_msm.system.runtime import Device
 
-# The error of a tool's force, in root mean squares of its difference to the run with fewer points over the frames with
-# contact; and the least, as a share of the greatest force, in errors of the displacement by points: where a grip holds
-# points of about the same force by chance, the first says little. The most is the error of the displacement
-# (docs/decisions/0027).
-IN_FORCES, IN_MESH_ERRORS = 1.15, 0.5
+# Error of a tool's force, as a multiple of the root mean square of its difference from the companion run over the
+# frames with contact (docs/decisions/0027).
+FORCE_ERROR_FACTOR = 1.15
+
+# Smallest error of a tool's force, relative to the greatest force, as a multiple of the mesh error of the displacement:
+# where a grip holds mass points with about the same force by chance, the difference is too small. The largest is the
+# error of the displacement (docs/decisions/0027).
+MIN_MESH_ERROR_SHARE = 0.5
 
 
 class ForceEstimate(NamedTuple):
-    """What is known about the error of the forces of tools on a path."""
+    """Estimated error of the forces of position-controlled tools.
 
-    error: float | None  # of any tool at any frame, as a fraction of the greatest force; None: not known
-    doubt: str = ""  # why it is not known
-
-
-class Known(NamedTuple):
-    """What is known about the error of a run."""
-
-    estimate: Estimate | None = None  # the error due to the step and to rounding; None: not estimated
-    reason: str = ""  # why it was not estimated
-    mesh: MeshEstimate | None = None  # the error due to the number of points; None: not estimated
-    force: ForceEstimate | None = None  # the error of the forces of tools on a path; None: there are none
-
-
-class RunError:
-    """The pilots of a run.
-
-    Args:
-        known: what was found before the run, and is not estimated again.
-
-    Raises:
-        DeviceError: when the device cannot run the scene in f64.
+    Attributes:
+        error: Largest error of any tool at any frame, as a fraction of the greatest force; None if unknown.
+        doubt: Why the error is unknown.
     """
 
-    def __init__(self, plan: Plan, pilots: Pilots, known: Known, device: Device, cores: int) -> None:
-        self._plan, self._pilots, self._known = plan, pilots, known
+    error: float | None
+    doubt: str = ""
+
+
+class RunErrorEstimates(NamedTuple):
+    """Estimated errors of a run.
+
+    Attributes:
+        estimate: Error of the time step and of rounding; None if not estimated.
+        reason: Why it was not estimated.
+        mesh: Discretisation error of the mesh; None if not estimated.
+        force: Error of the forces of position-controlled tools; None without such tools.
+    """
+
+    estimate: TimeStepEstimate | None = None
+    reason: str = ""
+    mesh: MeshEstimate | None = None
+    force: ForceEstimate | None = None
+
+
+class RunErrorEstimator:
+    """Companion runs of a run, and the errors that they estimate.
+
+    Args:
+        plan: Plan of the run.
+        companions: Companion runs that were chosen for it.
+        known: Estimates from before the run, which are not repeated.
+        device: Device to run on.
+        cores: Number of CPU cores for stepping.
+
+    Raises:
+        DeviceError: When the device cannot run the scene in f64.
+    """
+
+    def __init__(
+        self, plan: Plan, companions: CompanionRuns, known: RunErrorEstimates, device: Device, cores: int
+    ) -> None:
+        self._plan, self._companions, self._known = plan, companions, known
         self._device, self._cores = device, cores
-        self._coarse = known.estimate is None and 0 < pilots.beside < plan.grid.steps_per_frame
-        tells_time = known.estimate is None and not pilots.reason
-        self._time = Pilot(plan, pilots.beside, device, cores) if tells_time else None
-        coarse = companion(plan) if pilots.points and known.mesh is None else None
-        # Otherwise it is compared with the run itself.
-        self._mesh_beside_coarse = self._coarse and not plan.tools
-        beside = plan.with_grid(steps_per_frame=pilots.beside) if self._mesh_beside_coarse else plan
-        self._mesh = None if coarse is None else MeshPilot(beside, coarse, device, cores)
-        self._squares, self._touched, self._greatest = np.zeros((3, len(plan.tools)))
+        steps = companions.concurrent_steps
+        self._coarse = known.estimate is None and 0 < steps < plan.grid.steps_per_frame
+        estimates_step = known.estimate is None and not companions.reason
+        self._time_step = TimeStepCompanion(plan, steps, device, cores) if estimates_step else None
+        coarse = mesh_companion_plan(plan) if companions.mesh and known.mesh is None else None
+        # The meshes are compared with the coarse time-step companion if there is one, except in contact.
+        self._mesh_follows_coarse = self._coarse and not plan.tools
+        reference = plan.with_grid(steps_per_frame=steps) if self._mesh_follows_coarse else plan
+        self._mesh = None if coarse is None else MeshCompanion(reference, coarse, device, cores)
+        self._squared_errors, self._contact_frames, self._max_force = np.zeros((3, len(plan.tools)))
         self._all_forces = True
 
     def compile(self) -> None:
-        """Compile now what the first frame would compile."""
-        for pilot in (self._time, self._mesh):
-            if pilot is not None:
-                pilot.compile()
+        """Compile the kernels that the first frame would compile."""
+        for companion in (self._time_step, self._mesh):
+            if companion is not None:
+                companion.compile()
 
-    def follow(self, displacement: NDArray[Any], pause: Pause, forces: NDArray[np.float64] | None = None) -> None:
-        """Step to the next frame, and compare, as a `Pilot` does.
+    def compare_frame(
+        self, displacement: NDArray[Any], pause: Pause, forces: NDArray[np.float64] | None = None
+    ) -> None:
+        """Step to the next frame and compare it.
 
         Args:
-            displacement: of the run at that frame [m], shape (rows, cols, 3).
-            pause: as of a `Pilot`.
-            forces: of the tools on a path, the means since the frame before [N], shape (tools, 3); None: not kept.
+            displacement: Displacements of the run at that frame [m], shape (rows, cols, 3).
+            pause: Called several times a second; after an exception from it the companion runs cannot continue.
+            forces: Mean forces of the position-controlled tools since the previous frame [N], shape (tools, 3); None if
+                they were not kept.
         """
-        if self._time is not None:
-            self._time.follow(displacement, pause)
+        if self._time_step is not None:
+            self._time_step.compare_frame(displacement, pause)
         if self._mesh is not None:
-            beside = self._time.displacement if self._time and self._mesh_beside_coarse else displacement
-            self._mesh.follow(beside, pause)
+            coarse = self._time_step if self._mesh_follows_coarse else None
+            self._mesh.compare_frame(coarse.displacement if coarse else displacement, pause)
         if forces is None:
             self._all_forces = False
         elif self._plan.tools and self._mesh is not None:
-            coarse = self._mesh.tool_forces()
-            apart = IN_FORCES * np.abs(forces - coarse)
-            if self._time is not None:
-                apart = np.maximum(apart, self._time.force_error(forces))
-            self._squares += (apart**2).sum(axis=1)
-            self._touched += forces.any(axis=1) | coarse.any(axis=1)
-            self._greatest = np.maximum(self._greatest, np.linalg.norm(forces, axis=1))
+            coarse_forces = self._mesh.tool_forces()
+            error = FORCE_ERROR_FACTOR * np.abs(forces - coarse_forces)
+            if self._time_step is not None:
+                error = np.maximum(error, self._time_step.force_error(forces))
+            self._squared_errors += (error**2).sum(axis=1)
+            self._contact_frames += forces.any(axis=1) | coarse_forces.any(axis=1)
+            self._max_force = np.maximum(self._max_force, np.linalg.norm(forces, axis=1))
 
     def finish(self, displacements: Iterator[NDArray[Any]] | None, progress: ProgressCallback) -> None:
-        """After the last frame, take pilots again where the first ones show an error that matters.
+        """Run further companion runs after the last frame where the first ones show an error that is not negligible.
 
-        displacements: of the run at all frames but the first [m]; None: not kept, and the run is repeated.
+        Args:
+            displacements: Displacements of the run at all frames but the first [m], each of shape (rows, cols, 3); None
+                if they were not kept, and the run has to be repeated.
+            progress: Called with the number of finished frames and their total.
         """
-        early = self._time
-        takes_finer = early is not None and self._pilots.after and early.estimate.error >= ENOUGH
-        fine = Pilot(self._plan, self._pilots.after, self._device, self._cores) if takes_finer else None
-        nearer = self._mesh.nearer(self._plan, self._device, self._cores) if self._mesh is not None else None
-        pilots = [pilot for pilot in (fine, nearer) if pilot is not None]
-        if not pilots:
+        first = self._time_step
+        fine_steps, fine, second_mesh = self._companions.subsequent_steps, None, None
+        if first is not None and fine_steps and first.estimate.error >= NEGLIGIBLE_ERROR:
+            fine = TimeStepCompanion(self._plan, fine_steps, self._device, self._cores)
+        if self._mesh is not None:
+            second_mesh = self._mesh.build_second_run(self._plan, self._device, self._cores)
+        companions = [companion for companion in (fine, second_mesh) if companion is not None]
+        if not companions:
             return
         frames = self._plan.grid.frames
         for frame, displacement in enumerate(displacements or self._repeated(), 1):
-            for pilot in pilots:
-                pilot.follow(displacement, partial(progress, frame, frames))
-        if early is not None and fine is not None:
-            self._known = self._known._replace(estimate=reconcile(early.estimate, fine.estimate))
+            for companion in companions:
+                companion.compare_frame(displacement, partial(progress, frame, frames))
+        if first is not None and fine is not None:
+            self._known = self._known._replace(estimate=combine_estimates(first.estimate, fine.estimate))
 
     def _repeated(self) -> Iterator[NDArray[Any]]:
-        """Run the scene again; give the displacements of its frames."""
-        own = Dynamics(self._plan, self._device, cores=self._cores)
+        """Repeat the run, and yield the displacements of its frames."""
+        dynamics = Dynamics(self._plan, self._device, cores=self._cores)
         for _ in range(self._plan.grid.frames):
-            own.advance(self._plan.grid.steps_per_frame)
-            yield own.displacement()
+            dynamics.advance(self._plan.grid.steps_per_frame)
+            yield dynamics.displacement()
 
     @property
-    def known(self) -> Known:
-        """What the frames so far show."""
+    def estimates(self) -> RunErrorEstimates:
+        """Estimates from the frames so far."""
         known = self._known
-        if known.estimate is None and self._time is not None:
-            estimate = self._time.estimate
-            # What a coarse pilot tells of a run in f32 is an upper bound.
-            if self._coarse and estimate.parted and ENOUGH <= estimate.error < math.inf:
+        if known.estimate is None and self._time_step is not None:
+            estimate = self._time_step.estimate
+            # For a run in f32 the estimate of a coarse companion run is an upper bound already.
+            if self._coarse and estimate.parted and NEGLIGIBLE_ERROR <= estimate.error < math.inf:
                 estimate = replace(estimate, at_least=True)
             known = known._replace(estimate=estimate)
         if self._mesh is not None:
             known = known._replace(mesh=self._mesh.estimate)
-            if self._plan.tools and self._all_forces and not self._greatest.all():
-                known = known._replace(mesh=MeshEstimate(math.inf, UNTOUCHED))
-            elif self._plan.tools and known.estimate is not None and known.estimate.error > LARGEST_DIFFERENCE:
-                known = known._replace(mesh=MeshEstimate(math.inf, STEPPED))
-        return known._replace(force=self._force(known)) if self._plan.tools else known
+            if self._plan.tools and self._all_forces and not self._max_force.all():
+                known = known._replace(mesh=MeshEstimate(math.inf, NO_CONTACT))
+            elif self._plan.tools and known.estimate is not None and known.estimate.error > MAX_DIFFERENCE:
+                known = known._replace(mesh=MeshEstimate(math.inf, LARGE_STEP_ERROR))
+        return known._replace(force=self._force_estimate(known)) if self._plan.tools else known
 
-    def _force(self, known: Known) -> ForceEstimate:
-        """Estimate the error of the forces."""
+    def _force_estimate(self, known: RunErrorEstimates) -> ForceEstimate:
         mesh = known.mesh
         if self._mesh is None or mesh is None:
             return ForceEstimate(None, "there is no run with fewer points")
@@ -171,63 +197,64 @@ class RunError:
             return ForceEstimate(None, "the forces of the frames before the run was continued are not kept")
         if mesh.error == math.inf:
             return ForceEstimate(None, mesh.doubt)
-        relative = float(np.sqrt(self._squares / np.maximum(self._touched, 1)).max() / self._greatest.max())
-        if relative > IN_FORCES * LARGEST_DIFFERENCE:
-            return ForceEstimate(None, APART)
-        most = max(mesh.error, known.estimate.error if known.estimate is not None else 0.0)
-        return ForceEstimate(min(max(relative, IN_MESH_ERRORS * mesh.error), most))
+        root_mean_square = np.sqrt(self._squared_errors / np.maximum(self._contact_frames, 1)).max()
+        relative = float(root_mean_square / self._max_force.max())
+        if relative > FORCE_ERROR_FACTOR * MAX_DIFFERENCE:
+            return ForceEstimate(None, NOT_CONVERGED)
+        displacement_error = max(mesh.error, known.estimate.error if known.estimate is not None else 0.0)
+        return ForceEstimate(min(max(relative, MIN_MESH_ERROR_SHARE * mesh.error), displacement_error))
 
 
-pass  # REMOVED
+# The stability limit holds while no spring is compressed below this share of its rest length (see `SpringTerm.stiffness_bound`).
+MIN_SPRING_RATIO = 0.5
 
-# The stability limit holds while no spring is compressed below this share of its rest length (see
-# `SpringTerm.stiffness_bound`).
-SHORTEST = 0.5
+# Tissue that is compressed by more than this share of its depth stiffens, which the elastic foundation does not.
+MAX_DEPTH_RATIO = 1 / 3
 
-# Tissue that is compressed by more than this share of its depth gets much stiffer, which the foundation does not.
-DEEPEST = 1 / 3
+# No tissue can be stretched to more than this multiple of its rest length.
+MAX_SPRING_RATIO = 2.0
 
-# No tissue can be stretched to more than this many times its rest length.
-LONGEST = 2.0
-
-# If an error is above this share of the largest displacement, a remedy is named.
-WRONG = 0.01
+# A remedy is suggested for an error above this share of the largest displacement.
+REMEDY_THRESHOLD = 0.01
 
 
-def run_notes(
+def run_warnings(
     plan: Plan,
     probes: Sequence[ProbeRecord],
     progress: RunProgress,
-    estimate: Estimate | None,
+    estimate: TimeStepEstimate | None,
     reason: str = "",
     mesh: MeshEstimate | None = None,
     force: ForceEstimate | None = None,
     affords: Callable[[Plan], bool] = lambda plan: True,
     scale: float | None = None,
 ) -> Iterator[str]:
-    """Say what is remarkable about a run up to its last frame, each in a line.
+    """List the error estimates and warnings of a run up to its last frame.
 
     Args:
-        plan: of the run.
-        probes: what is known of the force of each.
-        progress: of the run.
-        estimate: as in `Known`, like the next three.
-        reason: why there is none.
-        mesh: the error due to the number of points.
-        force: the error of the forces.
-        affords: whether a run takes at most an hour.
-        scale: pixels per metre at the middle of the sheet; None: no picture is drawn.
+        plan: Plan of the run.
+        probes: Records of the probes' forces.
+        progress: Progress of the run.
+        estimate: Error of the time step, like the next three as in `RunErrorEstimates`.
+        reason: Why it was not estimated.
+        mesh: Discretisation error of the mesh.
+        force: Error of the forces.
+        affords: Returns whether a plan can be run within an hour.
+        scale: Pixels per metre at the middle of the sheet; None without a picture.
+
+    Returns:
+        Lines of text.
     """
     scene, grid = plan.scene, plan.grid
     if estimate is not None or mesh is not None:
-        yield error(estimate, mesh, progress.max_displacement, scale) + (
+        yield error_line(estimate, mesh, progress.max_displacement, scale) + (
             "; mesh error unknown: another number of points is another sheet" if scene.tissue is None else ""
         )
     if estimate is not None:
-        if WRONG < estimate.error < math.inf:
-            of = "the time step" if not estimate.parted or estimate.in_f64 > WRONG / 2 else "rounding"
-            yield f"for a smaller error of {of}, {_remedy(plan, estimate, affords)}"
-    elif reason == AT_REST:
+        if REMEDY_THRESHOLD < estimate.error < math.inf:
+            of = "the time step" if not estimate.parted or estimate.in_f64 > REMEDY_THRESHOLD / 2 else "rounding"
+            yield f"for a smaller error of {of}, {_step_remedy(plan, estimate, affords)}"
+    elif reason == QUASISTATIC_REASON:
         yield "error: none due to a time step, as the sheet is at rest"
     elif reason:
         yield f"error {'of the time step ' if mesh is not None else ''}not estimated: {reason}"
@@ -237,63 +264,77 @@ def run_notes(
         else:
             yield f"force error at most about {_percent(force.error, 2)} % of the greatest force"
     yield from tool_force.force_warnings(scene, probes)
-    paths = list(path_warnings(scene, plan.tools))
-    yield from paths
-    yield from contact_notes(plan, progress)
-    yield from growth_notes(plan, progress)
+    path_warnings = list(path_warnings(scene, plan.tools))
+    yield from path_warnings
+    yield from tool_contact_warnings(plan, progress)
+    yield from energy_growth_warnings(plan, progress)
     if mesh is not None and mesh.doubt and mesh.error < math.inf:
         yield f"the error due to the number of points may be larger: {mesh.doubt}"
-    # Where points are too far apart for a tool, it is said already what would help.
-    if mesh is not None and WRONG < mesh.error < math.inf and not any(COARSE_TIP_PHRASE in note for note in paths):
-        yield f"for a smaller error of the mesh, {_finer(plan, mesh, affords)}"
+    # The warning about a mesh that is too coarse for a tool already contains the remedy.
+    too_coarse_for_tool = any(TOO_FEW in warning for warning in path_warnings)
+    if mesh is not None and REMEDY_THRESHOLD < mesh.error < math.inf and not too_coarse_for_tool:
+        yield f"for a smaller error of the mesh, {_mesh_remedy(plan, mesh, affords)}"
     if progress.max_displacement == 0 and progress.frame > 0:
         yield "nothing moved: does a probe press where and when it should?"
-    below = scene.tissue.foundation if scene.tissue is not None else None
-    if isinstance(below, Foundation) and progress.deepest > DEEPEST * below.depth:
+    foundation = scene.tissue.foundation if scene.tissue is not None else None
+    if isinstance(foundation, Foundation) and progress.deepest > MAX_DEPTH_RATIO * foundation.depth:
         yield (
-            f"the sheet was pressed {1000 * progress.deepest:.3g} mm into the {1000 * below.depth:.3g} mm of "
+            f"the sheet was pressed {1000 * progress.deepest:.3g} mm into the {1000 * foundation.depth:.3g} mm of "
             "tissue.foundation.depth: beyond a third tissue gets much stiffer than this foundation, so that the true "
             "dent of a force is less deep, and the true force of a path larger; press less"
         )
-    if progress.longest_spring > LONGEST:
+    if progress.longest_spring > MAX_SPRING_RATIO:
         yield (
             f"a spring was stretched to {progress.longest_spring:.2g} times its rest length, which no tissue "
             "withstands: press less, or with a wider tool"
         )
-    if progress.shortest_spring < SHORTEST:
+    if progress.shortest_spring < MIN_SPRING_RATIO:
         yield (
-            f"a spring was pressed to {progress.shortest_spring:.2g} of its rest length: below {SHORTEST} the sheet "
-            "folds over itself and small errors grow; press less"
+            f"a spring was pressed to {progress.shortest_spring:.2g} of its rest length: below {MIN_SPRING_RATIO} the "
+            "sheet folds over itself and small errors grow; press less"
         )
-    quick = plan.material.drag * grid.step
-    if quick > 2 and scene.time.damping_difference == "central":
+    damping_ratio = plan.material.drag * grid.step
+    if damping_ratio > 2 and scene.time.damping_difference == "central":
         yield (
-            f"the damping stops a point within 1/{quick:.3g} of a step: velocities change their sign at every step; "
-            f"take a time.step of at most {2 * grid.step / quick:.2g} s"
+            f"the damping stops a point within 1/{damping_ratio:.3g} of a step: velocities change their sign at every "
+            f"step; take a time.step of at most {2 * grid.step / damping_ratio:.2g} s"
         )
 
 
-def error(
-    estimate: Estimate | None, mesh: MeshEstimate | None = None, largest: float = 0.0, scale: float | None = None
+def error_line(
+    estimate: TimeStepEstimate | None,
+    mesh: MeshEstimate | None = None,
+    max_displacement: float = 0.0,
+    scale: float | None = None,
 ) -> str:
-    """Say how wrong a run is, in parts of its largest displacement [m]; scale: in pixels per metre, if any."""
+    """Format the errors of a run in a line.
+
+    Args:
+        estimate: Error of the time step and of rounding; None if not estimated.
+        mesh: Discretisation error of the mesh; None if not estimated.
+        max_displacement: Largest displacement of the run [m].
+        scale: Pixels per metre; None without a picture.
+
+    Returns:
+        The line.
+    """
     if estimate is not None and estimate.error == math.inf:
         return "error not known: a pilot run diverged, or steps do not resolve the damping"
-    parts, known = [], [mesh.error] if mesh is not None and mesh.error < math.inf else []
+    parts, errors = [], [mesh.error] if mesh is not None and mesh.error < math.inf else []
     if estimate is not None:
-        bound = _bound(estimate.at_most or not estimate.parted, estimate.at_least)
-        named = "time step" if estimate.parted else "time step and rounding"
-        parts.append(f"{named} {bound}{_percent(estimate.in_f64 if estimate.parted else estimate.error, 1)} %")
+        bound = _bound_words(estimate.at_most or not estimate.parted, estimate.at_least)
+        name = "time step" if estimate.parted else "time step and rounding"
+        parts.append(f"{name} {bound}{_percent(estimate.in_f64 if estimate.parted else estimate.error, 1)} %")
         if estimate.parted and estimate.rounding:
             parts.append(f"rounding {_percent(estimate.rounding, 1)} %")
-        known.append(estimate.error)
+        errors.append(estimate.error)
     if mesh is not None and mesh.error < math.inf:
-        parts.append(f"mesh {_bound(mesh.at_most, bool(mesh.doubt))}{_percent(mesh.error, 2)} %")
+        parts.append(f"mesh {_bound_words(mesh.at_most, bool(mesh.doubt))}{_percent(mesh.error, 2)} %")
     of = ""
-    if known:
-        away = max(known) * largest
-        pixels = f", {_digits(away * scale)} px" if scale is not None else ""
-        of = f" of {_digits(1000 * largest, 2)} mm ({_digits(1000 * away)} mm{pixels})"
+    if errors:
+        distance = max(errors) * max_displacement
+        pixels = f", {_digits(distance * scale)} px" if scale is not None else ""
+        of = f" of {_digits(1000 * max_displacement, 2)} mm ({_digits(1000 * distance)} mm{pixels})"
     unknown = f"; mesh error not known: {mesh.doubt}" if mesh is not None and mesh.error == math.inf else ""
     return f"error: {', '.join(parts)}{of}{unknown}" if parts else f"error{unknown}".replace("error; ", "")
 
@@ -303,41 +344,41 @@ def _percent(share: float, digits: int) -> str:
 
 
 def _digits(number: float, digits: int = 1) -> str:
-    """Write a number with this many digits, and without an exponent unless it is tiny."""
+    """Format a number with significant digits, and without an exponent unless it is tiny or huge."""
     rounded = float(f"{number:.{digits}g}")
     return np.format_float_positional(rounded, trim="-") if 1e-6 <= rounded < 1e6 or not rounded else f"{rounded:g}"
 
 
-def _finer(plan: Plan, mesh: MeshEstimate, affords: Callable[[Plan], bool]) -> str:
-    """Say what would reduce the error that the number of points makes: no more than four times as many."""
-    scene, cut = plan.scene, math.sqrt(mesh.error / (WRONG / 2))
-    rows, cols = (math.ceil((count - 1) * cut) + 1 for count in scene.sheet.points)
-    few = rows * cols <= MAX_REFINEMENT * math.prod(scene.sheet.points) and max(rows, cols) < MAX_POINTS
-    if few and affords(plan_variant(plan, with_points(scene, (rows, cols)))):
+def _mesh_remedy(plan: Plan, mesh: MeshEstimate, affords: Callable[[Plan], bool]) -> str:
+    """Suggest a remedy for the mesh error: a finer mesh, if it has at most four times the mass points."""
+    scene, refinement = plan.scene, math.sqrt(mesh.error / (REMEDY_THRESHOLD / 2))
+    rows, cols = (math.ceil((count - 1) * refinement) + 1 for count in scene.sheet.points)
+    allowed = rows * cols <= MAX_REFINEMENT * math.prod(scene.sheet.points) and max(rows, cols) < MAX_POINTS
+    if allowed and affords(plan_variant(plan, with_points(scene, (rows, cols)))):
         return f"try sheet.points: {[rows, cols]}"
     return "more than points, tissue.bending, tissue.pretension or a wider tip help"
 
 
-def _bound(at_most: bool, at_least: bool) -> str:
-    """Say whether an error may be smaller or larger than what is told; if it may be both, it is known roughly."""
+def _bound_words(at_most: bool, at_least: bool) -> str:
+    """Return the words before an error that may be smaller, larger or both."""
     return ("roughly " if at_least else "at most about ") if at_most else "at least " if at_least else ""
 
 
-def _remedy(plan: Plan, estimate: Estimate, affords: Callable[[Plan], bool]) -> str:
-    """Say what would reduce the error."""
+def _step_remedy(plan: Plan, estimate: TimeStepEstimate, affords: Callable[[Plan], bool]) -> str:
+    """Suggest a remedy for the error of the time step and of rounding."""
     if not estimate.parted:
         return "pass --estimate-error to learn whether the step or rounding makes it"
-    said = []
-    if estimate.rounding > WRONG / 2:
-        said.append("time.precision: f64")
+    remedies = []
+    if estimate.rounding > REMEDY_THRESHOLD / 2:
+        remedies.append("time.precision: f64")
         if max(plan.material.across, plan.material.down, plan.material.shear) > 0:
-            held = "tissue.pretension or bending" if has_fixed_border(plan.fixed) else "tissue.foundation"
-            support = "springs.virtual" if plan.scene.tissue is None else held
-            said.append(f"more {support}, where the sheet buckles")
-    if estimate.in_f64 > WRONG / 2:
-        needed = plan.grid.steps_per_frame * (estimate.in_f64 / (WRONG / 2)) ** (1 / estimate.order)
-        finer = replace(plan.grid, steps_per_frame=math.ceil(needed))
+            of_tissue = "tissue.pretension or bending" if has_fixed_border(plan.fixed) else "tissue.foundation"
+            support = "springs.virtual" if plan.scene.tissue is None else of_tissue
+            remedies.append(f"more {support}, where the sheet buckles")
+    if estimate.in_f64 > REMEDY_THRESHOLD / 2:
+        steps = plan.grid.steps_per_frame * (estimate.in_f64 / (REMEDY_THRESHOLD / 2)) ** (1 / estimate.order)
+        finer = replace(plan.grid, steps_per_frame=math.ceil(steps))
         if not affords(replace(plan, grid=finer)):
             return "steps as short as that needs take more than an hour: fewer sheet.points make them faster"
-        said.insert(0, f"time.step: {finer.step:.9g}")
-    return f"try {', or '.join(said)}"
+        remedies.insert(0, f"time.step: {finer.step:.9g}")
+    return f"try {', or '.join(remedies)}"

@@ -1,14 +1,15 @@
-"""The error of a run, estimated by a pilot beside it, and the largest step within a tolerance.
+"""Error of the time step, estimated by a companion run, and the largest step within a tolerance.
 
 The error of a displacement u_h is its distance from Richardson's extrapolation of runs with steps h and h / r in f64:
 
     u* = u_{h/r} + (u_{h/r} - u_h) / (r^p - 1)        p: order of the method, r: 2 or more (fine), or about 1/2 (coarse)
 
-So it includes the rounding of the run's own precision. Errors are the largest of any point at any frame, relative to
-the largest displacement of any point at any frame.
+So it includes the rounding of the run's own precision. An error is the largest of any mass point at any frame, relative
+to the largest displacement of any mass point at any frame.
 
-Where tools are moved, a point touches from one step to the next, so that the order is about 1 and errors fall in leaps.
-What is told is then what is hardly exceeded: "at most about" (docs/decisions/0027).
+Mass points come into contact with position-controlled tools from one step to the next, so the order is about 1, and the
+error falls irregularly with the step. The estimate is then a bound that is rarely exceeded, reported as "at most about"
+(docs/decisions/0027).
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.accuracy.companions import fine_steps
-from taichi_msm.accuracy.divergence import farthest_displacement
+from taichi_msm.accuracy.divergence import displacement_bound
 from taichi_msm.errors import Pause, ProgressCallback, SceneError
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
@@ -32,248 +33,296 @@ from taichi_msm.scene.section import MAX_TOLERANCE
 from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.system.runtime import Device
 
-# The search ends when the error is at least this share of the tolerance: the step is then within about 10 % of the
+# The search ends when the error is at least this share of the tolerance; the step is then within about 10 % of the
 # largest possible one.
-CLOSE = 0.75
+MIN_TOLERANCE_SHARE = 0.75
 
-# The error of the step that a coarse pilot tells is so many times what its difference from the run shows: the kinks of
-# a load meet its steps otherwise than those of the run (docs/decisions/0021).
-MARGIN = 1.25
+# Safety factor of an error estimated by a coarse companion run, since the kinks of a load meet its steps at other times
+# than those of the run (docs/decisions/0021).
+COARSE_MARGIN = 1.25
 
-# With contact, a fine pilot alone tells so many times the error that it shows by order 1, and with a coarse one up to
-# this share more or less (docs/decisions/0027).
-ALONE, SHARE = 1.5, 1 / 3
+# With contact, safety factor of an error estimated by a fine companion run at order 1, and the largest relative change
+# of this error that a coarse companion run can cause (docs/decisions/0027).
+CONTACT_MARGIN, COARSE_INFLUENCE = 1.5, 1 / 3
 
-# The largest number of pilot runs in a search, and the largest factor by which steps get finer from one to the next.
-MOST_PILOTS = 12
-LARGEST_CUT = 8.0
+# The largest number of trial runs in a search, and the largest refinement of the step from one to the next.
+MAX_STEP_TRIALS = 12
+MAX_STEP_REFINEMENT = 8.0
 
 
 @dataclass(frozen=True)
-class Estimate:
-    """What is known about the error of a step."""
+class TimeStepEstimate:
+    """Estimated error of the time step and of rounding.
 
-    steps_per_frame: int  # of the step
-    # The largest error, as a fraction of the largest displacement; infinite if it is not known because a pilot diverged
-    # or the step does not resolve the damping.
+    Attributes:
+        steps_per_frame: Number of steps per frame that the estimate is of.
+        error: Largest error, as a fraction of the largest displacement; infinite if it is unknown because a companion
+            run diverged or the step does not resolve the damping.
+        rounding: Part of the error that comes from f32, including positions in the trajectory; 0 in f64.
+        in_f64: Error of the same step in f64.
+        order: Order of the method in this scene.
+        parted: Whether the two parts are known separately. After a coarse companion run of a run in f32 they are not,
+            and each is at most the error.
+        at_least: Whether the error may be larger: a coarse companion run shows an error that only a fine one could
+            determine, the error does not decrease with the step in contact, or the error is too large to be estimated.
+        at_most: Whether the error may be much smaller, because of contact.
+    """
+
+    steps_per_frame: int
     error: float
-    rounding: float  # the part of the error that comes from f32, also of positions in the trajectory; 0 in f64
-    in_f64: float  # the error of the same step in f64
-    order: int  # of the method in this scene
-    # Whether the two parts are known; else, by a coarse pilot beside a run in f32, neither is larger than the error.
+    rounding: float
+    in_f64: float
+    order: int
     parted: bool = True
-    # Whether the error may be larger: a coarse pilot shows one that only a fine one would tell, or with contact smaller
-    # steps do not come closer to each other, or the error is so large that nothing is known.
     at_least: bool = False
-    at_most: bool = False  # whether the error may be much smaller, because of contact
+    at_most: bool = False
 
 
-def order(plan: Plan) -> int:
-    """Give the order of the method: 1 with a damping by backward differences or with contact, else 2."""
+def convergence_order(plan: Plan) -> int:
+    """Return the order of the method: 1 with damping by backward differences or with contact, else 2."""
     backward = plan.scene.time.damping_difference == "backward" and plan.material.drag > 0
     return 1 if backward or plan.tools else 2
 
 
-def estimate_error(plan: Plan, device: Device, progress: ProgressCallback = lambda done, total: None) -> Estimate:
-    """Estimate the error of a run; progress counts frames."""
-    return Trials(plan, device).estimate(plan.grid.steps_per_frame, progress)
+def estimate_error(plan: Plan, device: Device, progress: ProgressCallback = lambda done, total: None) -> TimeStepEstimate:
+    """Estimate the time-step error of a run.
+
+    Args:
+        plan: Plan of the run.
+        device: Device to run it on.
+        progress: Called with the number of finished frames and their total.
+
+    Returns:
+        The estimate.
+    """
+    return TimeStepTrials(plan, device).estimate(plan.grid.steps_per_frame, progress)
 
 
 def choose_step(
     plan: Plan, device: Device, progress: ProgressCallback = lambda done, total: None
-) -> tuple[Plan, Estimate]:
-    """Find the largest stable step whose estimated error is within the scene's tolerance, and this error.
-
-    No fewer steps than the plan's are tried; progress counts the frames of each pilot run.
-
-    Raises:
-        SceneError: when no step meets the tolerance; names a precision or a tolerance that would do.
-    """
-    tolerance, steps, trials = plan.scene.time.tolerance, plan.grid.steps_per_frame, Trials(plan, device)
-    assert tolerance is not None
-    too_few, enough, failures = steps - 1, None, []
-    for _ in range(MOST_PILOTS):
-        tried = trials.estimate(steps, progress)
-        if tried.error <= tolerance:
-            enough = tried
-        else:
-            too_few = steps
-            failures.append(tried)
-            if tried.rounding > CLOSE * tolerance or _stuck(failures):
-                break
-        if enough and (enough.error >= CLOSE * tolerance or enough.steps_per_frame - too_few <= 1):
-            break
-        steps = max(_next(tried, tolerance), too_few + 1)
-        if enough and steps >= enough.steps_per_frame:
-            break
-    if not enough:
-        raise SceneError([_out_of_reach(tolerance, failures)])
-    return plan.with_grid(steps_per_frame=enough.steps_per_frame), enough
-
-
-class Pilot:
-    """A run in f64 beside another run, with other steps, which gives its error frame by frame.
-
-    Beside a run in f32 a fine pilot has a second one with the run's own steps, which tells the part of rounding. A
-    coarse one is alone, to be cheap, and the error told is the difference of the two runs: rounding as it is, and
-    r^-p - 1 times the error of the step; where that is less than MARGIN times, the difference is enlarged accordingly.
+) -> tuple[Plan, TimeStepEstimate]:
+    """Search for the largest stable step whose estimated error is within the scene's tolerance.
 
     Args:
-        steps: per frame of the pilot, as in `Pilots`; 0: the error is not known.
-        cores: number of cores that stepping may use; None: all. With as many as the run has, its kernels are reused.
+        plan: Plan with a tolerance; its number of steps per frame is the smallest that is tried.
+        device: Device for the trial runs.
+        progress: Called with the number of finished frames of each trial run and their total.
 
-    Attributes:
-        displacement: of the pilot at the last frame [m], shape (rows, cols, 3).
+    Returns:
+        The plan with that step, and its estimated error.
 
     Raises:
-        DeviceError: when the device cannot run it in f64.
+        SceneError: When no step meets the tolerance; suggests a precision or a tolerance.
+    """
+    tolerance, steps, trials = plan.scene.time.tolerance, plan.grid.steps_per_frame, TimeStepTrials(plan, device)
+    assert tolerance is not None
+    insufficient, best, failures = steps - 1, None, []
+    for _ in range(MAX_STEP_TRIALS):
+        trial = trials.estimate(steps, progress)
+        if trial.error <= tolerance:
+            best = trial
+        else:
+            insufficient = steps
+            failures.append(trial)
+            if trial.rounding > MIN_TOLERANCE_SHARE * tolerance or _stagnates(failures):
+                break
+        if best and (best.error >= MIN_TOLERANCE_SHARE * tolerance or best.steps_per_frame - insufficient <= 1):
+            break
+        steps = max(_next_steps(trial, tolerance), insufficient + 1)
+        if best and steps >= best.steps_per_frame:
+            break
+    if not best:
+        raise SceneError([_out_of_reach(tolerance, failures)])
+    return plan.with_grid(steps_per_frame=best.steps_per_frame), best
+
+
+class TimeStepCompanion:
+    """Companion run in f64 with another time step, compared with a run frame by frame.
+
+    A fine companion of a run in f32 includes a second run in f64 with the run's own steps, which separates the
+    rounding. A coarse companion has none, to be cheap. Its error is the difference of the two runs, which contains the
+    rounding and r^-p - 1 times the error of the step. If this factor is below `COARSE_MARGIN`, the difference is scaled
+    up to it.
+
+    Args:
+        plan: Plan of the run.
+        steps: Steps per frame of the companion run; 0 if the error cannot be estimated.
+        device: Device to run on.
+        cores: Number of CPU cores for stepping; None for all. With the run's number of cores its kernels are reused.
+
+    Attributes:
+        displacement: Displacements of the companion run at the last frame [m], shape (rows, cols, 3).
+
+    Raises:
+        DeviceError: When the device cannot run it in f64.
     """
 
     def __init__(self, plan: Plan, steps: int, device: Device, cores: int | None = None) -> None:
-        self._order, exact = order(plan), plan.with_grid(precision="f64")
+        self._order, exact = convergence_order(plan), plan.with_grid(precision="f64")
         coarse = 0 < steps < plan.grid.steps_per_frame
         self._parted = plan.grid.precision == "f64" or not coarse
-        self._other = Dynamics(exact, device, cores=cores)
-        # A run in f64 is itself the one with its own steps.
-        own = plan.grid.precision == "f64" or coarse
-        self._same = None if own else Dynamics(exact, device, cores=cores)
-        self._margin = MARGIN * ALONE if plan.tools else 1.0
+        self._dynamics = Dynamics(exact, device, cores=cores)
+        # A run in f64 is itself the one in f64 with its own steps.
+        needs_same_step = plan.grid.precision != "f64" and not coarse
+        self._same_step = Dynamics(exact, device, cores=cores) if needs_same_step else None
+        self._margin = COARSE_MARGIN * CONTACT_MARGIN if plan.tools else 1.0
         self._overlap = overlap(plan.tools, plan.scene.time.duration) is not None
         if coarse:
-            shown = (plan.grid.steps_per_frame / steps) ** self._order - 1
-            self._margin = MARGIN if self._parted else max(1.0, MARGIN / shown)
+            factor = (plan.grid.steps_per_frame / steps) ** self._order - 1
+            self._margin = COARSE_MARGIN if self._parted else max(1.0, COARSE_MARGIN / factor)
         self.restart(plan, steps)
 
     def restart(self, plan: Plan, steps: int) -> None:
-        """Begin again beside another run of the same scene, with its steps and the pilot's; fine ones stay fine."""
+        """Restart for another run of the same scene; a fine companion must stay fine.
+
+        Args:
+            plan: Plan of the run.
+            steps: Steps per frame of the companion run.
+        """
         self._plan, self._steps = plan, steps
         exact = plan.with_grid(precision="f64")
         if steps:
-            self._other.restart(exact.with_grid(steps_per_frame=steps))
-            if self._same:
-                self._same.restart(exact)
+            self._dynamics.restart(exact.with_grid(steps_per_frame=steps))
+            if self._same_step:
+                self._same_step.restart(exact)
         self._error = self._rounding = self._in_f64 = self._largest = 0.0
 
     def compile(self) -> None:
-        """Compile now what the first frame would compile."""
-        self._other.compile()
+        """Compile the kernels that the first frame would compile."""
+        self._dynamics.compile()
 
-    def follow(self, displacement: NDArray[Any], pause: Pause) -> None:
-        """Step to the next frame, and compare.
+    def compare_frame(self, displacement: NDArray[Any], pause: Pause) -> None:
+        """Step to the next frame and compare it.
 
         Args:
-            displacement: of the run at that frame [m], shape (rows, cols, 3).
-            pause: called several times a second; after an exception from it the pilot cannot continue.
+            displacement: Displacements of the run at that frame [m], shape (rows, cols, 3).
+            pause: Called several times a second; after an exception from it the companion run cannot continue.
         """
         if not self._steps:
             return
-        self._other.advance(self._steps, pause)
-        if self._same:
-            self._same.advance(self._plan.grid.steps_per_frame, pause)
-        other = self.displacement = self._other.displacement()
-        same = self._same.displacement() if self._same else displacement
+        self._dynamics.advance(self._steps, pause)
+        if self._same_step:
+            self._same_step.advance(self._plan.grid.steps_per_frame, pause)
+        companion = self.displacement = self._dynamics.displacement()
+        same_step = self._same_step.displacement() if self._same_step else displacement
         with np.errstate(all="ignore"):
             ratio = self._steps / self._plan.grid.steps_per_frame
-            exact = other + (other - same) / (ratio**self._order - 1) if self._parted else other
-            self._error = max(self._error, longest(displacement - exact))
-            # Where errors fall in leaps, what is extrapolated may be larger by far.
-            best = exact if not self._plan.tools else other if ratio > 1 else displacement
-            self._largest = max(self._largest, longest(best))
-            if self._same:
-                self._in_f64 = max(self._in_f64, longest(same - exact))
-                self._rounding = max(self._rounding, longest(displacement - same))
+            exact = companion + (companion - same_step) / (ratio**self._order - 1) if self._parted else companion
+            self._error = max(self._error, max_norm(displacement - exact))
+            # With contact the extrapolated displacement may be far too large.
+            best = exact if not self._plan.tools else companion if ratio > 1 else displacement
+            self._largest = max(self._largest, max_norm(best))
+            if self._same_step:
+                self._in_f64 = max(self._in_f64, max_norm(same_step - exact))
+                self._rounding = max(self._rounding, max_norm(displacement - same_step))
 
     def force_error(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Estimate the error of the mean forces since the frame before [N], shape (tools, 3), by order 1."""
+        """Estimate the error of the mean forces since the previous frame [N], shape (tools, 3), at order 1."""
         ratio = self._steps / self._plan.grid.steps_per_frame
-        return np.asarray(self._margin * abs(ratio / (ratio - 1)) * np.abs(forces - self._other.tool_forces()))
+        return np.asarray(self._margin * abs(ratio / (ratio - 1)) * np.abs(forces - self._dynamics.tool_forces()))
 
     @property
-    def estimate(self) -> Estimate:
-        """What the frames so far show."""
+    def estimate(self) -> TimeStepEstimate:
+        """Estimate from the frames so far."""
         if not self._steps:
-            return Estimate(self._plan.grid.steps_per_frame, math.inf, 0.0, math.inf, self._order)
-        farthest = farthest_displacement(self._plan, self._plan.scene.time.duration)
+            return TimeStepEstimate(self._plan.grid.steps_per_frame, math.inf, 0.0, math.inf, self._order)
+        bound = displacement_bound(self._plan, self._plan.scene.time.duration)
 
-        def share(part: float) -> float:
-            # If nothing moves, there is no error; an error that is not finite is not known.
-            relative = self._margin * part / self._largest if self._largest > 0 else 0.0
-            return relative if relative < math.inf and self._largest <= farthest else math.inf
+        def relative(distance: float) -> float:
+            # Without motion there is no error; a non-finite error is unknown.
+            share = self._margin * distance / self._largest if self._largest > 0 else 0.0
+            return share if share < math.inf and self._largest <= bound else math.inf
 
-        error, rounding, in_f64 = (share(part) for part in (self._error, self._rounding, self._in_f64))
-        if not self._same:
+        error, rounding, in_f64 = (relative(each) for each in (self._error, self._rounding, self._in_f64))
+        if not self._same_step:
             rounding, in_f64 = 0.0 if self._parted else error, error
         steps, contact = self._plan.grid.steps_per_frame, bool(self._plan.tools)
         at_least = contact and (self._overlap or error > MAX_TOLERANCE)
-        return Estimate(steps, error, rounding, in_f64, self._order, self._parted, at_least, contact)
+        return TimeStepEstimate(steps, error, rounding, in_f64, self._order, self._parted, at_least, contact)
 
 
-def reconcile(coarse: Estimate, fine: Estimate) -> Estimate:
-    """Give what both pilots of a run tell: the finer one, but with contact the coarse one within its doubt."""
+def combine_estimates(coarse: TimeStepEstimate, fine: TimeStepEstimate) -> TimeStepEstimate:
+    """Combine the estimates of both companion runs: the fine one, adjusted by the coarse one in contact.
+
+    Args:
+        coarse: Estimate of the coarse companion run.
+        fine: Estimate of the fine companion run.
+
+    Returns:
+        The combined estimate.
+    """
     if not fine.at_most or fine.error in (0, math.inf):
         return fine
-    share = min(max(coarse.error / fine.error, 1 - SHARE), 1 + SHARE)
-    # But for the factors of both, the difference of the finer one from the run is larger than that of the coarse one.
-    grows = fine.error > 2 * ALONE * coarse.error
+    share = min(max(coarse.error / fine.error, 1 - COARSE_INFLUENCE), 1 + COARSE_INFLUENCE)
+    # Without the margins, the fine companion run differs from the run by more than the coarse one.
+    grows = fine.error > 2 * CONTACT_MARGIN * coarse.error
     return replace(fine, error=share * fine.error, in_f64=share * fine.in_f64, at_least=fine.at_least or grows)
 
 
-class Trials:
-    """Runs of a scene with different steps, one after the other, each with a pilot beside it."""
+class TimeStepTrials:
+    """Trial runs of a scene with different steps, each with a companion run."""
 
     def __init__(self, plan: Plan, device: Device) -> None:
         self._plan = plan
-        self._pilot = Pilot(plan, fine_steps(plan), device)
-        self._own = Dynamics(plan, device)
+        self._companion = TimeStepCompanion(plan, fine_steps(plan), device)
+        self._dynamics = Dynamics(plan, device)
 
-    def estimate(self, steps: int, progress: ProgressCallback) -> Estimate:
-        """Run the scene with so many steps per frame, and estimate its error; progress counts frames."""
+    def estimate(self, steps: int, progress: ProgressCallback) -> TimeStepEstimate:
+        """Run the scene and estimate its error.
+
+        Args:
+            steps: Number of steps per frame.
+            progress: Called with the number of finished frames and their total.
+
+        Returns:
+            The estimate.
+        """
         plan = self._plan.with_grid(steps_per_frame=steps)
         fine, frames = fine_steps(plan), plan.grid.frames
-        self._pilot.restart(plan, fine)
-        self._own.restart(plan)
+        self._companion.restart(plan, fine)
+        self._dynamics.restart(plan)
         for frame in range(frames if fine else 0):
             pause = partial(progress, frame, frames)
             pause()
-            self._own.advance(steps, pause)
-            self._pilot.follow(self._as_written(self._own.displacement()), pause)
-        return self._pilot.estimate
+            self._dynamics.advance(steps, pause)
+            self._companion.compare_frame(self._as_stored(self._dynamics.displacement()), pause)
+        return self._companion.estimate
 
-    def _as_written(self, displacement: NDArray[Any]) -> NDArray[Any]:
-        """Round as positions in the trajectory are rounded: in f32, relative to the size of the sheet."""
+    def _as_stored(self, displacement: NDArray[Any]) -> NDArray[Any]:
+        """Round displacements like positions in a trajectory: in f32, relative to the size of the sheet."""
         if "trajectory" not in self._plan.scene.output or self._plan.grid.precision == "f64":
             return displacement
         rest = rest_positions(self._plan.scene.sheet)
         return (rest + displacement).astype(np.float32) - rest
 
 
-def longest(vectors: NDArray[Any]) -> float:
-    """Give the length of the longest vector, shape (..., 3); infinite if one is not finite."""
+def max_norm(vectors: NDArray[Any]) -> float:
+    """Return the largest Euclidean norm of vectors of shape (..., 3), infinite if any is not finite."""
     with np.errstate(all="ignore"):
         length = math.sqrt(np.einsum("...k,...k->...", vectors, vectors, dtype=np.float64).max())
     return length if length < math.inf else math.inf
 
 
-def _above(error: float) -> float:
+def _rounded_up(error: float) -> float:
     """Round up to one digit, with a margin of 20 %."""
     digit = 10.0 ** math.floor(math.log10(error))
     return float(f"{math.ceil(1.2 * error / digit) * digit:.3g}")
 
 
-def _next(tried: Estimate, tolerance: float) -> int:
-    """Extrapolate the fewest steps per frame that are enough: the error falls with the order of the method."""
-    if tried.error == math.inf:
-        cut = LARGEST_CUT
+def _next_steps(trial: TimeStepEstimate, tolerance: float) -> int:
+    """Extrapolate the smallest sufficient number of steps per frame by the order of the method."""
+    if trial.error == math.inf:
+        refinement = MAX_STEP_REFINEMENT
     else:
-        # The error that the step may make, apart from rounding, and the error that it makes.
-        allowed = max((1 + CLOSE) / 2 * tolerance - tried.rounding, tolerance / 16)
-        error = max(tried.error - tried.rounding, 0.0)
-        cut = min((error / allowed) ** (1 / tried.order), LARGEST_CUT)
-    return max(1, math.ceil(tried.steps_per_frame * cut))
+        # Both the allowed error of the step and the estimated one exclude the rounding.
+        allowed = max((1 + MIN_TOLERANCE_SHARE) / 2 * tolerance - trial.rounding, tolerance / 16)
+        error = max(trial.error - trial.rounding, 0.0)
+        refinement = min((error / allowed) ** (1 / trial.order), MAX_STEP_REFINEMENT)
+    return max(1, math.ceil(trial.steps_per_frame * refinement))
 
 
-def _stuck(failures: list[Estimate]) -> bool:
-    """Tell whether much smaller steps hardly reduced the error, three times in a row."""
+def _stagnates(failures: list[TimeStepEstimate]) -> bool:
+    """Return whether smaller steps hardly reduced the error three times in a row."""
     if len(failures) < 4:
         return False
     return all(
@@ -282,23 +331,23 @@ def _stuck(failures: list[Estimate]) -> bool:
     )
 
 
-def _out_of_reach(tolerance: float, failures: list[Estimate]) -> str:
-    best = min(failures, key=lambda one: one.error)
+def _out_of_reach(tolerance: float, failures: list[TimeStepEstimate]) -> str:
+    best = min(failures, key=lambda failure: failure.error)
     last = failures[-1]
     if best.error == math.inf:
         return (
             f"time.tolerance: {tolerance:g} is out of reach: with {last.steps_per_frame} steps a frame the error is "
             "not known, as runs diverge or steps do not resolve the damping; take a weaker load or less damping"
         )
-    if last.rounding > CLOSE * tolerance:
+    if last.rounding > MIN_TOLERANCE_SHARE * tolerance:
         return (
             f"time.tolerance: {tolerance:g} is out of reach of f32, whose rounding alone makes an error of "
-            f"{last.rounding:.2g} here; take time.precision: f64, or a tolerance of {_above(4 * last.rounding):g}"
+            f"{last.rounding:.2g} here; take time.precision: f64, or a tolerance of {_rounded_up(4 * last.rounding):g}"
         )
     weaker = "move the tools less deep, or take" if last.at_most else "take a weaker load or"
     remedy = f"{weaker} a shorter time"
     if best.error < MAX_TOLERANCE / 2:
-        remedy += f", or a tolerance of {_above(best.error):g}"
+        remedy += f", or a tolerance of {_rounded_up(best.error):g}"
     return (
         f"time.tolerance: {tolerance:g} is out of reach: with {last.steps_per_frame} steps a frame the error is still "
         f"{last.error:.2g}, and finer steps hardly reduce it; {remedy}"

@@ -71,13 +71,13 @@ def study(
         raise click.BadParameter(f"{tolerance:g} is not allowed; {expected}", param_hint="--tolerance")
 
     from taichi_msm.cli.console import ProgressDisplay
-    from taichi_msm.study.report import RECORD, as_record, require_writable, summary, write_report
-    from taichi_msm.study.study import study as study_scene
+    from taichi_msm.study.report import RECORD_FILE, format_summary, require_writable, study_record, write_report
+    from taichi_msm.study.study import run_study
 
     require_writable(directory)
     interruption = Interruption()
     with ProgressDisplay(quiet=as_json) as bar, prefix_errors(scene):
-        results = study_scene(
+        results = run_study(
             loaded,
             Path(scene).stem,
             tolerance=tolerance,
@@ -88,14 +88,14 @@ def study(
         )
     if not results.stepping:
         return report_interruption(interruption, as_json)
-    if results.status == "interrupted" and (directory / RECORD).exists():
+    if results.status == "interrupted" and (directory / RECORD_FILE).exists():
         # A partial study must not replace a complete one.
         directory = without_link(directory / "interrupted", "--out")
     outputs = write_report(results, directory)
     if as_json:
-        print_json({"directory": str(directory), **as_record(results), "outputs": outputs})
+        print_json({"directory": str(directory), **study_record(results), "outputs": outputs})
     else:
-        click.echo(summary(results))
+        click.echo(format_summary(results))
         click.echo(printable(f"{directory}: {', '.join(outputs)}"))
     return EXIT_CODES.get(results.status, interruption.code)
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Unpack
 
-from taichi_msm.accuracy.mesh import WITH_CONTACT
+from taichi_msm.accuracy.mesh import CONTACT_ORDER
 from taichi_msm.errors import SceneError, StageProgressCallback, writing
 from taichi_msm.fitting import rejection
 from taichi_msm.fitting import result as result_module
@@ -229,7 +229,7 @@ def _mesh(runs: Runs, misfit: Misfit, solution: Solution, uncertain: Uncertainty
     error = runs.mesh_error(solution.x)
     if error is None or (half := runs.coarse(solution.x, 1)) is None:
         return None, None
-    most = WITH_CONTACT if any(probe.moved for probe in runs.job.scene.probes) else 2.0
+    most = CONTACT_ORDER if any(probe.moved for probe in runs.job.scene.probes) else 2.0
 
     def moved_by(coarse: Predicted, fine: Predicted) -> Array:
         rows = misfit.row(coarse) - misfit.row(fine)

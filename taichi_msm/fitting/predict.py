@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.accuracy.mesh import coarser, estimate_points
+from taichi_msm.accuracy.mesh import coarser_plan, estimate_mesh_error
 from taichi_msm.errors import DivergedError, ExecutorError, Pause, SceneError, StageProgressCallback
 from taichi_msm.fitting.observations import Observations, Sight, between, in_frames
 from taichi_msm.fitting.parameters import Parameter, as_data, with_values
@@ -93,7 +93,7 @@ class Predictor:
             x: of every parameter.
             steps: of a frame, as of a run that this one is compared with, if it needs no more; None: so many that
                 runs with neighbouring values can have them too.
-            coarse: how many times to halve the cells a side; a SceneError where `mesh.coarser` gives None.
+            coarse: how many times to halve the cells a side; a SceneError where `mesh.coarser_plan` gives None.
             whole: go on to the last frame, even if nothing was seen there.
             pause: called some times a second; what it raises stops it.
 
@@ -103,7 +103,7 @@ class Predictor:
         """
         plan = self.plan(x)
         for _ in range(coarse):
-            if (half := coarser(plan)) is None:
+            if (half := coarser_plan(plan)) is None:
                 raise SceneError(["sheet.points: too few to take half of them"])
             plan = half
         if plan.scene.time.step == "auto" and not plan.scene.time.at_rest:
@@ -199,10 +199,10 @@ def points_error(plan: Plan, pause: Pause) -> float | None:
 
     None: no tissue, too few points to tell, or no run with fewer points.
     """
-    if coarser(plan) is None:
+    if coarser_plan(plan) is None:
         return None
     try:
-        error = estimate_points(plan, runtime.current_device(), lambda done, total: pause()).error
+        error = estimate_mesh_error(plan, runtime.current_device(), lambda done, total: pause()).error
     except (DivergedError, SceneError):
         return None
     return error if math.isfinite(error) else None

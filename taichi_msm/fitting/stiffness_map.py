@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.accuracy.mesh import coarser
+from taichi_msm.accuracy.mesh import coarser_plan
 from taichi_msm.errors import SceneError, StageProgressCallback
 from taichi_msm.fitting.checks import faults, faults_beside
 from taichi_msm.fitting.observations import Observations, Sight
@@ -125,7 +125,7 @@ def fit_map(given: Scene, seen: Observations, task: MapTask, image: str, progres
     position = adjoint.run(fields.factors(start), tell)
     points = _first(position, sight, seen, given)
     by_points = 0.0
-    if (half := coarser(plan)) is not None:
+    if (half := coarser_plan(plan)) is not None:
         few = Fields(task.resolution, _cells(half)).factors(start)
         other = Sight(half.scene, seen, half.grid.frames + 1)
         moved = other.points(Adjoint(half, device).run(few, tell))

@@ -1,1 +1,1 @@
-"""Gradients of a loss by the exact adjoint of the discrete steps."""
+"""Gradients of a loss, by the adjoint of the discrete time steps and of the equilibrium."""

@@ -1,9 +1,10 @@
-"""Derivatives of a loss by the numbers that the steps of a sheet are made of, and by those of its scene.
+"""Chain rule from the derivatives of a loss by the numbers of a sheet to those by the numbers of its scene.
 
-From the scene to a `Material`, and on to what a step keeps and gains, lead short closed forms (`derive` of every term,
-`damping.coefficients`). They are differentiated by complex steps, exact to the last digits: f(x + i h) is
-f(x) + i h f'(x) with an h so small that its square vanishes. Loads are linear in percents, in components of forces, and
-control points in their keys; so the derivative by one of these is what comes out for 1, with 0 for all others.
+Short closed forms lead from the scene to a `Material`, and on to the factors of a step (`derive` of every term,
+`damping.coefficients`). They are differentiated by complex steps, exactly but for rounding: f(x + i h) is
+f(x) + i h f'(x) with an h so small that its square vanishes. Loads are linear in the percents of the load and in the
+components of the force, and control points are linear in their keyframes. Hence the derivative by one of these values
+follows from the schedule in which it is 1 and all others are 0.
 """
 
 from __future__ import annotations
@@ -29,30 +30,40 @@ from taichi_msm.terms.springs import spring_stiffness
 
 Array = NDArray[np.float64]
 
-# The imaginary part of a complex step.
-STEP = 1e-60
+# Imaginary part of a complex step.
+COMPLEX_STEP = 1e-60
 
 
 @dataclass
-class Slopes:
-    """Derivatives by the numbers of a sheet."""
+class SheetGradient:
+    """Derivatives of a loss by the numbers of a sheet.
 
-    # by k - tau of every spring: along rows, along columns, and of both diagonals of a cell; as in `springs.stiffness`
+    Attributes:
+        springs: By k - tau of every spring along rows, along columns, and of both diagonals of a cell, with shapes as
+            in `springs.stiffness`.
+        tensions: By tau of each family at constant k - tau, shape (3,).
+        foundation: By the logarithm of the foundation stiffness K of every mass point, shape (rows, cols).
+        bending: By the logarithm of the bending stiffness.
+        keep: By the factor `keep` of the steps.
+        gain: By the logarithm of the gain of all steps but step 0.
+        first_gain: By the logarithm of the gain of step 0.
+    """
+
     springs: tuple[Array, Array, Array]
-    tensions: Array  # by tau of each family, with k - tau as it is, shape (3,)
-    held: Array  # by the logarithm of K of every point, shape (rows, cols)
-    bent: float  # by the logarithm of the bending stiffness
-    keep: float = 0.0  # by the factor `keep` of the steps
-    gain: float = 0.0  # by the logarithm of their gain, after step 0
-    first_gain: float = 0.0  # by that of the gain of step 0
+    tensions: Array
+    foundation: Array
+    bending: float
+    keep: float = 0.0
+    gain: float = 0.0
+    first_gain: float = 0.0
 
     def work(self, plan: Plan) -> float:
-        """Give the derivative by the logarithm of all forces of the sheet together."""
+        """Return the derivative by the logarithm of all internal forces of the sheet together."""
         factors, material = plan.material.factors, plan.material
         assert factors is not None
-        total = float(self.tensions @ material.tensions) + float(self.held.sum()) + self.bent
-        for slope, k, tension in zip(self.springs, spring_stiffness(material, factors), material.tensions, strict=True):
-            total += float((slope * (k - tension)).sum())
+        total = float(self.tensions @ material.tensions) + float(self.foundation.sum()) + self.bending
+        for by_spring, k, tension in zip(self.springs, spring_stiffness(material, factors), material.tensions, strict=True):
+            total += float((by_spring * (k - tension)).sum())
         return total
 
 
@@ -61,89 +72,102 @@ class Derivatives:
     """Derivatives of a loss by the numbers of a scene.
 
     Attributes:
-        numbers: by the paths of keys, such as tissue.young, probes.0.total (one for each component), probes.0.load (by
-            the percent of each key), and probes.0.at (by across and down; of keys in rows of two). A material number
-            that is 0 is not among them.
-        maps: by the factor of every cell, `tissue.map` or `springs.map`, shape (rows - 1, cols - 1), and with a
-            foundation by that of every point, `tissue.foundation_map`, shape (rows, cols); also where the scene has no
-            such map, which is a factor of 1 everywhere.
+        numbers: Derivatives by the paths of keys, such as tissue.young, probes.0.total (of shape (3,), by component),
+            probes.0.load (by the percent of each keyframe), and probes.0.at (by across and down; shape (keyframes, 2)
+            for a moving control point). Material numbers that are 0 are left out.
+        maps: Derivatives by the factor of every cell, `tissue.map` or `springs.map`, shape (rows - 1, cols - 1), and
+            with a foundation by the factor of every mass point, `tissue.foundation_map`, shape (rows, cols). A scene
+            without such a map has the factor 1 everywhere.
     """
 
     numbers: dict[str, float | Array]
     maps: dict[str, Array]
 
 
-def derivatives(plan: Plan, slopes: Slopes, loads: LoadSlopes) -> Derivatives:
-    """Go from the numbers of a sheet to those of its scene."""
+def scene_derivatives(plan: Plan, gradient: SheetGradient, loads: LoadGradient) -> Derivatives:
+    """Apply the chain rule from the numbers of a sheet to those of its scene.
+
+    Args:
+        plan: Plan of the scene.
+        gradient: Derivatives by the numbers of the sheet.
+        loads: Derivatives by the loads.
+
+    Returns:
+        Derivatives by the numbers of the scene.
+    """
     material, kind = plan.material, plan.scene.kind
     assert material.factors is not None
-    by_number = _by_numbers(plan, slopes)
+    by_sheet_number = _gradient_by_numbers(plan, gradient)
     numbers: dict[str, float | Array] = {}
     for path in _paths(plan.scene):
         value = _value(plan.scene, path)
-        changed = _numbers(plan, _with(plan.scene, path, value + 1j * STEP))
-        numbers[".".join(path)] = float(by_number @ changed.imag) / STEP
-    maps = {f"{kind}.map": _by_factors(plan, slopes)}
+        perturbed = _sheet_numbers(plan, _with_value(plan.scene, path, value + 1j * COMPLEX_STEP))
+        numbers[".".join(path)] = float(by_sheet_number @ perturbed.imag) / COMPLEX_STEP
+    maps = {f"{kind}.map": _gradient_by_factors(plan, gradient)}
     if kind == "tissue" and material.virtual > 0:
         factors = material.virtual_factors
-        maps["tissue.foundation_map"] = slopes.held / (1.0 if factors is None else factors)
+        maps["tissue.foundation_map"] = gradient.foundation / (1.0 if factors is None else factors)
     return Derivatives(numbers | loads.by_key, maps)
 
 
-def _numbers(plan: Plan, scene: Scene) -> NDArray[Any]:
-    """List the numbers of a sheet of which `_by_numbers` gives the derivatives; they may be complex."""
-    one = derive_material(scene, {})
-    springs = [one.across, one.down, one.shear, one.tension]
-    steps = () if scene.time.at_rest else coefficients(replace(plan, scene=scene, material=one))
-    return np.array([*springs, one.virtual, one.bending, *steps])
+def _sheet_numbers(plan: Plan, scene: Scene) -> NDArray[Any]:
+    """Return the numbers of a sheet, in the order of `_gradient_by_numbers`; they may be complex."""
+    material = derive_material(scene, {})
+    springs = [material.across, material.down, material.shear, material.tension]
+    steps = () if scene.time.at_rest else coefficients(replace(plan, scene=scene, material=material))
+    return np.array([*springs, material.virtual, material.bending, *steps])
 
 
-def _by_numbers(plan: Plan, slopes: Slopes) -> Array:
-    """List the derivatives by across, down, shear, tension, virtual, bending, keep, gain and the first gain."""
+def _gradient_by_numbers(plan: Plan, gradient: SheetGradient) -> Array:
+    """Return the derivatives by across, down, shear, tension, virtual, bending, keep, gain and the first gain."""
     material = plan.material
     assert material.factors is not None
     unit = spring_stiffness(replace(material, across=1.0, down=1.0, shear=1.0), material.factors)
-    # tau is a stiffness times the tension, and k - tau falls as it grows.
-    tensions = slopes.tensions - [float(slope.sum()) for slope in slopes.springs]
+    # tau is the stiffness times the tension, and k - tau decreases with tau.
+    tensions = gradient.tensions - [float(by_spring.sum()) for by_spring in gradient.springs]
     springs = [
-        float((slope * share).sum()) + material.tension * tension
-        for slope, share, tension in zip(slopes.springs, unit, tensions, strict=True)
+        float((by_spring * share).sum()) + material.tension * tension
+        for by_spring, share, tension in zip(gradient.springs, unit, tensions, strict=True)
     ]
-    by = [*springs, float(tensions @ (material.across, material.down, material.shear))]
-    by += [_by_log(float(slopes.held.sum()), material.virtual), _by_log(slopes.bent, material.bending)]
+    derivatives = [*springs, float(tensions @ (material.across, material.down, material.shear))]
+    derivatives += [
+        _from_logarithm(float(gradient.foundation.sum()), material.virtual),
+        _from_logarithm(gradient.bending, material.bending),
+    ]
     if not plan.scene.time.at_rest:
         _, gain, first_gain = coefficients(plan)
-        by += [slopes.keep, slopes.gain / gain, slopes.first_gain / first_gain]
-    return np.array(by)
+        derivatives += [gradient.keep, gradient.gain / gain, gradient.first_gain / first_gain]
+    return np.array(derivatives)
 
 
-def _by_log(slope: float, value: float) -> float:
-    return slope / value if value else 0.0
+def _from_logarithm(derivative: float, value: float) -> float:
+    """Convert a derivative by the logarithm of a value to that by the value."""
+    return derivative / value if value else 0.0
 
 
-def _by_factors(plan: Plan, slopes: Slopes) -> Array:
-    """Give the derivatives by the factors of the cells: `springs.stiffness` transposed."""
+def _gradient_by_factors(plan: Plan, gradient: SheetGradient) -> Array:
+    """Return the derivatives by the factors of the cells: the transpose of `springs.stiffness`."""
     material = plan.material
-    along_rows, along_columns = slopes.springs[0].copy(), slopes.springs[1].copy()
+    along_rows, along_columns = gradient.springs[0].copy(), gradient.springs[1].copy()
     if not material.by_area:
         along_rows[[0, -1]] *= 2
         along_columns[:, [0, -1]] *= 2
     across = material.across / 2 * (along_rows[:-1] + along_rows[1:])
     down = material.down / 2 * (along_columns[:, :-1] + along_columns[:, 1:])
-    return across + down + material.shear * slopes.springs[2]
+    return across + down + material.shear * gradient.springs[2]
 
 
 def _paths(scene: Scene) -> Iterator[tuple[str, ...]]:
     """List the keys of the material that have a derivative."""
     names = ["young", "thickness", "foundation", "pretension", "bending"]
-    moving: list[tuple[str, ...]] = [("tissue", "density"), ("tissue", "damping")]
-    every: list[tuple[str, ...]] = [("tissue", name) for name in names]
+    dynamic: list[tuple[str, ...]] = [("tissue", "density"), ("tissue", "damping")]
+    static: list[tuple[str, ...]] = [("tissue", name) for name in names]
     if scene.tissue is None:
-        every = [("springs", name) for name in ("structural", "shear", "virtual")]
-        moving = [("sheet", "mass"), ("damping",)]
+        static = [("springs", name) for name in ("structural", "shear", "virtual")]
+        dynamic = [("sheet", "mass"), ("damping",)]
     elif isinstance(scene.tissue.foundation, Foundation):
-        every[2:3] = [("tissue", "foundation", "young"), ("tissue", "foundation", "depth")]
-    for path in every if scene.time.at_rest else every + moving:
+        static[2:3] = [("tissue", "foundation", "young"), ("tissue", "foundation", "depth")]
+    for path in static if scene.time.at_rest else static + dynamic:
         value = _value(scene, path)
         if value and not isinstance(value, str):
             yield path
@@ -155,91 +179,93 @@ def _value(section: Any, path: tuple[str, ...]) -> Any:
     return section
 
 
-def _with(section: Any, path: tuple[str, ...], value: complex) -> Any:
-    """Change a number of a scene without checking it."""
+def _with_value(section: Any, path: tuple[str, ...], value: complex) -> Any:
+    """Replace a number of a scene without validation."""
     assert isinstance(section, Section)
     name, *inner = path
-    changed = {name: _with(getattr(section, name), tuple(inner), value) if inner else value}
+    changed = {name: _with_value(getattr(section, name), tuple(inner), value) if inner else value}
     return BaseModel.model_copy(section, update=changed)
 
 
-class LoadSlopes:
-    """Derivatives by the loads of the probes, added up from some steps to the next.
+class LoadGradient:
+    """Derivatives of a loss by the loads of the probes, accumulated over blocks of steps.
 
     Attributes:
-        by_key: derivatives by the paths of keys, as in `Derivatives`.
+        by_key: Derivatives by the paths of keys, as in `Derivatives`.
     """
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
         self.by_key: dict[str, float | Array] = {}
-        self._own = {
+        self._slots = {
             index: [n for n, slot in enumerate(plan.slots) if slot.probe == index]
             for index in sorted({slot.probe for slot in plan.slots})
         }
-        for index in self._own:
+        for index in self._slots:
             probe = plan.scene.probes[index]
-            self.by_key[f"probes.{index}.{_force(probe)}"] = np.zeros(3)
+            self.by_key[f"probes.{index}.{_force_key(probe)}"] = np.zeros(3)
             self.by_key[f"probes.{index}.load"] = np.zeros(len(probe.load))
             self.by_key[f"probes.{index}.at"] = np.zeros((*np.shape(probe.at)[:-1], 2))
 
-    def add(self, schedule_of: Callable[[Plan], Schedule], pushes: Array, times: tuple[float, float]) -> None:
-        """Add the derivatives by some steps.
+    def add(self, schedule_of: Callable[[Plan], Schedule], by_slot: Array, times: tuple[float, float]) -> None:
+        """Add the derivatives by the loads of some steps.
 
         Args:
-            schedule_of: gives the loads of these steps, of a plan with other loads.
-            pushes: derivatives by the forces at the control points, and by the control points; (steps, slots, 5).
-            times: no load before or after these times enters the steps [s].
+            schedule_of: Returns the schedule of these steps for a plan with other loads.
+            by_slot: Derivatives by the force and by the control point of every slot, shape (steps, slots, 5).
+            times: Interval that contains all loads of these steps [s].
         """
         height, width = self._plan.scene.sheet.size
-        for index, own in self._own.items():
-            probe, by_force, by_place = self._plan.scene.probes[index], pushes[:, own, :3], pushes[:, own, 3:]
-            unit = schedule_of(self._with_probe(index, {_force(probe): (1.0, 1.0, 1.0)})).strength
-            self._at(index, _force(probe))[:] += (by_force * unit).sum(axis=(0, 1))
+        for index, slots in self._slots.items():
+            probe, by_force, by_point = self._plan.scene.probes[index], by_slot[:, slots, :3], by_slot[:, slots, 3:]
+            unit = schedule_of(self._with_probe(index, {_force_key(probe): (1.0, 1.0, 1.0)})).strength
+            self._derivatives(index, _force_key(probe))[:] += (by_force * unit).sum(axis=(0, 1))
             keys = [time for time, _ in probe.load]
-            for n in _acting(keys, times):
+            for n in _active_keys(keys, times):
                 load = tuple((time, float(m == n)) for m, time in enumerate(keys))
                 unit = schedule_of(self._with_probe(index, {"load": load})).strength
-                self._at(index, "load")[n] += (by_force * unit).sum()
-            places = self._at(index, "at").reshape(-1, 2)
-            at = control_points(probe, self._plan.scene.sheet)[0].tolist()
-            # A control point is held before its first key, too.
-            for n in _acting(at, times, before=True):
-                share = schedule_of(self._with_place(index, n)).point
-                places[n] += (by_place * share).sum(axis=(0, 1)) * (width, -height)
+                self._derivatives(index, "load")[n] += (by_force * unit).sum()
+            by_position = self._derivatives(index, "at").reshape(-1, 2)
+            keys = control_points(probe, self._plan.scene.sheet)[0].tolist()
+            # The first position also holds before its keyframe.
+            for n in _active_keys(keys, times, before=True):
+                share = schedule_of(self._with_unit_position(index, n)).point
+                by_position[n] += (by_point * share).sum(axis=(0, 1)) * (width, -height)
 
-    def _at(self, index: int, name: str) -> Array:
-        slope = self.by_key[f"probes.{index}.{name}"]
-        assert isinstance(slope, np.ndarray)
-        return slope
+    def _derivatives(self, index: int, name: str) -> Array:
+        derivatives = self.by_key[f"probes.{index}.{name}"]
+        assert isinstance(derivatives, np.ndarray)
+        return derivatives
 
     def _with_probe(self, index: int, changes: dict[str, Any]) -> Plan:
-        """Change a probe, and leave the slots of the others out."""
+        """Change a probe, and remove the slots of all others."""
         scene, slots = self._plan.scene, self._plan.slots
         probes = list(scene.probes)
         probes[index] = probes[index].model_copy(update=changes)
         changed = scene.model_copy(update={"probes": tuple(probes)})
-        return replace(self._plan, scene=changed, slots=tuple(slots[n] for n in self._own[index]))
+        return replace(self._plan, scene=changed, slots=tuple(slots[n] for n in self._slots[index]))
 
-    def _with_place(self, index: int, key: int) -> Plan:
-        """Put a key of a control point to (1, 1) m, all others to the middle; where it jumps stays as it is."""
+    def _with_unit_position(self, index: int, key: int) -> Plan:
+        """Set a position of a control point to (1, 1) m and all others to 0; jumps stay in place."""
         plan, slots = self._with_probe(index, {}), []
         for slot in plan.slots:
             ends = np.cumsum([len(segment.times) for segment in slot.segments])
             unit = np.zeros((ends[-1], 2))
             unit[key] = 1.0
             points = np.split(unit, ends[:-1])
-            segments = [ProbeSegment(one.times, own) for one, own in zip(slot.segments, points, strict=True)]
+            segments = [
+                ProbeSegment(segment.times, positions) for segment, positions in zip(slot.segments, points, strict=True)
+            ]
             slots.append(replace(slot, segments=tuple(segments)))
         return replace(plan, slots=tuple(slots))
 
 
-def _force(probe: Probe) -> str:
+def _force_key(probe: Probe) -> str:
     return "force" if probe.total is None else "total"
 
 
-def _acting(keys: list[float], times: tuple[float, float], *, before: bool = False) -> Iterator[int]:
-    """List the keys of a piecewise linear function that matter between two times; the last holds on."""
+def _active_keys(keys: list[float], times: tuple[float, float], *, before: bool = False) -> Iterator[int]:
+    """List the keyframes that affect a piecewise linear function in an interval; the last value holds on."""
     for n in range(len(keys)):
         begin = keys[max(0, n - 1)] if n or not before else -np.inf
         end = keys[n + 1] if n + 1 < len(keys) else np.inf

@@ -1,7 +1,4 @@
-"""A sheet and its adjoint: where it goes, and the derivatives of a loss of that by all numbers of its scene.
-
-The gradient of a loss by the numbers of a scene.
-"""
+"""Gradient of a loss by the numbers of a scene: the loss depends on the positions of all frames."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError, MsmError, Pause, SceneError, as_array, is_real_array
-from taichi_msm.gradients.chain_rule import Derivatives, derivatives
+from taichi_msm.gradients.chain_rule import Derivatives, scene_derivatives
 from taichi_msm.gradients.motion import MotionAdjoint, motion_bytes
 from taichi_msm.gradients.rest import RestAdjoint
 from taichi_msm.load.check import check_scene
@@ -29,32 +26,38 @@ from taichi_msm.system.runtime import Device
 
 Array = NDArray[np.float64]
 
-# Arrays of the positions of every frame at one time: displacements, positions, the loss's derivative, and their copies.
+# Number of arrays of the size of all positions that exist at a time: displacements, positions, the derivative of the
+# loss, and their copies.
 FRAME_COPIES = 4
 
-# Bytes per point of a sparse solution at rest: 10,400 were measured with 81 x 81 points, 13,600 with 161 x 161.
-SOLUTION_BYTES = 14_000
+# Memory of a sparse solution per mass point [bytes]: measured were 10,400 for 81 x 81 mass points and 13,600 for
+# 161 x 161.
+SOLUTION_BYTES_PER_NODE = 14_000
 
 
 def require_differentiable(plan: Plan) -> None:
-    """Make sure that a scene has a gradient; SceneError: it has tools with a path."""
+    """Check that a scene has a gradient.
+
+    Raises:
+        SceneError: When it has position-controlled tools.
+    """
     for tool in plan.tools:
-        said = "a tool with a path has no gradient, as points meet and leave it; fit such scenes by differences"
-        raise SceneError([f"probes.{tool.probe}.path: {said}"])
+        reason = "a tool with a path has no gradient, as points meet and leave it; fit such scenes by differences"
+        raise SceneError([f"probes.{tool.probe}.path: {reason}"])
 
 
-def mapped(plan: Plan) -> Plan:
-    """Give a plan a map of the stiffness, of factors 1 where it has none, and steps in f64."""
+def with_stiffness_map(plan: Plan) -> Plan:
+    """Return a plan in f64 with a stiffness map, whose factors are 1 for a scene without a map."""
     material, (rows, cols) = plan.material, plan.scene.sheet.points
     factors = np.ones((rows - 1, cols - 1)) if material.factors is None else material.factors
     return replace(plan.with_grid(precision="f64"), material=replace(material, factors=factors))
 
 
 def _require_memory(plan: Plan) -> None:
-    """Raise SceneError unless the adjoint and the positions of every frame, of which there are some copies, fit."""
+    """Raise SceneError unless the adjoint and the positions of all frames fit in memory."""
     frames, points = plan.grid.frames + 1, math.prod(plan.scene.sheet.points)
     needed = FRAME_COPIES * 3 * 8 * frames * points
-    needed += SOLUTION_BYTES * points if plan.scene.time.at_rest else motion_bytes(plan)
+    needed += SOLUTION_BYTES_PER_NODE * points if plan.scene.time.at_rest else motion_bytes(plan)
     if needed > (free := available_memory()):
         raise SceneError([
             f"a gradient by {points} points in {frames} frames and {plan.grid.steps} steps takes about "
@@ -64,20 +67,20 @@ def _require_memory(plan: Plan) -> None:
 
 
 class Adjoint:
-    """A compiled sheet that is run and differentiated any number of times, in f64; a map of its stiffness may change.
+    """Compiled sheet in f64 that can be run and differentiated repeatedly, also with another stiffness map.
 
     Args:
-        plan: of the scene.
-        device: a CPU.
-        cores: number of cores that it may use; None: all.
+        plan: Plan of the scene.
+        device: Device to run on, a CPU.
+        cores: Number of CPU cores; None for all.
 
     Raises:
-        SceneError: when a probe has a path, or the memory does not suffice.
+        SceneError: When a probe has a path, or the memory does not suffice.
     """
 
     def __init__(self, plan: Plan, device: Device, cores: int | None = None) -> None:
         require_differentiable(plan)
-        self._plan = mapped(plan)
+        self._plan = with_stiffness_map(plan)
         _require_memory(self._plan)
         self._sheet: MotionAdjoint | RestAdjoint
         if plan.scene.time.at_rest:
@@ -90,15 +93,15 @@ class Adjoint:
         """Run the scene.
 
         Args:
-            factors: of the stiffness of every cell, shape (rows - 1, cols - 1), in the place of those of the scene.
-            pause: called some times a second; what it raises stops here, and nothing has run.
+            factors: Stiffness factors of the cells, shape (rows - 1, cols - 1), which replace those of the scene.
+            pause: Called several times a second; an exception from it ends the run, which has no derivatives then.
 
         Returns:
-            Positions of every frame [m], shape (F + 1, rows, cols, 3).
+            Positions at every frame [m], shape (F + 1, rows, cols, 3).
 
         Raises:
-            ArgumentError: when the factors are not positive numbers of that shape, or too large for the step.
-            DivergedError: when the simulation diverges.
+            ArgumentError: When the factors are not positive numbers of that shape, or too large for the step.
+            DivergedError: When the simulation diverges.
         """
         self._ran = False
         plan = self._plan if factors is None else self._with_factors(factors)
@@ -107,35 +110,38 @@ class Adjoint:
         self._ran = True
         return rest_positions(plan.scene.sheet) + displacements
 
-    def backward(self, slope: Array, pause: Pause = lambda: None) -> Derivatives:
+    def backward(self, by_position: Array, pause: Pause = lambda: None) -> Derivatives:
         """Differentiate a loss at the last `run`.
 
         Args:
-            slope: derivative of the loss by the positions of every frame, shape (F + 1, rows, cols, 3).
-            pause: called some times a second; what it raises stops here.
+            by_position: Derivative of the loss by the positions at every frame, shape (F + 1, rows, cols, 3).
+            pause: Called several times a second; an exception from it ends the differentiation.
+
+        Returns:
+            Derivatives by the numbers of the scene.
 
         Raises:
-            ArgumentError: when it is not an array of finite numbers of that shape.
-            MsmError: when nothing has run.
+            ArgumentError: When it is not an array of finite numbers of that shape.
+            MsmError: When nothing has run.
         """
         if not self._ran:
             raise MsmError("nothing has run yet that could be differentiated; call run first")
-        plan, slope = self._sheet.plan, as_array(slope, "slope")
+        plan, by_position = self._sheet.plan, as_array(by_position, "slope")
         shape = plan.grid.frames + 1, *plan.scene.sheet.points, 3
-        if not is_real_array(slope, shape) or not np.isfinite(slope).all():
+        if not is_real_array(by_position, shape) or not np.isfinite(by_position).all():
             raise ArgumentError(
-                f"the loss's derivative: {slope.dtype} of shape {slope.shape}; take finite numbers of shape {shape}, "
-                "that of the positions"
+                f"the loss's derivative: {by_position.dtype} of shape {by_position.shape}; take finite numbers of "
+                f"shape {shape}, that of the positions"
             )
-        return derivatives(plan, *self._sheet.backward(np.asarray(slope, float), pause))
+        return scene_derivatives(plan, *self._sheet.backward(np.asarray(by_position, float), pause))
 
     def _with_factors(self, factors: Array) -> Plan:
-        """Change the map of the stiffness."""
+        """Replace the stiffness map."""
         plan, factors = self._plan, as_array(factors, "factors")
         assert plan.material.factors is not None
-        shape, least = plan.material.factors.shape, plan.material.tension
-        if not is_real_array(factors, shape) or not (np.isfinite(factors) & (factors > least)).all():
-            raise ArgumentError(f"factors: take numbers above {least:g}, of shape {shape}")
+        shape, lower_bound = plan.material.factors.shape, plan.material.tension
+        if not is_real_array(factors, shape) or not (np.isfinite(factors) & (factors > lower_bound)).all():
+            raise ArgumentError(f"factors: take numbers above {lower_bound:g}, of shape {shape}")
         material = replace(plan.material, factors=np.asarray(factors, float))
         limit = stable_step(material, plan.scene.sheet, plan.scene.time.damping_difference)
         if not plan.scene.time.at_rest and plan.grid.step > limit:
@@ -146,47 +152,48 @@ class Adjoint:
         return replace(plan, material=material, stable_step=limit)
 
 
-pass  # REMOVED
-
-# Gives the value of a loss and its derivative by the positions, both of the positions of every frame.
+# Function of the positions at every frame that returns the value of a loss and its derivative by them.
 Loss = Callable[[Array], tuple[float, Array]]
 
 
 @dataclass(frozen=True)
 class Gradient(Derivatives):
-    """A loss and its derivatives by the numbers of a scene; `numbers` and `maps` as below.
+    """Value of a loss, and its derivatives by the numbers of a scene.
 
     Attributes:
-        numbers: derivatives by the paths of keys: by material numbers that are not 0, such as tissue.young; by the
-            components of a force, such as probes.0.total, shape (3,); by the percents of a load's keys, such as
-            probes.0.load, shape (keys,); and by across and down of a control point, such as probes.0.at, shape (2,), or
-            (keys, 2) where it has keys.
-        maps: derivatives by the factors of maps, also where the scene has none, which is a factor of 1 everywhere:
-            tissue.map or springs.map, of every cell, shape (rows - 1, cols - 1); with a foundation also
-            tissue.foundation_map, of every point, shape (rows, cols).
-        value: of the loss.
+        numbers: Derivatives by the paths of keys: by material numbers other than 0, such as tissue.young; by the
+            components of a force, such as probes.0.total, shape (3,); by the percents of a load, such as probes.0.load,
+            shape (keyframes,); and by across and down of a control point, such as probes.0.at, shape (2,), or
+            (keyframes, 2) for a moving one.
+        maps: Derivatives by the factors of maps, where a scene without a map has the factor 1 everywhere: tissue.map or
+            springs.map, by cell, shape (rows - 1, cols - 1); with a foundation also tissue.foundation_map, by mass
+            point, shape (rows, cols).
+        value: Value of the loss.
     """
 
     value: float
 
 
 def gradient(scene: Scene | Mapping[str, Any], loss: Loss, threads: int | None = None) -> Gradient:
-    """Differentiate a loss of where the points go by the numbers of a scene, in f64, exactly but for rounding.
+    """Differentiate a loss of the positions of all frames by the numbers of a scene, in f64, exactly but for rounding.
 
-    The steps are as the scene's numbers make them, and do not change with them. Neither sizes, times nor radii have
-    derivatives. A scene with tolerances is resolved first.
+    The time step follows from the scene and is held constant. There are no derivatives by sizes, times or radii. A
+    scene with tolerances is resolved first.
 
     Args:
-        scene: what `load_scene` returned, or the same as a mapping.
-        loss: takes the positions of every frame [m], shape (F + 1, rows, cols, 3), and returns its value and its
-            derivative by them, an array of their shape.
-        threads: number of CPU threads; None takes every core.
+        scene: Scene from `load_scene`, or the same as a mapping.
+        loss: Function of the positions at every frame [m], shape (F + 1, rows, cols, 3), that returns its value and its
+            derivative by them, an array of the same shape.
+        threads: Number of CPU threads; None for every core.
+
+    Returns:
+        The value of the loss and its derivatives.
 
     Raises:
-        SceneError: when the scene cannot be run, or a tool has a path.
-        ArgumentError: when the loss returns something else.
-        DivergedError: when the simulation diverges.
-        MsmError: when a sheet at rest has no stiffness against some motion.
+        SceneError: When the scene cannot be run, or a tool has a path.
+        ArgumentError: When the loss returns something else.
+        DivergedError: When the simulation diverges.
+        MsmError: When a quasi-static sheet has no stiffness against some motion.
 
     Example:
         >>> from taichi_msm import gradient, load_scene
@@ -195,10 +202,10 @@ def gradient(scene: Scene | Mapping[str, Any], loss: Loss, threads: int | None =
         ...     slope = 0 * position
         ...     slope[-1, 10, 10, 2] = -1
         ...     return -position[-1, 10, 10, 2], slope
-        >>> found = gradient(scene, depth)
-        >>> sorted(found.maps)
+        >>> result = gradient(scene, depth)
+        >>> sorted(result.maps)
         ['tissue.foundation_map', 'tissue.map']
-        >>> bool(found.numbers["tissue.young"] < 0 < found.numbers["probes.0.load"][1])
+        >>> bool(result.numbers["tissue.young"] < 0 < result.numbers["probes.0.load"][1])
         True
     """
     if not callable(loss):
@@ -211,12 +218,12 @@ def gradient(scene: Scene | Mapping[str, Any], loss: Loss, threads: int | None =
     position.flags.writeable = False
     returned = loss(position)
     if not (isinstance(returned, tuple) and len(returned) == 2):
-        said = f"returned {type(returned).__name__}; return a pair, its value and its derivative by the positions"
-        raise ArgumentError(f"loss: {said}")
-    value, slope = returned
-    given = as_array(value, "loss")
-    if not is_real_array(given, ()) or not np.isfinite(given):
-        said = f"an array of shape {given.shape}" if given.ndim else repr(value)
-        raise ArgumentError(f"loss: its value is {said}; return a finite number")
-    found = adjoint.backward(slope)
-    return Gradient(found.numbers, found.maps, float(value))
+        reason = f"returned {type(returned).__name__}; return a pair, its value and its derivative by the positions"
+        raise ArgumentError(f"loss: {reason}")
+    value, by_position = returned
+    array = as_array(value, "loss")
+    if not is_real_array(array, ()) or not np.isfinite(array):
+        description = f"an array of shape {array.shape}" if array.ndim else repr(value)
+        raise ArgumentError(f"loss: its value is {description}; return a finite number")
+    derivatives = adjoint.backward(by_position)
+    return Gradient(derivatives.numbers, derivatives.maps, float(value))

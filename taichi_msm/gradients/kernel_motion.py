@@ -1,18 +1,19 @@
-"""Kernel 1 backward in time: the steps of a segment once more, with every shape kept, and then their adjoint.
+"""Kernels of the adjoint of the time stepping: one steps forward and stores every shape, one sweeps backward.
 
-A step is d' = keep d + G F(u), u' = u + d', where G is the gain over a point's share of mass, 0 where it is fixed. Let
-e be the derivative of the loss by d'. Then p = G e follows, from the last step to the first,
+A step is d' = keep d + G F(u), u' = u + d', where G is the gain over the area share of a mass point, 0 where it is
+fixed. Let e be the derivative of the loss by d'. Then p = G e follows, from the last step to the first,
 
     p_n = p_{n+1} + q_n,    q_n = keep q_{n+1} + G (F'(u_n) p_{n+1} + l_n)
 
-where F' is the tangent, which is symmetric, and l_n the derivative of the loss by u_n itself: the steps of a sheet with
-the tangents of the springs for springs. So the adjoint is swept like the sheet. What enters the force of step n changes
-the loss by the product of p_{n+1} with the change of the force; these products are added up on the way.
+where F' is the tangent stiffness, which is symmetric, and l_n the derivative of the loss by u_n itself. These are the
+steps of a sheet whose springs are the tangents of the springs, so the adjoint is swept like the sheet. A number that
+enters the force of step n changes the loss by the product of p_{n+1} with the change of the force; these products are
+accumulated during the sweep.
 
-Every worker has a band of rows, and steps it from one buffer into another as soon as its neighbours have come as far. A
-row is swept from left to right, cell by cell. Each spring is evaluated once, except those between two bands, which both
-workers evaluate alike; sums are kept row by row. So the bits do not depend on the number of workers. Where a worker
-waits in vain it gives up, and one worker goes on for all (`bands`).
+Every worker has a band of rows, and steps it from one buffer into another as soon as its neighbours have reached the
+same step. A row is swept from left to right, cell by cell. Each spring is evaluated once, except that both workers
+evaluate those between their bands; sums are stored row by row. Hence the bits do not depend on the number of workers. A
+worker that waits too long gives up, and a single worker finishes for all (`bands`).
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -31,110 +32,142 @@ from taichi_msm.terms.foundation import FoundationTerm
 from taichi_msm.terms.loads import ProbeTerm
 from taichi_msm.terms.springs import ALONG_COLUMN, ALONG_ROW, DIAGONAL, SpringTerm
 
-# The sizes that a launch is given: steps to take; workers; rows of the sheet; columns of a strip; the first of the
-# shapes, or at the adjoint the last; where the arrays have moments, and where the forces carried to the next row, of
-# which a worker has so many rows; how many times a worker looks for its neighbour before it gives up; which of two
-# buffers holds p; whether the last step adds the derivative of the loss.
+# Indices of the sizes of a launch: number of steps; number of workers; rows of the sheet; columns of a strip; first of
+# the shapes, or in the sweep the last; row of the arrays where the moments begin, and where the forces carried to the
+# next row begin; rows of carried forces per worker; number of times that a worker checks its neighbour before it gives
+# up; which of two buffers contains p; whether the last step adds the derivative of the loss.
 COUNT, WORKERS, ROWS, STRIP, SHAPE, MOMENT_ROW, CARRY, CARRIED_ROWS, PATIENCE, BUFFER, WITH_LOSS, SIZES = range(12)
 
-# Integers of a worker in the array `progress`: the first is how many steps it has taken.
+# Integers per worker in the array `progress`, of which the first is the number of its finished steps.
 STRIDE = 16
 
-# What the adjoint's arrays hold, by multiples of the sheet's rows: p in two buffers, q, and the derivative of the loss.
-BUFFERS, LAST, LOSS, ADJOINT_PARTS = 0, 2, 3, 4
+# Parts of the adjoint's arrays, in multiples of the sheet's rows: p in two buffers, q, and the derivative of the loss.
+BUFFERS, ADJOINT_CHANGE, LOSS, ADJOINT_PARTS = 0, 2, 3, 4
 
-# What is added up, by multiples of the sheet's rows: the derivatives by k - tau of springs along rows, along columns
-# and of diagonals, and by the logarithm of K, for a share of 1; after them the slopes of the decays of standing slots;
-# and then sums of a row each: of q u, for the derivative by keep; by tau of each family; by the logarithm of D.
-FAMILIES, HELD, SUM_PARTS = 0, 3, 4
-KEPT, TENSE, BENT, ROW_SUMS = 0, 1, 4, 5
+# Parts of the accumulated derivatives, in multiples of the sheet's rows: by k - tau of springs along rows, along
+# columns and of diagonals; and by the logarithm of K, for an area share of 1. The derivatives of the decays of standing
+# slots follow.
+SPRING_PARTS, FOUNDATION_PART, SUM_PARTS = 0, 3, 4
 
-# The derivatives by the force and by the control point of a slot, in every step and row.
-PUSHED = 5
+# Indices of the sums of a row, which follow the parts: of q u, for the derivative by keep; the derivatives by tau of
+# each family; the derivative by the logarithm of D.
+KEEP_SUM, TENSION_SUMS, BENDING_SUM, ROW_SUMS = 0, 1, 4, 5
+
+# Number of derivatives by the force and by the control point of a slot, in every step and row.
+LOAD_DERIVATIVES = 5
 
 
 class AdjointSheet(NamedTuple):
-    """A `KernelSheet` with what the adjoint needs besides."""
+    """Arrays of a `KernelSheet`, extended for the adjoint.
 
-    u: Any  # here p, q and the derivative of the loss, with bending also moments of p
+    Attributes:
+        u: p, q and the derivative of the loss, and with bending moments of p.
+        by_column: As in `KernelSheet`, like the next five.
+        stiffness: Stiffness of the springs.
+        fields: Fields of the mass points.
+        numbers: Numbers of the sheet.
+        rows: Number of rows.
+        width: Entries of a row.
+        shapes: Displacements of the steps of a segment, three arrays.
+        derivatives: Accumulated derivatives.
+    """
+
+    u: Any
     by_column: Any
     stiffness: Any
     fields: Any
-    constants: Any
+    numbers: Any
     rows: Any
     width: Any
-    shapes: Any  # displacements of the steps of a segment, three arrays
-    found: Any  # what is added up
+    shapes: Any
+    derivatives: Any
 
 
-class Strip(NamedTuple):
-    """A worker's band of rows at a step, within a kernel."""
+class AdjointBand(NamedTuple):
+    """A worker's band of rows at a step, within a kernel.
 
-    # low, high: its first row, and the row after its last
+    Attributes:
+        low: First row.
+        high: Row after the last one.
+        source: Row where the buffer that is read begins.
+        target: Row where the buffer that is written begins.
+        shape: Row where the displacements begin.
+        carry: Row of the forces that are carried to the next row.
+        moments: Row where the moments begin.
+        n: Index of the step in the table of loads.
+        with_loss: Whether the derivative of the loss is added.
+    """
+
     low: Any
     high: Any
-    before: Any  # the row where the buffer begins that is read
-    after: Any  # where the one begins that is written
-    shape: Any  # where the displacements begin
-    carry: Any  # where the forces carried to the next row are
-    moments: Any  # where moments are
-    n: Any  # of the step, in the table of loads
-    with_loss: Any  # whether the derivative of the loss is added
+    source: Any
+    target: Any
+    shape: Any
+    carry: Any
+    moments: Any
+    n: Any
+    with_loss: Any
 
 
-class Tables(NamedTuple):
-    """The loads of every step, and where the derivatives by them go."""
+class LoadTables(NamedTuple):
+    """Loads of every step, and the derivatives by them."""
 
     loads: Any
-    pushes: Any
+    by_load: Any
 
 
 @cache
-def kernels(code: KernelConfig, *, parallel: bool) -> tuple[Callable[..., None], Callable[..., None]]:
-    """Make the kernels that step forward and keep every shape, and that sweep backward."""
-    return _recording(code, parallel=parallel), _sweeping(code, parallel=parallel)
+def adjoint_kernels(code: KernelConfig, *, parallel: bool) -> tuple[Callable[..., None], Callable[..., None]]:
+    """Build the kernel that steps forward and stores every shape, and the one that sweeps backward.
 
+    Args:
+        code: Compile-time configuration of the steps.
+        parallel: Whether the workers run in parallel.
 
-def _banded(take: Callable[..., None], *, parallel: bool) -> Callable[..., None]:
-    """Make the function that takes the steps of a launch with a worker, or alone for all workers.
-
-    take(sheet, loads, sizes, worker, k) takes step k with the worker's band.
+    Returns:
+        Both kernels, which share the arguments `sizes` (int64, in the order of `COUNT`) and `progress` (int64, `STRIDE`
+        per worker).
     """
+    return _storing_kernel(code, parallel=parallel), _sweeping_kernel(code, parallel=parallel)
+
+
+def _banded(step_band: Callable[..., None], *, parallel: bool) -> Callable[..., None]:
+    """Build the function that runs the steps of a launch for a worker, or for all workers in a single one."""
 
     @ti.func
-    def has_come(progress: ti.template(), sizes: ti.template(), worker, k):
-        """Wait until a worker, if there is such, has taken k steps, but not for long; returns whether it has."""
-        come = True
+    def wait_for(progress: ti.template(), sizes: ti.template(), worker, k):
+        """Wait for a worker, if it exists, to finish k steps; return whether it did so in time."""
+        finished = True
         if 0 <= worker < sizes[WORKERS]:
-            steps, looks = ti.atomic_add(progress[STRIDE * worker], 0), 0
-            while steps < k and looks < sizes[PATIENCE]:
+            steps, checks = ti.atomic_add(progress[STRIDE * worker], 0), 0
+            while steps < k and checks < sizes[PATIENCE]:
                 steps = ti.atomic_add(progress[STRIDE * worker], 0)
-                looks += 1
-            come = steps >= k
-        return come
+                checks += 1
+            finished = steps >= k
+        return finished
 
     @ti.func
-    def work(sheet: ti.template(), loads: ti.template(), sizes: ti.template(), progress: ti.template(), worker):
+    def run_worker(sheet: ti.template(), loads: ti.template(), sizes: ti.template(), progress: ti.template(), worker):
         if ti.static(parallel):
-            k, goes = ti.cast(progress[STRIDE * worker], ti.i32), True
-            while goes and k < sizes[COUNT]:
-                goes = has_come(progress, sizes, worker - 1, k) and has_come(progress, sizes, worker + 1, k)
-                if goes:
-                    take(sheet, loads, sizes, worker, k)
+            k, ready = ti.cast(progress[STRIDE * worker], ti.i32), True
+            while ready and k < sizes[COUNT]:
+                ready = wait_for(progress, sizes, worker - 1, k) and wait_for(progress, sizes, worker + 1, k)
+                if ready:
+                    step_band(sheet, loads, sizes, worker, k)
                     ti.atomic_add(progress[STRIDE * worker], 1)
                     k += 1
         else:
             for k in range(ti.cast(sizes[COUNT], ti.i32)):
-                for other in range(ti.cast(sizes[WORKERS], ti.i32)):
-                    if progress[STRIDE * other] <= k:
-                        take(sheet, loads, sizes, other, k)
-                        progress[STRIDE * other] = k + 1
+                for each in range(ti.cast(sizes[WORKERS], ti.i32)):
+                    if progress[STRIDE * each] <= k:
+                        step_band(sheet, loads, sizes, each, k)
+                        progress[STRIDE * each] = k + 1
 
-    return work
+    return run_worker
 
 
-def _storing(code: KernelConfig) -> list[Callable[..., None]]:
-    """Make the function that stores the moments that row i of a band needs, if any: at first of three, then of one."""
+def _moment_storing(code: KernelConfig) -> list[Callable[..., None]]:
+    """Build the function that stores the moments for row i of a band: first those of three rows, then of one more."""
     bending, join_strips = code.get(BendingTerm), build_join_strips(code)
     if bending is None:
         return []
@@ -144,18 +177,18 @@ def _storing(code: KernelConfig) -> list[Callable[..., None]]:
     def store_moments(sheet: ti.template(), band: ti.template(), i):
         for ahead in range(ti.select(i == band.low, i - 1, i + 1), i + 2):
             last = sheet.rows - 1
-            before = band.before + ti.max(0, ti.min(ahead - 1, last))
-            here, after = band.before + ti.max(0, ti.min(ahead, last)), band.before + ti.min(ahead + 1, last)
+            above = band.source + ti.max(0, ti.min(ahead - 1, last))
+            row, below = band.source + ti.max(0, ti.min(ahead, last)), band.source + ti.min(ahead + 1, last)
             target = band.moments + (ahead + MOMENT_ROWS) % MOMENT_ROWS
             for b in range(1, sheet.width - 1):
-                store_moment(sheet, ahead, before, here, after, b, target)
+                store_moment(sheet, ahead, above, row, below, b, target)
             join_strips(sheet.u, target, sheet.width)
 
     return [store_moments]
 
 
-def _clearing(code: KernelConfig) -> Callable[..., None]:
-    """Make Taichi's function clear(sheet, row), for a row of u."""
+def _row_clearing(code: KernelConfig) -> Callable[..., None]:
+    """Build the function that sets a row of u to 0."""
     vector = code.vector
 
     @ti.func
@@ -167,11 +200,11 @@ def _clearing(code: KernelConfig) -> Callable[..., None]:
     return clear
 
 
-def _recording(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
-    """Make the kernel that takes steps, each from one shape to the next."""
+def _storing_kernel(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
+    """Build the kernel that steps forward and stores every shape."""
     real, vector, vectors = code.real, code.vector, code.vectors
     count_of_numbers, join_strips, step = code.first_constant(None), build_join_strips(code), build_point_step(code)
-    clear, storing = _clearing(code), _storing(code)
+    clear, storing = _row_clearing(code), _moment_storing(code)
 
     @ti.func
     def move(sheet: ti.template(), entry: ti.template(), target, force: ti.template(), now: ti.template()):
@@ -180,14 +213,14 @@ def _recording(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
     pass_row = build_pass_row(code, move)
 
     @ti.func
-    def take(sheet: ti.template(), loads: ti.template(), sizes: ti.template(), worker, k):
-        """Take step k of the launch with a band."""
+    def step_band(sheet: ti.template(), loads: ti.template(), sizes: ti.template(), worker, k):
+        """Run step k of the launch for a band."""
         workers = ti.cast(sizes[WORKERS], ti.i32)
         low, high = sheet.rows * worker // workers, sheet.rows * (worker + 1) // workers
         shape = (ti.cast(sizes[SHAPE], ti.i32) + k) * sheet.rows
         carry = ti.cast(sizes[CARRY] + sizes[CARRIED_ROWS] * worker, ti.i32)
         moments = ti.cast(sizes[MOMENT_ROW], ti.i32) + MOMENT_ROWS * worker
-        band = ti.static(Strip(low, high, shape, shape, shape, carry, moments, k, 0))
+        band = ti.static(AdjointBand(low, high, shape, shape, shape, carry, moments, k, 0))
         if low == 0:
             clear(sheet, carry)
         for i in range(ti.max(low - 1, 0), high):
@@ -197,17 +230,17 @@ def _recording(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
             kind = ti.select(i == sheet.rows - 1, 2, ti.select(i == 0, 0, 1))
             exists = ti.cast(i + 1 < sheet.rows, real)
             below = shape + ti.min(i + 1, sheet.rows - 1)
-            before, at = moments + (i + 2) % MOMENT_ROWS, moments + i % MOMENT_ROWS
-            line = ti.static(KernelRow(i, kind, before, at, moments + (i + 1) % MOMENT_ROWS))
+            above, at = moments + (i + 2) % MOMENT_ROWS, moments + i % MOMENT_ROWS
+            line = ti.static(KernelRow(i, kind, above, at, moments + (i + 1) % MOMENT_ROWS))
             up = 0 - sheet.constants[DY]
             pass_row(sheet, sheet.u, carry, line, shape + i, below, exists, up, loads, k, i >= low)
             if i >= low:
                 join_strips(sheet.u, shape + sheet.rows + i, sheet.width)
 
-    work = _banded(take, parallel=parallel)
+    run_worker = _banded(step_band, parallel=parallel)
 
     @ti.kernel
-    def record(
+    def store(
         sizes: ti.types.ndarray(dtype=ti.i64, ndim=1),
         progress: ti.types.ndarray(dtype=ti.i64, ndim=1),
         loads: ti.types.ndarray(dtype=real, ndim=2),
@@ -223,90 +256,95 @@ def _recording(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
                 constants = [constants_of[n][0] for n in ti.static(range(count_of_numbers))]
                 u, d = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z))
                 sheet = ti.static(KernelSheet(u, d, by_column, stiffness, fields, constants, rows, width))
-                work(sheet, loads, sizes, progress, index // ITERATIONS_PER_THREAD)
+                run_worker(sheet, loads, sizes, progress, index // ITERATIONS_PER_THREAD)
 
-    return record
+    return store
 
 
 def _row_sweeping(code: KernelConfig) -> Callable[..., None]:
-    """Make the function that takes a row of the adjoint a step backward."""
+    """Build the function that sweeps a row of the adjoint by a step."""
     vector, columns, springs = code.vector, code.first_column(None), code.require(SpringTerm)
-    structural, shear, tense = springs.structural, springs.shear, springs.tense
-    differentiate, (*_, of_row, of_column, of_diagonal) = (
+    structural, shear, tension = springs.structural, springs.shear, springs.tense
+    differentiate, (*_, row_stiffness, column_stiffness, diagonal_stiffness) = (
         springs.build_spring_tangent(code),
         springs.build_spring_forces(code),
     )
     tangents = [add for term in code.terms for add in term.build_tangents(code)]
     reducing = [reduce for term in code.terms for reduce in term.build_damping(code)]
-    probes, holds = code.require(ProbeTerm), code.get(FoundationTerm) is not None
-    curving = [] if code.get(BendingTerm) is None else [build_laplacian(code)]
+    probes, has_foundation = code.require(ProbeTerm), code.get(FoundationTerm) is not None
+    laplacians = [] if code.get(BendingTerm) is None else [build_laplacian(code)]
     sense, slots, standing = probes.build_load_adjoint(code, SUM_PARTS), len(probes.moves), probes.moves.count(False)
-    first_tension, held = code.first_constant(SpringTerm) + 3, code.first_column(FoundationTerm) if holds else 0
+    first_tension = code.first_constant(SpringTerm) + 3
+    foundation = code.first_column(FoundationTerm) if has_foundation else 0
 
     @ti.func
-    def of_spring(sheet: ti.template(), ahead, p, q, x0, y0, length, k, family: ti.template()):
-        """Differentiate the force of entry p on entry q; entries of p and q, of which shapes are `ahead`."""
-        change = [sheet.u[c][p] - sheet.u[c][q] for c in ti.static(range(3))]
-        apart = [sheet.shapes[c][p + ahead] - sheet.shapes[c][q + ahead] for c in ti.static(range(3))]
-        tension = sheet.constants[first_tension + family]
-        return differentiate(apart, change, x0, y0, length, k, tension)
+    def spring_tangent(sheet: ti.template(), offset, p, q, x0, y0, length, k, family: ti.template()):
+        """Differentiate the force of entry p on entry q; their shapes are `offset` entries further on."""
+        p_difference = [sheet.u[c][p] - sheet.u[c][q] for c in ti.static(range(3))]
+        u_difference = [sheet.shapes[c][p + offset] - sheet.shapes[c][q + offset] for c in ti.static(range(3))]
+        tau = sheet.constants[first_tension + family]
+        return differentiate(u_difference, p_difference, x0, y0, length, k, tau)
 
     @ti.func
     def add(array: ti.template(), at, value):
-        # To an array, += would be atomic.
+        # On an array, += would be atomic.
         array[at] = array[at] + value
 
     @ti.func
-    def sweep_row(sheet: ti.template(), band: ti.template(), i, loads: ti.template(), pushes: ti.template()):
-        """Sweep row i of a band; row low - 1 only for what it carries to the next."""
+    def sweep_row(sheet: ti.template(), band: ti.template(), i, loads: ti.template(), by_load: ti.template()):
+        """Sweep row i of a band; row low - 1 only computes the forces that it carries to the next row."""
         width, dx, dy, owned = sheet.width, sheet.constants[DX], sheet.constants[DY], i >= band.low
         diagonal, kind = ti.sqrt(dx * dx + dy * dy), ti.select(i == sheet.rows - 1, 2, ti.select(i == 0, 0, 1))
-        here, below = (band.before + i) * width, (band.before + ti.min(i + 1, sheet.rows - 1)) * width
-        ahead, carry = (band.shape - band.before) * width, band.carry * width
+        entry_row, below = (band.source + i) * width, (band.source + ti.min(i + 1, sheet.rows - 1)) * width
+        offset, carry = (band.shape - band.source) * width, band.carry * width
         sums = [vector(0) for _ in ti.static(range(ROW_SUMS))]
-        pushed = [vector(0) for _ in ti.static(range(PUSHED * slots))]
+        load_sums = [vector(0) for _ in ti.static(range(LOAD_DERIVATIVES * slots))]
         now = [loads[band.n, c] for c in ti.static(range(columns))]
-        # What the cell before an entry adds to it, and to the entry below it.
-        beside, under = [vector(0) for _ in ti.static(range(3))], [vector(0) for _ in ti.static(range(3))]
-        before, at = band.moments + (i + 2) % MOMENT_ROWS, band.moments + i % MOMENT_ROWS
-        line = ti.static(KernelRow(i, kind, before, at, band.moments + (i + 1) % MOMENT_ROWS))
+        # Forces of the previous cell on the current entry, and on the entry below it.
+        to_next, to_below = [vector(0) for _ in ti.static(range(3))], [vector(0) for _ in ti.static(range(3))]
+        above, at = band.moments + (i + 2) % MOMENT_ROWS, band.moments + i % MOMENT_ROWS
+        line = ti.static(KernelRow(i, kind, above, at, band.moments + (i + 1) % MOMENT_ROWS))
         for b in range(width - 1):
             # The cell to the right of the entry: the spring along its upper edge, and its diagonals.
             right = [vector(0) for _ in ti.static(range(5))]
-            to_right, to_left = [vector(0) for _ in ti.static(range(5))], [vector(0) for _ in ti.static(range(5))]
+            falling, rising = [vector(0) for _ in ti.static(range(5))], [vector(0) for _ in ti.static(range(5))]
             if ti.static(structural):
-                k = of_row(sheet, i, kind, b)
-                found = of_spring(sheet, ahead, here + b, here + b + 1, 0 - dx, 0 * dy, dx, k, ALONG_ROW)
+                k = row_stiffness(sheet, i, kind, b)
+                spring = spring_tangent(
+                    sheet, offset, entry_row + b, entry_row + b + 1, 0 - dx, 0 * dy, dx, k, ALONG_ROW
+                )
                 for c in ti.static(range(5)):
-                    right[c] = found[c]
+                    right[c] = spring[c]
             if ti.static(shear):
-                k = of_diagonal(sheet, i + 1, b)
-                falling = of_spring(sheet, ahead, here + b, below + b + 1, 0 - dx, dy, diagonal, k, DIAGONAL)
-                rising = of_spring(sheet, ahead, here + b + 1, below + b, dx, dy, diagonal, k, DIAGONAL)
+                k = diagonal_stiffness(sheet, i + 1, b)
+                down_right = spring_tangent(
+                    sheet, offset, entry_row + b, below + b + 1, 0 - dx, dy, diagonal, k, DIAGONAL
+                )
+                down_left = spring_tangent(sheet, offset, entry_row + b + 1, below + b, dx, dy, diagonal, k, DIAGONAL)
                 for c in ti.static(range(5)):
-                    to_right[c], to_left[c] = falling[c], rising[c]
+                    falling[c], rising[c] = down_right[c], down_left[c]
             if b > 0:
                 down = [vector(0) for _ in ti.static(range(5))]
                 if ti.static(structural):
-                    k = of_column(sheet, i + 1, b)
-                    found = of_spring(sheet, ahead, here + b, below + b, 0 * dx, dy, dy, k, ALONG_COLUMN)
+                    k = column_stiffness(sheet, i + 1, b)
+                    spring = spring_tangent(sheet, offset, entry_row + b, below + b, 0 * dx, dy, dy, k, ALONG_COLUMN)
                     for c in ti.static(range(5)):
-                        down[c] = found[c]
+                        down[c] = spring[c]
                 force = [vector(0) for _ in ti.static(range(3))]
                 for c in ti.static(range(3)):
                     carried = sheet.u[c][carry + b]
-                    force[c] = carried + (beside[c] - right[c]) - (to_right[c] + down[c])
-                    sheet.u[c][carry + b] = (under[c] + to_left[c]) + down[c]
+                    force[c] = carried + (to_next[c] - right[c]) - (falling[c] + down[c])
+                    sheet.u[c][carry + b] = (to_below[c] + rising[c]) + down[c]
                 if owned:
-                    p = [sheet.u[c][here + b] for c in ti.static(range(3))]
-                    u = [sheet.shapes[c][here + ahead + b] for c in ti.static(range(3))]
+                    p = [sheet.u[c][entry_row + b] for c in ti.static(range(3))]
+                    u = [sheet.shapes[c][entry_row + offset + b] for c in ti.static(range(3))]
                     entry = ti.static(Entry(line, b, p))
                     for add_change in ti.static(tangents):
                         add_change(force, sheet, entry, now)
                     gain = now[GAIN] * sheet.by_column[(MOBILITY + kind) * width + b]
-                    q = [sheet.u[c][(LAST * sheet.rows + i) * width + b] for c in ti.static(range(3))]
-                    # The sum of p_{n+1} (u_n - u_{n-1}) over all n, added up in another order: of u_n q_{n+1}.
-                    kept = q[0] * u[0] + q[1] * u[1] + q[2] * u[2]
+                    q = [sheet.u[c][(ADJOINT_CHANGE * sheet.rows + i) * width + b] for c in ti.static(range(3))]
+                    # The sum of p_{n+1} (u_n - u_{n-1}) over all n equals that of u_n q_{n+1}, up to their order.
+                    keep_sum = q[0] * u[0] + q[1] * u[1] + q[2] * u[2]
                     for reduce in ti.static(reducing):
                         reduce(q, sheet)
                     if band.with_loss:
@@ -314,58 +352,59 @@ def _row_sweeping(code: KernelConfig) -> Callable[..., None]:
                             force[c] += sheet.u[c][(LOSS * sheet.rows + i) * width + b]
                     for c in ti.static(range(3)):
                         q[c] += gain * force[c]
-                        sheet.u[c][(LAST * sheet.rows + i) * width + b] = q[c]
-                        sheet.u[c][(band.after + i) * width + b] = p[c] + q[c]
-                    # The derivatives. A spring pulls its ends in opposite directions.
+                        sheet.u[c][(ADJOINT_CHANGE * sheet.rows + i) * width + b] = q[c]
+                        sheet.u[c][(band.target + i) * width + b] = p[c] + q[c]
+                    # A spring pulls its ends in opposite directions.
                     if ti.static(structural):
-                        add(sheet.found, (ALONG_ROW * sheet.rows + i) * width + b, right[3] * (-1.0))
-                        add(sheet.found, (ALONG_COLUMN * sheet.rows + i) * width + b, down[3] * (-1.0))
+                        add(sheet.derivatives, (ALONG_ROW * sheet.rows + i) * width + b, right[3] * (-1.0))
+                        add(sheet.derivatives, (ALONG_COLUMN * sheet.rows + i) * width + b, down[3] * (-1.0))
                     if ti.static(shear):
-                        both = to_right[3] + to_left[3]
-                        add(sheet.found, (DIAGONAL * sheet.rows + i) * width + b, both * (-1.0))
-                    if ti.static(holds):
+                        diagonals = falling[3] + rising[3]
+                        add(sheet.derivatives, (DIAGONAL * sheet.rows + i) * width + b, diagonals * (-1.0))
+                    if ti.static(has_foundation):
                         product = p[0] * u[0] + p[1] * u[1] + p[2] * u[2]
-                        add(sheet.found, (HELD * sheet.rows + i) * width + b, product * (0 - now[held]))
-                    if ti.static(tense):
-                        sums[TENSE + ALONG_ROW] = sums[TENSE + ALONG_ROW] - right[4]
-                        sums[TENSE + ALONG_COLUMN] = sums[TENSE + ALONG_COLUMN] - down[4]
-                        sums[TENSE + DIAGONAL] = sums[TENSE + DIAGONAL] - (to_right[4] + to_left[4])
+                        index = (FOUNDATION_PART * sheet.rows + i) * width + b
+                        add(sheet.derivatives, index, product * (0 - now[foundation]))
+                    if ti.static(tension):
+                        sums[TENSION_SUMS + ALONG_ROW] = sums[TENSION_SUMS + ALONG_ROW] - right[4]
+                        sums[TENSION_SUMS + ALONG_COLUMN] = sums[TENSION_SUMS + ALONG_COLUMN] - down[4]
+                        sums[TENSION_SUMS + DIAGONAL] = sums[TENSION_SUMS + DIAGONAL] - (falling[4] + rising[4])
                     if ti.static(code.by_area):
-                        kept *= sheet.by_column[(AREA_SHARE + kind) * width + b]
-                    sums[KEPT] += kept
-                    sense(pushed, sheet, entry, now)
-                    for laplacian in ti.static(curving):
+                        keep_sum *= sheet.by_column[(AREA_SHARE + kind) * width + b]
+                    sums[KEEP_SUM] += keep_sum
+                    sense(load_sums, sheet, entry, now)
+                    for laplacian in ti.static(laplacians):
                         if kind == 1:
-                            # Between the shapes of rows; and moments of p are D times its Laplacian, 0 at edges.
+                            # The moments of p are D times its Laplacian, and 0 at the border.
                             shape = band.shape + i
                             for c in ti.static(range(3)):
-                                curved = laplacian(
+                                curvature = laplacian(
                                     sheet.shapes[c], width, shape - 1, shape, shape + 1, b,
                                     1 / (dx * dx), 1 / (dy * dy),
                                 )  # fmt: skip
-                                sums[BENT] = sums[BENT] - curved * sheet.u[c][at * width + b]
+                                sums[BENDING_SUM] = sums[BENDING_SUM] - curvature * sheet.u[c][at * width + b]
             for c in ti.static(range(3)):
-                beside[c] = right[c] - to_left[c]
-                under[c] = to_right[c]
+                to_next[c] = right[c] - rising[c]
+                to_below[c] = falling[c]
         if owned:
             first = (SUM_PARTS + 2 * standing) * sheet.rows * width + ROW_SUMS * i
             for n in ti.static(range(ROW_SUMS)):
-                add(sheet.found, first + n, sums[n])
-            for n in ti.static(range(PUSHED * slots)):
-                pushes[band.n, i, n] = pushed[n].sum()
+                add(sheet.derivatives, first + n, sums[n])
+            for n in ti.static(range(LOAD_DERIVATIVES * slots)):
+                by_load[band.n, i, n] = load_sums[n].sum()
 
     return sweep_row
 
 
-def _sweeping(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
-    """Make the kernel that takes steps of the adjoint, from the last to the first."""
+def _sweeping_kernel(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
+    """Build the kernel that sweeps the adjoint, from the last step to the first."""
     real, vector, vectors = code.real, code.vector, code.vectors
-    count_of_numbers, join_strips, storing = code.first_constant(None), build_join_strips(code), _storing(code)
-    clear, sweep_row = _clearing(code), _row_sweeping(code)
+    count_of_numbers, join_strips, storing = code.first_constant(None), build_join_strips(code), _moment_storing(code)
+    clear, sweep_row = _row_clearing(code), _row_sweeping(code)
 
     @ti.func
-    def take(sheet: ti.template(), tables: ti.template(), sizes: ti.template(), worker, k):
-        """Take the k-th step of the launch with a band."""
+    def step_band(sheet: ti.template(), tables: ti.template(), sizes: ti.template(), worker, k):
+        """Run the k-th step of the launch for a band."""
         workers = ti.cast(sizes[WORKERS], ti.i32)
         low, high = sheet.rows * worker // workers, sheet.rows * (worker + 1) // workers
         n = ti.cast(sizes[COUNT], ti.i32) - 1 - k
@@ -374,30 +413,30 @@ def _sweeping(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
         carry = ti.cast(sizes[CARRY] + sizes[CARRIED_ROWS] * worker, ti.i32)
         moments = ti.cast(sizes[MOMENT_ROW], ti.i32) + MOMENT_ROWS * worker
         with_loss = n == 0 and sizes[WITH_LOSS] != 0
-        before, after = buffer * sheet.rows, (1 - buffer) * sheet.rows
-        band = ti.static(Strip(low, high, before, after, shape, carry, moments, n, with_loss))
+        source, target = buffer * sheet.rows, (1 - buffer) * sheet.rows
+        band = ti.static(AdjointBand(low, high, source, target, shape, carry, moments, n, with_loss))
         if low == 0:
             clear(sheet, carry)
         for i in range(ti.max(low - 1, 0), high):
             for store_moments in ti.static(storing):
                 if i >= low:
                     store_moments(sheet, band, i)
-            sweep_row(sheet, band, i, tables.loads, tables.pushes)
+            sweep_row(sheet, band, i, tables.loads, tables.by_load)
             if i >= low:
-                join_strips(sheet.u, after + i, sheet.width)
+                join_strips(sheet.u, target + i, sheet.width)
 
-    work = _banded(take, parallel=parallel)
+    run_worker = _banded(step_band, parallel=parallel)
 
     @ti.kernel
     def sweep(
         sizes: ti.types.ndarray(dtype=ti.i64, ndim=1),
         progress: ti.types.ndarray(dtype=ti.i64, ndim=1),
         loads: ti.types.ndarray(dtype=real, ndim=2),
-        pushes: ti.types.ndarray(dtype=real, ndim=3),
+        by_load: ti.types.ndarray(dtype=real, ndim=3),
         p_x: vectors, p_y: vectors, p_z: vectors,
         u_x: vectors, u_y: vectors, u_z: vectors,
         constants_of: ti.types.ndarray(dtype=vector, ndim=1),
-        by_column: vectors, stiffness: vectors, fields: vectors, found: vectors,
+        by_column: vectors, stiffness: vectors, fields: vectors, derivatives: vectors,
     ):  # fmt: skip
         ti.loop_config(serialize=not parallel)
         for index in range(ti.cast(sizes[WORKERS], ti.i32) * ITERATIONS_PER_THREAD):
@@ -405,16 +444,16 @@ def _sweeping(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
                 rows, width = ti.cast(sizes[ROWS], ti.i32), ti.cast(sizes[STRIP], ti.i32) + 2
                 constants = [constants_of[n][0] for n in ti.static(range(count_of_numbers))]
                 p, u = ti.static((p_x, p_y, p_z), (u_x, u_y, u_z))
-                sheet = ti.static(AdjointSheet(p, by_column, stiffness, fields, constants, rows, width, u, found))
-                tables = ti.static(Tables(loads, pushes))
-                work(sheet, tables, sizes, progress, index // ITERATIONS_PER_THREAD)
+                sheet = ti.static(AdjointSheet(p, by_column, stiffness, fields, constants, rows, width, u, derivatives))
+                tables = ti.static(LoadTables(loads, by_load))
+                run_worker(sheet, tables, sizes, progress, index // ITERATIONS_PER_THREAD)
 
     return sweep
 
 
 @cache
-def copying(code: KernelConfig) -> Callable[..., None]:
-    """Make the kernel that copies so many entries, from one entry of some arrays to one of others."""
+def copy_kernel(code: KernelConfig) -> Callable[..., None]:
+    """Build the kernel that copies a number of entries between three arrays, from and to given first entries."""
     vectors = code.vectors
 
     @ti.kernel

@@ -1,8 +1,8 @@
-"""The derivatives of a loss by what the steps of a moving sheet are made of.
+"""Adjoint of the time stepping, with checkpoints.
 
-A forward run keeps the state every so many steps, about the root of their number, or more if the sheet is small.
-Backward, each segment between two such states is run again, all of its shapes are kept, and the adjoint is swept over
-them (`kernel_adjoint`).
+The forward run stores its state at the beginning of every segment. A segment has about as many steps as the square root
+of their number, or more if the sheet is small. Backward in time, each segment is run again with all shapes stored, and
+the adjoint is swept over them (`kernel_motion`).
 """
 
 from __future__ import annotations
@@ -14,24 +14,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.accuracy import divergence
-from taichi_msm.accuracy.divergence import Watch
+from taichi_msm.accuracy.divergence import DivergenceMonitor
 from taichi_msm.errors import DivergedError, Pause
-from taichi_msm.gradients.chain_rule import LoadSlopes, Slopes
+from taichi_msm.gradients.chain_rule import LoadGradient, SheetGradient
 from taichi_msm.gradients.kernel_motion import (
     ADJOINT_PARTS,
-    BENT,
+    BENDING_SUM,
     BUFFERS,
-    FAMILIES,
-    HELD,
-    KEPT,
+    FOUNDATION_PART,
+    KEEP_SUM,
+    LOAD_DERIVATIVES,
     LOSS,
-    PUSHED,
     ROW_SUMS,
+    SPRING_PARTS,
     STRIDE,
     SUM_PARTS,
-    TENSE,
-    copying,
-    kernels,
+    TENSION_SUMS,
+    adjoint_kernels,
+    copy_kernel,
 )
 from taichi_msm.model.loads import average_loads
 from taichi_msm.model.plan import Plan
@@ -47,110 +47,144 @@ from taichi_msm.terms.damping import coefficients
 from taichi_msm.terms.foundation import point_shares
 from taichi_msm.terms.loads import ProbeTerm
 
-# A segment may take so much, as each costs some launches.
+# Memory that the shapes of a segment may always take [bytes], since each segment costs some launches.
 SEGMENT_BYTES = 64 * 2**20
 
-# How many times a worker looks for its neighbour before it gives up: longer than forward, as one alone takes all the
-# rest of the launch, and its kernel may have to be compiled.
-LONG_PATIENCE = 8 * MAX_CHECKS
+# Number of times that a worker checks its neighbour before it gives up. It is larger than forward in time, because the
+# rest of the launch then falls to a single worker, whose kernel may have to be compiled.
+MAX_WAIT_CHECKS = 8 * MAX_CHECKS
 
-# A launch of the adjoint takes no more steps times points than this, about 0.1 s of one core.
-POINT_STEPS_PER_LAUNCH = 10_000_000
+# Largest number of steps times mass points in a launch of the adjoint, about 0.1 s of one core.
+NODE_STEPS_PER_LAUNCH = 10_000_000
 
 Array = NDArray[np.float64]
 
 
 def segment_steps(steps: int, shape_bytes: int) -> int:
-    """Return the number of steps of a segment; all beginnings, two shapes each, then take about as much memory."""
+    """Return the number of steps of a segment, whose shapes take about as much memory as all checkpoints.
+
+    Args:
+        steps: Number of steps of the run.
+        shape_bytes: Memory of the displacements of a step [bytes]; a checkpoint takes twice as much.
+
+    Returns:
+        Number of steps.
+    """
     return min(steps, max(math.ceil(math.sqrt(2 * steps)), SEGMENT_BYTES // shape_bytes))
 
 
 def motion_bytes(plan: Plan) -> int:
-    """Estimate the memory of the adjoint of a sheet in motion, without that of the frames [bytes]."""
+    """Estimate the memory of the adjoint of a dynamic sheet, except that of the frames [bytes]."""
     steps, shape_bytes = plan.grid.steps, 3 * 8 * math.prod(plan.scene.sheet.points)
     segment = segment_steps(steps, shape_bytes)
     return shape_bytes * (segment + 2 * -(-steps // segment) + ADJOINT_PARTS + SUM_PARTS)
 
 
 class _Arrays(NamedTuple):
-    """The arrays of the adjoint; those of three, for x, y and z."""
+    """Arrays of the adjoint; a list holds three, for x, y and z.
 
-    # kept, last: displacements and last differences at the beginning of every segment
-    kept: list[Any]
-    last: list[Any]
-    # shapes, moving: displacements in a segment, one shape after the other, and the last difference
+    Attributes:
+        checkpoints: Displacements at the beginning of every segment.
+        checkpoint_differences: Last differences at the beginning of every segment.
+        shapes: Displacements in a segment, step by step.
+        differences: Last difference in a segment.
+        adjoint: Adjoint state, see `kernel_motion`.
+        loss: Derivative of the loss by the displacements of a frame.
+        derivatives: Accumulated derivatives, see `kernel_motion`.
+    """
+
+    checkpoints: list[Any]
+    checkpoint_differences: list[Any]
     shapes: list[Any]
-    moving: list[Any]
-    adjoint: list[Any]  # see `kernel_adjoint`
-    loss: list[Any]  # the derivative by the shape of a frame
-    found: Any  # what is added up
+    differences: list[Any]
+    adjoint: list[Any]
+    loss: list[Any]
+    derivatives: Any
 
 
 class MotionAdjoint(Dynamics):
-    """A sheet in motion, and its adjoint; its plan has a map of the stiffness, in f64."""
+    """Dynamic sheet and its adjoint; the plan must be in f64 and have a stiffness map."""
 
-    # What memory was taken for.
+    # Layout, number of steps and number of standing slots that memory was allocated for.
     _allocated: tuple[Any, ...] = ()
 
     def restart(self, plan: Plan, state: State | None = None) -> None:
-        """Begin again with the same scene or another, as `Dynamics` does."""
+        """Restart with the same scene or another, like `Dynamics`.
+
+        Args:
+            plan: Plan of the scene.
+            state: State to start from; None for the state of rest.
+        """
         super().restart(plan, state)
-        self._slopes = self.layout.config.require(ProbeTerm).decay_gradients(plan)
-        key = self.layout, plan.grid.steps, len(self._slopes)
+        self._decay_slopes = self.layout.config.require(ProbeTerm).decay_gradients(plan)
+        key = self.layout, plan.grid.steps, len(self._decay_slopes)
         if key != self._allocated:
             self._allocate()
             self._allocated = key
 
     def _allocate(self) -> None:
-        """Take memory for a layout, a number of steps and of standing slots."""
         plan = self.plan
         layout, memory = self.layout, Memory()
         row_bytes = layout.width * layout.config.lanes * 8
         self._segment = segment_steps(plan.grid.steps, 3 * layout.rows * row_bytes)
-        # No two workers write to one page of what they carry.
+        # The carried forces of two workers never share a page.
         self._carried_rows = 1 - (-PAGE // row_bytes)
-        self._extra = (MOMENT_ROWS + self._carried_rows) * layout.workers
-        sums = -(-ROW_SUMS * layout.rows // layout.width)
+        self._worker_rows = (MOMENT_ROWS + self._carried_rows) * layout.workers
+        row_sums = -(-ROW_SUMS * layout.rows // layout.width)
 
-        def rows(count: int) -> Any:
-            return memory.array("f64", layout.config.lanes, count * layout.width)
+        def scalar(rows: int) -> Any:
+            return memory.array("f64", layout.config.lanes, rows * layout.width)
 
-        def three(count: int) -> list[Any]:
-            return [rows(count) for _ in range(3)]
+        def vector(rows: int) -> list[Any]:
+            return [scalar(rows) for _ in range(3)]
 
-        kept = -(-plan.grid.steps // self._segment) * layout.rows
+        checkpoint_rows = -(-plan.grid.steps // self._segment) * layout.rows
         self._memory = memory
         self._arrays = _Arrays(
-            three(kept), three(kept),
-            three(self._segment * layout.rows + self._extra), three(layout.rows),
-            three(ADJOINT_PARTS * layout.rows + self._extra), three(layout.rows),
-            rows((SUM_PARTS + 2 * len(self._slopes)) * layout.rows + sums),
+            vector(checkpoint_rows), vector(checkpoint_rows),
+            vector(self._segment * layout.rows + self._worker_rows), vector(layout.rows),
+            vector(ADJOINT_PARTS * layout.rows + self._worker_rows), vector(layout.rows),
+            scalar((SUM_PARTS + 2 * len(self._decay_slopes)) * layout.rows + row_sums),
         )  # fmt: skip
 
     def run(self, pause: Pause = lambda: None) -> Array:
-        """Take all steps anew, with pauses; returns the displacements of every frame [m], shape (F + 1, rows, cols, 3).
+        """Run all steps and store the checkpoints.
+
+        Args:
+            pause: Called several times a second; an exception from it ends the run.
+
+        Returns:
+            Displacements at every frame [m], shape (F + 1, rows, cols, 3).
 
         Raises:
-            DivergedError: when the sheet diverges.
+            DivergedError: When the sheet diverges.
         """
         plan, grid = self.plan, self.plan.grid
-        watch, frames = Watch(plan), np.zeros((grid.frames + 1, *plan.scene.sheet.points, 3))
-        marks = {*range(0, grid.steps + 1, grid.steps_per_frame), *range(0, grid.steps, self._segment)}
-        for n in sorted(marks):
+        monitor, frames = DivergenceMonitor(plan), np.zeros((grid.frames + 1, *plan.scene.sheet.points, 3))
+        stops = {*range(0, grid.steps + 1, grid.steps_per_frame), *range(0, grid.steps, self._segment)}
+        for n in sorted(stops):
             self.advance(n - self.steps_done, pause)
             if n % self._segment == 0 and n < grid.steps:
-                self._keep(n // self._segment)
+                self._store_checkpoint(n // self._segment)
             if n and n % grid.steps_per_frame == 0:
                 reading = self.read()
-                fault = watch.follow(reading)
+                fault = monitor.check_frame(reading)
                 if fault:
-                    said = divergence.message(grid.time(n), n, fault, exact=False)
-                    raise DivergedError(said, n, grid.time(n), largest_displacement(reading.displacement)[:2])
+                    message = divergence.format_message(grid.time(n), n, fault, exact=False)
+                    raise DivergedError(message, n, grid.time(n), largest_displacement(reading.displacement)[:2])
                 frames[n // grid.steps_per_frame] = reading.displacement
         return frames
 
-    def backward(self, by_frame: Array, pause: Pause = lambda: None) -> tuple[Slopes, LoadSlopes]:
-        """Sweep the adjoint of the last `run`; by_frame: derivative of the loss by what that returned."""
+    def backward(self, by_frame: Array, pause: Pause = lambda: None) -> tuple[SheetGradient, LoadGradient]:
+        """Sweep the adjoint of the last `run` backward in time.
+
+        Args:
+            by_frame: Derivative of the loss by the displacements at every frame, shape (F + 1, rows, cols, 3).
+            pause: Called several times a second; an exception from it ends the sweep.
+
+        Returns:
+            Derivatives by the numbers of the sheet and by its loads.
+        """
         grid, layout, arrays = self.plan.grid, self.layout, self._arrays
         _, gain, _ = coefficients(self.plan)
         shares = area_shares(self.plan.scene.sheet) if layout.config.by_area else np.ones((layout.rows, layout.cols))
@@ -159,24 +193,24 @@ class MotionAdjoint(Dynamics):
             # p, an empty buffer, and q.
             parts = start[..., c], 0 * start[..., c], start[..., c]
             write_vectors(arrays.adjoint[c], to_lanes(layout, np.concatenate(parts)))
-        none = np.zeros((SUM_PARTS * layout.rows, layout.cols))
-        slopes = self._slopes.reshape(-1, layout.cols)
-        write_vectors(arrays.found, to_lanes(layout, np.concatenate([none, slopes])))
-        loads, self._buffer, totals = LoadSlopes(self.plan), BUFFERS, np.zeros(2)
+        zeros = np.zeros((SUM_PARTS * layout.rows, layout.cols))
+        decay_slopes = self._decay_slopes.reshape(-1, layout.cols)
+        write_vectors(arrays.derivatives, to_lanes(layout, np.concatenate([zeros, decay_slopes])))
+        loads, self._buffer, work = LoadGradient(self.plan), BUFFERS, np.zeros(2)
         block = max(1, STEPS_PER_TABLE // self._segment) * self._segment
         for first in reversed(range(0, grid.steps, block)):
-            totals += self._sweep_block(first, min(first + block, grid.steps), by_frame, loads, pause)
-        return self._collect(gain, totals), loads
+            work += self._sweep_block(first, min(first + block, grid.steps), by_frame, loads, pause)
+        return self._sheet_gradient(gain, work), loads
 
-    def _sweep_block(self, first: int, end: int, by_frame: Array, loads: LoadSlopes, pause: Pause) -> Array:
-        """Sweep back over some segments; returns the work of the loads on the adjoint after step 0, and in step 0."""
+    def _sweep_block(self, first: int, end: int, by_frame: Array, loads: LoadGradient, pause: Pause) -> Array:
+        """Sweep backward over some segments; return the work of the loads on the adjoint after and in step 0."""
         table, h = self._table(first, end - first), self.plan.grid.step
-        by_slot = np.zeros((end - first, len(self.plan.slots), PUSHED))
+        by_slot = np.zeros((end - first, len(self.plan.slots), LOAD_DERIVATIVES))
         at = end
         for begin in reversed(range(first, end, self._segment)):
-            self._record(begin, table[begin - first : at - first], pause)
+            self._store_shapes(begin, table[begin - first : at - first], pause)
             while at > begin:
-                to = self._last_frame(begin, at)
+                to = self._launch_begin(begin, at)
                 rows = slice(to - first, at - first)
                 by_slot[rows] = self._sweep(begin, at, by_frame, table[rows])
                 at = to
@@ -190,100 +224,96 @@ class MotionAdjoint(Dynamics):
         work = (by_slot[..., :3] * average_loads(self.plan, first, end - first).strength).sum(axis=(1, 2))
         return np.array([work[int(first == 0) :].sum(), work[: int(first == 0)].sum()])
 
-    def _keep(self, segment: int) -> None:
-        """Keep the state at the beginning of a segment."""
-        arrays, first = self._arrays, segment * self._entries
-        self._copy_entries(0, first, self._moving.arrays.u, arrays.kept)
-        self._copy_entries(0, first, self._moving.arrays.d, arrays.last)
+    def _store_checkpoint(self, segment: int) -> None:
+        arrays, first = self._arrays, segment * self._shape_entries
+        self._copy_shape(0, first, self._moving.arrays.u, arrays.checkpoints)
+        self._copy_shape(0, first, self._moving.arrays.d, arrays.checkpoint_differences)
 
     @property
-    def _entries(self) -> int:
-        """Entries of a shape."""
+    def _shape_entries(self) -> int:
         return self.layout.rows * self.layout.width
 
-    def _copy_entries(self, source: int, target: int, of: list[Any], to: list[Any]) -> None:
-        """Copy a shape from one entry of three arrays to one of others."""
+    def _copy_shape(self, from_entry: int, to_entry: int, source: list[Any], target: list[Any]) -> None:
         with compilation_options():
-            copying(self.layout.config)(self._entries, source, target, *of, *to)
+            copy_kernel(self.layout.config)(self._shape_entries, from_entry, to_entry, *source, *target)
 
-    def _record(self, first: int, table: Array, pause: Pause) -> None:
-        """Take the steps of a segment, from its first one on, and keep every shape; table: of its loads."""
+    def _store_shapes(self, first: int, table: Array, pause: Pause) -> None:
+        """Run a segment from its checkpoint with the given table of loads, and store every shape."""
         layout, arrays, count = self.layout, self._arrays, len(table) - 1
-        begins = first // self._segment * self._entries
-        self._copy_entries(begins, 0, arrays.kept, arrays.shapes)
-        self._copy_entries(begins, 0, arrays.last, arrays.moving)
-        most = self._most_steps()
-        for done in range(0, count, most):
-            steps = min(most, count - done)
+        checkpoint = first // self._segment * self._shape_entries
+        self._copy_shape(checkpoint, 0, arrays.checkpoints, arrays.shapes)
+        self._copy_shape(checkpoint, 0, arrays.checkpoint_differences, arrays.differences)
+        max_steps = self._max_launch_steps()
+        for done in range(0, count, max_steps):
+            steps = min(max_steps, count - done)
             sizes = self._sizes(steps, done, self._segment * layout.rows)
-            self._launch(0, sizes, table[done : done + steps], *arrays.shapes, *arrays.moving, *self._sheet_arrays)
+            self._launch(0, sizes, table[done : done + steps], *arrays.shapes, *arrays.differences, *self._sheet_arrays)
             pause()
 
-    def _last_frame(self, first: int, end: int) -> int:
-        """Tell how far back a launch goes from step `end` of a segment: to the last frame before it at most."""
+    def _launch_begin(self, first: int, end: int) -> int:
+        """Return the first step of the launch that ends at step `end` of a segment; it never crosses a frame."""
         frame = (end - 1) // self.plan.grid.steps_per_frame * self.plan.grid.steps_per_frame
-        return max(first, frame, end - self._most_steps())
+        return max(first, frame, end - self._max_launch_steps())
 
     def _sweep(self, first: int, end: int, by_frame: Array, table: Array) -> Array:
-        """Sweep back from step `end` of the segment that begins with step `first`, over the steps of a table.
-
-        Returns:
-            Derivatives by the force and the control point of every slot in every step, shape (steps, slots, 5).
-        """
+        """Sweep a segment backward from step `end`; return the derivatives by its loads, shape (steps, slots, 5)."""
         layout, arrays, grid, count = self.layout, self._arrays, self.plan.grid, len(table)
-        frame, beyond = divmod(end - count, grid.steps_per_frame)
-        if not beyond:
-            self._put(by_frame[frame])
-        sizes = self._sizes(count, end - first - 1, ADJOINT_PARTS * layout.rows, not beyond)
-        pushes = np.zeros((count, layout.rows, max(1, PUSHED * len(self.plan.slots))))
-        self._launch(1, sizes, table, pushes, *arrays.adjoint, *arrays.shapes, *self._sheet_arrays, arrays.found)
+        frame, steps_after_frame = divmod(end - count, grid.steps_per_frame)
+        if not steps_after_frame:
+            self._write_loss(by_frame[frame])
+        sizes = self._sizes(count, end - first - 1, ADJOINT_PARTS * layout.rows, not steps_after_frame)
+        columns = LOAD_DERIVATIVES * len(self.plan.slots)
+        by_row = np.zeros((count, layout.rows, max(1, columns)))
+        self._launch(1, sizes, table, by_row, *arrays.adjoint, *arrays.shapes, *self._sheet_arrays, arrays.derivatives)
         self._buffer = (self._buffer + count) % 2
-        return pushes[..., : PUSHED * len(self.plan.slots)].sum(axis=1).reshape(count, -1, PUSHED)
+        return by_row[..., :columns].sum(axis=1).reshape(count, -1, LOAD_DERIVATIVES)
 
-    def _put(self, slopes: Array) -> None:
-        """Put the derivative by the shape of a frame where the kernel adds it."""
+    def _write_loss(self, by_displacement: Array) -> None:
+        """Write the derivative by the displacements of a frame for the kernel."""
         for c in range(3):
-            write_vectors(self._arrays.loss[c], to_lanes(self.layout, slopes[..., c]))
-        self._copy_entries(0, LOSS * self._entries, self._arrays.loss, self._arrays.adjoint)
+            write_vectors(self._arrays.loss[c], to_lanes(self.layout, by_displacement[..., c]))
+        self._copy_shape(0, LOSS * self._shape_entries, self._arrays.loss, self._arrays.adjoint)
 
-    def _collect(self, gain: float, totals: Array) -> Slopes:
-        """Add up what was found."""
+    def _sheet_gradient(self, gain: float, work: Array) -> SheetGradient:
+        """Read and sum the accumulated derivatives."""
         layout = self.layout
-        rows, cols, found = layout.rows, layout.cols, self._arrays.found.to_numpy()
-        every = from_lanes(layout, found, SUM_PARTS * rows).reshape(SUM_PARTS, rows, cols)
-        first = (SUM_PARTS + 2 * len(self._slopes)) * rows * layout.width
-        # Row by row, each in the order of its lanes.
-        sums = found[first : first + ROW_SUMS * rows].reshape(rows, ROW_SUMS, -1).sum(axis=2).sum(axis=0)
-        springs = every[FAMILIES][:, :-1], every[FAMILIES + 1][:-1], every[FAMILIES + 2][:-1, :-1]
-        held = every[HELD] * point_shares(self.plan)
-        slopes = Slopes(springs, sums[TENSE:BENT], held, float(sums[BENT]), keep=float(sums[KEPT]) / gain)
-        slopes.gain = slopes.work(self.plan) + float(totals[0])
-        slopes.first_gain = float(totals[1])
-        return slopes
+        rows, cols, derivatives = layout.rows, layout.cols, self._arrays.derivatives.to_numpy()
+        parts = from_lanes(layout, derivatives, SUM_PARTS * rows).reshape(SUM_PARTS, rows, cols)
+        first = (SUM_PARTS + 2 * len(self._decay_slopes)) * rows * layout.width
+        # The sums of a row are added lane by lane, and then row by row.
+        row_sums = derivatives[first : first + ROW_SUMS * rows].reshape(rows, ROW_SUMS, -1)
+        sums = row_sums.sum(axis=2).sum(axis=0)
+        springs = parts[SPRING_PARTS][:, :-1], parts[SPRING_PARTS + 1][:-1], parts[SPRING_PARTS + 2][:-1, :-1]
+        foundation, keep = parts[FOUNDATION_PART] * point_shares(self.plan), float(sums[KEEP_SUM]) / gain
+        tensions, bending = sums[TENSION_SUMS:BENDING_SUM], float(sums[BENDING_SUM])
+        gradient = SheetGradient(springs, tensions, foundation, bending, keep=keep)
+        gradient.gain = gradient.work(self.plan) + float(work[0])
+        gradient.first_gain = float(work[1])
+        return gradient
 
     @property
     def _sheet_arrays(self) -> tuple[Any, ...]:
-        """The arrays of the sheet that the kernels only read."""
+        """Read-only arrays of the sheet."""
         arrays = self._moving.arrays
         return arrays.constants, arrays.by_column, arrays.stiffness, arrays.fields
 
-    def _most_steps(self) -> int:
-        return max(1, POINT_STEPS_PER_LAUNCH // (self.layout.rows * self.layout.cols))
+    def _max_launch_steps(self) -> int:
+        return max(1, NODE_STEPS_PER_LAUNCH // (self.layout.rows * self.layout.cols))
 
-    def _sizes(self, count: int, shape: int, extra: int, with_loss: bool = False) -> NDArray[np.int64]:
-        """List the sizes of a launch, in the order that `kernel_adjoint` gives; extra: rows before moments."""
+    def _sizes(self, count: int, shape: int, moment_row: int, with_loss: bool = False) -> NDArray[np.int64]:
+        """Return the sizes of a launch in the order of `kernel_motion`."""
         layout = self.layout
-        carry = extra + MOMENT_ROWS * layout.workers
+        carry = moment_row + MOMENT_ROWS * layout.workers
         return np.array([
-            count, layout.workers, layout.rows, layout.strip, shape, extra, carry, self._carried_rows, LONG_PATIENCE,
-            self._buffer if extra == ADJOINT_PARTS * layout.rows else 0, with_loss,
+            count, layout.workers, layout.rows, layout.strip, shape, moment_row, carry, self._carried_rows,
+            MAX_WAIT_CHECKS, self._buffer if moment_row == ADJOINT_PARTS * layout.rows else 0, with_loss,
         ])  # fmt: skip
 
     def _launch(self, which: int, sizes: NDArray[np.int64], *arguments: Any) -> None:
-        """Launch the kernel that records, or the one that sweeps; if a worker gives up, one goes on alone."""
+        """Launch the storing or the sweeping kernel; if a worker gives up, one worker finishes alone."""
         code, workers = self.layout.config, self.layout.workers
         progress = np.zeros(STRIDE * workers, np.int64)
         for parallel in (True, False) if workers > 1 else (False,):
             if (progress[::STRIDE] < sizes[0]).any():
                 with compilation_options():
-                    kernels(code, parallel=parallel)[which](sizes, progress, *arguments)
+                    adjoint_kernels(code, parallel=parallel)[which](sizes, progress, *arguments)

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from taichi_msm.accuracy.companions import choose_pilots
+from taichi_msm.accuracy.companions import choose_companion_runs
 from taichi_msm.errors import Problem, SceneError
 from taichi_msm.model.plan import Plan
 from taichi_msm.render import texture
@@ -127,7 +127,7 @@ def estimate_budget(plan: Plan) -> Budget:
     numbers = STATE_NUMBERS + OUTPUT_NUMBERS + contact_numbers + sum(MAP_NUMBERS[name] for name in scene.maps)
     numbers += sum(not probe.moved for probe in scene.probes)  # the load of each force-controlled tool
     # Companion runs add up to two sheets in f64, and with tissue two smaller ones.
-    has_companions = scene.time.tolerance is not None or choose_pilots(plan).some
+    has_companions = scene.time.tolerance is not None or choose_companion_runs(plan).planned
     bytes_per_number = number_bytes + (8 * (2 + (scene.tissue is not None) * 5 / 16) if has_companions else 0)
     return Budget(
         points=points,
@@ -253,7 +253,7 @@ class DurationEstimate(NamedTuple):
 
 def estimate_duration(plan: Plan) -> DurationEstimate:
     """Estimate the duration of a run on all cores of the CPU; the calibration takes milliseconds."""
-    units = count_work(plan, choose_pilots(plan).cost)
+    units = count_work(plan, choose_companion_runs(plan).cost)
     unit_s = WORK_UNIT_S * _calibrate() / CALIBRATION_S
     return DurationEstimate(unit_s * sum(units), unit_s * units.start)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from taichi_msm.accuracy.mesh import MeshEstimate, choose_points
-from taichi_msm.accuracy.time_step import Estimate, choose_step
+from taichi_msm.accuracy.time_step import TimeStepEstimate, choose_step
 from taichi_msm.errors import ProgressCallback
 from taichi_msm.load.check import check_scene
 from taichi_msm.model.plan import Plan
@@ -19,7 +19,7 @@ class ResolvedPlan(NamedTuple):
 
     Attributes:
         plan: plan whose scene contains the chosen numbers of mass points, time step and precision.
-        estimate: estimate of the error due to the time step; None without `time.tolerance`.
+        estimate: TimeStepEstimate | None  # of the error due to the time step; None without `time.tolerance`.
         mesh: estimate of the discretisation error (mesh); None without `sheet.tolerance`.
     """
 

@@ -13,7 +13,7 @@ from typing import Any, cast
 from pydantic import TypeAdapter
 
 from taichi_msm.accuracy.mesh import MeshEstimate
-from taichi_msm.accuracy.time_step import Estimate
+from taichi_msm.accuracy.time_step import TimeStepEstimate
 from taichi_msm.errors import DamagedError, FilesError, SceneError
 from taichi_msm.images import PictureError, file_sha256
 from taichi_msm.model.plan import Plan
@@ -36,7 +36,7 @@ class Manifest:
     given: Scene  # as it was loaded
     scene: Scene  # with the points, the step and the precision that were chosen
     overrides: tuple[str, ...]  # of the scene file
-    estimate: Estimate | None  # of the error, if a tolerance required it before the run
+    estimate: TimeStepEstimate | None  # of the error, if a tolerance required it before the run
     mesh: MeshEstimate | None  # error of the points, if a tolerance of the sheet required it before the run
     asks_estimate: bool | None  # whether to estimate the error beside the run; None: if it is cheap
     folder: str  # the current directory, from which the paths of the scene's pictures start

@@ -15,9 +15,9 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.accuracy.companions import AT_REST, Pilots, choose_pilots
+from taichi_msm.accuracy.companions import QUASISTATIC_REASON, CompanionRuns, choose_companion_runs
 from taichi_msm.accuracy.path_dependence import PathDependence
-from taichi_msm.accuracy.report import Known, RunError, run_notes
+from taichi_msm.accuracy.report import RunErrorEstimates, RunErrorEstimator, run_warnings
 from taichi_msm.errors import (
     DamagedError,
     DeviceError,
@@ -258,16 +258,16 @@ class _Run:
         self._simulation = opened.enter_context(Simulation(plan, device.arch, device.threads, task.texture, cores))
         self._resumed = self._writer.stored
         pilots = _pilots(task, resumed=self._resumed > 0)
-        self._error: RunError | None = None
+        self._error: RunErrorEstimator | None = None
         self._ways = PathDependence(plan) if plan.scene.time.at_rest else None
         asked = manifest.asks_estimate
         self._solves_again = self._ways is not None and (
             asked is True or (asked is None and device.arch == "cpu" and self._ways.affords(pilots.cost))
         )
-        self._known = Known(manifest.estimate, pilots.reason, manifest.mesh)
-        if pilots.some:
+        self._known = RunErrorEstimates(manifest.estimate, pilots.reason, manifest.mesh)
+        if pilots.planned:
             try:
-                self._error = RunError(plan, pilots, self._known, device, cores)
+                self._error = RunErrorEstimator(plan, pilots, self._known, device, cores)
             except DeviceError:
                 self._known = self._known._replace(reason=f"{device.arch} cannot run this scene in f64")
 
@@ -288,12 +288,12 @@ class _Run:
             self._simulation.restore(writer.saved)
         if self._ways and self._task.plan.scene.output:
             for frame in range(writer.frames):
-                self._ways.follow(frame, writer.position(frame) - rest)
+                self._ways.check_frame(frame, writer.position(frame) - rest)
         if self._error:
             with self._watch.stage("pilot"):
                 for frame in range(1, writer.frames):
                     told = partial(self._progress, "pilot", frame, writer.frames)
-                    self._error.follow(writer.position(frame) - rest, told)
+                    self._error.compare_frame(writer.position(frame) - rest, told)
 
     def go_through_frames(self) -> None:
         """Simulate, draw and write every frame that is missing, and finish the results."""
@@ -315,12 +315,12 @@ class _Run:
                     observed[camera] = simulation.observe(before.labels, camera, position, time)
             writer.add(position, observed, simulation.forces(), told)
             if self._ways:
-                self._ways.follow(frame, position - rest)
+                self._ways.check_frame(frame, position - rest)
             if self._error and frame > 0:
                 with stage("pilot"):
                     of_tools = [simulation.forces()[tool.probe].force for tool in self._task.plan.tools]
                     forces = np.array(of_tools).reshape(-1, 3) if frame >= self._resumed else None
-                    self._error.follow(position - rest, told, forces)
+                    self._error.compare_frame(position - rest, told, forces)
         try:
             if self._error:
                 kept = (writer.position(frame) - rest for frame in range(1, self._frames)) if scene.output else None
@@ -353,15 +353,15 @@ class _Run:
     def find_cause(self, error: DivergedError) -> dict[str, Any]:
         """Say why the run diverged, and save its last sound state."""
         writer = self._writer
-        self._error, self._known = None, Known(reason="the run diverged")
+        self._error, self._known = None, RunErrorEstimates(reason="the run diverged")
         ending: dict[str, Any] = {"status": "diverged", "error": str(error), "dump": None}
         with suppress(KeyboardInterrupt):
             diagnosis = self._simulation.diagnose(
                 writer.load(), partial(self._progress, "diagnosis", writer.frames, self._frames)
             )
             ending["error"] = diagnosis.message
-            if diagnosis.good:
-                ending["dump"] = writer.save(diagnosis.good)
+            if diagnosis.last_sound_state:
+                ending["dump"] = writer.save(diagnosis.last_sound_state)
         return ending
 
     def conclude(self, ending: dict[str, Any]) -> RunRecord:
@@ -369,12 +369,14 @@ class _Run:
         writer, simulation, device, watch = self._writer, self._simulation, self._task.device, self._watch
         self._progress("write", writer.frames, self._frames)
         writer.finish()
-        known = self._error.known if self._error else self._known
+        known = self._error.estimates if self._error else self._known
         stages = ["startup", *(["pilot"] if "pilot" in watch.seconds else []), "compile", "simulate", "render"]
         seconds = {stage: watch.seconds.get(stage, 0.0) for stage in stages}
         record = {
             **ending,
-            **_facts(self._task, simulation.progress, simulation.felt, known, self._ways.notes() if self._ways else ()),
+            **_facts(
+                self._task, simulation.progress, simulation.felt, known, self._ways.warnings() if self._ways else ()
+            ),
             "resumed": self._resumed,
             "timings": {**seconds, "encode": writer.encode_seconds, "total": watch.total()},
             "arch": device.arch,
@@ -394,21 +396,21 @@ class _Run:
                 self._writer.save(self._simulation.save())
 
 
-def _pilots(task: _Task, *, resumed: bool) -> Pilots:
+def _pilots(task: _Task, *, resumed: bool) -> CompanionRuns:
     """Choose the pilots of a run, or say why there are none."""
     asked = task.manifest.asks_estimate
     if asked is False:
-        return Pilots(reason="not asked for")
+        return CompanionRuns(reason="not asked for")
     if asked is None and task.device.arch != "cpu":
-        return Pilots(reason="on a GPU, this needs --estimate-error")
-    pilots = choose_pilots(task.plan, asked=asked is True)
-    if pilots.some and resumed and not task.plan.scene.output:
-        return Pilots(reason="the frames before the interruption were not kept")
+        return CompanionRuns(reason="on a GPU, this needs --estimate-error")
+    pilots = choose_companion_runs(task.plan, requested=asked is True)
+    if pilots.planned and resumed and not task.plan.scene.output:
+        return CompanionRuns(reason="the frames before the interruption were not kept")
     return pilots
 
 
 def _facts(
-    task: _Task, progress: RunProgress, felt: ProbeForces, known: Known, path_dependence: Iterable[str]
+    task: _Task, progress: RunProgress, felt: ProbeForces, known: RunErrorEstimates, path_dependence: Iterable[str]
 ) -> dict[str, Any]:
     """Say what was run, and what is known of its last frame, for run.json."""
     manifest, plan = task.manifest, task.plan
@@ -436,7 +438,7 @@ def _facts(
         "longest_spring": progress.longest_spring,
         "probes": probes,
         "notes": [
-            *run_notes(plan, probes, progress, *known, _affords, _scale(scene)),
+            *run_warnings(plan, probes, progress, *known, _affords, _scale(scene)),
             *path_dependence,
             *drawing_warnings(scene),
         ],
@@ -493,12 +495,12 @@ def _scale(scene: Scene) -> float | None:
     return scale if math.isfinite(scale) else None
 
 
-def error_record(known: Known) -> dict[str, Any] | None:
+def error_record(known: RunErrorEstimates) -> dict[str, Any] | None:
     """Write what is known of the error for run.json, where null stands for what is not known, or not there."""
     estimate, mesh, keys = known.estimate, known.mesh, ("error", "rounding", "in_f64", "order", "at_least")
     if estimate is not None:
         fields: dict[str, Any] = {key: getattr(estimate, key) for key in keys}
-    elif mesh is not None and known.reason == AT_REST:
+    elif mesh is not None and known.reason == QUASISTATIC_REASON:
         fields = dict.fromkeys(keys) | {"at_least": False}
     else:
         return None

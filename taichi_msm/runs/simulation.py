@@ -20,7 +20,7 @@ from PIL import Image
 
 from taichi_msm.accuracy import divergence
 from taichi_msm.accuracy.diagnosis import Diagnosis, diagnose
-from taichi_msm.accuracy.divergence import Watch
+from taichi_msm.accuracy.divergence import DivergenceMonitor
 from taichi_msm.errors import (
     ArgumentError,
     DivergedError,
@@ -99,7 +99,7 @@ class Simulation:
         self._plan = resolve(plan, self.device).plan
         # As they are before they are steered.
         self._probes = self.scene.probes
-        self._watch: Watch
+        self._watch: DivergenceMonitor
         self._gauge: ForceRecorder
         self._felt: ProbeForces
         self._placed: Array | None
@@ -187,7 +187,7 @@ class Simulation:
         self._find_first()
         plan = steer_plan(self._plan, probes, self._plan.grid.time(self.steps))
         self._dynamics.steer(plan)
-        self._watch.steer(plan)
+        self._watch.change_loads(plan)
         self._gauge = ForceRecorder(plan)
         self._plan, self.renderer.scene = plan, plan.scene
 
@@ -224,7 +224,7 @@ class Simulation:
         self._require_open()
         self._find_first()
         reading = self._dynamics.read()
-        self._require_good(reading, self._watch.judge(reading))
+        self._require_good(reading, self._watch.check(reading))
         return Snapshot(self._dynamics.state(), self.progress, self._felt, self.scene.probes)
 
     def restore(self, saved: Snapshot) -> None:
@@ -451,7 +451,7 @@ class Simulation:
             self._divergence = error
             raise
         reading = self._dynamics.read()
-        self._require_good(reading, self._watch.follow(reading))
+        self._require_good(reading, self._watch.check_frame(reading))
         position = to_positions(reading.displacement, self.scene.sheet)
         self._felt = self._gauge.follow(self._felt, self.frame, position, self._dynamics.tool_forces())
         self._placed = position
@@ -484,13 +484,15 @@ class Simulation:
         if fault:
             steps, time = reading.steps, self._plan.grid.time(reading.steps)
             point = largest_displacement(reading.displacement)[:2]
-            self._divergence = DivergedError(divergence.message(time, steps, fault, exact=False), steps, time, point)
+            self._divergence = DivergedError(
+                divergence.format_message(time, steps, fault, exact=False), steps, time, point
+            )
             raise self._divergence
 
     def _begin(self) -> None:
         """Begin with the flat sheet; at rest, the first frame is yet to be found."""
         self._divergence = None
-        self._watch, self._gauge = Watch(self._plan), ForceRecorder(self._plan)
+        self._watch, self._gauge = DivergenceMonitor(self._plan), ForceRecorder(self._plan)
         self._felt = self._gauge.at_rest()
         flat = to_positions(self._dynamics.displacement(), self.scene.sheet)
         self._placed = None if self.scene.time.at_rest else flat

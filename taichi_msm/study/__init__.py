@@ -1,1 +1,1 @@
-"""Speed against error: what every setting of a scene costs and how wrong it is."""
+"""Speed against error: the cost and the error of every setting of a scene."""

@@ -1,12 +1,10 @@
-"""Work and precision of stepping: every precision and damping difference, from the largest stable step downwards.
+"""Measurements of a study.
 
-Work and precision of the number of points: tissue with a quarter, half and twice the cells a side.
-
-Work and precision of drawing: every refinement and supersampling, for the most deformed frame.
-
-The cost of each term of the model: the time of a step without it.
-
-The same equations solved by SciPy's DOP853, as a careful person would do without this program.
+- Work-precision diagram of stepping: every precision and damping difference, from the largest stable step downwards.
+- Work-precision diagram of the mesh: tissue with a quarter, half and twice the cells per side.
+- Work-precision diagram of drawing: every refinement and supersampling, for the most deformed frame.
+- Cost of each term of the model: the time of a step without it.
+- Solution of the same equations by SciPy's DOP853, for comparison.
 """
 
 from __future__ import annotations
@@ -23,9 +21,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
-from taichi_msm.accuracy.divergence import farthest_displacement
-from taichi_msm.accuracy.mesh import FEWEST, CubicSampling, MeshPilot, companion, with_points
-from taichi_msm.accuracy.time_step import longest
+from taichi_msm.accuracy.divergence import displacement_bound
+from taichi_msm.accuracy.mesh import (
+    MIN_POINTS_PER_SIDE,
+    CubicInterpolation,
+    MeshCompanion,
+    mesh_companion_plan,
+    with_points,
+)
+from taichi_msm.accuracy.time_step import max_norm
 from taichi_msm.errors import ProgressCallback
 from taichi_msm.load import cost
 from taichi_msm.model.loads import Schedule, evaluate_loads, keyframe_times
@@ -39,7 +43,14 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_POINTS
 from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.solver.planning import plan_variant, stable_steps, try_plan, with_time
-from taichi_msm.study.result import Drawn, Points, Reference, Stepping, Study, TimedTerm
+from taichi_msm.study.result import (
+    DrawingMeasurement,
+    MeshMeasurement,
+    Reference,
+    SteppingMeasurement,
+    Study,
+    TermMeasurement,
+)
 from taichi_msm.system import process
 from taichi_msm.system.runtime import Device
 from taichi_msm.terms.elasticity import elastic_force, spring_families
@@ -47,25 +58,31 @@ from taichi_msm.terms.elasticity import elastic_force, spring_families
 PRECISIONS: tuple[Precision, ...] = ("f64", "f32")
 DIFFERENCES = ("central", "backward")
 
-# How many times every setting is timed; all settings take turns.
-ROUNDS = 5
+# Number of times that every setting is timed, in turns.
+STEPPING_ROUNDS = 5
 
-# An error counts as known if it is at least this many times that of the reference.
-MARGIN = 20
+# An error is known if it is at least this multiple of that of the reference.
+REFERENCE_MARGIN = 20
 
-# How many times the largest stable step is halved at least, whatever it costs.
-LEAST_HALVINGS = 2
+# The largest stable step is halved at least this number of times, whatever it costs.
+MIN_HALVINGS = 2
 
 Frames = NDArray[Any]
 
 
 class SteppingStudy:
-    """Measures the stepping of a checked scene, in runs of up to about `longest_run` seconds.
+    """Work-precision diagram of stepping.
 
-    `progress` may raise KeyboardInterrupt: the results in `study` stay.
+    Args:
+        plan: Plan of the scene.
+        device: Device to run on.
+        longest_run: Approximate time limit of a run [s].
+        study: Receives the results.
+        progress: Called with the number of finished runs and their total. It may raise KeyboardInterrupt; the results
+            so far remain in `study`.
 
     Attributes:
-        frames: displacements of the reference at every frame but the first [m], shape (F, rows, cols, 3).
+        frames: Displacements of the reference at every frame but the first [m], shape (F, rows, cols, 3).
     """
 
     def __init__(
@@ -78,36 +95,36 @@ class SteppingStudy:
         }
         self.frames: Frames | None = None
         self._longest_run, self.study, self._progress = longest_run, study, progress
-        self._done, self._to_do = 0, 1
+        self._done, self._total = 0, 1
         self._dynamics: dict[str, Dynamics] = {
-            one: Dynamics(plan.with_grid(precision=one), device) for one in PRECISIONS
+            precision: Dynamics(plan.with_grid(precision=precision), device) for precision in PRECISIONS
         }
 
     def run(self) -> None:
-        """Compute the reference, then the errors, then measure the times."""
+        """Compute the reference and the errors, and then measure the times."""
         for dynamics in self._dynamics.values():
-            self._progress(0, self._to_do)
+            self._progress(0, self._total)
             dynamics.compile()
         series = {difference: list(self._series(difference)) for difference in DIFFERENCES}
         finest = max(steps for counts in series.values() for steps in counts)
-        self._to_do = 3 + ROUNDS * len(PRECISIONS) * sum(len(counts) for counts in series.values())
-        self._make_reference(finest)
+        self._total = 3 + STEPPING_ROUNDS * len(PRECISIONS) * sum(len(counts) for counts in series.values())
+        self._compute_reference(finest)
         for difference, counts in series.items():
             self._measure_errors(difference, counts)
-        self._to_do = self._done + (ROUNDS - 1) * len(self.study.stepping)
-        for _ in range(ROUNDS - 1):
-            for one in self.study.stepping:
-                self._run(one.precision, one.damping_difference, one.steps_per_frame, one.samples)
+        self._total = self._done + (STEPPING_ROUNDS - 1) * len(self.study.stepping)
+        for _ in range(STEPPING_ROUNDS - 1):
+            for point in self.study.stepping:
+                self._run(point.precision, point.damping_difference, point.steps_per_frame, point.samples)
 
-    def relative(self, frames: Frames) -> float:
-        """Give the largest error of frames relative to the reference, as a fraction of the largest displacement."""
+    def relative_error(self, frames: Frames) -> float:
+        """Return the largest error of frames against the reference, as a fraction of the largest displacement."""
         assert self.frames is not None
         largest = self._reference.largest
-        return longest(frames - self.frames) / largest if largest > 0 else 0.0
+        return max_norm(frames - self.frames) / largest if largest > 0 else 0.0
 
-    def known(self, error: float) -> bool:
-        """Tell whether the reference is exact enough to know an error."""
-        return error >= MARGIN * self._reference.error
+    def determines(self, error: float) -> bool:
+        """Return whether the reference is exact enough to determine an error."""
+        return error >= REFERENCE_MARGIN * self._reference.error
 
     def close(self) -> None:
         """Free the memory."""
@@ -120,58 +137,57 @@ class SteppingStudy:
         return self.study.reference
 
     def _series(self, difference: str) -> Iterator[int]:
-        """Give the steps per frame of a series: of the largest valid step, doubled until a run would take too long."""
+        """List steps per frame, beginning with the largest valid step, doubled until a run would take too long."""
         steps = min_steps_per_frame(self.plan.tools, self.plan.grid, stable_steps(self._plans[difference]))
         samples: list[float] = []
         self._run("f64", difference, steps, samples)
         yield steps
         for halving in range(1, 64):
-            if halving > LEAST_HALVINGS and samples[0] * 2**halving > self._longest_run:
+            if halving > MIN_HALVINGS and samples[0] * 2**halving > self._longest_run:
                 return
             yield steps * 2**halving
 
-    def _make_reference(self, finest: int) -> None:
-        """Extrapolate central differences from steps well below the finest that is measured.
-
-        u* = u_{h/2} + (u_{h/2} - u_h) / 3. Its error is at most about its distance from the same with 2 h for h. With
-        contact, which is of order 1 about, nothing is extrapolated.
-        """
+    def _compute_reference(self, finest: int) -> None:
+        """Extrapolate central differences with steps well below the finest measured one."""
+        # u* = u_{h/2} + (u_{h/2} - u_h) / 3. Its error is at most about its distance from the same formula with 2 h for
+        # h. With contact, where the order is about 1, nothing is extrapolated.
         coarse, middle, fine = (self._run("f64", "central", finest * 2**halving, []) for halving in range(3))
         before, self.frames = middle + (middle - coarse) / 3, fine + (fine - middle) / 3
         if self.plan.tools:
             before, self.frames = middle, fine
-        largest = longest(self.frames)
-        error = longest(self.frames - before) / largest if largest > 0 else 0.0
+        largest = max_norm(self.frames)
+        error = max_norm(self.frames - before) / largest if largest > 0 else 0.0
         self.study.reference = Reference(4 * finest, error, largest)
 
     def _measure_errors(self, difference: str, counts: list[int]) -> None:
-        """Run every step once: in f32 until rounding dominates, in f64 until the reference is not exact enough."""
-        going, farthest = set(PRECISIONS), farthest_displacement(self.plan, self.plan.scene.time.duration)
+        """Run every step once, in f32 until rounding dominates, in f64 until the reference is not exact enough."""
+        remaining, bound = set(PRECISIONS), displacement_bound(self.plan, self.plan.scene.time.duration)
         for steps in counts:
             exact: Frames | None = None
-            for precision in (one for one in PRECISIONS if one in going):
-                point = Stepping(precision, difference, steps, replace(self.plan.grid, steps_per_frame=steps).step)
+            for precision in (each for each in PRECISIONS if each in remaining):
+                step = replace(self.plan.grid, steps_per_frame=steps).step
+                point = SteppingMeasurement(precision, difference, steps, step)
                 frames = self._run(precision, difference, steps, point.samples)
-                error, rounding = self.relative(frames), None
+                error, rounding = self.relative_error(frames), None
                 if precision == "f64":
                     exact = frames
                 elif exact is not None and self._reference.largest > 0:
-                    rounding = longest(frames - exact) / self._reference.largest
+                    rounding = max_norm(frames - exact) / self._reference.largest
                 self.study.stepping.append(point)
-                if error < math.inf and longest(frames) <= farthest:
-                    point.error, point.rounding, point.known = error, rounding, self.known(error)
+                if error < math.inf and max_norm(frames) <= bound:
+                    point.error, point.rounding, point.known = error, rounding, self.determines(error)
                     if not point.known or (rounding is not None and rounding > error / 2):
-                        going.discard(precision)
+                        remaining.discard(precision)
 
     def _run(self, precision: str, difference: str, steps: int, samples: list[float]) -> Frames:
-        """Step through the scene, and append the time of stepping alone [s] to the samples."""
+        """Step through the scene, append the time of stepping alone [s] to the samples, and return the frames."""
         dynamics = self._dynamics[precision]
         plan = self._plans[difference].with_grid(precision=precision, steps_per_frame=steps)
         dynamics.restart(plan)
         frames = np.empty((plan.grid.frames, *plan.scene.sheet.points, 3), precision.replace("f", "float"))
         seconds = 0.0
         for frame in frames:
-            self._progress(self._done, self._to_do)
+            self._progress(self._done, self._total)
             start = time.perf_counter()
             dynamics.advance(steps)
             seconds += time.perf_counter() - start
@@ -181,40 +197,44 @@ class SteppingStudy:
         return frames
 
 
-# Cells a side, relative to those of the scene.
-COARSER = (1 / 4, 1 / 2)
-FINER = 2
+# Cells per side of the other meshes, relative to those of the scene.
+COARSE_CELL_RATIOS = (1 / 4, 1 / 2)
+FINE_CELL_RATIO = 2
 
-# How many times every sheet is timed; all sheets take turns.
-POINT_ROUNDS = 5
+# Number of times that every mesh is timed, in turns.
+MESH_ROUNDS = 5
 
-# An error counts as known if it is at least this many times the bound of the reference's own error.
-POINT_MARGIN = 5
+# An error is known if it is at least this multiple of the bound of the reference's own error.
+MESH_REFERENCE_MARGIN = 5
 
 Field = NDArray[Any]
-Lattice = tuple[int, int]
 
 
-class _Sheet(NamedTuple):
-    """A sheet with some number of points, and what is known about it so far."""
+class _MeshRun(NamedTuple):
+    """A sheet with some mesh, and its measurement."""
 
     plan: Plan
     dynamics: Dynamics
-    measured: Points
+    measurement: MeshMeasurement
 
 
-class PointStudy:
-    """Measures the error and the speed of a sheet of tissue with more or fewer points, in f64.
+class MeshStudy:
+    """Work-precision diagram of the mesh of a sheet of tissue, in f64.
 
-    Errors are measured with the same steps for all sheets, so that the errors of the step cancel. Times are measured
-    with the automatic step of each sheet, which is longer for fewer points.
+    Errors are measured with the same steps for all meshes, so that the time-step errors cancel. Times are measured with
+    the automatic step of each mesh, which is longer for coarser ones.
 
-    The reference is a sheet with more points than all those listed, if there is time for it. Otherwise it is the finest
-    of those listed, whose own error is then known only as a bound.
+    The reference is a mesh finer than all measured ones, if there is time for it. Otherwise it is the finest measured
+    one, whose own error is then known only as a bound. The reference is run only once, and may take as long as all the
+    timed runs of another mesh together.
 
-    A run takes up to about `longest_run` seconds; the reference, which is run only once, as long as all the runs
-    together by which another sheet is timed. The results in `study` come with the fewest points first; `progress` may
-    raise KeyboardInterrupt: they stay.
+    Args:
+        plan: Plan of the scene.
+        device: Device to run on.
+        longest_run: Approximate time limit of a run [s].
+        study: Receives the results, the coarsest mesh first.
+        progress: Called with the number of finished runs and their total. It may raise KeyboardInterrupt; the results
+            so far remain in `study`.
     """
 
     def __init__(
@@ -223,72 +243,68 @@ class PointStudy:
         scene = with_time(plan.scene, step="auto", tolerance=None, precision="f64")
         self._plan = plan_variant(plan, with_points(scene, scene.sheet.points))
         self._device, self._longest_run, self._study, self._progress = device, longest_run, study, progress
-        self._sheets: list[_Sheet] = []
+        self._sheets: list[_MeshRun] = []
         self._done = 0
 
     def run(self) -> None:
-        """Compute the estimates, then the errors, then measure the times; with springs nothing.
+        """Compute the estimates and the errors, and then measure the times.
 
-        Other points would make another sheet of springs.
+        A sheet of springs is not measured, because it is a different sheet with another mesh.
         """
         if self._plan.scene.tissue is None:
             return
         with ExitStack() as opened:
             seconds = 0.0
-            for plan in lattices(self._plan):
-                seconds = self._try(plan, opened)
+            for plan in mesh_plans(self._plan):
+                seconds = self._measure_mesh(plan, opened)
             if not self._sheets:
-                said = f"points were not measured: with fewer than {FEWEST} a side they cannot be compared"
-                self._study.notes.append(said)
+                note = f"points were not measured: with fewer than {MIN_POINTS_PER_SIDE} a side they cannot be compared"
+                self._study.notes.append(note)
                 return
-            finer = self._finer(self._plan, seconds, self._longest_run)
+            finer = self._finer_plan(self._plan, seconds, self._longest_run)
             if finer is None:
-                rows, cols = _scaled(self._plan, FINER)
+                rows, cols = _scaled(self._plan, FINE_CELL_RATIO)
                 self._study.notes.append(f"{rows} x {cols} points were not measured: time or memory")
             else:
-                seconds = self._try(finer, opened)
-                finer = self._finer(finer, seconds, POINT_ROUNDS * self._longest_run)
+                seconds = self._measure_mesh(finer, opened)
+                finer = self._finer_plan(finer, seconds, MESH_ROUNDS * self._longest_run)
             if len(self._sheets) < 2:
                 return
             self._measure_errors(finer)
-            for _ in range(POINT_ROUNDS):
+            for _ in range(MESH_ROUNDS):
                 for sheet in self._sheets:
-                    sheet.measured.samples.append(self._step_through(sheet))
+                    sheet.measurement.samples.append(self._step_through(sheet))
 
-    def _try(self, plan: Plan, opened: ExitStack) -> float:
-        """Run a sheet with its own step beside the pilot that `run` would have; returns the time of stepping [s]."""
+    def _measure_mesh(self, plan: Plan, opened: ExitStack) -> float:
+        """Run a mesh with its automatic step and the companion runs of `run`; return the time of stepping [s]."""
         dynamics = opened.enter_context(closing(Dynamics(plan, self._device)))
-        sheet = _Sheet(plan, dynamics, Points(*plan.scene.sheet.points, plan.grid.steps_per_frame))
-        coarse = companion(plan)
+        sheet = _MeshRun(plan, dynamics, MeshMeasurement(*plan.scene.sheet.points, plan.grid.steps_per_frame))
+        coarse = mesh_companion_plan(plan)
         assert coarse is not None
         self._sheets.append(sheet)
-        self._study.points.append(sheet.measured)
+        self._study.points.append(sheet.measurement)
         self._tick()
         dynamics.compile()
-        pilot = MeshPilot(plan, coarse, self._device)
-        pilot.compile()
-        first = self._step_through(sheet, pilot)
-        # The faster of two runs: what disturbs one may not disturb the other.
-        seconds = min(first, self._step_through(sheet, pilot.nearer(plan, self._device)))
-        estimate = pilot.estimate.error
-        sheet.measured.estimate = estimate if estimate < math.inf else None
+        companion = MeshCompanion(plan, coarse, self._device)
+        companion.compile()
+        first = self._step_through(sheet, companion)
+        # The minimum of two runs is less sensitive to other load on the machine.
+        seconds = min(first, self._step_through(sheet, companion.build_second_run(plan, self._device)))
+        estimate = companion.estimate.error
+        sheet.measurement.estimate = estimate if estimate < math.inf else None
         return seconds
 
-    def _finer(self, plan: Plan, seconds: float, longest_run: float) -> Plan | None:
-        """Plan more points than a plan has, through which it took `seconds` to step.
-
-        Returns:
-            The plan; None if stepping through it would take longer than `longest_run` [s], or too much memory.
-        """
-        points = _scaled(plan, FINER)
+    def _finer_plan(self, plan: Plan, seconds: float, longest_run: float) -> Plan | None:
+        """Plan a finer mesh than that of a run of `seconds`; return None if it takes too much time or memory."""
+        points = _scaled(plan, FINE_CELL_RATIO)
         if max(points) > MAX_POINTS:
             return None
         finer = plan_variant(plan, with_points(plan.scene, points))
-        work = [math.prod(one.scene.sheet.points) * one.grid.steps_per_frame for one in (plan, finer)]
+        work = [math.prod(each.scene.sheet.points) * each.grid.steps_per_frame for each in (plan, finer)]
         return None if seconds * work[1] / work[0] > longest_run or any(cost.size_problems(finer)) else finer
 
     def _measure_errors(self, finer: Plan | None) -> None:
-        """Step through the scene with all sheets side by side, and with a finer one if any; compare every frame."""
+        """Step all meshes through the scene in parallel, and a finer one if given; compare every frame."""
         finest = self._sheets[-1].plan if finer is None else finer
         grid = finest.grid
         with ExitStack() as opened:
@@ -298,7 +314,7 @@ class PointStudy:
                 sheets[-1].compile()
             for sheet in sheets:
                 sheet.restart(sheet.plan.with_grid(steps_per_frame=grid.steps_per_frame))
-            errors, own_error, largest = [0.0] * len(sheets), 0.0, 0.0
+            errors, reference_error, largest = [0.0] * len(sheets), 0.0, 0.0
             for _ in range(grid.frames):
                 for sheet in sheets:
                     self._tick()
@@ -306,25 +322,25 @@ class PointStudy:
                 fields = [sheet.displacement() for sheet in sheets]
                 with np.errstate(all="ignore"):
                     exact, bound = _reference(fields, extrapolate=not finest.tools)
-                    apart = [longest(_sampled(one, exact) - exact) for one in fields[:-1]]
-                    # Between the points of the finest sheet, its error is not known. But if its order is 1 or more, it
-                    # is at most its distance from a sheet that is twice as coarse.
-                    apart.append(longest(_sampled(fields[-2], fields[-1]) - fields[-1]))
-                errors = [max(pair) for pair in zip(errors, apart, strict=True)]
-                own_error, largest = max(own_error, bound), max(largest, longest(exact))
+                    frame_errors = [max_norm(_sampled(field, exact) - exact) for field in fields[:-1]]
+                    # The error of the finest mesh is unknown between its mass points. But at an order of 1 or more, it
+                    # is at most its distance from a mesh that is twice as coarse.
+                    frame_errors.append(max_norm(_sampled(fields[-2], fields[-1]) - fields[-1]))
+                errors = [max(pair) for pair in zip(errors, frame_errors, strict=True)]
+                reference_error, largest = max(reference_error, bound), max(largest, max_norm(exact))
             self._done += 1
-        farthest = farthest_displacement(finest, finest.scene.time.duration)
-        if not largest <= farthest:
+        max_displacement = displacement_bound(finest, finest.scene.time.duration)
+        if not largest <= max_displacement:
             return
-        for (plan, _, measured), error in zip(self._sheets, errors, strict=False):
+        for (plan, _, measurement), error in zip(self._sheets, errors, strict=False):
             if plan is not finest:
-                measured.known = error >= POINT_MARGIN * own_error
-                error += 0.0 if measured.known else own_error
+                measurement.known = error >= MESH_REFERENCE_MARGIN * reference_error
+                error += 0.0 if measurement.known else reference_error
             share = error / largest if largest > 0 else 0.0
-            measured.error = share if share < math.inf else None
+            measurement.error = share if share < math.inf else None
 
-    def _step_through(self, sheet: _Sheet, pilot: MeshPilot | None = None) -> float:
-        """Step through the scene with the sheet's own step; returns the time of stepping alone [s]."""
+    def _step_through(self, sheet: _MeshRun, companion: MeshCompanion | None = None) -> float:
+        """Step through the scene with the automatic step; return the time of stepping alone [s]."""
         plan, dynamics, _ = sheet
         dynamics.restart(plan)
         seconds = 0.0
@@ -334,75 +350,68 @@ class PointStudy:
             dynamics.advance(plan.grid.steps_per_frame)
             seconds += time.perf_counter() - start
             displacement = dynamics.displacement()
-            if pilot is not None:
-                pilot.follow(displacement, self._tick)
+            if companion is not None:
+                companion.compare_frame(displacement, self._tick)
         self._done += 1
         return seconds
 
     def _tick(self) -> None:
-        # For each sheet the estimate, another run and the rounds; for all of them together the errors.
-        self._progress(self._done, 1 + (2 + POINT_ROUNDS) * len(self._sheets))
+        # Every mesh has a run with its companions, a second run and the rounds; the errors are one run of all.
+        self._progress(self._done, 1 + (2 + MESH_ROUNDS) * len(self._sheets))
 
 
-def lattices(plan: Plan) -> Iterator[Plan]:
-    """Plan the numbers of points to compare, as far as the scene allows them; its own come last."""
-    for share in COARSER:
-        points = _scaled(plan, share)
-        coarse, _ = try_plan(with_points(plan.scene, points), plan.maps) if min(points) >= FEWEST else (None, [])
+def mesh_plans(plan: Plan) -> Iterator[Plan]:
+    """Plan the meshes to compare, as far as the scene allows them; its own is the last."""
+    for ratio in COARSE_CELL_RATIOS:
+        points = _scaled(plan, ratio)
+        coarse, _ = (
+            try_plan(with_points(plan.scene, points), plan.maps) if min(points) >= MIN_POINTS_PER_SIDE else (None, [])
+        )
         if coarse is not None:
             yield coarse
-    if min(plan.scene.sheet.points) >= FEWEST:
+    if min(plan.scene.sheet.points) >= MIN_POINTS_PER_SIDE:
         yield plan
 
 
-def _scaled(plan: Plan, factor: float) -> Lattice:
-    """Give the rows and columns of points for `factor` times the cells a side."""
-    rows, cols = (round((count - 1) * factor) + 1 for count in plan.scene.sheet.points)
+def _scaled(plan: Plan, ratio: float) -> tuple[int, int]:
+    """Return the rows and columns of mass points for `ratio` times the cells per side."""
+    rows, cols = (round((count - 1) * ratio) + 1 for count in plan.scene.sheet.points)
     return rows, cols
 
 
 def _reference(fields: list[Field], *, extrapolate: bool) -> tuple[Field, float]:
-    """Extrapolate the two finest fields by Richardson, for an error of order 2 in the length of cells.
-
-    u* = u + (u - u_r) / (r^2 - 1), where u_r has cells r times as long. The correction is computed at the points of u_r
-    and interpolated at those of u. The error of u* is at most about its distance from the extrapolation of the next two
-    fields, or of u from u_r if there are only two.
-
-    Args:
-        fields: two or more of displacements [m], the fewest points first, each of shape (rows, cols, 3).
-        extrapolate: whether to; else, as with contact, which has a lower order, u* is the finest one.
-
-    Returns:
-        u* at the points of the finest field [m], and an approximate bound of its error [m].
-    """
+    """Extrapolate the two finest displacement fields to order 2; return the result and a bound of its error [m]."""
+    # u* = u + (u - u_r) / (r^2 - 1), where u_r has cells r times as long. The correction is computed at the mass points
+    # of u_r and interpolated at those of u. The error of u* is at most about its distance from the extrapolation of the
+    # next two fields, or that of u from u_r if there are only two. With contact the order is lower.
     if not extrapolate:
-        return fields[-1], longest(_sampled(fields[-1], fields[-2]) - fields[-2])
+        return fields[-1], max_norm(_sampled(fields[-1], fields[-2]) - fields[-2])
     exact = fields[-1] + _sampled(_correction(fields[-1], fields[-2]), fields[-1])
     if len(fields) > 2:
         before = fields[-2] + _sampled(_correction(fields[-2], fields[-3]), fields[-2])
     else:
         before = _sampled(fields[-1], fields[-2])
-    return exact, longest(_sampled(exact, before) - before)
+    return exact, max_norm(_sampled(exact, before) - before)
 
 
 def _correction(fine: Field, coarse: Field) -> Field:
-    """Compute the correction of Richardson's extrapolation at the points of the coarse field."""
-    ratio = min((of - 1) / (to - 1) for of, to in zip(fine.shape[:2], coarse.shape[:2], strict=True))
+    """Return the correction of Richardson's extrapolation at the mass points of the coarse field."""
+    ratio = min((many - 1) / (few - 1) for many, few in zip(fine.shape[:2], coarse.shape[:2], strict=True))
     correction: Field = (_sampled(fine, coarse) - coarse) / (ratio**2 - 1)
     return correction
 
 
 def _sampled(values: Field, like: Field) -> Field:
-    """Interpolate a field at the points of another one."""
-    (rows, cols), (to_rows, to_cols) = values.shape[:2], like.shape[:2]
-    return CubicSampling((rows, cols), (to_rows, to_cols)).at(values)
+    """Interpolate a field at the mass points of another one."""
+    (rows, cols), (target_rows, target_cols) = values.shape[:2], like.shape[:2]
+    return CubicInterpolation((rows, cols), (target_rows, target_cols)).evaluate(values)
 
 
 REFINES = (0, 1, 2, 5, 10, 20)
 SUPERSAMPLES = (1, 2, 3, 4)
 
-# Settings of the reference picture, if there is memory for it; they must be finer than all that are compared with it.
-FINEST = {"refine": 40, "supersample": 8}
+# Settings of the reference picture, if there is memory for it. They must be finer than all settings compared with it.
+REFERENCE_RENDER = {"refine": 40, "supersample": 8}
 
 PICTURE_ROUNDS = 5
 
@@ -412,20 +421,26 @@ Picture = NDArray[np.uint8]
 def measure_pictures(
     scene: Scene, position: NDArray[Any], texture: Picture, quick: bool, study: Study, progress: ProgressCallback
 ) -> None:
-    """Draw the reference picture, then every setting, taking turns; `quick` varies the settings one at a time.
+    """Measure the error and the time of drawing with every setting.
 
-    The positions of the points [m] have the shape (rows, cols, 3), the picture on the sheet (height, width, 3).
+    Args:
+        scene: Scene to draw.
+        position: Positions of the mass points [m], shape (rows, cols, 3).
+        texture: Picture on the sheet, 8-bit RGB, shape (height, width, 3).
+        quick: Whether to vary the settings one at a time.
+        study: Receives the results.
+        progress: Called with the number of finished pictures and their total.
     """
     position = np.ascontiguousarray(position, np.float32)
     memory = process.available_memory() // 2
-    finest = _with_render(scene, **FINEST)
+    finest = _with_render(scene, **REFERENCE_RENDER)
     if cost.drawing_bytes(finest) > memory:
         study.notes.append("drawing was not measured: there is no memory for a picture fine enough to compare with")
         return
-    truth = Rasterizer(finest, texture).draw(position)
-    drawings, compared = [], list(settings(scene, quick))
-    for number, (refine, supersample) in enumerate(compared):
-        progress(number, len(compared) * PICTURE_ROUNDS)
+    reference = Rasterizer(finest, texture).draw(position)
+    drawings, candidates = [], list(render_settings(scene, quick))
+    for number, (refine, supersample) in enumerate(candidates):
+        progress(number, len(candidates) * PICTURE_ROUNDS)
         changed = _with_render(scene, refine=refine, supersample=supersample)
         memory -= cost.drawing_bytes(changed)
         if memory < 0:
@@ -434,39 +449,55 @@ def measure_pictures(
         drawing = Rasterizer(changed, texture)
         drawings.append(drawing)
         picture = drawing.draw(position)
-        apart = int(np.abs(picture.astype(np.int16) - truth).max())
-        study.drawing.append(Drawn(refine, supersample, psnr(picture, truth), apart))
+        error = int(np.abs(picture.astype(np.int16) - reference).max())
+        study.drawing.append(DrawingMeasurement(refine, supersample, psnr(picture, reference), error))
     for round_ in range(PICTURE_ROUNDS):
-        for number, (drawing, drawn) in enumerate(zip(drawings, study.drawing, strict=True)):
+        for number, (drawing, measurement) in enumerate(zip(drawings, study.drawing, strict=True)):
             progress(round_ * len(drawings) + number, len(drawings) * PICTURE_ROUNDS)
             start = time.perf_counter()
             drawing.draw(position)
-            drawn.samples.append(time.perf_counter() - start)
+            measurement.samples.append(time.perf_counter() - start)
 
 
-def settings(scene: Scene, quick: bool) -> Iterator[tuple[int, int]]:
-    """List refinements and supersamplings to compare; `quick`: with one of them as in the scene."""
-    own = scene.render
-    for supersample in sorted({*SUPERSAMPLES, own.supersample}):
-        for refine in sorted({*REFINES, own.refine}):
-            if not quick or refine == own.refine or supersample == own.supersample:
+def render_settings(scene: Scene, quick: bool) -> Iterator[tuple[int, int]]:
+    """List the refinements and supersamplings to compare.
+
+    Args:
+        scene: Scene with its own settings.
+        quick: Whether one of both is always that of the scene.
+
+    Returns:
+        Pairs of a refinement and a supersampling.
+    """
+    render = scene.render
+    for supersample in sorted({*SUPERSAMPLES, render.supersample}):
+        for refine in sorted({*REFINES, render.refine}):
+            if not quick or refine == render.refine or supersample == render.supersample:
                 yield refine, supersample
 
 
-def psnr(picture: Picture, truth: Picture) -> float | None:
-    """Give the peak signal-to-noise ratio [dB], 10 log10(255^2 / mean square error); None where they are the same."""
-    square = float(np.mean((picture.astype(np.float64) - truth) ** 2))
+def psnr(picture: Picture, reference: Picture) -> float | None:
+    """Compute the peak signal-to-noise ratio [dB], 10 log10(255^2 / mean square error).
+
+    Args:
+        picture: Picture, 8-bit RGB, shape (height, width, 3).
+        reference: Reference of the same shape.
+
+    Returns:
+        The ratio [dB]; None if both pictures are equal.
+    """
+    square = float(np.mean((picture.astype(np.float64) - reference) ** 2))
     return 10 * math.log10(255**2 / square) if square > 0 else None
 
 
 def _with_render(scene: Scene, **changes: int) -> Scene:
-    # Not checked, because the settings of the reference picture exceed the limits of a scene.
+    # There is no validation, because the settings of the reference picture exceed the limits of a scene.
     return scene.model_copy(update={"render": BaseModel.model_copy(scene.render, update=changes)})
 
 
 TERM_ROUNDS = 9
 
-# The terms of a sheet that can be left out, and the values that leave them out.
+# Keys of the terms of a sheet that can be left out, and the values that leave them out.
 SPRING_TERMS: dict[str, float | None] = {"structural": 0.0, "shear": 0.0, "virtual": 0.0, "map": None}
 TISSUE_TERMS: dict[str, float | None] = {
     **dict.fromkeys(("foundation", "damping", "pretension", "bending"), 0.0),
@@ -475,11 +506,19 @@ TISSUE_TERMS: dict[str, float | None] = {
 
 
 def measure_terms(plan: Plan, device: Device, sample: float, study: Study, progress: ProgressCallback) -> None:
-    """Measure the time of a step with each term left out in turn, in samples of about so many seconds."""
-    # All variants have the steps of the whole scene: without a spring the automatic step would be another.
+    """Measure the time of a step with each term left out in turn.
+
+    Args:
+        plan: Plan of the scene.
+        device: Device to run on.
+        sample: Approximate time of a measurement [s].
+        study: Receives the results.
+        progress: Called with the number of finished measurements and their total.
+    """
+    # All variants have the step of the full scene, because the automatic step depends on the springs.
     grid = {"steps_per_frame": plan.grid.steps_per_frame, "precision": plan.grid.precision}
-    plans = {without: plan_variant(plan, scene).with_grid(**grid) for without, scene in variants(plan.scene)}
-    study.terms += map(TimedTerm, plans)
+    plans = {without: plan_variant(plan, scene).with_grid(**grid) for without, scene in scene_variants(plan.scene)}
+    study.terms += map(TermMeasurement, plans)
     with ExitStack() as opened:
         sheets: list[Dynamics] = []
         for without in plans.values():
@@ -491,25 +530,25 @@ def measure_terms(plan: Plan, device: Device, sample: float, study: Study, progr
         for round_ in range(TERM_ROUNDS):
             for number, (term, sheet) in enumerate(zip(study.terms, sheets, strict=True)):
                 progress(round_ * len(sheets) + number, TERM_ROUNDS * len(sheets))
-                # From rest, so that all variants step through the same part of the scene.
+                # All variants start from rest, and so step through the same part of the scene.
                 sheet.restart(sheet.plan)
                 term.samples.append(_step_seconds(sheet, frames))
 
 
-def variants(scene: Scene) -> Iterator[tuple[str, Scene]]:
-    """Give the scene without each of its terms in turn, by the term's key; the first variant is the whole scene."""
+def scene_variants(scene: Scene) -> Iterator[tuple[str, Scene]]:
+    """List the scene without each of its terms in turn, with the term's key; the first variant is the full scene."""
     yield "", scene
     terms, sheet = (SPRING_TERMS, scene.springs) if scene.tissue is None else (TISSUE_TERMS, scene.tissue)
     assert sheet is not None
     for name, absent in terms.items():
         if getattr(sheet, name) not in (0, None):
-            rest = sheet.model_copy(update={name: absent})
-            yield f"{scene.kind}.{name}", scene.model_copy(update={scene.kind: rest})
+            without = sheet.model_copy(update={name: absent})
+            yield f"{scene.kind}.{name}", scene.model_copy(update={scene.kind: without})
     if scene.damping > 0:
         yield "damping", scene.model_copy(update={"damping": 0.0})
     for index in range(len(scene.probes)):
-        others = scene.probes[:index] + scene.probes[index + 1 :]
-        yield f"probes.{index}", scene.model_copy(update={"probes": others})
+        remaining = scene.probes[:index] + scene.probes[index + 1 :]
+        yield f"probes.{index}", scene.model_copy(update={"probes": remaining})
 
 
 def _step_seconds(dynamics: Dynamics, frames: int) -> float:
@@ -520,74 +559,87 @@ def _step_seconds(dynamics: Dynamics, frames: int) -> float:
     return (time.perf_counter() - start) / steps
 
 
-# Loads are evaluated this far inside an interval between two keys, as a fraction of it: at its ends they may jump.
-INSIDE = 1e-9
+# Distance from the ends of an interval between keyframes, where loads may jump, at which they are evaluated, as a
+# fraction of the interval.
+KEY_MARGIN = 1e-9
 
 Array = NDArray[np.float64]
 
 
-class TooSlowError(Exception):
+class TimeLimitError(Exception):
     """The time limit is exceeded."""
 
 
-class FailedError(Exception):
-    """The solver finds no step that is small enough; the message says when."""
+class IntegrationError(Exception):
+    """The solver has no step that is small enough; the message contains the time."""
 
 
-def solve(plan: Plan, rtol: float, atol: float, deadline: float, tick: Callable[[], None]) -> tuple[Array, int]:
-    """Integrate from key to key of the loads, between which they are smooth.
+def solve_with_dop853(
+    plan: Plan, rtol: float, atol: float, deadline: float, tick: Callable[[], None]
+) -> tuple[Array, int]:
+    """Integrate the scene with SciPy's DOP853, between keyframes of the loads, where they are smooth.
 
-    The absolute tolerance is of displacements [m] and velocities [m/s]; `tick` is called now and then.
+    Args:
+        plan: Plan of the scene.
+        rtol: Relative tolerance.
+        atol: Absolute tolerance of displacements [m] and velocities [m/s].
+        deadline: Time limit, on the clock of `time.perf_counter` [s].
+        tick: Called several times a second.
 
     Returns:
-        Displacements at every frame but the first [m], shape (F, rows, cols, 3); and the number of evaluations.
+        Displacements at every frame but the first [m], shape (F, rows, cols, 3), and the number of evaluations.
 
     Raises:
-        TooSlowError: when `time.perf_counter()` has come to the deadline.
-        FailedError: when SciPy fails.
+        TimeLimitError: When the deadline has passed.
+        IntegrationError: When SciPy fails.
     """
     from scipy.integrate import solve_ivp
 
     scene = plan.scene
     shape = (*scene.sheet.points, 3)
-    accelerate, moves = acceleration(plan), ~plan.fixed[..., None]
+    accelerate, free = acceleration_function(plan), ~plan.fixed[..., None]
     state = np.zeros(2 * int(np.prod(shape)))
     evaluations = 0
     displacements = []
-    for start, end, frames in _pieces(scene):
-        margin = INSIDE * (end - start)
-        first = evaluate_loads(plan, np.array([start + margin, end - margin]))
+    for start, end, frames in _smooth_intervals(scene):
+        margin = KEY_MARGIN * (end - start)
+        end_loads = evaluate_loads(plan, np.array([start + margin, end - margin]))
 
-        def motion(t: float, y: Array, start: float = start, end: float = end, ends: Schedule = first) -> Array:
+        def motion(t: float, y: Array, start: float = start, end: float = end, ends: Schedule = end_loads) -> Array:
             if time.perf_counter() > deadline:
-                raise TooSlowError
+                raise TimeLimitError
             tick()
             share = (t - start) / (end - start)
             between = (each[:1] + share * (each[1:] - each[:1]) for each in ends[1:])
             loads = Schedule(ends.slots, *between)
             u, v = y.reshape(2, *shape)
-            return np.concatenate([v.ravel(), (accelerate(u, v, loads) * moves).ravel()])
+            return np.concatenate([v.ravel(), (accelerate(u, v, loads) * free).ravel()])
 
         times = np.union1d(frames, end)
-        solved = solve_ivp(motion, (start, end), state, "DOP853", t_eval=times, rtol=rtol, atol=atol)
-        if not solved.success:
-            raise FailedError(f"after {solved.t[-1] if solved.t.size else start:.3g} s")
-        state = solved.y[:, -1]
-        evaluations += solved.nfev
-        displacements += [column[: state.size // 2].reshape(shape) for column in solved.y.T[: len(frames)]]
+        solution = solve_ivp(motion, (start, end), state, "DOP853", t_eval=times, rtol=rtol, atol=atol)
+        if not solution.success:
+            raise IntegrationError(f"after {solution.t[-1] if solution.t.size else start:.3g} s")
+        state = solution.y[:, -1]
+        evaluations += solution.nfev
+        displacements += [column[: state.size // 2].reshape(shape) for column in solution.y.T[: len(frames)]]
     return np.array(displacements), evaluations
 
 
-def acceleration(plan: Plan) -> Callable[[Array, Array, Schedule], Array]:
-    """Prepare the right side of eq. 1 over the mass: displacements [m] and velocities [m/s] to accelerations [m/s2].
+def acceleration_function(plan: Plan) -> Callable[[Array, Array, Schedule], Array]:
+    """Build the right-hand side of eq. 1, divided by the mass.
 
-    The arrays have the shape (rows, cols, 3), and the schedule one step.
+    Args:
+        plan: Plan of the scene.
+
+    Returns:
+        Function of displacements [m] and velocities [m/s], shape (rows, cols, 3), and of a schedule of one step, that
+        returns accelerations [m/s2].
     """
-    scene, sheet, every = plan.scene, plan.material, tuple(spring_families(plan))
+    scene, material, families = plan.scene, plan.material, tuple(spring_families(plan))
     (dx, dy), (x, y) = spacing(scene.sheet), axes(scene.sheet)
     shares = area_shares(scene.sheet)
-    area = shares if sheet.by_area else np.ones_like(shares)
-    held = area if sheet.virtual_factors is None else area * sheet.virtual_factors
+    area = shares if material.by_area else np.ones_like(shares)
+    foundation = area if material.virtual_factors is None else area * material.virtual_factors
     probes = [probe_force(probe, scene.sheet) for probe in scene.probes]
 
     def laplacian(u: Array) -> Array:
@@ -595,26 +647,26 @@ def acceleration(plan: Plan) -> Callable[[Array, Array, Schedule], Array]:
         return (u[1:-1, 2:] - 2 * inner + u[1:-1, :-2]) / dx**2 + (u[2:, 1:-1] - 2 * inner + u[:-2, 1:-1]) / dy**2
 
     def accelerate(u: Array, v: Array, loads: Schedule) -> Array:
-        force = elastic_force(every, u) - (loads.active[0] * sheet.virtual * held)[..., None] * u
+        force = elastic_force(families, u) - (loads.active[0] * material.virtual * foundation)[..., None] * u
         for slot, strength, (at_x, at_y) in zip(loads.slots, loads.strength[0], loads.point[0], strict=True):
             probe = probes[slot.probe]
             decay = probe.decay(np.hypot(x - at_x, y - at_y)) * (shares if probe.by_area else 1)
             force += decay[..., None] * strength
-        if sheet.bending:
-            # Points with four neighbours have a moment; those at the edges, which are fixed, need no force.
+        if material.bending:
+            # Mass points with four neighbours have a moment; those at the border are fixed and need no force.
             moment = np.zeros_like(u)
-            moment[1:-1, 1:-1] = sheet.bending * laplacian(u)
+            moment[1:-1, 1:-1] = material.bending * laplacian(u)
             force[1:-1, 1:-1] -= laplacian(moment)
-        return np.asarray(force / (sheet.mass * area)[..., None] - sheet.drag * v)
+        return np.asarray(force / (material.mass * area)[..., None] - material.drag * v)
 
     return accelerate
 
 
-def _pieces(scene: Scene) -> Iterator[tuple[float, float, Array]]:
-    """Split the time at the keys: start, end, and the times t of frames with start < t <= end."""
+def _smooth_intervals(scene: Scene) -> Iterator[tuple[float, float, Array]]:
+    """Split the time at the keyframes into start, end, and the times t of frames with start < t <= end."""
     frames = np.arange(1, scene.time.frames + 1) / scene.time.frames_per_second
     bounds = [0.0, *keyframe_times(scene), float(frames[-1])]
     for start, end in pairwise(bounds):
-        # A key that differs from the time of a frame only by rounding is at that frame.
-        near = frames[(frames > start * (1 + INSIDE)) & (frames <= end * (1 + INSIDE))]
-        yield start, end, np.minimum(near, end)
+        # A keyframe that differs from the time of a frame only by rounding is at that frame.
+        inside = frames[(frames > start * (1 + KEY_MARGIN)) & (frames <= end * (1 + KEY_MARGIN))]
+        yield start, end, np.minimum(inside, end)

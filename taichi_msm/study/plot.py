@@ -1,4 +1,4 @@
-"""A study as a picture: work against precision of stepping, drawing and points, and the cost of every term."""
+"""Picture of a study: work-precision diagrams of stepping, drawing and meshes, and the cost of every term."""
 
 from __future__ import annotations
 
@@ -35,8 +35,14 @@ from taichi_msm.plot_style import (
     TWO_COLUMN_WIDTH,
     VERMILION,
 )
-from taichi_msm.study.format import mostly_rounding, number, unit, where
-from taichi_msm.study.result import Drawn, Peer, Points, Stepping, Study
+from taichi_msm.study.format import (
+    ErrorMeasurement,
+    format_number,
+    is_mostly_rounding,
+    machine_summary,
+    time_unit,
+)
+from taichi_msm.study.result import DrawingMeasurement, Study
 from taichi_msm.system.compiler import compiler_label
 
 # Colour shows the damping difference, dashes and markers the precision.
@@ -45,24 +51,28 @@ PRECISION_LINES: dict[str, dict[str, Any]] = {
     "f32": {"linestyle": "-", "marker": "o"},
     "f64": {"linestyle": (0, (3.5, 1.8)), "marker": "s"},
 }
-PEER_LINE: dict[str, Any] = {"color": INK, "linestyle": ":", "marker": "D"}
+DOP853_LINE: dict[str, Any] = {"color": INK, "linestyle": ":", "marker": "D"}
 TOLERANCE_LINE: dict[str, Any] = {"color": GREY, "linewidth": 0.8, "linestyle": (0, (6, 3))}
-RING: dict[str, Any] = {"ls": "none", "marker": "o", "ms": 11, "mfc": "none", "mec": INK, "zorder": 5}
-HOLLOW: dict[str, Any] = {"mfc": "white"}
-HALF: dict[str, Any] = {"fillstyle": "bottom", "markerfacecoloralt": "white"}
-DOT: dict[str, Any] = {"linestyle": "none", "marker": "o", "color": GREY}
+RECOMMENDED_MARKER: dict[str, Any] = {"ls": "none", "marker": "o", "ms": 11, "mfc": "none", "mec": INK, "zorder": 5}
+BOUND_MARKER: dict[str, Any] = {"mfc": "white"}
+ROUNDING_MARKER: dict[str, Any] = {"fillstyle": "bottom", "markerfacecoloralt": "white"}
+LEGEND_MARKER: dict[str, Any] = {"linestyle": "none", "marker": "o", "color": GREY}
 SUPERSAMPLE_COLOURS = (SKY, BLUE, GREEN, ORANGE, PURPLE, VERMILION)
 MARKERS = "osD^vPX"
 
-# Where the panels are, by their number; the first of three is as high as the others together.
-LAYOUTS = {1: "A", 2: "AB", 3: "AB;AC", 4: "AB;CD"}
+# Mosaic of the panels by their number; the first of three is as high as the others together.
+PANEL_MOSAICS = {1: "A", 2: "AB", 3: "AB;AC", 4: "AB;CD"}
 
 Panel = Callable[[Axes, Study], None]
-Point = Stepping | Peer | Points
 
 
 def plot(study: Study, path: Path) -> None:
-    """Draw the parts that a study has measured, at least one of the `panels`, as a PNG."""
+    """Draw the measured parts of a study.
+
+    Args:
+        study: Results with at least one of the `panels`.
+        path: PNG file to write.
+    """
     with style.context(STYLE, after_reset=True), warnings.catch_warnings():
         # The name of a scene may contain characters that the font lacks.
         warnings.filterwarnings("ignore", "Glyph .* missing")
@@ -70,49 +80,51 @@ def plot(study: Study, path: Path) -> None:
 
 
 def panels(study: Study) -> Iterator[Panel]:
-    """List the parts that have something to draw."""
+    """List the panels that have something to draw."""
     if any(_drawable(point.error) for point in study.stepping):
         yield _plot_stepping
-    if any(_drawable(drawn.psnr) for drawn in study.drawing):
+    if any(_drawable(drawing.psnr) for drawing in study.drawing):
         yield _plot_drawing
-    if any(_drawable(points.error) for points in study.points):
-        yield _plot_points
+    if any(_drawable(mesh.error) for mesh in study.points):
+        yield _plot_meshes
     if study.terms:
         yield _plot_terms
 
 
 def _drawable(value: float | None) -> bool:
-    """Tell whether a value can be shown on a logarithmic axis."""
+    """Return whether a logarithmic axis can show a value."""
     return value is not None and 0 < value < math.inf
 
 
 def _figure(study: Study) -> Figure:
-    every = list(panels(study))
-    layout = LAYOUTS[len(every)]
-    size = (TWO_COLUMN_WIDTH if len(every) > 1 else ONE_COLUMN_WIDTH, 4.2 * (layout.count(";") + 1) + 0.5)
+    study_panels = list(panels(study))
+    layout = PANEL_MOSAICS[len(study_panels)]
+    size = (TWO_COLUMN_WIDTH if len(study_panels) > 1 else ONE_COLUMN_WIDTH, 4.2 * (layout.count(";") + 1) + 0.5)
     figure = Figure(figsize=size, dpi=DPI, layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1, wspace=0.05))
     FigureCanvasAgg(figure)
     versions = study.machine["versions"]
     state = " (interrupted)" if study.status == "interrupted" else ""
     figure.suptitle(f"{printable(study.scene)}: speed against error{state}", x=0.01, ha="left", parse_math=False)
-    machine = f"{where(study)}; taichi-msm {versions['taichi-msm']}, {compiler_label(versions)}"
-    figure.supxlabel(f"{_advice(study)}\n{machine}", x=0.01, ha="left", size=8, parse_math=False, wrap=True)
+    machine = f"{machine_summary(study)}; taichi-msm {versions['taichi-msm']}, {compiler_label(versions)}"
+    figure.supxlabel(
+        f"{_recommendation_line(study)}\n{machine}", x=0.01, ha="left", size=8, parse_math=False, wrap=True
+    )
     axes = figure.subplot_mosaic(layout)
-    for name, panel in zip("ABCD", every, strict=False):
+    for name, panel in zip("ABCD", study_panels, strict=False):
         panel(axes[name], study)
     return figure
 
 
-def _advice(study: Study) -> str:
-    """Say in a line what the study recommends."""
+def _recommendation_line(study: Study) -> str:
+    """Format the recommendation in a line."""
     settings = [line.strip() for line in study.recommendation() if not line.endswith(":")]
-    if study.more_points is None and study.best_stepping is None:
+    if study.recommended_points is None and study.best_stepping is None:
         settings.append(f"no step measured is within the tolerance of {study.tolerance:g}")
     return f"Recommended (ringed where measured): {'; '.join(settings)}" if study.stepping else ""
 
 
 def _plot_stepping(axes: Axes, study: Study) -> None:
-    largest = "" if study.reference is None else f" ({number(study.reference.largest)} m)"
+    largest = "" if study.reference is None else f" ({format_number(study.reference.largest)} m)"
     axes.set(title="Stepping", ylabel="time to step through the scene [s]")
     axes.set_xlabel(f"error, as a fraction of the largest displacement{largest}")
     handles = []
@@ -125,92 +137,94 @@ def _plot_stepping(axes: Axes, study: Study) -> None:
         right = axes.get_yaxis_transform()
         axes.plot([0.985] * len(diverged), diverged, "x", color=line["color"], transform=right)
     if study.peers:
-        handles.append(_plot_line(axes, study.peers, PEER_LINE, "SciPy DOP853"))
+        handles.append(_plot_line(axes, study.peers, DOP853_LINE, "SciPy DOP853"))
     best = study.best_stepping
     if best is not None and _drawable(best.error):
-        axes.plot([best.error or 0.0], [best.seconds.median], **RING)
+        axes.plot([best.error or 0.0], [best.seconds.median], **RECOMMENDED_MARKER)
     _scale_errors(axes, [*study.stepping, *study.peers], study.tolerance)
-    _legend(axes, [*handles, *_marks(study)])
+    _legend(axes, [*handles, *_marker_legend(study)])
 
 
-def _plot_line(axes: Axes, points: Sequence[Point], line: dict[str, Any], label: str) -> Line2D:
-    """Draw a line through points; markers are hollow for upper bounds, half filled where rounding dominates.
-
-    Returns:
-        Its entry in the legend.
-    """
+def _plot_line(axes: Axes, points: Sequence[ErrorMeasurement], line: dict[str, Any], label: str) -> Line2D:
+    """Draw a line through measurements, and return its entry in the legend."""
     points = [point for point in points if _drawable(point.error)]
     errors = [point.error or 0.0 for point in points]
     axes.plot(errors, [point.seconds.median for point in points], **line, zorder=3)
     _plot_spread(axes, errors, points, line["color"])
     for point, error in zip(points, errors, strict=True):
-        if not point.known or mostly_rounding(point):
-            axes.plot([error], [point.seconds.median], **line | (HALF if point.known else HOLLOW), zorder=4)
+        # Markers are hollow for upper bounds, and half filled where rounding dominates.
+        if not point.known or is_mostly_rounding(point):
+            axes.plot(
+                [error], [point.seconds.median], **line | (ROUNDING_MARKER if point.known else BOUND_MARKER), zorder=4
+            )
     return Line2D([], [], **line, label=label)
 
 
-def _marks(study: Study) -> Iterator[Line2D]:
-    """Give legend entries for the kinds of markers in the picture."""
-    points: list[Point] = [*study.stepping, *study.peers]
+def _marker_legend(study: Study) -> Iterator[Line2D]:
+    """List the legend entries for the kinds of markers in the picture."""
+    points: list[ErrorMeasurement] = [*study.stepping, *study.peers]
     yield Line2D([], [], **TOLERANCE_LINE, label="tolerance")
     if study.best_stepping is not None:
-        yield Line2D([], [], **RING | {"ms": 8}, label="recommended")
-    if any(point.known and mostly_rounding(point) for point in points):
-        yield Line2D([], [], **DOT | HALF, label="mostly rounding")
+        yield Line2D([], [], **RECOMMENDED_MARKER | {"ms": 8}, label="recommended")
+    if any(point.known and is_mostly_rounding(point) for point in points):
+        yield Line2D([], [], **LEGEND_MARKER | ROUNDING_MARKER, label="mostly rounding")
     if any(_drawable(point.error) and not point.known for point in points):
-        yield Line2D([], [], **DOT | HOLLOW, label="at most this error")
+        yield Line2D([], [], **LEGEND_MARKER | BOUND_MARKER, label="at most this error")
     if any(point.error is None for point in study.stepping):
-        yield Line2D([], [], **DOT | {"marker": "x"}, label="diverged")
+        yield Line2D([], [], **LEGEND_MARKER | {"marker": "x"}, label="diverged")
 
 
 def _plot_drawing(axes: Axes, study: Study) -> None:
-    drawings = [drawn for drawn in study.drawing if _drawable(drawn.psnr)]
+    drawings = [drawing for drawing in study.drawing if _drawable(drawing.psnr)]
     axes.set(title="Drawing", xlabel="PSNR of the most deformed frame [dB]", ylabel="time of a frame [ms]")
     axes.margins(x=0.1)
-    colours = dict(zip(sorted({drawn.supersample for drawn in drawings}), cycle(SUPERSAMPLE_COLOURS)))
-    markers = dict(zip(sorted({drawn.refine for drawn in drawings}), cycle(MARKERS)))
+    colours = dict(zip(sorted({drawing.supersample for drawing in drawings}), cycle(SUPERSAMPLE_COLOURS)))
+    markers = dict(zip(sorted({drawing.refine for drawing in drawings}), cycle(MARKERS)))
     for supersample, colour in colours.items():
-        own = [drawn for drawn in drawings if drawn.supersample == supersample]
-        axes.plot(*zip(*map(_place, own), strict=True), color=colour, linewidth=0.8)
-        _plot_spread(axes, [drawn.psnr or 0.0 for drawn in own], own, colour, 1e3)
-    for drawn in drawings:
-        axes.plot(*_place(drawn), color=colours[drawn.supersample], marker=markers[drawn.refine], **HOLLOW, zorder=3)
+        series = [drawing for drawing in drawings if drawing.supersample == supersample]
+        axes.plot(*zip(*map(_coordinates, series), strict=True), color=colour, linewidth=0.8)
+        _plot_spread(axes, [drawing.psnr or 0.0 for drawing in series], series, colour, 1e3)
+    for drawing in drawings:
+        colour, marker = colours[drawing.supersample], markers[drawing.refine]
+        axes.plot(*_coordinates(drawing), color=colour, marker=marker, **BOUND_MARKER, zorder=3)
     best = study.best_drawing
     if best is not None and _drawable(best.psnr):
-        axes.plot(*_place(best), **RING)
+        axes.plot(*_coordinates(best), **RECOMMENDED_MARKER)
     _scale(axes, "y", [1e3 * seconds for seconds in _extremes(drawings)], 0.8)
-    handles = [Line2D([], [], color=colour, label=f"supersample {many}") for many, colour in colours.items()]
-    handles += [Line2D([], [], **DOT | HOLLOW | {"marker": m}, label=f"refine {n}") for n, m in markers.items()]
+    handles = [Line2D([], [], color=colour, label=f"supersample {n}") for n, colour in colours.items()]
+    handles += [
+        Line2D([], [], **LEGEND_MARKER | BOUND_MARKER | {"marker": m}, label=f"refine {n}") for n, m in markers.items()
+    ]
     _legend(axes, handles, 3)
 
 
-def _place(drawn: Drawn) -> tuple[float, float]:
-    return drawn.psnr or 0.0, 1e3 * drawn.seconds.median
+def _coordinates(drawing: DrawingMeasurement) -> tuple[float, float]:
+    return drawing.psnr or 0.0, 1e3 * drawing.seconds.median
 
 
-def _plot_points(axes: Axes, study: Study) -> None:
-    points = [one for one in study.points if _drawable(one.error)]
+def _plot_meshes(axes: Axes, study: Study) -> None:
+    meshes = [mesh for mesh in study.points if _drawable(mesh.error)]
     axes.set(title="Points", ylabel="time of the scene [s]")
     axes.set_xlabel("error, as a fraction of the largest displacement")
-    axes.plot([one.error or 0.0 for one in points], [one.seconds.median for one in points], color=BLUE)
+    axes.plot([mesh.error or 0.0 for mesh in meshes], [mesh.seconds.median for mesh in meshes], color=BLUE)
     handles = []
-    for one, marker in zip(points, cycle(MARKERS)):
-        line = {"color": BLUE, "linestyle": "none", "marker": marker} | ({} if one.known else HOLLOW)
-        own, bound = " (the scene)" if one is study.own_points else "", "" if one.known else ", at most"
-        handles.append(_plot_line(axes, [one], line, f"{one.name}{own}{bound}"))
-        if (one.rows, one.cols) == study.more_points:
-            axes.plot([one.error or 0.0], [one.seconds.median], **RING)
-        if _drawable(one.estimate):
-            axes.plot([one.error or 0.0, one.estimate or 0.0], [one.seconds.median] * 2, color=ORANGE, linewidth=0.7)
-            axes.plot([one.estimate or 0.0], [one.seconds.median], color=ORANGE, marker=marker)
-    if any(_drawable(one.estimate) for one in points):
+    for mesh, marker in zip(meshes, cycle(MARKERS)):
+        line = {"color": BLUE, "linestyle": "none", "marker": marker} | ({} if mesh.known else BOUND_MARKER)
+        role, bound = " (the scene)" if mesh is study.scene_mesh else "", "" if mesh.known else ", at most"
+        handles.append(_plot_line(axes, [mesh], line, f"{mesh.name}{role}{bound}"))
+        if (mesh.rows, mesh.cols) == study.recommended_points:
+            axes.plot([mesh.error or 0.0], [mesh.seconds.median], **RECOMMENDED_MARKER)
+        if _drawable(mesh.estimate):
+            axes.plot([mesh.error or 0.0, mesh.estimate or 0.0], [mesh.seconds.median] * 2, color=ORANGE, linewidth=0.7)
+            axes.plot([mesh.estimate or 0.0], [mesh.seconds.median], color=ORANGE, marker=marker)
+    if any(_drawable(mesh.estimate) for mesh in meshes):
         handles.append(Line2D([], [], color=ORANGE, marker="o", linestyle="none", label="estimated by run"))
-    _scale_errors(axes, points, study.points_tolerance, [one.estimate or 0.0 for one in points])
+    _scale_errors(axes, meshes, study.mesh_tolerance, [mesh.estimate or 0.0 for mesh in meshes])
     _legend(axes, [*handles, Line2D([], [], **TOLERANCE_LINE, label="tolerance")])
 
 
 def _plot_terms(axes: Axes, study: Study) -> None:
-    scale, name = unit(study.terms[0].seconds.median)
+    scale, name = time_unit(study.terms[0].seconds.median)
     rows = range(len(study.terms))
     times = [scale * term.seconds.median for term in study.terms]
     below = [scale * (term.seconds.median - term.seconds.fastest) for term in study.terms]
@@ -218,7 +232,7 @@ def _plot_terms(axes: Axes, study: Study) -> None:
     colours = [SKY if term.without else SILVER for term in study.terms]
     error_line = {"linewidth": 0.8, "ecolor": INK}
     bars = axes.barh(rows, times, height=0.6, color=colours, xerr=(below, above), error_kw=error_line)
-    axes.bar_label(bars, [number(time) for time in times], padding=3, size=7, color=GREY)
+    axes.bar_label(bars, [format_number(time) for time in times], padding=3, size=7, color=GREY)
     axes.axvline(times[0], **TOLERANCE_LINE, zorder=0)
     axes.set_yticks(rows, [f"without {term.without}" if term.without else "whole step" for term in study.terms])
     axes.set(title="Terms", xlabel=f"time of a step [{name.replace('us', 'µs')}]")
@@ -229,43 +243,47 @@ def _plot_terms(axes: Axes, study: Study) -> None:
 
 
 def _plot_spread(
-    axes: Axes, at: Sequence[float], points: Sequence[Point | Drawn], colour: str, scale: float = 1
+    axes: Axes,
+    x: Sequence[float],
+    points: Sequence[ErrorMeasurement | DrawingMeasurement],
+    colour: str,
+    scale: float = 1,
 ) -> None:
-    """Draw a thin line from the fastest to the slowest run of every point."""
+    """Draw a thin line from the fastest to the slowest run of every measurement."""
     fastest = [scale * point.seconds.fastest for point in points]
     slowest = [scale * point.seconds.slowest for point in points]
-    axes.vlines(at, fastest, slowest, color=colour, linewidth=0.7, alpha=0.6)
+    axes.vlines(x, fastest, slowest, color=colour, linewidth=0.7, alpha=0.6)
 
 
-def _extremes(points: Iterable[Point | Drawn]) -> Iterator[float]:
+def _extremes(points: Iterable[ErrorMeasurement | DrawingMeasurement]) -> Iterator[float]:
     """List the fastest and slowest times [s]."""
     for point in points:
         yield from (point.seconds.fastest, point.seconds.slowest)
 
 
-def _scale_errors(axes: Axes, points: Sequence[Point], tolerance: float, more: Iterable[float] = ()) -> None:
+def _scale_errors(axes: Axes, points: Sequence[ErrorMeasurement], tolerance: float, more: Iterable[float] = ()) -> None:
     """Fit logarithmic axes to times and errors, and mark the tolerance."""
     axes.axvline(tolerance, **TOLERANCE_LINE)
     _scale(axes, "x", [*(point.error or 0.0 for point in points), *more, tolerance], 2)
     _scale(axes, "y", _extremes(points), 1)
 
 
-def _scale(axes: Axes, axis: str, values: Iterable[float], least: float) -> None:
-    """Make an axis logarithmic; it spans the values with a margin, and at least `least` decades."""
+def _scale(axes: Axes, axis: str, values: Iterable[float], min_decades: float) -> None:
+    """Make an axis logarithmic, with a margin around the values and at least `min_decades` decades."""
     exponents = [math.log10(value) for value in values if _drawable(value)]
     low, high = min(exponents), max(exponents)
-    room = max(0.07 * (high - low), (least - (high - low)) / 2)
-    axes.set(**{f"{axis}scale": "log", f"{axis}lim": (10 ** (low - room), 10 ** (high + room))})
+    margin = max(0.07 * (high - low), (min_decades - (high - low)) / 2)
+    axes.set(**{f"{axis}scale": "log", f"{axis}lim": (10 ** (low - margin), 10 ** (high + margin))})
     ticks: Axis = getattr(axes, f"{axis}axis")
     if axis == "y":
-        # 0.05 rather than 5 x 10^-2.
-        ticks.set_major_locator(LogLocator(subs=(1, 2, 5) if high - low + 2 * room < 2.5 else (1,)))
+        # Times are written like 0.05 rather than 5 x 10^-2.
+        ticks.set_major_locator(LogLocator(subs=(1, 2, 5) if high - low + 2 * margin < 2.5 else (1,)))
         ticks.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     ticks.set_minor_formatter(NullFormatter())
 
 
 def _legend(axes: Axes, handles: Sequence[Line2D], columns: int = 2) -> None:
-    """Put a legend below a panel and its label, as wide as the panel."""
+    """Add a legend below a panel and its label, as wide as the panel."""
     figure = axes.figure
     assert isinstance(figure, Figure)
     axes.legend(

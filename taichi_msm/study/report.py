@@ -1,7 +1,4 @@
-"""The files of a study: everything as JSON, tables in Markdown, a picture.
-
-A study in words: its page in Markdown, and the shorter form that the terminal shows.
-"""
+"""Report of a study: the results as JSON, a page in Markdown, a picture, and a summary for the terminal."""
 
 from __future__ import annotations
 
@@ -15,56 +12,78 @@ from typing import Any, TypeVar
 from taichi_msm.errors import printable, writing
 from taichi_msm.runs.directory import staged
 from taichi_msm.scene.section import MAX_POINTS
-from taichi_msm.study.format import Columns, duration, number, size, table, timing, where, wrong
-from taichi_msm.study.result import Drawn, Measured, Peer, Points, Reference, Stepping, Study
+from taichi_msm.study.format import (
+    Columns,
+    ErrorMeasurement,
+    comparable_error,
+    format_duration,
+    format_error,
+    format_number,
+    format_table,
+    format_timing,
+    machine_summary,
+)
+from taichi_msm.study.result import (
+    DrawingMeasurement,
+    Measurement,
+    PeerMeasurement,
+    Reference,
+    SteppingMeasurement,
+    Study,
+)
 from taichi_msm.system.compiler import compiler_label
 
-pass  # REMOVED
-
-PICTURE, PAGE, RECORD = "study.png", "study.md", "study.json"
+PICTURE_FILE, PAGE_FILE, RECORD_FILE = "study.png", "study.md", "study.json"
 
 WITHOUT_MATPLOTLIB = "study.png needs matplotlib: pip install matplotlib"
 
 
 def require_writable(directory: Path) -> None:
-    """Check before a long measurement that its report can be written; raises FilesError."""
+    """Check before a long measurement that its report can be written.
+
+    Raises:
+        FilesError: When the directory cannot be written.
+    """
     with writing(directory), staged(directory):
         pass
 
 
 def write_report(study: Study, directory: Path) -> list[str]:
-    """Write the report of a study, replacing an earlier one; other files in the directory stay.
+    """Write the report of a study, replacing an earlier one; other files in the directory remain.
 
-    Every file is written as a whole or not at all, study.json last. A note is added to the study if its picture cannot
-    be drawn.
+    Every file is written atomically, study.json last.
+
+    Args:
+        study: Results; a note is added to them if the picture cannot be drawn.
+        directory: Directory of the report.
 
     Returns:
-        The names of the files, study.json last.
+        Names of the files, study.json last.
 
     Raises:
-        FilesError: when the directory cannot be written.
+        FilesError: When the directory cannot be written.
     """
     with writing(directory), staged(directory) as hidden:
-        outputs = [*([PICTURE] if _draw(study, hidden / PICTURE) else []), PAGE, RECORD]
-        record = json.dumps({**as_record(study), "outputs": outputs}, indent=2, ensure_ascii=False, allow_nan=False)
-        for file, text in ((PAGE, page(study)), (RECORD, record + "\n")):
-            # A file name that is not UTF-8 has surrogates; written with backslashes they are valid in JSON too.
+        outputs = [*([PICTURE_FILE] if _draw(study, hidden / PICTURE_FILE) else []), PAGE_FILE, RECORD_FILE]
+        record = json.dumps({**study_record(study), "outputs": outputs}, indent=2, ensure_ascii=False, allow_nan=False)
+        for file, text in ((PAGE_FILE, format_page(study)), (RECORD_FILE, record + "\n")):
+            # The surrogates of a file name that is not UTF-8 become backslashes, which are valid in JSON too.
             (hidden / file).write_text(text, encoding="utf-8", errors="backslashreplace", newline="")
-        if PICTURE not in outputs:
-            (directory / PICTURE).unlink(missing_ok=True)
+        if PICTURE_FILE not in outputs:
+            (directory / PICTURE_FILE).unlink(missing_ok=True)
         for output in outputs:
             (hidden / output).replace(directory / output)
     return outputs
 
 
-def as_record(study: Study) -> dict[str, Any]:
-    """Give the whole study as data for JSON; numbers that are not finite become null."""
+def study_record(study: Study) -> dict[str, Any]:
+    """Convert a study to data for JSON; non-finite numbers become null."""
     return {**_as_data(vars(study)), "recommendation": study.recommendation()}
 
 
 def _as_data(value: Any) -> Any:
-    if isinstance(value, Measured):
-        method = {"method": value.method} if isinstance(value, Stepping) else {}
+    if isinstance(value, Measurement):
+        method = {"method": value.method} if isinstance(value, SteppingMeasurement) else {}
         return {**method, **{key: _as_data(inner) for key, inner in vars(value).items() if key != "samples"}} | {
             "seconds": asdict(value.seconds)
         }
@@ -78,7 +97,7 @@ def _as_data(value: Any) -> Any:
 
 
 def _draw(study: Study, path: Path) -> bool:
-    """Draw the picture, if there is something to draw and Matplotlib is installed; returns whether it was drawn."""
+    """Draw the picture if Matplotlib is installed and there is something to draw; return whether it was drawn."""
     try:
         from taichi_msm.study.plot import panels, plot
     except ImportError:
@@ -96,51 +115,51 @@ def _draw(study: Study, path: Path) -> bool:
     return True
 
 
-METHODS: Columns = {
+STEPPING_COLUMNS: Columns = {
     "method": lambda point: point.method,
-    "step": lambda point: duration(point.step),
+    "step": lambda point: format_duration(point.step),
     "steps/frame": lambda point: str(point.steps_per_frame),
-    "error": wrong,
-    "of it rounding": lambda point: "" if point.rounding is None else number(point.rounding),
-    "time of the scene": lambda point: timing(point.seconds),
+    "error": format_error,
+    "of it rounding": lambda point: "" if point.rounding is None else format_number(point.rounding),
+    "time of the scene": lambda point: format_timing(point.seconds),
 }
-PEERS: Columns = {
+PEER_COLUMNS: Columns = {
     "rtol": lambda peer: f"{peer.rtol:g}",
-    "error": wrong,
+    "error": format_error,
     "evaluations": lambda peer: str(peer.evaluations),
-    "time of the scene": lambda peer: timing(peer.seconds),
+    "time of the scene": lambda peer: format_timing(peer.seconds),
 }
-DRAWINGS: Columns = {
-    "refine": lambda drawn: str(drawn.refine),
-    "supersample": lambda drawn: str(drawn.supersample),
-    "PSNR": lambda drawn: "equal" if drawn.psnr is None else f"{drawn.psnr:.1f} dB",
-    "largest error": lambda drawn: str(drawn.largest_error),
-    "time of a frame": lambda drawn: timing(drawn.seconds),
+DRAWING_COLUMNS: Columns = {
+    "refine": lambda drawing: str(drawing.refine),
+    "supersample": lambda drawing: str(drawing.supersample),
+    "PSNR": lambda drawing: "equal" if drawing.psnr is None else f"{drawing.psnr:.1f} dB",
+    "largest error": lambda drawing: str(drawing.largest_error),
+    "time of a frame": lambda drawing: format_timing(drawing.seconds),
 }
-SHEETS: Columns = {
-    "points": lambda points: points.name,
-    "steps/frame": lambda points: str(points.steps_per_frame),
-    "error": wrong,
-    "estimate": lambda points: "not known" if points.estimate is None else number(points.estimate),
-    "time of the scene": lambda points: timing(points.seconds),
+MESH_COLUMNS: Columns = {
+    "points": lambda mesh: mesh.name,
+    "steps/frame": lambda mesh: str(mesh.steps_per_frame),
+    "error": format_error,
+    "estimate": lambda mesh: "not known" if mesh.estimate is None else format_number(mesh.estimate),
+    "time of the scene": lambda mesh: format_timing(mesh.seconds),
 }
-TERMS: Columns = {
+TERM_COLUMNS: Columns = {
     "without": lambda term: term.without or "nothing",
-    "time of a step": lambda term: timing(term.seconds),
+    "time of a step": lambda term: format_timing(term.seconds),
 }
-# The columns of stepping that the terminal shows.
-BRIEF = ("method", "step", "error", "time of the scene")
+# Columns of stepping in the summary.
+SUMMARY_COLUMNS = ("method", "step", "error", "time of the scene")
 
-Point = TypeVar("Point", Stepping, Peer)
+M = TypeVar("M", SteppingMeasurement, PeerMeasurement)
 
 
-def page(study: Study) -> str:
-    """Write the page."""
+def format_page(study: Study) -> str:
+    """Format the page of a study in Markdown."""
     versions = study.machine["versions"]
     state = "" if study.status == "complete" else f" ({study.status})"
     blocks = [
         f"# {printable(study.scene)}: speed against error{state}",
-        f"Measured on {where(study)}, with taichi-msm {versions['taichi-msm']}, {compiler_label(versions)}, "
+        f"Measured on {machine_summary(study)}, with taichi-msm {versions['taichi-msm']}, {compiler_label(versions)}, "
         f"NumPy {versions['numpy']} and Python {versions['python']} ({versions['platform']}). "
         "Times are medians, with the fastest and the slowest in brackets.",
         *(_stepping(study) if study.stepping or study.peers else ()),
@@ -153,11 +172,11 @@ def page(study: Study) -> str:
             _drawings_table(study, study.drawing),
         ]
     if study.points:
-        blocks += _points(study)
+        blocks += _meshes(study)
     if study.terms:
-        whole = study.terms[0].seconds.median
-        share: Columns = {"of the whole step": lambda term: f"{100 * term.seconds.median / whole:.0f} %"}
-        blocks += ["## Terms", table(study.terms, {**TERMS, **share})]
+        full = study.terms[0].seconds.median
+        share: Columns = {"of the whole step": lambda term: f"{100 * term.seconds.median / full:.0f} %"}
+        blocks += ["## Terms", format_table(study.terms, {**TERM_COLUMNS, **share})]
     if study.notes:
         blocks += ["## Notes", "\n".join(f"- {note}" for note in study.notes)]
     blocks += ["## Recommendation", *remarks(study)]
@@ -166,76 +185,79 @@ def page(study: Study) -> str:
     return "\n\n".join(blocks) + "\n"
 
 
-def summary(study: Study) -> str:
-    """Write the most important results for the terminal, and last the lines to put in the scene."""
-    lines = [f"{printable(study.scene)} on {where(study)}"]
+def format_summary(study: Study) -> str:
+    """Format the most important results for the terminal, followed by the recommended lines of a scene."""
+    lines = [f"{printable(study.scene)} on {machine_summary(study)}"]
     if study.reference is not None:
         lines.append(
-            f"error: the largest of any point at any frame, as a fraction of {number(study.reference.largest)} m; "
-            f"tolerance {study.tolerance:g}"
+            "error: the largest of any point at any frame, as a fraction of "
+            f"{format_number(study.reference.largest)} m; tolerance {study.tolerance:g}"
         )
     methods = dict.fromkeys(point.method for point in study.stepping)
-    every = (_best([one for one in study.stepping if one.method == method], study.tolerance) for method in methods)
-    fastest = [one for one in every if one]
+    best = (_best([point for point in study.stepping if point.method == method], study.tolerance) for method in methods)
+    fastest = [point for point in best if point]
     blocks = ["\n".join(lines)]
     if fastest:
-        blocks.append(_methods_table(study, fastest, {name: METHODS[name] for name in BRIEF}))
+        blocks.append(_methods_table(study, fastest, {name: STEPPING_COLUMNS[name] for name in SUMMARY_COLUMNS}))
     if peer := _best(study.peers, study.tolerance):
-        blocks.append(f"SciPy's DOP853 at rtol {peer.rtol:g}: error {wrong(peer)}, {timing(peer.seconds)}")
+        blocks.append(
+            f"SciPy's DOP853 at rtol {peer.rtol:g}: error {format_error(peer)}, {format_timing(peer.seconds)}"
+        )
     if study.drawing:
         blocks.append(_drawings_table(study, list(_drawings(study))))
     if study.points:
-        blocks.append(_sheets_table(study))
+        blocks.append(_meshes_table(study))
     notes = [f"note: {printable(note)}" for note in study.notes]
-    if said := [*notes, *_bounds([*fastest, *study.points]), *remarks(study)]:
-        blocks.append("\n".join(said))
+    if remark_lines := [*notes, *_bounds([*fastest, *study.points]), *remarks(study)]:
+        blocks.append("\n".join(remark_lines))
     if recommended := study.recommendation():
         blocks += ["To put in the scene:", "\n".join(recommended)]
     return "\n\n".join(blocks)
 
 
 def remarks(study: Study) -> Iterator[str]:
-    """Say what the recommendation leaves open, and what the points make of the error."""
-    own, more = study.own_points, study.more_points
-    if more is None and study.best_stepping is None:
+    """List remarks on the recommendation, and on the share of the mesh in the error."""
+    mesh, recommended = study.scene_mesh, study.recommended_points
+    if recommended is None and study.best_stepping is None:
         yield _shortfall(study)
-    if own is None:
+    if mesh is None:
         return
-    bound = f"{'' if own.known else 'at most about '}{number(own.error or 0.0)}"
-    if more is None:
+    bound = f"{'' if mesh.known else 'at most about '}{format_number(mesh.error or 0.0)}"
+    if recommended is None:
         step = study.best_stepping
-        beside = "" if step is None else f", the recommended step one of {number(step.error or 0.0)}"
-        yield f"{own.name} points make an error of {bound}{beside}; the tolerance is {study.points_tolerance:g}."
+        step_error = "" if step is None else f", the recommended step one of {format_number(step.error or 0.0)}"
+        yield f"{mesh.name} points make an error of {bound}{step_error}; the tolerance is {study.mesh_tolerance:g}."
         return
-    rows, cols = more
+    rows, cols = recommended
     points = f"{rows} x {cols}"
-    if max(more) > MAX_POINTS:
+    if max(recommended) > MAX_POINTS:
         advice = (
             f"About {points} would be within it, and a scene may have {MAX_POINTS} a side: take a wider "
             "tool (probes.N.radius, a smaller falloff), or allow a larger error with --tolerance."
         )
     else:
-        measured = any((one.rows, one.cols) == more for one in study.points)
-        enough = f"{points} are within it" if measured else f"Take about {points} (extrapolated, not measured)"
-        advice = f"{enough}; with time.tolerance a run finds the step for them."
+        measured = any((each.rows, each.cols) == recommended for each in study.points)
+        sufficient = f"{points} are within it" if measured else f"Take about {points} (extrapolated, not measured)"
+        advice = f"{sufficient}; with time.tolerance a run finds the step for them."
     yield (
-        f"{own.name} points make an error of {bound}, which no step can mend; the tolerance is "
-        f"{study.points_tolerance:g}. {advice}"
+        f"{mesh.name} points make an error of {bound}, which no step can mend; the tolerance is "
+        f"{study.mesh_tolerance:g}. {advice}"
     )
 
 
 def _shortfall(study: Study) -> str:
-    """Say why no step is recommended, and what to do about it."""
+    """Explain why no step is recommended, and suggest a remedy."""
     closest = _best(study.stepping, study.tolerance)
     if closest is None:
         return "No step is recommended: none was measured."
-    said = f"No step that was measured is within the tolerance of {study.tolerance:g}"
+    reason = f"No step that was measured is within the tolerance of {study.tolerance:g}"
     if closest.error is None:
-        said += ": all diverged."
+        reason += ": all diverged."
     else:
-        said += f"; the closest is {closest.method} at {duration(closest.step)}, with an error of {wrong(closest)}."
+        step, error = format_duration(closest.step), format_error(closest)
+        reason += f"; the closest is {closest.method} at {step}, with an error of {error}."
     return (
-        f"{said} Set time.tolerance, with which a run searches for a finer step itself, and time.precision: f64; "
+        f"{reason} Set time.tolerance, with which a run searches for a finer step itself, and time.precision: f64; "
         "or allow a larger error with --tolerance."
     )
 
@@ -243,26 +265,26 @@ def _shortfall(study: Study) -> str:
 def _stepping(study: Study) -> Iterator[str]:
     yield "## Stepping"
     if (reference := study.reference) is not None:
-        extrapolated = ", not extrapolated as contact is of order 1," if study.touches else ", extrapolated,"
+        extrapolated = ", not extrapolated as contact is of order 1," if study.has_contact else ", extrapolated,"
         yield (
             "An error is the largest of any point at any frame, as a fraction of the largest displacement, "
-            f"{number(reference.largest)} m. The reference is central differences in f64{extrapolated} with up to "
-            f"{reference.steps_per_frame} steps a frame; its own error is about {number(reference.error)}. "
+            f"{format_number(reference.largest)} m. The reference is central differences in f64{extrapolated} with up "
+            f"to {reference.steps_per_frame} steps a frame; its own error is about {format_number(reference.error)}. "
             f"The tolerance is {study.tolerance:g}."
         )
-    yield _methods_table(study, study.stepping, METHODS)
+    yield _methods_table(study, study.stepping, STEPPING_COLUMNS)
     orders = [f"{method} {order:.2f}" for method, order in study.orders.items() if order is not None]
     if orders:
         yield f"Observed orders: {', '.join(orders)}."
     if study.peers:
         yield "SciPy's DOP853 on the same equations:"
-        yield table(study.peers, PEERS)
+        yield format_table(study.peers, PEER_COLUMNS)
     yield from _bounds([*study.stepping, *study.peers])
 
 
-def _points(study: Study) -> Iterator[str]:
+def _meshes(study: Study) -> Iterator[str]:
     yield "## Points"
-    reference = "the finest sheet" if study.touches else "the extrapolation, of order 2, of the two finest sheets"
+    reference = "the finest sheet" if study.has_contact else "the extrapolation, of order 2, of the two finest sheets"
     yield (
         "The error is that made by the number of points, at the points and between them, where the displacement is "
         "interpolated by cubics: the largest anywhere at any frame, as a fraction of the largest displacement. The "
@@ -270,43 +292,43 @@ def _points(study: Study) -> Iterator[str]:
         "step. The estimate is that of `run`, by a sheet beside it with half the cells a side. "
         "Times are those of each sheet's automatic step."
     )
-    yield _sheets_table(study)
+    yield _meshes_table(study)
     yield from _bounds(study.points)
 
 
-def _bounds(points: Sequence[Stepping | Peer | Points]) -> Iterator[str]:
+def _bounds(points: Sequence[ErrorMeasurement]) -> Iterator[str]:
     """Explain errors that are upper bounds, if there are any."""
-    if any(wrong(one).startswith("<") for one in points):
+    if any(format_error(point).startswith("<") for point in points):
         yield "An error with < is an approximate upper bound; the reference is not exact enough to know the error."
 
 
-def _methods_table(study: Study, points: Sequence[Stepping], columns: Columns) -> str:
+def _methods_table(study: Study, points: Sequence[SteppingMeasurement], columns: Columns) -> str:
     best = study.best_stepping
-    return table(points, columns, lambda one: "recommended" if one is best else "")
+    return format_table(points, columns, lambda each: "recommended" if each is best else "")
 
 
-def _drawings_table(study: Study, drawings: Sequence[Drawn]) -> str:
+def _drawings_table(study: Study, drawings: Sequence[DrawingMeasurement]) -> str:
     best = study.best_drawing
-    return table(drawings, DRAWINGS, lambda one: "recommended" if one is best else "")
+    return format_table(drawings, DRAWING_COLUMNS, lambda each: "recommended" if each is best else "")
 
 
-def _sheets_table(study: Study) -> str:
-    roles = {tuple(study.settings["sheet"]["points"]): "of the scene", study.more_points: "recommended"}
-    return table(study.points, SHEETS, lambda one: roles.get((one.rows, one.cols), ""))
+def _meshes_table(study: Study) -> str:
+    roles = {tuple(study.settings["sheet"]["points"]): "of the scene", study.recommended_points: "recommended"}
+    return format_table(study.points, MESH_COLUMNS, lambda mesh: roles.get((mesh.rows, mesh.cols), ""))
 
 
-def _drawings(study: Study) -> Iterator[Drawn]:
-    """Choose for every supersampling the refinement that would be recommended if the scene had that supersampling."""
-    for supersample in sorted({drawn.supersample for drawn in study.drawing}):
+def _drawings(study: Study) -> Iterator[DrawingMeasurement]:
+    """List, for every supersampling, the refinement that would be recommended with it."""
+    for supersample in sorted({drawing.supersample for drawing in study.drawing}):
         render = {**study.settings["render"], "supersample": supersample}
         best = replace(study, settings={**study.settings, "render": render}).best_drawing
         if best is not None:
             yield best
 
 
-def _best(points: Sequence[Point], tolerance: float) -> Point | None:
-    """Find the fastest point within the tolerance, or else the most exact one."""
-    good = [point for point in points if size(point) <= tolerance]
-    if good:
-        return min(good, key=lambda point: point.seconds.median)
-    return min(points, key=size, default=None)
+def _best(points: Sequence[M], tolerance: float) -> M | None:
+    """Return the fastest measurement within the tolerance, or else the most accurate one."""
+    sufficient = [point for point in points if comparable_error(point) <= tolerance]
+    if sufficient:
+        return min(sufficient, key=lambda point: point.seconds.median)
+    return min(points, key=comparable_error, default=None)

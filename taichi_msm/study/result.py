@@ -1,4 +1,4 @@
-"""The results of a study: plain data, and the settings it recommends."""
+"""Results of a study as plain data, and the recommended settings."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import numpy as np
 
 from taichi_msm.scene.section import MAX_POINTS
 
-# A picture is refined enough if no other one of the same supersampling has a PSNR higher by more than this [dB].
-REFINED_ENOUGH = 0.1
+# A refinement suffices if no other one with the same supersampling has a PSNR higher by more than this [dB].
+PSNR_TOLERANCE_DB = 0.1
 
-# Timings within 10 % count as equal.
-AS_FAST = 1.1
+# Timings count as equal within this factor.
+TIMING_TOLERANCE = 1.1
 
 
 @dataclass(frozen=True)
@@ -30,158 +30,213 @@ class Timing:
 
     @classmethod
     def of(cls, samples: Sequence[float]) -> Timing:
-        """Summarise samples [s], at least one."""
+        """Summarise one or more samples [s]."""
         return cls(statistics.median(samples), min(samples), max(samples), len(samples))
 
 
 @dataclass(frozen=True)
 class Reference:
-    """The solution that errors of the stepping refer to: central differences in f64, extrapolated."""
+    """Reference solution for the errors of stepping: central differences in f64, extrapolated.
 
-    steps_per_frame: int  # of its finest run
-    error: float  # its own, estimated by halving the step, as a fraction of the largest displacement
-    largest: float  # displacement of any point at any frame [m]
+    Attributes:
+        steps_per_frame: Steps per frame of its finest run.
+        error: Its own error, estimated by halving the step, as a fraction of the largest displacement.
+        largest: Largest displacement of any mass point at any frame [m].
+    """
+
+    steps_per_frame: int
+    error: float
+    largest: float
 
 
 @dataclass
-class Measured:
-    """What is known of one setting so far."""
+class Measurement:
+    """Measurement of one setting.
 
-    samples: list[float] = field(default_factory=list, kw_only=True)  # times of repeated, equal work [s]
+    Attributes:
+        samples: Times of repeated, equal work [s].
+    """
+
+    samples: list[float] = field(default_factory=list, kw_only=True)
 
     @property
     def seconds(self) -> Timing:
-        """Summarise the times, of which there is at least one."""
+        """Summary of the samples, of which there must be at least one."""
         return Timing.of(self.samples)
 
 
 @dataclass
-class Stepping(Measured):
-    """One way to step the scene; timed is stepping through the whole of it, compiled and warm.
+class SteppingMeasurement(Measurement):
+    """Measurement of stepping through the whole scene with one method and step, compiled and warm.
 
     Attributes:
-        error: largest of any point at any frame, as a fraction of the largest displacement; None: it diverged.
-        rounding: the part of the error that comes from f32; None for f64.
-        known: whether the reference is exact enough to know this error; if not, it is an approximate upper bound.
+        precision: Precision, f32 or f64.
+        damping_difference: Difference of the damping, central or backward.
+        steps_per_frame: Steps per frame.
+        step: Time step h [s].
+        error: Largest error of any mass point at any frame, as a fraction of the largest displacement; None if the
+            simulation diverged.
+        rounding: Part of the error that comes from f32; None for f64.
+        known: Whether the reference is exact enough to determine this error; otherwise it is an approximate bound.
     """
 
     precision: str
     damping_difference: str
     steps_per_frame: int
-    step: float  # h [s]
+    step: float
     error: float | None = None
     rounding: float | None = None
     known: bool = False
 
     @property
     def method(self) -> str:
-        """Name the method, such as f32 central."""
+        """Name of the method, such as f32 central."""
         return f"{self.precision} {self.damping_difference}"
 
 
 @dataclass
-class Peer(Measured):
-    """SciPy's DOP853 on the same equations, timed for the whole scene; error and known as for `Stepping`."""
+class PeerMeasurement(Measurement):
+    """Measurement of SciPy's DOP853 on the same equations, for the whole scene.
 
-    rtol: float  # relative tolerance; the absolute one is rtol x the largest displacement / 10
+    Attributes:
+        rtol: Relative tolerance; the absolute one is rtol x the largest displacement / 10.
+        error: Error, as in `SteppingMeasurement`.
+        known: Whether the error is exact, as in `SteppingMeasurement`.
+        evaluations: Number of evaluations of the forces.
+    """
+
+    rtol: float
     error: float
     known: bool
-    evaluations: int  # of the forces
+    evaluations: int
 
 
 @dataclass
-class Drawn(Measured):
-    """One way to draw the most deformed frame, timed for one frame."""
+class DrawingMeasurement(Measurement):
+    """Measurement of drawing the most deformed frame.
+
+    Attributes:
+        refine: Refinement.
+        supersample: Supersampling.
+        psnr: PSNR against a picture of high refinement and supersampling [dB]; None if both are equal.
+        largest_error: Largest error of any colour of any pixel, 0 to 255.
+    """
 
     refine: int
     supersample: int
-    psnr: float | None  # against a picture of high refinement and supersampling [dB]; None: they are equal
-    largest_error: int  # of any colour of any pixel, 0 to 255
+    psnr: float | None
+    largest_error: int
 
 
 @dataclass
-class Points(Measured):
-    """A sheet of tissue with more or fewer points, in f64, timed like `Stepping`; error and known are as there.
+class MeshMeasurement(Measurement):
+    """Measurement of stepping tissue with another mesh through the whole scene, in f64.
 
-    The error is that which the number of points makes, at the points and between them.
+    Attributes:
+        rows: Rows of mass points.
+        cols: Columns of mass points.
+        steps_per_frame: Steps per frame of the automatic step on this mesh.
+        error: Discretisation error of the mesh, at the mass points and between them, as in `SteppingMeasurement`.
+        known: Whether the error is exact, as in `SteppingMeasurement`.
+        estimate: Estimate of this error by the companion runs of `run`; None if unknown.
     """
 
     rows: int
     cols: int
-    steps_per_frame: int  # of the automatic step with these points
+    steps_per_frame: int
     error: float | None = None
     known: bool = False
-    estimate: float | None = None  # of this error, by the pilot that `run` has beside it; None: not known
+    estimate: float | None = None
 
     @property
     def name(self) -> str:
-        """Give its name, such as 31 x 31."""
+        """Name of the mesh, such as 31 x 31."""
         return f"{self.rows} x {self.cols}"
 
 
 @dataclass
-class TimedTerm(Measured):
-    """The cost of a step without one term of the model, timed for one step."""
+class TermMeasurement(Measurement):
+    """Measurement of a step without one term of the model.
 
-    without: str  # key of the term that is left out; empty: none is
+    Attributes:
+        without: Key of the term that is left out; empty for the full model.
+    """
+
+    without: str
 
 
 @dataclass
 class Study:
-    """Speed against error of one scene on one machine."""
+    """Speed against error of a scene on a machine.
 
-    scene: str  # its name
-    settings: dict[str, Any]  # the scene with its defaults filled in
-    status: str  # complete or interrupted
-    tolerance: float  # largest allowed error, as a fraction of the largest displacement
-    machine: dict[str, Any]  # cpu, cores, arch, threads, bits of a vector and versions
-    reference: Reference | None = None  # None: interrupted before there was one
-    stepping: list[Stepping] = field(default_factory=list)  # by method and, within a method, by falling step
-    orders: dict[str, float | None] = field(default_factory=dict)  # `observed_orders`
-    peers: list[Peer] = field(default_factory=list)
-    drawing: list[Drawn] = field(default_factory=list)  # by supersample and refine; empty without a picture
-    points: list[Points] = field(default_factory=list)  # from few to many; empty with springs
-    terms: list[TimedTerm] = field(default_factory=list)  # the first leaves nothing out
-    notes: list[str] = field(default_factory=list)  # what a reader must know, such as parts left out and why
+    Attributes:
+        scene: Name of the scene.
+        settings: The scene with its defaults filled in.
+        status: complete or interrupted.
+        tolerance: Largest allowed error, as a fraction of the largest displacement.
+        machine: CPU, cores, arch, threads, bits of a vector, and versions.
+        reference: Reference solution; None if the study was interrupted before it was computed.
+        stepping: Measurements of stepping, by method and then by decreasing step.
+        orders: Result of `observed_orders`.
+        peers: Measurements of DOP853.
+        drawing: Measurements of drawing, by supersampling and refinement; empty without a picture.
+        points: Measurements of meshes, from coarse to fine; empty for springs.
+        terms: Measurements without single terms; the first is of the full model.
+        notes: Remarks for the reader, such as omitted parts and the reason.
+    """
+
+    scene: str
+    settings: dict[str, Any]
+    status: str
+    tolerance: float
+    machine: dict[str, Any]
+    reference: Reference | None = None
+    stepping: list[SteppingMeasurement] = field(default_factory=list)
+    orders: dict[str, float | None] = field(default_factory=dict)
+    peers: list[PeerMeasurement] = field(default_factory=list)
+    drawing: list[DrawingMeasurement] = field(default_factory=list)
+    points: list[MeshMeasurement] = field(default_factory=list)
+    terms: list[TermMeasurement] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
     def finish(self) -> None:
-        """Leave out what was not timed, order the steppings and fit their orders."""
+        """Remove settings that were not timed, sort the measurements of stepping, and fit their orders."""
         self.stepping = sorted(
-            (one for one in self.stepping if one.samples),
-            key=lambda one: (one.precision, one.damping_difference != "central", one.steps_per_frame),
+            (point for point in self.stepping if point.samples),
+            key=lambda point: (point.precision, point.damping_difference != "central", point.steps_per_frame),
         )
         self.orders = observed_orders(self.stepping)
-        self.drawing = [one for one in self.drawing if one.samples]
-        self.points = [one for one in self.points if one.samples]
-        self.terms = [one for one in self.terms if one.samples]
+        self.drawing = [drawing for drawing in self.drawing if drawing.samples]
+        self.points = [mesh for mesh in self.points if mesh.samples]
+        self.terms = [term for term in self.terms if term.samples]
 
     @property
-    def touches(self) -> bool:
-        """Whether tools that are moved touch the sheet."""
+    def has_contact(self) -> bool:
+        """Whether the scene has position-controlled tools."""
         return any(probe.get("path") for probe in self.settings["probes"])
 
     @property
-    def points_tolerance(self) -> float:
-        """Largest allowed error due to the number of points, as a fraction of the largest displacement."""
+    def mesh_tolerance(self) -> float:
+        """Largest allowed discretisation error of the mesh, as a fraction of the largest displacement."""
         return float(self.settings["sheet"]["tolerance"] or self.tolerance)
 
     @property
-    def own_points(self) -> Points | None:
-        """Find the sheet with the scene's own points; None: it was not measured, or diverged."""
-        own = list(self.settings["sheet"]["points"])
-        return next((one for one in self.points if [one.rows, one.cols] == own and one.error is not None), None)
+    def scene_mesh(self) -> MeshMeasurement | None:
+        """Measurement of the scene's own mesh; None if it was not measured, or diverged."""
+        points = list(self.settings["sheet"]["points"])
+        return next((mesh for mesh in self.points if [mesh.rows, mesh.cols] == points and mesh.error is not None), None)
 
     @property
-    def more_points(self) -> tuple[int, int] | None:
-        """Tell how many points have an error within the tolerance, where the scene's own have not; None elsewhere.
+    def recommended_points(self) -> tuple[int, int] | None:
+        """Rows and columns of mass points with an error within the tolerance; None if the scene's own mesh suffices.
 
-        These are the fewest that were measured, or else an extrapolation: the error falls with the power of the cells'
-        size that the two finest sheets show, at least the first and at most the second. They may be more than allowed.
+        This is the coarsest sufficient mesh that was measured, or else an extrapolation: the error decreases with the
+        power of the cell size that the two finest meshes show, limited to 1 to 2. It may be finer than a scene allows.
         """
-        own, allowed = self.own_points, self.points_tolerance
-        if own is None or own.error is None or own.error <= allowed:
+        scene_mesh, allowed = self.scene_mesh, self.mesh_tolerance
+        if scene_mesh is None or scene_mesh.error is None or scene_mesh.error <= allowed:
             return None
-        errors = [(one.rows, one.cols, one.error) for one in self.points if one.error is not None]
+        errors = [(mesh.rows, mesh.cols, mesh.error) for mesh in self.points if mesh.error is not None]
         for rows, cols, error in errors:
             if error <= allowed:
                 return rows, cols
@@ -189,40 +244,44 @@ class Study:
         rows, cols, error = errors[-1]
         if len(errors) > 1:
             coarser_rows, _, coarser_error = errors[-2]
-            shown = math.log(coarser_error / error) / math.log((rows - 1) / (coarser_rows - 1))
-            order = min(2.0, max(1.0, shown))
-        times = (error / allowed) ** (1 / order)
-        return math.ceil((rows - 1) * times) + 1, math.ceil((cols - 1) * times) + 1
+            observed = math.log(coarser_error / error) / math.log((rows - 1) / (coarser_rows - 1))
+            order = min(2.0, max(1.0, observed))
+        refinement = (error / allowed) ** (1 / order)
+        return math.ceil((rows - 1) * refinement) + 1, math.ceil((cols - 1) * refinement) + 1
 
     @property
-    def best_stepping(self) -> Stepping | None:
-        """Find the fastest stepping within the tolerance, or one that is as fast and less wrong.
+    def best_stepping(self) -> SteppingMeasurement | None:
+        """Fastest stepping within the tolerance, or the most accurate of those that are equally fast.
 
-        None where there is none, or the scene needs other points, for which no step was measured. Of every method only
-        its largest step counts, so that noise of the clock cannot prefer a smaller one.
+        None if there is none, or if the scene needs another mesh, for which no step was measured. Only the largest step
+        of every method counts, so that the noise of the clock cannot prefer a smaller one.
         """
-        if self.more_points is not None:
+        if self.recommended_points is not None:
             return None
-        good = [one for one in self.stepping if one.error is not None and one.error <= self.tolerance]
-        largest = {one.method: one for one in sorted(good, key=lambda one: one.step)}
-        fastest = min((one.seconds.median for one in largest.values()), default=0.0)
-        alike = [one for one in largest.values() if one.seconds.median <= AS_FAST * fastest]
-        return min(alike, key=lambda one: one.error or 0.0, default=None)
+        sufficient = [point for point in self.stepping if point.error is not None and point.error <= self.tolerance]
+        largest = {point.method: point for point in sorted(sufficient, key=lambda point: point.step)}
+        fastest = min((point.seconds.median for point in largest.values()), default=0.0)
+        equal = [point for point in largest.values() if point.seconds.median <= TIMING_TOLERANCE * fastest]
+        return min(equal, key=lambda point: point.error or 0.0, default=None)
 
     @property
-    def best_drawing(self) -> Drawn | None:
-        """Find the fastest sufficient refinement at the scene's own supersampling."""
-        own = self.settings["render"]["supersample"]
-        decibels = [(math.inf if one.psnr is None else one.psnr, one) for one in self.drawing if one.supersample == own]
-        enough = max((psnr for psnr, _ in decibels), default=0.0) - REFINED_ENOUGH
-        good = [one for psnr, one in decibels if psnr >= enough]
-        return min(good, key=lambda one: one.seconds.median, default=None)
+    def best_drawing(self) -> DrawingMeasurement | None:
+        """Fastest sufficient refinement at the scene's own supersampling; None without one."""
+        supersample = self.settings["render"]["supersample"]
+        decibels = [
+            (math.inf if drawing.psnr is None else drawing.psnr, drawing)
+            for drawing in self.drawing
+            if drawing.supersample == supersample
+        ]
+        min_psnr = max((psnr for psnr, _ in decibels), default=0.0) - PSNR_TOLERANCE_DB
+        sufficient = [drawing for psnr, drawing in decibels if psnr >= min_psnr]
+        return min(sufficient, key=lambda drawing: drawing.seconds.median, default=None)
 
     def recommendation(self) -> list[str]:
-        """Write the recommended settings as lines of a scene file."""
+        """Format the recommended settings as lines of a scene file."""
         lines = []
-        if (points := self.more_points) is not None and max(points) <= MAX_POINTS:
-            # A run finds the step for these points.
+        if (points := self.recommended_points) is not None and max(points) <= MAX_POINTS:
+            # A run searches for the step on this mesh.
             lines += [
                 "sheet:",
                 f"  points: {list(points)}",
@@ -235,7 +294,7 @@ class Study:
             if self.settings["time"]["tolerance"] is not None:
                 lines.append("  tolerance: null")
             lines += [
-                # With all digits: rounded up, the largest stable step would exceed the limit.
+                # All digits are written, as the largest stable step exceeds the limit if it is rounded up.
                 f"  step: {step.step!r}",
                 f"  damping_difference: {step.damping_difference}",
                 f"  precision: {step.precision}",
@@ -245,8 +304,15 @@ class Study:
         return lines
 
 
-def observed_orders(points: list[Stepping]) -> dict[str, float | None]:
-    """Fit the order of every method over the points where the error comes from the step; None: too few of them."""
+def observed_orders(points: list[SteppingMeasurement]) -> dict[str, float | None]:
+    """Fit the order of every method to the measurements whose error comes from the step.
+
+    Args:
+        points: Measurements of stepping.
+
+    Returns:
+        The order by the name of the method; None for fewer than three such measurements.
+    """
     orders: dict[str, float | None] = {}
     for method in dict.fromkeys(point.method for point in points):
         fit = [

@@ -1,4 +1,4 @@
-"""A whole study: stepping, SciPy for comparison, drawing, points, terms; when interrupted it keeps what is done."""
+"""Study of a scene: stepping, SciPy for comparison, drawing, meshes and terms."""
 
 from __future__ import annotations
 
@@ -16,43 +16,45 @@ from taichi_msm.render.texture import load_texture
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.planning import choose_precision, plan_variant, with_time
 from taichi_msm.study.measurements import (
-    FailedError,
-    PointStudy,
+    IntegrationError,
+    MeshStudy,
     SteppingStudy,
-    TooSlowError,
+    TimeLimitError,
     measure_pictures,
     measure_terms,
-    solve,
+    solve_with_dop853,
 )
-from taichi_msm.study.result import Peer, Study
+from taichi_msm.study.result import PeerMeasurement, Study
 from taichi_msm.system import process, runtime
 from taichi_msm.system.compiler import versions
 from taichi_msm.system.runtime import Device
 
-TOLERANCE = 1e-3
-
-# What notes say of the integrator that the study compares with.
-DOP853 = "DOP853, SciPy's general integrator, which the study compares its own steps with,"
-APART = "no other figure depends on it"
-
-# Number of trajectories in memory at one time: the reference, and those that it is made of or compared with.
-TRAJECTORIES = 6
+# Subject of the notes about the integrator that the study compares with, and their end.
+DOP853_SUBJECT = "DOP853, SciPy's general integrator, which the study compares its own steps with,"
+DOP853_INDEPENDENCE = "no other figure depends on it"
 
 
-class Effort(NamedTuple):
-    """How long the parts of a study may take."""
+class TimeBudget(NamedTuple):
+    """Time budget of the parts of a study.
 
-    longest_run: float  # of stepping through the whole scene once [s]
-    peer: float  # of SciPy for each of its tolerances [s]
+    Attributes:
+        longest_run: Time to step through the whole scene once [s].
+        peer: Time of SciPy for each of its tolerances [s].
+        peer_rtols: Relative tolerances of SciPy.
+        sample: Time of one measurement of a step [s].
+    """
+
+    longest_run: float
+    peer: float
     peer_rtols: tuple[float, ...]
-    sample: float  # of one measurement of a step [s]
+    sample: float
 
 
-QUICK = Effort(longest_run=0.25, peer=10.0, peer_rtols=(1e-4,), sample=0.02)
-FULL = Effort(longest_run=2.0, peer=30.0, peer_rtols=(1e-3, 1e-5, 1e-7), sample=0.1)
+QUICK = TimeBudget(longest_run=0.25, peer=10.0, peer_rtols=(1e-4,), sample=0.02)
+FULL = TimeBudget(longest_run=2.0, peer=30.0, peer_rtols=(1e-3, 1e-5, 1e-7), sample=0.1)
 
 
-def study(
+def run_study(
     scene: Plan | Scene,
     name: str,
     *,
@@ -62,18 +64,28 @@ def study(
     threads: int | None = None,
     progress: StageProgressCallback = lambda stage, done, total: None,
 ) -> Study:
-    """Measure the cost and the error of the settings of a scene on this machine, under a name for the report.
+    """Measure the cost and the error of the settings of a scene on this machine.
 
-    The tolerance is a fraction of the largest displacement; None: the scene's, or else 1e-3. `quick` measures fewer
-    settings, in about a minute for a small sheet. If `progress` raises KeyboardInterrupt, the study returns what is
-    done.
+    Args:
+        scene: Scene or its plan.
+        name: Name of the scene for the report.
+        tolerance: Largest allowed error, as a fraction of the largest displacement; None for the scene's, or else 1e-3.
+        quick: Whether to measure fewer settings, in about a minute for a small sheet.
+        arch: Architecture to run on.
+        threads: Number of CPU threads; None for every core.
+        progress: Called with the stage, the finished part and the total; after a KeyboardInterrupt from it the study
+            returns the results so far.
+
+    Returns:
+        The results.
 
     Raises:
-        SceneError: when the picture cannot be decoded, or the trajectories do not fit in memory.
-        DeviceError: when the arch is not there.
+        SceneError: When the scene is quasi-static, the picture cannot be decoded, or the trajectories do not fit in
+            memory.
+        DeviceError: When the arch is not available.
     """
-    given, device = check_scene(scene), runtime.start(arch, threads)
-    scene = given.scene
+    plan, device = check_scene(scene), runtime.start(arch, threads)
+    scene = plan.scene
     if scene.time.at_rest:
         raise SceneError(["time.motion: quasistatic takes no steps, which a study compares; set time.motion: dynamic"])
     _require_memory(scene)
@@ -82,18 +94,18 @@ def study(
         scene=name,
         settings=scene.model_dump(mode="json"),
         status="complete",
-        tolerance=tolerance or scene.time.tolerance or TOLERANCE,
-        machine=machine(device),
+        tolerance=tolerance or scene.time.tolerance or 1e-3,
+        machine=machine_record(device),
     )
-    effort = QUICK if quick else FULL
+    budget = QUICK if quick else FULL
     # The study itself varies the step.
-    plan = choose_precision(plan_variant(given, with_time(scene, tolerance=None)), device.arch)
+    plan = choose_precision(plan_variant(plan, with_time(scene, tolerance=None)), device.arch)
     scene = plan.scene
     try:
-        stepping = SteppingStudy(plan, device, effort.longest_run, results, partial(progress, "stepping"))
+        stepping = SteppingStudy(plan, device, budget.longest_run, results, partial(progress, "stepping"))
         with closing(stepping):
             stepping.run()
-        _measure_peer(plan, stepping, effort, results, progress)
+        _measure_peer(plan, stepping, budget, results, progress)
         if texture is None:
             results.notes.append("drawing was left out: the scene names no image")
         else:
@@ -101,8 +113,8 @@ def study(
             deformed = max(stepping.frames, key=lambda frame: (frame**2).sum(axis=-1).max())
             position = rest_positions(scene.sheet) + deformed
             measure_pictures(scene, position, texture, quick, results, partial(progress, "drawing"))
-        PointStudy(plan, device, effort.longest_run, results, partial(progress, "points")).run()
-        measure_terms(plan, device, effort.sample, results, partial(progress, "terms"))
+        MeshStudy(plan, device, budget.longest_run, results, partial(progress, "points")).run()
+        measure_terms(plan, device, budget.sample, results, partial(progress, "terms"))
     except KeyboardInterrupt:
         results.status = "interrupted"
         results.notes.append("interrupted: what was measured until then")
@@ -110,8 +122,8 @@ def study(
     return results
 
 
-def machine(device: Device) -> dict[str, Any]:
-    """Describe the machine that the study ran on."""
+def machine_record(device: Device) -> dict[str, Any]:
+    """Describe the machine of the study for its record."""
     return {
         "cpu": process.processor_name(),
         "cores": os.cpu_count(),
@@ -124,45 +136,46 @@ def machine(device: Device) -> dict[str, Any]:
 
 def _require_memory(scene: Scene) -> None:
     rows, cols = scene.sheet.points
-    needed = TRAJECTORIES * scene.time.frames * rows * cols * 3 * 8
+    # Six trajectories are in memory at a time: the reference, and those that it is made of or compared with.
+    needed = 6 * scene.time.frames * rows * cols * 3 * 8
     available = process.available_memory()
     if needed > available:
-        said = (
+        fault = (
             f"time.duration: a study keeps the trajectories of all frames, {needed / 2**30:.3g} GiB here, but "
             f"{available / 2**30:.3g} GiB is free; study a shorter time.duration or fewer sheet.points"
         )
-        raise SceneError([said])
+        raise SceneError([fault])
 
 
 def _measure_peer(
-    plan: Plan, stepping: SteppingStudy, effort: Effort, results: Study, progress: StageProgressCallback
+    plan: Plan, stepping: SteppingStudy, budget: TimeBudget, results: Study, progress: StageProgressCallback
 ) -> None:
-    """Solve by DOP853 at several tolerances, each as many times as time allows, up to 5."""
+    """Measure DOP853 at several tolerances, up to five times each within the time budget."""
     assert results.reference is not None
     if plan.tools:
-        results.notes.append(f"{DOP853} is left out, as it knows no contact; {APART}")
+        results.notes.append(f"{DOP853_SUBJECT} is left out, as it knows no contact; {DOP853_INDEPENDENCE}")
         return
-    for index, rtol in enumerate(effort.peer_rtols):
+    for index, rtol in enumerate(budget.peer_rtols):
         samples: list[float] = []
-        deadline = time.perf_counter() + effort.peer
+        deadline = time.perf_counter() + budget.peer
         atol = rtol * (results.reference.largest or 1.0) / 10
-        tick = partial(progress, "dop853", index, len(effort.peer_rtols))
+        tick = partial(progress, "dop853", index, len(budget.peer_rtols))
         try:
             while len(samples) < 5:
                 start = time.perf_counter()
-                frames, evaluations = solve(plan, rtol, atol, deadline, tick)
+                frames, evaluations = solve_with_dop853(plan, rtol, atol, deadline, tick)
                 samples.append(time.perf_counter() - start)
-        except TooSlowError:
+        except TimeLimitError:
             if not samples:
-                said = f"takes more than {effort.peer:g} s at rtol {rtol:g} and was stopped"
-                results.notes.append(f"{DOP853} {said}; {APART}")
+                reason = f"takes more than {budget.peer:g} s at rtol {rtol:g} and was stopped"
+                results.notes.append(f"{DOP853_SUBJECT} {reason}; {DOP853_INDEPENDENCE}")
                 return
-        except FailedError as failure:
-            said = (
+        except IntegrationError as failure:
+            reason = (
                 f"finds no step small enough {failure}, at rtol {rtol:g}: forces change too suddenly for it there, as "
                 "where a spring is pressed to a point or the sheet runs away"
             )
-            results.notes.append(f"{DOP853} {said}; {APART}")
+            results.notes.append(f"{DOP853_SUBJECT} {reason}; {DOP853_INDEPENDENCE}")
             return
-        error = stepping.relative(frames)
-        results.peers.append(Peer(rtol, error, stepping.known(error), evaluations, samples=samples))
+        error = stepping.relative_error(frames)
+        results.peers.append(PeerMeasurement(rtol, error, stepping.determines(error), evaluations, samples=samples))

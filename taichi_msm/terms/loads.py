@@ -122,7 +122,7 @@ class ProbeTerm(Term):
 
         Args:
             config: compile-time configuration.
-            first_slope: index of the first array of `decay_gradients` in `sheet.found`, in multiples of the sheet's
+            first_slope: index of the first array of `decay_gradients` in `sheet.derivatives`, in multiples of the sheet's
                 rows.
         """
         ti = config.ti
@@ -153,7 +153,7 @@ class ProbeTerm(Term):
                     share = sheet.fields[((first_field + stationary[n]) * sheet.rows + i) * sheet.width + b]
                     for axis in ti.static(range(2)):
                         row = (first_slope + 2 * stationary[n] + axis) * sheet.rows + i
-                        slope[axis] = sheet.found[row * sheet.width + b]
+                        slope[axis] = sheet.derivatives[row * sheet.width + b]
                 work = vector(0)
                 for c in ti.static(range(3)):
                     sums[5 * n + c] += share * entry.u[c]

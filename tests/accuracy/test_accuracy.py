@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 from taichi_msm.accuracy import time_step
 from taichi_msm.accuracy.companions import coarse_steps, fine_steps
 from taichi_msm.accuracy.mesh import MeshEstimate
-from taichi_msm.accuracy.time_step import Estimate, Trials, choose_step, estimate_error, longest, order
+from taichi_msm.accuracy.time_step import (
+    TimeStepEstimate,
+    TimeStepTrials,
+    choose_step,
+    convergence_order,
+    estimate_error,
+    max_norm,
+)
 from taichi_msm.errors import SceneError
 from taichi_msm.model.plan import Plan
 from taichi_msm.runs.simulation import Simulation
@@ -53,12 +60,12 @@ SCENES: dict[str, Any] = {
 }
 
 
-def estimated(made: Scene, device: Device) -> Estimate:
+def estimated(made: Scene, device: Device) -> TimeStepEstimate:
     """What is known of the error of a scene's own steps."""
     return estimate_error(plan_of(made), device)
 
 
-def chosen(made: Scene, device: Device) -> tuple[Plan, Estimate]:
+def chosen(made: Scene, device: Device) -> tuple[Plan, TimeStepEstimate]:
     """The plan for a scene's tolerance, and their error."""
     return choose_step(plan_of(made), device)
 
@@ -76,7 +83,7 @@ def test_the_step_chosen_is_right_and_the_largest(kind: str, precision: str, tol
     assert estimate.steps_per_frame == grid.steps_per_frame >= plan_of(made).grid.steps_per_frame
     if grid.steps_per_frame > plan_of(made).grid.steps_per_frame:
         # Half as many steps would not have done.
-        fewer = Trials(plan, device).estimate(grid.steps_per_frame // 2, lambda done, total: None)
+        fewer = TimeStepTrials(plan, device).estimate(grid.steps_per_frame // 2, lambda done, total: None)
         assert fewer.error > tolerance
 
 
@@ -88,7 +95,7 @@ def test_an_estimate_is_near_the_error(kind: str, difference: str, device: Devic
     estimate = estimated(made, device)
     exact = with_time(made, damping_difference="central")
     reference = frames(exact, device, cut=64 * plan_of(made).grid.steps_per_frame)
-    error = longest(frames(made, device) - reference) / longest(reference)
+    error = max_norm(frames(made, device) - reference) / max_norm(reference)
     assert error / 1.5 < estimate.error < 1.5 * error
     if difference == "central":
         # The next power of h is (w h)^2 / 24 of the error at most, w h <= 1; and twice that for the kinks of the load.
@@ -141,12 +148,12 @@ def test_rounding_is_part_of_the_estimate(device: Device) -> None:
     made = with_steps(scene(probes=[SOFT_PRESS], damping=0.02, time={"precision": "f32"}), 2000)
     estimate = estimated(made, device)
     exact = frames(with_time(made, precision="f64"), device)
-    rounding = longest(frames(made, device) - exact) / longest(exact)
+    rounding = max_norm(frames(made, device) - exact) / max_norm(exact)
     assert estimate.rounding == pytest.approx(rounding, rel=1e-3)
     assert estimate.rounding > estimate.error / 2
     # The whole error, the rounding in it, by an exact solution: 20 times finer than a step that is far below rounding.
     truth = frames(with_time(made, precision="f64"), device, cut=10000)
-    error = longest(frames(made, device) - truth) / longest(truth)
+    error = max_norm(frames(made, device) - truth) / max_norm(truth)
     assert estimate.error == pytest.approx(error, rel=0.02)
     assert estimate.error > 1.5 * estimate.in_f64
     assert estimated(with_time(made, precision="f64"), device).rounding == 0
@@ -168,7 +175,7 @@ def test_a_motion_that_does_not_converge_is_refused(device: Device) -> None:
 
 def test_a_sheet_that_does_not_move_has_no_error(device: Device) -> None:
     made = scene(probes=[], time={"tolerance": 1e-6})
-    assert chosen(made, device)[1] == Estimate(plan_of(made).grid.steps_per_frame, 0.0, 0.0, 0.0, 2)
+    assert chosen(made, device)[1] == TimeStepEstimate(plan_of(made).grid.steps_per_frame, 0.0, 0.0, 0.0, 2)
 
 
 def test_a_simulation_meets_the_tolerance_by_itself(device: Device) -> None:
@@ -201,10 +208,8 @@ BETWEEN = 0.105
     ],
 )
 def test_order(expected: int, sections: dict[str, Any]) -> None:
-    assert (
-        order(plan_of(scene(sheet=SHEET, **sections | {"time": {"step": 0.01, **sections.get("time", {})}})))
-        == expected
-    )
+    plan = plan_of(scene(sheet=SHEET, **sections | {"time": {"step": 0.01, **sections.get("time", {})}}))
+    assert convergence_order(plan) == expected
 
 
 @pytest.mark.parametrize(
@@ -222,7 +227,7 @@ def test_jumps_between_steps_leave_the_order_2(probe: dict[str, Any], device: De
     made = scene(probes=[{**SOFT_PRESS, **probe}], damping=0.02)
     counts = (20, 40, 80, 160)
     exact = frames(made, device, cut=1280)
-    errors = [longest(frames(made, device, cut=count) - exact) / longest(exact) for count in counts]
+    errors = [max_norm(frames(made, device, cut=count) - exact) / max_norm(exact) for count in counts]
     slope = np.polyfit(np.log(counts), np.log(errors), 1)[0]
     assert slope == pytest.approx(-2, abs=0.1), errors
 
@@ -233,7 +238,7 @@ def test_damping_within_a_step_is_known_or_not_told(damping: float, device: Devi
     made = scene(probes=[{**SOFT_PRESS, "load": [[0, 100]]}], damping=damping)
     estimate = estimated(made, device)
     reference = frames(made, device, cut=128 * plan_of(made).grid.steps_per_frame)
-    error = longest(frames(made, device) - reference) / longest(reference)
+    error = max_norm(frames(made, device) - reference) / max_norm(reference)
     assert error / 1.5 < estimate.error < 1.5 * error
     assert "velocities change their sign" in "".join(notes_of(made, MOVED, None))
 
@@ -250,14 +255,14 @@ def test_the_error_of_a_load_shorter_than_a_step_is_known(pulse: list[float], de
     made = scene(probes=[{**SOFT_PRESS, "load": [[start, 0], [start, 100], [end, 100], [end, 0]]}])
     estimate = estimated(made, device)
     exact = frames(made, device, cut=64 * plan_of(made).grid.steps_per_frame)
-    error = longest(frames(made, device) - exact) / longest(exact)
+    error = max_norm(frames(made, device) - exact) / max_norm(exact)
     assert error / 1.5 < estimate.error < 1.5 * error < 0.2
     assert not notes_of(made, MOVED, None)
 
 
 def test_a_scene_that_is_all_right_has_no_notes() -> None:
     assert not notes_of(scene(), RunProgress(1, 1.0, 0.51), None)
-    assert notes_of(scene(), RunProgress(1, 0.0, 0.49), Estimate(40, 1e-3, 1e-4, 1e-3, 2))[0] == (
+    assert notes_of(scene(), RunProgress(1, 0.0, 0.49), TimeStepEstimate(40, 1e-3, 1e-4, 1e-3, 2))[0] == (
         "error: time step 0.1 %, rounding 0.01 % of 0 mm (0 mm); mesh error unknown: another number of points is "
         "another sheet"
     )
@@ -274,7 +279,7 @@ def test_points_are_advised_where_they_can_help(error: float, advice: str) -> No
     assert note == f"for a smaller error of the mesh, {advice}"
     slow = notes_of(made, MOVED, None, mesh=MeshEstimate(error), affords=lambda plan: False)[-1]
     assert slow.endswith(HELPS)
-    steps = Estimate(40, error, 0.0, error, 2)
+    steps = TimeStepEstimate(40, error, 0.0, error, 2)
     assert "for a smaller error of the time step, try time.step: " in notes_of(made, MOVED, steps)[1]
     assert notes_of(made, MOVED, steps, affords=lambda plan: False)[1].endswith("fewer sheet.points make them faster")
 
@@ -285,7 +290,7 @@ def test_positions_written_in_f32_have_the_digits_of_the_sheet(device: Device) -
     written = scene(**faint, output=["trajectory"])
     estimate = estimated(written, device)
     twin = frames(with_time(written, precision="f64"), device)
-    assert 0.3 * 2**-27 < estimate.rounding * longest(twin) < 3**0.5 * 2**-27
+    assert 0.3 * 2**-27 < estimate.rounding * max_norm(twin) < 3**0.5 * 2**-27
     assert estimated(scene(**faint), device).rounding < 1e-5
     with pytest.raises(SceneError, match="out of reach of f32"):
         chosen(with_time(written, tolerance=estimate.rounding / 2), device)
@@ -335,5 +340,5 @@ def test_a_press_and_release_that_are_missed_alike_do_not_hide_each_other(
     for tolerance in (1e-2, 3e-3):
         plan, estimate = chosen(with_time(made, tolerance=tolerance), device)
         truth = frames(made, device, cut=200_000)
-        error = longest(frames(made, device, cut=plan.grid.steps_per_frame) - truth) / longest(truth)
+        error = max_norm(frames(made, device, cut=plan.grid.steps_per_frame) - truth) / max_norm(truth)
         assert error <= 1.5 * tolerance, estimate

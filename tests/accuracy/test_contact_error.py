@@ -14,10 +14,17 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm.accuracy import time_step
-from taichi_msm.accuracy.companions import choose_pilots
-from taichi_msm.accuracy.mesh import MeshEstimate, companion, estimate_points, with_points
-from taichi_msm.accuracy.report import Known, RunError
-from taichi_msm.accuracy.time_step import Estimate, choose_step, estimate_error, longest, order, reconcile
+from taichi_msm.accuracy.companions import choose_companion_runs
+from taichi_msm.accuracy.mesh import MeshEstimate, estimate_mesh_error, mesh_companion_plan, with_points
+from taichi_msm.accuracy.report import RunErrorEstimates, RunErrorEstimator
+from taichi_msm.accuracy.time_step import (
+    TimeStepEstimate,
+    choose_step,
+    combine_estimates,
+    convergence_order,
+    estimate_error,
+    max_norm,
+)
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.tools import overlap, path_warnings
 from taichi_msm.runs.run import run
@@ -42,16 +49,17 @@ def image(tmp_path_factory: pytest.TempPathFactory) -> str:
     return str(path)
 
 
-def told(plan: Plan, device: Device) -> Known:
+def told(plan: Plan, device: Device) -> RunErrorEstimates:
     """What a run says of its error."""
-    known = RunError(plan, choose_pilots(plan, asked=True), Known(), device, device.threads)
+    companions = choose_companion_runs(plan, requested=True)
+    known = RunErrorEstimator(plan, companions, RunErrorEstimates(), device, device.threads)
     own, kept = Dynamics(plan, device), []
     for _ in range(plan.grid.frames):
         own.advance(plan.grid.steps_per_frame)
         kept.append(own.displacement())
-        known.follow(kept[-1], lambda: None, own.tool_forces())
+        known.compare_frame(kept[-1], lambda: None, own.tool_forces())
     known.finish(iter(kept), lambda done, total: None)
-    return known.known
+    return known.estimates
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -59,7 +67,8 @@ def test_the_error_of_the_step_is_hardly_above_what_is_told(
     seed: int, image: str, device: Device, record_property: Callable[[str, object], None]
 ) -> None:
     plan = plan_of(random_contact(seed, image))
-    assert choose_pilots(plan).cost <= 0.75 + 1 / plan.grid.steps_per_frame  # Of an odd number the half is rounded.
+    # Of an odd number the half is rounded.
+    assert choose_companion_runs(plan).cost <= 0.75 + 1 / plan.grid.steps_per_frame
     estimate = told(plan, device).estimate
     assert estimate is not None
     assert estimate.at_most
@@ -84,7 +93,7 @@ def test_the_error_of_the_points_is_hardly_above_what_is_told(
     finer = plan_variant(exact, with_points(plan.scene, (4 * rows - 3, 4 * cols - 3))).with_grid(precision="f64")
     reference = frames_on(finer, device)[:, ::4, ::4]
     own = frames_on(exact.with_grid(steps_per_frame=8 * plan.grid.steps_per_frame), device)
-    error = longest(own - reference) / longest(reference)
+    error = max_norm(own - reference) / max_norm(reference)
     record_property("told", f"{mesh.error:.3g}, {mesh.error / error:.2f} of the truth, {mesh.doubt=}")
     assert error <= (2 if mesh.doubt else 1.5) * mesh.error
 
@@ -117,9 +126,9 @@ def test_the_errors_of_a_drag_are_about_what_is_told(
         for one in (own, reference):
             one.advance(one.plan.grid.steps_per_frame)
         exact, force = reference.displacement()[::2, ::2], reference.tool_forces()
-        apart, most = max(apart, longest(own.displacement() - exact)), max(most, longest(exact))
-        forces_apart = max(forces_apart, longest(own.tool_forces() - force))
-        greatest = max(greatest, longest(force))
+        apart, most = max(apart, max_norm(own.displacement() - exact)), max(most, max_norm(exact))
+        forces_apart = max(forces_apart, max_norm(own.tool_forces() - force))
+        greatest = max(greatest, max_norm(force))
     shares = known.mesh.error / (apart / most), known.force.error / (forces_apart / greatest)
     record_property("told", f"{shares[0]:.2f} and {shares[1]:.2f} of the truth")
     assert all(0.67 <= share <= 4 for share in shares)
@@ -134,8 +143,8 @@ def test_a_tolerance_is_kept(case: list[dict[str, Any]], tolerance: float, devic
 
 
 def test_contact_is_of_order_1() -> None:
-    assert order(plan_of(touching([PRESSED]))) == 1
-    assert order(plan_of(touching([]))) == 2
+    assert convergence_order(plan_of(touching([PRESSED]))) == 1
+    assert convergence_order(plan_of(touching([]))) == 2
 
 
 def test_without_a_coarse_pilot_half_as_much_again_is_told(monkeypatch: pytest.MonkeyPatch, device: Device) -> None:
@@ -149,22 +158,22 @@ def test_without_a_coarse_pilot_half_as_much_again_is_told(monkeypatch: pytest.M
     [(0.01, 2 / 3, True), (0.9, 0.9, False), (math.inf, 4 / 3, False), (0.34, 2 / 3, False), (0.33, 2 / 3, True)],
 )
 def test_a_coarse_pilot_decides_within_the_doubt_of_the_fine_one(coarse: float, share: float, at_least: bool) -> None:
-    def of(error: float, *, at_most: bool = True) -> Estimate:
-        return Estimate(10, error, 0.0, error, 1, at_most=at_most)
+    def of(error: float, *, at_most: bool = True) -> TimeStepEstimate:
+        return TimeStepEstimate(10, error, 0.0, error, 1, at_most=at_most)
 
-    both = reconcile(of(coarse), of(1.0))
+    both = combine_estimates(of(coarse), of(1.0))
     assert [both.error, both.in_f64] == pytest.approx([share, share])
     assert both.at_least == at_least
-    assert reconcile(of(coarse), of(1.0, at_most=False)) == of(1.0, at_most=False)
-    assert reconcile(of(coarse), of(0.0)).error == 0
-    assert reconcile(of(coarse), of(math.inf)).error == math.inf
+    assert combine_estimates(of(coarse), of(1.0, at_most=False)) == of(1.0, at_most=False)
+    assert combine_estimates(of(coarse), of(0.0)).error == 0
+    assert combine_estimates(of(coarse), of(math.inf)).error == math.inf
 
 
 def test_how_wrong_it_is_is_said_as_a_bound() -> None:
     made = touching([PRESSED])
 
     def said(*, at_least: bool) -> list[str]:
-        return notes_of(made, MOVED, Estimate(10, 0.04, 0.0, 0.04, 1, at_least=at_least, at_most=True))
+        return notes_of(made, MOVED, TimeStepEstimate(10, 0.04, 0.0, 0.04, 1, at_least=at_least, at_most=True))
 
     first, step = said(at_least=False)
     assert first.startswith("error: time step at most about 4 % of ")
@@ -231,16 +240,16 @@ def test_the_error_with_tools_in_one_place_may_be_larger(device: Device) -> None
 def test_the_pilot_of_the_points_is_compared_with_the_run(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """A coarse pilot, with steps twice as long, may press quite otherwise."""
     plan = plan_of(touching([PRESSED]))
-    known = RunError(plan, choose_pilots(plan, asked=True), Known(), device, 1)
+    known = RunErrorEstimator(plan, choose_companion_runs(plan, requested=True), RunErrorEstimates(), device, 1)
     given: list[Any] = []
     assert known._mesh is not None
-    monkeypatch.setattr(known._mesh, "follow", lambda displacement, pause: given.append(displacement))
+    monkeypatch.setattr(known._mesh, "compare_frame", lambda displacement, pause: given.append(displacement))
     of_the_run = np.zeros((*plan.scene.sheet.points, 3))
-    known.follow(of_the_run, lambda: None)
+    known.compare_frame(of_the_run, lambda: None)
     assert given[0] is of_the_run
     steps = [sheet.plan.grid.steps_per_frame for sheet in known._mesh._sheets]
     assert steps == [math.ceil(plan.grid.steps_per_frame / 2)]
-    of_25 = companion(plan_of(with_points(moved_tissue(), (25, 25))))
+    of_25 = mesh_companion_plan(plan_of(with_points(moved_tissue(), (25, 25))))
     assert of_25 is not None
     assert of_25.scene.sheet.points == (18, 18)  # 24 / √2 is 16.97.
 
@@ -288,9 +297,9 @@ def test_where_a_tip_is_as_narrow_as_a_cell_a_nearer_run_follows(radius: float, 
     assert mesh is not None
     finer = plan_variant(plan, with_points(plan.scene, (91, 91))).with_grid(precision="f64")
     reference = frames_on(finer, device)[:, ::3, ::3]
-    error = longest(frames_on(plan, device) - reference) / longest(reference)
+    error = max_norm(frames_on(plan, device) - reference) / max_norm(reference)
     assert 0.67 <= mesh.error / error <= 4
-    assert estimate_points(plan, device, lambda done, total: None).error == pytest.approx(mesh.error)
+    assert estimate_mesh_error(plan, device, lambda done, total: None).error == pytest.approx(mesh.error)
 
 
 @pytest.mark.parametrize(
@@ -310,22 +319,22 @@ def test_large_differences_tell_little(
 ) -> None:
     """Above 0.4 of the displacement a nearer run is needed; above all of it, and of such steps, nothing is known."""
     plan = plan_of(moved_tissue())
-    of_steps = Estimate(10, steps, 0.0, steps, 1, at_most=True)
-    known = RunError(plan, choose_pilots(plan, asked=True), Known(of_steps), device, 1)
+    of_steps = TimeStepEstimate(10, steps, 0.0, steps, 1, at_most=True)
+    known = RunErrorEstimator(plan, choose_companion_runs(plan, requested=True), RunErrorEstimates(of_steps), device, 1)
     mesh = known._mesh
     assert mesh is not None
     displacement = np.zeros((*plan.scene.sheet.points, 3))
     displacement[6, 6, 2] = 1.0
-    known.follow(displacement, lambda: None, np.ones((1, 3)))
+    known.compare_frame(displacement, lambda: None, np.ones((1, 3)))
     mesh._differences = [apart]
-    second = mesh.nearer(plan, device, 1)
+    second = mesh.build_second_run(plan, device, 1)
     assert (second is None) == (apart < 0.4)
     if second is not None:
         if nearer is None:
-            mesh._nearer = None
+            mesh._second_run = None
         else:
             second._largest, second._differences = 1.0, [nearer]
-    found, force = known.known.mesh, known.known.force
+    found, force = known.estimates.mesh, known.estimates.force
     assert found is not None
     assert force is not None
     assert found.error == (pytest.approx(expected) if expected else math.inf)

@@ -12,7 +12,7 @@ import pytest
 
 from taichi_msm import DivergedError, Simulation
 from taichi_msm.accuracy.diagnosis import Diagnosis
-from taichi_msm.accuracy.divergence import farthest_displacement
+from taichi_msm.accuracy.divergence import displacement_bound
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.dynamics import ForceRecorder
 from taichi_msm.solver.state import RunProgress, Snapshot, State
@@ -221,11 +221,11 @@ def test_a_force_that_is_too_strong_is_named(device: Device) -> None:
     )
     # The step named is the first: one less is fine, and it is not.
     bad = int(re.findall(r"step (\d+)", found.message)[0])
-    assert found.good
-    assert found.good.state.steps == bad - 1
-    assert np.isfinite(found.good.state.displacement).all()
+    assert found.last_sound_state
+    assert found.last_sound_state.state.steps == bad - 1
+    assert np.isfinite(found.last_sound_state.state.displacement).all()
     with Simulation(made, threads=device.threads) as simulation:
-        simulation.restore(found.good)
+        simulation.restore(found.last_sound_state)
         with pytest.raises(DivergedError):
             simulation.advance()
 
@@ -258,10 +258,10 @@ def test_a_machine_that_makes_errors_is_told_of(device: Device) -> None:
     assert found.message.endswith(
         "but not when it was repeated, so the machine has made an error; continue with --resume"
     )
-    assert found.good
-    assert found.good.progress.frame == 1, "where it was saved"
+    assert found.last_sound_state
+    assert found.last_sound_state.progress.frame == 1, "where it was saved"
     with Simulation(made, threads=device.threads) as simulation:
-        simulation.restore(found.good)
+        simulation.restore(found.last_sound_state)
         simulation.advance(made.time.frames - simulation.frame)
         resumed = simulation.positions()
     with Simulation(made, threads=device.threads) as simulation:
@@ -272,12 +272,12 @@ def test_a_machine_that_makes_errors_is_told_of(device: Device) -> None:
 def test_how_far_a_point_may_be() -> None:
     # 0.05 N on 1 g is 50 m/s^2; the sheet is 0.4 m long.
     probes = [{"force": [0, 0, 0.05], "falloff": 0, "offset": 0}]
-    assert farthest_displacement(plan_of(scene(probes=probes)), 3.0) == pytest.approx(10 * 0.4)
+    assert displacement_bound(plan_of(scene(probes=probes)), 3.0) == pytest.approx(10 * 0.4)
     loose = {"sheet": {**SHEET, "fixed": "none"}, "springs": {"structural": 20}}, {"springs": {"shear": 20}}
     for sections in loose:
-        flying = farthest_displacement(plan_of(scene(probes=probes, **sections)), 3.0)
+        flying = displacement_bound(plan_of(scene(probes=probes, **sections)), 3.0)
         assert flying == pytest.approx(10 * 0.4 + 50 * 3.0**2 / 2)
-    assert farthest_displacement(plan_of(scene(probes=probes, springs={"virtual": 1})), 3.0) == math.inf
+    assert displacement_bound(plan_of(scene(probes=probes, springs={"virtual": 1})), 3.0) == math.inf
 
 
 def released(across: float, down: float, active: str) -> Scene:

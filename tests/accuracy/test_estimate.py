@@ -12,7 +12,7 @@ import pytest
 
 from taichi_msm import load_scene, resume, run
 from taichi_msm.accuracy import companions
-from taichi_msm.accuracy.companions import ENOUGH, Pilots, choose_pilots
+from taichi_msm.accuracy.companions import NEGLIGIBLE_ERROR, CompanionRuns, choose_companion_runs
 from taichi_msm.errors import Pause
 from taichi_msm.runs.writer import RunRecord
 from taichi_msm.scene.scene import Scene
@@ -96,10 +96,10 @@ def test_a_resumed_run_has_the_same_estimate(small: Path, device: Device) -> Non
 
 
 def test_a_run_that_is_wrong_says_what_helps() -> None:
-    from taichi_msm.accuracy.time_step import Estimate
+    from taichi_msm.accuracy.time_step import TimeStepEstimate
 
     def said(error: float, rounding: float, in_f64: float) -> list[str]:
-        return notes_of(scene(), MOVED, Estimate(10, error, rounding, in_f64, 2))
+        return notes_of(scene(), MOVED, TimeStepEstimate(10, error, rounding, in_f64, 2))
 
     assert len(said(0.009, 0.0, 0.009)) == 1
     (_, step) = said(0.04, 0.0, 0.04)
@@ -151,8 +151,8 @@ def test_pilots_are_taken_while_they_are_two_fifths_of_the_run() -> None:
     assert [affords_companions(double, steps) for steps in (0.66, 0.67)] == [True, False]
     assert [affords_companions(single, steps) for steps in (0.33, 0.34)] == [True, False]
     steps = math.ceil(double.grid.steps_per_frame / 2)
-    assert choose_pilots(double) == Pilots(steps, 0, False, steps / double.grid.steps_per_frame)
-    assert choose_pilots(single).reason
+    assert choose_companion_runs(double) == CompanionRuns(steps, 0, False, steps / double.grid.steps_per_frame)
+    assert choose_companion_runs(single).reason
 
 
 @pytest.fixture
@@ -174,7 +174,7 @@ def test_pilots_are_cheap(name: str, most: float, root: Path, tmp_path: Path, de
     made = load_scene(root / f"scenes/{name}.yaml", ["output=[]", "time.duration=0.2"])
     record = run(made, tmp_path / "out", threads=device.threads)
     assert record["precision"] == "f64"
-    assert told(record) < ENOUGH
+    assert told(record) < NEGLIGIBLE_ERROR
     assert record["steps"] is not None
     own = record["steps"] * math.prod(made.sheet.points)
     assert 0.5 * own <= sum(taken) - own <= most * own
@@ -224,7 +224,7 @@ def test_beside_f32_a_coarse_pilot_of_order_1_tells_a_bound(small: Path, device:
     step = ["time.frames_per_second=50", "time.step=0.004", "time.damping_difference=backward", "time.precision=f32"]
     soft = ["springs.structural=8", "springs.shear=4", "output=[trajectory]"]
     made = load_scene("small.yaml", [*step, *soft, "probes.0.load=[[0, 0], [0.4, 100]]"])
-    assert choose_pilots(plan_of(made)).beside == 3
+    assert choose_companion_runs(plan_of(made)).concurrent_steps == 3
     record = run(made, "out", threads=device.threads)
     error = true_error(plan_of(made), device, fine=32)
     assert error < told(record) < 4 * error

@@ -179,7 +179,7 @@ def test_a_study_that_could_not_be_written_is_not_begun(
     def begun(*_: object, **__: object) -> None:
         raise AssertionError
 
-    monkeypatch.setattr("taichi_msm.study.study.study", begun)
+    monkeypatch.setattr("taichi_msm.study.study.run_study", begun)
     (small / "file").touch()
     for out in ("file", "file/below"):
         done = program("study", "small.yaml", "--out", out)

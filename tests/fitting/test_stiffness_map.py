@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm import FitResult, SceneError, fit, load_scene
-from taichi_msm.accuracy.mesh import estimate_points
+from taichi_msm.accuracy.mesh import estimate_mesh_error
 from taichi_msm.fitting.observations import Observations, Sight, read_observations
 from taichi_msm.fitting.predict import runnable
 from taichi_msm.fitting.tikhonov import Fields, Search
@@ -87,7 +87,7 @@ def result(device: Device, folder: Path) -> FitResult:
     observed = seen_in(scene(), device, TRUTH, np.array([1.0, 2.0]), 1e-5)
     # Half the cells a side would say little of these.
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("taichi_msm.fitting.stiffness_map.coarser", lambda plan: None)
+        patch.setattr("taichi_msm.fitting.stiffness_map.coarser_plan", lambda plan: None)
         return fit(scene(), observed, ["tissue.map"], resolution=4, directory=folder)
 
 
@@ -203,7 +203,7 @@ def test_bounds_must_leave_springs_a_length(device: Device) -> None:
 def test_the_mesh_error_is_that_of_the_map_that_was_found(result: FitResult, folder: Path, device: Device) -> None:
     # The lump of the truth, where the search begins with none, changes it by more than the last digit.
     found, even = (
-        estimate_points(check_scene(runnable(each)), device, lambda done, total: None).error
+        estimate_mesh_error(check_scene(runnable(each)), device, lambda done, total: None).error
         for each in (load_scene(folder / "scene.yaml"), scene())
     )
     assert result.mesh_error == pytest.approx(found, rel=1e-6)

@@ -19,7 +19,7 @@ from taichi_msm import Scene, Simulation, gradient
 from taichi_msm.errors import ArgumentError, MsmError, SceneError
 from taichi_msm.gradients import motion, rest
 from taichi_msm.gradients.chain_rule import Derivatives
-from taichi_msm.gradients.gradient import Adjoint, mapped
+from taichi_msm.gradients.gradient import Adjoint, with_stiffness_map
 from taichi_msm.gradients.motion import MotionAdjoint
 from taichi_msm.model.loads import average_loads
 from taichi_msm.model.plan import Plan
@@ -296,13 +296,13 @@ def test_the_bits_depend_neither_on_workers_nor_on_segments(
     made = described("tissue", image)
     # With bending a worker needs two rows that move.
     made["sheet"] |= {"points": [9, 11], "size": [0.16, 0.19]}
-    plan = mapped(plan_of(Scene.model_validate(made)))
+    plan = with_stiffness_map(plan_of(Scene.model_validate(made)))
 
     def bits(workers: int) -> bytes:
         sheet = MotionAdjoint(plan, device, layout=replace(choose_layout(plan, device), workers=workers))
         slopes, loads = sheet.backward(loss(sheet.run())[1])
-        arrays = [*slopes.springs, slopes.tensions, slopes.held, *loads.by_key.values()]
-        arrays += [slopes.bent, slopes.keep, slopes.gain, slopes.first_gain]
+        arrays = [*slopes.springs, slopes.tensions, slopes.foundation, *loads.by_key.values()]
+        arrays += [slopes.bending, slopes.keep, slopes.gain, slopes.first_gain]
         return b"".join(np.asarray(array).tobytes() for array in arrays)
 
     alone = bits(1)
@@ -311,7 +311,7 @@ def test_the_bits_depend_neither_on_workers_nor_on_segments(
         patched.setattr(motion, "SEGMENT_BYTES", 2**20)
         assert bits(2) == alone
     # Workers that give up at once.
-    monkeypatch.setattr(motion, "LONG_PATIENCE", 0)
+    monkeypatch.setattr(motion, "MAX_WAIT_CHECKS", 0)
     assert bits(3) == alone
 
 
@@ -396,7 +396,7 @@ def test_a_shape_without_stiffness_is_named(device: Device, monkeypatch: pytest.
     adjoint = Adjoint(plan_of(Scene.model_validate(REST)), device)
     slope = 1 + 0 * adjoint.run()
     # As if no solution were one.
-    monkeypatch.setattr(rest, "SOLVED", -1)
+    monkeypatch.setattr(rest, "RESIDUAL_TOLERANCE", -1)
     with pytest.raises(MsmError, match=r"frame 1 has no gradient: .*give it a foundation, pretension or bending"):
         adjoint.backward(slope)
 
@@ -475,7 +475,7 @@ def test_a_pause_follows_every_launch(image: str, device: Device, monkeypatch: p
 def test_a_solution_that_takes_long_is_left_behind(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     adjoint, pauses = Adjoint(plan_of(Scene.model_validate(REST)), device), []
     slope = loss(adjoint.run())[1]
-    monkeypatch.setattr(rest, "_solved", lambda *_: time.sleep(20))
+    monkeypatch.setattr(rest, "_solve", lambda *_: time.sleep(20))
 
     def stop() -> None:
         pauses.append(1)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from taichi_msm.accuracy.companions import choose_pilots
+from taichi_msm.accuracy.companions import choose_companion_runs
 from taichi_msm.load import cost
 from taichi_msm.load.cost import CALIBRATION_S, WORK_UNIT_S
 from taichi_msm.solver.planning import START, count_work
@@ -27,7 +27,7 @@ def test_the_estimate_is_the_work_at_the_speed_of_the_machine(cores: int, monkey
     monkeypatch.setattr(cost, "_calibrate", lambda: 2 * CALIBRATION_S)
     monkeypatch.setattr(process, "available_threads", lambda: cores)
     plan = plan_of(small_scene(image="none.png", output=["gif"]))
-    parts = count_work(plan, choose_pilots(plan).cost)
+    parts = count_work(plan, choose_companion_runs(plan).cost)
     assert min(parts) > 0
     assert cost.estimate_duration(plan) == pytest.approx((2 * WORK_UNIT_S * sum(parts), 2 * WORK_UNIT_S * START))
 

@@ -193,7 +193,7 @@ def test_what_was_felt_before_a_divergence_is_kept(device: Device) -> None:
         with pytest.raises(DivergedError):
             simulation.advance()
         assert simulation.felt == felt
-        good = simulation.diagnose(start).good
+        good = simulation.diagnose(start).last_sound_state
         assert good is not None
         assert good.felt == felt
         assert felt.forces[0].force[2] < -0.1

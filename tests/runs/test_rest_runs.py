@@ -22,7 +22,7 @@ from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.dynamics import choose_layout
 from taichi_msm.solver.rest import FORCE_TOLERANCE, build_dynamics
-from taichi_msm.study.study import study
+from taichi_msm.study.study import run_study
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
 from tests.scenes import plan_of
@@ -221,7 +221,7 @@ def test_friction_and_gpus_and_studies_are_refused(device: Device) -> None:
     ):
         choose_layout(plan_of(at_rest([PUSH])), Device("vulkan", 1))
     with pytest.raises(SceneError, match=r"time.motion: quasistatic takes no steps, which a study compares; set time"):
-        study(at_rest([PUSH]), "rest", threads=device.threads)
+        run_study(at_rest([PUSH]), "rest", threads=device.threads)
 
 
 def test_a_pilot_that_never_rests_leaves_the_error_unknown(
@@ -281,8 +281,8 @@ def test_a_frame_that_jumps_is_noted() -> None:
         for frame in range(5):
             moved = np.zeros((25, 25, 3))
             moved[12, 12, 0] = 0.01 * frame / 4 + (jump if frame >= 3 else 0)
-            path.follow(frame, moved)
-        return list(path.notes())
+            path.check_frame(frame, moved)
+        return list(path.warnings())
 
     assert not notes(0)
     # 0.0025 a frame.

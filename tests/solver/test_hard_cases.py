@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm.accuracy.divergence import MOST_SHEET_SIZES
+from taichi_msm.accuracy.divergence import MAX_SHEET_SIZES
 from taichi_msm.accuracy.time_step import estimate_error
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.model import sheet
@@ -179,7 +179,7 @@ def test_adrift_moves_its_centre_of_mass_as_one_body(device: Device) -> None:
     t = np.arange(1, scene.time.frames + 1) / scene.time.frames_per_second
     pushed = np.minimum(t, probe.load[-1][0])
     way = a * pushed**2 / 2 + a * pushed * (t - pushed)
-    assert way[-1] > MOST_SHEET_SIZES * max(scene.sheet.size), "would be taken for diverged if something held it"
+    assert way[-1] > MAX_SHEET_SIZES * max(scene.sheet.size), "would be taken for diverged if something held it"
     centre = frames(scene, device).mean(axis=(1, 2))
     rounding = F32 * plan_of(scene).grid.steps * way[-1]
     np.testing.assert_allclose(centre[:, 0], way, rtol=0, atol=rounding)

@@ -17,9 +17,18 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm.errors import FilesError
-from taichi_msm.study.format import duration, number, timing
-from taichi_msm.study.report import WITHOUT_MATPLOTLIB, as_record, summary, write_report
-from taichi_msm.study.result import Drawn, Peer, Points, Reference, Stepping, Study, TimedTerm, Timing
+from taichi_msm.study.format import format_duration, format_number, format_timing
+from taichi_msm.study.report import WITHOUT_MATPLOTLIB, format_summary, study_record, write_report
+from taichi_msm.study.result import (
+    DrawingMeasurement,
+    MeshMeasurement,
+    PeerMeasurement,
+    Reference,
+    SteppingMeasurement,
+    Study,
+    TermMeasurement,
+    Timing,
+)
 from tests.scenes import scene
 
 FILES = ["study.png", "study.md", "study.json"]
@@ -42,9 +51,9 @@ def spread(median: float, runs: int = 5) -> list[float]:
     return [0.9 * median, *[median] * (runs - 2), 1.3 * median] if runs > 1 else [median]
 
 
-def series(precision: str, difference: str) -> list[Stepping]:
+def series(precision: str, difference: str) -> list[SteppingMeasurement]:
     """Points of order 2 or 1, the coarsest of which diverged."""
-    points = [Stepping(precision, difference, 10, 0.004, None, None, False, samples=spread(0.02))]
+    points = [SteppingMeasurement(precision, difference, 10, 0.004, None, None, False, samples=spread(0.02))]
     for halving in range(6):
         exact = 9e-4 / 4**halving if difference == "central" else 2.7e-3 / 2**halving
         rounding = FLOOR if precision == "f32" else None
@@ -52,7 +61,7 @@ def series(precision: str, difference: str) -> list[Stepping]:
         seconds = (0.03 if precision == "f32" else 0.05) * 2**halving
         known = error > 2e-6
         points.append(
-            Stepping(
+            SteppingMeasurement(
                 precision,
                 difference,
                 20 * 2**halving,
@@ -75,11 +84,13 @@ def realistic() -> Study:
             found.stepping += series(precision, difference)
             found.orders[f"{precision} {difference}"] = 1.98 if difference == "central" else 1.01
     found.peers = [
-        Peer(10.0**-digits, 10.0 ** (-digits - 2), digits < 4, 2000 + 500 * digits, samples=spread(3 + digits, 1))
+        PeerMeasurement(
+            10.0**-digits, 10.0 ** (-digits - 2), digits < 4, 2000 + 500 * digits, samples=spread(3 + digits, 1)
+        )
         for digits in (2, 4, 6)
     ]
     found.drawing = [
-        Drawn(
+        DrawingMeasurement(
             refine,
             supersample,
             50 + 5 * supersample - 4 / (1 + refine) ** 4,
@@ -90,7 +101,7 @@ def realistic() -> Study:
         for refine in (0, 1, 2, 5)
     ]
     names = ("", "springs.structural", "springs.shear", "springs.virtual", "damping", "probes.0")
-    found.terms = [TimedTerm(name, samples=spread(23e-6 - 2e-6 * len(name) / 9, 9)) for name in names]
+    found.terms = [TermMeasurement(name, samples=spread(23e-6 - 2e-6 * len(name) / 9, 9)) for name in names]
     found.notes = ["DOP853 takes more than 20 s at rtol 1e-08 and was stopped"]
     return found
 
@@ -100,10 +111,10 @@ def of_tissue() -> Study:
     found = realistic()
     found.settings["sheet"]["points"] = [31, 31]
     found.points = [
-        Points(9, 9, 58, 0.191, True, 0.0511, samples=spread(0.00227)),
-        Points(16, 16, 88, 0.0836, True, None, samples=spread(0.00293)),
-        Points(31, 31, 162, 0.0209, True, 0.0217, samples=spread(0.0112)),
-        Points(61, 61, 317, 0.0105, False, 0.0114, samples=spread(0.0484)),
+        MeshMeasurement(9, 9, 58, 0.191, True, 0.0511, samples=spread(0.00227)),
+        MeshMeasurement(16, 16, 88, 0.0836, True, None, samples=spread(0.00293)),
+        MeshMeasurement(31, 31, 162, 0.0209, True, 0.0217, samples=spread(0.0112)),
+        MeshMeasurement(61, 61, 317, 0.0105, False, 0.0114, samples=spread(0.0484)),
     ]
     return found
 
@@ -142,7 +153,7 @@ def without_reference() -> Study:
     """Every run diverged, the reference with them."""
     found = diverged()
     found.reference = Reference(40, float("nan"), float("inf"))
-    found.peers = [Peer(1e-4, float("nan"), False, 100, samples=spread(1, 1))]
+    found.peers = [PeerMeasurement(1e-4, float("nan"), False, 100, samples=spread(1, 1))]
     return found
 
 
@@ -186,7 +197,7 @@ def page(directory: Path) -> str:
 
 def printed(found: Study) -> list[str]:
     """Lines of the summary, without the lines of its tables."""
-    return [" ".join(line.replace("|", " ").split()) for line in summary(found).splitlines()]
+    return [" ".join(line.replace("|", " ").split()) for line in format_summary(found).splitlines()]
 
 
 @pytest.fixture
@@ -205,7 +216,7 @@ def test_every_study_is_reported(made: Callable[[], Study], tmp_path: Path) -> N
     assert sorted(outputs) == sorted(path.name for path in (tmp_path / "new" / "out").iterdir())
     record = json.loads((tmp_path / "new" / "out" / "study.json").read_text(encoding="utf-8"))
     assert record["status"] == found.status
-    assert len(summary(found).splitlines()) > 2
+    assert len(format_summary(found).splitlines()) > 2
     assert page(tmp_path / "new" / "out").count("## Recommendation") == 1
 
 
@@ -215,12 +226,12 @@ def test_the_record_has_everything(tmp_path: Path) -> None:
     outputs = write_report(found, tmp_path)
     record = json.loads((tmp_path / "study.json").read_text(encoding="utf-8"))
     assert record.pop("outputs") == outputs
-    assert record == json.loads(json.dumps(as_record(found)))
+    assert record == json.loads(json.dumps(study_record(found)))
     assert record["recommendation"] == found.recommendation()
     known = [dict(one) for one in record["stepping"]]
     for one in known:
         del one["method"], one["seconds"]
-    assert [Stepping(**one) for one in known] == [replace(one, samples=[]) for one in found.stepping]
+    assert [SteppingMeasurement(**one) for one in known] == [replace(one, samples=[]) for one in found.stepping]
     assert [Timing(**one["seconds"]) for one in record["stepping"]] == [one.seconds for one in found.stepping]
     assert [one["method"] for one in record["stepping"]] == [point.method for point in found.stepping]
     assert record["machine"] == MACHINE
@@ -228,7 +239,7 @@ def test_the_record_has_everything(tmp_path: Path) -> None:
 
 
 def test_numbers_that_json_has_not_are_null() -> None:
-    record = as_record(without_reference())
+    record = study_record(without_reference())
     assert record["reference"] == {"steps_per_frame": 40, "error": None, "largest": None}
     assert record["peers"][0]["error"] is None
 
@@ -288,7 +299,7 @@ def test_points_are_reported_beside_their_estimates(tmp_path: Path) -> None:
     record = json.loads((tmp_path / "study.json").read_text(encoding="utf-8"))
     seconds = [Timing(**one.pop("seconds")) for one in record["points"]]
     assert seconds == [one.seconds for one in found.points]
-    assert [Points(**one) for one in record["points"]] == [replace(one, samples=[]) for one in found.points]
+    assert [MeshMeasurement(**one) for one in record["points"]] == [replace(one, samples=[]) for one in found.points]
     assert "61 x 61 317 < 0.0105 0.0114 48.4 ms (43.6 to 62.9)" in printed(found)
     assert "9 x 9 58 diverged 0.0511 2.27 ms (2.04 to 2.95)" in printed(tissue_alone())
 
@@ -384,7 +395,7 @@ def test_without_matplotlib_there_is_a_note_and_no_old_picture(tmp_path: Path) -
     assert found.notes.count(WITHOUT_MATPLOTLIB) == 1
     assert json.loads((tmp_path / "study.json").read_text())["notes"] == found.notes
     assert WITHOUT_MATPLOTLIB in page(tmp_path)
-    assert f"note: {WITHOUT_MATPLOTLIB}" in summary(found)
+    assert f"note: {WITHOUT_MATPLOTLIB}" in format_summary(found)
 
 
 def test_a_study_with_nothing_to_draw_removes_the_old_picture(tmp_path: Path) -> None:
@@ -435,7 +446,7 @@ def test_the_record_comes_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 def test_the_summary_is_short_and_ends_in_the_recommendation() -> None:
     found = realistic()
-    text = summary(found)
+    text = format_summary(found)
     assert text.rstrip().endswith("\n".join(["To put in the scene:", "", *found.recommendation()]))
     lines = text.splitlines()
     assert len(lines) < 40
@@ -452,7 +463,7 @@ def test_the_summary_is_short_and_ends_in_the_recommendation() -> None:
 
 def test_the_summary_says_what_is_closest_to_the_tolerance() -> None:
     found = replace(realistic(), tolerance=5e-7)
-    text = summary(found)
+    text = format_summary(found)
     assert "f64 central 62.5 us < 8.79e-07 1.60 s (1.44 to 2.08)" in printed(found)
     assert "An error with < is an approximate upper bound" in text
     assert "No step that was measured is within the tolerance of 5e-07; the closest is f64 central" in text
@@ -465,7 +476,7 @@ def test_the_summary_of_a_method_that_diverged() -> None:
 
 
 def test_names_are_printed_as_they_are() -> None:
-    assert summary(oddly_named()).startswith(
+    assert format_summary(oddly_named()).startswith(
         "[bold]$x$ 呼 \\udcff | :smile: on AMD EPYC 7R13, 2 threads, vectors of 512 bits\n"
     )
 
@@ -485,17 +496,17 @@ def test_names_are_printed_as_they_are() -> None:
     ],
 )
 def test_times_read_well(seconds: float, text: str) -> None:
-    assert duration(seconds) == text
+    assert format_duration(seconds) == text
 
 
 def test_numbers_have_three_digits() -> None:
-    written = [number(value) for value in (0.0, 1.0, 0.00027, 2.7e-9, 99.96, 999.6, 1e7)]
+    written = [format_number(value) for value in (0.0, 1.0, 0.00027, 2.7e-9, 99.96, 999.6, 1e7)]
     assert written == ["0.00", "1.00", "0.000270", "2.70e-09", "100", "1000", "1.00e+07"]
 
 
 def test_a_spread_is_in_the_unit_of_its_median() -> None:
-    assert timing(Timing(0.0011, 0.0009, 0.012, 5)) == "1.10 ms (0.900 to 12.0)"
-    assert timing(Timing(0.0011, 0.0011, 0.0011, 1)) == "1.10 ms (once)"
+    assert format_timing(Timing(0.0011, 0.0009, 0.012, 5)) == "1.10 ms (0.900 to 12.0)"
+    assert format_timing(Timing(0.0011, 0.0011, 0.0011, 1)) == "1.10 ms (once)"
 
 
 def test_of_steppings_that_are_as_fast_the_least_wrong_is_recommended() -> None:
@@ -512,7 +523,7 @@ def with_points(tolerance: float, *errors: float, own: int = 31) -> Study:
     found = replace(realistic(), tolerance=tolerance)
     found.settings["sheet"]["points"] = [own, own]
     found.points = [
-        Points(count, count, 100, error, True, None, samples=spread(0.01))
+        MeshMeasurement(count, count, 100, error, True, None, samples=spread(0.01))
         for count, error in zip((16, 31, 61, 121), errors, strict=False)
     ]
     return found
@@ -521,11 +532,11 @@ def with_points(tolerance: float, *errors: float, own: int = 31) -> Study:
 def test_points_that_are_too_few_are_told_before_any_step() -> None:
     found = with_points(1e-3, 0.128, 0.032, 0.008, own=61)
     # Four times less at each halving, so that 8 times less takes sqrt(8) times the cells: 169.7 on 60.
-    assert found.more_points == (171, 171)
+    assert found.recommended_points == (171, 171)
     assert found.best_stepping is None
     lines = ["sheet:", "  points: [171, 171]", "time:", "  step: auto", "  tolerance: 0.001"]
     assert found.recommendation()[:5] == lines
-    text = summary(found)
+    text = format_summary(found)
     said = (
         "61 x 61 points make an error of 0.00800, which no step can mend; the tolerance is 0.001. Take about 171 x 171"
     )
@@ -549,7 +560,7 @@ def test_points_that_are_too_few_are_told_before_any_step() -> None:
 )
 def test_the_points_for_a_tolerance(errors: tuple[float, ...], more: int | None) -> None:
     found = with_points(1e-3, *errors)
-    assert found.more_points == (None if more is None else (more, more))
+    assert found.recommended_points == (None if more is None else (more, more))
     assert (found.best_stepping is None) == (more is not None)
 
 
@@ -564,16 +575,16 @@ def test_points_that_were_measured_and_do_are_recommended(tmp_path: Path) -> Non
 
 def test_more_points_than_a_scene_may_have_are_not_recommended() -> None:
     found = with_points(1e-6, 0.04, 0.02)
-    assert found.more_points == (600001, 600001)
+    assert found.recommended_points == (600001, 600001)
     assert found.recommendation()[0] == "render:"
-    assert "take a wider tool (probes.N.radius, a smaller falloff), or allow a larger error" in summary(found)
+    assert "take a wider tool (probes.N.radius, a smaller falloff), or allow a larger error" in format_summary(found)
 
 
 def test_points_that_do_are_told_beside_the_step() -> None:
     said = "31 x 31 points make an error of 0.0100, the recommended step one of 0.000903; the tolerance is 0.02."
-    assert said in summary(with_points(0.02, 0.04, 0.01)).replace("\n", " ")
+    assert said in format_summary(with_points(0.02, 0.04, 0.01)).replace("\n", " ")
     # The scene's own tolerance for points comes first.
     found = with_points(1e-3, 0.04, 0.01)
     found.settings["sheet"]["tolerance"] = 0.015
     assert found.recommendation()[0] == "time:"
-    assert "an error of 0.0100, the recommended step one of 0.000903; the tolerance is 0.015." in summary(found)
+    assert "an error of 0.0100, the recommended step one of 0.000903; the tolerance is 0.015." in format_summary(found)

@@ -14,7 +14,7 @@ from PIL import Image
 from pydantic import BaseModel
 
 from taichi_msm.accuracy.mesh import with_points
-from taichi_msm.accuracy.time_step import longest
+from taichi_msm.accuracy.time_step import max_norm
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.runs.run import run
@@ -24,21 +24,21 @@ from taichi_msm.solver.planning import with_time
 from taichi_msm.study import measurements
 from taichi_msm.study import study as study_module
 from taichi_msm.study.measurements import (
-    MARGIN,
-    POINT_ROUNDS,
-    FailedError,
-    PointStudy,
+    MESH_ROUNDS,
+    REFERENCE_MARGIN,
+    IntegrationError,
+    MeshStudy,
     SteppingStudy,
-    TooSlowError,
+    TimeLimitError,
     _reference,
-    lattices,
     measure_pictures,
     measure_terms,
-    solve,
-    variants,
+    mesh_plans,
+    scene_variants,
+    solve_with_dop853,
 )
-from taichi_msm.study.measurements import POINT_ROUNDS as POINTS_ROUNDS
-from taichi_msm.study.result import Drawn, Stepping, Study, Timing, observed_orders
+from taichi_msm.study.measurements import MESH_ROUNDS as POINTS_ROUNDS
+from taichi_msm.study.result import DrawingMeasurement, SteppingMeasurement, Study, Timing, observed_orders
 from taichi_msm.system.runtime import Device
 from taichi_msm.terms.damping import DampingTerm
 from taichi_msm.terms.foundation import FoundationTerm
@@ -78,7 +78,7 @@ def test_stepping_starts_at_the_largest_stable_step_and_halves_it(stepping: Step
         assert 0.5 * limit < steps[0] <= limit
         np.testing.assert_allclose(np.divide(steps[:-1], steps[1:]), 2)
         assert len(steps) >= 3
-    assert all(point.seconds.runs == POINT_ROUNDS for point in points)
+    assert all(point.seconds.runs == MESH_ROUNDS for point in points)
     assert all(point.seconds.fastest <= point.seconds.median <= point.seconds.slowest for point in points)
 
 
@@ -98,13 +98,13 @@ def test_the_reference_is_as_exact_as_it_says(stepping: SteppingStudy) -> None:
     assert stepping.frames is not None
     assert stepping.study.reference is not None
     made = with_time(stepping.plan.scene, damping_difference="central")
-    solved, _ = solve(plan_of(made), 1e-12, 1e-14, float("inf"), lambda: None)
+    solved, _ = solve_with_dop853(plan_of(made), 1e-12, 1e-14, float("inf"), lambda: None)
     error = np.linalg.norm(solved - stepping.frames, axis=-1).max() / stepping.study.reference.largest
     # The integrator keeps 1e-12 a step, of some thousand steps.
     assert error < stepping.study.reference.error + 1e-9
     for point in stepping.study.stepping:
         assert point.error is not None
-        assert point.known == (point.error >= MARGIN * stepping.study.reference.error)
+        assert point.known == (point.error >= REFERENCE_MARGIN * stepping.study.reference.error)
 
 
 def test_observed_orders(stepping: SteppingStudy) -> None:
@@ -115,8 +115,8 @@ def test_observed_orders(stepping: SteppingStudy) -> None:
 
 
 def test_orders_are_fitted_above_the_rounding_floor() -> None:
-    def point(step: float, error: float, rounding: float) -> Stepping:
-        return Stepping("f32", "central", 1, step, error, rounding, True, samples=[1.0])
+    def point(step: float, error: float, rounding: float) -> SteppingMeasurement:
+        return SteppingMeasurement("f32", "central", 1, step, error, rounding, True, samples=[1.0])
 
     points = [point(0.1**n, 0.1 ** (2 * n) + 1e-6, 1e-6) for n in range(5)]
     # The points of 1e-6 and 2e-6 are mostly rounding; the next is, by 1 %.
@@ -138,7 +138,7 @@ def test_dop853_solves_moving_and_jumping_probes() -> None:
     at = [[0, 0.2, 0.3], [0.2, 0.6, 0.5], [0.2, 0.4, 0.4], [0.3, 0.5, 0.7]]
     probe = {"at": at, "force": [200, 100, -500], "load": [[0.05, 50], [0.3, 100], [0.3, 0]], "falloff": 20}
     made = scene(probes=[probe], springs={**SPRINGS, "virtual": 5}, time={"step": 0.04 / 320})
-    solved, evaluations = solve(plan_of(made), 1e-8, 1e-12, float("inf"), lambda: None)
+    solved, evaluations = solve_with_dop853(plan_of(made), 1e-8, 1e-12, float("inf"), lambda: None)
     coarse, fine = (
         (reference.simulate(with_time(made, step=0.04 / cut)) - rest_positions(made.sheet))[1:] for cut in (160, 320)
     )
@@ -157,20 +157,20 @@ def test_a_timing_is_a_median_with_its_spread() -> None:
 
 def test_an_error_near_that_of_the_reference_is_not_known(stepping: SteppingStudy) -> None:
     assert stepping.study.reference is not None
-    assert stepping.known(21 * stepping.study.reference.error)
-    assert not stepping.known(19 * stepping.study.reference.error)
+    assert stepping.determines(21 * stepping.study.reference.error)
+    assert not stepping.determines(19 * stepping.study.reference.error)
 
 
 def test_dop853_gives_up_in_time() -> None:
-    with pytest.raises(TooSlowError):
-        solve(plan_of(scene()), 1e-3, 1e-6, 0.0, lambda: None)
+    with pytest.raises(TimeLimitError):
+        solve_with_dop853(plan_of(scene()), 1e-3, 1e-6, 0.0, lambda: None)
 
 
 def test_dop853_fails_where_no_step_is_small_enough(monkeypatch: pytest.MonkeyPatch) -> None:
     failed = SimpleNamespace(success=False, t=np.array([0.04, 0.08]))
     monkeypatch.setattr("scipy.integrate.solve_ivp", lambda *_, **__: failed)
-    with pytest.raises(FailedError, match=r"^after 0.08 s$"):
-        solve(plan_of(scene()), 1e-4, 1e-6, float("inf"), lambda: None)
+    with pytest.raises(IntegrationError, match=r"^after 0.08 s$"):
+        solve_with_dop853(plan_of(scene()), 1e-4, 1e-6, float("inf"), lambda: None)
 
 
 def test_dop853_is_left_out_where_tools_touch(device: Device) -> None:
@@ -193,7 +193,7 @@ def test_dop853_is_left_out_where_tools_touch(device: Device) -> None:
     )
     assert measured.frames is not None
     assert measured.frames.tobytes() == fine.tobytes()
-    assert known.error == longest(fine - half) / longest(fine)
+    assert known.error == max_norm(fine - half) / max_norm(fine)
 
 
 def test_a_study_takes_no_steps_in_which_a_tool_moves_too_far(device: Device) -> None:
@@ -214,16 +214,16 @@ def test_points_in_contact_are_not_extrapolated() -> None:
 
 def test_a_tool_that_is_moved_is_left_out_like_any_other() -> None:
     made = touching([PRESSED, RUBBED])
-    without = dict(variants(made))
+    without = dict(scene_variants(made))
     assert [len(plan_of(without[f"probes.{n}"]).tools) for n in (0, 1)] == [1, 1]
 
 
 @pytest.mark.parametrize(
     ("raised", "said"),
     [
-        (TooSlowError(), "takes more than 10 s at rtol 0.0001 and was stopped"),
+        (TimeLimitError(), "takes more than 10 s at rtol 0.0001 and was stopped"),
         (
-            FailedError("after 0.3 s"),
+            IntegrationError("after 0.3 s"),
             "finds no step small enough after 0.3 s, at rtol 0.0001: forces change too suddenly for it there, as where "
             "a spring is pressed to a point or the sheet runs away",
         ),
@@ -233,10 +233,10 @@ def test_a_tool_that_is_moved_is_left_out_like_any_other() -> None:
 def test_why_dop853_is_left_out_is_told(
     raised: Exception, said: str, stepping: SteppingStudy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def solve(*_: Any) -> Any:
+    def solve_with_dop853(*_: Any) -> Any:
         raise raised
 
-    monkeypatch.setattr(study_module, "solve", solve)
+    monkeypatch.setattr(study_module, "solve_with_dop853", solve_with_dop853)
     found = study_of(scene())
     found.reference = stepping.study.reference
     study_module._measure_peer(plan_of(scene()), stepping, study_module.QUICK, found, lambda stage, done, total: None)
@@ -246,7 +246,7 @@ def test_why_dop853_is_left_out_is_told(
 
 def test_terms_are_left_out_of_the_kernel(device: Device) -> None:
     made = scene(probes=[PRESS, PRESS])
-    shapes = {name: structure_of(variant, device).config for name, variant in variants(made)}
+    shapes = {name: structure_of(variant, device).config for name, variant in scene_variants(made)}
     assert list(shapes) == [
         "",
         "springs.structural",
@@ -263,7 +263,7 @@ def test_terms_are_left_out_of_the_kernel(device: Device) -> None:
     assert not shapes["springs.virtual"].get(FoundationTerm)
     assert not shapes["damping"].get(DampingTerm)
     assert shapes["probes.1"].get(ProbeTerm) == ProbeTerm((False,), (False,))
-    assert list(dict(variants(scene(springs={}, damping=0, probes=[])))) == [""]
+    assert list(dict(scene_variants(scene(springs={}, damping=0, probes=[])))) == [""]
 
 
 def test_all_terms_are_timed_on_the_grid_of_the_whole_scene(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -278,8 +278,8 @@ def test_all_terms_are_timed_on_the_grid_of_the_whole_scene(device: Device, monk
     monkeypatch.setattr(measurements, "Dynamics", Recorded)
     made = scene(time={"precision": "auto"})
     measure_terms(plan_of(made), device, 0.0001, study_of(made), nothing)
-    assert len(grids) == len(list(variants(made)))
-    assert set(grids) == {plan_of(made).grid} != {plan_of(variant).grid for _, variant in variants(made)}
+    assert len(grids) == len(list(scene_variants(made)))
+    assert set(grids) == {plan_of(made).grid} != {plan_of(variant).grid for _, variant in scene_variants(made)}
 
 
 def test_terms_are_timed(device: Device) -> None:
@@ -310,7 +310,7 @@ def tissue(points: tuple[int, int] = (33, 33), **time: Any) -> Scene:
 
 def points_study(made: Scene, device: Device, longest_run: float) -> Study:
     study = study_of(made)
-    PointStudy(plan_of(made), device, longest_run, study, nothing).run()
+    MeshStudy(plan_of(made), device, longest_run, study, nothing).run()
     return study
 
 
@@ -381,12 +381,12 @@ def points_of(plans: Iterable[Plan]) -> list[tuple[int, int]]:
 
 
 def test_points_are_quarters_and_halves_of_the_cells() -> None:
-    assert points_of(lattices(plan_of(tissue((31, 31))))) == [(9, 9), (16, 16), (31, 31)]
-    assert points_of(lattices(plan_of(tissue((41, 25))))) == [(11, 7), (21, 13), (41, 25)]
+    assert points_of(mesh_plans(plan_of(tissue((31, 31))))) == [(9, 9), (16, 16), (31, 31)]
+    assert points_of(mesh_plans(plan_of(tissue((41, 25))))) == [(11, 7), (21, 13), (41, 25)]
     # Too few to be compared with half as many; and cells that would be too long.
-    assert points_of(lattices(plan_of(tissue((13, 15))))) == [(7, 8), (13, 15)]
-    assert points_of(lattices(plan_of(tissue((6, 6))))) == []
-    assert points_of(lattices(plan_of(tissue((46, 27))))) == [(23, 14), (46, 27)]
+    assert points_of(mesh_plans(plan_of(tissue((13, 15))))) == [(7, 8), (13, 15)]
+    assert points_of(mesh_plans(plan_of(tissue((6, 6))))) == []
+    assert points_of(mesh_plans(plan_of(tissue((46, 27))))) == [(23, 14), (46, 27)]
 
 
 def test_a_sheet_of_too_few_points_is_left_out(device: Device) -> None:
@@ -409,7 +409,7 @@ def test_an_interruption_leaves_the_points_that_were_timed(device: Device) -> No
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        PointStudy(plan_of(tissue((13, 13))), device, study_module.QUICK.longest_run, made, stop).run()
+        MeshStudy(plan_of(tissue((13, 13))), device, study_module.QUICK.longest_run, made, stop).run()
     made.finish()
     assert [(one.name, one.seconds.runs) for one in made.points] == [("7 x 7", 1)]
     assert made.points[0].error is not None
@@ -419,7 +419,7 @@ def test_an_interruption_leaves_the_points_that_were_timed(device: Device) -> No
 def test_pictures_are_judged_by_a_finer_one(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(measurements, "REFINES", (0, 3))
     monkeypatch.setattr(measurements, "SUPERSAMPLES", (1, 4))
-    monkeypatch.setattr(measurements, "FINEST", {"refine": 4, "supersample": 5})
+    monkeypatch.setattr(measurements, "REFERENCE_RENDER", {"refine": 4, "supersample": 5})
     made = scene(render={"size": [60, 45], "camera": "oblique", "refine": 3})
     position = rest_positions(made.sheet)
     position[4, 5, 2] += 0.05
@@ -431,7 +431,7 @@ def test_pictures_are_judged_by_a_finer_one(device: Device, monkeypatch: pytest.
     assert psnr[3, 4] > max(psnr[0, 4], psnr[3, 1]) > psnr[0, 1]
     assert points[3, 4].largest_error < points[0, 1].largest_error
     # By the twin.
-    fine = made.model_copy(update={"render": BaseModel.model_copy(made.render, update=measurements.FINEST)})
+    fine = made.model_copy(update={"render": BaseModel.model_copy(made.render, update=measurements.REFERENCE_RENDER)})
     own = made.model_copy(update={"render": made.render.model_copy(update={"refine": 0})})
     apart = reference.draw(fine, position, speckle(20, 30)).astype(float) - reference.draw(
         own, position, speckle(20, 30)
@@ -447,13 +447,13 @@ def test_psnr_is_of_values_to_255() -> None:
 
 def test_a_quick_study_of_pictures_varies_one_at_a_time() -> None:
     made = scene(render={"size": [6, 4], "refine": 2, "supersample": 3})
-    settings = list(measurements.settings(made, quick=True))
+    settings = list(measurements.render_settings(made, quick=True))
     assert settings == [(2, 1), (2, 2), *((refine, 3) for refine in (0, 1, 2, 5, 10, 20)), (2, 4)]
 
 
-def stepping_point(error: float | None, seconds: float, **changes: Any) -> Stepping:
+def stepping_point(error: float | None, seconds: float, **changes: Any) -> SteppingMeasurement:
     values: dict[str, Any] = {"precision": "f32", "damping_difference": "central", "steps_per_frame": 40, "step": 0.001}
-    return Stepping(
+    return SteppingMeasurement(
         **values | changes,
         error=error,
         rounding=0.0,
@@ -462,8 +462,8 @@ def stepping_point(error: float | None, seconds: float, **changes: Any) -> Stepp
     )
 
 
-def drawn(refine: int, psnr: float | None, seconds: float, supersample: int = 1) -> Drawn:
-    return Drawn(refine, supersample, psnr, 1, samples=[seconds])
+def drawn(refine: int, psnr: float | None, seconds: float, supersample: int = 1) -> DrawingMeasurement:
+    return DrawingMeasurement(refine, supersample, psnr, 1, samples=[seconds])
 
 
 def test_the_recommendation_is_the_cheapest_within_the_tolerance() -> None:

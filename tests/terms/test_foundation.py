@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from taichi_msm.accuracy.mesh import coarser
+from taichi_msm.accuracy.mesh import coarser_plan
 from taichi_msm.errors import SceneError
 from taichi_msm.load.scene_file import load_plan, load_scene
 from taichi_msm.model.loads import average_loads
@@ -23,7 +23,7 @@ from taichi_msm.scene.sheet import Foundation
 from taichi_msm.solver.arrays import SheetLayout
 from taichi_msm.solver.planning import plan_variant
 from taichi_msm.solver.state import RunProgress, largest_displacement
-from taichi_msm.study.measurements import acceleration, variants
+from taichi_msm.study.measurements import acceleration_function, scene_variants
 from taichi_msm.sweeps.spec import load_sweep
 from taichi_msm.system.runtime import Device
 from taichi_msm.terms.foundation import FoundationTerm
@@ -123,7 +123,7 @@ def test_steering_leaves_it_as_it_is(image: str, device: Device) -> None:
 
 
 def test_a_coarser_sheet_samples_it_anew(image: str) -> None:
-    coarse = coarser(plan_of(mapped(image)))
+    coarse = coarser_plan(plan_of(mapped(image)))
     assert coarse is not None
     again = plan_of(coarse.scene).material.virtual_factors
     assert coarse.material.virtual_factors is not None
@@ -156,10 +156,10 @@ def test_the_peer_and_the_terms_of_a_study_know_it(image: str, device: Device) -
     force = reference.force(made, u, loads, 0)
     expected = force / reference.sheet(made).mass[..., None]
     np.testing.assert_allclose(
-        acceleration(plan)(u, 0 * u, loads), expected, rtol=0, atol=1e-12 * np.abs(expected).max()
+        acceleration_function(plan)(u, 0 * u, loads), expected, rtol=0, atol=1e-12 * np.abs(expected).max()
     )
 
-    without = dict(variants(made))
+    without = dict(scene_variants(made))
     assert list(without) == ["", "tissue.foundation", "tissue.map", "tissue.foundation_map", "probes.0"]
     unmapped, unheld = (plan_variant(plan, without[f"tissue.{name}"]) for name in ("foundation_map", "foundation"))
     assert FoundationTerm.from_plan(unmapped) == FoundationTerm(by_area=True, mapped=False)

@@ -12,8 +12,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from taichi_msm.accuracy.mesh import FEWEST, CubicSampling, MeshEstimate, MeshPilot, choose_points, coarser
-from taichi_msm.accuracy.time_step import longest
+from taichi_msm.accuracy.mesh import (
+    MIN_POINTS_PER_SIDE,
+    CubicInterpolation,
+    MeshCompanion,
+    MeshEstimate,
+    choose_points,
+    coarser_plan,
+)
+from taichi_msm.accuracy.time_step import max_norm
 from taichi_msm.cli.console import run_summary
 from taichi_msm.errors import ArgumentError, FilesError, SceneError
 from taichi_msm.load.check import check_scene
@@ -378,13 +385,13 @@ def test_the_mesh_error_is_that_of_the_points(count: int, load: Any, device: Dev
     tense = ("tissue.pretension=20", "tissue.foundation=0")
     smooth = (*tense, "probes.0.radius=0", "probes.0.at=[-0.3, 0.4]", "probes.0.falloff=10")
     made = load(f"sheet.points=[{count}, {count}]", *smooth)
-    coarse = coarser(plan_of(made))
+    coarse = coarser_plan(plan_of(made))
     assert coarse is not None
-    pilot = MeshPilot(plan_of(made), coarse, device)
+    pilot = MeshCompanion(plan_of(made), coarse, device)
     for u in (found := frames(made, device)):
-        pilot.follow(u, lambda: None)
+        pilot.compare_frame(u, lambda: None)
     fine = frames(load(f"sheet.points=[{4 * count - 3}, {4 * count - 3}]", *smooth), device)[:, ::4, ::4]
-    error = longest(found - fine) / longest(fine)
+    error = max_norm(found - fine) / max_norm(fine)
     # An order of 2 to 3, as the runs show here, counts as 2 to 1.75: (2^2 - 1) / (2^1.75 - 1) = 1.3.
     assert 0.8 * error < pilot.estimate.error < 1.3 * 1.5 * error
     assert not pilot.estimate.doubt
@@ -395,14 +402,14 @@ def test_the_pilot_of_the_points_samples_cubics_exactly() -> None:
         x, y = np.arange(cols) / (cols - 1), np.arange(rows)[:, None] / (rows - 1)
         return np.stack([(x**3 - 2 * x) * y, y**3 + 0 * x, x * x * y * y], axis=-1)
 
-    sampled = CubicSampling((5, 8), (9, 13)).at(surface(5, 8))
+    sampled = CubicInterpolation((5, 8), (9, 13)).evaluate(surface(5, 8))
     np.testing.assert_allclose(sampled, surface(9, 13), atol=1e-14)
 
 
 def test_few_points_and_springs_have_no_mesh_error(load: Any, image: str) -> None:
-    assert coarser(plan_of(load(f"sheet.points=[{FEWEST}, 9]", "sheet.size=[0.1, 0.13]"))) is not None
-    assert coarser(plan_of(load(f"sheet.points=[{FEWEST - 1}, 7]", "sheet.size=[0.1, 0.13]"))) is None
-    assert coarser(plan_of(random_scene(1))) is None
+    assert coarser_plan(plan_of(load(f"sheet.points=[{MIN_POINTS_PER_SIDE}, 9]", "sheet.size=[0.1, 0.13]"))) is not None
+    assert coarser_plan(plan_of(load(f"sheet.points=[{MIN_POINTS_PER_SIDE - 1}, 7]", "sheet.size=[0.1, 0.13]"))) is None
+    assert coarser_plan(plan_of(random_scene(1))) is None
 
 
 def test_a_tolerance_of_the_points_chooses_them(load: Any, device: Device, tmp_path: Path) -> None:
@@ -460,11 +467,11 @@ def test_tissue_that_wrinkles_has_an_error_of_at_least_what_is_told(load: Any, d
 
     def known(*overrides: str) -> MeshEstimate:
         made = load(*pushed, *overrides)
-        coarse = coarser(plan_of(made))
+        coarse = coarser_plan(plan_of(made))
         assert coarse is not None
-        pilot = MeshPilot(plan_of(made), coarse, device)
+        pilot = MeshCompanion(plan_of(made), coarse, device)
         for u in frames(made, device):
-            pilot.follow(u, lambda: None)
+            pilot.compare_frame(u, lambda: None)
         return pilot.estimate
 
     assert known().doubt
@@ -588,7 +595,7 @@ def test_a_coarser_sheet_may_meet_a_darker_part_of_the_map(load: Any, tmp_path: 
     most = 1.5 * 3e4 * 3e-3
     override = f"tissue={{young: 3.0e4, thickness: 3.0e-3, density: 1050, pretension: {0.99 * most * softest}"
     made = load(f"{override}, map: {{image: map.png, range: [0.01, 1]}}}}", "sheet.points=[13, 15]")
-    coarse = coarser(plan_of(made))
+    coarse = coarser_plan(plan_of(made))
     assert coarse is not None
     assert coarse.scene.sheet.points == (7, 8)
     assert coarse.material.factors is not None
