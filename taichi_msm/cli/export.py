@@ -30,7 +30,7 @@ FEW = 2
     type=Choice(FORMATS),
     metavar="FORMAT",
     required=True,
-    help="; ".join(f"{name}: {row.means}" for name, row in FORMATS.items()) + ".",
+    help="; ".join(f"{name}: {row.description}" for name, row in FORMATS.items()) + ".",
 )
 @click.option(
     "--out",

@@ -15,7 +15,7 @@ from taichi_msm.errors import (
     FilesError,
     SceneError,
 )
-from taichi_msm.runs.directory import without_link
+from taichi_msm.runs.directory import require_no_link
 from taichi_msm.system.process import Interruption, tell
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def repeated(directory: str) -> tuple[Plan, list[str]]:
     from taichi_msm.runs.finished import read_run
 
     earlier = read_run(result_directory(directory, option="--again"))
-    earlier.require_pictures(drawn=earlier.scene.draws or "image" in earlier.sha256)
+    earlier.require_same_pictures(drawn=earlier.scene.draws or "image" in earlier.sha256)
     return checked(earlier.scene), earlier.overrides
 
 
@@ -46,7 +46,7 @@ def result_directory(out: str | None, default: str = "", option: str = "--out") 
         return Path(out)
     if default in (".", ".."):
         raise click.BadParameter(f"the scene's name gives the folder output/{default}; name another", param_hint=option)
-    return without_link(without_link(Path("output"), option) / default, option)
+    return require_no_link(require_no_link(Path("output"), option) / default, option)
 
 
 def going_on(directory: Path) -> str:

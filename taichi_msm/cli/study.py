@@ -31,7 +31,7 @@ from taichi_msm.cli.session import (
 from taichi_msm.errors import (
     printable,
 )
-from taichi_msm.runs.directory import without_link
+from taichi_msm.runs.directory import require_no_link
 from taichi_msm.system.process import Interruption, tell
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ def study(
         return interrupted(interruption, as_json)
     if results.status == "interrupted" and (directory / RECORD).exists():
         # An earlier study is not replaced by part of a new one.
-        directory = without_link(directory / "interrupted", "--out")
+        directory = require_no_link(directory / "interrupted", "--out")
     outputs = write_report(results, directory)
     if as_json:
         print_json({"directory": str(directory), **as_record(results), "outputs": outputs})

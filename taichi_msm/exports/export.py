@@ -17,27 +17,35 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from taichi_msm.errors import ArgumentError, Count, FilesError, SceneError, did_you_mean, require_path, writing
-from taichi_msm.exports.formats import ANY, FORMATS, Source, Write, read_runs
-from taichi_msm.runs.directory import Contents, Listed, Publication, add, create, files, without_link
-from taichi_msm.runs.finished import PUT_BACK, FinishedRun
+from taichi_msm.exports.formats import ANY_CAMERA, FORMATS, ExportSource, FormatWriter, read_runs
+from taichi_msm.runs.directory import (
+    IsListed,
+    Publication,
+    PublicationSpec,
+    create_file,
+    list_files,
+    require_no_link,
+    write_new_file,
+)
+from taichi_msm.runs.finished import RESTORE_PICTURE, FinishedRun
 from taichi_msm.scene.outputs import OUTPUTS, numbered
 
 # The file that lists the others, and that which leads from numbers to runs.
-RECORD, INDEX = "export.json", "index.csv"
+EXPORT_RECORD, INDEX_FILE = "export.json", "index.csv"
 
 
-def _listed(record: Mapping[str, Any]) -> Listed:
-    return {RECORD, *record["files"]}.__contains__
+def _export_file_test(record: Mapping[str, Any]) -> IsListed:
+    return {EXPORT_RECORD, *record["files"]}.__contains__
 
 
 # The files of all formats: any of them may have been exported to a folder before, or been about to be. A folder with
 # anything else in it is refused, as nobody would find it again among so many files.
-PATTERNS = (
+EXPORT_PATTERNS = (
     r"export\.json",
     r"index\.csv",
-    *dict.fromkeys(pattern for row in FORMATS.values() for pattern in row.files),
+    *dict.fromkeys(pattern for row in FORMATS.values() for pattern in row.file_patterns),
 )
-EXPORT = Contents("export", RECORD, PATTERNS, _listed, alone=True)
+EXPORT_PUBLICATION = PublicationSpec("export", EXPORT_RECORD, EXPORT_PATTERNS, _export_file_test, exclusive=True)
 
 
 class Exported(NamedTuple):
@@ -90,36 +98,40 @@ def export(
         raise ArgumentError("runs: []; take the folder of a run or of a sweep, or several")
     if format not in list(FORMATS):
         raise ArgumentError(f"format: {format!r}; take one of {', '.join(FORMATS)}{did_you_mean(str(format), FORMATS)}")
-    if camera is not None and FORMATS[format].cameras != ANY:
+    if camera is not None and FORMATS[format].cameras != ANY_CAMERA:
         raise ArgumentError(f"camera: {camera!r}; {format} has no choice of a camera; leave it out")
-    directory = _default(directories, format) if out is None else Path(out)
+    directory = _default_folder(directories, format) if out is None else Path(out)
     finished, left_out = read_runs(directories)
-    if camera is not None and not any(run.cameras() for run in finished):
+    if camera is not None and not any(run.camera_names() for run in finished):
         raise ArgumentError(f"camera: {camera!r}; {finished[0].directory} has one camera, without a name; leave it out")
-    views = [_views(run, format, camera) for run in finished]
-    exported = _convert(views, format, directory, progress)
+    views = [_camera_views(run, format, camera) for run in finished]
+    exported = _write_export(views, format, directory, progress)
     if left_out:
         of_all = f"{left_out} of {left_out + len(finished)} runs"
         exported.notes.insert(0, f"left out, as not complete: {of_all}; table.csv of the sweep tells why")
     return exported
 
 
-def _default(directories: Sequence[str | Path], name: str) -> Path:
-    folder = Path(directories[0]) if len(directories) == 1 else without_link(Path("output"), "--out")
-    return without_link(folder / f"export-{name}", "--out")
+def _default_folder(directories: Sequence[str | Path], name: str) -> Path:
+    folder = Path(directories[0]) if len(directories) == 1 else require_no_link(Path("output"), "--out")
+    return require_no_link(folder / f"export-{name}", "--out")
 
 
-def _views(run: FinishedRun, name: str, camera: str | None) -> list[FinishedRun]:
+def _camera_views(run: FinishedRun, name: str, camera: str | None) -> list[FinishedRun]:
     """Find the results of each camera that a format shows; of the run alone if it shows none, or one without a name."""
-    wanted, known = FORMATS[name], run.cameras()
+    wanted, known = FORMATS[name], run.camera_names()
     shown = wanted.cameras
-    if shown == ANY and camera is not None and camera in known:
+    if shown == ANY_CAMERA and camera is not None and camera in known:
         return [replace(run, camera=camera)]
-    seen = [key for key in (*wanted.needs, *wanted.uses) if OUTPUTS[key].is_seen and key in run.scene.output]
-    if not shown or (shown == ANY and not (known and seen)):
+    seen = [
+        key
+        for key in (*wanted.required_outputs, *wanted.optional_outputs)
+        if OUTPUTS[key].is_seen and key in run.scene.output
+    ]
+    if not shown or (shown == ANY_CAMERA and not (known and seen)):
         return [run]
     said = f"its cameras are {', '.join(known)}" if known else "it has one camera, without a name"
-    if shown == ANY:
+    if shown == ANY_CAMERA:
         given, near = ("none is chosen", "") if camera is None else (repr(camera), did_you_mean(camera, known))
         raise ArgumentError(f"camera: {given}; take one of those of {run.directory}: {', '.join(known)}{near}")
     if set(shown) <= set(known):
@@ -128,44 +140,48 @@ def _views(run: FinishedRun, name: str, camera: str | None) -> list[FinishedRun]
     raise FilesError(f"{run.directory}: {said}")
 
 
-def _convert(views: Sequence[Sequence[FinishedRun]], name: str, directory: Path, progress: Count) -> Exported:
+def _write_export(views: Sequence[Sequence[FinishedRun]], name: str, directory: Path, progress: Count) -> Exported:
     """Convert runs, one or more, as the cameras have seen them that the format shows."""
     runs = [run for run, *_ in views]
     wanted, total, done = FORMATS[name], sum(run.frames for run in runs), 0
-    write: Write = import_module(f"taichi_msm.exports.{wanted.module or name}").write
+    write: FormatWriter = import_module(f"taichi_msm.exports.{wanted.module or name}").write
     sources = []
     for number, run in enumerate(runs):
-        own = partial(_count, progress, done, run.frames, total)
-        sources.append(Source(run, numbered(number) if len(runs) > 1 else "", own))
+        own = partial(_report_progress, progress, done, run.frames, total)
+        sources.append(ExportSource(run, numbered(number) if len(runs) > 1 else "", own))
         done += run.frames
     progress(0, total)
     notes: dict[str, list[Path]] = {}
-    with writing(directory), Publication(directory, EXPORT) as publication:
+    with writing(directory), Publication(directory, EXPORT_PUBLICATION) as publication:
         for run in chain.from_iterable(views):
             with run.unchanged():
-                if missing := [key for key in wanted.needs if not run.has(key)]:
-                    remedy = run.remedy(*wanted.needs, *wanted.uses)
+                if missing := [key for key in wanted.required_outputs if not run.has_output(key)]:
+                    remedy = run.remedy(*wanted.required_outputs, *wanted.optional_outputs)
                     raise FilesError(f"{run.directory / run.camera}: {name} needs {' and '.join(missing)}; {remedy}")
-        writer = write(sources, publication.staged)
+        writer = write(sources, publication.new_folder)
         for run in runs:
-            with _naming(run, name), run.unchanged():
+            with _name_run_in_errors(run, name), run.unchanged():
                 for note in next(writer):
                     notes.setdefault(note, []).append(run.directory)
         next(writer, None)
-        _write_index(runs, wanted.pairs, publication.staged / INDEX)
-        written = sorted(files(publication.staged, PATTERNS, strict=True))
-        add(publication.staged / RECORD, (json.dumps({"files": written}, indent=1) + "\n").encode())
-        publication.publish([*written, RECORD])
-    return Exported(directory, written, [*(_told(note, of) if len(runs) > 1 else note for note, of in notes.items())])
+        _write_index(runs, wanted.numbers_pairs, publication.new_folder / INDEX_FILE)
+        written = sorted(list_files(publication.new_folder, EXPORT_PATTERNS, strict=True))
+        write_new_file(
+            publication.new_folder / EXPORT_RECORD, (json.dumps({"files": written}, indent=1) + "\n").encode()
+        )
+        publication.publish([*written, EXPORT_RECORD])
+    return Exported(
+        directory, written, [*(_name_runs(note, of) if len(runs) > 1 else note for note, of in notes.items())]
+    )
 
 
-def _count(progress: Count, before: int, frames: int, total: int, done: int, parts: int) -> None:
+def _report_progress(progress: Count, before: int, frames: int, total: int, done: int, parts: int) -> None:
     """Report the progress of a run as that of all runs."""
     progress(before + frames * done // parts, total)
 
 
 @contextmanager
-def _naming(run: FinishedRun, name: str) -> Iterator[None]:
+def _name_run_in_errors(run: FinishedRun, name: str) -> Iterator[None]:
     """Say of which run a fault is that its scene or its numbers have."""
     try:
         with np.errstate(over="raise", divide="raise", invalid="raise"):
@@ -173,13 +189,13 @@ def _naming(run: FinishedRun, name: str) -> Iterator[None]:
     except SceneError as error:
         # The fault names what the scene is to change; here the picture itself must be put back.
         fault = error.lines[0].partition(";")[0]
-        raise FilesError(f"{run.directory}: {fault}; {PUT_BACK}") from None
+        raise FilesError(f"{run.directory}: {fault}; {RESTORE_PICTURE}") from None
     except FloatingPointError:
         said = f"its numbers are too large for {name}; run the scene again"
         raise FilesError(f"{run.directory}: {said}") from None
 
 
-def _told(note: str, runs: Sequence[Path]) -> str:
+def _name_runs(note: str, runs: Sequence[Path]) -> str:
     """Say of which runs a note is."""
     return f"{runs[0]}{f' and {len(runs) - 1} more' if len(runs) > 1 else ''}: {note}"
 
@@ -190,7 +206,7 @@ def _write_index(runs: Sequence[FinishedRun], pairs: bool, path: Path) -> None:
     for run in runs:
         name = run.directory.as_posix()
         rows += [(name, frame) for frame in range(run.frames - 1)] if pairs else [(name,)]
-    with io.TextIOWrapper(create(path), "utf-8", "surrogateescape", newline="") as file:
+    with io.TextIOWrapper(create_file(path), "utf-8", "surrogateescape", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["number", "run", *(["frame"] if pairs else [])])
         writer.writerows([numbered(number), *row] for number, row in enumerate(rows))

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from taichi_msm.errors import Count, FilesError
-from taichi_msm.runs.directory import MAX_RECORD, files
+from taichi_msm.runs.directory import MAX_RECORD_BYTES, list_files
 from taichi_msm.runs.finished import FinishedRun, read_run, reading
 from taichi_msm.scene.outputs import NUMBERED, RECORD, RUNS, SWEEP
 from taichi_msm.system.files import read_regular
@@ -21,42 +21,49 @@ from taichi_msm.system.files import read_regular
 class Format(NamedTuple):
     """An export format."""
 
-    means: str  # what it is for, in few words
-    needs: tuple[str, ...]  # the entries of a scene's `output` that it is made from
-    files: tuple[str, ...]  # their names as regular expressions, for `directory.files`
-    uses: tuple[str, ...] = ()  # further entries of `output`, of which it would have more
-    pairs: bool = False  # whether it numbers pairs of frames, not runs
+    description: str  # what it is for, in few words
+    required_outputs: tuple[str, ...]  # the entries of a scene's `output` that it is made from
+    file_patterns: tuple[str, ...]  # their names as regular expressions, for `directory.files`
+    optional_outputs: tuple[str, ...] = ()  # further entries of `output`, of which it would have more
+    numbers_pairs: bool = False  # whether it numbers pairs of frames, not runs
     cameras: tuple[str, ...] = ()  # what it shows: nothing that a camera sees, ANY camera, or those of these names
     module: str = ""  # if it has another name than the format
 
 
-def _each(*patterns: str) -> tuple[str, ...]:
+def _patterns_per_run(*patterns: str) -> tuple[str, ...]:
     """Give the patterns of files that are there for each run: in a folder of its own, or of the only run in none."""
     return (*patterns, *(f"{NUMBERED}/{pattern}" for pattern in patterns))
 
 
 # A camera that is chosen, or the only one.
-ANY = ("",)
+ANY_CAMERA = ("",)
 
 FORMATS = {
     "kitti": Format(
         "optical flow",
-        needs=("flow",),
-        uses=("occlusion", "png"),
-        files=(
+        required_outputs=("flow",),
+        optional_outputs=("occlusion", "png"),
+        file_patterns=(
             rf"training/image_2/{NUMBERED}_1[01]\.png",
             rf"training/flow_occ/{NUMBERED}_10\.png",
             rf"training/flow_noc/{NUMBERED}_10\.png",
         ),
-        pairs=True,
-        cameras=ANY,
+        numbers_pairs=True,
+        cameras=ANY_CAMERA,
     ),
-    "tapvid": Format("tracks of points", needs=("tracks", "png"), files=(r"tapvid\.pkl",), cameras=ANY),
-    "tapvid3d": Format("tracks of points in space", needs=("tracks", "png"), files=(rf"{NUMBERED}\.npz",), cameras=ANY),
+    "tapvid": Format(
+        "tracks of points", required_outputs=("tracks", "png"), file_patterns=(r"tapvid\.pkl",), cameras=ANY_CAMERA
+    ),
+    "tapvid3d": Format(
+        "tracks of points in space",
+        required_outputs=("tracks", "png"),
+        file_patterns=(rf"{NUMBERED}\.npz",),
+        cameras=ANY_CAMERA,
+    ),
     "stir": Format(
         "tracks of points in stereo",
-        needs=("tracks", "png"),
-        files=(
+        required_outputs=("tracks", "png"),
+        file_patterns=(
             rf"{NUMBERED}/calib\.json",
             rf"{NUMBERED}/(?:left|right)/seq00/frames/0ms-[0-9]+ms-visible\.mp4",
             rf"{NUMBERED}/(?:left|right)/seq00/[0-9]+ms_icg(?:start|end)\.png",
@@ -65,26 +72,30 @@ FORMATS = {
         cameras=("left", "right"),
     ),
     "vtk": Format(
-        "for ParaView", needs=("trajectory",), files=_each(r"[0-9]{4,}\.vtu", r"surface\.pvd", r"picture\.png")
+        "for ParaView",
+        required_outputs=("trajectory",),
+        file_patterns=_patterns_per_run(r"[0-9]{4,}\.vtu", r"surface\.pvd", r"picture\.png"),
     ),
-    "gltf": Format("for Blender and browsers", needs=("trajectory",), files=_each(r"surface\.glb")),
+    "gltf": Format(
+        "for Blender and browsers", required_outputs=("trajectory",), file_patterns=_patterns_per_run(r"surface\.glb")
+    ),
     "obj": Format(
         "for other programs with surfaces",
-        needs=("trajectory",),
-        files=_each(r"[0-9]{4,}\.obj", r"surface\.mtl", r"picture\.png"),
+        required_outputs=("trajectory",),
+        file_patterns=_patterns_per_run(r"[0-9]{4,}\.obj", r"surface\.mtl", r"picture\.png"),
     ),
     "csv": Format(
         "forces and tracks as tables",
-        needs=(),
-        uses=("forces", "tracks"),
-        files=(r"forces\.csv", r"tracks\.csv"),
-        cameras=ANY,
+        required_outputs=(),
+        optional_outputs=("forces", "tracks"),
+        file_patterns=(r"forces\.csv", r"tracks\.csv"),
+        cameras=ANY_CAMERA,
         module="csv_tables",
     ),
 }
 
 
-class Source(NamedTuple):
+class ExportSource(NamedTuple):
     """A run that is exported."""
 
     run: FinishedRun  # as the first camera that the format shows has seen it
@@ -94,14 +105,14 @@ class Source(NamedTuple):
 
 # Writes the files of all runs into an empty folder. It is a generator: after each run it gives what the user should
 # know about that run, and after the last it writes what is of all runs together.
-Write = Callable[[Sequence[Source], Path], Iterator[list[str]]]
+FormatWriter = Callable[[Sequence[ExportSource], Path], Iterator[list[str]]]
 
 
-def in_folders(write: Callable[[FinishedRun, Path, Count], list[str]]) -> Write:
+def one_folder_per_run(write: Callable[[FinishedRun, Path, Count], list[str]]) -> FormatWriter:
     """Make a format of what writes one run into an empty folder."""
 
     @wraps(write)
-    def write_all(sources: Sequence[Source], folder: Path) -> Iterator[list[str]]:
+    def write_all(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
         for source in sources:
             own = folder / source.name
             own.mkdir(exist_ok=True)
@@ -127,9 +138,9 @@ def read_runs(directories: Sequence[str | Path]) -> tuple[list[FinishedRun], int
             runs.append(read_run(directory))
             continue
         with reading(record):
-            names = files(directory, (rf"{RUNS}/{NUMBERED}/{RECORD}",), strict=False)
+            names = list_files(directory, (rf"{RUNS}/{NUMBERED}/{RECORD}",), strict=False)
             folders = sorted(((directory / name).parent for name in names), key=lambda folder: int(folder.name))
-            count = len(json.loads(read_regular(record, MAX_RECORD))["values"])
+            count = len(json.loads(read_regular(record, MAX_RECORD_BYTES))["values"])
         complete = [run for run in map(read_run, folders) if run.status == "complete"]
         left_out += count - len(complete)
         runs += complete

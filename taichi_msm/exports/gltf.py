@@ -26,41 +26,41 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import Count
-from taichi_msm.exports.formats import in_folders
-from taichi_msm.exports.inputs import REFINE, picture_png, unit_normals
+from taichi_msm.exports.formats import one_folder_per_run
+from taichi_msm.exports.inputs import EXPORT_REFINE, picture_png, unit_normals
 from taichi_msm.model.surface import surface
-from taichi_msm.runs.directory import create
+from taichi_msm.runs.directory import create_file
 from taichi_msm.runs.finished import FinishedRun
 from taichi_msm.version import __version__
 
 FILE = "surface.glb"
 
 # Limits of morph targets: by number, MAX_ARRAY_TEXTURE_LAYERS of every WebGL 2; by bytes, what still loads well.
-MOST_TARGETS = 256
-MOST_BYTES = 1 << 28
+MAX_TARGETS = 256
+MAX_TARGETS_BYTES = 1 << 28
 # Bytes per vertex in a target: the differences of its position and of its normal.
-VERTEX_BYTES = 2 * 3 * 4
+TARGET_VERTEX_BYTES = 2 * 3 * 4
 
 # OpenGL's constants for filtering a picture, and for clamping it at its edge.
-LINEAR, MIPMAPS, CLAMPED = 9729, 9987, 33071
+GL_LINEAR, GL_LINEAR_MIPMAP_LINEAR, GL_CLAMP_TO_EDGE = 9729, 9987, 33071
 
 MAGIC, VERSION = b"glTF", 2
-JSON, BINARY = b"JSON", b"BIN\0"
+JSON_CHUNK, BINARY_CHUNK = b"JSON", b"BIN\0"
 
-COMPONENTS = {"f": 5126, "u": 5125}  # float32, uint32
-KINDS = {1: "SCALAR", 2: "VEC2", 3: "VEC3"}
+COMPONENT_TYPES = {"f": 5126, "u": 5125}  # float32, uint32
+ACCESSOR_TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3"}
 # What a buffer holds: vertices, or indices of vertices.
-VERTICES, INDICES = 34962, 34963
+GL_ARRAY_BUFFER, GL_ELEMENT_ARRAY_BUFFER = 34962, 34963
 
 # Every part begins at a multiple of this many bytes.
-ALIGNMENT = 4
+ALIGNMENT_BYTES = 4
 
 
-@in_folders
+@one_folder_per_run
 def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
     """Write the surface of a run, with its picture; raises what `FinishedRun.positions` and `picture_png` do."""
-    positions, picture, binary = run.positions(), picture_png(run), Binary()
-    most = max(1, min(MOST_TARGETS, MOST_BYTES // (VERTEX_BYTES * positions[0, ..., 0].size)))
+    positions, picture, binary = run.positions(), picture_png(run), BinaryChunk()
+    most = max(1, min(MAX_TARGETS, MAX_TARGETS_BYTES // (TARGET_VERTEX_BYTES * positions[0, ..., 0].size)))
     keys = key_frames(positions, 1 + most, progress)
     primitive = _surface(positions[0], picture is not None, binary)
     targets = []
@@ -82,7 +82,7 @@ def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
         mesh["weights"] = [0.0] * len(targets)
         mesh["extras"] = {"targetNames": [f"{time:g} s" for time in times[1:]], "error": keys.error}
         document["animations"] = [_animation(times.astype(np.float32), binary)]
-    with create(folder / FILE) as file:
+    with create_file(folder / FILE) as file:
         file.writelines(binary.container({**document, "meshes": [mesh]}))
     if len(keys.frames) == run.frames:
         return []
@@ -92,30 +92,30 @@ def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
     ]
 
 
-def _surface(position: NDArray[np.floating], has_picture: bool, binary: Binary) -> dict[str, Any]:
+def _surface(position: NDArray[np.floating], has_picture: bool, binary: BinaryChunk) -> dict[str, Any]:
     """Make the triangles of the first frame, with the place of each vertex in the picture if there is one."""
-    first = surface(position, REFINE)
+    first = surface(position, EXPORT_REFINE)
     attributes = {
-        "POSITION": binary.accessor(first.vertices.astype(np.float32), VERTICES, bounds=True),
-        "NORMAL": binary.accessor(unit_normals(position).astype(np.float32), VERTICES),
+        "POSITION": binary.accessor(first.vertices.astype(np.float32), GL_ARRAY_BUFFER, bounds=True),
+        "NORMAL": binary.accessor(unit_normals(position).astype(np.float32), GL_ARRAY_BUFFER),
     }
     if has_picture:
-        attributes["TEXCOORD_0"] = binary.accessor(first.texture_coordinates.astype(np.float32), VERTICES)
+        attributes["TEXCOORD_0"] = binary.accessor(first.texture_coordinates.astype(np.float32), GL_ARRAY_BUFFER)
     indices = first.triangles.reshape(-1).astype(np.uint32)
-    return {"attributes": attributes, "indices": binary.accessor(indices, INDICES)}
+    return {"attributes": attributes, "indices": binary.accessor(indices, GL_ELEMENT_ARRAY_BUFFER)}
 
 
-def _target(first: NDArray[np.floating], position: NDArray[np.floating], binary: Binary) -> dict[str, int]:
+def _target(first: NDArray[np.floating], position: NDArray[np.floating], binary: BinaryChunk) -> dict[str, int]:
     """Make the morph target of a frame."""
     moved = (position.astype(np.float64) - first).reshape(-1, 3).astype(np.float32)
     turned = (unit_normals(position) - unit_normals(first)).astype(np.float32)
     return {
-        "POSITION": binary.accessor(moved, VERTICES, bounds=True),
-        "NORMAL": binary.accessor(turned, VERTICES),
+        "POSITION": binary.accessor(moved, GL_ARRAY_BUFFER, bounds=True),
+        "NORMAL": binary.accessor(turned, GL_ARRAY_BUFFER),
     }
 
 
-def _animation(times: NDArray[np.float32], binary: Binary) -> dict[str, Any]:
+def _animation(times: NDArray[np.float32], binary: BinaryChunk) -> dict[str, Any]:
     """Make the weights of all targets at all key frames: each is 1 at its own frame; the first frame has no target."""
     weights = np.eye(len(times), dtype=np.float32)[:, 1:].reshape(-1)
     sampler = {
@@ -137,12 +137,19 @@ def _material(has_picture: bool) -> dict[str, Any]:
     return {"name": "sheet", "doubleSided": True, "pbrMetallicRoughness": {**colour, **rough}}
 
 
-def _texture(picture: bytes, binary: Binary) -> dict[str, Any]:
+def _texture(picture: bytes, binary: BinaryChunk) -> dict[str, Any]:
     """Add the picture to the document as a texture."""
     return {
         "textures": [{"source": 0, "sampler": 0}],
         "images": [{"name": "picture", "mimeType": "image/png", "bufferView": binary.view(picture)}],
-        "samplers": [{"magFilter": LINEAR, "minFilter": MIPMAPS, "wrapS": CLAMPED, "wrapT": CLAMPED}],
+        "samplers": [
+            {
+                "magFilter": GL_LINEAR,
+                "minFilter": GL_LINEAR_MIPMAP_LINEAR,
+                "wrapS": GL_CLAMP_TO_EDGE,
+                "wrapT": GL_CLAMP_TO_EDGE,
+            }
+        ],
     }
 
 
@@ -166,13 +173,13 @@ def key_frames(position: NDArray[np.floating], most: int, progress: Count = lamb
     if count <= most:
         return KeyFrames(list(range(count)), 0.0)
     chosen = [0, count - 1]
-    spans = [_farthest(position, 0, count - 1)]
+    spans = [_worst_frame(position, 0, count - 1)]
     while len(chosen) < most and -spans[0].error > 0:
         progress(len(chosen), most)
         span = heapq.heappop(spans)
         chosen.append(span.frame)
-        heapq.heappush(spans, _farthest(position, span.first, span.frame))
-        heapq.heappush(spans, _farthest(position, span.frame, span.last))
+        heapq.heappush(spans, _worst_frame(position, span.first, span.frame))
+        heapq.heappush(spans, _worst_frame(position, span.frame, span.last))
     return KeyFrames(sorted(chosen), -spans[0].error)
 
 
@@ -185,7 +192,7 @@ class _Span(NamedTuple):
     last: int
 
 
-def _farthest(position: NDArray[np.floating], first: int, last: int) -> _Span:
+def _worst_frame(position: NDArray[np.floating], first: int, last: int) -> _Span:
     """Find the frame between two key frames that is farthest from the straight line between them."""
     start, end = position[first].astype(np.float64), position[last].astype(np.float64)
     worst = _Span(0.0, first, first, last)
@@ -196,7 +203,7 @@ def _farthest(position: NDArray[np.floating], first: int, last: int) -> _Span:
     return worst
 
 
-class Binary:
+class BinaryChunk:
     """The binary chunk of a .glb file as it grows: its container has JSON, and this chunk that the JSON refers to.
 
     It is written here because a header of 12 bytes and two chunks cost less than pygltflib and what that depends on.
@@ -213,7 +220,7 @@ class Binary:
         place = {"buffer": 0, "byteOffset": self._length, "byteLength": len(data)}
         self._views.append(place if target is None else {**place, "target": target})
         self._parts += [data, _padding(len(data), b"\0")]
-        self._length += _padded(len(data))
+        self._length += _aligned_length(len(data))
         return len(self._views) - 1
 
     def accessor(self, values: NDArray[Any], target: int | None = None, *, bounds: bool = False) -> int:
@@ -224,9 +231,9 @@ class Binary:
         rows = np.ascontiguousarray(values).reshape(len(values), -1)
         accessor = {
             "bufferView": self.view(rows.data.cast("B"), target),
-            "componentType": COMPONENTS[rows.dtype.kind],
+            "componentType": COMPONENT_TYPES[rows.dtype.kind],
             "count": len(rows),
-            "type": KINDS[rows.shape[1]],
+            "type": ACCESSOR_TYPES[rows.shape[1]],
         }
         if bounds:
             accessor |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
@@ -239,15 +246,15 @@ class Binary:
         text = json.dumps({**document, **own}, separators=(",", ":"), allow_nan=False).encode()
         text += _padding(len(text), b" ")
         yield struct.pack("<4sII", MAGIC, VERSION, 12 + 8 + len(text) + 8 + self._length)
-        yield struct.pack("<I4s", len(text), JSON)
+        yield struct.pack("<I4s", len(text), JSON_CHUNK)
         yield text
-        yield struct.pack("<I4s", self._length, BINARY)
+        yield struct.pack("<I4s", self._length, BINARY_CHUNK)
         yield from self._parts
 
 
-def _padded(length: int) -> int:
-    return -(-length // ALIGNMENT) * ALIGNMENT
+def _aligned_length(length: int) -> int:
+    return -(-length // ALIGNMENT_BYTES) * ALIGNMENT_BYTES
 
 
 def _padding(length: int, filler: bytes) -> bytes:
-    return filler * (_padded(length) - length)
+    return filler * (_aligned_length(length) - length)

@@ -17,18 +17,18 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm.errors import ArgumentError
-from taichi_msm.exports.formats import ANY, FORMATS
+from taichi_msm.exports.formats import ANY_CAMERA, FORMATS
 from taichi_msm.render.texture import load_texture
 from taichi_msm.runs.arrays import read_rows
-from taichi_msm.runs.finished import FinishedRun, damaged, reading
+from taichi_msm.runs.finished import FinishedRun, damaged_result, reading
 from taichi_msm.scene.outputs import CAMERA
 from taichi_msm.system.files import read_regular
 
 # The vertices are the mass points, and cells are cut as in the picture. The surface between mass points is bilinear, so
 # more vertices would add nothing about the motion.
-REFINE = 0
+EXPORT_REFINE = 0
 
-PICTURE = "picture.png"
+PICTURE_FILE = "picture.png"
 
 
 def picture_png(run: FinishedRun) -> bytes | None:
@@ -57,35 +57,35 @@ def read_tracks(run: FinishedRun) -> tuple[NDArray[np.float32], NDArray[np.bool_
 
     A point behind the eye has no place in the picture's plane: it is hidden and NaN.
     """
-    path = run.result("tracks")
+    path = run.result_path("tracks")
     with reading(path), zipfile.ZipFile(path) as archive:
         points = read_rows(archive, "points", np.float32, (run.frames, 2))
         occluded = read_rows(archive, "occluded", np.bool_, (run.frames,))
     somewhere = np.isfinite(points).all(axis=-1)
     if points.shape[:2] != occluded.shape or not (somewhere | occluded).all():
-        raise damaged(path)
+        raise damaged_result(path)
     return np.where(somewhere[..., None], points, np.float32(np.nan)), occluded
 
 
-def read_places(run: FinishedRun) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def read_track_positions(run: FinishedRun) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Read the points' coordinates on the sheet, shape (tracks, 2), and where they are [m], (tracks, frames, 3)."""
-    path = run.result("tracks")
+    path = run.result_path("tracks")
     with reading(path), zipfile.ZipFile(path) as archive:
         coordinates = read_rows(archive, "coordinates", np.float32, (2,))
         position = read_rows(archive, "position", np.float32, (run.frames, 3))
         tracks, _ = read_rows(archive, "occluded", np.bool_, (run.frames,)).shape
     if not len(coordinates) == len(position) == tracks or not np.isfinite(position).all():
-        raise damaged(path)
+        raise damaged_result(path)
     return coordinates, position
 
 
 Array = NDArray[np.float64]
 
 # OpenCV counts from the centre of the first pixel, this program from the picture's corner.
-FIRST_CENTRE = 0.5
+FIRST_PIXEL_CENTRE = 0.5
 
 # The largest camera.json that is read [bytes]: of 100,000 poses.
-MAX_BYTES = 1 << 25
+MAX_CAMERA_BYTES = 1 << 25
 
 
 class Pinhole(NamedTuple):
@@ -111,9 +111,9 @@ def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
         ArgumentError: when the format cannot describe it.
     """
     path = run.directory / run.camera / CAMERA
-    another = "choose another camera by --camera, or " if FORMATS[name].cameras == ANY else ""
+    another = "choose another camera by --camera, or " if FORMATS[name].cameras == ANY_CAMERA else ""
     with reading(path):
-        described = json.loads(read_regular(run.own(path, "tracks"), MAX_BYTES))
+        described = json.loads(read_regular(run.require_own_file(path, "tracks"), MAX_CAMERA_BYTES))
         # A fisheye is one with any coefficients.
         is_distorted = described.get("model") == "fisheye" or bool(np.any(described.get("distortion", ())))
         is_pinhole = "intrinsics" in described
@@ -127,8 +127,8 @@ def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
         matrix = np.array(described["intrinsics"], float)
         poses = np.array(described.get("poses", [described["pose"]] * run.frames), float)[: run.frames]
         if matrix.shape != (3, 3) or poses.shape != (run.frames, 3, 4) or not np.isfinite(poses).all():
-            raise damaged(path)
+            raise damaged_result(path)
         focal, centre = matrix[[0, 1], [0, 1]], matrix[:2, 2]
         if not (np.isfinite(matrix).all() and (focal > 0).all()):
-            raise damaged(path)
+            raise damaged_result(path)
     return Pinhole(focal, centre, poses)

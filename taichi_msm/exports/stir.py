@@ -34,29 +34,29 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm.errors import Count, FilesError, NotInstalledError
-from taichi_msm.exports.formats import Source
-from taichi_msm.exports.inputs import FIRST_CENTRE, Pinhole, read_pinhole, read_tracks
+from taichi_msm.exports.formats import ExportSource
+from taichi_msm.exports.inputs import FIRST_PIXEL_CENTRE, Pinhole, read_pinhole, read_tracks
 from taichi_msm.runs import media
-from taichi_msm.runs.directory import add, create
+from taichi_msm.runs.directory import create_file, write_new_file
 from taichi_msm.runs.finished import FinishedRun
 from taichi_msm.scene import outputs
 from taichi_msm.scene.outputs import numbered
 
-NAME, SIDES = "stir", ("left", "right")
+FORMAT, CAMERAS = "stir", ("left", "right")
 
 # What STIR's loader takes: pictures of this size, and for places in space disparities between these [px].
-SIZE, LEAST, MOST = (1280, 1024), 8, 105
+LOADER_SIZE, MIN_DISPARITY_PX, MAX_DISPARITY_PX = (1280, 1024), 8, 105
 
 # The radius of a disc is the width of the picture over this.
-PER_WIDTH = 160
+WIDTH_PER_DISC_RADIUS = 160
 
 # How far the cameras may be from being beside each other: cosines of angles, and shares of the baseline.
-ALIGNED = 1e-6
+ALIGNMENT_TOLERANCE = 1e-6
 
 Pixels = NDArray[np.int64]
 
 
-def write(sources: Sequence[Source], folder: Path) -> Iterator[list[str]]:
+def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
     """Write the films of runs, the marked points and the cameras.
 
     Raises:
@@ -64,26 +64,26 @@ def write(sources: Sequence[Source], folder: Path) -> Iterator[list[str]]:
         NotInstalledError: when PyAV is not installed.
     """
     if not outputs.is_pyav_installed():
-        raise NotInstalledError(f"--format {outputs.PYAV_NOT_INSTALLED.replace('mp4', NAME, 1)}")
+        raise NotInstalledError(f"--format {outputs.PYAV_NOT_INSTALLED.replace('mp4', FORMAT, 1)}")
     for run, name, progress in sources:
         yield _write_run(run, folder / (name or numbered(0)), progress)
 
 
 def _write_run(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
-    runs = [replace(run, camera=side) for side in SIDES]
+    runs = [replace(run, camera=side) for side in CAMERAS]
     folder.mkdir()
-    left, right = (read_pinhole(each, NAME) for each in runs)
+    left, right = (read_pinhole(each, FORMAT) for each in runs)
     baseline = _baseline(run, left, right)
-    add(folder / "calib.json", (json.dumps(_calibration(left, right, baseline), indent=2) + "\n").encode())
-    radius = max(1, round(run.scene.render.size[0] / PER_WIDTH))
-    pixels, tracks = _marked(runs, radius)
+    write_new_file(folder / "calib.json", (json.dumps(_calibration(left, right, baseline), indent=2) + "\n").encode())
+    radius = max(1, round(run.scene.render.size[0] / WIDTH_PER_DISC_RADIUS))
+    pixels, tracks = _choose_points(runs, radius)
     for number, each in enumerate(runs):
         sequence = folder / each.camera / "seq00"
         (sequence / "segmentation").mkdir(parents=True)
         for part, place in zip(("start", "end"), pixels[number], strict=True):
             mask = _png(_discs(place, run.scene.render.size, radius))
-            add(sequence / "segmentation" / f"icg{part}seg.png", mask)
-        _write_frames(each, sequence, partial(_of_both, progress, number))
+            write_new_file(sequence / "segmentation" / f"icg{part}seg.png", mask)
+        _write_frames(each, sequence, partial(_report_progress, progress, number))
     return _notes(run.scene.render.size, pixels, tracks, baseline)
 
 
@@ -93,10 +93,10 @@ def _baseline(run: FinishedRun, left: Pinhole, right: Pinhole) -> float:
     turn = right.poses[..., :3] @ left.poses[..., :3].transpose(0, 2, 1)
     shift = right.poses[..., 3] - (turn @ left.poses[..., 3:])[..., 0]
     baseline = -float(shift[0, 0])
-    aligned = np.abs(turn - np.eye(3)).max() < ALIGNED
-    aside = np.abs(shift - [-baseline, 0.0, 0.0]).max() < ALIGNED * baseline
+    aligned = np.abs(turn - np.eye(3)).max() < ALIGNMENT_TOLERANCE
+    aside = np.abs(shift - [-baseline, 0.0, 0.0]).max() < ALIGNMENT_TOLERANCE * baseline
     if not (aligned and aside) or (left.focal != right.focal).any():
-        said = f"{NAME} needs the camera right beside left, to the right of it and just like it"
+        said = f"{FORMAT} needs the camera right beside left, to the right of it and just like it"
         raise FilesError(f"{run.directory}: {said}; run the scene with `right: {{beside: left, baseline: 0.005}}`")
     return baseline
 
@@ -104,19 +104,19 @@ def _baseline(run: FinishedRun, left: Pinhole, right: Pinhole) -> float:
 def _calibration(left: Pinhole, right: Pinhole, baseline: float) -> dict[str, Any]:
     """Describe both cameras as STIR does."""
     matrices: dict[str, Any] = {}
-    for side, camera in zip(SIDES, (left, right), strict=True):
-        (across, down), (x, y) = camera.focal.tolist(), (camera.centre - FIRST_CENTRE).tolist()
+    for side, camera in zip(CAMERAS, (left, right), strict=True):
+        (across, down), (x, y) = camera.focal.tolist(), (camera.centre - FIRST_PIXEL_CENTRE).tolist()
         matrices[f"{side}cameramat"] = [[across, 0.0, x], [0.0, down, y], [0.0, 0.0, 1.0]]
         matrices[f"{side}distortioncoeffs"] = [0.0] * 5
     return {**matrices, "rotation": np.eye(3).tolist(), "translation": [-baseline, 0.0, 0.0]}
 
 
-def _of_both(progress: Count, before: int, done: int, total: int) -> None:
+def _report_progress(progress: Count, before: int, done: int, total: int) -> None:
     """Report the progress of a camera, after so many others, as that of both."""
-    progress(before * total + done, len(SIDES) * total)
+    progress(before * total + done, len(CAMERAS) * total)
 
 
-def _marked(runs: Sequence[FinishedRun], radius: int) -> tuple[Pixels, int]:
+def _choose_points(runs: Sequence[FinishedRun], radius: int) -> tuple[Pixels, int]:
     """Choose the points to mark: their pixels of both cameras in the first and last frame, shape (2, 2, n, 2).
 
     Also gives how many are tracked.
@@ -147,14 +147,14 @@ def _write_frames(run: FinishedRun, folder: Path, progress: Count) -> None:
     render = run.scene.render
     end = round(1000 * run.time[-1])
     (folder / "frames").mkdir()
-    with create(folder / "frames" / f"0ms-{end}ms-visible.mp4") as file:
+    with create_file(folder / "frames" / f"0ms-{end}ms-visible.mp4") as file:
         film = media.Mp4Writer(file, render.size, run.scene.time.frames_per_second, render.quality)
         for frame in range(run.frames):
             progress(frame, run.frames)
-            film.add(run.picture("png", frame))
+            film.add(run.read_picture("png", frame))
         film.close()
-    add(folder / "0ms_icgstart.png", _png(run.picture("png", 0)))
-    add(folder / f"{end}ms_icgend.png", _png(run.picture("png", run.frames - 1)))
+    write_new_file(folder / "0ms_icgstart.png", _png(run.read_picture("png", 0)))
+    write_new_file(folder / f"{end}ms_icgend.png", _png(run.read_picture("png", run.frames - 1)))
 
 
 def _png(picture: NDArray[np.uint8]) -> bytes:
@@ -171,14 +171,14 @@ def _notes(size: tuple[int, int], pixels: Pixels, tracks: int, baseline: float) 
             f"{marked} of {tracks} points are marked; the others are hidden from a camera in the first or last frame, "
             "or too near to the edge or to a marked one"
         )
-    if size != SIZE:
+    if size != LOADER_SIZE:
         notes.append(
-            f"STIR's loader reads films of {SIZE[0]} x {SIZE[1]} pixels only; these have {size[0]} x {size[1]}"
+            f"STIR's loader reads films of {LOADER_SIZE[0]} x {LOADER_SIZE[1]} pixels only; these have {size[0]} x {size[1]}"
         )
     disparity = pixels[0, :, :, 0] - pixels[1, :, :, 0]
-    if ((disparity < LEAST) | (disparity > MOST)).any():
+    if ((disparity < MIN_DISPARITY_PX) | (disparity > MAX_DISPARITY_PX)).any():
         notes.append(
-            f"STIR's loader finds places in space for disparities of {LEAST} to {MOST} px; here they are "
+            f"STIR's loader finds places in space for disparities of {MIN_DISPARITY_PX} to {MAX_DISPARITY_PX} px; here they are "
             f"{disparity.min()} to {disparity.max()} px with a baseline of {baseline:g} m"
         )
     return notes

@@ -25,9 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import Count, FilesError
-from taichi_msm.exports.formats import Source
+from taichi_msm.exports.formats import ExportSource
 from taichi_msm.exports.inputs import read_tracks
-from taichi_msm.runs.directory import create
+from taichi_msm.runs.directory import create_file
 from taichi_msm.runs.finished import FinishedRun
 from taichi_msm.system.process import available_memory
 
@@ -44,14 +44,14 @@ class _Pickler(pickle.Pickler):
         return NotImplemented
 
 
-def write(sources: Sequence[Source], folder: Path) -> Iterator[list[str]]:
+def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
     """Write the tracks of runs and their frames; raises a FilesError when the videos do not fit into memory."""
     _require_memory([source.run for source in sources])
     videos = {}
     for run, name, progress in sources:
         videos[name or run.directory.resolve().name] = _video(run, progress)
         yield []
-    with create(folder / "tapvid.pkl") as file:
+    with create_file(folder / "tapvid.pkl") as file:
         _Pickler(file, PROTOCOL).dump(videos)
 
 
@@ -74,5 +74,5 @@ def _video(run: FinishedRun, progress: Count) -> dict[str, NDArray[Any]]:
     video = np.empty((run.frames, height, width, 3), np.uint8)
     for frame in range(run.frames):
         progress(frame, run.frames)
-        video[frame] = run.picture("png", frame)
+        video[frame] = run.read_picture("png", frame)
     return {"video": video, "points": (points / (width, height)).astype(np.float32), "occluded": occluded}

@@ -27,32 +27,32 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm.errors import Count
-from taichi_msm.exports.formats import Source
-from taichi_msm.exports.inputs import read_pinhole, read_places, read_tracks
+from taichi_msm.exports.formats import ExportSource
+from taichi_msm.exports.inputs import read_pinhole, read_track_positions, read_tracks
 from taichi_msm.runs.arrays import write_arrays
-from taichi_msm.runs.directory import create
+from taichi_msm.runs.directory import create_file
 from taichi_msm.runs.finished import FinishedRun
 from taichi_msm.scene.outputs import numbered
 
-NAME = "tapvid3d"
+FORMAT = "tapvid3d"
 
 # Of a JPEG: nearly lossless, with colours as fine as light.
 QUALITY, SUBSAMPLING = 95, 0
 
 
-def write(sources: Sequence[Source], folder: Path) -> Iterator[list[str]]:
+def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
     """Write the tracks of runs and their frames; raises what `read_pinhole` does."""
     for run, name, progress in sources:
         yield _write_run(run, folder / f"{name or numbered(0)}.npz", progress)
 
 
 def _write_run(run: FinishedRun, path: Path, progress: Count) -> list[str]:
-    camera, (points, occluded), (_, position) = read_pinhole(run, NAME), read_tracks(run), read_places(run)
+    camera, (points, occluded), (_, position) = read_pinhole(run, FORMAT), read_tracks(run), read_track_positions(run)
     images = []
     for frame in range(run.frames):
         progress(frame, run.frames)
         file = io.BytesIO()
-        Image.fromarray(run.picture("png", frame)).save(file, "JPEG", quality=QUALITY, subsampling=SUBSAMPLING)
+        Image.fromarray(run.read_picture("png", frame)).save(file, "JPEG", quality=QUALITY, subsampling=SUBSAMPLING)
         images.append(file.getvalue())
     seen: NDArray[np.bool_] = np.any(~occluded, axis=1)
     visible = ~occluded[seen]
@@ -60,7 +60,7 @@ def _write_run(run: FinishedRun, path: Path, progress: Count) -> list[str]:
     queries = np.column_stack([points[seen][np.arange(len(first)), first], first])
     extrinsics = np.concatenate([camera.poses, np.tile([[[0.0, 0.0, 0.0, 1.0]]], (run.frames, 1, 1))], axis=1)
     turned = np.einsum("fij,nfj->fni", camera.poses[..., :3], position[seen].astype(np.float64))
-    with create(path) as out:
+    with create_file(path) as out:
         write_arrays(
             out,
             {

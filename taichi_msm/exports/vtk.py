@@ -22,16 +22,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import Count, NotInstalledError
-from taichi_msm.exports.formats import in_folders
-from taichi_msm.exports.inputs import PICTURE, REFINE, picture_png
+from taichi_msm.exports.formats import one_folder_per_run
+from taichi_msm.exports.inputs import EXPORT_REFINE, PICTURE_FILE, picture_png
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.surface import surface
-from taichi_msm.runs.directory import add
+from taichi_msm.runs.directory import write_new_file
 from taichi_msm.runs.finished import FinishedRun
 from taichi_msm.solver.planning import make_plan
 from taichi_msm.terms.elasticity import energy_density
 
-COLLECTION = "surface.pvd"
+COLLECTION_FILE = "surface.pvd"
 
 DISPLACEMENT, SPEED, ENERGY = "displacement", "speed", "energy_density"
 UNITS = {DISPLACEMENT: "m", SPEED: "m/s", ENERGY: "J/m2"}
@@ -39,7 +39,7 @@ UNITS = {DISPLACEMENT: "m", SPEED: "m/s", ENERGY: "J/m2"}
 Array = NDArray[np.floating]
 
 
-@in_folders
+@one_folder_per_run
 def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
     """Write the surface of every frame, their times and the picture.
 
@@ -51,7 +51,7 @@ def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
         said = "--format vtk: needs VTK, which is not installed; pip install vtk"
         raise NotInstalledError(said) from None
     positions, picture = run.positions(), picture_png(run)
-    run.require_pictures(drawn=False)
+    run.require_same_pictures(drawn=False)
     plan, rest = make_plan(run.scene), rest_positions(run.scene.sheet)
     for frame in range(run.frames):
         progress(frame, run.frames)
@@ -61,10 +61,10 @@ def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
             SPEED: speed(positions, run.time, frame).ravel(),
             ENERGY: energy_density(plan, displacement).ravel(),
         }
-        add(folder / _name(frame), _grid(positions[frame], values))
+        write_new_file(folder / _name(frame), _grid(positions[frame], values))
     if picture is not None:
-        add(folder / PICTURE, picture)
-    add(folder / COLLECTION, _collection(run.time))
+        write_new_file(folder / PICTURE_FILE, picture)
+    write_new_file(folder / COLLECTION_FILE, _collection(run.time))
     return []
 
 
@@ -101,7 +101,7 @@ def _grid(position: Array, values: dict[str, Array]) -> bytes:
             array.GetInformation().Set(vtkDataArray.UNITS_LABEL(), UNITS[name])
         return array
 
-    shown = surface(position, REFINE)
+    shown = surface(position, EXPORT_REFINE)
     points, cells, grid = vtkPoints(), vtkCellArray(), vtkUnstructuredGrid()
     points.SetData(named("points", shown.vertices))
     starts = np.arange(0, shown.triangles.size + 1, 3)

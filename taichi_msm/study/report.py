@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from taichi_msm.errors import printable, writing
-from taichi_msm.runs.directory import staged
+from taichi_msm.runs.directory import hidden_folder
 from taichi_msm.scene.section import MAX_POINTS
 from taichi_msm.study.format import Columns, duration, number, size, table, timing, where, wrong
 from taichi_msm.study.result import Drawn, Measured, Peer, Points, Reference, Stepping, Study
@@ -28,7 +28,7 @@ WITHOUT_MATPLOTLIB = "study.png needs matplotlib: pip install matplotlib"
 
 def require_writable(directory: Path) -> None:
     """Check before a long measurement that its report can be written; raises FilesError."""
-    with writing(directory), staged(directory):
+    with writing(directory), hidden_folder(directory):
         pass
 
 
@@ -44,7 +44,7 @@ def write_report(study: Study, directory: Path) -> list[str]:
     Raises:
         FilesError: when the directory cannot be written.
     """
-    with writing(directory), staged(directory) as hidden:
+    with writing(directory), hidden_folder(directory) as hidden:
         outputs = [*([PICTURE] if _draw(study, hidden / PICTURE) else []), PAGE, RECORD]
         record = json.dumps({**as_record(study), "outputs": outputs}, indent=2, ensure_ascii=False, allow_nan=False)
         for file, text in ((PAGE, page(study)), (RECORD, record + "\n")):

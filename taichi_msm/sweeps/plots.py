@@ -266,11 +266,11 @@ def _last_frames(
     for run, directory in directories.items():
         try:
             finished = read_run(directory)
-            if finished.has("png"):
-                frames[run] = Image.fromarray(finished.picture("png", finished.frames - 1))
-            elif finished.has("gif"):
-                frames[run] = last_picture(finished.result("gif"))
-            elif finished.has("trajectory") and finished.scene.image is not None:
+            if finished.has_output("png"):
+                frames[run] = Image.fromarray(finished.read_picture("png", finished.frames - 1))
+            elif finished.has_output("gif"):
+                frames[run] = last_picture(finished.result_path("gif"))
+            elif finished.has_output("trajectory") and finished.scene.image is not None:
                 drawn[run] = executor.submit(draw_last, directory.absolute())
         except FilesError as error:
             errors.append(str(error))

@@ -37,7 +37,16 @@ from taichi_msm.errors import (
     writing,
 )
 from taichi_msm.load.scene_file import File, plan_file
-from taichi_msm.runs.directory import FILE, FOLDER, MAX_RECORD, give_name, kind, lock, require, staged
+from taichi_msm.runs.directory import (
+    FILE,
+    FOLDER,
+    MAX_RECORD_BYTES,
+    entry_kind,
+    hidden_folder,
+    link_without_replacing,
+    lock_file,
+    require_kind,
+)
 from taichi_msm.scene.outputs import RECORD, RUNS, SWEEP, numbered
 from taichi_msm.sweeps.pool import DiedError
 from taichi_msm.sweeps.spec import Sweep
@@ -64,8 +73,8 @@ def values_in(directory: Path, sweep: Sweep) -> list[list[Any]]:
         SceneError: when the folder holds another sweep, or the same of versions that give other bits.
         FilesError: when it cannot be read or written, something is in the way, or it keeps other values.
     """
-    record = require(directory / SWEEP, FILE)
-    require(directory / RUNS, FOLDER)
+    record = require_kind(directory / SWEEP, FILE)
+    require_kind(directory / RUNS, FOLDER)
     description, values = sweep.description(), sweep.values()
     if not record.exists():
         for name in (RUNS, *FILES, RECORD):
@@ -78,9 +87,9 @@ def values_in(directory: Path, sweep: Sweep) -> list[list[Any]]:
             "versions": versions(),
             "values": values,
         }
-        with writing(directory), staged(directory) as hidden:
+        with writing(directory), hidden_folder(directory) as hidden:
             (hidden / SWEEP).write_text(json.dumps(content) + "\n", encoding="utf-8", errors="backslashreplace")
-            give_name(hidden / SWEEP, record)  # unless another shard has just done so
+            link_without_replacing(hidden / SWEEP, record)  # unless another shard has just done so
     # As a text, in which no number equals another one, and NaN itself.
     own_values = json.dumps(values)
     try:
@@ -131,7 +140,7 @@ def begin_sweep(sweep: Sweep, directory: Path, shard: tuple[int, int] = (1, 1)) 
     done, missing = [], []
     for run in range(part - 1, len(values), parts):
         task = Task(run, sweep.scene, sweep.overrides(values[run]), directory, home)
-        require(task.directory, FOLDER)
+        require_kind(task.directory, FOLDER)
         if outcome := ended(task, sweep):
             done.append(outcome)
         else:
@@ -143,9 +152,9 @@ def ended(task: Task, sweep: Sweep) -> Outcome | None:
     """Find the outcome of a run that has ended; None: it is missing, was interrupted, or is another task's."""
     # A record that no run has written is as none.
     with suppress(OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        if kind(task.directory / RECORD) == FILE:
+        if entry_kind(task.directory / RECORD) == FILE:
             with (task.directory / RECORD).open("rb") as file:
-                record = json.loads(file.read(MAX_RECORD))
+                record = json.loads(file.read(MAX_RECORD_BYTES))
             is_own = tuple(record["overrides"]) == task.overrides
             has_same_files = sweep.digests.issuperset(record["sha256"].values())
             if record["status"] in ENDED and is_own and has_same_files:
@@ -159,7 +168,7 @@ def alone(directory: Path, pause: Pause) -> Iterator[None]:
     with ExitStack() as opened:
         while True:
             try:
-                opened.enter_context(lock(directory / SWEEP))
+                opened.enter_context(lock_file(directory / SWEEP))
                 break
             except BlockingIOError:
                 pause()

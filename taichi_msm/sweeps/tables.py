@@ -35,7 +35,7 @@ from taichi_msm.load import cost as cost_module
 from taichi_msm.load.cost import rough_time
 from taichi_msm.load.scene_file import plan_file
 from taichi_msm.model.plan import Plan
-from taichi_msm.runs.directory import MAX_RECORD, replacing
+from taichi_msm.runs.directory import MAX_RECORD_BYTES, replacing
 from taichi_msm.scene.outputs import RECORD
 from taichi_msm.sweeps.plots import parameters, results, sensitivity, write_contact
 from taichi_msm.sweeps.runs import (
@@ -217,7 +217,7 @@ def split(runs: int, seed: int) -> list[str]:
 
 def _facts(directory: Path) -> dict[str, Any]:
     """Give what a loader needs to know of a run: its outputs, the frames, their size [px] and how many a second."""
-    record = json.loads(read_regular(directory / RECORD, MAX_RECORD))
+    record = json.loads(read_regular(directory / RECORD, MAX_RECORD_BYTES))
     scene = record["scene"]
     return {
         "outputs": record["outputs"],
