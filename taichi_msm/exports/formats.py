@@ -1,6 +1,6 @@
-"""The formats of `export`. A new one is a row of this table, and a module of its name with a function `write`.
+"""Table of the export formats, and the runs as their input.
 
-The runs that an export is of, and how a format takes them.
+A format is a row of `FORMATS` and a module of its name with a function `write`.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from taichi_msm.system.files import read_regular
 
 
 class Format(NamedTuple):
-    """An export format."""
+    """Export format."""
 
-    description: str  # what it is for, in few words
-    required_outputs: tuple[str, ...]  # the entries of a scene's `output` that it is made from
-    file_patterns: tuple[str, ...]  # their names as regular expressions, for `directory.files`
-    optional_outputs: tuple[str, ...] = ()  # further entries of `output`, of which it would have more
-    numbers_pairs: bool = False  # whether it numbers pairs of frames, not runs
-    cameras: tuple[str, ...] = ()  # what it shows: nothing that a camera sees, ANY camera, or those of these names
-    module: str = ""  # if it has another name than the format
+    description: str  # purpose, in few words
+    required_outputs: tuple[str, ...]  # entries of a scene's `output` that it needs
+    file_patterns: tuple[str, ...]  # regular expressions of its file names, for `list_files`
+    optional_outputs: tuple[str, ...] = ()  # further entries of `output` that it exports
+    numbers_pairs: bool = False  # whether numbers refer to pairs of frames instead of runs
+    cameras: tuple[str, ...] = ()  # cameras whose results it exports: none, ANY_CAMERA or these names
+    module: str = ""  # name of its module, if different from the format's
 
 
 def _patterns_per_run(*patterns: str) -> tuple[str, ...]:
-    """Give the patterns of files that are there for each run: in a folder of its own, or of the only run in none."""
+    """Return the patterns of files per run: in a numbered folder, or without a folder for a single run."""
     return (*patterns, *(f"{NUMBERED}/{pattern}" for pattern in patterns))
 
 
-# A camera that is chosen, or the only one.
+# The camera chosen by the user, or the only one.
 ANY_CAMERA = ("",)
 
 FORMATS = {
@@ -96,40 +96,41 @@ FORMATS = {
 
 
 class ExportSource(NamedTuple):
-    """A run that is exported."""
+    """Run to export."""
 
-    run: FinishedRun  # as the first camera that the format shows has seen it
-    name: str  # its number among the runs; empty if it is the only one
-    progress: Count  # of this run
+    run: FinishedRun  # with the first of the format's cameras selected
+    name: str  # number of the run as text; empty for a single run
+    progress: Count  # called with the finished and total frames of this run
 
 
-# Writes the files of all runs into an empty folder. It is a generator: after each run it gives what the user should
-# know about that run, and after the last it writes what is of all runs together.
+# Writes the files of all runs to an empty folder. It is a generator that yields the warnings about each run in turn,
+# and then writes the files that combine runs.
 FormatWriter = Callable[[Sequence[ExportSource], Path], Iterator[list[str]]]
 
 
 def one_folder_per_run(write: Callable[[FinishedRun, Path, Count], list[str]]) -> FormatWriter:
-    """Make a format of what writes one run into an empty folder."""
+    """Build a format's `write` from a function that writes one run to an empty folder and returns warnings."""
 
     @wraps(write)
     def write_all(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
         for source in sources:
-            own = folder / source.name
-            own.mkdir(exist_ok=True)
-            yield write(source.run, own, source.progress)
+            run_folder = folder / source.name
+            run_folder.mkdir(exist_ok=True)
+            yield write(source.run, run_folder, source.progress)
 
     return write_all
 
 
 def read_runs(directories: Sequence[str | Path]) -> tuple[list[FinishedRun], int]:
-    """Read the records of runs in their folders and in those of sweeps; also counts the runs that are left out.
+    """Read the records of runs, given as folders of runs or of sweeps.
 
-    Of a sweep these are all that are not complete.
+    Returns:
+        The runs, of sweeps only the complete ones; and the number of incomplete runs of the sweeps.
 
     Raises:
-        FilesError: as `read_run` does, and when no run is left.
+        FilesError: as for `read_run`, and when there is no run.
     """
-    runs, left_out = [], 0
+    runs, incomplete = [], 0
     for directory in map(Path, directories):
         record = directory / SWEEP
         with reading(record):
@@ -142,8 +143,8 @@ def read_runs(directories: Sequence[str | Path]) -> tuple[list[FinishedRun], int
             folders = sorted(((directory / name).parent for name in names), key=lambda folder: int(folder.name))
             count = len(json.loads(read_regular(record, MAX_RECORD_BYTES))["values"])
         complete = [run for run in map(read_run, folders) if run.status == "complete"]
-        left_out += count - len(complete)
+        incomplete += count - len(complete)
         runs += complete
     if not runs:
         raise FilesError(f"{', '.join(map(str, directories))}: no run is complete; table.csv there tells why")
-    return runs, left_out
+    return runs, incomplete

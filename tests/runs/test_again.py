@@ -194,7 +194,7 @@ def test_a_picture_that_changes_while_a_run_starts_is_noticed(
         Image.fromarray(speckle(30, 40, 1)).save(small / "speckle.png")
         return found
 
-    monkeypatch.setattr("taichi_msm.runs.run.digests", late)
+    monkeypatch.setattr("taichi_msm.runs.run.input_digests", late)
     with pytest.raises(SceneError, match=r"^image: speckle.png is not the file that was run"):
         run(load_scene("small.yaml"), "out", threads=device.threads)
 
