@@ -43,7 +43,7 @@ def _export_file_test(record: Mapping[str, Any]) -> IsListed:
 EXPORT_PATTERNS = (
     r"export\.json",
     r"index\.csv",
-    *dict.fromkeys(pattern for row in FORMATS.values() for pattern in row.file_patterns),
+    *dict.fromkeys(pattern for export_format in FORMATS.values() for pattern in export_format.file_patterns),
 )
 EXPORT_PUBLICATION = PublicationSpec("export", EXPORT_RECORD, EXPORT_PATTERNS, _export_file_test, exclusive=True)
 
@@ -117,13 +117,12 @@ def _default_folder(directories: Sequence[str | Path], name: str) -> Path:
 
 def _camera_views(run: FinishedRun, name: str, camera: str | None) -> list[FinishedRun]:
     """Select the cameras of a run that a format exports; return a copy of the run per camera."""
-    row, known = FORMATS[name], run.camera_names()
-    exported = row.cameras
+    export_format, known = FORMATS[name], run.camera_names()
+    exported = export_format.cameras
     if exported == ANY_CAMERA and camera is not None and camera in known:
         return [replace(run, camera=camera)]
-    depends_on_camera = any(
-        OUTPUTS[key].is_seen and key in run.scene.output for key in (*row.required_outputs, *row.optional_outputs)
-    )
+    outputs = (*export_format.required_outputs, *export_format.optional_outputs)
+    depends_on_camera = any(OUTPUTS[key].is_seen and key in run.scene.output for key in outputs)
     if not exported or (exported == ANY_CAMERA and not (known and depends_on_camera)):
         return [run]
     cameras = f"its cameras are {', '.join(known)}" if known else "it has one camera, without a name"
@@ -139,8 +138,8 @@ def _camera_views(run: FinishedRun, name: str, camera: str | None) -> list[Finis
 def _write_export(views: Sequence[Sequence[FinishedRun]], name: str, directory: Path, progress: Count) -> Exported:
     """Write an export atomically; `views` has a list of copies of each run, one per exported camera."""
     runs = [run for run, *_ in views]
-    row, total, done = FORMATS[name], sum(run.frames for run in runs), 0
-    write: FormatWriter = import_module(f"taichi_msm.exports.{row.module or name}").write
+    export_format, total, done = FORMATS[name], sum(run.frames for run in runs), 0
+    write: FormatWriter = import_module(f"taichi_msm.exports.{export_format.module or name}").write
     sources = []
     for number, run in enumerate(runs):
         run_progress = partial(_report_progress, progress, done, run.frames, total)
@@ -151,8 +150,8 @@ def _write_export(views: Sequence[Sequence[FinishedRun]], name: str, directory: 
     with writing(directory), Publication(directory, EXPORT_PUBLICATION) as publication:
         for run in chain.from_iterable(views):
             with run.unchanged():
-                if missing := [key for key in row.required_outputs if not run.has_output(key)]:
-                    remedy = run.remedy(*row.required_outputs, *row.optional_outputs)
+                if missing := [key for key in export_format.required_outputs if not run.has_output(key)]:
+                    remedy = run.remedy(*export_format.required_outputs, *export_format.optional_outputs)
                     raise FilesError(f"{run.directory / run.camera}: {name} needs {' and '.join(missing)}; {remedy}")
         writer = write(sources, publication.new_folder)
         for run in runs:
@@ -160,7 +159,7 @@ def _write_export(views: Sequence[Sequence[FinishedRun]], name: str, directory: 
                 for note in next(writer):
                     notes.setdefault(note, []).append(run.directory)
         next(writer, None)
-        _write_index(runs, row.numbers_pairs, publication.new_folder / INDEX_FILE)
+        _write_index(runs, export_format.numbers_pairs, publication.new_folder / INDEX_FILE)
         written = sorted(list_files(publication.new_folder, EXPORT_PATTERNS, strict=True))
         write_new_file(
             publication.new_folder / EXPORT_RECORD, (json.dumps({"files": written}, indent=1) + "\n").encode()

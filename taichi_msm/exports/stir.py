@@ -9,8 +9,8 @@ Every run has a folder with
     left/seq00/0ms_icgstart.png, 1200ms_icgend.png  first and last frame
 
 STIR's infrared pictures show only the tattoos. Here, they are the visible frames, whose texture the loader needs to
-match left and right tracks. Marked are the tracks that both cameras see in the first and the last frame, unless their
-discs would touch. The centre of a disc is the pixel that contains the track.
+match left and right tracks. Marked are the tracks that are visible to both cameras in the first and the last frame,
+unless their discs would touch. The centre of a disc is the pixel that contains the track.
 
 A position X in the axes of the left camera (OpenCV's, [m]) is `rotation` X + `translation` in those of the right one,
 so that the first component of `translation` is the negative baseline. Camera matrices count from the centre of the

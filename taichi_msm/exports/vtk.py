@@ -5,8 +5,8 @@ rendered surface. The data of each point are
 
     displacement     from the rest position [m]
     speed            central difference of the displacements in the adjacent frames [m/s]
-    energy_density   elastic energy of the structural and shear springs per rest area [J/m2], without plate bending and
-                     virtual springs
+    energy_density   elastic energy of the structural and shear springs, per area at rest [J/m2]; without plate bending
+                     and virtual springs
     texture          texture coordinates from the lower left corner of the exported picture
 
 Source: VTK's own writer; for the .pvd file, ParaView's guide.

@@ -148,11 +148,11 @@ class Checkpoint:
                 array_file.write(self.frames, values)
         self.frames += 1
 
-    def position(self, frame: int) -> NDArray[Any]:
+    def read_positions(self, frame: int) -> NDArray[Any]:
         """Read the positions of the mass points in a frame [m], shape (rows, cols, 3)."""
         return self._positions.read(frame)
 
-    def forces(self, frame: int) -> tuple[TipForce, ...]:
+    def read_forces(self, frame: int) -> tuple[TipForce, ...]:
         """Read the force of every probe in a frame; only for scenes that output forces."""
         return _tip_forces(self._forces.read(frame))
 
@@ -246,7 +246,7 @@ def load_with_checksum(data: bytes) -> Any:
 
 
 def _tip_force_array(forces: Sequence[TipForce]) -> NDArray[np.float64]:
-    return np.array([(*one.tip, *one.force) for one in forces], float).reshape(-1, FORCE_COLUMNS)
+    return np.array([(*force.tip, *force.force) for force in forces], float).reshape(-1, FORCE_COLUMNS)
 
 
 def _tip_forces(numbers: NDArray[np.float64]) -> tuple[TipForce, ...]:

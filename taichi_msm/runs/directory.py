@@ -51,9 +51,7 @@ class PublicationSpec(NamedTuple):
     patterns: Collection[str]  # of all files that may be published, including the record
     read_record: Callable[[Mapping[str, Any]], IsListed]  # converts a record to a test of file names
     exclusive: bool = False  # whether the directory may not contain other files
-    companion: tuple[str, Collection[str]] | None = (
-        None  # an unpublished folder in the staging folder, and its patterns
-    )
+    companion: tuple[str, Collection[str]] | None = None  # a folder that stays unpublished, and its patterns
 
 
 class Publication:
@@ -102,7 +100,7 @@ class Publication:
         for name in names:
             if entry_kind(self.new_folder / name) != FILE:
                 raise FilesError(f"{self.new_folder / name} was removed during the {self._spec.name}; run it again")
-        self._require_free(names, self._earlier(self._record))
+        self._require_free(names, self._listed_results(self._record))
         self.new_folder.replace(self.staging_folder / READY_FOLDER)
         self._complete()
 
@@ -112,13 +110,13 @@ class Publication:
             try:
                 opened.enter_context(self._acquire())
             except BlockingIOError:
-                said = f"another {self._spec.name} is writing there; choose another --out"
-                raise FilesError(f"{self._directory}: {said}") from None
+                fault = f"another {self._spec.name} is writing there; choose another --out"
+                raise FilesError(f"{self._directory}: {fault}") from None
             self._complete()
             self._clear()
-            earlier = self._earlier(self._record)
+            earlier = self._listed_results(self._record)
             if self._spec.exclusive:
-                for name in list_files(self._directory, self._spec.patterns, strict=True, besides=(STAGING_FOLDER,)):
+                for name in list_files(self._directory, self._spec.patterns, strict=True, ignored=(STAGING_FOLDER,)):
                     if name not in earlier:
                         raise ForeignError.at(self._directory / name, FILE)
             self._require_free(self._names, earlier)
@@ -133,7 +131,7 @@ class Publication:
             self._clear()
         self._open.close()
 
-    def _earlier(self, record: Path) -> set[str]:
+    def _listed_results(self, record: Path) -> set[str]:
         """List the existing results that a record names."""
         if entry_kind(record) is None:
             return set()
@@ -167,7 +165,7 @@ class Publication:
 
     def _complete(self) -> None:
         """Move committed files into place; complete an interrupted publication."""
-        ready, aside = self.staging_folder / READY_FOLDER, self.staging_folder / PREVIOUS_RECORD
+        ready, moved_record = self.staging_folder / READY_FOLDER, self.staging_folder / PREVIOUS_RECORD
         record = ready / self._spec.record
         if entry_kind(record) is None:
             return  # The record is moved last: nothing is committed, or all moves are done.
@@ -177,12 +175,12 @@ class Publication:
                 raise ValueError("no record of itself")
         except ValueError:
             raise DamagedError(f"{record} is damaged; remove {self.staging_folder} and run the scene again") from None
-        is_resumed = entry_kind(aside) is not None
-        earlier = self._earlier(aside if is_resumed else self._record)
+        is_resumed = entry_kind(moved_record) is not None
+        earlier = self._listed_results(moved_record if is_resumed else self._record)
         remaining = list(list_files(ready, self._spec.patterns, strict=True))
         self._require_free(remaining, earlier)
         if not is_resumed and entry_kind(self._record) is not None:
-            self._record.replace(aside)
+            self._record.replace(moved_record)
         for name in remaining:
             if name != record.name:
                 (self._directory / name).parent.mkdir(parents=True, exist_ok=True)
@@ -278,14 +276,14 @@ def require_no_link(folder: Path, option: str) -> Path:
     return folder
 
 
-def list_files(top: Path, patterns: Collection[str], *, strict: bool, besides: Collection[str] = ()) -> Iterator[str]:
+def list_files(top: Path, patterns: Collection[str], *, strict: bool, ignored: Collection[str] = ()) -> Iterator[str]:
     """List the files below a folder whose relative paths match a pattern. Links are not followed.
 
     Args:
         top: the folder.
         patterns: regular expressions for relative paths with slashes; the parts before slashes match subfolders.
         strict: whether other entries are errors.
-        besides: names of entries that are ignored.
+        ignored: names of entries to ignore.
 
     Returns:
         Relative paths with slashes.
@@ -298,7 +296,7 @@ def list_files(top: Path, patterns: Collection[str], *, strict: bool, besides: C
     def look(folder: Path, prefix: str) -> Iterator[str]:
         for path in folder.iterdir():
             actual, name = entry_kind(path), prefix + path.name
-            if actual is None or name in besides:
+            if actual is None or name in ignored:
                 continue
             if actual == FOLDER and folders.fullmatch(name):
                 yield from look(path, f"{name}/")
@@ -462,7 +460,15 @@ def create_file(path: Path, buffering: int = -1) -> BinaryIO:
 
 
 def write_new_file(path: Path, data: bytes) -> None:
-    """Create a file with this content; raise a FileExistsError when the path exists."""
+    """Create a file.
+
+    Args:
+        path: path of the file.
+        data: its content.
+
+    Raises:
+        FileExistsError: when the path exists.
+    """
     with create_file(path) as file:
         file.write(data)
 

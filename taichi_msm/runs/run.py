@@ -208,9 +208,9 @@ def _find_unfinished(context: _RunContext) -> Manifest | None:
         unfinished, _ = read_manifest(context.directory)
     except (FilesError, SceneError):
         return None
-    if not manifest.has_same_bits_as(unfinished) or _choose_pilots(context, resumed=True) != _choose_pilots(
-        context, resumed=False
-    ):
+    if not manifest.has_same_bits_as(unfinished):
+        return None
+    if _choose_pilots(context, resumed=True) != _choose_pilots(context, resumed=False):
         return None
     return replace(manifest, versions=unfinished.versions)
 
@@ -290,7 +290,7 @@ class _Run:
         """Verify the checksums of stored positions before they are used."""
         for frame in range(self._resumed if self._context.plan.scene.output else 0):
             self._progress("check", frame, self._resumed)
-            self._writer.position(frame)
+            self._writer.read_positions(frame)
 
     def prepare(self) -> None:
         """Compile, and restore the simulation and its companion runs to the state of the unfinished run."""
@@ -303,19 +303,19 @@ class _Run:
             self._simulation.restore(writer.saved)
         if self._path_dependence and self._context.plan.scene.output:
             for frame in range(writer.frames):
-                self._path_dependence.follow(frame, writer.position(frame) - rest)
+                self._path_dependence.follow(frame, writer.read_positions(frame) - rest)
         if self._error:
             with self._watch.stage("pilot"):
                 for frame in range(1, writer.frames):
                     report = partial(self._progress, "pilot", frame, writer.frames)
-                    self._error.follow(writer.position(frame) - rest, report)
+                    self._error.follow(writer.read_positions(frame) - rest, report)
 
     def simulate_frames(self) -> None:
         """Simulate, draw and write every missing frame, and complete the results."""
         writer, simulation, scene = self._writer, self._simulation, self._context.plan.scene
         stage, rest = self._watch.stage, rest_positions(scene.sheet)
         observed = dict.fromkeys(scene.render.all_cameras, Observed())
-        # Frames that need no steps are reported as a separate stage, because they would bias the estimate of the time.
+        # Frames that need no steps are reported as a separate stage: they would distort the estimated remaining time.
         redrawn_frames = max(self._resumed, 1)
         for frame in range(writer.frames, self._frames):
             kind, total = ("redraw", redrawn_frames) if frame < redrawn_frames else ("frames", self._frames)
@@ -323,7 +323,7 @@ class _Run:
             report()
             with stage("simulate"):
                 simulation.advance(max(0, frame - simulation.frame), self._pause)
-            position = writer.position(frame) if frame < self._resumed else simulation.positions()
+            position = writer.read_positions(frame) if frame < self._resumed else simulation.positions()
             with stage("render"):
                 time = frame / scene.time.frames_per_second
                 for camera, previous in observed.items():
@@ -338,7 +338,9 @@ class _Run:
                     self._error.follow(position - rest, report, forces)
         try:
             if self._error:
-                kept = (writer.position(frame) - rest for frame in range(1, self._frames)) if scene.output else None
+                kept = (
+                    (writer.read_positions(frame) - rest for frame in range(1, self._frames)) if scene.output else None
+                )
                 with stage("pilot"):
                     self._error.finish(kept, partial(self._progress, "pilot"))
             if self._path_dependence and self._repeats_solution:

@@ -101,10 +101,10 @@ class ResultWriter:
         """Number of frames in the checkpoint, including those from before the run was resumed."""
         return self._checkpoint.frames
 
-    def position(self, frame: int) -> NDArray[Any]:
+    def read_positions(self, frame: int) -> NDArray[Any]:
         """Read the positions of the mass points in a stored frame [m], shape (rows, cols, 3)."""
         with writing(self._directory):
-            return self._checkpoint.position(frame)
+            return self._checkpoint.read_positions(frame)
 
     def add(
         self,
@@ -200,7 +200,7 @@ class ResultWriter:
         shape = (frames, *self._scene.sheet.points, 3)
         arrays: dict[str, NDArray[Any] | ChunkedArray] = {
             "time": np.arange(frames) / self._scene.time.frames_per_second,
-            "position": ChunkedArray(checkpoint.precision, shape, map(checkpoint.position, range(frames))),
+            "position": ChunkedArray(checkpoint.precision, shape, map(checkpoint.read_positions, range(frames))),
         }
         with create_file(self._publication.new_folder / outputs.OUTPUTS["trajectory"].path()) as file:
             write_arrays(file, arrays)
@@ -215,7 +215,7 @@ class ResultWriter:
             rows.writerow(outputs.FORCES_HEADER)
             for frame in range(self.frames):
                 time = frame / self._scene.time.frames_per_second
-                forces = self._checkpoint.forces(frame)
+                forces = self._checkpoint.read_forces(frame)
                 rows.writerows((time, force.probe, *force.tip, *force.force) for force in forces)
 
     def __enter__(self) -> ResultWriter:

@@ -82,8 +82,8 @@ def read(out: Path) -> list[Any]:
     try:
         saved = checkpoint.reopen()
         assert saved is not None
-        positions = [checkpoint.position(frame).tolist() for frame in range(checkpoint.frames)]
-        forces = [checkpoint.forces(frame) for frame in range(checkpoint.frames)]
+        positions = [checkpoint.read_positions(frame).tolist() for frame in range(checkpoint.frames)]
+        forces = [checkpoint.read_forces(frame) for frame in range(checkpoint.frames)]
     finally:
         checkpoint.close()
     return [
