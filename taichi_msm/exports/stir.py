@@ -43,7 +43,7 @@ from taichi_msm.runs.finished import FinishedRun
 from taichi_msm.scene import outputs
 from taichi_msm.scene.outputs import numbered
 
-FORMAT, CAMERAS = "stir", ("left", "right")
+FORMAT_NAME, CAMERAS = "stir", ("left", "right")
 
 # Limits of STIR's loader: size of the pictures [px], and disparities for stereo triangulation.
 LOADER_SIZE, MIN_DISPARITY_PX, MAX_DISPARITY_PX = (1280, 1024), 8, 105
@@ -73,7 +73,7 @@ def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
         NotInstalledError: when PyAV is not installed.
     """
     if not outputs.is_pyav_installed():
-        raise NotInstalledError(f"--format {outputs.PYAV_NOT_INSTALLED.replace('mp4', FORMAT, 1)}")
+        raise NotInstalledError(f"--format {outputs.PYAV_NOT_INSTALLED.replace('mp4', FORMAT_NAME, 1)}")
     for run, name, progress in sources:
         yield _write_run(run, folder / (name or numbered(0)), progress)
 
@@ -81,7 +81,7 @@ def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
 def _write_run(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
     runs = [replace(run, camera=side) for side in CAMERAS]
     folder.mkdir()
-    left, right = (read_pinhole(each, FORMAT) for each in runs)
+    left, right = (read_pinhole(each, FORMAT_NAME) for each in runs)
     baseline = _baseline(run, left, right)
     write_new_file(folder / "calib.json", (json.dumps(_calibration(left, right, baseline), indent=2) + "\n").encode())
     radius = max(1, round(run.scene.render.size[0] / WIDTH_PER_DISC_RADIUS))
@@ -105,7 +105,7 @@ def _baseline(run: FinishedRun, left: Pinhole, right: Pinhole) -> float:
     is_parallel = np.abs(rotation - np.eye(3)).max() < ALIGNMENT_TOLERANCE
     is_horizontal = np.abs(translation - [-baseline, 0.0, 0.0]).max() < ALIGNMENT_TOLERANCE * baseline
     if not (is_parallel and is_horizontal) or (left.focal != right.focal).any():
-        fault = f"{FORMAT} needs the camera right beside left, to the right of it and just like it"
+        fault = f"{FORMAT_NAME} needs the camera right beside left, to the right of it and just like it"
         raise FilesError(f"{run.directory}: {fault}; run the scene with `right: {{beside: left, baseline: 0.005}}`")
     return baseline
 

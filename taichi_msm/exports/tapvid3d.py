@@ -34,7 +34,7 @@ from taichi_msm.runs.directory import create_file
 from taichi_msm.runs.finished import FinishedRun
 from taichi_msm.scene.outputs import numbered
 
-FORMAT = "tapvid3d"
+FORMAT_NAME = "tapvid3d"
 
 
 def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
@@ -56,7 +56,11 @@ def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
 
 
 def _write_run(run: FinishedRun, path: Path, progress: Count) -> list[str]:
-    camera, (pixels, occluded), (_, position) = read_pinhole(run, FORMAT), read_tracks(run), read_track_positions(run)
+    camera, (pixels, occluded), (_, position) = (
+        read_pinhole(run, FORMAT_NAME),
+        read_tracks(run),
+        read_track_positions(run),
+    )
     images = []
     for frame in range(run.frames):
         progress(frame, run.frames)

@@ -32,7 +32,7 @@ from taichi_msm.errors import Pause
 from taichi_msm.runs.directory import create_file
 from taichi_msm.scene.outputs import OUTPUTS
 
-Picture = NDArray[np.uint8]
+Picture = NDArray[np.uint8]  # colours, shape (height, width, 3), or palette indices, shape (height, width)
 
 # Limits of a frame's delay [1/100 s]: the field has 16 bits, and browsers replace 0 and 1 by 10.
 MIN_GIF_DELAY = 2
