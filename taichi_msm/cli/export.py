@@ -21,7 +21,7 @@ from taichi_msm.system.process import Interruption
     type=SuggestingChoice(FORMATS),
     metavar="FORMAT",
     required=True,
-    help="; ".join(f"{name}: {row.means}" for name, row in FORMATS.items()) + ".",
+    help="; ".join(f"{name}: {row.description}" for name, row in FORMATS.items()) + ".",
 )
 @click.option(
     "--out",

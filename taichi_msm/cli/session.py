@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from taichi_msm.errors import FilesError, SceneError
-from taichi_msm.runs.directory import without_link
+from taichi_msm.runs.directory import require_no_link
 from taichi_msm.system.process import Interruption, write_stderr
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ def plan_repetition(directory: str) -> tuple[Plan, list[str]]:
     from taichi_msm.runs.finished import read_run
 
     earlier = read_run(result_directory(directory, option="--again"))
-    earlier.require_pictures(drawn=earlier.scene.draws or "image" in earlier.sha256)
+    earlier.require_same_pictures(drawn=earlier.scene.draws or "image" in earlier.sha256)
     return check_scene(earlier.scene), earlier.overrides
 
 
@@ -52,7 +52,7 @@ def result_directory(out: str | None, default: str = "", option: str = "--out") 
         return Path(out)
     if default in (".", ".."):
         raise click.BadParameter(f"the scene's name gives the folder output/{default}; name another", param_hint=option)
-    return without_link(without_link(Path("output"), option) / default, option)
+    return require_no_link(require_no_link(Path("output"), option) / default, option)
 
 
 def resume_hint(directory: Path) -> str:

@@ -28,7 +28,7 @@ from taichi_msm.cli.session import (
     result_directory,
 )
 from taichi_msm.errors import printable
-from taichi_msm.runs.directory import without_link
+from taichi_msm.runs.directory import require_no_link
 from taichi_msm.system.process import Interruption, write_stderr
 
 
@@ -90,7 +90,7 @@ def study(
         return report_interruption(interruption, as_json)
     if results.status == "interrupted" and (directory / RECORD_FILE).exists():
         # A partial study must not replace a complete one.
-        directory = without_link(directory / "interrupted", "--out")
+        directory = require_no_link(directory / "interrupted", "--out")
     outputs = write_report(results, directory)
     if as_json:
         print_json({"directory": str(directory), **study_record(results), "outputs": outputs})

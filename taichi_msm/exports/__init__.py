@@ -1,1 +1,1 @@
-"""The results of a run in the files of other programs."""
+"""Export of results to the file formats of other programs and data sets."""

@@ -1,4 +1,4 @@
-"""Convert the folders of runs to a folder with another program's files."""
+"""Export of the results of runs to files of other programs and data sets."""
 
 from __future__ import annotations
 
@@ -25,35 +25,43 @@ from taichi_msm.errors import (
     require_path,
     writing,
 )
-from taichi_msm.exports.formats import ANY, FORMATS, Source, Write, read_runs
-from taichi_msm.runs.directory import Contents, Listed, Publication, add, create, files, without_link
-from taichi_msm.runs.finished import PUT_BACK, FinishedRun
+from taichi_msm.exports.formats import ANY_CAMERA, FORMATS, ExportSource, FormatWriter, read_runs
+from taichi_msm.runs.directory import (
+    IsListed,
+    Publication,
+    PublicationSpec,
+    create_file,
+    list_files,
+    require_no_link,
+    write_new_file,
+)
+from taichi_msm.runs.finished import RESTORE_PICTURE, FinishedRun
 from taichi_msm.scene.outputs import OUTPUTS, zero_padded
 
-# The file that lists the others, and that which leads from numbers to runs.
-RECORD, INDEX = "export.json", "index.csv"
+# The list of exported files, and the table of runs by number.
+EXPORT_RECORD, INDEX_FILE = "export.json", "index.csv"
 
 
-def _listed(record: Mapping[str, Any]) -> Listed:
-    return {RECORD, *record["files"]}.__contains__
+def _export_file_test(record: Mapping[str, Any]) -> IsListed:
+    return {EXPORT_RECORD, *record["files"]}.__contains__
 
 
-# The files of all formats: any of them may have been exported to a folder before, or been about to be. A folder with
-# anything else in it is refused, as nobody would find it again among so many files.
-PATTERNS = (
+# Files of all formats, because the folder may contain an earlier export of another format. Other files are errors: the
+# user would not find them among the exported ones.
+EXPORT_PATTERNS = (
     r"export\.json",
     r"index\.csv",
-    *dict.fromkeys(pattern for row in FORMATS.values() for pattern in row.files),
+    *dict.fromkeys(pattern for export_format in FORMATS.values() for pattern in export_format.file_patterns),
 )
-EXPORT = Contents("export", RECORD, PATTERNS, _listed, alone=True)
+EXPORT_PUBLICATION = PublicationSpec("export", EXPORT_RECORD, EXPORT_PATTERNS, _export_file_test, exclusive=True)
 
 
 class Exported(NamedTuple):
-    """What was written."""
+    """Result of an export."""
 
     directory: Path
-    files: list[str]  # names in the directory, with slashes
-    notes: list[str]  # what the user should know about them
+    files: list[str]  # relative paths with slashes
+    notes: list[str]  # warnings
 
 
 def export(
@@ -63,27 +71,25 @@ def export(
     progress: ProgressCallback = lambda done, total: None,
     camera: str | None = None,
 ) -> Exported:
-    """Convert the results of runs for another program, whole or not at all.
+    """Export the results of runs to the format of another program, atomically.
 
-    Runs are numbered in their order; index.csv leads from the numbers to the runs. The files replace those of an
-    earlier export.
+    Runs are numbered in order; index.csv maps the numbers to the runs. The files replace those of an earlier export.
 
     Args:
-        runs: the folder of a run, or that of a sweep, of which all complete runs are taken; or several of them.
+        runs: folder of a run, or of a sweep, whose complete runs are exported; or a sequence of folders.
         format: kitti, tapvid, tapvid3d, stir, vtk, gltf, obj or csv.
-        out: where the files go; None: into export-FORMAT, in the folder if it is one, in output if they are several.
-        progress: called often, with the frames done and the frames in all; what it raises stops the export, and no file
-            changes.
-        camera: of runs with several cameras, the name of the one whose pictures, labels and tracks are taken.
+        out: destination; None for export-FORMAT in the folder of a single run or sweep, or in output for several.
+        progress: called often with the finished frames and the total number of frames; an exception from it cancels the
+            export without changing any file.
+        camera: for runs with several cameras, the name of the camera whose pictures, labels and tracks are exported.
 
     Returns:
-        The `directory` where the files are; the names of the `files` in it; and `notes`, a line each, on what is left
-        out or only near.
+        The `directory`; the relative paths of the `files` in it; and `notes`, which list omissions and approximations.
 
     Raises:
-        ArgumentError: when an argument is not what it must be.
-        FilesError: when a file that is needed is missing or damaged, or the files cannot be written.
-        NotInstalledError: when a package that writes the format is not installed.
+        ArgumentError: when an argument is invalid.
+        FilesError: when a required file is missing or damaged, or the files cannot be written.
+        NotInstalledError: when a package for the format is not installed.
 
     Example:
         >>> from taichi_msm import export
@@ -98,109 +104,112 @@ def export(
         raise ArgumentError("runs: []; take the folder of a run or of a sweep, or several")
     if format not in list(FORMATS):
         raise ArgumentError(f"format: {format!r}; take one of {', '.join(FORMATS)}{did_you_mean(str(format), FORMATS)}")
-    if camera is not None and FORMATS[format].cameras != ANY:
+    if camera is not None and FORMATS[format].cameras != ANY_CAMERA:
         raise ArgumentError(f"camera: {camera!r}; {format} has no choice of a camera; leave it out")
-    directory = _default(directories, format) if out is None else Path(out)
-    finished, left_out = read_runs(directories)
-    if camera is not None and not any(run.cameras() for run in finished):
+    directory = _default_folder(directories, format) if out is None else Path(out)
+    finished, incomplete = read_runs(directories)
+    if camera is not None and not any(run.camera_names() for run in finished):
         raise ArgumentError(f"camera: {camera!r}; {finished[0].directory} has one camera, without a name; leave it out")
-    views = [_views(run, format, camera) for run in finished]
-    exported = _convert(views, format, directory, progress)
-    if left_out:
-        of_all = f"{left_out} of {left_out + len(finished)} runs"
-        exported.notes.insert(0, f"left out, as not complete: {of_all}; table.csv of the sweep tells why")
+    views = [_camera_views(run, format, camera) for run in finished]
+    exported = _write_export(views, format, directory, progress)
+    if incomplete:
+        count = f"{incomplete} of {incomplete + len(finished)} runs"
+        exported.notes.insert(0, f"left out, as not complete: {count}; table.csv of the sweep tells why")
     return exported
 
 
-def _default(directories: Sequence[str | Path], name: str) -> Path:
-    folder = Path(directories[0]) if len(directories) == 1 else without_link(Path("output"), "--out")
-    return without_link(folder / f"export-{name}", "--out")
+def _default_folder(directories: Sequence[str | Path], name: str) -> Path:
+    folder = Path(directories[0]) if len(directories) == 1 else require_no_link(Path("output"), "--out")
+    return require_no_link(folder / f"export-{name}", "--out")
 
 
-def _views(run: FinishedRun, name: str, camera: str | None) -> list[FinishedRun]:
-    """Find the results of each camera that a format shows; of the run alone if it shows none, or one without a name."""
-    wanted, known = FORMATS[name], run.cameras()
-    shown = wanted.cameras
-    if shown == ANY and camera is not None and camera in known:
+def _camera_views(run: FinishedRun, name: str, camera: str | None) -> list[FinishedRun]:
+    """Select the cameras of a run that a format exports; return a copy of the run per camera."""
+    export_format, known = FORMATS[name], run.camera_names()
+    exported = export_format.cameras
+    if exported == ANY_CAMERA and camera is not None and camera in known:
         return [replace(run, camera=camera)]
-    seen = [key for key in (*wanted.needs, *wanted.uses) if OUTPUTS[key].is_camera_output and key in run.scene.output]
-    if not shown or (shown == ANY and not (known and seen)):
+    outputs = (*export_format.required_outputs, *export_format.optional_outputs)
+    depends_on_camera = any(OUTPUTS[key].is_camera_output and key in run.scene.output for key in outputs)
+    if not exported or (exported == ANY_CAMERA and not (known and depends_on_camera)):
         return [run]
-    said = f"its cameras are {', '.join(known)}" if known else "it has one camera, without a name"
-    if shown == ANY:
-        given, near = ("none is chosen", "") if camera is None else (repr(camera), did_you_mean(camera, known))
-        raise ArgumentError(f"camera: {given}; take one of those of {run.directory}: {', '.join(known)}{near}")
-    if set(shown) <= set(known):
-        return [replace(run, camera=each) for each in shown]
-    said = f"{name} needs the cameras {' and '.join(shown)}; {said}; run the scene with `cameras` of these names"
-    raise FilesError(f"{run.directory}: {said}")
+    cameras = f"its cameras are {', '.join(known)}" if known else "it has one camera, without a name"
+    if exported == ANY_CAMERA:
+        choice, hint = ("none is chosen", "") if camera is None else (repr(camera), did_you_mean(camera, known))
+        raise ArgumentError(f"camera: {choice}; take one of those of {run.directory}: {', '.join(known)}{hint}")
+    if set(exported) <= set(known):
+        return [replace(run, camera=camera) for camera in exported]
+    fault = f"{name} needs the cameras {' and '.join(exported)}; {cameras}"
+    raise FilesError(f"{run.directory}: {fault}; run the scene with `cameras` of these names")
 
 
-def _convert(
+def _write_export(
     views: Sequence[Sequence[FinishedRun]], name: str, directory: Path, progress: ProgressCallback
 ) -> Exported:
-    """Convert runs, one or more, as the cameras have seen them that the format shows."""
+    """Write an export atomically; `views` has a list of copies of each run, one per exported camera."""
     runs = [run for run, *_ in views]
-    wanted, total, done = FORMATS[name], sum(run.frames for run in runs), 0
-    write: Write = import_module(f"taichi_msm.exports.{wanted.module or name}").write
+    export_format, total, done = FORMATS[name], sum(run.frames for run in runs), 0
+    write: FormatWriter = import_module(f"taichi_msm.exports.{export_format.module or name}").write
     sources = []
     for number, run in enumerate(runs):
-        own = partial(_count, progress, done, run.frames, total)
-        sources.append(Source(run, zero_padded(number) if len(runs) > 1 else "", own))
+        run_progress = partial(_report_progress, progress, done, run.frames, total)
+        sources.append(ExportSource(run, zero_padded(number) if len(runs) > 1 else "", run_progress))
         done += run.frames
     progress(0, total)
     notes: dict[str, list[Path]] = {}
-    with writing(directory), Publication(directory, EXPORT) as publication:
+    with writing(directory), Publication(directory, EXPORT_PUBLICATION) as publication:
         for run in chain.from_iterable(views):
             with run.unchanged():
-                if missing := [key for key in wanted.needs if not run.has(key)]:
-                    remedy = run.remedy(*wanted.needs, *wanted.uses)
+                if missing := [key for key in export_format.required_outputs if not run.has_output(key)]:
+                    remedy = run.remedy(*export_format.required_outputs, *export_format.optional_outputs)
                     raise FilesError(f"{run.directory / run.camera}: {name} needs {' and '.join(missing)}; {remedy}")
-        writer = write(sources, publication.staged)
+        writer = write(sources, publication.new_folder)
         for run in runs:
-            with _naming(run, name), run.unchanged():
+            with _name_run_in_errors(run, name), run.unchanged():
                 for note in next(writer):
                     notes.setdefault(note, []).append(run.directory)
         next(writer, None)
-        _write_index(runs, wanted.pairs, publication.staged / INDEX)
-        written = sorted(files(publication.staged, PATTERNS, strict=True))
-        add(publication.staged / RECORD, (json.dumps({"files": written}, indent=1) + "\n").encode())
-        publication.publish([*written, RECORD])
-    return Exported(directory, written, [*(_told(note, of) if len(runs) > 1 else note for note, of in notes.items())])
+        _write_index(runs, export_format.numbers_pairs, publication.new_folder / INDEX_FILE)
+        written = sorted(list_files(publication.new_folder, EXPORT_PATTERNS, strict=True))
+        write_new_file(
+            publication.new_folder / EXPORT_RECORD, (json.dumps({"files": written}, indent=1) + "\n").encode()
+        )
+        publication.publish([*written, EXPORT_RECORD])
+    several = len(runs) > 1
+    return Exported(directory, written, [_name_runs(note, of) if several else note for note, of in notes.items()])
 
 
-def _count(progress: ProgressCallback, before: int, frames: int, total: int, done: int, parts: int) -> None:
-    """Report the progress of a run as that of all runs."""
+def _report_progress(progress: ProgressCallback, before: int, frames: int, total: int, done: int, parts: int) -> None:
+    """Report the progress within a run as progress within all runs."""
     progress(before + frames * done // parts, total)
 
 
 @contextmanager
-def _naming(run: FinishedRun, name: str) -> Iterator[None]:
-    """Say of which run a fault is that its scene or its numbers have."""
+def _name_run_in_errors(run: FinishedRun, name: str) -> Iterator[None]:
+    """Convert errors of a run's scene or numbers to a FilesError that names the run."""
     try:
         with np.errstate(over="raise", divide="raise", invalid="raise"):
             yield
     except SceneError as error:
-        # The fault names what the scene is to change; here the picture itself must be put back.
+        # The remedy in the SceneError is to change the scene; here the picture must be restored.
         fault = error.lines[0].partition(";")[0]
-        raise FilesError(f"{run.directory}: {fault}; {PUT_BACK}") from None
+        raise FilesError(f"{run.directory}: {fault}; {RESTORE_PICTURE}") from None
     except FloatingPointError:
-        said = f"its numbers are too large for {name}; run the scene again"
-        raise FilesError(f"{run.directory}: {said}") from None
+        raise FilesError(f"{run.directory}: its numbers are too large for {name}; run the scene again") from None
 
 
-def _told(note: str, runs: Sequence[Path]) -> str:
-    """Say of which runs a note is."""
+def _name_runs(note: str, runs: Sequence[Path]) -> str:
+    """Prefix a warning with the runs to which it applies."""
     return f"{runs[0]}{f' and {len(runs) - 1} more' if len(runs) > 1 else ''}: {note}"
 
 
 def _write_index(runs: Sequence[FinishedRun], pairs: bool, path: Path) -> None:
-    """Write which run, or which pair of frames of it, has which number."""
+    """Write the table of runs, or of pairs of frames, by number."""
     rows: list[tuple[str | int, ...]] = []
     for run in runs:
         name = run.directory.as_posix()
         rows += [(name, frame) for frame in range(run.frames - 1)] if pairs else [(name,)]
-    with io.TextIOWrapper(create(path), "utf-8", "surrogateescape", newline="") as file:
+    with io.TextIOWrapper(create_file(path), "utf-8", "surrogateescape", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["number", "run", *(["frame"] if pairs else [])])
         writer.writerows([zero_padded(number), *row] for number, row in enumerate(rows))

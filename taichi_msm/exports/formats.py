@@ -1,6 +1,6 @@
-"""The formats of `export`. A new one is a row of this table, and a module of its name with a function `write`.
+"""Table of the export formats, and the runs as their input.
 
-The runs that an export is of, and how a format takes them.
+A format is a row of `FORMATS` and a module of its name with a function `write`.
 """
 
 from __future__ import annotations
@@ -12,53 +12,58 @@ from pathlib import Path
 from typing import NamedTuple
 
 from taichi_msm.errors import FilesError, ProgressCallback
-from taichi_msm.runs.directory import MAX_RECORD, files
+from taichi_msm.runs.directory import MAX_RECORD_BYTES, list_files
 from taichi_msm.runs.finished import FinishedRun, read_run, reading
 from taichi_msm.scene.outputs import NUMBER_PATTERN, RUN_RECORD, RUNS_FOLDER, SWEEP_RECORD
 from taichi_msm.system.files import read_regular
 
 
 class Format(NamedTuple):
-    """An export format."""
+    """Export format."""
 
-    means: str  # what it is for, in few words
-    needs: tuple[str, ...]  # the entries of a scene's `output` that it is made from
-    files: tuple[str, ...]  # their names as regular expressions, for `directory.files`
-    uses: tuple[str, ...] = ()  # further entries of `output`, of which it would have more
-    pairs: bool = False  # whether it numbers pairs of frames, not runs
-    cameras: tuple[str, ...] = ()  # what it shows: nothing that a camera sees, ANY camera, or those of these names
-    module: str = ""  # if it has another name than the format
+    description: str  # purpose, in few words
+    required_outputs: tuple[str, ...]  # entries of a scene's `output` that it needs
+    file_patterns: tuple[str, ...]  # regular expressions of its file names, for `list_files`
+    optional_outputs: tuple[str, ...] = ()  # further entries of `output` that it exports
+    numbers_pairs: bool = False  # whether numbers refer to pairs of frames instead of runs
+    cameras: tuple[str, ...] = ()  # cameras whose results it exports: none, ANY_CAMERA or these names
+    module: str = ""  # name of its module, if different from the format's
 
 
-def _each(*patterns: str) -> tuple[str, ...]:
-    """Give the patterns of files that are there for each run: in a folder of its own, or of the only run in none."""
+def _patterns_per_run(*patterns: str) -> tuple[str, ...]:
+    """Return the patterns of files per run: in a numbered folder, or without a folder for a single run."""
     return (*patterns, *(f"{NUMBER_PATTERN}/{pattern}" for pattern in patterns))
 
 
-# A camera that is chosen, or the only one.
-ANY = ("",)
+# The camera chosen by the user, or the only one.
+ANY_CAMERA = ("",)
 
 FORMATS = {
     "kitti": Format(
         "optical flow",
-        needs=("flow",),
-        uses=("occlusion", "png"),
-        files=(
+        required_outputs=("flow",),
+        optional_outputs=("occlusion", "png"),
+        file_patterns=(
             rf"training/image_2/{NUMBER_PATTERN}_1[01]\.png",
             rf"training/flow_occ/{NUMBER_PATTERN}_10\.png",
             rf"training/flow_noc/{NUMBER_PATTERN}_10\.png",
         ),
-        pairs=True,
-        cameras=ANY,
+        numbers_pairs=True,
+        cameras=ANY_CAMERA,
     ),
-    "tapvid": Format("tracks of points", needs=("tracks", "png"), files=(r"tapvid\.pkl",), cameras=ANY),
+    "tapvid": Format(
+        "tracks of points", required_outputs=("tracks", "png"), file_patterns=(r"tapvid\.pkl",), cameras=ANY_CAMERA
+    ),
     "tapvid3d": Format(
-        "tracks of points in space", needs=("tracks", "png"), files=(rf"{NUMBER_PATTERN}\.npz",), cameras=ANY
+        "tracks of points in space",
+        required_outputs=("tracks", "png"),
+        file_patterns=(rf"{NUMBER_PATTERN}\.npz",),
+        cameras=ANY_CAMERA,
     ),
     "stir": Format(
         "tracks of points in stereo",
-        needs=("tracks", "png"),
-        files=(
+        required_outputs=("tracks", "png"),
+        file_patterns=(
             rf"{NUMBER_PATTERN}/calib\.json",
             rf"{NUMBER_PATTERN}/(?:left|right)/seq00/frames/0ms-[0-9]+ms-visible\.mp4",
             rf"{NUMBER_PATTERN}/(?:left|right)/seq00/[0-9]+ms_icg(?:start|end)\.png",
@@ -67,60 +72,65 @@ FORMATS = {
         cameras=("left", "right"),
     ),
     "vtk": Format(
-        "for ParaView", needs=("trajectory",), files=_each(r"[0-9]{4,}\.vtu", r"surface\.pvd", r"picture\.png")
+        "for ParaView",
+        required_outputs=("trajectory",),
+        file_patterns=_patterns_per_run(r"[0-9]{4,}\.vtu", r"surface\.pvd", r"picture\.png"),
     ),
-    "gltf": Format("for Blender and browsers", needs=("trajectory",), files=_each(r"surface\.glb")),
+    "gltf": Format(
+        "for Blender and browsers", required_outputs=("trajectory",), file_patterns=_patterns_per_run(r"surface\.glb")
+    ),
     "obj": Format(
         "for other programs with surfaces",
-        needs=("trajectory",),
-        files=_each(r"[0-9]{4,}\.obj", r"surface\.mtl", r"picture\.png"),
+        required_outputs=("trajectory",),
+        file_patterns=_patterns_per_run(r"[0-9]{4,}\.obj", r"surface\.mtl", r"picture\.png"),
     ),
     "csv": Format(
         "forces and tracks as tables",
-        needs=(),
-        uses=("forces", "tracks"),
-        files=(r"forces\.csv", r"tracks\.csv"),
-        cameras=ANY,
+        required_outputs=(),
+        optional_outputs=("forces", "tracks"),
+        file_patterns=(r"forces\.csv", r"tracks\.csv"),
+        cameras=ANY_CAMERA,
         module="csv_tables",
     ),
 }
 
 
-class Source(NamedTuple):
-    """A run that is exported."""
+class ExportSource(NamedTuple):
+    """Run to export."""
 
-    run: FinishedRun  # as the first camera that the format shows has seen it
-    name: str  # its number among the runs; empty if it is the only one
-    progress: ProgressCallback  # of this run
-
-
-# Writes the files of all runs into an empty folder. It is a generator: after each run it gives what the user should
-# know about that run, and after the last it writes what is of all runs together.
-Write = Callable[[Sequence[Source], Path], Iterator[list[str]]]
+    run: FinishedRun  # with the first of the format's cameras selected
+    name: str  # number of the run as text; empty for a single run
+    progress: ProgressCallback  # called with the finished and total frames of this run
 
 
-def in_folders(write: Callable[[FinishedRun, Path, ProgressCallback], list[str]]) -> Write:
-    """Make a format of what writes one run into an empty folder."""
+# Writes the files of all runs to an empty folder. It is a generator that yields the warnings about each run in turn,
+# and then writes the files that combine runs.
+FormatWriter = Callable[[Sequence[ExportSource], Path], Iterator[list[str]]]
+
+
+def one_folder_per_run(write: Callable[[FinishedRun, Path, ProgressCallback], list[str]]) -> FormatWriter:
+    """Build a format's `write` from a function that writes one run to an empty folder and returns warnings."""
 
     @wraps(write)
-    def write_all(sources: Sequence[Source], folder: Path) -> Iterator[list[str]]:
+    def write_all(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
         for source in sources:
-            own = folder / source.name
-            own.mkdir(exist_ok=True)
-            yield write(source.run, own, source.progress)
+            run_folder = folder / source.name
+            run_folder.mkdir(exist_ok=True)
+            yield write(source.run, run_folder, source.progress)
 
     return write_all
 
 
 def read_runs(directories: Sequence[str | Path]) -> tuple[list[FinishedRun], int]:
-    """Read the records of runs in their folders and in those of sweeps; also counts the runs that are left out.
+    """Read the records of runs, given as folders of runs or of sweeps.
 
-    Of a sweep these are all that are not complete.
+    Returns:
+        The runs, of sweeps only the complete ones; and the number of incomplete runs of the sweeps.
 
     Raises:
-        FilesError: as `read_run` does, and when no run is left.
+        FilesError: as for `read_run`, and when there is no run.
     """
-    runs, left_out = [], 0
+    runs, incomplete = [], 0
     for directory in map(Path, directories):
         record = directory / SWEEP_RECORD
         with reading(record):
@@ -129,12 +139,12 @@ def read_runs(directories: Sequence[str | Path]) -> tuple[list[FinishedRun], int
             runs.append(read_run(directory))
             continue
         with reading(record):
-            names = files(directory, (rf"{RUNS_FOLDER}/{NUMBER_PATTERN}/{RUN_RECORD}",), strict=False)
+            names = list_files(directory, (rf"{RUNS_FOLDER}/{NUMBER_PATTERN}/{RUN_RECORD}",), strict=False)
             folders = sorted(((directory / name).parent for name in names), key=lambda folder: int(folder.name))
-            count = len(json.loads(read_regular(record, MAX_RECORD))["values"])
+            count = len(json.loads(read_regular(record, MAX_RECORD_BYTES))["values"])
         complete = [run for run in map(read_run, folders) if run.status == "complete"]
-        left_out += count - len(complete)
+        incomplete += count - len(complete)
         runs += complete
     if not runs:
         raise FilesError(f"{', '.join(map(str, directories))}: no run is complete; table.csv there tells why")
-    return runs, left_out
+    return runs, incomplete

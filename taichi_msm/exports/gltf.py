@@ -1,13 +1,12 @@
-"""The surface in motion as glTF 2.0, in one file with its picture.
+"""glTF 2.0 export: the animated surface and its picture in a single file.
 
-The mesh is that of the first frame. Every other frame is a morph target, which holds the differences of each vertex and
-its normal from the mesh. An animation gives the target of a frame the weight 1 at its time and 0 at the times of the
-frames beside it, linear between. Both glTF and this program use metres, y up, and texture coordinates from the upper
-left.
+The mesh is the surface in the first frame. Every other frame is a morph target, which contains the differences of
+vertices and normals from the mesh. In the animation, the weight of a frame's target is 1 at its time and 0 at the times
+of the adjacent frames, with linear interpolation. Like this package, glTF uses metres, y up, and texture coordinates
+from the upper left corner.
 
-Browsers store the targets in a texture with a layer for each, and WebGL 2 guarantees 256 layers. A run with more
-frames, or with so many points that the file would be too large, is reduced to key frames, and the largest error of this
-is reported.
+Browsers store each target in a layer of a texture, and WebGL 2 guarantees 256 layers. Runs with more frames, or with
+meshes that would make the file too large, are reduced to keyframes, and the largest interpolation error is reported.
 
 Source: the glTF 2.0 specification of Khronos, sections 3.6 (accessors), 3.7.2.2 (morph targets), 3.11 (animations) and
 4.4 (GLB).
@@ -26,42 +25,51 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import ProgressCallback
-from taichi_msm.exports.formats import in_folders
-from taichi_msm.exports.inputs import REFINE, picture_png, unit_normals
+from taichi_msm.exports.formats import one_folder_per_run
+from taichi_msm.exports.inputs import EXPORT_REFINE, picture_png, unit_normals
 from taichi_msm.model.surface import refine_surface
-from taichi_msm.runs.directory import create
+from taichi_msm.runs.directory import create_file
 from taichi_msm.runs.finished import FinishedRun
 from taichi_msm.version import __version__
 
-FILE = "surface.glb"
+# Limits of the morph targets: MAX_ARRAY_TEXTURE_LAYERS of WebGL 2, and a size that browsers load quickly.
+MAX_TARGETS = 256
+MAX_TARGETS_BYTES = 1 << 28
+TARGET_VERTEX_BYTES = 2 * 3 * 4  # differences of position and normal, float32
 
-# Limits of morph targets: by number, MAX_ARRAY_TEXTURE_LAYERS of every WebGL 2; by bytes, what still loads well.
-MOST_TARGETS = 256
-MOST_BYTES = 1 << 28
-# Bytes per vertex in a target: the differences of its position and of its normal.
-VERTEX_BYTES = 2 * 3 * 4
+# Constants of OpenGL for texture filtering and wrapping.
+GL_LINEAR, GL_LINEAR_MIPMAP_LINEAR, GL_CLAMP_TO_EDGE = 9729, 9987, 33071
 
-# OpenGL's constants for filtering a picture, and for clamping it at its edge.
-LINEAR, MIPMAPS, CLAMPED = 9729, 9987, 33071
+JSON_CHUNK, BINARY_CHUNK = b"JSON", b"BIN\0"
 
-MAGIC, VERSION = b"glTF", 2
-JSON, BINARY = b"JSON", b"BIN\0"
+COMPONENT_TYPES = {"f": 5126, "u": 5125}  # float32, uint32
+ACCESSOR_TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3"}
+# Constants of OpenGL for buffers of vertices and of vertex indices.
+GL_ARRAY_BUFFER, GL_ELEMENT_ARRAY_BUFFER = 34962, 34963
 
-COMPONENTS = {"f": 5126, "u": 5125}  # float32, uint32
-KINDS = {1: "SCALAR", 2: "VEC2", 3: "VEC3"}
-# What a buffer holds: vertices, or indices of vertices.
-VERTICES, INDICES = 34962, 34963
-
-# Every part begins at a multiple of this many bytes.
-ALIGNMENT = 4
+# Alignment of the chunks and of the views in them.
+ALIGNMENT_BYTES = 4
 
 
-@in_folders
+@one_folder_per_run
 def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    """Write the surface of a run, with its picture; raises what `FinishedRun.positions` and `picture_png` do."""
-    positions, picture, binary = run.positions(), picture_png(run), Binary()
-    most = max(1, min(MOST_TARGETS, MOST_BYTES // (VERTEX_BYTES * positions[0, ..., 0].size)))
-    keys = key_frames(positions, 1 + most, progress)
+    """Write the animated surface of a run with its picture.
+
+    Args:
+        run: the run.
+        folder: destination, empty.
+        progress: called with the finished frames and the total number of frames.
+
+    Returns:
+        Warnings.
+
+    Raises:
+        FilesError: as for `FinishedRun.positions`.
+        SceneError: as for `picture_png`.
+    """
+    positions, picture, binary = run.positions(), picture_png(run), BinaryChunk()
+    max_targets = max(1, min(MAX_TARGETS, MAX_TARGETS_BYTES // (TARGET_VERTEX_BYTES * positions[0, ..., 0].size)))
+    keys = key_frames(positions, 1 + max_targets, progress)
     primitive = _surface(positions[0], picture is not None, binary)
     targets = []
     for count, frame in enumerate(keys.frames[1:]):
@@ -82,7 +90,7 @@ def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[st
         mesh["weights"] = [0.0] * len(targets)
         mesh["extras"] = {"targetNames": [f"{time:g} s" for time in times[1:]], "error": keys.error}
         document["animations"] = [_animation(times.astype(np.float32), binary)]
-    with create(folder / FILE) as file:
+    with create_file(folder / "surface.glb") as file:
         file.writelines(binary.container({**document, "meshes": [mesh]}))
     if len(keys.frames) == run.frames:
         return []
@@ -92,31 +100,31 @@ def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[st
     ]
 
 
-def _surface(position: NDArray[np.floating], has_picture: bool, binary: Binary) -> dict[str, Any]:
-    """Make the triangles of the first frame, with the place of each vertex in the picture if there is one."""
-    first = refine_surface(position, REFINE)
+def _surface(position: NDArray[np.floating], has_picture: bool, binary: BinaryChunk) -> dict[str, Any]:
+    """Build the mesh of the first frame, with texture coordinates if there is a picture."""
+    first = refine_surface(position, EXPORT_REFINE)
     attributes = {
-        "POSITION": binary.accessor(first.vertices.astype(np.float32), VERTICES, bounds=True),
-        "NORMAL": binary.accessor(unit_normals(position).astype(np.float32), VERTICES),
+        "POSITION": binary.accessor(first.vertices.astype(np.float32), GL_ARRAY_BUFFER, bounds=True),
+        "NORMAL": binary.accessor(unit_normals(position).astype(np.float32), GL_ARRAY_BUFFER),
     }
     if has_picture:
-        attributes["TEXCOORD_0"] = binary.accessor(first.texture_coordinates.astype(np.float32), VERTICES)
+        attributes["TEXCOORD_0"] = binary.accessor(first.texture_coordinates.astype(np.float32), GL_ARRAY_BUFFER)
     indices = first.triangles.reshape(-1).astype(np.uint32)
-    return {"attributes": attributes, "indices": binary.accessor(indices, INDICES)}
+    return {"attributes": attributes, "indices": binary.accessor(indices, GL_ELEMENT_ARRAY_BUFFER)}
 
 
-def _target(first: NDArray[np.floating], position: NDArray[np.floating], binary: Binary) -> dict[str, int]:
-    """Make the morph target of a frame."""
-    moved = (position.astype(np.float64) - first).reshape(-1, 3).astype(np.float32)
-    turned = (unit_normals(position) - unit_normals(first)).astype(np.float32)
+def _target(first: NDArray[np.floating], position: NDArray[np.floating], binary: BinaryChunk) -> dict[str, int]:
+    """Build the morph target of a frame."""
+    displacement = (position.astype(np.float64) - first).reshape(-1, 3).astype(np.float32)
+    normal_change = (unit_normals(position) - unit_normals(first)).astype(np.float32)
     return {
-        "POSITION": binary.accessor(moved, VERTICES, bounds=True),
-        "NORMAL": binary.accessor(turned, VERTICES),
+        "POSITION": binary.accessor(displacement, GL_ARRAY_BUFFER, bounds=True),
+        "NORMAL": binary.accessor(normal_change, GL_ARRAY_BUFFER),
     }
 
 
-def _animation(times: NDArray[np.float32], binary: Binary) -> dict[str, Any]:
-    """Make the weights of all targets at all key frames: each is 1 at its own frame; the first frame has no target."""
+def _animation(times: NDArray[np.float32], binary: BinaryChunk) -> dict[str, Any]:
+    """Build the animation: the weight of each target is 1 at its keyframe; the first frame has no target."""
     weights = np.eye(len(times), dtype=np.float32)[:, 1:].reshape(-1)
     sampler = {
         "input": binary.accessor(times, bounds=True),
@@ -131,77 +139,88 @@ def _animation(times: NDArray[np.float32], binary: Binary) -> dict[str, Any]:
 
 
 def _material(has_picture: bool) -> dict[str, Any]:
-    """Make a rough material, so that light shows the shape of the surface."""
+    """Build a rough material, whose shading shows the shape of the surface."""
     colour = {"baseColorTexture": {"index": 0}} if has_picture else {}
     rough = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
     return {"name": "sheet", "doubleSided": True, "pbrMetallicRoughness": {**colour, **rough}}
 
 
-def _texture(picture: bytes, binary: Binary) -> dict[str, Any]:
-    """Add the picture to the document as a texture."""
+def _texture(picture: bytes, binary: BinaryChunk) -> dict[str, Any]:
+    """Build the texture of the picture."""
     return {
         "textures": [{"source": 0, "sampler": 0}],
         "images": [{"name": "picture", "mimeType": "image/png", "bufferView": binary.view(picture)}],
-        "samplers": [{"magFilter": LINEAR, "minFilter": MIPMAPS, "wrapS": CLAMPED, "wrapT": CLAMPED}],
+        "samplers": [
+            {
+                "magFilter": GL_LINEAR,
+                "minFilter": GL_LINEAR_MIPMAP_LINEAR,
+                "wrapS": GL_CLAMP_TO_EDGE,
+                "wrapT": GL_CLAMP_TO_EDGE,
+            }
+        ],
     }
 
 
 class KeyFrames(NamedTuple):
-    """Key frames of a motion: between two of them every point moves in a straight line at constant speed."""
+    """Keyframes of a motion, which is interpolated linearly between them."""
 
-    frames: list[int]  # their numbers, in order; the first and the last frame are among them
-    error: float  # the largest distance between a point in any frame and where the key frames beside it place it [m]
+    frames: list[int]  # indices in ascending order, including the first and the last frame
+    error: float  # largest interpolation error of any mass point in any frame [m]
 
 
 def key_frames(
-    position: NDArray[np.floating], most: int, progress: ProgressCallback = lambda done, total: None
+    position: NDArray[np.floating], limit: int, progress: ProgressCallback = lambda done, total: None
 ) -> KeyFrames:
-    """Choose the key frames of a motion: all frames, unless they are too many.
+    """Choose the keyframes of a motion: all frames if possible, otherwise a greedy selection.
 
-    If they are, the first and the last frame are key frames to begin with. Then the frame that the key frames represent
-    worst becomes a key frame too, up to `most`, 2 or more. So key frames are close together where the motion is sudden.
-    Positions [m] are at equal distances in time, shape (frames, rows, cols, 3).
+    The selection starts with the first and the last frame, and repeatedly adds the frame with the largest interpolation
+    error. Keyframes are therefore dense where the motion is sudden.
 
-    Source: Douglas and Peucker 1973, for all points together and with a given number instead of a tolerance.
+    Args:
+        position: positions at equidistant times [m], shape (frames, rows, cols, 3).
+        limit: maximum number of keyframes, 2 or more.
+        progress: called with the chosen and the maximum number of keyframes.
+
+    Source: Douglas and Peucker 1973, applied to all mass points at once, with a number instead of a tolerance.
     """
     count = len(position)
-    if count <= most:
+    if count <= limit:
         return KeyFrames(list(range(count)), 0.0)
     chosen = [0, count - 1]
-    spans = [_farthest(position, 0, count - 1)]
-    while len(chosen) < most and -spans[0].error > 0:
-        progress(len(chosen), most)
+    spans = [_worst_frame(position, 0, count - 1)]
+    while len(chosen) < limit and -spans[0].error > 0:
+        progress(len(chosen), limit)
         span = heapq.heappop(spans)
         chosen.append(span.frame)
-        heapq.heappush(spans, _farthest(position, span.first, span.frame))
-        heapq.heappush(spans, _farthest(position, span.frame, span.last))
+        heapq.heappush(spans, _worst_frame(position, span.first, span.frame))
+        heapq.heappush(spans, _worst_frame(position, span.frame, span.last))
     return KeyFrames(sorted(chosen), -spans[0].error)
 
 
 class _Span(NamedTuple):
-    """The frames from one key frame to the next; the span with the largest error sorts first."""
+    """Frames between two adjacent keyframes. The span with the largest error sorts first."""
 
-    error: float  # minus the largest distance between a point in any frame and where the key frames place it [m]
+    error: float  # negative of the largest interpolation error [m]
     frame: int  # the frame with this error
-    first: int  # the key frames
-    last: int
+    first: int  # keyframe at the beginning
+    last: int  # keyframe at the end
 
 
-def _farthest(position: NDArray[np.floating], first: int, last: int) -> _Span:
-    """Find the frame between two key frames that is farthest from the straight line between them."""
+def _worst_frame(position: NDArray[np.floating], first: int, last: int) -> _Span:
+    """Find the frame with the largest interpolation error between two keyframes."""
     start, end = position[first].astype(np.float64), position[last].astype(np.float64)
     worst = _Span(0.0, first, first, last)
     for frame in range(first + 1, last):
-        share = (frame - first) / (last - first)
-        apart = position[frame] - (start + share * (end - start))
-        worst = min(worst, _Span(-float(np.linalg.norm(apart, axis=-1).max()), frame, first, last))
+        fraction = (frame - first) / (last - first)
+        error = position[frame] - (start + fraction * (end - start))
+        worst = min(worst, _Span(-float(np.linalg.norm(error, axis=-1).max()), frame, first, last))
     return worst
 
 
-class Binary:
-    """The binary chunk of a .glb file as it grows: its container has JSON, and this chunk that the JSON refers to.
+class BinaryChunk:
+    """Binary chunk of a .glb file, to which the JSON chunk refers.
 
-    It is written here because a header of 12 bytes and two chunks cost less than pygltflib and what that depends on.
+    The container, a header of 12 bytes and two chunks, is too simple to justify a dependency on pygltflib.
     """
 
     def __init__(self) -> None:
@@ -211,24 +230,38 @@ class Binary:
         self._length = 0
 
     def view(self, data: bytes | memoryview, target: int | None = None) -> int:
-        """Add bytes, and return the number of their view; `target` tells what they are for."""
-        place = {"buffer": 0, "byteOffset": self._length, "byteLength": len(data)}
-        self._views.append(place if target is None else {**place, "target": target})
+        """Append bytes.
+
+        Args:
+            data: the bytes.
+            target: their purpose, GL_ARRAY_BUFFER or GL_ELEMENT_ARRAY_BUFFER; None for other data.
+
+        Returns:
+            Index of their buffer view.
+        """
+        view = {"buffer": 0, "byteOffset": self._length, "byteLength": len(data)}
+        self._views.append(view if target is None else {**view, "target": target})
         self._parts += [data, _padding(len(data), b"\0")]
-        self._length += _padded(len(data))
+        self._length += _aligned_length(len(data))
         return len(self._views) - 1
 
     def accessor(self, values: NDArray[Any], target: int | None = None, *, bounds: bool = False) -> int:
-        """Add numbers, and return the number of their accessor, which has their `bounds` if asked for.
+        """Append numbers.
 
-        They are float32 or uint32, one number or a vector in each row; `target` tells what they are for.
+        Args:
+            values: float32 or uint32, shape (n,) or (n, k), k = 1 to 3.
+            target: as for `view`.
+            bounds: whether the accessor contains the minimum and maximum.
+
+        Returns:
+            Index of their accessor.
         """
         rows = np.ascontiguousarray(values).reshape(len(values), -1)
         accessor = {
             "bufferView": self.view(rows.data.cast("B"), target),
-            "componentType": COMPONENTS[rows.dtype.kind],
+            "componentType": COMPONENT_TYPES[rows.dtype.kind],
             "count": len(rows),
-            "type": KINDS[rows.shape[1]],
+            "type": ACCESSOR_TYPES[rows.shape[1]],
         }
         if bounds:
             accessor |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
@@ -236,20 +269,20 @@ class Binary:
         return len(self._accessors) - 1
 
     def container(self, document: dict[str, Any]) -> Iterator[bytes | memoryview]:
-        """Give the parts of a file with these data and the document that refers to them."""
-        own = {"accessors": self._accessors, "bufferViews": self._views, "buffers": [{"byteLength": self._length}]}
-        text = json.dumps({**document, **own}, separators=(",", ":"), allow_nan=False).encode()
+        """Yield the content of a .glb file with this chunk and the JSON document that refers to it."""
+        buffers = {"accessors": self._accessors, "bufferViews": self._views, "buffers": [{"byteLength": self._length}]}
+        text = json.dumps({**document, **buffers}, separators=(",", ":"), allow_nan=False).encode()
         text += _padding(len(text), b" ")
-        yield struct.pack("<4sII", MAGIC, VERSION, 12 + 8 + len(text) + 8 + self._length)
-        yield struct.pack("<I4s", len(text), JSON)
+        yield struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + self._length)
+        yield struct.pack("<I4s", len(text), JSON_CHUNK)
         yield text
-        yield struct.pack("<I4s", self._length, BINARY)
+        yield struct.pack("<I4s", self._length, BINARY_CHUNK)
         yield from self._parts
 
 
-def _padded(length: int) -> int:
-    return -(-length // ALIGNMENT) * ALIGNMENT
+def _aligned_length(length: int) -> int:
+    return -(-length // ALIGNMENT_BYTES) * ALIGNMENT_BYTES
 
 
 def _padding(length: int, filler: bytes) -> bytes:
-    return filler * (_padded(length) - length)
+    return filler * (_aligned_length(length) - length)

@@ -1,14 +1,14 @@
-"""Optical flow in the format of KITTI 2015.
+"""KITTI 2015 export: optical flow.
 
-Every pair of frames f and f + 1 is a scene of KITTI: `image_2/NNNNNN_10.png` and `_11.png`, and its flow in
-`flow_occ/NNNNNN_10.png`, valid wherever the sheet is, and `flow_noc/NNNNNN_10.png`, valid only where what is seen in f
-is seen in f + 1 too. Pairs are numbered through over all runs. All are in a folder `training`, as loaders of KITTI look
-for it. A flow (u, v) [px] is a PNG of 16 bits a channel,
+Every pair of frames f and f + 1 is a scene of KITTI with the pictures `image_2/NNNNNN_10.png` and `_11.png`. The flow
+in `flow_occ/NNNNNN_10.png` is valid on the whole sheet, that in `flow_noc/NNNNNN_10.png` only where the material point
+is visible in both frames. Pairs are numbered consecutively over all runs. The folders are in a folder `training`, as
+KITTI loaders expect. A flow (u, v) [px] is stored in a PNG with 16 bits per channel as
 
-    red = 64 u + 2^15,   green = 64 v + 2^15,   blue = 1: valid,
+    red = 64 u + 2^15,   green = 64 v + 2^15,   blue = 1,
 
-and all are 0 where it is not valid: on the background, and where red or green would not fit, that is beyond -512 and
-+511.98 px. Rounded to the nearest, flow is exact to 1/128 px.
+and invalid pixels are 0: the background, and values outside -512 to +511.98 px. Rounding makes the flow exact to
+1/128 px.
 
 Source: the development kit of KITTI's scene flow benchmark 2015, readme.txt and cpp/io_flow.h.
 """
@@ -24,34 +24,40 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import FilesError, ProgressCallback
-from taichi_msm.exports.formats import Source
+from taichi_msm.exports.formats import ExportSource
 from taichi_msm.runs.arrays import read_flo
-from taichi_msm.runs.directory import MAX_RECORD, add
+from taichi_msm.runs.directory import MAX_RECORD_BYTES, write_new_file
 from taichi_msm.runs.finished import FinishedRun, reading
 from taichi_msm.scene.outputs import OUTPUTS, zero_padded
 from taichi_msm.system.files import read_regular
 
-SCALE, ZERO, LARGEST = 64.0, 32768.0, 65535.0
+FLOW_SCALE, FLOW_OFFSET, MAX_VALUE = 64.0, 32768.0, 65535.0
 
-# Of PNGs.
-SIGNATURE = b"\x89PNG\r\n\x1a\n"
-DEPTH, RGB = 16, 2
-# The filter that keeps the difference from the row above, byte by byte.
-UP = 2
-
-# Level 1 takes a tenth of the time of the default (17 against 169 ms for rough flow of 512 x 512 pixels) for 7 % more
-# bytes.
-COMPRESS_LEVEL = 1
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+PNG_BIT_DEPTH, PNG_RGB = 16, 2
+# Stores the byte-wise difference from the row above.
+PNG_UP_FILTER = 2
 
 
-# The folders, each with the entry of `output` that it is made from.
-MADE_FROM = {"flow_occ": "flow", "flow_noc": "occlusion", "image_2": "png"}
+# The folders and the entries of `output` from which they are made.
+SOURCE_OUTPUTS = {"flow_occ": "flow", "flow_noc": "occlusion", "image_2": "png"}
 
 
-def write(sources: Sequence[Source], folder: Path) -> Iterator[list[str]]:
-    """Write the flow of runs, and the frames and occlusion of those that have them."""
+def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
+    """Write the flow of runs, with pictures and occlusion if available.
+
+    Args:
+        sources: the runs.
+        folder: destination, empty.
+
+    Yields:
+        Warnings about each run.
+
+    Raises:
+        FilesError: when a run has a single frame.
+    """
     training, first = folder / "training", 0
-    for name in MADE_FROM:
+    for name in SOURCE_OUTPUTS:
         (training / name).mkdir(parents=True)
     for source in sources:
         yield _write_run(source.run, training, first, source.progress)
@@ -59,39 +65,47 @@ def write(sources: Sequence[Source], folder: Path) -> Iterator[list[str]]:
 
 
 def _write_run(run: FinishedRun, training: Path, first: int, progress: ProgressCallback) -> list[str]:
-    """Write the pairs of a run, numbered from the first on."""
+    """Write the pairs of a run, numbered from `first`."""
     pairs = run.frames - 1
     if pairs == 0:
         raise FilesError(f"{run.directory}: has only one frame, and flow needs two; run the scene to its end")
-    flow_occ, flow_noc, image_2 = (training / name for name in MADE_FROM)
+    flow_occ, flow_noc, image_2 = (training / name for name in SOURCE_OUTPUTS)
     for pair in range(pairs):
         progress(pair, pairs)
-        source, name = run.result("flow", pair), zero_padded(first + pair)
+        source, name = run.result_path("flow", pair), zero_padded(first + pair)
         with reading(source):
             flow = read_flo(source, run.scene.render.size)
-        add(flow_occ / f"{name}_10.png", png16(encode(flow)))
-        if run.has("occlusion"):
-            add(flow_noc / f"{name}_10.png", png16(encode(flow, ~(run.picture("occlusion", pair)[..., 0] > 0))))
-        for number in (0, 1) if run.has("png") else ():
-            _copy(run, pair + number, image_2 / f"{name}_1{number}.png")
+        write_new_file(flow_occ / f"{name}_10.png", png16(encode_flow(flow)))
+        if run.has_output("occlusion"):
+            write_new_file(
+                flow_noc / f"{name}_10.png",
+                png16(encode_flow(flow, ~(run.read_picture("occlusion", pair)[..., 0] > 0))),
+            )
+        for number in (0, 1) if run.has_output("png") else ():
+            _copy_frame(run, pair + number, image_2 / f"{name}_1{number}.png")
     remedy = run.remedy("occlusion", "png")
     return [
         f"{name} is left out: {OUTPUTS[key].result} is not among the results; {remedy}"
-        for name, key in MADE_FROM.items()
-        if not run.has(key)
+        for name, key in SOURCE_OUTPUTS.items()
+        if not run.has_output(key)
     ]
 
 
-def encode(flow: NDArray[np.float32], seen: NDArray[np.bool_] | None = None) -> NDArray[np.uint16]:
-    """Turn flow to the right and down [px], shape (height, width, 2), into the colours of KITTI, shape (..., 3).
+def encode_flow(flow: NDArray[np.float32], visible: NDArray[np.bool_] | None = None) -> NDArray[np.uint16]:
+    """Encode flow as the colours of KITTI.
 
-    Values that do not fit are not valid, nor are those where nothing is `seen`, shape (height, width).
+    Args:
+        flow: flow to the right and down [px], shape (height, width, 2).
+        visible: mask of valid pixels, shape (height, width); None for all.
+
+    Returns:
+        Colours, shape (height, width, 3); 0 where the flow is invalid or out of range.
     """
-    # In double precision, so that the only rounding is to the nearest whole number.
-    scaled = np.rint(flow.astype(np.float64) * SCALE + ZERO)
-    valid = ((scaled >= 0) & (scaled <= LARGEST)).all(axis=-1)
-    if seen is not None:
-        valid &= seen
+    # In double precision, so that only the final rounding changes the value.
+    scaled = np.rint(flow.astype(np.float64) * FLOW_SCALE + FLOW_OFFSET)
+    valid = ((scaled >= 0) & (scaled <= MAX_VALUE)).all(axis=-1)
+    if visible is not None:
+        valid &= visible
     colours = np.zeros((*valid.shape, 3), np.uint16)
     colours[valid, :2] = scaled[valid]
     colours[valid, 2] = 1
@@ -99,10 +113,10 @@ def encode(flow: NDArray[np.float32], seen: NDArray[np.bool_] | None = None) -> 
 
 
 def png16(picture: NDArray[np.uint16]) -> bytes:
-    """Encode colours, shape (height, width, 3), as a PNG of 16 bits a channel.
+    """Encode colours, shape (height, width, 3), as a PNG with 16 bits per channel.
 
-    It is written here, in half a page: Pillow has no such pictures in colour, pypng has had no release since 2022, and
-    OpenCV would be 60 MB to install for one call.
+    Pillow does not support 16-bit colours, pypng has had no release since 2022, and OpenCV would be a dependency of
+    60 MB for a single call.
 
     Source: the PNG specification of the W3C (third edition), sections 9 (filters) and 11 (chunks).
     """
@@ -110,11 +124,12 @@ def png16(picture: NDArray[np.uint16]) -> bytes:
     rows = picture.astype(">u2").view(np.uint8).reshape(height, -1)
     above = np.zeros_like(rows)
     above[1:] = rows[:-1]
-    filtered = np.full((height, 1 + rows.shape[1]), UP, np.uint8)
+    filtered = np.full((height, 1 + rows.shape[1]), PNG_UP_FILTER, np.uint8)
     filtered[:, 1:] = rows - above
-    header = struct.pack(">IIBBBBB", width, height, DEPTH, RGB, 0, 0, 0)
-    data = zlib.compress(filtered.tobytes(), COMPRESS_LEVEL)
-    return b"".join([SIGNATURE, *_chunk(b"IHDR", header), *_chunk(b"IDAT", data), *_chunk(b"IEND", b"")])
+    header = struct.pack(">IIBBBBB", width, height, PNG_BIT_DEPTH, PNG_RGB, 0, 0, 0)
+    # For rough flow of 512 x 512 pixels, level 1 takes 17 ms, the default 169 ms for 7 % fewer bytes.
+    data = zlib.compress(filtered.tobytes(), 1)
+    return b"".join([PNG_SIGNATURE, *_chunk(b"IHDR", header), *_chunk(b"IDAT", data), *_chunk(b"IEND", b"")])
 
 
 def _chunk(kind: bytes, data: bytes) -> Iterator[bytes]:
@@ -124,10 +139,10 @@ def _chunk(kind: bytes, data: bytes) -> Iterator[bytes]:
     yield struct.pack(">I", zlib.crc32(data, zlib.crc32(kind)))
 
 
-def _copy(run: FinishedRun, number: int, path: Path) -> None:
-    """Copy a frame, after checking that it is a whole picture of the right size."""
-    run.picture("png", number)
-    source = run.result("png", number)
+def _copy_frame(run: FinishedRun, number: int, path: Path) -> None:
+    """Copy a frame after decoding it to verify its content and size."""
+    run.read_picture("png", number)
+    source = run.result_path("png", number)
     with reading(source):
-        data = read_regular(source, MAX_RECORD)
-    add(path, data)
+        data = read_regular(source, MAX_RECORD_BYTES)
+    write_new_file(path, data)

@@ -1,7 +1,7 @@
-"""The surface as Wavefront OBJ: one file for every frame; all share one material and the picture.
+"""Wavefront OBJ export: a file per frame, with a common material and texture.
 
-Texture coordinates are counted from the picture's lower left. The position, the texture coordinate and the normal of a
-vertex have the same index.
+Texture coordinates count from the picture's lower left corner. Position, texture coordinate and normal of a vertex
+share an index.
 
 Source: Wavefront's Advanced Visualizer manual, appendix B1 (OBJ) and its specification of materials (MTL).
 """
@@ -16,34 +16,43 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import ProgressCallback
-from taichi_msm.exports.formats import in_folders
-from taichi_msm.exports.inputs import PICTURE, REFINE, picture_png, unit_normals
+from taichi_msm.exports.formats import one_folder_per_run
+from taichi_msm.exports.inputs import EXPORT_REFINE, FLOAT32_FORMAT, PICTURE_FILE, picture_png, unit_normals
 from taichi_msm.model.surface import refine_surface
-from taichi_msm.runs.directory import add, create
+from taichi_msm.runs.directory import create_file, write_new_file
 from taichi_msm.runs.finished import FinishedRun
 
-MATERIAL = "surface.mtl"
-
-# As many digits as distinguish any two numbers of single precision.
-EXACT = "%.9g"
+MATERIAL_FILE = "surface.mtl"
 
 
-@in_folders
+@one_folder_per_run
 def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    """Write the surface of every frame, its material and the picture; raises as `gltf.write` does."""
+    """Write the surface of every frame, the material and the picture.
+
+    Args:
+        run: the run.
+        folder: destination, empty.
+        progress: called with the finished frames and the total number of frames.
+
+    Returns:
+        Warnings.
+
+    Raises:
+        FilesError: as for `FinishedRun.positions`.
+        SceneError: as for `picture_png`.
+    """
     positions, picture = run.positions(), picture_png(run)
     if picture is not None:
-        add(folder / PICTURE, picture)
-    add(folder / MATERIAL, "".join(f"{line}\n" for line in _material(picture is not None)).encode())
-    first = refine_surface(positions[0], REFINE)
-    from_below = first.texture_coordinates * (1, -1) + (0, 1)
-    coordinates = _lines("vt", from_below)
+        write_new_file(folder / PICTURE_FILE, picture)
+    write_new_file(folder / MATERIAL_FILE, "".join(f"{line}\n" for line in _material(picture is not None)).encode())
+    first = refine_surface(positions[0], EXPORT_REFINE)
+    coordinates = _lines("vt", first.texture_coordinates * (1, -1) + (0, 1))
     corners = np.repeat(first.triangles + 1, 3, axis=1)
     faces = ("f %d/%d/%d %d/%d/%d %d/%d/%d\n" * len(corners)) % tuple(corners.ravel().tolist())
     for frame, position in enumerate(positions):
         progress(frame, run.frames)
-        with io.TextIOWrapper(create(folder / f"{frame:04}.obj"), "ascii", newline="") as file:
-            file.write(f"# {run.time[frame]:g} s, in metres\nmtllib {MATERIAL}\n")
+        with io.TextIOWrapper(create_file(folder / f"{frame:04}.obj"), "ascii", newline="") as file:
+            file.write(f"# {run.time[frame]:g} s, in metres\nmtllib {MATERIAL_FILE}\n")
             file.write(_lines("v", position.reshape(-1, 3)))
             file.write(coordinates)
             file.write(_lines("vn", unit_normals(position)))
@@ -52,13 +61,13 @@ def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[st
 
 
 def _lines(key: str, rows: NDArray[np.floating]) -> str:
-    """Write a line for every row of numbers."""
-    line = " ".join([key, *[EXACT] * rows.shape[1]]) + "\n"
+    """Format one line per row of numbers."""
+    line = " ".join([key, *[FLOAT32_FORMAT] * rows.shape[1]]) + "\n"
     return (line * len(rows)) % tuple(rows.ravel().tolist())
 
 
 def _material(has_picture: bool) -> Iterable[str]:
-    """Write a material without highlights."""
+    """Return the lines of a material without highlights."""
     yield from ("newmtl sheet", "Kd 1 1 1", "Ks 0 0 0", "illum 1")
     if has_picture:
-        yield f"map_Kd {PICTURE}"
+        yield f"map_Kd {PICTURE_FILE}"

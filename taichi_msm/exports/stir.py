@@ -1,19 +1,20 @@
-"""Tracks of points in stereo in the format of STIR, surgical tattoos in infrared.
+"""STIR export (surgical tattoos in infrared): stereo tracks.
 
 Every run has a folder with
 
-    calib.json                                      both cameras, and from the left to the right one
-    left/seq00/frames/0ms-1200ms-visible.mp4        what the left camera sees; right/ is the same of the right one
-    left/seq00/segmentation/icgstartseg.png         255 on a disc around every marked point in the first frame, else 0
-    left/seq00/segmentation/icgendseg.png           the same in the last frame
-    left/seq00/0ms_icgstart.png, 1200ms_icgend.png  the first and the last frame
+    calib.json                                      both cameras, and the transform from the left to the right one
+    left/seq00/frames/0ms-1200ms-visible.mp4        video of the left camera; right/ has the files of the right camera
+    left/seq00/segmentation/icgstartseg.png         first frame: 255 on a disc around every marked track, else 0
+    left/seq00/segmentation/icgendseg.png           the same for the last frame
+    left/seq00/0ms_icgstart.png, 1200ms_icgend.png  first and last frame
 
-STIR's infrared pictures show the tattoos alone; here they are the frames, by whose texture its loader pairs the points
-of the left and the right picture. Marked are the tracked points that both cameras see in the first and in the last
-frame, as far as their discs do not touch. A disc's centre is the pixel that the point is in.
+STIR's infrared pictures show only the tattoos. Here, they are the visible frames, whose texture the loader needs to
+match left and right tracks. Marked are the tracks that are visible to both cameras in the first and the last frame,
+unless their discs would touch. The centre of a disc is the pixel that contains the track.
 
-A point X in the axes of the left camera (OpenCV's, [m]) is `rotation` X + `translation` in those of the right one, so
-that the first number of `translation` is minus the baseline. Camera matrices count from the centre of the first pixel.
+A position X in the axes of the left camera (OpenCV's, [m]) is `rotation` X + `translation` in those of the right one,
+so that the first component of `translation` is the negative baseline. Camera matrices count from the centre of the
+first pixel.
 
 Source: athaddius/STIRLoader, STIRLoader/STIRLoader.py at 7e7f87c (lines 23 to 53, 69 to 80, 128 to 200, 204 to 281,
 336 to 401, 582 to 587, 695 to 706).
@@ -34,127 +35,136 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm.errors import FilesError, NotInstalledError, ProgressCallback
-from taichi_msm.exports.formats import Source
-from taichi_msm.exports.inputs import FIRST_CENTRE, Pinhole, read_pinhole, read_tracks
+from taichi_msm.exports.formats import ExportSource
+from taichi_msm.exports.inputs import FIRST_PIXEL_CENTRE, Pinhole, read_pinhole, read_tracks
 from taichi_msm.runs import media
-from taichi_msm.runs.directory import add, create
+from taichi_msm.runs.directory import create_file, write_new_file
 from taichi_msm.runs.finished import FinishedRun
 from taichi_msm.scene import outputs
 from taichi_msm.scene.outputs import zero_padded
 
-NAME, SIDES = "stir", ("left", "right")
+FORMAT_NAME, CAMERAS = "stir", ("left", "right")
 
-# What STIR's loader takes: pictures of this size, and for places in space disparities between these [px].
-SIZE, LEAST, MOST = (1280, 1024), 8, 105
+# Limits of STIR's loader: size of the pictures [px], and disparities for stereo triangulation.
+LOADER_SIZE, MIN_DISPARITY_PX, MAX_DISPARITY_PX = (1280, 1024), 8, 105
 
-# The radius of a disc is the width of the picture over this.
-PER_WIDTH = 160
+# Ratio of the width of the picture to the radius of a disc.
+WIDTH_PER_DISC_RADIUS = 160
 
-# How far the cameras may be from being beside each other: cosines of angles, and shares of the baseline.
-ALIGNED = 1e-6
+# Tolerance of a rectified stereo pair: deviation of the rotation matrix, and offsets relative to the baseline.
+ALIGNMENT_TOLERANCE = 1e-6
 
 Pixels = NDArray[np.int64]
 
 
-def write(sources: Sequence[Source], folder: Path) -> Iterator[list[str]]:
-    """Write the films of runs, the marked points and the cameras.
+def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
+    """Write the videos, marked tracks and cameras of runs.
+
+    Args:
+        sources: the runs.
+        folder: destination, empty.
+
+    Yields:
+        Warnings about each run.
 
     Raises:
-        FilesError: what `read_pinhole` does, and when the cameras are not beside each other.
+        FilesError: as for `read_pinhole`, and when the cameras are not a rectified stereo pair.
+        ArgumentError: as for `read_pinhole`.
         NotInstalledError: when PyAV is not installed.
     """
     if not outputs.is_pyav_installed():
-        raise NotInstalledError(f"--format {outputs.PYAV_NOT_INSTALLED.replace('mp4', NAME, 1)}")
+        raise NotInstalledError(f"--format {outputs.PYAV_NOT_INSTALLED.replace('mp4', FORMAT_NAME, 1)}")
     for run, name, progress in sources:
         yield _write_run(run, folder / (name or zero_padded(0)), progress)
 
 
 def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    runs = [replace(run, camera=side) for side in SIDES]
+    runs = [replace(run, camera=side) for side in CAMERAS]
     folder.mkdir()
-    left, right = (read_pinhole(each, NAME) for each in runs)
+    left, right = (read_pinhole(each, FORMAT_NAME) for each in runs)
     baseline = _baseline(run, left, right)
-    add(folder / "calib.json", (json.dumps(_calibration(left, right, baseline), indent=2) + "\n").encode())
-    radius = max(1, round(run.scene.render.size[0] / PER_WIDTH))
-    pixels, tracks = _marked(runs, radius)
+    write_new_file(folder / "calib.json", (json.dumps(_calibration(left, right, baseline), indent=2) + "\n").encode())
+    radius = max(1, round(run.scene.render.size[0] / WIDTH_PER_DISC_RADIUS))
+    pixels, tracks = _choose_tracks(runs, radius)
     for number, each in enumerate(runs):
         sequence = folder / each.camera / "seq00"
         (sequence / "segmentation").mkdir(parents=True)
-        for part, place in zip(("start", "end"), pixels[number], strict=True):
-            mask = _png(_discs(place, run.scene.render.size, radius))
-            add(sequence / "segmentation" / f"icg{part}seg.png", mask)
-        _write_frames(each, sequence, partial(_of_both, progress, number))
+        for name, centres in zip(("start", "end"), pixels[number], strict=True):
+            mask = _png(_discs(centres, run.scene.render.size, radius))
+            write_new_file(sequence / "segmentation" / f"icg{name}seg.png", mask)
+        _write_frames(each, sequence, partial(_report_progress, progress, number))
     return _notes(run.scene.render.size, pixels, tracks, baseline)
 
 
 def _baseline(run: FinishedRun, left: Pinhole, right: Pinhole) -> float:
-    """Tell how far the right camera is to the right of the left one [m]; a FilesError if it is anywhere else."""
-    # From the axes of the left camera to those of the right one, in every frame.
-    turn = right.poses[..., :3] @ left.poses[..., :3].transpose(0, 2, 1)
-    shift = right.poses[..., 3] - (turn @ left.poses[..., 3:])[..., 0]
-    baseline = -float(shift[0, 0])
-    aligned = np.abs(turn - np.eye(3)).max() < ALIGNED
-    aside = np.abs(shift - [-baseline, 0.0, 0.0]).max() < ALIGNED * baseline
-    if not (aligned and aside) or (left.focal != right.focal).any():
-        said = f"{NAME} needs the camera right beside left, to the right of it and just like it"
-        raise FilesError(f"{run.directory}: {said}; run the scene with `right: {{beside: left, baseline: 0.005}}`")
+    """Return the baseline of a rectified stereo pair [m]; raise a FilesError for other cameras."""
+    # Transform from the axes of the left camera to those of the right one, in every frame.
+    rotation = right.poses[..., :3] @ left.poses[..., :3].transpose(0, 2, 1)
+    translation = right.poses[..., 3] - (rotation @ left.poses[..., 3:])[..., 0]
+    baseline = -float(translation[0, 0])
+    is_parallel = np.abs(rotation - np.eye(3)).max() < ALIGNMENT_TOLERANCE
+    is_horizontal = np.abs(translation - [-baseline, 0.0, 0.0]).max() < ALIGNMENT_TOLERANCE * baseline
+    if not (is_parallel and is_horizontal) or (left.focal != right.focal).any():
+        fault = f"{FORMAT_NAME} needs the camera right beside left, to the right of it and just like it"
+        raise FilesError(f"{run.directory}: {fault}; run the scene with `right: {{beside: left, baseline: 0.005}}`")
     return baseline
 
 
 def _calibration(left: Pinhole, right: Pinhole, baseline: float) -> dict[str, Any]:
-    """Describe both cameras as STIR does."""
+    """Build the content of calib.json."""
     matrices: dict[str, Any] = {}
-    for side, camera in zip(SIDES, (left, right), strict=True):
-        (across, down), (x, y) = camera.focal.tolist(), (camera.centre - FIRST_CENTRE).tolist()
+    for side, camera in zip(CAMERAS, (left, right), strict=True):
+        (across, down), (x, y) = camera.focal.tolist(), (camera.centre - FIRST_PIXEL_CENTRE).tolist()
         matrices[f"{side}cameramat"] = [[across, 0.0, x], [0.0, down, y], [0.0, 0.0, 1.0]]
         matrices[f"{side}distortioncoeffs"] = [0.0] * 5
     return {**matrices, "rotation": np.eye(3).tolist(), "translation": [-baseline, 0.0, 0.0]}
 
 
-def _of_both(progress: ProgressCallback, before: int, done: int, total: int) -> None:
-    """Report the progress of a camera, after so many others, as that of both."""
-    progress(before * total + done, len(SIDES) * total)
+def _report_progress(progress: ProgressCallback, before: int, done: int, total: int) -> None:
+    """Report the progress of a camera as that of both; `before` is the number of finished cameras."""
+    progress(before * total + done, len(CAMERAS) * total)
 
 
-def _marked(runs: Sequence[FinishedRun], radius: int) -> tuple[Pixels, int]:
-    """Choose the points to mark: their pixels of both cameras in the first and last frame, shape (2, 2, n, 2).
+def _choose_tracks(runs: Sequence[FinishedRun], radius: int) -> tuple[Pixels, int]:
+    """Choose the tracks to mark.
 
-    Also gives how many are tracked.
+    Returns:
+        Their pixels for each camera in the first and the last frame, shape (2, 2, n, 2); and the number of all tracks.
     """
-    points, occluded = (np.stack(each)[:, :, [0, -1]] for each in zip(*map(read_tracks, runs), strict=True))
-    pixels = np.floor(np.nan_to_num(points)).astype(np.int64).transpose(0, 2, 1, 3)
+    tracks, occluded = (np.stack(each)[:, :, [0, -1]] for each in zip(*map(read_tracks, runs), strict=True))
+    pixels = np.floor(np.nan_to_num(tracks)).astype(np.int64).transpose(0, 2, 1, 3)
     inside = ((pixels >= radius) & (pixels < np.array(runs[0].scene.render.size) - radius)).all(axis=(0, 1, 3))
     chosen: list[int] = []
     for n in np.flatnonzero(inside & ~occluded.any(axis=(0, 2))).tolist():
-        apart = np.abs(pixels[:, :, chosen] - pixels[:, :, [n]]).max(axis=-1)
-        if (apart > 2 * radius + 1).all():
+        distance = np.abs(pixels[:, :, chosen] - pixels[:, :, [n]]).max(axis=-1)
+        if (distance > 2 * radius + 1).all():
             chosen.append(n)
-    return pixels[:, :, chosen], points.shape[1]
+    return pixels[:, :, chosen], tracks.shape[1]
 
 
 def _discs(pixels: Pixels, size: tuple[int, int], radius: int) -> NDArray[np.uint8]:
-    """Draw discs around pixels, shape (n, 2), that are inside of a picture of this width and height."""
+    """Draw discs around pixels, shape (n, 2), in a mask of a width and height."""
     mask = np.zeros(size[::-1], np.uint8)
-    reach = np.arange(-radius, radius + 1)
-    disc = (reach[:, None] ** 2 + reach**2 <= radius**2) * np.uint8(255)
+    offset = np.arange(-radius, radius + 1)
+    disc = (offset[:, None] ** 2 + offset**2 <= radius**2) * np.uint8(255)
     for x, y in pixels.tolist():
         mask[y - radius : y + radius + 1, x - radius : x + radius + 1] |= disc
     return mask
 
 
 def _write_frames(run: FinishedRun, folder: Path, progress: ProgressCallback) -> None:
-    """Write the film of a camera, and its first and last frame."""
+    """Write the video of a camera, and its first and last frame."""
     render = run.scene.render
     end = round(1000 * run.time[-1])
     (folder / "frames").mkdir()
-    with create(folder / "frames" / f"0ms-{end}ms-visible.mp4") as file:
-        film = media.Mp4Writer(file, render.size, run.scene.time.frames_per_second, render.quality)
+    with create_file(folder / "frames" / f"0ms-{end}ms-visible.mp4") as file:
+        video = media.Mp4Writer(file, render.size, run.scene.time.frames_per_second, render.quality)
         for frame in range(run.frames):
             progress(frame, run.frames)
-            film.add(run.picture("png", frame))
-        film.close()
-    add(folder / "0ms_icgstart.png", _png(run.picture("png", 0)))
-    add(folder / f"{end}ms_icgend.png", _png(run.picture("png", run.frames - 1)))
+            video.add(run.read_picture("png", frame))
+        video.close()
+    write_new_file(folder / "0ms_icgstart.png", _png(run.read_picture("png", 0)))
+    write_new_file(folder / f"{end}ms_icgend.png", _png(run.read_picture("png", run.frames - 1)))
 
 
 def _png(picture: NDArray[np.uint8]) -> bytes:
@@ -164,21 +174,20 @@ def _png(picture: NDArray[np.uint8]) -> bytes:
 
 
 def _notes(size: tuple[int, int], pixels: Pixels, tracks: int, baseline: float) -> list[str]:
-    """Say what is left out, and what STIR's loader does not take."""
+    """Build warnings about omitted tracks and limits of STIR's loader."""
     notes, marked = [], pixels.shape[2]
     if marked < tracks:
         notes.append(
             f"{marked} of {tracks} points are marked; the others are hidden from a camera in the first or last frame, "
             "or too near to the edge or to a marked one"
         )
-    if size != SIZE:
-        notes.append(
-            f"STIR's loader reads films of {SIZE[0]} x {SIZE[1]} pixels only; these have {size[0]} x {size[1]}"
-        )
+    if size != LOADER_SIZE:
+        width, height = LOADER_SIZE
+        notes.append(f"STIR's loader reads films of {width} x {height} pixels only; these have {size[0]} x {size[1]}")
     disparity = pixels[0, :, :, 0] - pixels[1, :, :, 0]
-    if ((disparity < LEAST) | (disparity > MOST)).any():
+    if ((disparity < MIN_DISPARITY_PX) | (disparity > MAX_DISPARITY_PX)).any():
         notes.append(
-            f"STIR's loader finds places in space for disparities of {LEAST} to {MOST} px; here they are "
-            f"{disparity.min()} to {disparity.max()} px with a baseline of {baseline:g} m"
+            f"STIR's loader finds places in space for disparities of {MIN_DISPARITY_PX} to {MAX_DISPARITY_PX} px; "
+            f"here they are {disparity.min()} to {disparity.max()} px with a baseline of {baseline:g} m"
         )
     return notes

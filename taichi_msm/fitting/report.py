@@ -32,7 +32,7 @@ from taichi_msm.errors import printable
 from taichi_msm.fitting.result import FitResult, FittedMap, sixteen_bits
 from taichi_msm.fitting.tikhonov import Choice
 from taichi_msm.plot_style import BLUE, DPI, GREY, ORANGE, SILVER, STYLE, TWO_COLUMN_WIDTH, VERMILION
-from taichi_msm.runs.directory import Contents, Listed, Publication, add, create, files
+from taichi_msm.runs.directory import IsListed, Publication, PublicationSpec, create_file, list_files, write_new_file
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.system.compiler import versions
 
@@ -46,19 +46,19 @@ PATTERNS = (r"fit\.json", r"scene\.yaml", r"fit\.png", r"map\.png", r"map-error\
 NO_PLOT = 'fit.png is left out, as matplotlib is not installed; pip install "taichi-msm[report]"'
 
 
-def _listed(record: Mapping[str, Any]) -> Listed:
+def _listed(record: Mapping[str, Any]) -> IsListed:
     return {RECORD, *record["files"]}.__contains__
 
 
 def publication(directory: Path) -> Publication:
     """Begin to replace the fit in a directory."""
-    return Publication(directory, Contents("fit", RECORD, PATTERNS, _listed), [RECORD, SCENE, PLOT, MAP, ERRORS])
+    return Publication(directory, PublicationSpec("fit", RECORD, PATTERNS, _listed), [RECORD, SCENE, PLOT, MAP, ERRORS])
 
 
 def write_report(result: FitResult, published: Publication) -> None:
     """Write the files of a fit, and put them in place."""
-    folder = published.staged
-    add(folder / SCENE, _scene_text(result, folder).encode())
+    folder = published.new_folder
+    write_new_file(folder / SCENE, _scene_text(result, folder).encode())
     if result.map is not None:
         _write(result.map.grey, folder / MAP)
         # White: unknown, or not even known to 100 %.
@@ -68,16 +68,16 @@ def write_report(result: FitResult, published: Publication) -> None:
     except ImportError:
         result.notes.append(NO_PLOT)
     else:
-        with create(folder / PLOT) as file:
+        with create_file(folder / PLOT) as file:
             plot(result, file)
-    written = sorted(files(folder, PATTERNS, strict=True))
+    written = sorted(list_files(folder, PATTERNS, strict=True))
     record = {**result.as_json(), "versions": versions(), "files": written}
-    add(folder / RECORD, (json.dumps(record, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode())
+    write_new_file(folder / RECORD, (json.dumps(record, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode())
     published.publish([*written, RECORD])
 
 
 def _write(grey: NDArray[np.uint16], path: Path) -> None:
-    with create(path) as file:
+    with create_file(path) as file:
         Image.fromarray(grey).save(file, "PNG")
 
 

@@ -1,1 +1,1 @@
-"""One run: stepping, drawing, writing, resuming."""
+"""Runs of a scene: simulate, draw, write, resume and read results."""

@@ -1,6 +1,8 @@
-"""Arrays in .npz files: written piece by piece, and read without trusting the file's own headers.
+"""Array files: NumPy's .npz archives and Middlebury's .flo format.
 
-Optical flow in Middlebury's .flo format: a magic number, width, height, two floats per pixel; little-endian.
+Archives are written in chunks, because a trajectory may exceed memory. Readers pass the expected dtype and shape, so
+that a forged header cannot make them allocate more. A .flo file holds a magic number, width, height and two float32
+per pixel, all little-endian.
 """
 
 from __future__ import annotations
@@ -18,66 +20,104 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import DTypeLike, NDArray
 
-# Zip files contain dates. A fixed one, the earliest possible, makes files of equal arrays equal.
-EPOCH = (1980, 1, 1, 0, 0, 0)
-
 Shape = tuple[int, ...]
 
 
-class Pieces(NamedTuple):
-    """An array that need not be in memory as a whole."""
+class ChunkedArray(NamedTuple):
+    """An array that is written without being in memory at once."""
 
     dtype: DTypeLike
     shape: Shape
-    parts: Iterable[NDArray[Any]]  # its numbers in C order, in any number of pieces
+    chunks: Iterable[NDArray[Any]]  # contiguous; together the array's elements in C order
 
 
-def write_arrays(file: BinaryIO, arrays: Mapping[str, NDArray[Any] | Pieces]) -> None:
-    """Write arrays to an uncompressed archive, by name; equal arrays give equal files."""
+def write_arrays(file: BinaryIO, arrays: Mapping[str, NDArray[Any] | ChunkedArray]) -> None:
+    """Write arrays to an uncompressed .npz archive. Equal arrays produce identical files.
+
+    Args:
+        file: binary file, open for writing.
+        arrays: the arrays by name.
+    """
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         for name, array in arrays.items():
-            pieces = array if isinstance(array, Pieces) else Pieces(array.dtype, array.shape, _parts(array))
-            with archive.open(zipfile.ZipInfo(f"{name}.npy", EPOCH), "w", force_zip64=True) as entry:
-                entry.write(_header(pieces.dtype, pieces.shape))
-                for part in pieces.parts:
-                    entry.write(part.data)
+            chunked = array if isinstance(array, ChunkedArray) else ChunkedArray(array.dtype, array.shape, _rows(array))
+            # A fixed date, the earliest of the zip format, keeps files of equal arrays identical.
+            info = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
+            with archive.open(info, "w", force_zip64=True) as entry:
+                entry.write(_header(chunked.dtype, chunked.shape))
+                for chunk in chunked.chunks:
+                    entry.write(chunk.data)
 
 
-def _parts(array: NDArray[Any]) -> Iterable[NDArray[Any]]:
-    """Give an array without a second copy of all of it."""
+def _rows(array: NDArray[Any]) -> Iterable[NDArray[Any]]:
+    """Split an array into contiguous chunks, without copying it at once."""
     return [array] if array.flags.c_contiguous else (np.ascontiguousarray(row) for row in array)
 
 
 def read_array(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, shape: Shape) -> NDArray[Any]:
-    """Read an array that `write_arrays` wrote; raises ValueError before memory is allocated if dtype or shape differ.
+    """Read an array that `write_arrays` wrote, and verify its CRC-32.
 
-    Of a damaged archive it raises whatever `zipfile` does.
+    Args:
+        archive: the archive, open for reading.
+        name: name of the array.
+        dtype: expected type.
+        shape: expected shape.
+
+    Returns:
+        The array, read-only.
+
+    Raises:
+        ValueError: when type or shape differ; raised before memory is allocated.
+        Exception: when the archive is damaged; `zipfile` raises many types.
     """
     header, info = _header(dtype, shape), _entry(archive, name, dtype, shape)
-    # Checks the CRC-32.
     data = archive.read(info)
     if data[: len(header)] != header:
         raise ValueError(name)
     return np.frombuffer(data, dtype, offset=len(header)).reshape(shape)
 
 
-def read_rows(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, row: Shape) -> NDArray[Any]:
-    """Read an array of any number of rows, each of a known shape; raises what `read_array` does."""
-    header, size = len(_header(dtype, (0, *row))), math.prod(row) * np.dtype(dtype).itemsize
-    rows = (archive.getinfo(f"{name}.npy").file_size - header) // size
-    return read_array(archive, name, dtype, (max(0, rows), *row))
+def read_rows(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, row_shape: Shape) -> NDArray[Any]:
+    """Read an array with an unknown number of rows; derive the number from the size of the entry.
+
+    Args:
+        archive: the archive, open for reading.
+        name: name of the array.
+        dtype: expected type.
+        row_shape: expected shape of a row.
+
+    Returns:
+        The array, shape (rows, *row_shape), read-only.
+
+    Raises:
+        ValueError: when type or shape differ.
+        Exception: as for `read_array`.
+    """
+    header_bytes, row_bytes = len(_header(dtype, (0, *row_shape))), math.prod(row_shape) * np.dtype(dtype).itemsize
+    rows = (archive.getinfo(f"{name}.npy").file_size - header_bytes) // row_bytes
+    return read_array(archive, name, dtype, (max(0, rows), *row_shape))
 
 
 def map_array(path: Path, name: str, dtype: DTypeLike, shape: Shape) -> NDArray[Any]:
-    """Map an array that `write_arrays` wrote, after its checksum was verified.
+    """Map an array that `write_arrays` wrote into memory, and verify its CRC-32.
 
-    It may be larger than memory, but not empty. It is read-only, and the system reads it when it is accessed. Raises
-    what `read_array` does.
+    Args:
+        path: path of the archive.
+        name: name of the array.
+        dtype: expected type.
+        shape: expected shape, not empty; the array may exceed memory.
+
+    Returns:
+        The mapped array, read-only.
+
+    Raises:
+        ValueError: when type, shape or checksum differ.
+        Exception: as for `read_array`.
     """
     header = _header(dtype, shape)
     with path.open("rb") as file, zipfile.ZipFile(file) as archive:
         info = _entry(archive, name, dtype, shape)
-        # The data follow the entry's header, its name and its extra field; the header ends with the lengths of both.
+        # The data follow the local header, the name and the extra field; bytes 26 to 29 hold the two lengths.
         file.seek(info.header_offset + 26)
         file.seek(sum(struct.unpack("<HH", file.read(4))), 1)
         if file.read(len(header)) != header:
@@ -89,10 +129,10 @@ def map_array(path: Path, name: str, dtype: DTypeLike, shape: Shape) -> NDArray[
 
 
 def _entry(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, shape: Shape) -> zipfile.ZipInfo:
-    """Find an array that is stored uncompressed and has the expected size; raises ValueError if it does not."""
+    """Find the entry of an array; raise a ValueError unless it is uncompressed and of the expected size."""
     info = archive.getinfo(f"{name}.npy")
     size = len(_header(dtype, shape)) + math.prod(shape) * np.dtype(dtype).itemsize
-    # Compressed data might expand to any size, whatever the archive says.
+    # Compressed data could expand to any size, whatever the header states.
     if info.compress_type != zipfile.ZIP_STORED or (info.file_size, info.compress_size) != (size, size):
         raise ValueError(name)
     return info
@@ -105,22 +145,35 @@ def _header(dtype: DTypeLike, shape: Shape) -> bytes:
     return header.getvalue()
 
 
-MAGIC = b"PIEH"
-
-
 def write_flo(file: BinaryIO, flow: NDArray[np.float32]) -> None:
-    """Write flow to the right and down [px], shape (height, width, 2)."""
+    """Write optical flow as .flo.
+
+    Args:
+        file: binary file, open for writing.
+        flow: flow to the right and down [px], shape (height, width, 2).
+    """
     height, width, _ = flow.shape
     file.write(_flo_header(width, height))
     file.write(np.ascontiguousarray(flow, "<f4").data)
 
 
 def read_flo(path: Path, size: tuple[int, int]) -> NDArray[np.float32]:
-    """Read flow as above; raises ValueError when the file has no flow of this width and height [px]."""
+    """Read optical flow from a .flo file.
+
+    Args:
+        path: path of the file.
+        size: expected width and height [px].
+
+    Returns:
+        Flow to the right and down [px], shape (height, width, 2), read-only.
+
+    Raises:
+        ValueError: when the file does not hold flow of this size.
+    """
     width, height = size
     header, length = _flo_header(width, height), 8 * width * height
     with path.open("rb") as file:
-        # Only the expected size is read, so that a wrong one in the file takes no more memory.
+        # Reading the expected size only bounds the memory, whatever the file contains.
         start, data, rest = file.read(len(header)), file.read(length), file.read(1)
     if start != header or len(data) != length or rest:
         raise ValueError(f"not a flow of {width} x {height} pixels")
@@ -128,4 +181,4 @@ def read_flo(path: Path, size: tuple[int, int]) -> NDArray[np.float32]:
 
 
 def _flo_header(width: int, height: int) -> bytes:
-    return struct.pack("<4sii", MAGIC, width, height)
+    return struct.pack("<4sii", b"PIEH", width, height)

@@ -1,10 +1,9 @@
-"""The files from which another process can continue an unfinished run: its manifest, its frames and its last state.
+"""Checkpoint of an unfinished run, from which another process can continue it.
 
-Every part has a checksum, which is verified before the part is used: a SHA-256 for the manifest, one each for the
-positions and the forces of every frame, and the CRC-32 of the archive for the arrays of the state. What they say is not
-trusted, as anybody may have written them.
-
-A file of arrays of one shape, one for each frame, that grows while a run does, and survives its death.
+A checkpoint is a folder with the manifest of the run, the positions and, if requested, the forces of every frame, and
+the state of the solver saved last. Each part has a checksum, which is verified before the part is used: the manifest
+and each frame have a SHA-256, the archive of the state has CRC-32. Contents are also checked for plausibility, because
+the folder may come from anybody.
 """
 
 from __future__ import annotations
@@ -28,36 +27,56 @@ from numpy.typing import NDArray
 from taichi_msm.errors import DamagedError, FilesError, ForeignError
 from taichi_msm.model.time_grid import TimeGrid
 from taichi_msm.runs.arrays import read_array, write_arrays
-from taichi_msm.runs.directory import DRAFT, FILE, FOLDER, HIDDEN, LOCK, STAGING, clear, create, replacing, require
+from taichi_msm.runs.directory import (
+    DRAFT_FILE,
+    FILE,
+    FOLDER,
+    HIDDEN_FOLDER_PATTERN,
+    LOCK_FILE,
+    STAGING_FOLDER,
+    clear_folder,
+    create_file,
+    replacing,
+    require_kind,
+)
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.state import PeakForce, ProbeForces, RunProgress, Snapshot, State, TipForce
 from taichi_msm.terms.contact import contact_fields
 
-pass  # REMOVED
-
-# A folder is a checkpoint if it has a run's manifest. Beside it are the positions of the frames, the forces if they are
-# asked for, and the last state.
-CHECKPOINT, MANIFEST, POSITIONS, FORCES, STATE = "checkpoint", "manifest.json", "positions", "forces", "state.npz"
-PATTERNS = (
-    *(re.escape(name) for name in (MANIFEST, POSITIONS, FORCES, STATE)),
-    *(f"{HIDDEN}/{name}" for name in (LOCK, DRAFT)),
+# A folder without the manifest is not a checkpoint.
+CHECKPOINT_FOLDER, MANIFEST_FILE, POSITIONS_FILE, FORCES_FILE, STATE_FILE = (
+    "checkpoint",
+    "manifest.json",
+    "positions",
+    "forces",
+    "state.npz",
+)
+CHECKPOINT_PATTERNS = (
+    *(re.escape(name) for name in (MANIFEST_FILE, POSITIONS_FILE, FORCES_FILE, STATE_FILE)),
+    *(f"{HIDDEN_FOLDER_PATTERN}/{name}" for name in (LOCK_FILE, DRAFT_FILE)),
 )
 
-# The share of the time that saving states may take.
-SHARE = 0.02
+# Upper bound of the time spent on saving states, as a fraction of the run's time.
+MAX_SAVE_TIME_FRACTION = 0.02
 
-# Numbers of a `TipForce`, and of a `PeakForce`.
-FORCE_NUMBERS, PEAK_NUMBERS = 6, 4
+# Columns of the arrays: tip and force of a `TipForce`; time and force of a `PeakForce`.
+FORCE_COLUMNS, PEAK_FORCE_COLUMNS = 6, 4
 
 
 class Checkpoint:
-    """A folder, made by `begin`, from which a run can continue, no matter when its process is killed.
+    """Checkpoint folder of a run. It stays valid whenever the process is killed.
 
-    A FilesError, of the methods that read, says which part is damaged.
+    Args:
+        folder: the folder; `begin` creates it.
+        scene: the scene of the run.
+        grid: the time grid of the run.
+
+    Raises:
+        DamagedError: from the methods that read, when a part is damaged; the message names the part.
 
     Attributes:
-        frames: number of frames added so far.
-        precision: type of the positions.
+        frames: number of frames stored so far.
+        precision: dtype of the positions.
     """
 
     def __init__(self, folder: Path, scene: Scene, grid: TimeGrid) -> None:
@@ -67,134 +86,142 @@ class Checkpoint:
         self._shape, self._probes = (*scene.sheet.points, 3), len(scene.probes)
         self._contact_shape = (contact_fields(scene.probes), *scene.sheet.points)
         self.precision = np.dtype(np.float32 if grid.precision == "f32" else np.float64)
-        self._due = 0.0
-        # The digest of the manifest, to which all parts of a checkpoint are tied.
-        self._key = b""
-        self._positions = Records(folder / POSITIONS, self._shape, self.precision)
-        self._forces = Records(folder / FORCES, (self._probes, FORCE_NUMBERS), np.float64)
-        # What is kept of every frame.
-        self._kept = [self._positions] if scene.output else []
-        self._kept += [self._forces] if scene.asks_for("forces") else []
+        self._next_save = 0.0
+        # Checksums of all parts include this digest, so that parts of different runs do not mix.
+        self._manifest_digest = b""
+        self._positions = ArrayFile(folder / POSITIONS_FILE, self._shape, self.precision)
+        self._forces = ArrayFile(folder / FORCES_FILE, (self._probes, FORCE_COLUMNS), np.float64)
+        self._array_files = [self._positions] if scene.output else []
+        self._array_files += [self._forces] if scene.asks_for("forces") else []
 
     @property
-    def due(self) -> bool:
-        """Whether it is time to save again."""
-        return time.perf_counter() >= self._due
+    def is_save_due(self) -> bool:
+        """Whether the state should be saved again."""
+        return time.perf_counter() >= self._next_save
 
     def begin(self, manifest: Mapping[str, Any]) -> None:
-        """Begin a run with this manifest, without frames, replacing the checkpoint of any other run."""
+        """Begin the checkpoint of a new run, and delete that of an earlier run."""
         self.close()
         self._folder.mkdir(exist_ok=True)
-        self.forget()
-        clear(self._folder, PATTERNS)
-        sealed = seal(manifest)
-        self._key = digest(sealed)
-        for records in self._kept:
-            records.begin(self._key)
-        with replacing(self._folder / MANIFEST) as file:
-            file.write(sealed)
+        self.invalidate()
+        clear_folder(self._folder, CHECKPOINT_PATTERNS)
+        data = dump_with_checksum(manifest)
+        self._manifest_digest = sha256_digest(data)
+        for array_file in self._array_files:
+            array_file.begin(self._manifest_digest)
+        with replacing(self._folder / MANIFEST_FILE) as file:
+            file.write(data)
 
-    def forget(self) -> None:
-        """Remove the manifest: without it, what is left, even if it is only half removed, is no checkpoint."""
-        (self._folder / MANIFEST).unlink(missing_ok=True)
+    def invalidate(self) -> None:
+        """Delete the manifest, so that the remaining files no longer count as a checkpoint."""
+        (self._folder / MANIFEST_FILE).unlink(missing_ok=True)
 
     def reopen(self) -> Snapshot | None:
-        """Continue an earlier run; returns the state that it saved last, or None to continue from rest."""
+        """Open the checkpoint of an earlier run to continue it.
+
+        Returns:
+            The state saved last, or None when the run continues from its first frame.
+        """
         self.close()
         try:
-            self._key = digest((self._folder / MANIFEST).read_bytes())
-            for records in self._kept:
-                records.reopen(self._key)
+            self._manifest_digest = sha256_digest((self._folder / MANIFEST_FILE).read_bytes())
+            for array_file in self._array_files:
+                array_file.reopen(self._manifest_digest)
         except FileNotFoundError as error:
-            raise damaged(self._folder / Path(error.filename).name) from None
+            raise damaged_checkpoint(self._folder / Path(error.filename).name) from None
         saved = self.load()
         frames = 0 if saved is None else saved.progress.frame + 1
-        for records in self._kept:
-            records.require(frames)
+        for array_file in self._array_files:
+            array_file.require_length(frames)
         self.frames = frames
         return saved
 
     def add(self, position: NDArray[Any], forces: Sequence[TipForce]) -> None:
-        """Add the positions of the next frame [m], shape (rows, cols, 3), and the forces of every probe."""
-        for records, values in ((self._positions, position), (self._forces, _tips(forces))):
-            if records in self._kept:
-                records.add(self.frames, values)
+        """Store the next frame.
+
+        Args:
+            position: positions of the mass points [m], shape (rows, cols, 3).
+            forces: the force of every probe.
+        """
+        for array_file, values in ((self._positions, position), (self._forces, _tip_force_array(forces))):
+            if array_file in self._array_files:
+                array_file.write(self.frames, values)
         self.frames += 1
 
-    def position(self, frame: int) -> NDArray[Any]:
-        """Read the positions of a frame [m], shape (rows, cols, 3)."""
+    def read_positions(self, frame: int) -> NDArray[Any]:
+        """Read the positions of the mass points in a frame [m], shape (rows, cols, 3)."""
         return self._positions.read(frame)
 
-    def forces(self, frame: int) -> tuple[TipForce, ...]:
-        """Read the forces of a frame, where they were asked for."""
-        return _as_forces(self._forces.read(frame))
+    def read_forces(self, frame: int) -> tuple[TipForce, ...]:
+        """Read the force of every probe in a frame; only for scenes that output forces."""
+        return _tip_forces(self._forces.read(frame))
 
     def save(self, saved: Snapshot) -> str:
-        """Save a state of the run, replacing the one saved before; the frames up to it must have been added.
+        """Save a state of the run in place of the previous one. All frames up to it must have been stored.
 
-        Gives the path of the file, which has the arrays of `State` and the numbers of `RunProgress` by name.
+        Returns:
+            Path of the archive, with the fields of `State` and `RunProgress` by name.
         """
         start = time.perf_counter()
-        path = self._folder / STATE
+        path = self._folder / STATE_FILE
         with replacing(path) as file:
             write_arrays(file, self._arrays(saved))
         now = time.perf_counter()
-        self._due = now + (now - start) / SHARE
+        self._next_save = now + (now - start) / MAX_SAVE_TIME_FRACTION
         return str(path)
 
     def load(self) -> Snapshot | None:
-        """Read the state that was saved last; None: none was."""
-        like = self._arrays(Snapshot(State(0, np.empty(0), np.empty(0)), RunProgress(), ProbeForces((), ())))
-        kinds = {name: (array.dtype, array.shape) for name, array in like.items()}
-        kinds["forces"] = kinds["forces"][0], (self._probes, FORCE_NUMBERS)
-        kinds["greatest"] = kinds["greatest"][0], (self._probes, PEAK_NUMBERS)
-        kinds |= dict.fromkeys(("displacement", "difference"), (self.precision, self._shape))
-        kinds["contact"] = self.precision, self._contact_shape
+        """Read the state saved last; return None when none was saved."""
+        empty = self._arrays(Snapshot(State(0, np.empty(0), np.empty(0)), RunProgress(), ProbeForces((), ())))
+        types = {name: (array.dtype, array.shape) for name, array in empty.items()}
+        types["forces"] = types["forces"][0], (self._probes, FORCE_COLUMNS)
+        types["greatest"] = types["greatest"][0], (self._probes, PEAK_FORCE_COLUMNS)
+        types |= dict.fromkeys(("displacement", "difference"), (self.precision, self._shape))
+        types["contact"] = self.precision, self._contact_shape
         try:
-            with (self._folder / STATE).open("rb") as file, zipfile.ZipFile(file) as archive:
-                arrays = {name: read_array(archive, name, *kind) for name, kind in kinds.items()}
+            with (self._folder / STATE_FILE).open("rb") as file, zipfile.ZipFile(file) as archive:
+                arrays = {name: read_array(archive, name, *expected) for name, expected in types.items()}
         except FileNotFoundError:
             return None
-        # A forged archive can make zipfile raise almost anything.
-        except Exception:
-            raise damaged(self._folder / STATE) from None
+        except Exception:  # zipfile raises almost any type for a forged archive
+            raise damaged_checkpoint(self._folder / STATE_FILE) from None
         progress = RunProgress(**{field.name: arrays[field.name].item() for field in fields(RunProgress)})
         state = State(int(arrays["steps"]), arrays["displacement"], arrays["difference"], arrays["contact"])
         greatest = tuple(PeakForce(time, (x, y, z)) for time, x, y, z in arrays["greatest"].tolist())
-        saved = Snapshot(state, progress, ProbeForces(_as_forces(arrays["forces"]), greatest))
-        every = self._grid.steps_per_frame
+        saved = Snapshot(state, progress, ProbeForces(_tip_forces(arrays["forces"]), greatest))
+        steps_per_frame = self._grid.steps_per_frame
         if not (
             progress.frame <= self._grid.frames
-            and progress.frame * every <= saved.state.steps <= (progress.frame + 1) * every
+            and progress.frame * steps_per_frame <= saved.state.steps <= (progress.frame + 1) * steps_per_frame
             and all(np.isfinite(array).all() for array in arrays.values())
             and all(value >= 0 for value in asdict(progress).values())
-            and arrays["manifest"].tobytes() == self._key
+            and arrays["manifest"].tobytes() == self._manifest_digest
         ):
-            raise damaged(self._folder / STATE)
+            raise damaged_checkpoint(self._folder / STATE_FILE)
         return saved
 
     def close(self) -> None:
-        """Close its files."""
-        for records in self._kept:
-            records.close()
+        """Close the files."""
+        for array_file in self._array_files:
+            array_file.close()
 
     def _arrays(self, saved: Snapshot) -> dict[str, NDArray[Any]]:
-        """Give the arrays of a state, the numbers of its progress and the digest of the manifest, all by name."""
-        greatest = np.array([(peak.time, *peak.force) for peak in saved.felt.greatest]).reshape(-1, PEAK_NUMBERS)
-        forces = {"forces": _tips(saved.felt.forces), "greatest": greatest}
+        """Convert a state, its progress and the manifest's digest to arrays by name."""
+        greatest = np.array([(peak.time, *peak.force) for peak in saved.felt.greatest]).reshape(-1, PEAK_FORCE_COLUMNS)
+        forces = {"forces": _tip_force_array(saved.felt.forces), "greatest": greatest}
         named = {**saved.state._asdict(), **asdict(saved.progress), **forces}
-        named["manifest"] = np.frombuffer(self._key, np.uint8)
+        named["manifest"] = np.frombuffer(self._manifest_digest, np.uint8)
         return {name: np.asarray(value) for name, value in named.items()}
 
 
 def open_manifest(directory: Path) -> BinaryIO:
-    """Open the manifest of the unfinished run in a directory; raises OSError or ForeignError when there is none."""
-    checkpoint = require(require(directory / STAGING, FOLDER) / CHECKPOINT, FOLDER)
-    return require(checkpoint / MANIFEST, FILE).open("rb")
+    """Open the manifest of the unfinished run in a directory; raise OSError or ForeignError when there is none."""
+    checkpoint = require_kind(require_kind(directory / STAGING_FOLDER, FOLDER) / CHECKPOINT_FOLDER, FOLDER)
+    return require_kind(checkpoint / MANIFEST_FILE, FILE).open("rb")
 
 
 def is_unfinished(directory: Path) -> bool:
-    """Tell whether a directory has an unfinished run that can be continued."""
+    """Return whether a directory has an unfinished run that can be continued."""
     try:
         open_manifest(directory).close()
     except (OSError, FilesError):
@@ -202,85 +229,101 @@ def is_unfinished(directory: Path) -> bool:
     return True
 
 
-def seal(content: Any) -> bytes:
-    """Write a value as JSON together with its SHA-256."""
-    return json.dumps({"sha256": digest(json.dumps(content).encode()).hex(), "content": content}).encode()
+def dump_with_checksum(content: Any) -> bytes:
+    """Serialise a value as JSON together with its SHA-256."""
+    return json.dumps({"sha256": sha256_digest(json.dumps(content).encode()).hex(), "content": content}).encode()
 
 
-def unseal(data: bytes) -> Any:
-    """Read what `seal` wrote; raises ValueError when any bit of it, even of white space, is not as it was written."""
+def load_with_checksum(data: bytes) -> Any:
+    """Parse the output of `dump_with_checksum`; raise a ValueError when any byte of it has changed."""
     try:
         content = json.loads(data)["content"]
-        if seal(content) == data:
+        if dump_with_checksum(content) == data:
             return content
     except (KeyError, TypeError, RecursionError):
         pass
     raise ValueError("damaged")
 
 
-def _tips(forces: Sequence[TipForce]) -> NDArray[np.float64]:
-    return np.array([(*one.tip, *one.force) for one in forces], float).reshape(-1, FORCE_NUMBERS)
+def _tip_force_array(forces: Sequence[TipForce]) -> NDArray[np.float64]:
+    return np.array([(*force.tip, *force.force) for force in forces], float).reshape(-1, FORCE_COLUMNS)
 
 
-def _as_forces(numbers: NDArray[np.float64]) -> tuple[TipForce, ...]:
+def _tip_forces(numbers: NDArray[np.float64]) -> tuple[TipForce, ...]:
     return tuple(TipForce(n, (x, y, z), (a, b, c)) for n, (x, y, z, a, b, c) in enumerate(numbers.tolist()))
 
 
 DIGEST_BYTES = 32
 
 
-class Records:
-    """The arrays, each with a SHA-256 that also depends on its number and on the run.
+class ArrayFile:
+    """File of arrays of equal shape, one per frame, that grows with the run.
+
+    Each array has a SHA-256 that also covers its index and the digest of the run's manifest.
 
     Args:
-        path: of the file.
-        shape: of an array.
-        dtype: of its numbers.
+        path: path of the file.
+        shape: shape of an array.
+        dtype: type of its elements.
     """
 
     def __init__(self, path: Path, shape: tuple[int, ...], dtype: Any) -> None:
         self._path, self._shape, self._dtype = path, shape, np.dtype(dtype)
         self._size = DIGEST_BYTES + math.prod(shape) * self._dtype.itemsize
-        # The digest of the run's manifest, to which all parts of a checkpoint are tied.
-        self._key = b""
+        self._manifest_digest = b""
         self._file: BinaryIO
         self._open = ExitStack()
 
-    def begin(self, key: bytes) -> None:
-        """Make the file of a new run."""
-        # Unbuffered, so that what was written is not lost when the process is killed.
-        self._key, self._file = key, self._open.enter_context(create(self._path, buffering=0))
+    def begin(self, manifest_digest: bytes) -> None:
+        """Create the file for a new run."""
+        # Unbuffered, so that stored frames survive when the process is killed.
+        self._manifest_digest, self._file = (
+            manifest_digest,
+            self._open.enter_context(create_file(self._path, buffering=0)),
+        )
 
-    def reopen(self, key: bytes) -> None:
-        """Open the file of an earlier run; FileNotFoundError: there is none."""
-        self._key, self._file = key, self._open.enter_context(self._path.open("r+b", buffering=0))
+    def reopen(self, manifest_digest: bytes) -> None:
+        """Open the file of an earlier run; raise a FileNotFoundError when it is missing."""
+        self._manifest_digest, self._file = (
+            manifest_digest,
+            self._open.enter_context(self._path.open("r+b", buffering=0)),
+        )
         if os.fstat(self._file.fileno()).st_nlink > 1:
             raise ForeignError.at(self._path, "a file that has other names")
 
-    def require(self, count: int) -> None:
-        """Raise a DamagedError if the file has fewer arrays."""
+    def require_length(self, count: int) -> None:
+        """Raise a DamagedError if the file has fewer arrays than `count`."""
         if os.fstat(self._file.fileno()).st_size < count * self._size:
-            raise damaged(self._path)
+            raise damaged_checkpoint(self._path)
 
-    def add(self, number: int, values: NDArray[Any]) -> None:
-        """Write the array of a number, over any that is there."""
+    def write(self, number: int, values: NDArray[Any]) -> None:
+        """Write an array at an index, in place of an earlier one.
+
+        Args:
+            number: index of the array.
+            values: the array, of the file's shape.
+        """
         data = np.ascontiguousarray(values, self._dtype).reshape(-1).view(np.uint8).data
         self._file.seek(number * self._size)
-        for rest in (memoryview(self._digest(number, data)), data):
-            while rest:  # A write to an unbuffered file may take only some of the bytes.
-                rest = rest[self._file.write(rest) :]
+        for remaining in (memoryview(self._digest(number, data)), data):
+            while remaining:  # A write to an unbuffered file may be partial.
+                remaining = remaining[self._file.write(remaining) :]
 
     def read(self, number: int) -> NDArray[Any]:
-        """Read the array of a number; DamagedError: it is not what was written, or not finite."""
+        """Read the array at an index; raise a DamagedError if its checksum differs or it is not finite."""
         record = np.empty(self._size, np.uint8)
         self._file.seek(number * self._size)
-        rest = record.data
-        while rest and (count := self._file.readinto(rest)):  # type: ignore[attr-defined]
-            rest = rest[count:]
+        remaining = record.data
+        while remaining and (count := self._file.readinto(remaining)):  # type: ignore[attr-defined]
+            remaining = remaining[count:]
         data = record[DIGEST_BYTES:]
         values = data.view(self._dtype).reshape(self._shape)
-        if rest or record[:DIGEST_BYTES].tobytes() != self._digest(number, data.data) or not np.isfinite(values).all():
-            raise damaged(self._path)
+        if (
+            remaining
+            or record[:DIGEST_BYTES].tobytes() != self._digest(number, data.data)
+            or not np.isfinite(values).all()
+        ):
+            raise damaged_checkpoint(self._path)
         return values
 
     def close(self) -> None:
@@ -288,17 +331,17 @@ class Records:
         self._open.close()
 
     def _digest(self, number: int, data: memoryview) -> bytes:
-        return digest(self._key, number.to_bytes(8, "little"), data)
+        return sha256_digest(self._manifest_digest, number.to_bytes(8, "little"), data)
 
 
-def damaged(path: Path) -> DamagedError:
-    """Make the error for a part of a checkpoint that is not what the run has written."""
+def damaged_checkpoint(path: Path) -> DamagedError:
+    """Build the error for a damaged part of a checkpoint."""
     return DamagedError(f"{path} is damaged; run the scene again")
 
 
-def digest(*parts: bytes | memoryview) -> bytes:
-    """Compute the SHA-256 of some bytes."""
-    found = hashlib.sha256()
+def sha256_digest(*parts: bytes | memoryview) -> bytes:
+    """Compute the SHA-256 of concatenated bytes."""
+    sha256 = hashlib.sha256()
     for part in parts:
-        found.update(part)
-    return found.digest()
+        sha256.update(part)
+    return sha256.digest()

@@ -1,19 +1,17 @@
-"""Replace the results in a directory, whole or not at all, and only what a run, or an export, has written.
+"""Atomic replacement of files and of all results in a directory.
 
-New files are written in `.partial/new`, in the directory itself. When all are there, this folder is renamed to
-`.partial/whole`, and from then on the new results count: the record of the earlier ones is moved aside, the new files
-are moved into place, those of the earlier ones that are left are removed, and the new record is moved last. So where
-there is a record, the results are whole and belong together. If the process is killed before the folder is renamed, the
-directory stays as it was; if later, the next publication completes the moves.
+New results are written to `.partial/new` inside the directory. When they are complete, this folder is renamed to
+`.partial/whole`; this commits the publication. Then the record of the earlier results is moved aside, the new files are
+moved into place, leftover earlier files are deleted, and the new record is moved last. A directory with a record
+therefore always holds complete and consistent results. If the process is killed before the commit, the directory stays
+unchanged; if it is killed later, the next publication completes the moves.
 
-A record lists what was written, and only that is ever replaced or removed. Whatever else is in the way, a link or a
-device among it, is an error before anything is touched. Who may write to the directory while a run does is trusted.
+The record lists the files of a publication, and only listed files are replaced or deleted. Any other entry in the way,
+such as a link or a device, is an error, raised before anything is changed. A folder is checked once, when work in it
+begins; files are created exclusively afterwards. Processes that can write to the directory during a run are trusted.
 
-What is in a folder that we write in: only files of ours, or something that a link, a device or a person put there.
-
-A folder is checked once, when work in it begins. What is created later is created exclusively.
-
-Files that appear whole or not at all: written under a hidden name in the folder where they belong, then renamed.
+Single files are replaced atomically, too: they are written in a hidden folder next to their destination and then
+renamed.
 """
 
 from __future__ import annotations
@@ -33,61 +31,61 @@ from typing import Any, BinaryIO, NamedTuple
 
 from taichi_msm.errors import DamagedError, FilesError, ForeignError
 
-pass  # REMOVED
-pass  # REMOVED
+STAGING_FOLDER, NEW_FOLDER, READY_FOLDER, PREVIOUS_RECORD = ".partial", "new", "whole", "earlier.json"
 
-STAGING, NEW, WHOLE, EARLIER = ".partial", "new", "whole", "earlier.json"
+# Attempts to create and lock the staging folder while ending runs delete it.
+MAX_LOCK_ATTEMPTS = 100
 
-# How often the staging directory is tried again while ending runs remove it; then it counts as missing.
-ATTEMPTS = 100
+# Size limit of a record, larger than that of any run.
+MAX_RECORD_BYTES = 1 << 28
 
-# Size limit of a record [bytes]; even with more frames than any disk holds, it is smaller.
-MAX_RECORD = 1 << 28
-
-# Tells of the name of a file whether it is listed in a record.
-Listed = Callable[[str], bool]
+# Returns whether a record lists a file name.
+IsListed = Callable[[str], bool]
 
 
-class Contents(NamedTuple):
-    """What is published in a directory: the results of a run, or an export. Patterns are those of `directory.files`."""
+class PublicationSpec(NamedTuple):
+    """Files that a run, an export or a fit publishes in a directory. Patterns are those of `list_files`."""
 
-    name: str  # what writes it, in messages
-    record: str  # the file that lists what was written
-    patterns: Collection[str]  # of all files that may be written, the record among them
-    listed: Callable[[Mapping[str, Any]], Listed]  # turns the content of a record into what tells of the files
-    alone: bool = False  # whether nothing else may be in the directory
-    beside: tuple[str, Collection[str]] | None = None  # a folder, and patterns of its files, that `keep` is about
+    name: str  # name of the publishing command, for messages
+    record: str  # name of the file that lists the others
+    patterns: Collection[str]  # of all files that may be published, including the record
+    read_record: Callable[[Mapping[str, Any]], IsListed]  # converts a record to a test of file names
+    exclusive: bool = False  # whether the directory may not contain other files
+    companion: tuple[str, Collection[str]] | None = None  # a folder that stays unpublished, and its patterns
 
 
 class Publication:
-    """New contents for a directory. Leaving the with statement without `publish` discards them.
+    """Publication of new files in a directory, as a context manager. Without `publish`, they are discarded at exit.
 
-    `names` are all that may be published; it is an error if anything but earlier results has one of them.
+    Args:
+        directory: the directory; created if missing.
+        spec: the kind of the publication.
+        names: names of all files that may be published; checked at entry for conflicts with foreign files.
 
     Raises:
-        FilesError: on entering, when another process publishes there, or something is in the way that no run has put
-            there; here and in `publish`.
+        FilesError: at entry and in `publish`, when another process publishes to the directory, or a foreign file is in
+            the way.
         OSError: when the directory cannot be written.
 
     Attributes:
-        staging: the folder for all that is not published yet.
-        staged: the folder to write the new files in, under their final names; made on entering.
-        keep: whether the folder beside the new files stays when the with statement is left.
+        staging_folder: folder for unpublished files.
+        new_folder: folder for the new files under their final names; created at entry.
+        keep_companion: whether the companion folder is kept at exit.
     """
 
-    def __init__(self, directory: Path, contents: Contents, names: Collection[str] = ()) -> None:
-        self.staging = directory / STAGING
-        self.staged = self.staging / NEW
-        self.keep = True
+    def __init__(self, directory: Path, spec: PublicationSpec, names: Collection[str] = ()) -> None:
+        self.staging_folder = directory / STAGING_FOLDER
+        self.new_folder = self.staging_folder / NEW_FOLDER
+        self.keep_companion = True
         self._directory = directory
-        self._contents = contents
+        self._spec = spec
         self._names = names
-        self._record = directory / contents.record
-        self._beside, inner = contents.beside or ("", ())
+        self._record = directory / spec.record
+        self._companion, inner = spec.companion or ("", ())
         self._patterns = [
-            *(rf"{folder}/{pattern}" for folder in (NEW, WHOLE) for pattern in contents.patterns),
-            *(rf"{self._beside}/{pattern}" for pattern in inner),
-            *(LOCK, re.escape(EARLIER)),
+            *(rf"{folder}/{pattern}" for folder in (NEW_FOLDER, READY_FOLDER) for pattern in spec.patterns),
+            *(rf"{self._companion}/{pattern}" for pattern in inner),
+            *(LOCK_FILE, re.escape(PREVIOUS_RECORD)),
         ]
         self._lock: BinaryIO
         self._open = ExitStack()
@@ -98,125 +96,126 @@ class Publication:
         return (self._lock.fileno(),) if os.name == "posix" else ()
 
     def publish(self, names: Collection[str]) -> None:
-        """Replace earlier results by the staged files of these names, with the record among them."""
+        """Replace earlier results by the new files of these names, which include the record."""
         for name in names:
-            if kind(self.staged / name) != FILE:
-                raise FilesError(f"{self.staged / name} was removed during the {self._contents.name}; run it again")
-        self._require_free(names, self._earlier(self._record))
-        self.staged.replace(self.staging / WHOLE)
+            if entry_kind(self.new_folder / name) != FILE:
+                raise FilesError(f"{self.new_folder / name} was removed during the {self._spec.name}; run it again")
+        self._require_free(names, self._listed_results(self._record))
+        self.new_folder.replace(self.staging_folder / READY_FOLDER)
         self._complete()
 
     def __enter__(self) -> Publication:
         with ExitStack() as opened:
-            opened.enter_context(ensured(self._directory))
+            opened.enter_context(ensured_folder(self._directory))
             try:
                 opened.enter_context(self._acquire())
             except BlockingIOError:
-                said = f"another {self._contents.name} is writing there; choose another --out"
-                raise FilesError(f"{self._directory}: {said}") from None
+                fault = f"another {self._spec.name} is writing there; choose another --out"
+                raise FilesError(f"{self._directory}: {fault}") from None
             self._complete()
             self._clear()
-            earlier = self._earlier(self._record)
-            if self._contents.alone:
-                for name in files(self._directory, self._contents.patterns, strict=True, besides=(STAGING,)):
+            earlier = self._listed_results(self._record)
+            if self._spec.exclusive:
+                for name in list_files(self._directory, self._spec.patterns, strict=True, ignored=(STAGING_FOLDER,)):
                     if name not in earlier:
                         raise ForeignError.at(self._directory / name, FILE)
             self._require_free(self._names, earlier)
-            self.staged.mkdir()
+            self.new_folder.mkdir()
             self._open = opened.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
-        # What fails here is done by the next publication; an error that is being raised matters more.
+        # The next publication repeats a cleanup that fails; an exception in flight takes precedence.
         with suppress(OSError, FilesError):
             self._complete()
             self._clear()
         self._open.close()
 
-    def _earlier(self, record: Path) -> set[str]:
-        """List the results that are there, according to their record."""
-        if kind(record) is None:
+    def _listed_results(self, record: Path) -> set[str]:
+        """List the existing results that a record names."""
+        if entry_kind(record) is None:
             return set()
         try:
-            listed = self._listed(record)
+            is_listed = self._read_record(record)
         except ValueError:
             raise ForeignError.at(record, FILE) from None
-        return {name for name in files(self._directory, self._contents.patterns, strict=False) if listed(name)}
+        return {name for name in list_files(self._directory, self._spec.patterns, strict=False) if is_listed(name)}
 
-    def _listed(self, record: Path) -> Listed:
-        """Read a record; raises ValueError if it is none, and ForeignError if it is no file."""
+    def _read_record(self, record: Path) -> IsListed:
+        """Read a record; raise a ValueError if it is invalid, a ForeignError if it is not a regular file."""
         try:
-            with require(record, FILE).open("rb") as file:
-                return self._contents.listed(json.loads(file.read(MAX_RECORD)))
+            with require_kind(record, FILE).open("rb") as file:
+                return self._spec.read_record(json.loads(file.read(MAX_RECORD_BYTES)))
         except (KeyError, TypeError, RecursionError, OverflowError) as error:
             raise ValueError("no record") from error
 
     def _require_free(self, names: Collection[str], earlier: set[str]) -> None:
-        """Make sure that results can be put in place, and that only earlier results are in their places."""
-        for folder in sorted(parents(names)):
-            # Checked here, so that it fails before the run, and not halfway through the moves.
-            path = require(self._directory / folder, FOLDER)
-            if kind(path) is None:
+        """Raise an error unless the folders are writable and the names are free or those of earlier results."""
+        for folder in sorted(parent_folders(names)):
+            # Checked here to fail before the run rather than during the moves.
+            path = require_kind(self._directory / folder, FOLDER)
+            if entry_kind(path) is None:
                 continue
             if not os.access(path, os.W_OK):
                 raise PermissionError(errno.EACCES, f"{folder} is not a writable directory")
         for name in names:
-            actual = kind(self._directory / name)
+            actual = entry_kind(self._directory / name)
             if actual is not None and (actual != FILE or name not in earlier):
                 raise ForeignError.at(self._directory / name, actual)
 
     def _complete(self) -> None:
-        """Move the new files into place, if all are there; after an interruption, go on."""
-        whole, aside = self.staging / WHOLE, self.staging / EARLIER
-        record = whole / self._contents.record
-        if kind(record) is None:
-            return  # The record is moved last, so all is done, or nothing is to be done.
+        """Move committed files into place; complete an interrupted publication."""
+        ready, moved_record = self.staging_folder / READY_FOLDER, self.staging_folder / PREVIOUS_RECORD
+        record = ready / self._spec.record
+        if entry_kind(record) is None:
+            return  # The record is moved last: nothing is committed, or all moves are done.
         try:
-            is_new = self._listed(record)
+            is_new = self._read_record(record)
             if not is_new(record.name):
                 raise ValueError("no record of itself")
         except ValueError:
-            raise DamagedError(f"{record} is damaged; remove {self.staging} and run the scene again") from None
-        begun = kind(aside) is not None
-        earlier = self._earlier(aside if begun else self._record)
-        left = list(files(whole, self._contents.patterns, strict=True))
-        self._require_free(left, earlier)
-        if not begun and kind(self._record) is not None:
-            self._record.replace(aside)
-        for name in left:
+            raise DamagedError(f"{record} is damaged; remove {self.staging_folder} and run the scene again") from None
+        is_resumed = entry_kind(moved_record) is not None
+        earlier = self._listed_results(moved_record if is_resumed else self._record)
+        remaining = list(list_files(ready, self._spec.patterns, strict=True))
+        self._require_free(remaining, earlier)
+        if not is_resumed and entry_kind(self._record) is not None:
+            self._record.replace(moved_record)
+        for name in remaining:
             if name != record.name:
                 (self._directory / name).parent.mkdir(parents=True, exist_ok=True)
-                (whole / name).replace(self._directory / name)
-        gone = [name for name in earlier if not is_new(name)]
-        for name in gone:
+                (ready / name).replace(self._directory / name)
+        obsolete = [name for name in earlier if not is_new(name)]
+        for name in obsolete:
             (self._directory / name).unlink(missing_ok=True)
-        for folder in sorted(parents(gone), reverse=True):
-            with suppress(OSError):  # not empty
+        for folder in sorted(parent_folders(obsolete), reverse=True):
+            with suppress(OSError):  # when it is not empty
                 (self._directory / folder).rmdir()
         record.replace(self._record)
 
     def _clear(self) -> None:
-        """Empty the staging directory, except for the lock and what is to be kept."""
-        clear(self.staging, self._patterns, keep=(LOCK, self._beside) if self.keep else (LOCK,))
+        """Delete the contents of the staging folder except for the lock and a kept companion."""
+        keep = (LOCK_FILE, self._companion) if self.keep_companion else (LOCK_FILE,)
+        clear_folder(self.staging_folder, self._patterns, keep)
 
     def _acquire(self) -> ExitStack:
-        """Make the staging directory and lock it; released when all processes that hold the lock have ended."""
-        for _ in range(ATTEMPTS):
-            # A run that is ending may remove the directory before we open the lock, or before we have it.
+        """Create the staging folder and lock it until all processes that hold the lock have ended."""
+        for _ in range(MAX_LOCK_ATTEMPTS):
+            # An ending run may delete the folder before the lock is opened or acquired.
             with suppress(FileNotFoundError), ExitStack() as opened:
                 with suppress(FileExistsError):
-                    self.staging.mkdir()
-                # Checked before anything is written there.
-                list(files(require(self.staging, FOLDER), self._patterns, strict=True))
-                opened.callback(_try, self.staging.rmdir)
-                self._lock = opened.enter_context(lock(self.staging / LOCK))
-                if os.path.samestat(os.fstat(self._lock.fileno()), (self.staging / LOCK).lstat()):
-                    opened.callback(_try, (self.staging / LOCK).unlink)
+                    self.staging_folder.mkdir()
+                # Raises an error before anything is written there.
+                list(list_files(require_kind(self.staging_folder, FOLDER), self._patterns, strict=True))
+                opened.callback(_try_to_remove, self.staging_folder.rmdir)
+                self._lock = opened.enter_context(lock_file(self.staging_folder / LOCK_FILE))
+                if os.path.samestat(os.fstat(self._lock.fileno()), (self.staging_folder / LOCK_FILE).lstat()):
+                    opened.callback(_try_to_remove, (self.staging_folder / LOCK_FILE).unlink)
                     return opened.pop_all()
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
 
 
-def _try(remove: Callable[[], None]) -> None:
+def _try_to_remove(remove: Callable[[], None]) -> None:
     with suppress(OSError):
         remove()
 
@@ -224,8 +223,8 @@ def _try(remove: Callable[[], None]) -> None:
 FILE, FOLDER = "a file", "a folder"
 
 
-def kind(path: Path) -> str | None:
-    """Give the kind of an entry, not of what it links to: FILE, FOLDER or other words; None if missing."""
+def entry_kind(path: Path) -> str | None:
+    """Return the kind of a directory entry without following links: FILE, FOLDER or a description; None if missing."""
     try:
         mode = path.lstat().st_mode
     except FileNotFoundError:
@@ -237,15 +236,37 @@ def kind(path: Path) -> str | None:
     return "a symbolic link" if stat.S_ISLNK(mode) else "a pipe or a device"
 
 
-def require(path: Path, wanted: str) -> Path:
-    """Make sure that an entry, if it exists, is of a kind, or raise a ForeignError; returns its path."""
-    if (actual := kind(path)) not in (None, wanted):
+def require_kind(path: Path, wanted: str) -> Path:
+    """Check that a directory entry is missing or of a kind.
+
+    Args:
+        path: path of the entry.
+        wanted: FILE or FOLDER.
+
+    Returns:
+        The path.
+
+    Raises:
+        ForeignError: when the entry is of another kind.
+    """
+    if (actual := entry_kind(path)) not in (None, wanted):
         raise ForeignError.at(path, str(actual))
     return path
 
 
-def without_link(folder: Path, option: str) -> Path:
-    """Make sure that a folder which the user did not name is no symbolic link: it may have come with the scene."""
+def require_no_link(folder: Path, option: str) -> Path:
+    """Check that a default folder, which may have come with the scene, is not a symbolic link.
+
+    Args:
+        folder: the folder.
+        option: the command-line option that names it, for messages.
+
+    Returns:
+        The folder.
+
+    Raises:
+        FilesError: when it is a symbolic link or cannot be accessed.
+    """
     try:
         is_link = folder.is_symlink()
     except OSError as error:
@@ -255,18 +276,27 @@ def without_link(folder: Path, option: str) -> Path:
     return folder
 
 
-def files(top: Path, patterns: Collection[str], *, strict: bool, besides: Collection[str] = ()) -> Iterator[str]:
-    """List the files in a folder and below whose names, with slashes, match a pattern; no link is followed.
+def list_files(top: Path, patterns: Collection[str], *, strict: bool, ignored: Collection[str] = ()) -> Iterator[str]:
+    """List the files below a folder whose relative paths match a pattern. Links are not followed.
 
-    Patterns are regular expressions for whole names, and those for the folders are what is before their last slash. If
-    `strict`, the first other entry is a ForeignError, but for those `besides`.
+    Args:
+        top: the folder.
+        patterns: regular expressions for relative paths with slashes; the parts before slashes match subfolders.
+        strict: whether other entries are errors.
+        ignored: names of entries to ignore.
+
+    Returns:
+        Relative paths with slashes.
+
+    Raises:
+        ForeignError: with `strict`, at the first entry that matches no pattern.
     """
-    allowed, folders = re.compile("|".join(patterns)), re.compile("|".join(parents(patterns)))
+    allowed, folders = re.compile("|".join(patterns)), re.compile("|".join(parent_folders(patterns)))
 
     def look(folder: Path, prefix: str) -> Iterator[str]:
         for path in folder.iterdir():
-            actual, name = kind(path), prefix + path.name
-            if actual is None or name in besides:
+            actual, name = entry_kind(path), prefix + path.name
+            if actual is None or name in ignored:
                 continue
             if actual == FOLDER and folders.fullmatch(name):
                 yield from look(path, f"{name}/")
@@ -278,40 +308,56 @@ def files(top: Path, patterns: Collection[str], *, strict: bool, besides: Collec
     return look(top, "")
 
 
-def clear(top: Path, patterns: Collection[str], keep: Collection[str] = ()) -> None:
-    """Remove all entries of a folder but those to keep; before, raise a ForeignError if `files` does not allow one."""
-    list(files(top, patterns, strict=True))
+def clear_folder(top: Path, patterns: Collection[str], keep: Collection[str] = ()) -> None:
+    """Delete the contents of a folder.
+
+    Args:
+        top: the folder.
+        patterns: patterns of all permitted files, as for `list_files`.
+        keep: names of entries to keep.
+
+    Raises:
+        ForeignError: when an entry matches no pattern; nothing is deleted then.
+    """
+    list(list_files(top, patterns, strict=True))
     for path in list(top.iterdir()):
         if path.name in keep:
             continue
-        if kind(path) == FOLDER:
+        if entry_kind(path) == FOLDER:
             shutil.rmtree(path)
         else:
             path.unlink()
 
 
-def parents(names: Iterable[str]) -> set[str]:
-    """List the folders that names with slashes are in, and those around them."""
+def parent_folders(names: Iterable[str]) -> set[str]:
+    """Collect all ancestor folders of relative paths."""
     inner = {name.rpartition("/")[0] for name in names if "/" in name}
-    return inner | parents(inner) if inner else inner
+    return inner | parent_folders(inner) if inner else inner
 
-
-pass  # REMOVED
 
 if sys.platform == "win32":
     import msvcrt
 else:
     import fcntl
 
-HIDDEN, LOCK, DRAFT = r"\.partial-[0-9a-f]{16}", "lock", "draft"
+HIDDEN_FOLDER_PATTERN, LOCK_FILE, DRAFT_FILE = r"\.partial-[0-9a-f]{16}", "lock", "draft"
 
-# The files that are written in hidden folders.
-STAGED = (LOCK, DRAFT, "picture", "session", "copy", r"animation\.gif", r"study\.(?:png|md|json)", r"sweep\.json")
+# Files that may be in a hidden folder.
+STAGED_PATTERNS = (
+    LOCK_FILE,
+    DRAFT_FILE,
+    "picture",
+    "session",
+    "copy",
+    r"animation\.gif",
+    r"study\.(?:png|md|json)",
+    r"sweep\.json",
+)
 
 
 @contextmanager
-def ensured(folder: Path) -> Iterator[None]:
-    """Make a folder and those around it if they are missing; one that was made and stays empty is removed."""
+def ensured_folder(folder: Path) -> Iterator[None]:
+    """Create a folder and its ancestors if missing; delete the new folder at exit if it is empty."""
     is_new = not folder.exists()
     if is_new:
         folder.mkdir(parents=True, exist_ok=True)
@@ -319,22 +365,22 @@ def ensured(folder: Path) -> Iterator[None]:
         yield
     finally:
         if is_new:
-            with suppress(OSError):  # not empty
+            with suppress(OSError):  # when it is not empty
                 folder.rmdir()
 
 
 @contextmanager
-def staged(folder: Path) -> Iterator[Path]:
-    """Make a hidden folder to write files in until they are moved out; it is removed with those that are left.
+def hidden_folder(folder: Path) -> Iterator[Path]:
+    """Create a hidden folder for unfinished files, and delete it at exit.
 
-    What a killed process has left there is removed before. The folder where the files belong is made if missing.
+    Hidden folders of killed processes are deleted first. `folder`, the destination of the files, is created if missing.
     """
-    with ensured(folder):
+    with ensured_folder(folder):
         _clear_abandoned(folder)
         hidden = folder / f".partial-{secrets.token_hex(8)}"
         hidden.mkdir()
         try:
-            with lock(hidden / LOCK):
+            with lock_file(hidden / LOCK_FILE):
                 yield hidden
         finally:
             shutil.rmtree(hidden, ignore_errors=True)
@@ -342,12 +388,12 @@ def staged(folder: Path) -> Iterator[Path]:
 
 def _clear_abandoned(folder: Path) -> None:
     for hidden in list(folder.iterdir()):
-        if re.fullmatch(HIDDEN, hidden.name) and kind(hidden) == FOLDER:
-            # One that is locked, or still being made, or of another user, or has other files than ours, stays.
+        if re.fullmatch(HIDDEN_FOLDER_PATTERN, hidden.name) and entry_kind(hidden) == FOLDER:
+            # Folders that are locked, incomplete, of another user, or with foreign files are left alone.
             with suppress(OSError, FilesError):
-                list(files(hidden, STAGED, strict=True))
-                if kind(hidden / LOCK) == FILE:
-                    with (hidden / LOCK).open("ab", 0) as file:
+                list(list_files(hidden, STAGED_PATTERNS, strict=True))
+                if entry_kind(hidden / LOCK_FILE) == FILE:
+                    with (hidden / LOCK_FILE).open("ab", 0) as file:
                         is_abandoned = _try_lock(file)
                     if is_abandoned:
                         shutil.rmtree(hidden)
@@ -355,25 +401,43 @@ def _clear_abandoned(folder: Path) -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """Open a hidden draft of a file, which it replaces at the end of the block; if that raises, the file stays."""
-    with staged(path.parent) as hidden:
-        with create(hidden / DRAFT) as file:
+    """Open a hidden draft that replaces a file at exit; after an exception, the file stays unchanged."""
+    with hidden_folder(path.parent) as hidden:
+        with create_file(hidden / DRAFT_FILE) as file:
             yield file
-        (hidden / DRAFT).replace(path)
+        (hidden / DRAFT_FILE).replace(path)
 
 
-def place(draft: Path, folder: Path, stem: str, suffix: str) -> Path:
-    """Move a file to the first free name of stem-1, stem-2 and so on; replaces none, and returns where it is."""
+def move_to_free_name(draft: Path, folder: Path, stem: str, suffix: str) -> Path:
+    """Move a file to the first free name of stem-1, stem-2 and so on, without replacing any file.
+
+    Args:
+        draft: the file.
+        folder: the destination.
+        stem: beginning of the name.
+        suffix: end of the name, such as ".png".
+
+    Returns:
+        The new path.
+    """
     number = 1
-    while os.path.lexists(path := folder / f"{stem}-{number}{suffix}") or not give_name(draft, path):
+    while os.path.lexists(path := folder / f"{stem}-{number}{suffix}") or not link_without_replacing(draft, path):
         number += 1
     return path
 
 
-def give_name(draft: Path, path: Path) -> bool:
-    """Give a file a name, unless another has taken it meanwhile."""
+def link_without_replacing(draft: Path, path: Path) -> bool:
+    """Link a file to a new name without replacing another file.
+
+    Args:
+        draft: the file.
+        path: the new path.
+
+    Returns:
+        False when the new path exists already.
+    """
     try:
-        # Unlike a rename, a link does not replace another file.
+        # A rename would replace an existing file.
         os.link(draft, path)
     except FileExistsError:
         return False
@@ -382,21 +446,38 @@ def give_name(draft: Path, path: Path) -> bool:
     return True
 
 
-def create(path: Path, buffering: int = -1) -> BinaryIO:
-    """Make a new file, and open it for writing and reading; raises FileExistsError where there is anything."""
+def create_file(path: Path, buffering: int = -1) -> BinaryIO:
+    """Create a file and open it for writing and reading.
+
+    Args:
+        path: path of the file.
+        buffering: as for `open`.
+
+    Raises:
+        FileExistsError: when the path exists.
+    """
     return path.open("x+b", buffering)
 
 
-def add(path: Path, data: bytes) -> None:
-    """Write a new file."""
-    with create(path) as file:
+def write_new_file(path: Path, data: bytes) -> None:
+    """Create a file.
+
+    Args:
+        path: path of the file.
+        data: its content.
+
+    Raises:
+        FileExistsError: when the path exists.
+    """
+    with create_file(path) as file:
         file.write(data)
 
 
-def lock(path: Path) -> BinaryIO:
-    """Lock a file, made if missing, until it is closed here and in all processes that have inherited it.
+def lock_file(path: Path) -> BinaryIO:
+    """Lock a file until it is closed here and in all processes that inherit it. The file is created if missing.
 
-    Raises BlockingIOError when another process holds the lock.
+    Raises:
+        BlockingIOError: when another process holds the lock.
     """
     file = path.open("ab", 0)
     try:
@@ -408,7 +489,7 @@ def lock(path: Path) -> BinaryIO:
 
 
 def _try_lock(file: BinaryIO) -> bool:
-    """Lock an open file; False where the file system has no locks; BlockingIOError where another has the lock."""
+    """Lock an open file; return False when the file system has no locks."""
     try:
         if sys.platform == "win32":
             msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)

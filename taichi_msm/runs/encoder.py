@@ -1,7 +1,7 @@
-"""Encode pictures as PNG, GIF and MP4 in a separate process, in parallel with the simulation.
+"""Picture encoding in a separate process, in parallel with the simulation.
 
-Pillow releases Python's GIL while it encodes, but Taichi holds it while a kernel runs. Measured with launches of 25 ms
-and PNGs of 512 x 512 pixels, which take 18 ms: encoding in threads lengthens a frame by 22 ms, in a process by 1 ms.
+Pillow releases the GIL while it encodes, but Taichi holds it while a kernel runs. Measured with kernel launches of
+25 ms and PNGs of 512 x 512 pixels, which take 18 ms to encode: threads lengthen a frame by 22 ms, a process by 1 ms.
 """
 
 from __future__ import annotations
@@ -22,105 +22,117 @@ from typing import BinaryIO
 import numpy as np
 
 from taichi_msm.errors import FilesError, Pause
-from taichi_msm.runs.media import PATIENCE, Job, Picture, PictureWriter, Report
+from taichi_msm.runs.media import PAUSE_INTERVAL_S, EncodingJob, EncodingReport, Picture, PictureWriter
 
-# The most pictures that wait in memory: by number, and by bytes.
-WAITING = 4
-WAITING_BYTES = 256 << 20
+# Limits of the queue in memory.
+MAX_QUEUED_FRAMES = 4
+MAX_QUEUED_BYTES = 256 << 20
 
-# The child gets our path, so that it finds this package where we did. It must not run the caller's main module, as
-# multiprocessing would: a script that calls us then needs no guard against its own import.
-_CHILD = "import sys; sys.path[:] = {path!r}; from taichi_msm.runs.encoder import main; main()"
+# With the parent's path, the child imports the same package. Unlike with multiprocessing, the child does not import the
+# caller's main module, so that scripts need no guard.
+_CHILD_CODE = "import sys; sys.path[:] = {path!r}; from taichi_msm.runs.encoder import main; main()"
 
 
 class Encoder:
-    """A process that encodes pictures, and holds the file descriptors that it inherits open while it lives.
+    """Child process that encodes pictures.
 
-    An OSError, in any method and at the latest in `finish`, says that a file cannot be written or the process ended.
+    Args:
+        job: formats, destinations and size of the pictures.
+        inherit: file descriptors that the child keeps open while it lives, such as locks.
+
+    Raises:
+        OSError: from any method, at the latest from `finish`, when a file cannot be written or the process has died.
     """
 
-    def __init__(self, job: Job, inherit: tuple[int, ...] = ()) -> None:
-        with _hurry_held_back():
+    def __init__(self, job: EncodingJob, inherit: tuple[int, ...] = ()) -> None:
+        with _sigint_blocked():  # the child unblocks it when it can handle it
             self._process = subprocess.Popen(
-                [sys.executable, "-c", _CHILD.format(path=sys.path)],
+                [sys.executable, "-c", _CHILD_CODE.format(path=sys.path)],
                 bufsize=0,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 pass_fds=inherit,
-                # Ctrl-C must reach only us: the child still finishes the pictures so far, as it does after a SIGTERM.
+                # Ctrl-C must not reach the child, which still finishes the queued pictures.
                 start_new_session=True,
                 creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
             )
         assert self._process.stdin
         assert self._process.stdout
         self._pictures = self._process.stdin
-        self._answer = self._process.stdout
-        self._answered = b""
-        self._report: Report | None = None
+        self._report_pipe = self._process.stdout
+        self._report_data = b""
+        self._report: EncodingReport | None = None
         pickle.dump(job, self._pictures)
         if os.name != "nt":  # where pipes always block
             os.set_blocking(self._pictures.fileno(), False)
 
     def add(self, pictures: Picture, pause: Pause = lambda: None) -> None:
-        """Hand over the pictures of the next frame, shape (cameras, height, width, 3); waits while too many wait.
+        """Add the pictures of the next frame; wait while the queue is full.
 
-        `pause` is called some times a second while it waits; if it raises, the picture is given up.
+        Args:
+            pictures: colours, shape (cameras, height, width, 3).
+            pause: called several times a second while waiting; if it raises, the frame is discarded.
         """
-        rest = np.ascontiguousarray(pictures).reshape(-1).data
+        remaining = np.ascontiguousarray(pictures).reshape(-1).data
         try:
-            while rest:
-                count = self._pictures.write(rest)
-                # The process may have been stopped, so the waiting must be interruptible.
-                if count is None and not select.select([], [self._pictures], [], PATIENCE)[1]:
+            while remaining:
+                count = self._pictures.write(remaining)
+                # Waiting must be interruptible, because the child may be suspended.
+                if count is None and not select.select([], [self._pictures], [], PAUSE_INTERVAL_S)[1]:
                     pause()
-                rest = rest[count or 0 :]
+                remaining = remaining[count or 0 :]
         except BrokenPipeError:
-            self.finish()  # raises what ended the process
+            self.finish()  # raises the error that ended the process
             raise
 
-    def finish(self, pause: Pause = lambda: None, *, hurry: bool = False) -> Report:
-        """Wait until all pictures are encoded; in a hurry those that are not being encoded yet are given up.
+    def finish(self, pause: Pause = lambda: None, *, discard_queued: bool = False) -> EncodingReport:
+        """Wait until all pictures are encoded.
 
-        `pause` is called some times a second while it waits; if it raises, this can be called again.
+        Args:
+            pause: called several times a second while waiting; if it raises, `finish` can be called again.
+            discard_queued: whether to discard frames whose encoding has not begun, except for the first one.
+
+        Returns:
+            The number of encoded frames and the processor time.
         """
         if self._report is None:
-            if hurry:
-                with suppress(ValueError, OSError, AttributeError):  # a system without them, or an ended process
+            if discard_queued:
+                with suppress(ValueError, OSError, AttributeError):  # unsupported signals, or a dead process
                     self._process.send_signal(signal.SIGINT)
                     self._process.send_signal(signal.SIGCONT)
             with suppress(BrokenPipeError):
                 self._pictures.close()
-            while part := self._read_answer(pause):
-                self._answered += part
-            self._answer.close()
+            while data := self._read_report(pause):
+                self._report_data += data
+            self._report_pipe.close()
             code = self._process.wait()
-            result = pickle.loads(self._answered) if self._answered else None
+            result = pickle.loads(self._report_data) if self._report_data else None
             if isinstance(result, Exception):
                 raise result
-            if not isinstance(result, Report):
+            if not isinstance(result, EncodingReport):
                 raise ChildProcessError(f"the encoder ended with exit code {code}")
             self._report = result
         return self._report
 
-    def _read_answer(self, pause: Pause) -> bytes:
-        """Wait for the next part of the answer; an empty part is the last."""
-        if os.name != "nt":  # where pipes cannot be waited for
-            while not select.select([self._answer], [], [], PATIENCE)[0]:
+    def _read_report(self, pause: Pause) -> bytes:
+        """Wait for further bytes of the report; return empty bytes at its end."""
+        if os.name != "nt":  # where select does not support pipes
+            while not select.select([self._report_pipe], [], [], PAUSE_INTERVAL_S)[0]:
                 pause()
-        return self._answer.read(1 << 16)
+        return self._report_pipe.read(1 << 16)
 
     def abort(self) -> None:
-        """End the process at once."""
+        """Kill the process."""
         self._process.kill()
         with suppress(BrokenPipeError):
             self._pictures.close()
-        self._answer.close()
+        self._report_pipe.close()
         self._process.wait()
 
 
 @contextmanager
-def _hurry_held_back() -> Iterator[None]:
-    """Block SIGINT while a process is started, so that it stays blocked there until the process is ready for it."""
+def _sigint_blocked() -> Iterator[None]:
+    """Block SIGINT in this process and in the children started in the block."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -132,53 +144,61 @@ def _hurry_held_back() -> Iterator[None]:
 
 
 def main() -> None:
-    """Run as the child process: read a job and its pictures from stdin, report on stdout."""
-    answer: Report | Exception
-    hurry = Event()
-    # A SIGTERM to all processes of a service reaches this one too; it is ignored, as our pictures end when the parent
-    # process closes the stream.
+    """Run the child process: read a job and its pictures from stdin, write the report to stdout."""
+    report: EncodingReport | Exception
+    discard_queued = Event()
+    # A SIGTERM to a whole service also reaches this process. It is ignored: the parent closes the stream when it ends.
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    signal.signal(signal.SIGINT, lambda number, frame: hurry.set())
+    signal.signal(signal.SIGINT, lambda number, frame: discard_queued.set())
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     try:
-        answer = encode(pickle.load(sys.stdin.buffer), sys.stdin.buffer, hurry)
+        report = encode_stream(pickle.load(sys.stdin.buffer), sys.stdin.buffer, discard_queued)
     except (OSError, FilesError) as error:
-        answer = error
+        report = error
     except Exception as error:
-        # Not every exception can be pickled.
-        answer = RuntimeError(f"in the encoder: {type(error).__name__}: {error}")
-    with suppress(BrokenPipeError):  # when the parent process was killed
-        os.write(sys.stdout.fileno(), pickle.dumps(answer))
-    gc.freeze()  # The parent waits for the end, which a search for cycles would delay.
+        # Not all exceptions can be pickled.
+        report = RuntimeError(f"in the encoder: {type(error).__name__}: {error}")
+    with suppress(BrokenPipeError):  # when the parent was killed
+        os.write(sys.stdout.fileno(), pickle.dumps(report))
+    gc.freeze()  # A final garbage collection would delay the exit, for which the parent waits.
 
 
-def encode(job: Job, source: BinaryIO, hurry: Event) -> Report:
-    """Encode the pictures of a stream of bytes until it ends; in a hurry those are given up that are not begun."""
+def encode_stream(job: EncodingJob, source: BinaryIO, discard_queued: Event) -> EncodingReport:
+    """Encode the pictures of a byte stream until it ends.
+
+    Args:
+        job: formats, destinations and size of the pictures.
+        source: the frames one after another, each of shape (cameras, height, width, 3), uint8.
+        discard_queued: when set, pictures whose encoding has not begun are discarded, except for the first frame.
+
+    Returns:
+        The number of encoded frames and the processor time.
+    """
     width, height = job.size
     shape = len(job.folders), height, width, 3
     parent = os.getppid()
-    writer = PictureWriter(job, max(1, min(WAITING, WAITING_BYTES // math.prod(shape))), hurry)
+    writer = PictureWriter(job, max(1, min(MAX_QUEUED_FRAMES, MAX_QUEUED_BYTES // math.prod(shape))), discard_queued)
     try:
-        for pictures in _pictures(source, shape):
+        for pictures in _read_pictures(source, shape):
             writer.add(pictures)
-            if hurry.is_set():
+            if discard_queued.is_set():
                 break
-            _leave_orphaned(parent)
-        _leave_orphaned(parent)
+            _exit_if_orphaned(parent)
+        _exit_if_orphaned(parent)
         return writer.finish()
     finally:
         writer.abort()
 
 
-def _leave_orphaned(parent: int) -> None:
-    """End this process if its parent was killed, so that the directory is free for another run."""
+def _exit_if_orphaned(parent: int) -> None:
+    """End this process if its parent was killed, so that the lock on the directory is released."""
     if os.getppid() != parent:
         os._exit(1)
 
 
-def _pictures(source: BinaryIO, shape: tuple[int, ...]) -> Iterator[Picture]:
-    """Read the pictures of frames until the stream ends; an incomplete frame, of an interrupted run, is dropped."""
+def _read_pictures(source: BinaryIO, shape: tuple[int, ...]) -> Iterator[Picture]:
+    """Read frames until the stream ends; drop an incomplete last frame."""
     size = math.prod(shape)
     while True:
         data = source.read(size)

@@ -1,4 +1,4 @@
-"""Draw and label a run that has ended: any of its frames, from any camera, and the flow between any two frames."""
+"""Rendering of a finished run: pictures, labels and optical flow of any frame from any camera."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from taichi_msm.scene.scene import Scene
 
 
 class Playback:
-    """The frames of a run, by number. Usable in a with statement, which frees its memory.
+    """Frames of a finished run. As a context manager, it frees its memory at exit.
 
     Args:
-        directory: where its results are; the trajectory must be among them.
+        directory: folder of the results, which must include the trajectory.
         arch: as for `Simulation`.
         threads: as for `Simulation`.
 
     Raises:
-        ArgumentError: here and in all methods, when an argument is not what it must be.
+        ArgumentError: here and in all methods, when an argument is invalid.
         DeviceError: as for `Simulation`.
-        FilesError: when there is no trajectory of a run, or it is damaged.
+        FilesError: when the trajectory is missing or damaged.
 
     Attributes:
-        scene: the scene as it was run, with the points, the step and the precision that were chosen.
-        time: of every frame [s], shape (frames,).
-        positions: of the points in every frame [m], shape (frames, rows, cols, 3); not to be written to.
+        scene: the scene as simulated, with resolved mesh, step and precision.
+        time: times of the frames [s], shape (frames,).
+        positions: positions of the mass points [m], shape (frames, rows, cols, 3); read-only.
 
     Example:
         >>> from taichi_msm import Playback
@@ -51,34 +51,56 @@ class Playback:
         run = read_run(directory)
         with run.unchanged():
             self.scene, self.time, self.positions = run.scene, run.time, run.positions()
-        run.require_pictures(drawn=False)
-        self._require_picture = cache(partial(run.require_pictures, drawn=True))
+        run.require_same_pictures(drawn=False)
+        self._require_picture = cache(partial(run.require_same_pictures, drawn=True))
         self._simulation = Simulation(run.scene, arch, threads)
 
     def draw(self, frame: int, camera: CameraLike = None) -> NDArray[np.uint8]:
-        """Draw a frame; as `Simulation.draw`.
+        """Draw a frame.
+
+        Args:
+            frame: index of the frame.
+            camera: as for `Simulation.draw`.
+
+        Returns:
+            Colours, shape (height, width, 3).
 
         Raises:
-            FilesError: when the scene's picture is not the one that was run.
+            FilesError: when the scene's picture has changed since the run.
         """
         self._require_picture()
-        return self._simulation.draw(camera, *self._at(frame))
+        return self._simulation.draw(camera, *self._frame_state(frame))
 
     def labels(self, frame: int, camera: CameraLike = None) -> Labels:
-        """Give what each pixel of a frame shows; as `Simulation.labels`."""
-        return self._simulation.labels(camera, *self._at(frame))
+        """Compute the ground-truth labels of a frame.
+
+        Args:
+            frame: index of the frame.
+            camera: as for `Simulation.draw`.
+        """
+        return self._simulation.labels(camera, *self._frame_state(frame))
 
     def flow(self, first: int, second: int, camera: CameraLike = None, camera_then: CameraLike = None) -> Flow:
-        """Give the flow from one frame to another, before or after it, and which of its material is hidden there.
+        """Compute the optical flow from one frame to another, and which pixels of the first are occluded in the second.
 
-        `camera` sees the first and `camera_then` the second, which may be the same frame; None: the same camera.
+        Args:
+            first: index of the first frame.
+            second: index of the second frame, which may be the same or an earlier one.
+            camera: camera of the first frame, as for `Simulation.draw`.
+            camera_then: camera of the second frame; None for the same camera.
         """
         then = camera if camera_then is None else camera_then
-        return self._simulation.flow(self.labels(first, camera), then, *self._at(second))
+        return self._simulation.flow(self.labels(first, camera), then, *self._frame_state(second))
 
     def locate(self, frame: int, coordinates: NDArray[np.floating], camera: CameraLike = None) -> Sight:
-        """Find where material points are seen in a frame, and whether anything hides them; as `Simulation.locate`."""
-        return self._simulation.locate(coordinates, camera, *self._at(frame))
+        """Project material points into the picture of a frame, and determine whether they are hidden.
+
+        Args:
+            frame: index of the frame.
+            coordinates: as for `Simulation.locate`, shape (n, 2).
+            camera: as for `Simulation.draw`.
+        """
+        return self._simulation.locate(coordinates, camera, *self._frame_state(frame))
 
     def close(self) -> None:
         """Free the memory."""
@@ -90,8 +112,7 @@ class Playback:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _at(self, frame: int) -> tuple[NDArray[np.floating], float]:
-        """Give the positions and the time of a frame."""
+    def _frame_state(self, frame: int) -> tuple[NDArray[np.floating], float]:
         if isinstance(frame, bool) or not isinstance(frame, int | np.integer) or not 0 <= frame < len(self.time):
             raise ArgumentError(f"frame: {frame!r}; take a whole number, 0 to {len(self.time) - 1}")
         return self.positions[frame], float(self.time[frame])

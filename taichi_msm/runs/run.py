@@ -1,4 +1,4 @@
-"""The loop over the frames of a scene: it simulates, draws and writes them."""
+"""Run of a scene: simulate, draw and write all frames, with error estimates and checkpoints."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from taichi_msm.render.camera import view_at
 from taichi_msm.render.labels import FrameOutputs
 from taichi_msm.render.notes import drawing_warnings
 from taichi_msm.render.texture import load_texture
-from taichi_msm.runs.manifest import Manifest, digests, read_manifest
+from taichi_msm.runs.manifest import Manifest, input_digests, read_manifest
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.runs.writer import ResultWriter, RunRecord
 from taichi_msm.scene.scene import Scene
@@ -48,14 +48,18 @@ from taichi_msm.system import process, runtime
 from taichi_msm.system.compiler import versions
 from taichi_msm.system.runtime import Device
 
-# Points are advised only for a run that takes no longer than this [s].
-LONGEST_ADVISED = 3600.0
+# Finer meshes are recommended only up to this estimated duration of the run.
+MAX_ADVISED_DURATION_S = 3600.0
 
 
 class Stopwatch:
-    """Adds up the time of every stage of a run [s]; a stage within another one interrupts it.
+    """Timer of the stages of a run. A nested stage pauses the outer one.
 
-    The first stage, startup, began at `started`, a `time.perf_counter()`; None: now.
+    Args:
+        started: `time.perf_counter()` at the beginning of the first stage, startup; None for now.
+
+    Attributes:
+        seconds: time spent in each stage [s].
     """
 
     def __init__(self, started: float | None) -> None:
@@ -65,22 +69,22 @@ class Stopwatch:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Count the time of a block as that of a stage."""
-        around = self._switch(name)
+        """Attribute the time of a block to a stage."""
+        outer = self._switch(name)
         try:
             yield
         finally:
-            self._switch(around)
+            self._switch(outer)
 
     def _switch(self, stage: str) -> str:
-        """Begin a stage; returns the one that it interrupts."""
-        now, before = time.perf_counter(), self._stage
-        self.seconds[before] = self.seconds.get(before, 0.0) + now - self._last
+        """Begin a stage; return the previous one."""
+        now, previous = time.perf_counter(), self._stage
+        self.seconds[previous] = self.seconds.get(previous, 0.0) + now - self._last
         self._last, self._stage = now, stage
-        return before
+        return previous
 
     def total(self) -> float:
-        """Give the time since the beginning [s]."""
+        """Return the time since the start [s]."""
         return time.perf_counter() - self._started
 
 
@@ -95,32 +99,33 @@ def run(
     started: float | None = None,
     progress: StageProgressCallback = lambda stage, done, total: None,
 ) -> RunRecord:
-    """Simulate a scene and write its results, whole or not at all.
+    """Simulate a scene and write its results atomically.
 
-    An unfinished run of the same scene in the same directory is continued: the results have the same bits. Without any
-    output, and with an estimate of the error, it begins anew, as the estimate needs the frames that were not kept.
+    An unfinished run of the same scene in the same directory is continued, and the results have the same bits as those
+    of an uninterrupted run. It restarts if the error is estimated and the scene has no `output`, because the estimate
+    needs all frames.
 
     Args:
-        scene: what `load_scene` returned, or the same as a mapping.
-        directory: where frames/, animation.gif, animation.mp4, trajectory.npz, forces.csv and run.json go; of several
-            cameras, what each sees goes to a folder there that has its name.
+        scene: the scene, from `load_scene` or as a mapping with the keys of a scene file.
+        directory: destination of frames/, animation.gif, animation.mp4, trajectory.npz, forces.csv and run.json; with
+            several cameras, pictures and labels go to a subfolder named after each camera.
         arch: cpu, cuda or vulkan.
-        threads: number of CPU threads; None takes every core. With 1, pictures are encoded in this process too.
-        overrides: the overrides that made the scene, for the record.
-        estimate_error: whether to estimate the error of the run, by pilots; None: if they take at most two fifths of
-            the run. For a tolerance in the scene it is estimated in any case.
-        started: `time.perf_counter()` when the program began; None: now.
-        progress: called often, with the stage, the frames done and the frames in all; what it raises stops the run
-            there. After a KeyboardInterrupt the finished frames are kept.
+        threads: number of CPU threads; None for all cores. With 1, pictures are encoded in this process, too.
+        overrides: the overrides that were applied to the scene file, for the record.
+        estimate_error: whether to estimate the error by companion runs; None if they take at most two fifths of the
+            run's time. With a tolerance in the scene, the error is always estimated.
+        started: `time.perf_counter()` at the start of the program; None for now.
+        progress: called often with the stage, the finished frames and the total number of frames. An exception from it
+            stops the run; after a KeyboardInterrupt, finished frames are kept.
 
     Returns:
-        The content of run.json; its "status" is "complete", "diverged" (then "error" says where and why) or
-        "interrupted". After the last two, and after the process was killed, `resume` continues the run.
+        The content of run.json. Its "status" is "complete", "diverged" ("error" then contains the location and the
+        cause) or "interrupted". `resume` continues diverged, interrupted and killed runs.
 
     Raises:
-        ArgumentError: when an argument is not what it must be.
+        ArgumentError: when an argument is invalid.
         SceneError: when the scene cannot be run, its picture cannot be decoded, no step meets its tolerance, or the
-            disk has no room for the results.
+            disk is too small for the results.
         DeviceError: when the arch is not available.
         FilesError: when the results cannot be written.
         KeyboardInterrupt: when interrupted before the first frame; nothing is written then.
@@ -138,24 +143,24 @@ def run(
     folder = Path(directory)
     cost.require_disk(plan, folder)
     device = runtime.start(arch, threads)
-    sha256 = digests(plan)
+    sha256 = input_digests(plan)
     given = plan.scene
     texture = load_texture(given, sha256.get("image")) if given.draws else None
-    seeks = given.sheet.tolerance is not None or given.time.tolerance is not None
-    with watch.stage("pilot" if seeks else "startup"):
+    has_tolerance = given.sheet.tolerance is not None or given.time.tolerance is not None
+    with watch.stage("pilot" if has_tolerance else "startup"):
         plan, estimate, mesh = resolve(plan, device, partial(progress, "pilot"))
     if mesh is not None:
         cost.require_disk(plan, folder)
     with writing(directory):
-        here = str(Path.cwd())
+        current_folder = str(Path.cwd())
     manifest = Manifest(
-        given, plan.scene, tuple(overrides), estimate, mesh, estimate_error, here, arch, sha256, versions()
+        given, plan.scene, tuple(overrides), estimate, mesh, estimate_error, current_folder, arch, sha256, versions()
     )
-    task = _Task(manifest, plan, texture, device, folder)
-    if begun := _begun(task):
+    context = _RunContext(manifest, plan, texture, device, folder)
+    if unfinished := _find_unfinished(context):
         with suppress(DamagedError):
-            return _carry_out(task._replace(manifest=_with_versions(begun)), watch, progress, resumes=True)
-    return _carry_out(task, watch, progress, resumes=False)
+            return _execute(context._replace(manifest=_with_versions(unfinished)), watch, progress, resumes=True)
+    return _execute(context, watch, progress, resumes=False)
 
 
 def resume(
@@ -165,21 +170,23 @@ def resume(
     started: float | None = None,
     progress: StageProgressCallback = lambda stage, done, total: None,
 ) -> RunRecord:
-    """Continue a run that was interrupted or killed, ran out of disk space, or diverged; to the same bits.
+    """Continue a run that was interrupted or killed, ran out of disk space, or diverged.
+
+    The results have the same bits as those of an uninterrupted run.
 
     Args:
-        directory: where the results of the run go.
+        directory: destination of the run's results.
         threads: as for `run`.
         started: as for `run`.
         progress: as for `run`.
 
     Returns:
-        The same as `run`.
+        As for `run`.
 
     Raises:
-        SceneError: when the scene's picture or map cannot be decoded.
+        SceneError: when the scene's picture or a map cannot be decoded.
         DeviceError: when the arch is not available.
-        FilesError: when there is nothing to resume, or what there is cannot be used; and as for `run`.
+        FilesError: when there is no run to resume or it is damaged; and as for `run`.
         KeyboardInterrupt: when interrupted before another frame is finished; nothing has changed then.
     """
     watch = Stopwatch(started)
@@ -187,82 +194,90 @@ def resume(
     manifest, plan = read_manifest(Path(directory))
     if too_large := [str(problem) for problem in cost.size_problems(plan)]:
         raise SceneError(too_large)
-    manifest.require_same(digests(plan), versions())
+    manifest.require_same_inputs(input_digests(plan), versions())
     texture = load_texture(plan.scene, manifest.sha256.get("image")) if plan.scene.draws else None
     device = runtime.start(manifest.arch, threads)
-    task = _Task(_with_versions(manifest), plan, texture, device, Path(directory))
-    return _carry_out(task, watch, progress, resumes=True)
+    context = _RunContext(_with_versions(manifest), plan, texture, device, Path(directory))
+    return _execute(context, watch, progress, resumes=True)
 
 
-def _begun(task: _Task) -> Manifest | None:
-    """Find the unfinished run in the directory that leads to the same bits, and to the same estimate of their error."""
-    manifest = task.manifest
+def _find_unfinished(context: _RunContext) -> Manifest | None:
+    """Find the unfinished run in the directory, if it produces the same bits and the same error estimate."""
+    manifest = context.manifest
     try:
-        unfinished, _ = read_manifest(task.directory)
+        unfinished, _ = read_manifest(context.directory)
     except (FilesError, SceneError):
         return None
-    if not manifest.gives_the_bits_of(unfinished) or _pilots(task, resumed=True) != _pilots(task, resumed=False):
+    if not manifest.has_same_bits_as(unfinished):
+        return None
+    if _choose_pilots(context, resumed=True) != _choose_pilots(context, resumed=False):
         return None
     return replace(manifest, versions=unfinished.versions)
 
 
-def _with_versions(begun: Manifest) -> Manifest:
-    """Add the versions of this process, whose compiler may be another one, to those of the process that began a run."""
-    return replace(begun, versions={**begun.versions, **versions()})
+def _with_versions(manifest: Manifest) -> Manifest:
+    """Add the versions of this process, whose compiler may differ, to those of the process that began the run."""
+    return replace(manifest, versions={**manifest.versions, **versions()})
 
 
-class _Task(NamedTuple):
-    """What is to be run."""
+class _RunContext(NamedTuple):
+    """Inputs, device and destination of a run."""
 
-    manifest: Manifest  # as it is written down
-    plan: Plan  # of its scene, in which nothing is left open
-    texture: NDArray[np.uint8] | None  # the picture on the sheet, if anything is drawn
+    manifest: Manifest
+    plan: Plan  # of the manifest's resolved scene
+    texture: NDArray[np.uint8] | None  # the picture on the sheet, if the scene is drawn
     device: Device
-    directory: Path  # where the results go
+    directory: Path  # destination of the results
 
 
-def _carry_out(task: _Task, watch: Stopwatch, progress: StageProgressCallback, *, resumes: bool) -> RunRecord:
-    """Simulate and draw all frames, or those that the unfinished run in the directory lacks."""
+def _execute(context: _RunContext, watch: Stopwatch, progress: StageProgressCallback, *, resumes: bool) -> RunRecord:
+    """Simulate and draw all frames, or the missing frames of the unfinished run in the directory."""
     with ExitStack() as opened:
-        run = _Run(task, watch, progress, opened, resumes=resumes)
-        run.check_stored_frames()
+        run = _Run(context, watch, progress, opened, resumes=resumes)
+        run.verify_stored_frames()
         with watch.stage("hand over"):
             try:
                 run.prepare()
-                run.go_through_frames()
+                run.simulate_frames()
                 ending: dict[str, Any] = {"status": "complete"}
             except KeyboardInterrupt:
-                ending = run.keep_finished_frames()
+                ending = run.save_finished_frames()
             except DivergedError as error:
-                ending = run.find_cause(error)
-            return run.conclude(ending)
+                ending = run.diagnose_divergence(error)
+            return run.publish_results(ending)
 
 
 class _Run:
-    """A run under way: a simulation, the pilots beside it, and the results as they grow; all opened in a stack."""
+    """Run in progress: the simulation, its companion runs and the writer of the results."""
 
     def __init__(
-        self, task: _Task, watch: Stopwatch, progress: StageProgressCallback, opened: ExitStack, *, resumes: bool
+        self, context: _RunContext, watch: Stopwatch, progress: StageProgressCallback, opened: ExitStack, *, resumes: bool
     ) -> None:
-        self._task, self._watch, self._progress = task, watch, progress
-        plan, device, manifest = task.plan, task.device, task.manifest
+        self._context, self._watch, self._progress = context, watch, progress
+        plan, device, manifest = context.plan, context.device, context.manifest
         self._frames = plan.grid.frames + 1
         progress("compile", 0, self._frames)
         self._cores = cores = free_cores(plan)
-        # With one thread there is no core for an encoder beside the simulation.
-        beside = device.threads > 1
-        # In this order, so that the encoder starts up while kernels are compiled.
+        # The writer comes first, so that its encoder starts while kernels are compiled.
         self._writer = opened.enter_context(
-            ResultWriter(task.directory, plan.scene, plan.grid, manifest.as_json(), resumes=resumes, beside=beside)
+            ResultWriter(
+                context.directory,
+                plan.scene,
+                plan.grid,
+                manifest.as_json(),
+                resumes=resumes,
+                encode_in_subprocess=device.threads > 1,  # with one thread, no core is free for it
+            )
         )
-        self._simulation = opened.enter_context(Simulation(plan, device.arch, device.threads, task.texture, cores))
-        self._resumed = self._writer.stored
-        pilots = _pilots(task, resumed=self._resumed > 0)
+        self._simulation = opened.enter_context(Simulation(plan, device.arch, device.threads, context.texture, cores))
+        self._resumed = self._writer.stored_frames
+        pilots = _choose_pilots(context, resumed=self._resumed > 0)
         self._error: RunErrorEstimator | None = None
-        self._ways = PathDependence(plan) if plan.scene.time.at_rest else None
-        asked = manifest.asks_estimate
-        self._solves_again = self._ways is not None and (
-            asked is True or (asked is None and device.arch == "cpu" and self._ways.affords(pilots.cost))
+        self._path_dependence = PathDependence(plan) if plan.scene.time.at_rest else None
+        requested = manifest.asks_estimate
+        self._repeats_solution = self._path_dependence is not None and (
+            requested is True
+            or (requested is None and device.arch == "cpu" and self._path_dependence.affords(pilots.cost))
         )
         self._known = RunErrorEstimates(manifest.estimate, pilots.reason, manifest.mesh)
         if pilots.planned:
@@ -271,87 +286,91 @@ class _Run:
             except DeviceError:
                 self._known = self._known._replace(reason=f"{device.arch} cannot run this scene in f64")
 
-    def check_stored_frames(self) -> None:
-        """Find damage in the stored positions before they are used."""
-        for frame in range(self._resumed if self._task.plan.scene.output else 0):
+    def verify_stored_frames(self) -> None:
+        """Verify the checksums of stored positions before they are used."""
+        for frame in range(self._resumed if self._context.plan.scene.output else 0):
             self._progress("check", frame, self._resumed)
-            self._writer.position(frame)
+            self._writer.read_positions(frame)
 
     def prepare(self) -> None:
-        """Compile, and bring the simulation and its pilots to where the unfinished run was left."""
-        writer, rest = self._writer, rest_positions(self._task.plan.scene.sheet)
+        """Compile, and restore the simulation and its companion runs to the state of the unfinished run."""
+        writer, rest = self._writer, rest_positions(self._context.plan.scene.sheet)
         with self._watch.stage("compile"):
             self._simulation.compile(partial(self._progress, "compile", 0, self._frames))
             if self._error:
                 self._error.compile()
         if writer.saved:
             self._simulation.restore(writer.saved)
-        if self._ways and self._task.plan.scene.output:
+        if self._path_dependence and self._context.plan.scene.output:
             for frame in range(writer.frames):
-                self._ways.check_frame(frame, writer.position(frame) - rest)
+                self._path_dependence.check_frame(frame, writer.read_positions(frame) - rest)
         if self._error:
             with self._watch.stage("pilot"):
                 for frame in range(1, writer.frames):
-                    told = partial(self._progress, "pilot", frame, writer.frames)
-                    self._error.compare_frame(writer.position(frame) - rest, told)
+                    report = partial(self._progress, "pilot", frame, writer.frames)
+                    self._error.compare_frame(writer.read_positions(frame) - rest, report)
 
-    def go_through_frames(self) -> None:
-        """Simulate, draw and write every frame that is missing, and finish the results."""
-        writer, simulation, scene = self._writer, self._simulation, self._task.plan.scene
+    def simulate_frames(self) -> None:
+        """Simulate, draw and write every missing frame, and complete the results."""
+        writer, simulation, scene = self._writer, self._simulation, self._context.plan.scene
         stage, rest = self._watch.stage, rest_positions(scene.sheet)
         observed = dict.fromkeys(scene.render.all_cameras, FrameOutputs())
-        # Frames that need no step are told apart, as they say nothing of the time that the others will take.
-        without_steps = max(self._resumed, 1)
+        # Frames that need no steps are reported as a separate stage: they would distort the estimated remaining time.
+        redrawn_frames = max(self._resumed, 1)
         for frame in range(writer.frames, self._frames):
-            kind, of = ("redraw", without_steps) if frame < without_steps else ("frames", self._frames)
-            told = partial(self._progress, kind, frame, of)
-            told()
+            kind, total = ("redraw", redrawn_frames) if frame < redrawn_frames else ("frames", self._frames)
+            report = partial(self._progress, kind, frame, total)
+            report()
             with stage("simulate"):
                 simulation.advance(max(0, frame - simulation.frame), self._pause)
-            position = writer.position(frame) if frame < self._resumed else simulation.positions()
+            position = writer.read_positions(frame) if frame < self._resumed else simulation.positions()
             with stage("render"):
                 time = frame / scene.time.frames_per_second
-                for camera, before in observed.items():
-                    observed[camera] = simulation.observe(before.labels, camera, position, time)
-            writer.add(position, observed, simulation.forces(), told)
-            if self._ways:
-                self._ways.check_frame(frame, position - rest)
+                for camera, previous in observed.items():
+                    observed[camera] = simulation.observe(previous.labels, camera, position, time)
+            writer.add(position, observed, simulation.forces(), report)
+            if self._path_dependence:
+                self._path_dependence.check_frame(frame, position - rest)
             if self._error and frame > 0:
                 with stage("pilot"):
-                    of_tools = [simulation.forces()[tool.probe].force for tool in self._task.plan.tools]
-                    forces = np.array(of_tools).reshape(-1, 3) if frame >= self._resumed else None
-                    self._error.compare_frame(position - rest, told, forces)
+                    tool_forces = [simulation.forces()[tool.probe].force for tool in self._context.plan.tools]
+                    forces = np.array(tool_forces).reshape(-1, 3) if frame >= self._resumed else None
+                    self._error.compare_frame(position - rest, report, forces)
         try:
             if self._error:
-                kept = (writer.position(frame) - rest for frame in range(1, self._frames)) if scene.output else None
+                kept = (
+                    (writer.read_positions(frame) - rest for frame in range(1, self._frames)) if scene.output else None
+                )
                 with stage("pilot"):
                     self._error.finish(kept, partial(self._progress, "pilot"))
-            if self._ways and self._solves_again:
+            if self._path_dependence and self._repeats_solution:
                 with stage("pilot"):
-                    self._ways.finish(self._task.device, self._cores, partial(self._progress, "pilot", 0, 1))
+                    self._path_dependence.finish(
+                        self._context.device, self._cores, partial(self._progress, "pilot", 0, 1)
+                    )
         except KeyboardInterrupt:
-            # All frames are done, and what the coarse pilot tells stands.
+            # All frames are done; the estimate of the coarse companion run remains valid.
             writer.finish()
         else:
             writer.finish(partial(self._progress, "frames", self._frames, self._frames))
 
-    def keep_finished_frames(self) -> dict[str, Any]:
-        """Save what an interrupted run has; KeyboardInterrupt: no new frame."""
+    def save_finished_frames(self) -> dict[str, Any]:
+        """Save the state and the finished frames of an interrupted run; reraise if there is no new frame."""
         writer, simulation = self._writer, self._simulation
-        # An interruption outside `progress` may come before the last frame is stored.
-        if simulation.steps > 0 and simulation.frame < writer.stored and not simulation.inconsistent:
-            # If the simulation diverges within this frame, the resumed run will find it.
+        # The interruption may have come before the last simulated frame was stored.
+        if simulation.steps > 0 and simulation.frame < writer.stored_frames and not simulation.inconsistent:
+            # A divergence within this frame will recur in the resumed run.
             with suppress(DivergedError):
                 writer.save(simulation.save())
-        # Without a new frame there are no new results; to end soon, new frames may be given up too.
+        # To end soon, queued pictures are discarded, which may leave no new frame.
         if writer.frames > self._resumed:
-            writer.finish(hurry=True)
+            writer.finish(discard_queued=True)
         if writer.frames <= self._resumed:
             raise KeyboardInterrupt
         return {"status": "interrupted"}
 
-    def find_cause(self, error: DivergedError) -> dict[str, Any]:
-        """Say why the run diverged, and save its last sound state."""
+    def diagnose_divergence(self, error: DivergedError) -> dict[str, Any]:
+        """Diagnose the divergence, and save the last valid state."""
         writer = self._writer
         self._error, self._known = None, RunErrorEstimates(reason="the run diverged")
         ending: dict[str, Any] = {"status": "diverged", "error": str(error), "dump": None}
@@ -364,9 +383,9 @@ class _Run:
                 ending["dump"] = writer.save(diagnosis.last_sound_state)
         return ending
 
-    def conclude(self, ending: dict[str, Any]) -> RunRecord:
-        """Publish the results with their record."""
-        writer, simulation, device, watch = self._writer, self._simulation, self._task.device, self._watch
+    def publish_results(self, ending: dict[str, Any]) -> RunRecord:
+        """Publish the results together with run.json."""
+        writer, simulation, device, watch = self._writer, self._simulation, self._context.device, self._watch
         self._progress("write", writer.frames, self._frames)
         writer.finish()
         known = self._error.estimates if self._error else self._known
@@ -374,8 +393,12 @@ class _Run:
         seconds = {stage: watch.seconds.get(stage, 0.0) for stage in stages}
         record = {
             **ending,
-            **_facts(
-                self._task, simulation.progress, simulation.felt, known, self._ways.warnings() if self._ways else ()
+            **_record_facts(
+                self._context,
+                simulation.progress,
+                simulation.felt,
+                known,
+                self._path_dependence.warnings() if self._path_dependence else (),
             ),
             "resumed": self._resumed,
             "timings": {**seconds, "encode": writer.encode_seconds, "total": watch.total()},
@@ -384,36 +407,36 @@ class _Run:
             "threads": device.threads,
             "lanes": simulation.lanes,
             "workers": simulation.workers,
-            "versions": self._task.manifest.versions,
+            "versions": self._context.manifest.versions,
         }
         return cast(RunRecord, writer.publish(record))
 
     def _pause(self) -> None:
-        """Show the progress within a frame, and save the state of the run from time to time."""
+        """Report the progress within a frame, and save the state when due."""
         with self._watch.stage("hand over"):
             self._progress("frames", self._writer.frames, self._frames)
-            if self._writer.due:
+            if self._writer.is_save_due:
                 self._writer.save(self._simulation.save())
 
 
-def _pilots(task: _Task, *, resumed: bool) -> CompanionRuns:
-    """Choose the pilots of a run, or say why there are none."""
-    asked = task.manifest.asks_estimate
-    if asked is False:
+def _choose_pilots(context: _RunContext, *, resumed: bool) -> CompanionRuns:
+    """Choose the companion runs for the error estimate, or the reason for their absence."""
+    requested = context.manifest.asks_estimate
+    if requested is False:
         return CompanionRuns(reason="not asked for")
-    if asked is None and task.device.arch != "cpu":
+    if requested is None and context.device.arch != "cpu":
         return CompanionRuns(reason="on a GPU, this needs --estimate-error")
-    pilots = choose_companion_runs(task.plan, requested=asked is True)
-    if pilots.planned and resumed and not task.plan.scene.output:
+    pilots = choose_companion_runs(context.plan, requested=requested is True)
+    if pilots.planned and resumed and not context.plan.scene.output:
         return CompanionRuns(reason="the frames before the interruption were not kept")
     return pilots
 
 
-def _facts(
-    task: _Task, progress: RunProgress, felt: ProbeForces, known: RunErrorEstimates, path_dependence: Iterable[str]
+def _record_facts(
+    context: _RunContext, progress: RunProgress, felt: ProbeForces, known: RunErrorEstimates, path_dependence: Iterable[str]
 ) -> dict[str, Any]:
-    """Say what was run, and what is known of its last frame, for run.json."""
-    manifest, plan = task.manifest, task.plan
+    """Build the entries of run.json that describe the scene, the last frame and the errors."""
+    manifest, plan = context.manifest, context.plan
     scene = plan.scene
     probes = [
         ProbeRecord(
@@ -425,20 +448,20 @@ def _facts(
         for record, peak in zip(probe_records(scene), felt.greatest, strict=True)
     ]
     return {
-        # With the paths of pictures as they were given; only these two sections hold anything that is chosen.
+        # With picture paths as given; only the sections sheet and time contain resolved values.
         "scene": manifest.given.model_copy(update={"sheet": scene.sheet, "time": scene.time}).model_dump(mode="json"),
-        "asked": _asked(manifest.given, scene),
+        "asked": _chosen_keys(manifest.given, scene),
         "working_directory": manifest.folder,
         "sha256": dict(manifest.sha256),
         "overrides": list(manifest.overrides),
         "points": list(scene.sheet.points),
-        **_steps(plan, progress),
+        **_step_facts(plan, progress),
         "max_displacement": progress.max_displacement,
         "shortest_spring": progress.shortest_spring,
         "longest_spring": progress.longest_spring,
         "probes": probes,
         "notes": [
-            *run_warnings(plan, probes, progress, *known, _affords, _scale(scene)),
+            *run_warnings(plan, probes, progress, *known, _is_affordable, _pixels_per_metre(scene)),
             *path_dependence,
             *drawing_warnings(scene),
         ],
@@ -447,13 +470,13 @@ def _facts(
     }
 
 
-def _steps(plan: Plan, progress: RunProgress) -> dict[str, Any]:
-    """Say what steps were taken; at rest there are none, and how well the forces balance is said instead."""
+def _step_facts(plan: Plan, progress: RunProgress) -> dict[str, Any]:
+    """Build the entries about the time steps, or at equilibrium those about the residual."""
     grid, limit = plan.grid, plan.stable_step
     if plan.scene.time.at_rest:
         steps = dict.fromkeys(("step", "stable_step", "steps_per_frame", "steps"))
-        found = {"residual": progress.residual, "evaluations": progress.evaluations}
-        return {**steps, "precision": grid.precision, **found}
+        residual = {"residual": progress.residual, "evaluations": progress.evaluations}
+        return {**steps, "precision": grid.precision, **residual}
     return {
         "step": grid.step,
         "stable_step": limit if limit < math.inf else None,
@@ -464,7 +487,7 @@ def _steps(plan: Plan, progress: RunProgress) -> dict[str, Any]:
 
 
 def free_cores(plan: Plan) -> int:
-    """Count the cores that are free for stepping: all but one for the encoder, unless that mostly waits for frames."""
+    """Count the cores free for stepping: all, or all but one if the encoder is mostly busy."""
     width, height = plan.scene.render.size
     rows, cols = plan.scene.sheet.points
     encoding = width * height * len(plan.scene.render.all_cameras) * ENCODING if plan.scene.draws else 0
@@ -472,20 +495,20 @@ def free_cores(plan: Plan) -> int:
     return max(1, process.available_threads() - busy)
 
 
-def _asked(given: Scene, scene: Scene) -> dict[str, Any]:
-    """Give the keys of a scene, by their paths, for which a run chose other values, and the values that they had."""
+def _chosen_keys(given: Scene, scene: Scene) -> dict[str, Any]:
+    """Return the requested values of those keys that the run resolved to other values, by their paths."""
     keys = ("sheet.points", "sheet.tolerance", "time.step", "time.precision", "time.tolerance")
     pairs = [(key, attrgetter(key)(given), attrgetter(key)(scene)) for key in keys]
-    return {key: asked for key, asked, chosen in pairs if asked != chosen}
+    return {key: requested for key, requested, resolved in pairs if requested != resolved}
 
 
-def _affords(plan: Plan) -> bool:
-    """Tell whether a run takes at most an hour, as `check` estimates it."""
-    return cost.estimate_duration(plan).seconds <= LONGEST_ADVISED
+def _is_affordable(plan: Plan) -> bool:
+    """Return whether the estimated duration of a run permits recommending it."""
+    return cost.estimate_duration(plan).seconds <= MAX_ADVISED_DURATION_S
 
 
-def _scale(scene: Scene) -> float | None:
-    """Compute the pixels per metre at the middle of the sheet; None: no picture is drawn, or it is out of sight."""
+def _pixels_per_metre(scene: Scene) -> float | None:
+    """Compute the image scale at the centre of the sheet [px/m]; None without pictures or outside the view."""
     if not scene.renders:
         return None
     middle, right, up = view_at(scene, 0.0, next(iter(scene.render.all_cameras))).pixels(
@@ -496,7 +519,7 @@ def _scale(scene: Scene) -> float | None:
 
 
 def error_record(known: RunErrorEstimates) -> dict[str, Any] | None:
-    """Write what is known of the error for run.json, where null stands for what is not known, or not there."""
+    """Build the error estimate for run.json; unknown values are null."""
     estimate, mesh, keys = known.estimate, known.mesh, ("error", "rounding", "in_f64", "order", "at_least")
     if estimate is not None:
         fields: dict[str, Any] = {key: getattr(estimate, key) for key in keys}

@@ -1,7 +1,4 @@
-"""A scene in motion: a class whose methods run the two kernels.
-
-Show frames in a notebook.
-"""
+"""Interactive simulation of a scene: advance, steer, draw and label its frames, and play them in a notebook."""
 
 from __future__ import annotations
 
@@ -12,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from itertools import count
 from string import Template
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,35 +43,31 @@ from taichi_msm.solver.rest import build_dynamics
 from taichi_msm.solver.state import ProbeForces, Reading, RunProgress, Snapshot, TipForce, largest_displacement
 from taichi_msm.system import runtime
 
-if TYPE_CHECKING:
-    pass  # REMOVED
-
-
-# The kernels for drawing that were compiled in this process; to compile them by drawing takes as long as two frames.
-_compiled: set[tuple[object, ...]] = set()
+# Drawing kernels compiled in this process. Compiling them means drawing two frames, which is not repeated.
+_compiled_kernels: set[tuple[object, ...]] = set()
 
 
 class Simulation:
-    """A sheet that moves by frames and can be drawn. Usable in a with statement, which frees its memory.
+    """Simulation of a scene, frame by frame. As a context manager, it frees its memory at exit.
 
     Args:
-        scene: what `load_scene` returned, or the same as a mapping; if it has a tolerance, pilot runs first choose the
-            points or the step.
+        scene: the scene, from `load_scene` or as a mapping with the keys of a scene file. With a tolerance, companion
+            runs first choose the mesh or the step.
         arch: cpu, cuda or vulkan.
-        threads: number of CPU threads; None takes every core.
-        texture: the picture on the sheet, shape (height, width, 3); None: the scene's own, read when it is drawn.
-        cores: how many cores are free for stepping; None: all. The threads spin while they wait for each other, so a
-            thread without a core delays all of them.
+        threads: number of CPU threads; None for all cores.
+        texture: the picture on the sheet, shape (height, width, 3); None for the scene's, read at the first drawing.
+        cores: number of cores free for stepping; None for all. Threads spin while they wait for each other, so that a
+            thread without a core delays all others.
 
     Raises:
-        MsmError: here and in all methods, in any thread but that of the first simulation, or in a process that was
-            forked after it; in most methods also when it is closed.
-        ArgumentError: here and in all methods, when an argument is not what it must be.
-        DeviceError: when the arch is not available, or the compiler already runs on another one in this process.
+        MsmError: here and in all methods, in another thread than that of the first simulation, or in a process forked
+            after it; in most methods also after `close`.
+        ArgumentError: here and in all methods, when an argument is invalid.
+        DeviceError: when the arch is not available, or the compiler already runs on another arch in this process.
         SceneError: when the scene cannot be run, or no step meets its tolerance.
 
     Attributes:
-        renderer: what draws and labels it.
+        renderer: draws and labels the sheet.
 
     Example:
         >>> from taichi_msm import Simulation, load_scene
@@ -97,21 +90,21 @@ class Simulation:
         texture = None if texture is None else require_texture(texture)
         self.device = runtime.start(arch, threads)
         self._plan = resolve(plan, self.device).plan
-        # As they are before they are steered.
+        # The original probes, before `steer`.
         self._probes = self.scene.probes
         self._watch: DivergenceMonitor
         self._gauge: ForceRecorder
         self._felt: ProbeForces
-        self._placed: Array | None
+        self._frame_positions: Array | None
         self._divergence: DivergedError | None
         self._closed, self._cores = False, cores
         self._dynamics = build_dynamics(self._plan, self.device, cores=cores)
-        self._begin()
+        self._reset()
         self.renderer = Renderer(self.scene, texture)
 
     @property
     def scene(self) -> Scene:
-        """The scene, with the points, the step and the precision that were chosen."""
+        """The scene, with resolved mesh, step and precision."""
         return self._plan.scene
 
     @property
@@ -131,60 +124,62 @@ class Simulation:
 
     @property
     def inconsistent(self) -> bool:
-        """Whether it was interrupted while steps were taken, so that only `restore` or `restart` make it whole."""
+        """Whether an interruption within steps left the state inconsistent; `restore` or `restart` repair it."""
         return self._dynamics.inconsistent
 
     @property
     def lanes(self) -> int:
-        """Lanes of the vectors that the steps are computed in; 1 on a GPU."""
+        """Number of SIMD lanes used for stepping; 1 on a GPU."""
         return self._dynamics.layout.config.lanes
 
     @property
     def workers(self) -> int:
-        """Number of threads that share the steps while the cores are free; 0 on a GPU."""
+        """Number of threads used for stepping while the cores are free; 0 on a GPU."""
         return self._dynamics.layout.workers
 
     @property
     def progress(self) -> RunProgress:
-        """What is known of the run up to the last frame."""
+        """Progress and extrema of the run up to the last frame."""
         return self._watch.progress
 
     def advance(self, frames: int = 1, pause: Pause = lambda: None) -> None:
-        """Simulate a number of frames, with the loads of the scene's keys.
+        """Simulate a number of frames under the loads of the scene.
 
         Args:
-            frames: how many, 0 or more; 0 finds the shape of the first frame, where that is at rest under a load.
-            pause: called some times a second, between steps; what it raises stops the simulation there, and the next
-                call goes on from there.
+            frames: number of frames, 0 or more; with 0, only the equilibrium of the first frame is solved, if the
+                scene is quasistatic.
+            pause: called several times a second between steps; an exception from it stops the simulation, which the
+                next call continues.
 
         Raises:
-            DivergedError: when the simulation diverges: a position is no longer finite, or exceeds every bound; or no
-                shape is found in which the forces balance. `positions` and `draw` then give the last good frame.
+            DivergedError: when a position is not finite or exceeds its bounds, or the equilibrium solver does not
+                converge. `positions` and `draw` then return the last valid frame.
         """
         require_frame_count(frames)
         self._require_open()
-        self._find_first(pause)
+        self._solve_first_frame(pause)
         for _ in range(frames):
-            self._go_to(self.frame + 1, pause)
+            self._advance_to(self.frame + 1, pause)
 
     def steer(self, probes: Sequence[Probe | Mapping[str, Any] | None]) -> None:
-        """Replace the loads, and where tools are moved to, from here on.
+        """Replace the loads and tool paths from the current time on.
 
         Args:
-            probes: the scene's probes with other numbers, or None for one that stays as it is. Each control point must
-                move, jump or stand as before; for a tool that is to move later, give `at` as keys from the start, be it
-                a single one. Of a tool that has a path take `{"path": [[t, across, down, height], ...]}` with times
-                after `time`: it goes straight from where it is to the first of them. Its instrument, friction and grips
-                stay, unless they are given too; a grip that has begun goes on if its beginning is among them.
+            probes: one entry per probe of the scene: the probe with new values, or None to keep it. A control point
+                keeps its kind of motion (moving, jumping or fixed); a force-controlled tool that will move later needs
+                keyframes in `at` from the start. A position-controlled tool takes
+                `{"path": [[t, across, down, height], ...]}` with times after `time` and moves straight from its current
+                position to the first keyframe. Its instrument, friction and grips are kept unless replaced; a grip in
+                progress continues if the new grips contain its beginning.
 
         Raises:
-            ArgumentError: when the kernel was not compiled for such probes.
-            SceneError: when one of them is not a probe, or a tool would jump.
+            ArgumentError: when the compiled kernel does not support these probes.
+            SceneError: when an entry is not a valid probe, or a tool would jump.
         """
         self._require_open()
         if not isinstance(probes, Sequence):
             raise ArgumentError(f"probes: {probes!r}; take a list of them")
-        self._find_first()
+        self._solve_first_frame()
         plan = steer_plan(self._plan, probes, self._plan.grid.time(self.steps))
         self._dynamics.steer(plan)
         self._watch.change_loads(plan)
@@ -192,10 +187,10 @@ class Simulation:
         self._plan, self.renderer.scene = plan, plan.scene
 
     def restart(self, scene: Plan | Scene | Mapping[str, Any] | None = None) -> None:
-        """Begin again at rest. Nothing is compiled if the terms of the model and the precision stay the same.
+        """Return to the initial state. Kernels are reused if the terms of the model and the precision are unchanged.
 
         Args:
-            scene: another one; None: the same.
+            scene: a new scene; None for the same.
 
         Raises:
             SceneError: as for `Simulation`.
@@ -207,71 +202,67 @@ class Simulation:
             self._probes = self.scene.probes
             self.renderer.restart(self.scene)
         else:
-            self._follow_paths(self._probes)
+            self._restore_paths(self._probes)
         if self.scene.time.motion == motion:
             self._dynamics.restart(self._plan)
         else:
             self._dynamics.close()
             self._dynamics = build_dynamics(self._plan, self.device, cores=self._cores)
-        self._begin()
+        self._reset()
 
     def save(self) -> Snapshot:
-        """Save all that another simulation needs to continue from here.
+        """Return the state from which another simulation of the scene can continue.
 
         Raises:
             DivergedError: as for `advance`.
         """
         self._require_open()
-        self._find_first()
+        self._solve_first_frame()
         reading = self._dynamics.read()
         self._require_good(reading, self._watch.check(reading))
         return Snapshot(self._dynamics.state(), self.progress, self._felt, self.scene.probes)
 
     def restore(self, saved: Snapshot) -> None:
-        """Continue from where a simulation of the same scene was saved, also between two frames; to the same bits.
+        """Continue from a saved state of the same scene, to the same bits, also between two frames.
 
         Raises:
-            ArgumentError: when it was saved with other points or probes, another precision or another step.
+            ArgumentError: when the state has another mesh, precision, step or number of probes.
         """
         self._require_open()
         if not isinstance(saved, Snapshot):
             raise ArgumentError(f"{type(saved).__name__} is not what `save` returns")
         state, per_frame = saved.state, self._plan.grid.steps_per_frame
-        since = state.steps - saved.progress.frame * per_frame
-        here = self._dynamics.displacement()
-        alike = (state.displacement.shape, state.displacement.dtype) == (here.shape, here.dtype)
-        if not (alike and len(saved.felt.forces) == len(self.scene.probes) and 0 <= since <= per_frame):
+        steps_in_frame = state.steps - saved.progress.frame * per_frame
+        current = self._dynamics.displacement()
+        fits = (state.displacement.shape, state.displacement.dtype) == (current.shape, current.dtype)
+        if not (fits and len(saved.felt.forces) == len(self.scene.probes) and 0 <= steps_in_frame <= per_frame):
             raise ArgumentError(
                 f"saved at step {state.steps}, frame {saved.progress.frame}, {state.displacement.dtype} of shape "
                 f"{state.displacement.shape}; take what was saved with this scene's points, probes, precision and step"
             )
         if saved.probes:
-            self._follow_paths(saved.probes)
+            self._restore_paths(saved.probes)
         self._divergence = None
         self._dynamics.restart(self._plan, saved.state)
-        self._placed = to_positions(self._dynamics.displacement(), self.scene.sheet)
+        self._frame_positions = to_positions(self._dynamics.displacement(), self.scene.sheet)
         self._watch.progress, self._felt = saved.progress, saved.felt
 
     def positions(self) -> Array:
-        """Give where the points are.
-
-        Returns:
-            Positions [m], shape (rows, cols, 3), in the scene's precision; not to be written to.
-        """
+        """Return the positions of the mass points [m], shape (rows, cols, 3), in the scene's precision; read-only."""
         return self._position
 
     def forces(self) -> list[TipForce]:
-        """Give what every probe does at the last frame: where its tip is, and its force on the sheet."""
-        self._find_first()
+        """Return the tip position and the force on the sheet of every probe at the last frame."""
+        self._solve_first_frame()
         return list(self._felt.forces)
 
     @property
     def felt(self) -> ProbeForces:
-        """The forces at the last frame that was found, and the greatest so far, as in `progress`."""
+        """The forces of all probes at the last computed frame, and the greatest so far."""
         return self._felt
 
     def velocities(self) -> Array:
-        """Give the velocities of the points: the mean over the last step, so those half a step before `time`.
+        """Return the mean velocities of the mass points over the last step, which refer to half a step before `time`.
 
         Returns:
             Velocities [m/s], shape (rows, cols, 3), in the scene's precision; 0 at the start.
@@ -280,15 +271,15 @@ class Simulation:
         return self._dynamics.state().difference / self._position.dtype.type(self._plan.grid.step)
 
     def surface(self) -> Surface:
-        """Give the refined surface as textured triangles: vertices, triangles, texture coordinates."""
+        """Return the refined surface as a triangle mesh with texture coordinates."""
         return refine_surface(self._position, self.scene.render.refine)
 
     def diagnose(self, start: Snapshot | None = None, pause: Pause = lambda: None) -> Diagnosis:
-        """Find out why the simulation diverged in `advance`. Afterwards it can advance only after `restore`.
+        """Determine why the simulation diverged in `advance`. Afterwards, call `restore` before `advance`.
 
         Args:
-            start: what `save` returned before; the simulation is repeated from there. None: from rest.
-            pause: called some times a second; what it raises stops the search.
+            start: an earlier state from `save`, from which the simulation is repeated; None for the initial state.
+            pause: called several times a second; an exception from it stops the search.
 
         Raises:
             MsmError: when the simulation has not diverged.
@@ -299,7 +290,7 @@ class Simulation:
         if self.scene.time.at_rest:
             good = (
                 None
-                if self._placed is None
+                if self._frame_positions is None
                 else Snapshot(self._dynamics.state(), self.progress, self._felt, self.scene.probes)
             )
             return Diagnosis(str(self._divergence), good)
@@ -308,57 +299,74 @@ class Simulation:
     def draw(
         self, camera: CameraLike = None, positions: Array | None = None, time: float | None = None
     ) -> NDArray[np.uint8]:
-        """Draw the sheet as it is now, and the probes' instruments.
+        """Draw the sheet and the instruments of the probes.
 
         Args:
-            camera: the name of one of the scene's cameras, "top", "oblique", a `Camera` or its keys; None: the scene's,
-                of several the main one.
-            positions: other positions of the points [m], such as those of an earlier frame, shape (rows, cols, 3).
-            time: time of these positions [s], for control points that move; None: now.
+            camera: name of a camera of the scene, "top", "oblique", a `Camera` or a mapping of its keys; None for the
+                scene's main camera.
+            positions: positions of the mass points [m], shape (rows, cols, 3); None for the current ones.
+            time: time of these positions [s], which moves instruments and cameras; None for the current time.
 
         Returns:
             Colours, shape (height, width, 3).
 
         Raises:
             SceneError: when the scene's picture cannot be read, or the camera is not valid.
-            DeviceError: when the driver of a GPU ended part of the work early.
+            DeviceError: when the driver of a GPU aborted part of the work.
         """
         return self.renderer.draw(self._shot(camera, positions, time))
 
     def labels(self, camera: CameraLike = None, positions: Array | None = None, time: float | None = None) -> Labels:
-        """Give what each pixel shows at its centre: the material point, depth, normal, whether it is an instrument.
+        """Compute the ground-truth labels of each pixel centre: material point, depth, normal and instrument mask.
 
-        `camera`, `positions` and `time` are as for `draw`, here and in the methods below, and so are the errors.
+        Args:
+            camera: as for `draw`.
+            positions: as for `draw`.
+            time: as for `draw`.
+
+        Raises:
+            SceneError: as for `draw`.
+            DeviceError: as for `draw`.
         """
         return self.renderer.labels(self._shot(camera, positions, time))
 
     def flow(
         self, before: Labels, camera: CameraLike = None, positions: Array | None = None, time: float | None = None
     ) -> Flow:
-        """Give the optical flow from an earlier or later frame to this one, and which of its material is now hidden.
+        """Compute the optical flow from another frame to this one, and which pixels of that frame are now occluded.
 
-        `before` is what `labels` returned for the other frame, with the same size of the picture; if another `camera`
-        saw it, the flow is from that one's picture to this one's.
+        Args:
+            before: labels of the other frame, which may be earlier or later, with the same picture size. If they are of
+                another camera, the flow leads from its picture to that of `camera`.
+            camera: as for `draw`.
+            positions: as for `draw`.
+            time: as for `draw`.
         """
         return self.renderer.flow(before, self._shot(camera, positions, time))
 
     def locate(
         self, coordinates: Array, camera: CameraLike = None, positions: Array | None = None, time: float | None = None
     ) -> Sight:
-        """Find where material points are seen, and whether anything hides them; the inverse of `pick`.
+        """Project material points into the picture, and determine whether they are hidden; the inverse of `pick`.
 
-        `coordinates` are fractions of the sheet's width from its left and of its height from its top, shape (n, 2).
+        Args:
+            coordinates: fractions of the sheet's width from its left and of its height from its top, shape (n, 2).
+            camera: as for `draw`.
+            positions: as for `draw`.
+            time: as for `draw`.
         """
         return self.renderer.locate(coordinates, self._shot(camera, positions, time))
 
     def pick(self, pixel: tuple[float, float], camera: CameraLike = None) -> tuple[float, float] | None:
-        """Find the material point that is seen at the centre of a pixel.
+        """Return the material point visible at the centre of a pixel.
 
-        `pixel` is x to the right and y down from the picture's top-left pixel, which is (0, 0).
+        Args:
+            pixel: x to the right and y down, counted from the picture's top-left pixel (0, 0).
+            camera: as for `draw`.
 
         Returns:
-            Fractions of the sheet's width from its left and of its height from its top, as in a probe's `at`;
-            None if no surface is there.
+            Fractions of the sheet's width from its left and of its height from its top, as in a probe's `at`; None for
+            the background.
         """
         point = as_array(pixel, "pixel")
         if not (is_real_array(point, (2,)) and np.isfinite(point).all()):
@@ -373,13 +381,23 @@ class Simulation:
         positions: Array | None = None,
         time: float | None = None,
     ) -> FrameOutputs:
-        """Give all that the scene's output asks for of a frame; `before`: the labels of the frame before, if any."""
+        """Compute all pictures and labels that the scene's `output` requests for a frame.
+
+        Args:
+            before: labels of the previous frame, for the optical flow; None for the first frame.
+            camera: as for `draw`.
+            positions: as for `draw`.
+            time: as for `draw`.
+        """
         return self.renderer.observe(before, self._shot(camera, positions, time))
 
     def play(self, frames: int, camera: CameraLike = None) -> Player:
-        """Draw the present frame, simulate and draw that many more, and show them in a notebook."""
-        pass  # REMOVED
+        """Simulate and draw frames for playback in a notebook.
 
+        Args:
+            frames: number of frames to simulate after the current one, which is also shown.
+            camera: as for `draw`.
+        """
         require_frame_count(frames)
         pictures = [self.draw(camera)]
         for _ in range(frames):
@@ -388,33 +406,32 @@ class Simulation:
         return Player(pictures, self.scene.time.frames_per_second)
 
     def _repr_html_(self) -> str | None:
-        """Show the sheet as it is now, in a notebook."""
+        """Render the current frame for a notebook."""
         if self._closed:
             return None
-        pass  # REMOVED
-
         rows, cols = self.scene.sheet.points
         largest = 1000 * self.progress.max_displacement
         caption = f"{self.time:g} s, {rows} × {cols} points, largest displacement so far {largest:.1f} mm"
-        return captioned(self.draw(), caption)
+        return captioned_figure(self.draw(), caption)
 
     def compile(self, pause: Pause = lambda: None) -> None:
-        """Compile the kernels now that would otherwise be compiled at the first frame.
+        """Compile all kernels, which otherwise happens at the first frame.
 
-        `pause` is called between kernels; what it raises stops here.
+        Args:
+            pause: called between kernels; an exception from it stops the compilation.
         """
         self._require_open()
         self._dynamics.compile()
         pause()
-        if self.scene.renders and (kernels := self.renderer.kernels()) not in _compiled:
+        if self.scene.renders and (kernels := self.renderer.kernels()) not in _compiled_kernels:
             position = to_positions(self._dynamics.displacement(), self.scene.sheet)
             for camera in self.scene.render.all_cameras:
                 first = self.observe(None, camera, position)
                 self.observe(first.labels, camera, position)
-            _compiled.add(kernels)
+            _compiled_kernels.add(kernels)
 
     def close(self) -> None:
-        """Free the memory. `positions` still gives the last frame."""
+        """Free the memory. `positions` still returns the last frame."""
         runtime.require_start_thread()
         self._closed = True
         self._dynamics.close()
@@ -432,19 +449,18 @@ class Simulation:
 
     @property
     def _position(self) -> Array:
-        """Positions of the last frame [m], which is found first where it is at rest under a load."""
-        self._find_first()
-        assert self._placed is not None
-        return self._placed
+        """Positions of the last frame [m]; a quasistatic first frame is solved if necessary."""
+        self._solve_first_frame()
+        assert self._frame_positions is not None
+        return self._frame_positions
 
-    def _find_first(self, pause: Pause = lambda: None) -> None:
-        """Find the first frame, where it is at rest and that is yet to be done."""
-        if self._placed is None:
+    def _solve_first_frame(self, pause: Pause = lambda: None) -> None:
+        """Solve the equilibrium of the first frame, if it is still missing."""
+        if self._frame_positions is None:
             self._require_open()
-            self._go_to(0, pause)
+            self._advance_to(0, pause)
 
-    def _go_to(self, frame: int, pause: Pause) -> None:
-        """Simulate up to a frame."""
+    def _advance_to(self, frame: int, pause: Pause) -> None:
         try:
             self._dynamics.advance(frame * self._plan.grid.steps_per_frame - self.steps, pause)
         except DivergedError as error:
@@ -454,16 +470,16 @@ class Simulation:
         self._require_good(reading, self._watch.check_frame(reading))
         position = to_positions(reading.displacement, self.scene.sheet)
         self._felt = self._gauge.follow(self._felt, self.frame, position, self._dynamics.tool_forces())
-        self._placed = position
+        self._frame_positions = position
 
     def _require_open(self) -> None:
-        # The kernels would write to memory that was freed.
+        # Kernels would write to freed memory.
         if self._closed:
             raise MsmError("this simulation is closed; make another")
         runtime.require_start_thread()
 
     def _shot(self, camera: CameraLike, positions: Array | None, time: float | None) -> Shot:
-        """Check positions and a time, place the instruments on the sheet, and set up the camera."""
+        """Validate positions and time, place the instruments, and set up the camera."""
         self._require_open()
         if positions is None:
             positions = self._position
@@ -480,7 +496,7 @@ class Simulation:
         return Shot(positions, self.renderer.resolve_camera(camera, time), place_capsules(self.scene, positions, time))
 
     def _require_good(self, reading: Reading, fault: str) -> None:
-        """Raise the error of a divergence, if there is a fault."""
+        """Raise a DivergedError if there is a fault."""
         if fault:
             steps, time = reading.steps, self._plan.grid.time(reading.steps)
             point = largest_displacement(reading.displacement)[:2]
@@ -489,24 +505,24 @@ class Simulation:
             )
             raise self._divergence
 
-    def _begin(self) -> None:
-        """Begin with the flat sheet; at rest, the first frame is yet to be found."""
+    def _reset(self) -> None:
+        """Start from the flat sheet; a quasistatic first frame is solved later."""
         self._divergence = None
         self._watch, self._gauge = DivergenceMonitor(self._plan), ForceRecorder(self._plan)
         self._felt = self._gauge.at_rest()
         flat = to_positions(self._dynamics.displacement(), self.scene.sheet)
-        self._placed = None if self.scene.time.at_rest else flat
+        self._frame_positions = None if self.scene.time.at_rest else flat
 
-    def _follow_paths(self, probes: Sequence[Probe]) -> None:
-        """Move tools along the paths that these probes have, in place of those that they were steered along."""
+    def _restore_paths(self, probes: Sequence[Probe]) -> None:
+        """Replace steered tool paths by those of the given probes."""
         self._plan = with_current_paths(self._plan, probes)
         self._gauge, self.renderer.scene = ForceRecorder(self._plan), self.scene
 
 
-# The quality of JPEGs: some hundred frames fit into a notebook, and no difference from the picture is visible.
-QUALITY = 92
+# JPEG quality: differences are invisible, and hundreds of frames fit into a notebook.
+JPEG_QUALITY = 92
 
-_PAGE = Template("""\
+_PLAYER_HTML = Template("""\
 <div id="$name">
   <img alt="frame" style="display: block; max-width: 100%" src="$first">
   <button type="button">Play</button>
@@ -535,13 +551,15 @@ _PAGE = Template("""\
   </script>
 </div>""")
 
-_names = count()
+_player_numbers = count()
 
 
 class Player:
-    """Frames with a button and a slider, which a notebook shows as the value of a cell.
+    """Playback of frames in a notebook, with a button and a slider.
 
-    At least one picture, all of one size, shape (height, width, 3), at a rate of frames per second.
+    Args:
+        frames: pictures, at least one, each of shape (height, width, 3).
+        rate: frames per second.
     """
 
     def __init__(self, frames: Sequence[NDArray[np.uint8]], rate: float) -> None:
@@ -551,9 +569,9 @@ class Player:
         self.rate = rate
 
     def _repr_html_(self) -> str:
-        sources = [source(frame) for frame in self.frames]
-        return _PAGE.substitute(
-            name=f"taichi-msm-{next(_names)}",
+        sources = [jpeg_data_url(frame) for frame in self.frames]
+        return _PLAYER_HTML.substitute(
+            name=f"taichi-msm-{next(_player_numbers)}",
             first=sources[0],
             last=len(sources) - 1,
             frames=sources,
@@ -561,13 +579,18 @@ class Player:
         )
 
 
-def source(picture: NDArray[np.uint8]) -> str:
-    """Write a picture as a data URL."""
+def jpeg_data_url(picture: NDArray[np.uint8]) -> str:
+    """Encode a picture, shape (height, width, 3), as a data URL with a JPEG."""
     file = io.BytesIO()
-    Image.fromarray(picture).save(file, "JPEG", quality=QUALITY)
+    Image.fromarray(picture).save(file, "JPEG", quality=JPEG_QUALITY)
     return f"data:image/jpeg;base64,{b64encode(file.getvalue()).decode()}"
 
 
-def captioned(picture: NDArray[np.uint8], caption: str) -> str:
-    """Write the HTML of a picture with a caption below it."""
-    return f'<figure><img alt="" src="{source(picture)}"><figcaption>{escape(caption)}</figcaption></figure>'
+def captioned_figure(picture: NDArray[np.uint8], caption: str) -> str:
+    """Format a picture and a caption as HTML.
+
+    Args:
+        picture: colours, shape (height, width, 3).
+        caption: plain text.
+    """
+    return f'<figure><img alt="" src="{jpeg_data_url(picture)}"><figcaption>{escape(caption)}</figcaption></figure>'

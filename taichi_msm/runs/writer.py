@@ -1,9 +1,4 @@
-"""Write the results of a run: frames, animations, trajectory, forces and record, whole or not at all.
-
-Write the labels of the frames of a run to files.
-
-The content of run.json.
-"""
+"""Writers of the results of a run: pictures, labels, trajectory, forces and run.json, published atomically."""
 
 from __future__ import annotations
 
@@ -27,44 +22,50 @@ from taichi_msm.model.time_grid import TimeGrid
 from taichi_msm.model.tool_force import ProbeRecord
 from taichi_msm.render.camera import calibration, is_moving, pose, view_at
 from taichi_msm.render.labels import FrameOutputs, track_grid
-from taichi_msm.runs.arrays import Pieces, write_arrays, write_flo
-from taichi_msm.runs.checkpoint import CHECKPOINT, PATTERNS, Checkpoint
-from taichi_msm.runs.directory import Contents, Listed, Publication, add, create
+from taichi_msm.runs.arrays import ChunkedArray, write_arrays, write_flo
+from taichi_msm.runs.checkpoint import CHECKPOINT_FOLDER, CHECKPOINT_PATTERNS, Checkpoint
+from taichi_msm.runs.directory import IsListed, Publication, PublicationSpec, create_file, write_new_file
 from taichi_msm.runs.encoder import Encoder
-from taichi_msm.runs.media import Job, PictureWriter
+from taichi_msm.runs.media import EncodingJob, PictureWriter
 from taichi_msm.scene import outputs
 from taichi_msm.scene.outputs import CAMERA_FILE, OUTPUTS
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.state import Snapshot, TipForce
 
-pass  # REMOVED
 
-
-def _listed(record: Mapping[str, Any]) -> Listed:
-    """Tell of a file whether it is one of the run with this record."""
+def _run_file_test(record: Mapping[str, Any]) -> IsListed:
+    """Return a test of whether a file name is listed in a record."""
     return partial(outputs.is_result, set(record["outputs"]), int(record["frames"]))
 
 
-# The results of a run, and beside them the checkpoint from which it can go on.
-RUN = Contents("run", outputs.RUN_RECORD, outputs.RESULT_PATTERNS, _listed, beside=(CHECKPOINT, PATTERNS))
+RUN_PUBLICATION = PublicationSpec(
+    "run", outputs.RUN_RECORD, outputs.RESULT_PATTERNS, _run_file_test, companion=(CHECKPOINT_FOLDER, CHECKPOINT_PATTERNS)
+)
 
 
 class ResultWriter:
-    """Writes the frames of a run as they come, and puts all files in place at the end.
+    """Streaming writer of the results of a run, as a context manager.
 
-    Within the with statement the files grow in a hidden folder. Leaving it without `publish` removes them. But once a
-    run with a manifest has a frame, its checkpoint replaces any earlier one, and stays until results are published as
-    complete. A run that `resumes` continues from its checkpoint. Files that no run has written stay. Pictures are
-    encoded `beside` the simulation, in a process of their own, or else in this one, each before `add` returns.
+    Files are written to a hidden folder, and `publish` moves them into place atomically. At exit without `publish`,
+    they are deleted, but the checkpoint of a run with a manifest is kept from the first frame until complete results
+    are published. Foreign files in the directory are never changed.
+
+    Args:
+        directory: destination of the results.
+        scene: the resolved scene.
+        grid: its time grid.
+        manifest: manifest of the run for its checkpoint; None for a run that cannot be resumed.
+        resumes: whether to continue from the checkpoint in the directory.
+        encode_in_subprocess: whether pictures are encoded in a separate process; otherwise, `add` encodes them.
 
     Raises:
-        FilesError: on entering and in every method, when the directory cannot be written, another run writes there,
-            or something is in the way that no run has put there.
+        FilesError: at entry and in all methods, when the directory cannot be written, another run writes there, or a
+            foreign file is in the way.
 
     Attributes:
-        saved: the state from which the run continues; None: from rest.
-        frames: in the results; after an interruption their number is known only after `finish`.
-        encode_seconds: processor time spent encoding pictures [s]; known after `finish`.
+        saved: the state from which the run continues; None for the initial state.
+        frames: number of frames in the results; after an interruption, valid only after `finish`.
+        encode_seconds: processor time of encoding pictures [s]; valid after `finish`.
     """
 
     def __init__(
@@ -75,7 +76,7 @@ class ResultWriter:
         manifest: Mapping[str, Any] | None = None,
         *,
         resumes: bool = False,
-        beside: bool = True,
+        encode_in_subprocess: bool = True,
     ) -> None:
         self.saved: Snapshot | None = None
         self.frames = 0
@@ -84,26 +85,26 @@ class ResultWriter:
         self._scene = scene
         self._manifest = manifest
         self._resumes = resumes
-        self._beside = beside
+        self._encodes_in_subprocess = encode_in_subprocess
         names = outputs.file_names(outputs.result_names(scene.folders), scene.time.frames + 1)
-        self._publication = Publication(directory, RUN, names)
-        folder = self._publication.staging / CHECKPOINT
+        self._publication = Publication(directory, RUN_PUBLICATION, names)
+        folder = self._publication.staging_folder / CHECKPOINT_FOLDER
         self._checkpoint = Checkpoint(folder, scene, grid)
-        staged = self._publication.staged
+        staged = self._publication.new_folder
         self._labels = {name: LabelWriter(staged / name, scene, name) for name in scene.render.all_cameras}
         self._encoder: Encoder | PictureWriter | None = None
         self._open = ExitStack()
         self._finished = False
 
     @property
-    def stored(self) -> int:
-        """Number of frames whose positions are stored, including those from before the run was resumed."""
+    def stored_frames(self) -> int:
+        """Number of frames in the checkpoint, including those from before the run was resumed."""
         return self._checkpoint.frames
 
-    def position(self, frame: int) -> NDArray[Any]:
-        """Read the positions of a stored frame [m], shape (rows, cols, 3)."""
+    def read_positions(self, frame: int) -> NDArray[Any]:
+        """Read the positions of the mass points in a stored frame [m], shape (rows, cols, 3)."""
         with writing(self._directory):
-            return self._checkpoint.position(frame)
+            return self._checkpoint.read_positions(frame)
 
     def add(
         self,
@@ -115,48 +116,53 @@ class ResultWriter:
         """Add the next frame.
 
         Args:
-            position: of the points [m], shape (rows, cols, 3).
-            observed: what else is wanted, by the names of the cameras.
-            forces: of the probes; of a frame that is stored already they are not needed.
+            position: positions of the mass points [m], shape (rows, cols, 3).
+            observed: pictures and labels, by the names of the cameras.
+            forces: the force of every probe; not needed for a frame that the checkpoint contains.
             pause: as for `Encoder.add`.
         """
         with writing(self._directory):
-            # Positions come first: whenever the run is interrupted, there are at least as many of them as pictures.
-            if self.stored == 0:
-                self._publication.keep = False
+            # Positions are stored first, so that an interruption never leaves a picture without positions.
+            if self.stored_frames == 0:
+                self._publication.keep_companion = False
                 self._checkpoint.begin(self._manifest or {})
-            if self.frames == self.stored:
+            if self.frames == self.stored_frames:
                 self._checkpoint.add(position, forces)
-                self._publication.keep = self._manifest is not None
+                self._publication.keep_companion = self._manifest is not None
             for name, labels in self._labels.items():
                 labels.add(self.frames, observed[name], position)
             if self._encoder:
-                pictures = [seen.picture for seen in observed.values() if seen.picture is not None]
+                pictures = [frame.picture for frame in observed.values() if frame.picture is not None]
                 self._encoder.add(np.stack(pictures) if len(pictures) > 1 else pictures[0][None], pause)
             self.frames += 1
 
     @property
-    def due(self) -> bool:
-        """Whether it is time to save the state of the run."""
-        return self.stored > 0 and self._checkpoint.due
+    def is_save_due(self) -> bool:
+        """Whether the state of the run should be saved."""
+        return self.stored_frames > 0 and self._checkpoint.is_save_due
 
     def save(self, saved: Snapshot) -> str:
-        """Save the state of the run, in case it ends here; returns the file."""
+        """Save a state of the run in the checkpoint; return the path of the file."""
         with writing(self._directory):
             return self._checkpoint.save(saved)
 
     def load(self) -> Snapshot | None:
-        """Give the state that was saved last; None: none was."""
+        """Read the state saved last; return None when none was saved."""
         with writing(self._directory):
             return self._checkpoint.load()
 
-    def finish(self, pause: Pause = lambda: None, *, hurry: bool = False) -> None:
-        """Wait until every frame is encoded, and write what belongs to them all; arguments as for `Encoder.finish`."""
+    def finish(self, pause: Pause = lambda: None, *, discard_queued: bool = False) -> None:
+        """Wait until all frames are encoded, and write the files that combine frames.
+
+        Args:
+            pause: as for `Encoder.finish`.
+            discard_queued: as for `Encoder.finish`.
+        """
         if self._finished:
             return
         with writing(self._directory):
             if self._encoder:
-                self.frames, self.encode_seconds = self._encoder.finish(pause, hurry=hurry)
+                self.frames, self.encode_seconds = self._encoder.finish(pause, discard_queued=discard_queued)
             for labels in self._labels.values():
                 labels.finish(self.frames)
             if self.frames and "trajectory" in self._scene.output:
@@ -166,56 +172,61 @@ class ResultWriter:
         self._finished = True
 
     def publish(self, record: Mapping[str, Any]) -> dict[str, Any]:
-        """Write run.json: the record, "frames", their number, and "outputs", all results; replace earlier results.
+        """Write run.json and replace earlier results.
 
-        Gives the content of run.json.
+        Args:
+            record: content of run.json, except for the entries "frames" and "outputs".
+
+        Returns:
+            The complete content of run.json.
         """
         self.finish()
         with writing(self._directory):
             results = outputs.result_names(self._scene.folders if self.frames else {})
-            # By these names the next run into the directory recognises our files.
+            # By "outputs", the next run into the directory recognises these files.
             facts = {**record, "frames": self.frames, "outputs": results}
             text = json.dumps(facts, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-            # A file name that is not UTF-8 has surrogates; escaped with a backslash they are valid JSON.
-            add(self._publication.staged / outputs.RUN_RECORD, text.encode("utf-8", "backslashreplace"))
+            # File names that are not UTF-8 contain surrogates; backslash escapes keep the JSON valid.
+            write_new_file(self._publication.new_folder / outputs.RUN_RECORD, text.encode("utf-8", "backslashreplace"))
             self._publication.publish(outputs.file_names(results, self.frames))
             if record.get("status") == "complete":
-                self._checkpoint.forget()
-                self._publication.keep = False
+                self._checkpoint.invalidate()
+                self._publication.keep_companion = False
         return facts
 
     def _write_trajectory(self) -> None:
-        """Write the time [s] and the positions [m] of all frames, which may be larger than memory."""
+        """Write times [s] and positions [m] of all frames, which may exceed memory."""
         checkpoint, frames = self._checkpoint, self.frames
         shape = (frames, *self._scene.sheet.points, 3)
-        arrays: dict[str, NDArray[Any] | Pieces] = {
+        arrays: dict[str, NDArray[Any] | ChunkedArray] = {
             "time": np.arange(frames) / self._scene.time.frames_per_second,
-            "position": Pieces(checkpoint.precision, shape, map(checkpoint.position, range(frames))),
+            "position": ChunkedArray(checkpoint.precision, shape, map(checkpoint.read_positions, range(frames))),
         }
-        with create(self._publication.staged / outputs.OUTPUTS["trajectory"].path()) as file:
+        with create_file(self._publication.new_folder / outputs.OUTPUTS["trajectory"].path()) as file:
             write_arrays(file, arrays)
 
     def _write_forces(self) -> None:
-        """Write the forces of all frames, with numbers that can be read again without loss."""
+        """Write the forces of all frames with round-trip precision."""
         with (
-            create(self._publication.staged / outputs.OUTPUTS["forces"].path()) as file,
+            create_file(self._publication.new_folder / outputs.OUTPUTS["forces"].path()) as file,
             io.TextIOWrapper(file, encoding="ascii", newline="") as text,
         ):
             rows = csv.writer(text, lineterminator="\n")
             rows.writerow(outputs.FORCES_HEADER)
             for frame in range(self.frames):
                 time = frame / self._scene.time.frames_per_second
-                rows.writerows((time, one.probe, *one.tip, *one.force) for one in self._checkpoint.forces(frame))
+                forces = self._checkpoint.read_forces(frame)
+                rows.writerows((time, force.probe, *force.tip, *force.force) for force in forces)
 
     def __enter__(self) -> ResultWriter:
         scene = self._scene
         with writing(self._directory), ExitStack() as opened:
             opened.enter_context(self._publication)
             for name in scene.render.all_cameras if scene.renders else ():
-                (self._publication.staged / name).mkdir(exist_ok=True)
+                (self._publication.new_folder / name).mkdir(exist_ok=True)
             if scene.draws:
-                job = Job(
-                    folders=tuple(self._publication.staged / name for name in scene.render.all_cameras),
+                job = EncodingJob(
+                    folders=tuple(self._publication.new_folder / name for name in scene.render.all_cameras),
                     size=scene.render.size,
                     rate=scene.time.frames_per_second,
                     png="png" in scene.output,
@@ -225,12 +236,12 @@ class ResultWriter:
                     quality=scene.render.quality,
                 )
                 locks = self._publication.lock_descriptors
-                self._encoder = Encoder(job, locks) if self._beside else PictureWriter(job)
+                self._encoder = Encoder(job, locks) if self._encodes_in_subprocess else PictureWriter(job)
                 opened.callback(self._encoder.abort)
             opened.callback(self._checkpoint.close)
             if self._resumes:
                 self.saved = self._checkpoint.reopen()
-            self.frames = 0 if scene.renders else self.stored
+            self.frames = 0 if scene.renders else self.stored_frames
             self._open = opened.pop_all()
         return self
 
@@ -238,117 +249,127 @@ class ResultWriter:
         self._open.close()
 
 
-# Masks consist of few large areas, for which the fastest compression is enough.
-COMPRESS_LEVEL = 1
-
-
 class LabelWriter:
-    """Writes the labels of a camera that a scene's `output` asks for into a folder, frame by frame."""
+    """Writer of the labels of a camera, frame by frame.
+
+    Args:
+        folder: destination of the files.
+        scene: the scene, whose `output` selects the labels.
+        camera: name of the camera; empty for an unnamed camera.
+    """
 
     def __init__(self, folder: Path, scene: Scene, camera: str = "") -> None:
         self._folder, self._scene, self._camera = folder, scene, camera
-        wanted = [output for name, output in OUTPUTS.items() if name in scene.folders[camera]]
-        self._series = [output for output in wanted if output.source in ("labels", "flow", "stereo")]
-        self._described = any(output.needs_camera for output in wanted)
-        # Tracks are held until all are there, as their file has them point by point.
+        selected = [output for name, output in OUTPUTS.items() if name in scene.folders[camera]]
+        self._frame_outputs = [output for output in selected if output.source in ("labels", "flow", "stereo")]
+        self._writes_camera = any(output.needs_camera for output in selected)
+        # Tracks stay in memory until the end, because their file is ordered by track.
         shape = scene.render.tracks**2 if scene.asks_for("tracks") else 0, scene.time.frames + 1
-        self._points, self._occluded = np.empty((*shape, 2), np.float32), np.empty(shape, np.bool_)
+        self._pixels, self._occluded = np.empty((*shape, 2), np.float32), np.empty(shape, np.bool_)
         self._position = np.empty((*shape, 3), np.float32)
         self._grid = track_grid(scene.render.tracks)
         self._added = 0
 
     def add(self, frame: int, observed: FrameOutputs, position: NDArray[Any]) -> None:
-        """Write the labels of a frame, whose points are at `position` [m], and the flow from the frame before."""
+        """Write the labels of a frame and the optical flow from the previous frame.
+
+        Args:
+            frame: index of the frame.
+            observed: labels and flow of the frame.
+            position: positions of the mass points [m], shape (rows, cols, 3).
+        """
         self._added = frame + 1
-        for output in self._series:
+        for output in self._frame_outputs:
             number = frame - 1 if output.is_frame_pair else frame
             if number >= 0:
                 path = self._folder / output.path(number)
                 path.parent.mkdir(exist_ok=True)
-                with create(path) as file:
-                    _WRITERS[path.suffix](file, getattr(getattr(observed, output.source), output.name))
+                with create_file(path) as file:
+                    _LABEL_WRITERS[path.suffix](file, getattr(getattr(observed, output.source), output.name))
         if observed.tracks is not None:
-            self._points[:, frame], self._occluded[:, frame] = observed.tracks
+            self._pixels[:, frame], self._occluded[:, frame] = observed.tracks
             self._position[:, frame] = surface_positions(position, self._scene.render.refine, self._grid)
 
     def finish(self, frames: int) -> None:
-        """Keep the files of the first frames only, this many, and write those that belong to all frames together."""
+        """Delete the files of later frames than the first `frames`, and write camera.json and the tracks."""
         if not frames:
             return
-        for output in self._series:
+        for output in self._frame_outputs:
             for number in range(output.count(frames), self._added):
                 (self._folder / output.path(number)).unlink(missing_ok=True)
-        if self._described:
+        if self._writes_camera:
             scene, name = self._scene, self._camera
             matrices = {"size": list(scene.render.size), **calibration(view_at(scene, 0.0, name))}
             if is_moving(scene, name):
                 rate = scene.time.frames_per_second
                 matrices["poses"] = [pose(view_at(scene, frame / rate, name)) for frame in range(frames)]
-            add(self._folder / CAMERA_FILE, (json.dumps(matrices, indent=2) + "\n").encode())
+            write_new_file(self._folder / CAMERA_FILE, (json.dumps(matrices, indent=2) + "\n").encode())
         if self._scene.asks_for("tracks"):
-            tracks = {"points": self._points, "occluded": self._occluded, "position": self._position}
+            tracks = {"points": self._pixels, "occluded": self._occluded, "position": self._position}
             tracks = {name: values[:, :frames] for name, values in tracks.items()}
-            with create(self._folder / OUTPUTS["tracks"].path()) as file:
+            with create_file(self._folder / OUTPUTS["tracks"].path()) as file:
                 write_arrays(file, {"coordinates": self._grid, **tracks})
 
 
-_WRITERS: dict[str, Callable[[BinaryIO, Any], None]] = {
+_LABEL_WRITERS: dict[str, Callable[[BinaryIO, Any], None]] = {
     ".npy": np.save,
     ".tiff": lambda file, depth: Image.fromarray(depth).save(file, "TIFF"),
     ".flo": write_flo,
-    ".png": lambda file, mask: Image.fromarray(mask).save(file, "PNG", compress_level=COMPRESS_LEVEL),
+    ".png": lambda file, mask: Image.fromarray(mask).save(
+        file, "PNG", compress_level=1
+    ),  # masks consist of few large areas
 }
 
 
 class ErrorRecord(TypedDict):
-    """The error of a run, as fractions of the largest displacement; None: not known, because a pilot diverged."""
+    """Error estimate of a run, relative to the largest displacement. None if unknown, for example after divergence."""
 
-    error: float | None  # None at rest, too; largest of any point at any frame, due to the step and to rounding
-    rounding: float | None  # the part of it that comes from f32; None also where a coarse pilot does not tell the parts
+    error: float | None  # largest error of any mass point in any frame, due to step and rounding; None at equilibrium
+    rounding: float | None  # the part of `error` due to f32; None also if the companion run does not separate it
     in_f64: float | None  # the error of the same step in f64; None likewise
-    order: int | None  # of the method; None at rest
-    at_least: bool  # whether `error` may be larger
-    mesh_error: NotRequired[float | None]  # the error that the number of points makes; only with tissue
-    mesh_doubt: NotRequired[str]  # why `mesh_error` may be larger or is not known; empty: it is about that
-    force_error: NotRequired[float | None]  # of tools on a path, as a fraction of the greatest force
-    force_doubt: NotRequired[str]  # why `force_error` is not known
+    order: int | None  # of the method; None at equilibrium
+    at_least: bool  # whether `error` is a lower bound
+    mesh_error: NotRequired[float | None]  # discretisation error; only with tissue
+    mesh_doubt: NotRequired[str]  # why `mesh_error` may be larger or is unknown; empty if it is reliable
+    force_error: NotRequired[float | None]  # of position-controlled tools, relative to the greatest force
+    force_doubt: NotRequired[str]  # why `force_error` is unknown
 
 
 class RunRecord(TypedDict, total=False):
-    """What was run, on which machine, how far it came, and its error."""
+    """Content of run.json."""
 
     status: Literal["complete", "diverged", "interrupted"]
-    error: str  # where and why the run diverged; only if it did
-    dump: str | None  # file with the last good state; only if the run diverged. None: there is no such file
-    scene: dict[str, Any]  # as it was run, with the points, the step and the precision that were chosen
-    asked: dict[str, Any]  # keys by their paths, with the values of the scene where others were chosen
-    working_directory: str  # from which the paths of the scene's pictures start
-    # Of the files of the picture and the maps, by the keys that name them, such as image and tissue.map.image; without
-    # one that could not be read and was not drawn.
+    error: str  # location and cause of the divergence; only if diverged
+    dump: str | None  # file with the last valid state, None if there is none; only if diverged
+    scene: dict[str, Any]  # as simulated, with resolved mesh, step and precision
+    asked: dict[str, Any]  # requested values that were resolved to others, by the paths of their keys
+    working_directory: str  # folder to which picture paths are relative
+    # Digests of the files of picture and maps by their keys in the scene, such as image and tissue.map.image. An
+    # unreadable picture that was not drawn is omitted.
     sha256: dict[str, str]
     overrides: list[str]  # of the scene file
     points: list[int]  # rows and columns of mass points
-    step: float | None  # [s]; None: at rest, as the next ones
-    stable_step: float | None  # the largest stable step [s]; None: every step is stable
-    steps_per_frame: int | None
-    precision: str  # of the steps
-    steps: int | None  # in the run so far
-    residual: float  # at rest: the largest force left on a point at any frame, as a share of the largest force
-    evaluations: int  # at rest: of the forces, in the run so far
+    step: float | None  # [s]; None if quasistatic
+    stable_step: float | None  # largest stable step [s]; None if quasistatic or if every step is stable
+    steps_per_frame: int | None  # None if quasistatic
+    precision: str  # f32 or f64
+    steps: int | None  # number of steps so far; None if quasistatic
+    residual: float  # quasistatic: largest net force on a mass point in any frame, relative to the largest force
+    evaluations: int  # quasistatic: number of force evaluations so far
     max_displacement: float  # [m]
     shortest_spring: float  # smallest ratio of a spring's length to its rest length
-    longest_spring: float  # and the largest
-    probes: list[ProbeRecord]  # forces of each
-    notes: list[str]  # what to know before trusting the result
-    error_estimate: ErrorRecord | None  # None: there is none, for the reason that follows
+    longest_spring: float  # largest such ratio
+    probes: list[ProbeRecord]
+    notes: list[str]  # warnings about the validity of the results
+    error_estimate: ErrorRecord | None  # None for the reason in `error_estimate_reason`
     error_estimate_reason: str
-    resumed: int  # number of frames that an earlier run had simulated
-    timings: dict[str, float]  # of every stage [s]
+    resumed: int  # number of frames simulated before the run was resumed
+    timings: dict[str, float]  # time of every stage [s]
     arch: str
     device: str
     threads: int
     lanes: int
     workers: int
-    versions: dict[str, str]  # of all that the results depend on
+    versions: dict[str, str]  # of all software that affects the results
     frames: int
-    outputs: list[str]  # names of the files written, and of the folders with a file for every frame
+    outputs: list[str]  # names of files, and of folders with a file per frame

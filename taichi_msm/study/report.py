@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from taichi_msm.errors import printable, writing
-from taichi_msm.runs.directory import staged
+from taichi_msm.runs.directory import hidden_folder
 from taichi_msm.scene.section import MAX_POINTS
 from taichi_msm.study.format import (
     Columns,
@@ -44,7 +44,7 @@ def require_writable(directory: Path) -> None:
     Raises:
         FilesError: When the directory cannot be written.
     """
-    with writing(directory), staged(directory):
+    with writing(directory), hidden_folder(directory):
         pass
 
 
@@ -63,7 +63,7 @@ def write_report(study: Study, directory: Path) -> list[str]:
     Raises:
         FilesError: When the directory cannot be written.
     """
-    with writing(directory), staged(directory) as hidden:
+    with writing(directory), hidden_folder(directory) as hidden:
         outputs = [*([PICTURE_FILE] if _draw(study, hidden / PICTURE_FILE) else []), PAGE_FILE, RECORD_FILE]
         record = json.dumps({**study_record(study), "outputs": outputs}, indent=2, ensure_ascii=False, allow_nan=False)
         for file, text in ((PAGE_FILE, format_page(study)), (RECORD_FILE, record + "\n")):

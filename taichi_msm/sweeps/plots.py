@@ -274,11 +274,11 @@ def _last_frames(
     for run, directory in directories.items():
         try:
             finished = read_run(directory)
-            if finished.has("png"):
-                frames[run] = Image.fromarray(finished.picture("png", finished.frames - 1))
-            elif finished.has("gif"):
-                frames[run] = read_last_frame(finished.result("gif"))
-            elif finished.has("trajectory") and finished.scene.image is not None:
+            if finished.has_output("png"):
+                frames[run] = Image.fromarray(finished.read_picture("png", finished.frames - 1))
+            elif finished.has_output("gif"):
+                frames[run] = read_last_frame(finished.result_path("gif"))
+            elif finished.has_output("trajectory") and finished.scene.image is not None:
                 futures[run] = executor.submit(draw_last_frame, directory.absolute())
         except FilesError as error:
             errors.append(str(error))

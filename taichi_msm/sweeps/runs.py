@@ -28,7 +28,16 @@ from taichi_msm.errors import (
     writing,
 )
 from taichi_msm.load.scene_file import ParsedFile, plan_file
-from taichi_msm.runs.directory import FILE, FOLDER, MAX_RECORD, give_name, kind, lock, require, staged
+from taichi_msm.runs.directory import (
+    FILE,
+    FOLDER,
+    MAX_RECORD_BYTES,
+    entry_kind,
+    hidden_folder,
+    link_without_replacing,
+    lock_file,
+    require_kind,
+)
 from taichi_msm.scene.outputs import RUN_RECORD, RUNS_FOLDER, SWEEP_RECORD, zero_padded
 from taichi_msm.sweeps.pool import DiedError
 from taichi_msm.sweeps.spec import Sweep
@@ -52,8 +61,8 @@ def register_sweep(directory: Path, sweep: Sweep) -> list[list[Any]]:
         SceneError: when the directory holds another sweep, or the same sweep of versions with other results.
         FilesError: when the directory cannot be read or written, contains other files, or is damaged.
     """
-    record = require(directory / SWEEP_RECORD, FILE)
-    require(directory / RUNS_FOLDER, FOLDER)
+    record = require_kind(directory / SWEEP_RECORD, FILE)
+    require_kind(directory / RUNS_FOLDER, FOLDER)
     description, values = sweep.description(), sweep.values()
     if not record.exists():
         for name in (RUNS_FOLDER, *REPORT_FILES, RUN_RECORD):
@@ -66,9 +75,9 @@ def register_sweep(directory: Path, sweep: Sweep) -> list[list[Any]]:
             "versions": versions(),
             "values": values,
         }
-        with writing(directory), staged(directory) as hidden:
+        with writing(directory), hidden_folder(directory) as hidden:
             (hidden / SWEEP_RECORD).write_text(json.dumps(content) + "\n", encoding="utf-8", errors="backslashreplace")
-            give_name(hidden / SWEEP_RECORD, record)  # unless another shard has just done so
+            link_without_replacing(hidden / SWEEP_RECORD, record)  # unless another shard has just done so
     # Values are compared as text: 1 differs from 1.0, and NaN equals itself.
     expected_values = json.dumps(values)
     try:
@@ -140,7 +149,7 @@ def begin_sweep(sweep: Sweep, directory: Path, shard: tuple[int, int] = (1, 1)) 
     done, missing = [], []
     for run in range(part - 1, len(values), parts):
         task = RunTask(run, sweep.scene, sweep.overrides(values[run]), directory, home)
-        require(task.directory, FOLDER)
+        require_kind(task.directory, FOLDER)
         if outcome := read_outcome(task, sweep):
             done.append(outcome)
         else:
@@ -160,9 +169,9 @@ def read_outcome(task: RunTask, sweep: Sweep) -> Outcome | None:
     """
     # A damaged record counts as missing, so the run is repeated.
     with suppress(OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        if kind(task.directory / RUN_RECORD) == FILE:
+        if entry_kind(task.directory / RUN_RECORD) == FILE:
             with (task.directory / RUN_RECORD).open("rb") as file:
-                record = json.loads(file.read(MAX_RECORD))
+                record = json.loads(file.read(MAX_RECORD_BYTES))
             has_same_overrides = tuple(record["overrides"]) == task.overrides
             has_same_files = sweep.digests.issuperset(record["sha256"].values())
             if record["status"] in FINAL_STATUSES and has_same_overrides and has_same_files:
@@ -181,7 +190,7 @@ def report_lock(directory: Path, pause: Pause) -> Iterator[None]:
     with ExitStack() as stack:
         while True:
             try:
-                stack.enter_context(lock(directory / SWEEP_RECORD))
+                stack.enter_context(lock_file(directory / SWEEP_RECORD))
                 break
             except BlockingIOError:
                 pause()

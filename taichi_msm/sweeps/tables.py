@@ -27,7 +27,7 @@ from taichi_msm.load import cost as cost_module
 from taichi_msm.load.cost import format_rough_time
 from taichi_msm.load.scene_file import plan_file
 from taichi_msm.model.plan import Plan
-from taichi_msm.runs.directory import MAX_RECORD, replacing
+from taichi_msm.runs.directory import MAX_RECORD_BYTES, replacing
 from taichi_msm.scene.outputs import RUN_RECORD
 from taichi_msm.sweeps.plots import (
     PlotData,
@@ -222,7 +222,7 @@ def assign_splits(runs: int, seed: int) -> list[str]:
 
 def _output_format(directory: Path) -> dict[str, Any]:
     """Read the outputs, number of frames, frame size [px] and frame rate of a run, which a data loader needs."""
-    record = json.loads(read_regular(directory / RUN_RECORD, MAX_RECORD))
+    record = json.loads(read_regular(directory / RUN_RECORD, MAX_RECORD_BYTES))
     scene = record["scene"]
     return {
         "outputs": record["outputs"],

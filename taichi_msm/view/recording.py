@@ -15,9 +15,9 @@ from PIL import Image
 from taichi_msm.errors import FilesError, Pause, printable, writing
 from taichi_msm.load.scene_file import MAX_BYTES
 from taichi_msm.load.yaml_reader import MAX_NODES
-from taichi_msm.runs.directory import place, staged
+from taichi_msm.runs.directory import hidden_folder, move_to_free_name
 from taichi_msm.runs.encoder import Encoder
-from taichi_msm.runs.media import Job, Picture
+from taichi_msm.runs.media import EncodingJob, Picture
 from taichi_msm.scene.outputs import OUTPUTS
 from taichi_msm.scene.render import Render
 from taichi_msm.scene.scene import Scene
@@ -50,8 +50,8 @@ class Film:
         self.pictures = 0
         self._subframes, self._begin, self._location = subframes, begin, (folder, option)
         with writing(*self._location), ExitStack() as opened:
-            self._hidden = opened.enter_context(staged(folder))
-            job = Job((self._hidden,), render.size, rate, png=False, gif=True, background=render.background)
+            self._hidden = opened.enter_context(hidden_folder(folder))
+            job = EncodingJob((self._hidden,), render.size, rate, png=False, gif=True, background=render.background)
             self._encoder = Encoder(job)
             opened.callback(self._encoder.abort)
             self._opened = opened.pop_all()
@@ -100,13 +100,13 @@ class Captures:
 
     def save_picture(self, picture: Picture) -> Path:
         """Save a picture, shape (height, width, 3), as PNG; returns its file."""
-        with writing(self.folder), staged(self.folder) as hidden:
+        with writing(self.folder), hidden_folder(self.folder) as hidden:
             Image.fromarray(picture).save(hidden / "picture", "PNG")
             return self._move_to_free_name(hidden / "picture", "picture", ".png")
 
     def save_scene(self, scene: Scene) -> Path:
         """Save a scene and copies of its pictures in the same directory; returns the scene file."""
-        with writing(self.folder), staged(self.folder) as hidden:
+        with writing(self.folder), hidden_folder(self.folder) as hidden:
             scene = scene.with_pictures(lambda path: self._copy_picture(Path(path)).name)
             data = scene.model_dump(mode="json", exclude_none=True)
             text = yaml.dump(
@@ -126,7 +126,7 @@ class Captures:
 
     def _move_to_free_name(self, draft: Path, stem: str, suffix: str) -> Path:
         """Move a file to the next free name."""
-        self.saved.append(place(draft, self.folder, stem, suffix))
+        self.saved.append(move_to_free_name(draft, self.folder, stem, suffix))
         return self.saved[-1]
 
     def _copy_picture(self, image: Path) -> Path:
@@ -138,7 +138,7 @@ class Captures:
             number += 1
             copy = self.folder / f"{image.stem}-{number}{image.suffix}"
         if not os.path.lexists(copy):
-            with staged(self.folder) as hidden:
+            with hidden_folder(self.folder) as hidden:
                 shutil.copyfile(image, hidden / "copy").replace(copy)
         return copy
 

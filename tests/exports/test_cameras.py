@@ -107,7 +107,7 @@ def test_a_link_on_the_way_is_not_followed(name: str, formats: list[str], stereo
 
 def test_another_folder_is_no_camera(stereo: Path) -> None:
     shutil.copytree(stereo / "left", stereo / "again")
-    assert read_run(stereo).cameras() == ["left", "right"]
+    assert read_run(stereo).camera_names() == ["left", "right"]
 
 
 @pytest.mark.parametrize(

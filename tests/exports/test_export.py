@@ -21,7 +21,7 @@ from taichi_msm.exports import obj
 from taichi_msm.exports.export import export
 from taichi_msm.exports.formats import FORMATS
 from taichi_msm.runs import directory
-from taichi_msm.runs.finished import PUT_BACK, read_run
+from taichi_msm.runs.finished import RESTORE_PICTURE, read_run
 from taichi_msm.runs.run import run
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
@@ -124,7 +124,7 @@ def test_a_picture_that_is_gone_is_named(results: Path, program: Program) -> Non
     record["scene"]["image"] = "gone.png"
     (results / "run.json").write_text(json.dumps(record))
     done = program("export", str(results), "--format", "gltf")
-    error = f"{results}: image: gone.png: no such file or directory; {PUT_BACK}\n"
+    error = f"{results}: image: gone.png: no such file or directory; {RESTORE_PICTURE}\n"
     assert (done.returncode, done.stderr) == (4, error)
 
 
@@ -229,13 +229,13 @@ def test_many_files_are_compared_in_time_proportional_to_their_number(
         (out / name).write_text("of an earlier export")
     (out / "export.json").write_text(json.dumps({"files": names}))
     calls: list[str] = []
-    kind = directory.kind
+    kind = directory.entry_kind
 
     def counted(path: Path) -> str | None:
         calls.append(path.name)
         return kind(path)
 
-    monkeypatch.setattr(directory, "kind", counted)
+    monkeypatch.setattr(directory, "entry_kind", counted)
     assert len(exported(results, out)) == 8
     # A name is looked up some times, and never beside each of the others.
     assert count < len(calls) < 10 * count < count**2
@@ -292,7 +292,7 @@ def test_a_record_that_names_a_picture_elsewhere_gets_nothing_of_it(name: str, r
     change_scene(results, image=path)
     fault = f"{path} is not the file that was run, as its SHA-256 tells"
     done = program("export", str(results), "--format", name)
-    assert (done.returncode, done.stderr) == (4, f"{results}: image: {fault}; {PUT_BACK}\n")
+    assert (done.returncode, done.stderr) == (4, f"{results}: image: {fault}; {RESTORE_PICTURE}\n")
     change(results, sha256={})
     assert program("export", str(results), "--format", name).stderr == done.stderr
     assert not (results / f"export-{name}").exists()
@@ -304,7 +304,7 @@ def test_a_record_that_names_a_map_elsewhere_gets_nothing_of_it_for_vtk(results:
     change_scene(results, springs={"map": {"image": path, "range": [1.0, 2.0]}})
     done = program("export", str(results), "--format", "vtk")
     fault = f"springs.map.image: {path} is not the file that was run, as its SHA-256 tells"
-    assert (done.returncode, done.stderr) == (4, f"{results}: {fault}; {PUT_BACK}\n")
+    assert (done.returncode, done.stderr) == (4, f"{results}: {fault}; {RESTORE_PICTURE}\n")
 
 
 @pytest.mark.parametrize("name", ["trajectory.npz", "frames/0001.png", "frames"])
@@ -314,7 +314,7 @@ def test_results_that_are_links_get_nothing_of_what_they_lead_to(name: str, resu
     (results / name).symlink_to(moved)
     found = read_run(results)
     with pytest.raises(FilesError, match="a symbolic link, which no run writes"):
-        found.positions() if name == "trajectory.npz" else found.result("png", 1)
+        found.positions() if name == "trajectory.npz" else found.result_path("png", 1)
 
 
 @pytest.mark.parametrize("name", ["gltf", "obj", "vtk"])
@@ -401,7 +401,7 @@ def test_a_full_disk_leaves_the_earlier_files(results: Path, monkeypatch: pytest
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(obj, "create", full)
+    monkeypatch.setattr(obj, "create_file", full)
     with pytest.raises(FilesError, match=r"here: cannot write: No space left on device; free some space or choose"):
         exported(results, out)
     with pytest.raises(FilesError, match="cannot write"):

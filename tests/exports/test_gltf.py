@@ -276,7 +276,7 @@ def test_more_key_frames_than_are_needed_are_not_taken() -> None:
 
 
 def test_a_run_of_many_frames_is_told_by_key_frames(ran: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gltf, "MOST_TARGETS", 2)
+    monkeypatch.setattr(gltf, "MAX_TARGETS", 2)
     done = export(ran, "gltf", tmp_path)
     found, expected = read_glb(tmp_path / "surface.glb"), positions(ran)
     keys = key_frames(expected, 3)
@@ -291,7 +291,7 @@ def test_a_sheet_of_many_points_has_fewer_key_frames(
     ran: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """So that a file stays of a size that browsers load."""
-    monkeypatch.setattr(gltf, "MOST_BYTES", 3 * 99 * 24)
+    monkeypatch.setattr(gltf, "MAX_TARGETS_BYTES", 3 * 99 * 24)
     export(ran, "gltf", tmp_path)
     targets = read_glb(tmp_path / "surface.glb").primitive["targets"]
     assert len(targets) == 3

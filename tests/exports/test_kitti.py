@@ -17,7 +17,7 @@ from PIL import Image
 
 from taichi_msm.errors import FilesError
 from taichi_msm.exports.export import export
-from taichi_msm.exports.kitti import encode, png16
+from taichi_msm.exports.kitti import encode_flow, png16
 from taichi_msm.runs.arrays import read_flo
 from taichi_msm.runs.finished import reading
 from tests.outputs import files
@@ -112,8 +112,8 @@ def test_every_pair_has_its_two_pictures(labelled: Path) -> None:
     ],
 )
 def test_what_a_flow_is_in_colours(flow: tuple[float, float], colours: tuple[int, ...]) -> None:
-    assert encode(np.array([[flow]], np.float32)).ravel().tolist() == list(colours)
-    assert encode(np.array([[flow]], np.float32), np.array([[False]])).ravel().tolist() == [0, 0, 0]
+    assert encode_flow(np.array([[flow]], np.float32)).ravel().tolist() == list(colours)
+    assert encode_flow(np.array([[flow]], np.float32), np.array([[False]])).ravel().tolist() == [0, 0, 0]
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 50), (50, 1), (37, 53)])

@@ -14,8 +14,8 @@ from PIL import Image
 from taichi_msm.errors import FilesError, SceneError
 from taichi_msm.load.scene_file import load_plan, load_scene
 from taichi_msm.model.plan import Plan
-from taichi_msm.runs.finished import PUT_BACK, read_run
-from taichi_msm.runs.manifest import digests
+from taichi_msm.runs.finished import RESTORE_PICTURE, read_run
+from taichi_msm.runs.manifest import input_digests
 from taichi_msm.runs.playback import Playback
 from taichi_msm.runs.run import resume, run
 from taichi_msm.runs.writer import RunRecord
@@ -130,7 +130,7 @@ def test_other_pictures_are_refused(
     alter()
     before = files(mapped)
     done = program("run", "--again", "out", "--out", "second")
-    assert (done.returncode, done.stdout, done.stderr) == (4, "", f"out: {said}; {PUT_BACK}\n")
+    assert (done.returncode, done.stdout, done.stderr) == (4, "", f"out: {said}; {RESTORE_PICTURE}\n")
     assert files(mapped) == before
 
 
@@ -190,11 +190,11 @@ def test_a_picture_that_changes_while_a_run_starts_is_noticed(
     """The record tells of the file that was drawn."""
 
     def late(plan: Plan) -> dict[str, str]:
-        found = digests(plan)
+        found = input_digests(plan)
         Image.fromarray(speckle(30, 40, 1)).save(small / "speckle.png")
         return found
 
-    monkeypatch.setattr("taichi_msm.runs.run.digests", late)
+    monkeypatch.setattr("taichi_msm.runs.run.input_digests", late)
     with pytest.raises(SceneError, match=r"^image: speckle.png is not the file that was run"):
         run(load_scene("small.yaml"), "out", threads=device.threads)
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from taichi_msm.runs.directory import LOCK, lock, place, replacing, staged
+from taichi_msm.runs.directory import LOCK_FILE, hidden_folder, lock_file, move_to_free_name, replacing
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no lock")
@@ -17,8 +17,8 @@ def test_what_a_killed_process_left_is_cleared_by_the_next(tmp_path: Path) -> No
         folder.mkdir()
         (folder / "animation.gif").write_text("half")
         if folder != begun:
-            (folder / LOCK).touch()
-    with lock(living / LOCK), staged(tmp_path) as hidden:
+            (folder / LOCK_FILE).touch()
+    with lock_file(living / LOCK_FILE), hidden_folder(tmp_path) as hidden:
         assert set(tmp_path.iterdir()) == {living, begun, mine, hidden}
         (hidden / "a").write_text("half")
     assert set(tmp_path.iterdir()) == {living, begun, mine}
@@ -29,11 +29,11 @@ def test_a_link_among_what_was_left_leads_nowhere(tmp_path: Path) -> None:
     (treasure / "lock").mkdir(parents=True)
     for name in ("a", "b"):
         (out / f".partial-{16 * name}").mkdir(parents=True)
-    (out / f".partial-{16 * 'a'}" / LOCK).touch()
+    (out / f".partial-{16 * 'a'}" / LOCK_FILE).touch()
     (out / f".partial-{16 * 'a'}" / "deep").symlink_to(treasure)
-    (out / f".partial-{16 * 'b'}" / LOCK).symlink_to(treasure / "notes.txt")
+    (out / f".partial-{16 * 'b'}" / LOCK_FILE).symlink_to(treasure / "notes.txt")
     (out / f".partial-{16 * 'c'}").symlink_to(treasure)
-    with staged(out):
+    with hidden_folder(out):
         pass
     assert (treasure / "lock").is_dir()
     assert not (treasure / "notes.txt").exists()
@@ -42,9 +42,9 @@ def test_a_link_among_what_was_left_leads_nowhere(tmp_path: Path) -> None:
 def test_a_folder_with_files_of_the_user_stays(tmp_path: Path) -> None:
     mine = tmp_path / f".partial-{16 * 'a'}"
     mine.mkdir()
-    for name in (LOCK, "thesis.txt"):
+    for name in (LOCK_FILE, "thesis.txt"):
         (mine / name).touch()
-    with staged(tmp_path):
+    with hidden_folder(tmp_path):
         pass
     assert (mine / "thesis.txt").exists()
 
@@ -57,15 +57,15 @@ def test_without_locks_nothing_is_taken_for_abandoned(tmp_path: Path, monkeypatc
         raise OSError(errno.ENOLCK, "no locks")
 
     monkeypatch.setattr("fcntl.flock", refuse)
-    with staged(tmp_path) as film:
+    with hidden_folder(tmp_path) as film:
         (film / "animation.gif").touch()
-        with staged(tmp_path):
+        with hidden_folder(tmp_path):
             pass
         assert (film / "animation.gif").exists()
 
 
 def test_a_folder_made_for_nothing_goes(tmp_path: Path) -> None:
-    with staged(tmp_path / "out"):
+    with hidden_folder(tmp_path / "out"):
         pass
     assert list(tmp_path.iterdir()) == []
 
@@ -97,10 +97,10 @@ def test_a_draft_of_the_user_stays(tmp_path: Path) -> None:
 def test_a_file_takes_the_first_free_name(tmp_path: Path) -> None:
     for name in ("a-1.png", "a-3.png"):
         (tmp_path / name).write_text("mine")
-    with staged(tmp_path) as hidden:
+    with hidden_folder(tmp_path) as hidden:
         for data in ("second", "fourth"):
             (hidden / "a").write_text(data)
-            place(hidden / "a", tmp_path, "a", ".png")
+            move_to_free_name(hidden / "a", tmp_path, "a", ".png")
             (hidden / "a").unlink(missing_ok=True)
     texts = {path.name: path.read_text() for path in tmp_path.iterdir()}
     assert texts == {"a-1.png": "mine", "a-2.png": "second", "a-3.png": "mine", "a-4.png": "fourth"}

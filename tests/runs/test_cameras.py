@@ -174,7 +174,7 @@ def test_results_replace_those_of_other_cameras_and_nothing_else(small: Path, de
 
 def test_cameras_have_names_in_python(stereo: Path, device: Device) -> None:
     found = read_run(stereo)
-    assert (found.cameras(), found.camera) == (["left", "right"], "left")
+    assert (found.camera_names(), found.camera) == (["left", "right"], "left")
     with Playback(stereo, threads=device.threads) as playback:
         for name in ("left", "right"):
             with Image.open(stereo / name / "frames/0002.png") as image:

@@ -13,7 +13,15 @@ import numpy as np
 import pytest
 
 from taichi_msm.errors import DamagedError
-from taichi_msm.runs.checkpoint import FORCES, MANIFEST, POSITIONS, STATE, Checkpoint, seal, unseal
+from taichi_msm.runs.checkpoint import (
+    FORCES_FILE,
+    MANIFEST_FILE,
+    POSITIONS_FILE,
+    STATE_FILE,
+    Checkpoint,
+    dump_with_checksum,
+    load_with_checksum,
+)
 from taichi_msm.runs.manifest import Manifest, read_manifest
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.state import PeakForce, ProbeForces, RunProgress, Snapshot, State, TipForce
@@ -74,8 +82,8 @@ def read(out: Path) -> list[Any]:
     try:
         saved = checkpoint.reopen()
         assert saved is not None
-        positions = [checkpoint.position(frame).tolist() for frame in range(checkpoint.frames)]
-        forces = [checkpoint.forces(frame) for frame in range(checkpoint.frames)]
+        positions = [checkpoint.read_positions(frame).tolist() for frame in range(checkpoint.frames)]
+        forces = [checkpoint.read_forces(frame) for frame in range(checkpoint.frames)]
     finally:
         checkpoint.close()
     return [
@@ -93,12 +101,12 @@ def read(out: Path) -> list[Any]:
 @pytest.mark.parametrize(
     ("name", "harmless", "every"),
     [
-        (MANIFEST, 0.0, 1),
-        (POSITIONS, 0.0, 5),
-        (FORCES, 0.0, 5),
-        (STATE, 0.25, 5),
-        pytest.param(POSITIONS, 0.0, 1, marks=pytest.mark.fuzz),
-        pytest.param(STATE, 0.25, 1, marks=pytest.mark.fuzz),
+        (MANIFEST_FILE, 0.0, 1),
+        (POSITIONS_FILE, 0.0, 5),
+        (FORCES_FILE, 0.0, 5),
+        (STATE_FILE, 0.25, 5),
+        pytest.param(POSITIONS_FILE, 0.0, 1, marks=pytest.mark.fuzz),
+        pytest.param(STATE_FILE, 0.25, 1, marks=pytest.mark.fuzz),
     ],
 )
 def test_a_flipped_bit_is_found(name: str, harmless: float, every: int, out: Path) -> None:
@@ -157,7 +165,7 @@ FORGED: dict[str, Callable[[dict[str, Any]], object]] = {
 
 @pytest.mark.parametrize("case", FORGED)
 def test_a_forged_state_is_refused(case: str, out: Path) -> None:
-    path = out / ".partial" / "checkpoint" / STATE
+    path = out / ".partial" / "checkpoint" / STATE_FILE
     repacked(path, lambda arrays: None)
     read(out)
     repacked(path, FORGED[case])
@@ -166,7 +174,7 @@ def test_a_forged_state_is_refused(case: str, out: Path) -> None:
 
 
 def test_an_array_that_claims_to_be_huge_takes_no_memory(out: Path) -> None:
-    path = out / ".partial" / "checkpoint" / STATE
+    path = out / ".partial" / "checkpoint" / STATE_FILE
     with zipfile.ZipFile(path) as found:
         entries = {name: found.read(name) for name in found.namelist()}
     header = io.BytesIO()
@@ -181,7 +189,7 @@ def test_an_array_that_claims_to_be_huge_takes_no_memory(out: Path) -> None:
 
 def test_a_compressed_array_takes_no_memory(out: Path) -> None:
     """A few bytes of bzip2 may be gigabytes, whatever the archive says of them."""
-    path = out / ".partial" / "checkpoint" / STATE
+    path = out / ".partial" / "checkpoint" / STATE_FILE
     with zipfile.ZipFile(path) as whole:
         entries = {name: whole.read(name) for name in whole.namelist()}
     with zipfile.ZipFile(path, "w", zipfile.ZIP_BZIP2) as made:
@@ -191,7 +199,7 @@ def test_a_compressed_array_takes_no_memory(out: Path) -> None:
         read(out)
 
 
-@pytest.mark.parametrize("name", [POSITIONS, FORCES, STATE])
+@pytest.mark.parametrize("name", [POSITIONS_FILE, FORCES_FILE, STATE_FILE])
 def test_parts_of_another_run_are_refused(name: str, out: Path, tmp_path: Path) -> None:
     """Of the same sheet, and whole."""
     other = checkpoint_in(tmp_path)
@@ -218,7 +226,7 @@ def test_positions_that_are_no_numbers_are_refused(out: Path) -> None:
 
 
 def test_frames_that_are_exchanged_are_found(out: Path) -> None:
-    path = out / ".partial" / "checkpoint" / POSITIONS
+    path = out / ".partial" / "checkpoint" / POSITIONS_FILE
     data = path.read_bytes()
     size = len(data) // FRAMES
     path.write_bytes(data[size : 2 * size] + data[:size] + data[2 * size :])
@@ -246,20 +254,20 @@ def test_frames_that_are_exchanged_are_found(out: Path) -> None:
     ],
 )
 def test_a_forged_plan_is_refused(change: dict[str, Any], out: Path) -> None:
-    path = out / ".partial" / "checkpoint" / MANIFEST
-    path.write_bytes(seal({**manifest().as_json(), **change}))
+    path = out / ".partial" / "checkpoint" / MANIFEST_FILE
+    path.write_bytes(dump_with_checksum({**manifest().as_json(), **change}))
     with pytest.raises(DamagedError, match=r"manifest\.json is"):
         read_manifest(out)
 
 
 def test_a_seal_is_broken_by_what_is_still_valid_json() -> None:
-    sealed = seal({"frames": 12, "name": "a"})
+    sealed = dump_with_checksum({"frames": 12, "name": "a"})
     for changed in (sealed.replace(b"12", b"13"), sealed.replace(b'"a"', b'"b"'), sealed.replace(b"name", b"nane")):
         assert changed != sealed
         with pytest.raises(ValueError, match="damaged"):
-            unseal(changed)
+            load_with_checksum(changed)
 
 
 def test_what_is_sealed_comes_back() -> None:
     value = {"a": [1, 2.5, math.inf, "é\udcff", None, True], "b": {}}
-    assert unseal(seal(value)) == value
+    assert load_with_checksum(dump_with_checksum(value)) == value

@@ -13,8 +13,8 @@ from typing import BinaryIO
 import pytest
 
 from taichi_msm.errors import FilesError, ForeignError
-from taichi_msm.runs.directory import Publication, lock
-from taichi_msm.runs.writer import RUN
+from taichi_msm.runs.directory import Publication, lock_file
+from taichi_msm.runs.writer import RUN_PUBLICATION
 from taichi_msm.scene.outputs import RESULT_PATTERNS
 
 OLD = ["frames/0000.png", "frames/0001.png", "frames/0002.png", "flow/0000.flo", "animation.gif", "run.json"]
@@ -66,8 +66,8 @@ def write(directory: Path, names: Collection[str], text: str) -> None:
 
 
 def publish(directory: Path, names: Collection[str]) -> None:
-    with Publication(directory, RUN, names) as publication:
-        write(publication.staged, names, "new")
+    with Publication(directory, RUN_PUBLICATION, names) as publication:
+        write(publication.new_folder, names, "new")
         publication.publish(names)
 
 
@@ -97,8 +97,8 @@ def assert_tidy(directory: Path) -> None:
 
 
 def test_new_results_take_the_place_of_all_old_ones(directory: Path) -> None:
-    with Publication(directory, RUN) as publication:
-        write(publication.staged, NEW, "new")
+    with Publication(directory, RUN_PUBLICATION) as publication:
+        write(publication.new_folder, NEW, "new")
         assert contents(directory) == expected(OLD, "old")
         publication.publish(NEW)
         assert contents(directory) == expected(NEW, "new")
@@ -107,29 +107,29 @@ def test_new_results_take_the_place_of_all_old_ones(directory: Path) -> None:
 
 
 def test_leaving_without_publishing_changes_nothing(directory: Path) -> None:
-    with Publication(directory, RUN) as publication:
-        write(publication.staged, NEW, "new")
+    with Publication(directory, RUN_PUBLICATION) as publication:
+        write(publication.new_folder, NEW, "new")
     assert contents(directory) == expected(OLD, "old")
     assert_tidy(directory)
 
 
 def test_a_directory_made_for_nothing_goes(tmp_path: Path) -> None:
-    with Publication(tmp_path / "out" / "press", RUN):
+    with Publication(tmp_path / "out" / "press", RUN_PUBLICATION):
         assert (tmp_path / "out" / "press").is_dir()
     assert not (tmp_path / "out" / "press").exists()
     assert tmp_path.exists()
 
 
 def test_an_empty_directory_of_the_user_stays(tmp_path: Path) -> None:
-    with Publication(tmp_path, RUN):
+    with Publication(tmp_path, RUN_PUBLICATION):
         pass
     assert list(tmp_path.iterdir()) == []
 
 
 def test_frames_that_are_not_wanted_go_with_their_directory(tmp_path: Path) -> None:
     write(tmp_path, OLD, "old")
-    with Publication(tmp_path, RUN, ["run.json"]) as publication:
-        write(publication.staged, ["run.json"], "new")
+    with Publication(tmp_path, RUN_PUBLICATION, ["run.json"]) as publication:
+        write(publication.new_folder, ["run.json"], "new")
         publication.publish(["run.json"])
     assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
 
@@ -154,7 +154,7 @@ def test_killed_at_any_moment_the_results_are_all_old_or_all_new(directory: Path
                 assert contents(directory) in (expected(OLD, "old"), expected(NEW, "new"))
             else:
                 assert (directory / ".partial" / "whole" / "run.json").exists()
-            with Publication(directory, RUN):
+            with Publication(directory, RUN_PUBLICATION):
                 pass
             found = contents(directory)
             assert found in (expected(OLD, "old"), expected(NEW, "new")), f"killed before operation {moment}"
@@ -169,14 +169,14 @@ def test_killed_at_any_moment_the_results_are_all_old_or_all_new(directory: Path
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no lock")
 def test_a_second_run_is_refused_until_the_first_ends(directory: Path) -> None:
-    with Publication(directory, RUN) as first:
-        write(first.staged, NEW, "new")
-        with pytest.raises(FilesError) as refused, Publication(directory, RUN):
+    with Publication(directory, RUN_PUBLICATION) as first:
+        write(first.new_folder, NEW, "new")
+        with pytest.raises(FilesError) as refused, Publication(directory, RUN_PUBLICATION):
             pass
         assert str(refused.value) == f"{directory}: another run is writing there; choose another --out"
         first.publish(NEW)
     assert contents(directory) == expected(NEW, "new")
-    with Publication(directory, RUN):
+    with Publication(directory, RUN_PUBLICATION):
         pass
     assert_tidy(directory)
 
@@ -196,25 +196,25 @@ def test_the_lock_of_a_directory_that_was_removed_is_no_lock(directory: Path, mo
         flock(file, operation)
 
     monkeypatch.setattr(fcntl, "flock", late)
-    with Publication(directory, RUN):
+    with Publication(directory, RUN_PUBLICATION):
         assert len(opened) == 2
         monkeypatch.undo()
-        with pytest.raises(FilesError), Publication(directory, RUN):
+        with pytest.raises(FilesError), Publication(directory, RUN_PUBLICATION):
             pass
 
 
 def test_what_a_killed_run_left_is_cleared(directory: Path) -> None:
     write(directory / ".partial", ["lock", "earlier.json", "new/frames/0000.png", "whole/frames/0000.png"], "stale")
-    with Publication(directory, RUN) as publication:
-        assert list(publication.staged.iterdir()) == []
+    with Publication(directory, RUN_PUBLICATION) as publication:
+        assert list(publication.new_folder.iterdir()) == []
     assert contents(directory) == expected(OLD, "old")
     assert_tidy(directory)
 
 
 def test_a_staged_file_that_is_taken_away_is_missed(directory: Path) -> None:
-    with Publication(directory, RUN, NEW) as publication:
-        write(publication.staged, NEW, "new")
-        (publication.staged / "frames" / "0001.png").unlink()
+    with Publication(directory, RUN_PUBLICATION, NEW) as publication:
+        write(publication.new_folder, NEW, "new")
+        (publication.new_folder / "frames" / "0001.png").unlink()
         with pytest.raises(FilesError, match=r"new/frames/0001\.png was removed during the run; run it again"):
             publication.publish(NEW)
     assert contents(directory) == expected(OLD, "old")
@@ -227,7 +227,7 @@ def test_new_files_with_a_damaged_record_are_not_published(directory: Path) -> N
         (directory / ".partial" / "whole" / "run.json").write_text(damaged)
         with (
             pytest.raises(FilesError, match=r"/whole/run\.json is damaged; remove .*/\.partial and run"),
-            Publication(directory, RUN),
+            Publication(directory, RUN_PUBLICATION),
         ):
             pass
         assert contents(directory) == expected(OLD, "old")
@@ -238,7 +238,7 @@ def test_new_files_that_were_made_up_take_no_file_of_the_user(tmp_path: Path) ->
     write(tmp_path / ".partial" / "whole", ["animation.gif", "run.json"], "new")
     with (
         pytest.raises(ForeignError, match=r"/animation\.gif: a file that no run has put there"),
-        Publication(tmp_path, RUN),
+        Publication(tmp_path, RUN_PUBLICATION),
     ):
         pass
     assert contents(tmp_path) == expected(["animation.gif", "trajectory.npz", "frames/0000.png"], "mine")
@@ -249,10 +249,10 @@ def test_a_directory_that_is_removed_when_it_was_opened_is_no_endless_loop(
 ) -> None:
     def remove(path: Path) -> BinaryIO:
         shutil.rmtree(tmp_path / "out", ignore_errors=True)
-        return lock(path)
+        return lock_file(path)
 
-    monkeypatch.setattr("taichi_msm.runs.directory.lock", remove)
-    with pytest.raises(FileNotFoundError), Publication(tmp_path / "out", RUN):
+    monkeypatch.setattr("taichi_msm.runs.directory.lock_file", remove)
+    with pytest.raises(FileNotFoundError), Publication(tmp_path / "out", RUN_PUBLICATION):
         pass
 
 

@@ -24,8 +24,8 @@ from PIL import Image
 from taichi_msm.errors import FilesError
 from taichi_msm.render.labels import FrameOutputs
 from taichi_msm.runs import media
-from taichi_msm.runs.encoder import Encoder, encode
-from taichi_msm.runs.media import Job
+from taichi_msm.runs.encoder import Encoder, encode_stream
+from taichi_msm.runs.media import EncodingJob
 from taichi_msm.runs.writer import ResultWriter
 from taichi_msm.scene.scene import Scene
 from tests.outputs import files
@@ -71,7 +71,7 @@ def picture(frame: int) -> NDArray[np.uint8]:
 
 
 def write(directory: Path, frames: int, scene: Scene, *, beside: bool = True) -> list[str]:
-    with ResultWriter(directory, *scene_and_grid(scene), beside=beside) as writer:
+    with ResultWriter(directory, *scene_and_grid(scene), encode_in_subprocess=beside) as writer:
         for frame in range(frames):
             writer.add(position(frame), {"": FrameOutputs(picture(frame) if scene.draws else None)})
         names: list[str] = writer.publish({})["outputs"]
@@ -168,7 +168,7 @@ def test_leaving_without_publishing_leaves_what_was_there(beside: bool, tmp_path
     write(tmp_path / "out", 3, small_scene())
     before = files(tmp_path / "out")
     for directory in (tmp_path / "out", tmp_path / "fresh"):
-        with ResultWriter(directory, *scene_and_grid(small_scene()), beside=beside) as writer:
+        with ResultWriter(directory, *scene_and_grid(small_scene()), encode_in_subprocess=beside) as writer:
             writer.add(position(9), {"": FrameOutputs(picture(9))})
     assert files(tmp_path / "out") == before
     assert not (tmp_path / "fresh").exists()
@@ -219,13 +219,13 @@ def test_an_interruption_while_a_picture_is_encoded_here_leaves_whole_frames(
         time.sleep(1)  # until the main thread has heard of it
         return original(*arguments, **keywords)
 
-    with ResultWriter(tmp_path / "interrupted", *scene_and_grid(small_scene()), beside=False) as writer:
+    with ResultWriter(tmp_path / "interrupted", *scene_and_grid(small_scene()), encode_in_subprocess=False) as writer:
         writer.add(position(0), {"": FrameOutputs(picture(0))})
         with monkeypatch.context() as patch:
             patch.setattr(owner, part, interrupted)
             with pytest.raises(KeyboardInterrupt):
                 finish_after_another(writer)
-        writer.finish(hurry=True)
+        writer.finish(discard_queued=True)
         writer.publish({})
         frames = writer.frames
     write(tmp_path / "whole", frames, small_scene())
@@ -245,8 +245,8 @@ def test_an_encoder_in_a_hurry_takes_no_more_pictures(taken: int, tmp_path: Path
                 hurry.set()
             return data
 
-    job = Job((tmp_path,), (30, 20), 25.0, png=True, gif=True, background=(0, 0, 0))
-    frames = encode(job, Pictures(b"".join(one.tobytes() for one in shown)), hurry).frames
+    job = EncodingJob((tmp_path,), (30, 20), 25.0, png=True, gif=True, background=(0, 0, 0))
+    frames = encode_stream(job, Pictures(b"".join(one.tobytes() for one in shown)), hurry).frames
     assert 1 <= frames <= taken
     assert sorted(path.name for path in (tmp_path / "frames").glob("*")) == [f"000{n}.png" for n in range(frames)]
 
@@ -258,7 +258,7 @@ def test_in_a_hurry_frames_are_given_up_and_those_left_are_whole(tmp_path: Path)
     with ResultWriter(tmp_path, *scene_and_grid(made)) as writer:
         for frame, shown in enumerate(large):
             writer.add(position(frame), {"": FrameOutputs(shown)})
-        writer.finish(hurry=True)
+        writer.finish(discard_queued=True)
         writer.publish({})
         frames = writer.frames
     # On a busy machine the encoder may be done before it is told to hurry; see the test below.
@@ -294,14 +294,14 @@ def test_who_waits_for_a_stopped_encoder_can_stop_waiting(tmp_path: Path) -> Non
             writer.add(position(frame), {"": FrameOutputs(picture(frame))})
         with pytest.raises(KeyboardInterrupt):
             writer.finish(stop)
-        writer.finish(hurry=True)
+        writer.finish(discard_queued=True)
         writer.publish({})
         assert writer.frames <= 3
 
 
 @pytest.mark.parametrize("beside", [True, False])
 def test_the_time_spent_encoding_is_told(beside: bool, tmp_path: Path) -> None:
-    with ResultWriter(tmp_path, *scene_and_grid(small_scene()), beside=beside) as writer:
+    with ResultWriter(tmp_path, *scene_and_grid(small_scene()), encode_in_subprocess=beside) as writer:
         writer.add(position(0), {"": FrameOutputs(picture(0))})
         writer.finish()
         assert 0 < writer.encode_seconds < 60
@@ -334,7 +334,7 @@ def full_disk(*_: object, **__: object) -> None:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-@pytest.mark.parametrize("target", ["checkpoint.create", "checkpoint.replacing", "writer.add"])
+@pytest.mark.parametrize("target", ["checkpoint.create_file", "checkpoint.replacing", "writer.write_new_file"])
 def test_a_full_disk_is_one_line_and_changes_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, target: str
 ) -> None:
@@ -383,7 +383,7 @@ def refused(directory: Path, meanwhile: Callable[[ResultWriter], None] = lambda 
     """The error of a run of many frames in whose course something happens."""
 
     def run() -> None:
-        with ResultWriter(directory, *scene_and_grid(small_scene()), beside=beside) as writer:
+        with ResultWriter(directory, *scene_and_grid(small_scene()), encode_in_subprocess=beside) as writer:
             meanwhile(writer)
             for frame in range(1000):
                 writer.add(position(frame), {"": FrameOutputs(picture(frame))})

@@ -48,7 +48,7 @@ def test_a_run_is_read_as_it_was(ran: Path) -> None:
     np.testing.assert_array_equal(positions, written["position"])
     np.testing.assert_array_equal(run.time, written["time"])
     assert run.scene.time.precision == "f64"
-    assert run.result("png", 4) == ran / "frames" / "0004.png"
+    assert run.result_path("png", 4) == ran / "frames" / "0004.png"
 
 
 def test_pictures_are_found_from_where_the_run_was(results: Path) -> None:
@@ -80,13 +80,13 @@ def test_what_is_missing_is_named_with_the_remedy(results: Path) -> None:
         run.positions()
     assert str(caught.value) == f'trajectory.npz: {missing}; {again}]"'
     with pytest.raises(FilesError) as caught:
-        run.result("flow")
+        run.result_path("flow")
     assert str(caught.value) == f'flow: {missing}; {again},flow]"'
     with pytest.raises(FilesError) as caught:
-        run.result("png", 3)
+        run.result_path("png", 3)
     assert str(caught.value) == f'{results / "frames" / "0003.png"}: no such file; {again}]"'
-    assert run.has("png")
-    assert not run.has("flow")
+    assert run.has_output("png")
+    assert not run.has_output("flow")
 
 
 @pytest.mark.parametrize("name", ["nowhere", "empty", "run.json"])

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial import cKDTree
 
-from taichi_msm.runs.media import MAX_GIF_DELAY, SHORTEST, TRANSPARENT, GifWriter, Palette
+from taichi_msm.runs.media import MAX_GIF_DELAY, MIN_GIF_DELAY, TRANSPARENT_INDEX, GifWriter, Palette
 from tests.scenes import speckle
 
 Picture = NDArray[np.uint8]
@@ -88,7 +88,7 @@ def test_total_time_is_right_and_the_last_frame_is_shown(
     write(path, [grey(f) for f in range(frames)], rate, palette)
     shown, delays = read(path)
     assert abs(sum(delays) - 1000 * frames / rate) <= 5  # half of GIF's unit
-    assert min(delays) >= 10 * SHORTEST
+    assert min(delays) >= 10 * MIN_GIF_DELAY
     np.testing.assert_array_equal(shown[-1], grey(frames - 1))
     if rate <= 50:
         ends = [10 * round(100 * (f + 1) / rate) for f in range(frames)]
@@ -102,7 +102,7 @@ def test_the_shortest_animations(tmp_path: Path, palette: Palette, rate: float, 
     shown, delays = read(tmp_path / "a.gif")
     # All in less than GIF's unit is shown for that unit; more than one frame, each for long enough.
     assert abs(sum(delays) - max(10, 1000 * frames / rate)) <= 5
-    assert len(delays) == 1 or min(delays) >= 10 * SHORTEST
+    assert len(delays) == 1 or min(delays) >= 10 * MIN_GIF_DELAY
     np.testing.assert_array_equal(shown[-1], grey(frames - 1))
 
 
@@ -178,7 +178,7 @@ def test_indices_are_those_of_the_nearest_colours_but_for_the_lookup() -> None:
     skin = np.stack([225 - 60 * x * y, 150 - 80 * x + 20 * y, 130 - 50 * y], axis=-1).astype(np.uint8)
     palette = Palette(skin, BACKGROUND)
     error = palette.table[palette.indices(skin)].astype(float) - skin
-    nearest, _ = cKDTree(palette.table[:TRANSPARENT]).query(skin)
+    nearest, _ = cKDTree(palette.table[:TRANSPARENT_INDEX]).query(skin)
     assert (np.sqrt(np.square(error).sum(axis=2)) <= nearest + 2 * np.sqrt(3 * 2**2)).all()
     assert np.abs(error.mean(axis=(0, 1))).max() < 1
 
@@ -195,7 +195,7 @@ def test_the_transparent_index_is_never_a_colour() -> None:
     """Few colours leave entries free, which are black in the file."""
     for samples in (np.full((4, 4, 3), 255, np.uint8), speckle(64, 64)):
         palette = Palette(samples, (255, 255, 255))
-        assert palette.indices(np.zeros((HEIGHT, WIDTH, 3), np.uint8)).max() < TRANSPARENT
+        assert palette.indices(np.zeros((HEIGHT, WIDTH, 3), np.uint8)).max() < TRANSPARENT_INDEX
 
 
 def test_few_colours_are_kept_exactly() -> None:

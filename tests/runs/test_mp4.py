@@ -17,7 +17,7 @@ from PIL import Image
 
 from taichi_msm import SceneError, run
 from taichi_msm.load.scene_file import load_scene
-from taichi_msm.runs.media import Job, Mp4Writer, PictureWriter
+from taichi_msm.runs.media import EncodingJob, Mp4Writer, PictureWriter
 from taichi_msm.scene import outputs
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
@@ -153,7 +153,7 @@ def test_a_film_alone_is_enough_and_the_same_after_an_interruption(small: Path, 
 
 
 def test_a_film_can_be_given_up(tmp_path: Path) -> None:
-    job = Job((tmp_path,), (64, 48), 25.0, png=False, gif=True, background=(0, 0, 0), mp4=True)
+    job = EncodingJob((tmp_path,), (64, 48), 25.0, png=False, gif=True, background=(0, 0, 0), mp4=True)
     writer = PictureWriter(job)
     for frame in range(30):
         writer.add(smooth(64, 48, frame)[None])

@@ -14,7 +14,7 @@ import pytest
 
 from taichi_msm.errors import FilesError
 from taichi_msm.render.labels import FrameOutputs
-from taichi_msm.runs.checkpoint import MANIFEST, is_unfinished
+from taichi_msm.runs.checkpoint import MANIFEST_FILE, is_unfinished
 from taichi_msm.runs.manifest import read_manifest
 from taichi_msm.runs.writer import ResultWriter
 from taichi_msm.scene.scene import Scene
@@ -231,5 +231,5 @@ def test_the_default_folder_is_not_reached_by_a_link(treasure: Path, monkeypatch
 
 
 def test_a_plan_alone_is_enough_to_be_unfinished(tmp_path: Path) -> None:
-    file(f".partial/checkpoint/{MANIFEST}")(tmp_path, tmp_path)
+    file(f".partial/checkpoint/{MANIFEST_FILE}")(tmp_path, tmp_path)
     assert is_unfinished(tmp_path)

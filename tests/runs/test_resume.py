@@ -22,7 +22,7 @@ from PIL import Image
 from taichi_msm import FilesError, resume, run
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.runs import run as run_module
-from taichi_msm.runs.checkpoint import MANIFEST, POSITIONS, STATE, Checkpoint
+from taichi_msm.runs.checkpoint import MANIFEST_FILE, POSITIONS_FILE, STATE_FILE, Checkpoint
 from taichi_msm.runs.writer import RunRecord
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver import dynamics, planning
@@ -108,7 +108,7 @@ def test_a_run_that_is_interrupted_goes_on_to_the_same_bits(
     steps = []
     for after in range(4, 40, 4):
         assert record["status"] == "interrupted"
-        with np.load(checkpoint_in(small / "parts") / STATE) as state:
+        with np.load(checkpoint_in(small / "parts") / STATE_FILE) as state:
             steps.append(int(state["steps"]))
         before = published(small / "parts")
         try:
@@ -174,7 +174,9 @@ def test_a_run_that_finds_the_disk_full_goes_on_when_it_is_not(
             run(made, "parts", threads=device.threads)
     left = files(small / "parts")
     assert {name: left[name] for name in earlier} == earlier
-    assert sorted(set(left) - set(earlier)) == [f".partial/checkpoint/{name}" for name in (MANIFEST, POSITIONS, STATE)]
+    assert sorted(set(left) - set(earlier)) == [
+        f".partial/checkpoint/{name}" for name in (MANIFEST_FILE, POSITIONS_FILE, STATE_FILE)
+    ]
     assert 0 < resume("parts", threads=device.threads)["resumed"] <= 6
     assert results(small / "parts") == results(small / "whole")
 
@@ -239,15 +241,15 @@ def array() -> bytes:
 @pytest.mark.parametrize(
     ("name", "damage"),
     [
-        (MANIFEST, lambda data: data[: len(data) // 2]),
-        (MANIFEST, lambda data: b"[]"),
-        (MANIFEST, lambda data: data.replace(b'"rows"', b'"sheep"').replace(b'"points"', b'"sheep"')),
-        (STATE, lambda data: data[: len(data) // 2]),
-        (MANIFEST, lambda data: b"[" * 100_000),
-        (STATE, lambda data: b"nothing like it"),
-        (STATE, lambda data: b""),
-        (STATE, lambda data: array()),
-        (POSITIONS, lambda data: data[:-500]),
+        (MANIFEST_FILE, lambda data: data[: len(data) // 2]),
+        (MANIFEST_FILE, lambda data: b"[]"),
+        (MANIFEST_FILE, lambda data: data.replace(b'"rows"', b'"sheep"').replace(b'"points"', b'"sheep"')),
+        (STATE_FILE, lambda data: data[: len(data) // 2]),
+        (MANIFEST_FILE, lambda data: b"[" * 100_000),
+        (STATE_FILE, lambda data: b"nothing like it"),
+        (STATE_FILE, lambda data: b""),
+        (STATE_FILE, lambda data: array()),
+        (POSITIONS_FILE, lambda data: data[:-500]),
     ],
 )
 def test_what_is_damaged_is_not_gone_on_with(
@@ -328,7 +330,7 @@ def test_a_run_that_is_killed_at_any_moment_goes_on_to_the_same_bits(kills: int,
         shutil.rmtree(small / "parts", ignore_errors=True)
         going = True
         while going:
-            begun = (checkpoint_in(small / "parts") / MANIFEST).exists()
+            begun = (checkpoint_in(small / "parts") / MANIFEST_FILE).exists()
             # Mostly while it works, which it begins after half of the time, and else at its start or end.
             seconds = whole * random.uniform(0.4, 1.1) if done < kills else 100
             going = killed(["--resume", "parts"] if begun else [*begin, "parts"], seconds)

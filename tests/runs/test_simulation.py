@@ -46,7 +46,7 @@ def test_kernels_are_compiled_once_in_a_process(device: Device, monkeypatch: pyt
         made = scene(render={"size": [40, 30], "refine": refine}, image="any.png", output=["png"])
         with Simulation(made, threads=device.threads, texture=speckle(30, 40)) as simulation:
             if refine == 3:
-                monkeypatch.setattr("taichi_msm.runs.simulation._compiled", set())
+                monkeypatch.setattr("taichi_msm.runs.simulation._compiled_kernels", set())
             simulation.compile()
         assert len(observed) == drawn
 

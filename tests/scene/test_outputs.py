@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from taichi_msm.render.labels import Flow, FrameOutputs, Labels, Stereo
-from taichi_msm.runs.writer import _WRITERS
+from taichi_msm.runs.writer import _LABEL_WRITERS
 from taichi_msm.scene.outputs import OUTPUTS, RESULT_PATTERNS, file_names, result_names
 
 FIELDS = {"labels": Labels._fields, "flow": Flow._fields, "stereo": Stereo._fields}
@@ -19,7 +19,7 @@ def test_every_label_has_its_field_and_a_format() -> None:
         assert output.source in (*FrameOutputs._fields, "positions", "forces")
         if output.source in FIELDS:
             assert output.name in FIELDS[output.source]
-            assert Path(output.file).suffix in _WRITERS
+            assert Path(output.file).suffix in _LABEL_WRITERS
             assert output.is_series
             assert output.pixel_bytes > 0
 
