@@ -35,8 +35,12 @@ BEARING = (
 )
 
 
-def read_archive(name: str) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a file by their names; SceneError: it is no .npz, or one of them cannot be used."""
+def read_archive(name: str) -> tuple[dict[str, NDArray[Any]], list[str]]:
+    """Return the arrays of an .npz that observations may have, and the names of all its arrays.
+
+    Raises:
+        SceneError: when the file is not an .npz, or an array cannot be used.
+    """
     path, remedy = Path(name), f"name an .npz with {NEEDS}, or a run's trajectory.npz or tracks.npz"
     reason = "not an .npz"
     try:
@@ -66,8 +70,7 @@ def require_understood(name: str, keys: list[str]) -> None:
         raise SceneError([f"{name}: {', '.join(map(ascii, unknown))}: {said}"])
 
 
-def _members(name: str, archive: zipfile.ZipFile) -> dict[str, NDArray[Any]]:
-    """Read the arrays that observations may have."""
+def _members(name: str, archive: zipfile.ZipFile) -> tuple[dict[str, NDArray[Any]], list[str]]:
     infos = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
     require_understood(name, list(infos))
     wanted = {key: info for key, info in infos.items() if key in MEMBERS}
@@ -84,6 +87,4 @@ def _members(name: str, archive: zipfile.ZipFile) -> dict[str, NDArray[Any]]:
             why = "encrypted" if info.flag_bits & 1 else why
             why = "an array of Python objects" if why.startswith("Object arrays") else f"cannot be read: {why}"
             raise SceneError([f"{name}: {key}: {why}; write it again by np.savez, as numbers"]) from None
-    if not arrays and infos:
-        raise SceneError([f"{name}: has only {', '.join(map(ascii, list(infos)[:20]))}; expected {NEEDS}"])
-    return arrays
+    return arrays, list(infos)

@@ -30,7 +30,7 @@ SMALL_SHARE, FEW_SIGMAS = 0.1, 5.0
 FEWEST_KNOWN, FEWEST_UNKNOWN = 3, 12
 
 # Units of force by their number in a newton, and the factor by which a ratio may be off.
-UNITS, FACTOR = {"mN": 1000.0, "gf": 101.97}, 3.0
+UNITS, FACTOR = {"mN": 1000.0, "gf": 101.97, "kN": 0.001}, 3.0
 
 
 def half_pixel(seen: Observations, scene: Scene, first: Predicted) -> Iterator[str]:
@@ -96,7 +96,8 @@ def force_unit(seen: Observations, *predictions: Predicted) -> Iterator[str]:
     for unit, number in UNITS.items():
         if all(1 / FACTOR < ratio / number < FACTOR for ratio in ratios):
             said = f"{ratios[0]:.3g} times those of the scene where the search begins; are they in {unit}?"
-            yield f"{forces.name}: forces: {said} divide them by {number:g}, or start nearer by --set"
+            remedy = f"divide them by {number:g}" if number > 1 else f"multiply them by {1 / number:g}"
+            yield f"{forces.name}: forces: {said} {remedy}, or start nearer by --set"
             return
 
 
@@ -119,6 +120,6 @@ def _ratio(observed: Array, predicted: Array, sigma: float) -> float:
     known = np.isfinite(observed)
     one, other = observed[known], predicted[known]
     lengths = float(np.linalg.norm(one)), float(np.linalg.norm(other))
-    if len(one) < FEWEST_KNOWN or lengths[0] < FEW_SIGMAS * sigma * np.sqrt(len(one)):
+    if len(one) < FEWEST_KNOWN or max(lengths) < FEW_SIGMAS * sigma * np.sqrt(len(one)):
         return 0.0
     return lengths[0] / lengths[1] if one @ other > -OPPOSED * lengths[0] * lengths[1] > 0 else 0.0

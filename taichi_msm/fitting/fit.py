@@ -159,7 +159,11 @@ def _fit(runs: Runs, given: Scene, method: Method) -> FitResult:
     first = runs.first(start)
     same_camera = not any(one.key.startswith("render.") for one in parameters)
     same_signs = all(one.is_log for one in parameters)
-    if wrong := list(faults_beside(seen, given, first, same_camera=same_camera, same_signs=same_signs)):
+    wrong = list(faults_beside(seen, given, first, same_camera=same_camera, same_signs=same_signs))
+    if not any(probe.moved for probe in given.probes):
+        # A tool with a force acts with that force whatever the tissue is.
+        wrong += force_unit(seen, first)
+    if wrong:
         raise SceneError(wrong)
     motion = moved(seen, given) or 1.0
     misfit = Misfit(seen, motion, robust=method.get("robust", False))
@@ -217,6 +221,14 @@ def _rejection(misfit: Misfit, solution: Solution, uncertain: Uncertainty, alike
     if said is None and len(forces):
         what = f"chi-square{plain} of the forces"
         said = rejection.by_chi_square(float(forces @ forces), len(forces), len(forces), what)
+    if said is not None and seen.forces is not None:
+        values = uncertain.left[: misfit.count[0]]
+        shares = f"{np.mean(values**2):.2g} per coordinate, {np.mean(forces**2):.2g} per force component"
+        product, square = (
+            float(np.nansum(solution.predicted.forces * each))
+            for each in (seen.forces.force, solution.predicted.forces)
+        )
+        said += f" ({shares}; measured forces {product / max(square, 1e-300):.3g} times predicted)"
     return said
 
 

@@ -297,8 +297,6 @@ class Search:
         return list(qmc.scale(shares, low, high))
 
 
-pass  # REMOVED
-
 # Of singular values, as a share of the largest: what is smaller, which differences hardly tell from 0, is not seen at
 # all. In such a direction the smallest parts of parameters are none, and this is its standard deviation.
 UNSEEN, LEAST_PART, AT_LARGE = 1e-8, 1e-3, 1e4
@@ -436,9 +434,6 @@ def _likeness(seen: Observations, ever: NDArray[np.bool_], alike: Alike) -> tupl
     return space, time
 
 
-pass  # REMOVED
-pass  # REMOVED
-
 # The most places that are tried on a side, and steps of the other parameters at each.
 MOST_PLACES, MOST_STEPS = 8, 6
 
@@ -550,8 +545,6 @@ class Profiler:
             place[others] += step
         return least
 
-
-pass  # REMOVED
 
 # A parameter is not identifiable if its standard error is above this share of its value, of a place of its range.
 MOST_ERROR = 1.0

@@ -21,14 +21,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import SceneError, as_array
+from taichi_msm.errors import SceneError, as_array, did_you_mean
 from taichi_msm.fitting.archive import NEEDS, read_archive, require_understood
 from taichi_msm.model.surface import surface_weights
 from taichi_msm.render.camera import view
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import LARGEST, SMALLEST
-
-pass  # REMOVED
 
 Array = NDArray[np.float64]
 
@@ -188,9 +186,10 @@ def read_observations(observed: str | Path | Mapping[str, Any], rate: float) -> 
         filled = {
             key: np.ma.filled(1.0 * value, np.nan) if np.ma.isMA(value) else value for key, value in observed.items()
         }
-        require_understood("observed", [str(key) for key in filled])
-        return _checked("observed", {str(key): as_array(value, str(key)) for key, value in filled.items()}, rate)
-    return _checked(str(observed), read_archive(str(observed)), rate)
+        require_understood("observed", names := [str(key) for key in filled])
+        arrays = {str(key): as_array(value, str(key)) for key, value in filled.items()}
+        return _checked("observed", arrays, names, rate)
+    return _checked(str(observed), *read_archive(str(observed)), rate)
 
 
 def with_sigma(seen: Observations, sigma: Any) -> Observations:
@@ -206,13 +205,15 @@ def with_sigma(seen: Observations, sigma: Any) -> Observations:
     return replace(seen, sigma=value)
 
 
-def _checked(name: str, arrays: dict[str, NDArray[Any]], rate: float) -> Observations:
-    """Make observations of arrays; SceneError: they are none."""
-    found, arrays = ", ".join(arrays) or "nothing", _thinned(_hidden(name, arrays, rate))
+def _checked(name: str, arrays: dict[str, NDArray[Any]], names: list[str], rate: float) -> Observations:
+    """Build observations from arrays, of a file or mapping with these names; SceneError: they are not valid."""
+    arrays = _thinned(_hidden(name, arrays, rate))
     kinds = [kind for kind in ("position", "pixel") if kind in arrays]
     missing = [key for key in ("time", "coordinates") if key not in arrays]
     if missing := missing + ([] if kinds else ["position or pixel"]):
-        raise SceneError([f"{name}: {missing[0]}: missing; expected {NEEDS}, and it has {found}"])
+        found = ", ".join(map(ascii, names[:20])) or "nothing"
+        near = did_you_mean(missing[0].partition(" ")[0], names).replace("; did you mean", "; is it")
+        raise SceneError([f"{name}: {missing[0]}: missing; expected {NEEDS}, and it has {found}{near}"])
     if len(kinds) == 2:
         raise SceneError([f"{name}: has both position and pixel; leave one of them out"])
     kind: Literal["position", "pixel"] = "position" if kinds[0] == "position" else "pixel"

@@ -185,8 +185,6 @@ def predict(job: Job, x: Array, steps: int | None) -> Predicted | None:
     return _kept[job.token].attempt(x, steps)
 
 
-pass  # REMOVED
-
 # Processes are started where so many runs for each parameter take longer than this [s]; to start them takes a few.
 RUNS_EACH, WORTHWHILE = 8, 8.0
 

@@ -228,7 +228,7 @@ def of_the_search(solution: Solution, parameters: Sequence[Parameter], *, fits: 
     if not solution.converged:
         yield "the search ended before it came to rest; start nearer by --set, or give --bounds"
     if not fits:
-        yield "what is left is large: the scene does not move as was seen with any of these values"
+        yield "the residual is large: no values of these parameters reproduce the observations"
     for one, x in zip(parameters, solution.x.tolist(), strict=True):
         low, high = one.limits
         if min(x - low, high - x) < AT_BOUND:

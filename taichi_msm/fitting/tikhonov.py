@@ -30,8 +30,6 @@ from taichi_msm.errors import SceneError
 from taichi_msm.fitting.observations import Observations, Sight
 from taichi_msm.gradients.gradient import Adjoint
 
-pass  # REMOVED
-
 Array = NDArray[np.float64]
 
 # A field that has a larger relative error even if all others are known is unknown.

@@ -114,9 +114,12 @@ def read_calibration(path: str) -> Calibration:
         said = "has a camera matrix, and no distortion that is known"
         remedy = "write distortion_coefficients, [0, 0, 0, 0] where there is none"
         raise CameraFileError(f"{path}: {said}; found {keys.found}; {remedy}")
-    if len(values) not in ((4,) if fisheye else COUNTS) or any(values[KNOWN:]):
-        expected = "4 of a fisheye" if fisheye else "k1, k2, p1, p2, k3, k4, k5, k6, and 0 after them"
-        raise CameraFileError(f"{path}: {len(values)} distortion coefficients that are not known; expected {expected}")
+    if len(values) not in ((4,) if fisheye else COUNTS):
+        expected = "4 of a fisheye: k1, k2, k3, k4" if fisheye else "4, 5, 8, 12 or 14: k1, k2, p1, p2, k3, ..."
+        raise CameraFileError(f"{path}: {len(values)} distortion coefficients; expected {expected}")
+    if any(values[KNOWN:]):
+        said = f"distortion coefficient {1 + next(n for n in range(KNOWN, len(values)) if values[n])} is not 0"
+        raise CameraFileError(f"{path}: {said}; thin prisms and tilted sensors are not modelled, calibrate without")
     keys.require_all_understood()
     return Calibration((matrix[0], matrix[4]), (matrix[2], matrix[5]), fisheye, tuple(values[:KNOWN]), size)
 
@@ -151,7 +154,8 @@ def _size(keys: _Keys) -> tuple[int, int] | None:
     """Find the width and height of the pictures [px]; None: the file has none."""
     width, height, both = (keys.numbers(spelling) for spelling in (WIDTH, HEIGHT, SIZE))
     if bool(width) != bool(height):
-        raise CameraFileError(f"{keys.path}: has only one of image_width and image_height; write both")
+        said = f"has only one of image_width and image_height; found {keys.found}; write both"
+        raise CameraFileError(f"{keys.path}: {said}")
     sizes = [width + height] if width and height else []
     sizes += [both] if both else []
     if any(len(size) != 2 or size != sizes[0] for size in sizes):
@@ -506,9 +510,15 @@ def _numbers(path: str, name: str, value: Any) -> list[float]:
         numbers = [math.nan if isinstance(one, bool) else float(one) for one in _flat(value)]
     except (TypeError, ValueError, OverflowError):
         numbers = [math.nan]
+    if isinstance(value, dict) and "data" not in value:
+        raise CameraFileError(f"{path}: {name}: has {_listed(value)}; expected a matrix with rows, cols and data")
     # Written so that NaN is found too.
     if not all(abs(number) <= LARGEST for number in numbers):
         said = f"{cut(str(value))} is not a list of numbers up to {LARGEST:g}; write it as OpenCV does"
+        raise CameraFileError(f"{path}: {name}: {said}")
+    sides = [value.get(side) for side in ("rows", "cols")] if isinstance(value, dict) else []
+    if all(isinstance(side, int) for side in sides) and sides and math.prod(sides) != len(numbers):
+        said = f"has {len(numbers)} numbers, and {sides[0]} rows of {sides[1]}; write what belongs there"
         raise CameraFileError(f"{path}: {name}: {said}")
     return numbers
 

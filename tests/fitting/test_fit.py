@@ -62,7 +62,7 @@ def one_device(device: Device) -> Iterator[None]:
     """A fit takes every core, and a process has one device."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(process, "available_threads", lambda: device.threads)
-        patch.setattr("taichi_msm.system.runtime.resources.available_threads", lambda: device.threads)
+        patch.setattr("taichi_msm.system.runtime.process_module.available_threads", lambda: device.threads)
         yield
 
 
@@ -756,7 +756,9 @@ def test_conventions_of_other_programs_are_asked_about(tracks: dict[str, Array])
     assert "are they frame numbers? divide time by the frames per second, 25" in answer(time=np.arange(11))
 
 
-@pytest.mark.parametrize(("factor", "unit"), [(1, None), (-1, None), (1000, "mN"), (101.97, "gf")])
+@pytest.mark.parametrize(
+    ("factor", "unit"), [(1, None), (1.1, None), (-1, None), (1000, "mN"), (101.97, "gf"), (0.001, "kN")]
+)
 def test_units_and_signs_of_forces_are_asked_about(
     tracks: dict[str, Array], device: Device, tmp_path: Path, factor: float, unit: str | None
 ) -> None:
@@ -769,10 +771,15 @@ def test_units_and_signs_of_forces_are_asked_about(
     # The force of the tool is given, so that no parameter scales it.
     given = changed(tissue__young=2e5), noisy(tracks, 0.1, sigma=0.1), ["tissue.young"]
     forces = tmp_path / "forces.csv", 0.01 * abs(factor)
-    if factor == 1:
+    if factor == 1.1:
+        first = fit(*given, forces=(forces[0], 0.01), workers=1).summary()[0]
+        assert "per force component; measured forces 1.1 times predicted)" in first
+    if abs(factor) < 1.2 and factor > 0.5:
         assert not any("times those of the scene" in note for note in fit(*given, forces=forces, workers=1).notes)
         return
     said = "is it the force on the tool" if factor < 0 else f"are they in {unit}\\? divide them by {factor:g}"
+    if unit == "kN":
+        said = "are they in kN\\? multiply them by 1000"
     with pytest.raises(SceneError, match=said):
         fit(*given, forces=forces, workers=1)
 

@@ -71,7 +71,7 @@ def seen_in(truth: Scene, device: Device, factors: Array, times: Array, error: f
 def one_device(device: Device) -> Iterator[None]:
     """A fit takes every core, and a process has one device."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("taichi_msm.system.runtime.resources.available_threads", lambda: device.threads)
+        patch.setattr("taichi_msm.system.runtime.process_module.available_threads", lambda: device.threads)
         patch.setattr(process_module, "available_threads", lambda: device.threads)
         yield
 
