@@ -1,4 +1,4 @@
-"""Read the arrays of an .npz that observations may have; members of other names are left unread."""
+"""Read the arrays of observations from an .npz; other arrays stay unread."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from taichi_msm.system.process import available_memory
 NEEDS = "time (T,), coordinates (N, 2) and position (N, T, 3) or pixel (N, T, 2)"
 MEMBERS = ("time", "coordinates", "position", "pixel", "sigma", "points", "occluded", "visible")
 
-# Arrays with such words in their names bear on what was seen.
-BEARING = (
+# Words in the names of arrays with a meaning for observations.
+MEANINGFUL_WORDS = (
     "visib",
     "occlu",
     "mask",
@@ -63,8 +63,8 @@ def read_archive(name: str) -> tuple[dict[str, NDArray[Any]], list[str]]:
 
 
 def require_understood(name: str, keys: list[str]) -> None:
-    """Check that no array that bears on what was seen is left out; SceneError: lists those that are."""
-    unknown = [key for key in keys if key not in MEMBERS and any(word in key.lower() for word in BEARING)]
+    """Check that no array with a meaning for observations stays unread; SceneError: lists such arrays."""
+    unknown = [key for key in keys if key not in MEMBERS and any(word in key.lower() for word in MEANINGFUL_WORDS)]
     if unknown:
         said = "not understood; take NaN for what was not seen, or visible or occluded (N, T), and sigma for errors"
         raise SceneError([f"{name}: {', '.join(map(ascii, unknown))}: {said}"])

@@ -20,16 +20,15 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import printable
 from taichi_msm.fitting.result import FitResult, FittedMap
-from taichi_msm.fitting.tikhonov import Choice
+from taichi_msm.fitting.tikhonov import SmoothnessWeight
 from taichi_msm.plot_style import BLUE, DPI, GREY, ORANGE, SILVER, STYLE, VERMILION, WIDE
 from taichi_msm.scene.sheet import Sheet
 
-# Columns of panels, the height of one [in], and how many points are drawn in time and how many dots.
-COLUMNS, HEIGHT, FEW, MOST_DOTS = 3, 2.7, 3, 20000
+COLUMN_COUNT, PANEL_HEIGHT_IN, MAX_DRAWN_POINTS, MAX_DOTS = 3, 2.7, 3, 20000
 
 
 def plot(result: FitResult, file: BinaryIO) -> None:
-    """Draw a fit as a PNG."""
+    """Write fit.png to a file."""
     with style.context(STYLE, after_reset=True), warnings.catch_warnings():
         # A name may contain characters that the font lacks; a point that was never seen has no mean.
         warnings.filterwarnings("ignore", "Glyph .* missing")
@@ -41,21 +40,23 @@ def plot(result: FitResult, file: BinaryIO) -> None:
 def _figure(result: FitResult) -> Figure:
     forces = result.observations.forces is not None
     points, times = result.observations.there.any(axis=1).sum(), result.observations.there.any(axis=0).sum()
-    # One time has no motion, and one point no place where more is left than elsewhere.
+    # A single time has no motion, a single point no map of residuals.
     drawn = [
-        draw for draw, some in ((_plot_motion, times > 1), (_plot_match, times > 1), (_plot_left, points > 1)) if some
+        draw
+        for draw, some in ((_plot_motion, times > 1), (_plot_match, times > 1), (_plot_residuals, points > 1))
+        if some
     ]
     drawn += [_plot_forces] if forces else []
     count = len(drawn) + len(result.parameters) + 3 * (result.map is not None)
-    rows = math.ceil(count / COLUMNS)
+    rows = math.ceil(count / COLUMN_COUNT)
     engine = ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1)
-    figure = Figure(figsize=(WIDE, HEIGHT * rows + 0.5), dpi=DPI, layout=engine)
+    figure = Figure(figsize=(WIDE, PANEL_HEIGHT_IN * rows + 0.5), dpi=DPI, layout=engine)
     FigureCanvasAgg(figure)
     figure.suptitle(f"Fit to {printable(result.observations.name)}", x=0.01, ha="left", parse_math=False)
-    panels = list(figure.subplots(rows, COLUMNS, squeeze=False).ravel())
+    panels = list(figure.subplots(rows, COLUMN_COUNT, squeeze=False).ravel())
     if result.map is not None:
-        plot_map(panels[:COLUMNS], result.map, result.scene.sheet)
-        panels, count = panels[COLUMNS:], count - COLUMNS
+        plot_map(panels[:COLUMN_COUNT], result.map, result.scene.sheet)
+        panels, count = panels[COLUMN_COUNT:], count - COLUMN_COUNT
     for axes, draw in zip(panels, drawn, strict=False):
         draw(axes, result)
     for axes, key in zip(panels[len(drawn) :], result.parameters, strict=False):
@@ -70,27 +71,27 @@ def _unit(result: FitResult) -> tuple[float, str]:
 
 
 def _plot_motion(axes: Axes, result: FitResult) -> None:
-    """Draw how the points that move most go in time, along the direction in which they move most."""
-    seen, (scale, unit) = result.observations, _unit(result)
-    order, centre = np.argsort(seen.time), np.nanmean(result.fitted, axis=1, keepdims=True)
+    """Plot the points of largest motion in time, along their principal direction."""
+    observations, (scale, unit) = result.observations, _unit(result)
+    order, centre = np.argsort(observations.time), np.nanmean(result.fitted, axis=1, keepdims=True)
     motion = np.nan_to_num(result.fitted - centre)
-    for number, n in enumerate(np.argsort(-np.linalg.norm(motion, axis=(1, 2)))[:FEW]):
+    for number, n in enumerate(np.argsort(-np.linalg.norm(motion, axis=(1, 2)))[:MAX_DRAWN_POINTS]):
         along = np.linalg.svd(motion[n], full_matrices=False).Vh[0]
         along = along if along[np.argmax(np.abs(along))] > 0 else -along
-        fitted, points = (scale * (values[n] - centre[n]) @ along for values in (result.fitted, seen.values))
-        axes.plot(seen.time[order], fitted[order], color=BLUE, label="fitted" if number == 0 else None)
+        fitted, points = (scale * (values[n] - centre[n]) @ along for values in (result.fitted, observations.values))
+        axes.plot(observations.time[order], fitted[order], color=BLUE, label="fitted" if number == 0 else None)
         label = "seen" if number == 0 else None
-        axes.plot(seen.time, points, ".", color=VERMILION, markersize=3, label=label)
+        axes.plot(observations.time, points, ".", color=VERMILION, markersize=3, label=label)
     axes.set(title="The points that move most", xlabel="time [s]", ylabel=f"place along the motion [{unit}]")
     axes.legend()
 
 
 def _plot_match(axes: Axes, result: FitResult) -> None:
-    """Draw every number that was seen against the fitted one, both from their means."""
-    seen, (scale, unit) = result.observations, _unit(result)
+    """Plot observed against fitted numbers, both from their means."""
+    observations, (scale, unit) = result.observations, _unit(result)
     middle = np.nanmean(result.fitted, axis=1, keepdims=True)
-    one, other = (scale * (values - middle)[seen.known] for values in (result.fitted, seen.values))
-    thinned = slice(None, None, math.ceil(len(one) / MOST_DOTS) or 1)
+    one, other = (scale * (values - middle)[observations.known] for values in (result.fitted, observations.values))
+    thinned = slice(None, None, math.ceil(len(one) / MAX_DOTS) or 1)
     axes.scatter(one[thinned], other[thinned], 2, color=BLUE, alpha=0.4, linewidths=0)
     if len(one):
         ends = [float(one.min()), float(one.max())]
@@ -98,11 +99,13 @@ def _plot_match(axes: Axes, result: FitResult) -> None:
     axes.set(title="Seen against fitted", xlabel=f"fitted, from the mean [{unit}]", ylabel=f"seen [{unit}]")
 
 
-def _plot_left(axes: Axes, result: FitResult) -> None:
-    """Draw what is left at every point, on the sheet."""
-    seen, (scale, unit) = result.observations, _unit(result)
-    left = scale * np.sqrt(np.nanmean(np.where(seen.known, result.fitted - seen.values, np.nan) ** 2, axis=(1, 2)))
-    across, down = seen.coordinates.T
+def _plot_residuals(axes: Axes, result: FitResult) -> None:
+    """Plot the residual of every point on the sheet."""
+    observations, (scale, unit) = result.observations, _unit(result)
+    left = scale * np.sqrt(
+        np.nanmean(np.where(observations.known, result.fitted - observations.values, np.nan) ** 2, axis=(1, 2))
+    )
+    across, down = observations.coordinates.T
     dots = axes.scatter(across, down, 14, c=left, cmap="viridis", vmin=0)
     height, width = result.scene.sheet.size
     axes.set(title="What is left", xlim=(0, 1), ylim=(1, 0), xlabel="across", ylabel="down", aspect=height / width)
@@ -111,27 +114,29 @@ def _plot_left(axes: Axes, result: FitResult) -> None:
 
 
 def _plot_forces(axes: Axes, result: FitResult) -> None:
-    """Draw every tool's force in time."""
-    seen = result.observations.forces
-    assert seen is not None
-    for probe in np.unique(seen.probe):
-        rows = np.flatnonzero(seen.probe == probe)
-        rows = rows[np.argsort(seen.time[rows])]
+    """Plot the force of every tool in time."""
+    observations = result.observations.forces
+    assert observations is not None
+    for probe in np.unique(observations.probe):
+        rows = np.flatnonzero(observations.probe == probe)
+        rows = rows[np.argsort(observations.time[rows])]
         label = len(axes.lines) == 0
-        for component in np.flatnonzero(np.isfinite(seen.force[rows]).any(axis=0)):
-            fitted, points = (force[rows, component] for force in (result.fitted_forces, seen.force))
-            axes.plot(seen.time[rows], fitted, color=BLUE, label="fitted" if label else None)
-            axes.plot(seen.time[rows], points, ".", color=VERMILION, markersize=3, label="seen" if label else None)
+        for component in np.flatnonzero(np.isfinite(observations.force[rows]).any(axis=0)):
+            fitted, points = (force[rows, component] for force in (result.fitted_forces, observations.force))
+            axes.plot(observations.time[rows], fitted, color=BLUE, label="fitted" if label else None)
+            axes.plot(
+                observations.time[rows], points, ".", color=VERMILION, markersize=3, label="seen" if label else None
+            )
             largest = np.argmax(np.abs(fitted))
             if abs(fitted[largest]) > 0.1 * np.abs(result.fitted_forces).max():
-                axes.text(seen.time[rows[largest]], fitted[largest], f"  {'xyz'[component]}")
+                axes.text(observations.time[rows[largest]], fitted[largest], f"  {'xyz'[component]}")
             label = False
     axes.set(title="Forces on the sheet", xlabel="time [s]", ylabel="force [N]")
     axes.legend()
 
 
 def _plot_parameter(axes: Axes, result: FitResult, key: str) -> None:
-    """Draw how the misfit rises on both sides of a value, and its interval."""
+    """Plot the profile of a parameter and its interval."""
     one, places = result.parameters[key], result.curves[key]
     axes.plot([place.x for place in places], [place.deviations**2 for place in places], ".-", color=BLUE)
     ends = [end for end in one.interval if end is not None]
@@ -147,27 +152,27 @@ def _plot_parameter(axes: Axes, result: FitResult, key: str) -> None:
 
 Array = NDArray[np.float64]
 
-# The colours of stiffness and of errors are spread over so much at least.
-LEAST_SPREAD = 1.05
+# Smallest ratio of the ends of the colour scale.
+MIN_COLOUR_RATIO = 1.05
 
 
 def plot_map(panels: Sequence[Axes], found: FittedMap, sheet: Sheet) -> None:
-    """Draw a map on three panels."""
+    """Plot a map, its errors and the choice of its smoothness on three panels."""
     low, high = found.range
-    spread = max(high / low, LEAST_SPREAD)
+    spread = max(high / low, MIN_COLOUR_RATIO)
     middle = np.sqrt(low * high)
     norm = LogNorm(middle / np.sqrt(spread), middle * np.sqrt(spread))
-    _plot_fields(panels[0], found, found.factors, sheet, norm, ("Stiffness", "factor of young", "viridis"))
+    _plot_cells(panels[0], found, found.factors, sheet, norm, ("Stiffness", "factor of young", "viridis"))
     errors = 100 * found.errors
     top = float(np.nanmax(errors)) if not found.unknown.all() else 100.0
-    _plot_fields(panels[1], found, errors, sheet, Normalize(0, top), ("How well it is known", "error [%]", "cividis"))
-    _plot_choice(panels[2], found.choice)
+    _plot_cells(panels[1], found, errors, sheet, Normalize(0, top), ("How well it is known", "error [%]", "cividis"))
+    _plot_weight(panels[2], found.choice)
 
 
-def _plot_fields(
+def _plot_cells(
     axes: Axes, found: FittedMap, values: Array, sheet: Sheet, norm: Normalize, words: tuple[str, str, str]
 ) -> None:
-    """Draw a number of every field where it is on the sheet, and hatch the unknown ones."""
+    """Plot a number of every map cell on the sheet, unknown ones hatched."""
     title, label, colours = words
     image = axes.imshow(
         np.where(found.unknown, np.nan, values), colours, norm=norm, extent=(0, 1, 1, 0), interpolation="nearest"
@@ -190,8 +195,8 @@ def _plot_fields(
         bar.update_ticks()
 
 
-def _plot_choice(axes: Axes, choice: Choice) -> None:
-    """Draw what is left above the least, and what is expected, against the weight of the smoothness."""
+def _plot_weight(axes: Axes, choice: SmoothnessWeight) -> None:
+    """Plot the excess of chi-square and its expectation against the weight of the smoothness."""
     axes.plot(choice.weights, choice.left, color=BLUE, label="left above the least")
     axes.plot(choice.weights, choice.expected, color=GREY, linestyle=(0, (4, 2)), label="expected")
     taken = np.abs(np.log(choice.weights / choice.weight)).argmin()

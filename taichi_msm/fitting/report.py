@@ -24,7 +24,6 @@ MAP, ERRORS = FittedMap.FILE, "map-error.png"
 
 PATTERNS = (r"fit\.json", r"scene\.yaml", r"fit\.png", r"map\.png", r"map-error\.png", rf"{PICTURES}/.+")
 
-# What fit.png needs, and is left out without.
 NO_PLOT = 'fit.png is left out, as matplotlib is not installed; pip install "taichi-msm[report]"'
 
 

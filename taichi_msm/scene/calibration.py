@@ -516,9 +516,9 @@ def _numbers(path: str, name: str, value: Any) -> list[float]:
     if not all(abs(number) <= LARGEST for number in numbers):
         said = f"{cut(str(value))} is not a list of numbers up to {LARGEST:g}; write it as OpenCV does"
         raise CameraFileError(f"{path}: {name}: {said}")
-    sides = [value.get(side) for side in ("rows", "cols")] if isinstance(value, dict) else []
-    if all(isinstance(side, int) for side in sides) and sides and math.prod(sides) != len(numbers):
-        said = f"has {len(numbers)} numbers, and {sides[0]} rows of {sides[1]}; write what belongs there"
+    rows, cols = (value.get(side) if isinstance(value, dict) else None for side in ("rows", "cols"))
+    if isinstance(rows, int) and isinstance(cols, int) and rows * cols != len(numbers):
+        said = f"has {len(numbers)} numbers, and {rows} rows of {cols}; write what belongs there"
         raise CameraFileError(f"{path}: {name}: {said}")
     return numbers
 
