@@ -88,8 +88,8 @@ def faults_at_start(
         moving = np.flatnonzero(first.motion > 0.5 * whole) / rate
         yield (
             f"{observations.name}: its {len(observations.time)} times miss the motion: "
-            f"the scene's points move by up to {1000 * whole:.3g} mm, and at these times by {1000 * observed:.3g} mm; observe between "
-            f"{moving[0]:g} and {moving[-1]:g} s too"
+            f"the scene's points move by up to {1000 * whole:.3g} mm, and at these times by {1000 * observed:.3g} mm; "
+            f"observe between {moving[0]:g} and {moving[-1]:g} s too"
         )
         return
     if lost := int((observations.known & ~np.isfinite(first.values)).any(axis=(1, 2)).sum()):
