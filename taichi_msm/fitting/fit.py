@@ -35,7 +35,7 @@ from taichi_msm.fitting.least_squares import (
     uncertainty,
     unseen,
 )
-from taichi_msm.fitting.observations import read_observations, with_sigma
+from taichi_msm.fitting.observations import Forces, read_observations, with_sigma
 from taichi_msm.fitting.parameters import (
     Bounds,
     Method,
@@ -54,6 +54,10 @@ from taichi_msm.load.scene_file import load_scene
 from taichi_msm.scene.scene import Scene
 
 Array = NDArray[np.float64]
+
+# Ratio of the mean squares of two kinds of residuals at which the larger kind is named, and the smallest deviation of a
+# common factor of the forces.
+MIN_PART_RATIO, MIN_COMMON_SHARE = 2.0, 0.02
 
 # Standard deviations at which the quadratic approximation of a profile is drawn; the largest one, in units of x.
 CURVE_DEVIATIONS, MAX_CURVE_DEVIATION = np.linspace(-3, 3, 25), 3.0
@@ -230,14 +234,23 @@ def _rejection(
         what = f"chi-square{plain} of the forces"
         said = rejection.by_chi_square(float(forces @ forces), len(forces), len(forces), what)
     if said is not None and observations.forces is not None:
-        values = uncertainties.left[: misfit.count[0]]
-        shares = f"{np.mean(values**2):.2g} per coordinate, {np.mean(forces**2):.2g} per force component"
-        product, square = (
-            float(np.nansum(solution.predicted.forces * each))
-            for each in (observations.forces.force, solution.predicted.forces)
+        said += _larger_part(
+            uncertainties.left[: misfit.count[0]], forces, observations.forces, solution.predicted.forces
         )
-        said += f" ({shares}; measured forces {product / max(square, 1e-300):.3g} times predicted)"
     return said
+
+
+def _larger_part(values: Array, forces: Array, measured: Forces, predicted: Array) -> str:
+    """Name the larger residuals [sigma], those of coordinates or of forces, and a common factor of the forces."""
+    of_values, of_forces = (float(np.mean(residuals**2)) for residuals in (values, forces))
+    if max(of_values, of_forces) < MIN_PART_RATIO * min(of_values, of_forces):
+        return ""
+    if of_values > of_forces:
+        return ", mostly of the coordinates"
+    square = float(np.nansum(predicted**2 * np.isfinite(measured.force)))
+    factor = float(np.nansum(predicted * measured.force)) / square if square else 1.0
+    common = f", which are {factor:.3g} times the predicted ones" if abs(factor - 1) > MIN_COMMON_SHARE else ""
+    return f", mostly of the forces{common}"
 
 
 def _mesh(

@@ -773,7 +773,7 @@ def test_units_and_signs_of_forces_are_asked_about(
     forces = tmp_path / "forces.csv", 0.01 * abs(factor)
     if factor == 1.1:
         first = fit(*given, forces=(forces[0], 0.01), workers=1).summary()[0]
-        assert "per force component; measured forces 1.1 times predicted)" in first
+        assert ", mostly of the forces, which are 1.1 times the predicted ones; the intervals" in first
     if abs(factor) < 1.2 and factor > 0.5:
         assert not any("times those of the scene" in note for note in fit(*given, forces=forces, workers=1).notes)
         return
