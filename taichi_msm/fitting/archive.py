@@ -1,4 +1,4 @@
-"""Read the arrays of an .npz that observations may have; members of other names are left unread."""
+"""Read the arrays of observations from an .npz; other arrays stay unread."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from taichi_msm.system.process import available_memory
 NEEDS = "time (T,), coordinates (N, 2) and position (N, T, 3) or pixel (N, T, 2)"
 MEMBERS = ("time", "coordinates", "position", "pixel", "sigma", "points", "occluded", "visible")
 
-# Arrays with such words in their names bear on what was seen.
-BEARING = (
+# Words in the names of arrays with a meaning for observations.
+MEANINGFUL_WORDS = (
     "visib",
     "occlu",
     "mask",
@@ -35,8 +35,12 @@ BEARING = (
 )
 
 
-def read_archive(name: str) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a file by their names; SceneError: it is no .npz, or one of them cannot be used."""
+def read_archive(name: str) -> tuple[dict[str, NDArray[Any]], list[str]]:
+    """Return the arrays of an .npz that observations may have, and the names of all its arrays.
+
+    Raises:
+        SceneError: when the file is not an .npz, or an array cannot be used.
+    """
     path, remedy = Path(name), f"name an .npz with {NEEDS}, or a run's trajectory.npz or tracks.npz"
     reason = "not an .npz"
     try:
@@ -59,15 +63,14 @@ def read_archive(name: str) -> dict[str, NDArray[Any]]:
 
 
 def require_understood(name: str, keys: list[str]) -> None:
-    """Check that no array that bears on what was seen is left out; SceneError: lists those that are."""
-    unknown = [key for key in keys if key not in MEMBERS and any(word in key.lower() for word in BEARING)]
+    """Check that no array with a meaning for observations stays unread; SceneError: lists such arrays."""
+    unknown = [key for key in keys if key not in MEMBERS and any(word in key.lower() for word in MEANINGFUL_WORDS)]
     if unknown:
         said = "not understood; take NaN for what was not seen, or visible or occluded (N, T), and sigma for errors"
         raise SceneError([f"{name}: {', '.join(map(ascii, unknown))}: {said}"])
 
 
-def _members(name: str, archive: zipfile.ZipFile) -> dict[str, NDArray[Any]]:
-    """Read the arrays that observations may have."""
+def _members(name: str, archive: zipfile.ZipFile) -> tuple[dict[str, NDArray[Any]], list[str]]:
     infos = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
     require_understood(name, list(infos))
     wanted = {key: info for key, info in infos.items() if key in MEMBERS}
@@ -84,6 +87,4 @@ def _members(name: str, archive: zipfile.ZipFile) -> dict[str, NDArray[Any]]:
             why = "encrypted" if info.flag_bits & 1 else why
             why = "an array of Python objects" if why.startswith("Object arrays") else f"cannot be read: {why}"
             raise SceneError([f"{name}: {key}: {why}; write it again by np.savez, as numbers"]) from None
-    if not arrays and infos:
-        raise SceneError([f"{name}: has only {', '.join(map(ascii, list(infos)[:20]))}; expected {NEEDS}"])
-    return arrays
+    return arrays, list(infos)

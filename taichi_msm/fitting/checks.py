@@ -1,4 +1,4 @@
-"""What cannot be right about observations of a scene: a sentence each, with the remedy."""
+"""Plausibility checks of observations."""
 
 from __future__ import annotations
 
@@ -9,131 +9,142 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.fitting.conventions import force_unit, half_pixel, mirrored, opposed
-from taichi_msm.fitting.observations import Observations, places_at_rest, seen_at_rest
-from taichi_msm.fitting.predict import Predicted
+from taichi_msm.fitting.observations import Observations, observe_at_rest, positions_at_rest
+from taichi_msm.fitting.predict import Prediction
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import FRAME_TOLERANCE
 
 Array = NDArray[np.float64]
 
-# Units are wrong if what was seen is spread so many times wider than the points are at rest, or narrower.
-OFF = 30.0
+# Largest ratio of the observed extent to that at rest, or its inverse, with the right units.
+MAX_EXTENT_RATIO = 30.0
 
-# Points move if one of them does by so many sigma in the root mean square over time, or if the sum of all squares over
-# sigma^2 is so many of its standard deviations above what errors alone give.
-MOVES, SIGNIFICANT = 1.5, 5.0
+# Motion is significant if the root mean square of a point exceeds this many sigma, or if chi-square exceeds that of
+# errors alone by this many of its standard deviations.
+MIN_MOTION_SIGMAS, MIN_SIGNIFICANCE = 1.5, 5.0
 
-# Without a sigma, and in the scene, what moves by less than this share of where it is moves by rounding.
-ROUNDING = 1e-9
+# Motion below this share of the coordinates is rounding.
+ROUNDING_SHARE = 1e-9
 
-# Frames miss the motion if the points move less at the observed times than this share of their motion.
-MISSED = 0.1
+# Smallest share of the whole motion that the observed times must contain.
+MIN_MOTION_SHARE = 0.1
 
-# Pixels are fractions of the frame if none is greater.
-FRACTION = 1.5
+# Pixels up to this value are fractions of the frame.
+MAX_FRACTION = 1.5
 
-# Pixels are of another camera, and positions of another place, if the points are farther from where they are at rest
-# than this [px], or this share of the sheet, and than so many times the motion.
-ASTRAY, ASIDE, TIMES = 3.0, 0.02, 3.0
+# Largest offset of the first observed points from rest, with the right camera and origin: in pixels or as a share of
+# the sheet, and in multiples of the motion.
+MAX_OFFSET_PX, MAX_OFFSET_SHARE, MAX_OFFSET_MOTIONS = 3.0, 0.02, 3.0
 
 
-def faults(seen: Observations, scene: Scene, parameters: int) -> Iterator[str]:
-    """Say what is wrong before anything is run: too few numbers, units, times, nothing that moves."""
-    numbers, name = int(seen.known.sum()), seen.name
-    forces = 0 if seen.forces is None else int(np.isfinite(seen.forces.force).sum())
+def faults(observations: Observations, scene: Scene, parameters: int) -> Iterator[str]:
+    """Yield the faults that are known before any run: too few observations, units, times, no motion."""
+    numbers, name = int(observations.known.sum()), observations.name
+    forces = 0 if observations.forces is None else int(np.isfinite(observations.forces.force).sum())
     if numbers + forces <= parameters:
         said = f"{numbers + forces} numbers were seen, too few for {parameters} parameters and their errors"
         yield f"{name}: {said}; observe more points or times, or name fewer keys in --free"
         return
-    yield from _times(seen.time, name, scene)
-    if seen.forces is not None:
-        yield from _times(seen.forces.time, seen.forces.name, scene)
-    yield from _units(seen, scene)
-    yield from _lost(seen, scene)
-    if seen.forces is None and _is_still(seen, scene):
-        said = f"by more than its error, sigma {seen.sigma:g} {seen.unit}" if seen.sigma else "at all"
+    yield from _times(observations.time, name, scene)
+    if observations.forces is not None:
+        yield from _times(observations.forces.time, observations.forces.name, scene)
+    yield from _units(observations, scene)
+    yield from _lost_markers(observations, scene)
+    if observations.forces is None and _is_still(observations, scene):
+        said = (
+            f"by more than its error, sigma {observations.sigma:g} {observations.unit}"
+            if observations.sigma
+            else "at all"
+        )
         yield f"{name}: no point moves {said}; observe while a tool acts, at points near it"
 
 
-def faults_beside(
-    seen: Observations, scene: Scene, first: Predicted, *, same_camera: bool = True, same_signs: bool = True
+def faults_at_start(
+    observations: Observations, scene: Scene, first: Prediction, *, same_camera: bool = True, same_signs: bool = True
 ) -> Iterator[str]:
     """Check observations against a run of the scene to its end.
 
     Args:
-        seen: the observations.
-        scene: with the values where the search begins.
+        observations: the observations.
+        scene: the scene with its initial values.
         first: its prediction.
-        same_camera: whether the scene has the camera that saw, and not one that is to be found.
-        same_signs: whether the parameters keep the signs of forces and motion.
+        same_camera: whether the camera is known, and not fitted.
+        same_signs: whether the parameters cannot change the signs of forces and motion.
 
     Yields:
-        A line of each fault: times that miss the motion, another camera, conventions of other programs.
+        A line for each fault: times that miss the motion, another camera, conventions of other programs.
     """
     rate, whole = scene.time.frames_per_second, float(first.motion.max())
-    if whole <= ROUNDING * max(scene.sheet.size):
-        yield f"{seen.name}: none of its points moves in the scene; give the scene probes that press near them"
+    if whole <= ROUNDING_SHARE * max(scene.sheet.size):
+        yield f"{observations.name}: none of its points moves in the scene; give the scene probes that press near them"
         return
-    times = seen.time if seen.forces is None else np.concatenate([seen.time, seen.forces.time])
+    times = (
+        observations.time
+        if observations.forces is None
+        else np.concatenate([observations.time, observations.forces.time])
+    )
     observed = float(np.interp(times * rate, np.arange(len(first.motion)), first.motion).max())
-    if observed < MISSED * whole:
+    if observed < MIN_MOTION_SHARE * whole:
         moving = np.flatnonzero(first.motion > 0.5 * whole) / rate
         yield (
-            f"{seen.name}: its {len(seen.time)} times miss the motion: the scene's points move by up to "
-            f"{1000 * whole:.3g} mm, and at these times by {1000 * observed:.3g} mm; observe between "
-            f"{moving[0]:g} and {moving[-1]:g} s too"
+            f"{observations.name}: its {len(observations.time)} times miss the motion: "
+            f"the scene's points move by up to {1000 * whole:.3g} mm, and at these times by {1000 * observed:.3g} mm; "
+            f"observe between {moving[0]:g} and {moving[-1]:g} s too"
         )
         return
-    if lost := int((seen.known & ~np.isfinite(first.values)).any(axis=(1, 2)).sum()):
+    if lost := int((observations.known & ~np.isfinite(first.values)).any(axis=(1, 2)).sum()):
         said = "are behind the eye of the scene's camera, or beyond its lens, where the search begins"
         remedy = "give the scene the camera that saw them, or NaN in their place"
-        yield f"{seen.name}: {seen.kind}: {lost} of the points that were seen {said}; {remedy}"
+        where = f"{observations.name}: {observations.kind}"
+        yield f"{where}: {lost} of the points that were seen {said}; {remedy}"
         return
-    wrong = [*_other_places(seen, scene, first)] if same_camera else []
+    wrong = [*_faults_at_rest(observations, scene, first)] if same_camera else []
     yield from wrong
     if same_signs and not wrong:
-        yield from opposed(seen, scene, first)
+        yield from opposed(observations, scene, first)
 
 
-def faults_of_best(seen: Observations, scene: Scene, first: Predicted, best: Predicted) -> Iterator[str]:
-    """Check signs and units of forces, which are wrong where the search begins and where it ended."""
-    yield from opposed(seen, scene, first, best)
-    yield from force_unit(seen, first, best)
+def faults_at_solution(observations: Observations, scene: Scene, first: Prediction, best: Prediction) -> Iterator[str]:
+    """Yield signs and units that contradict both the initial and the fitted scene."""
+    yield from opposed(observations, scene, first, best)
+    yield from force_unit(observations, first, best)
 
 
-def _other_places(seen: Observations, scene: Scene, first: Predicted) -> Iterator[str]:
-    """Compare places at rest: mirrored ones, others, and those half a pixel off."""
-    if wrong := [*mirrored(seen, scene)]:
+def _faults_at_rest(observations: Observations, scene: Scene, first: Prediction) -> Iterator[str]:
+    """Yield faults of the points at rest: mirrored, misplaced, half a pixel off."""
+    if wrong := [*mirrored(observations, scene)]:
         yield from wrong
         return
-    yield from _elsewhere(seen, scene, first)
-    if seen.kind == "pixel":
-        yield from half_pixel(seen, scene, first)
+    yield from _misplaced(observations, scene, first)
+    if observations.kind == "pixel":
+        yield from half_pixel(observations, scene, first)
 
 
-def moved(seen: Observations, scene: Scene) -> float:
-    """Give the motion of the point that moves most: root mean square over time, or from rest [m] or [px]."""
-    motion = _motion(seen, scene)
+def largest_motion(observations: Observations, scene: Scene) -> float:
+    """Return the largest motion of a point: root mean square over time, or from rest [m] or [px]."""
+    motion = _motion(observations, scene)
     return float(np.sqrt(np.nanmean(motion**2, axis=(1, 2)).max())) if len(motion) else math.inf
 
 
-def _motion(seen: Observations, scene: Scene) -> Array:
-    """Give the points that were seen from their means in time, or, if each was seen once, from rest."""
-    known = seen.there.any(axis=1)
-    values, several = seen.values[known], seen.there.sum(axis=1).max() > 1
-    motion = values - (np.nanmean(values, axis=1, keepdims=True) if several else seen_at_rest(scene, seen)[known])
-    # At rest a camera may not see all of them.
+def _motion(observations: Observations, scene: Scene) -> Array:
+    """Return the observed points from their means in time, or from rest if each was observed once."""
+    known = observations.there.any(axis=1)
+    values, several = observations.values[known], observations.there.sum(axis=1).max() > 1
+    motion = values - (
+        np.nanmean(values, axis=1, keepdims=True) if several else observe_at_rest(scene, observations)[known]
+    )
+    # At rest some points may be behind the camera.
     return motion[np.isfinite(motion).any(axis=(1, 2))]
 
 
-def _is_still(seen: Observations, scene: Scene) -> bool:
-    """Tell whether nothing was seen but errors."""
-    if seen.sigma is None:
-        return moved(seen, scene) <= ROUNDING * float(np.nanmax(np.abs(seen.values)))
-    square = float(np.nansum((_motion(seen, scene) / seen.sigma) ** 2))
-    freedom = seen.known.sum() - seen.known.any(axis=1).sum()
-    is_significant = square > freedom + SIGNIFICANT * math.sqrt(2 * freedom) > 0
-    return not (is_significant or moved(seen, scene) > MOVES * seen.sigma)
+def _is_still(observations: Observations, scene: Scene) -> bool:
+    """Return whether the observed motion is within its errors."""
+    if observations.sigma is None:
+        return largest_motion(observations, scene) <= ROUNDING_SHARE * float(np.nanmax(np.abs(observations.values)))
+    square = float(np.nansum((_motion(observations, scene) / observations.sigma) ** 2))
+    freedom = observations.known.sum() - observations.known.any(axis=1).sum()
+    is_significant = square > freedom + MIN_SIGNIFICANCE * math.sqrt(2 * freedom) > 0
+    return not (is_significant or largest_motion(observations, scene) > MIN_MOTION_SIGMAS * observations.sigma)
 
 
 def _times(time: Array, name: str, scene: Scene) -> Iterator[str]:
@@ -154,51 +165,56 @@ def _times(time: Array, name: str, scene: Scene) -> Iterator[str]:
         yield f"{name}: time: from {low:g} s, and the scene begins at 0 s; let the scene's clock count"
 
 
-def _units(seen: Observations, scene: Scene) -> Iterator[str]:
-    """Compare how wide the points are spread with how wide they are at rest."""
-    known = seen.there
-    rest = places_at_rest(scene, seen)[known.any(axis=1)]
-    if seen.kind != "position" or len(rest) < 2:
+def _units(observations: Observations, scene: Scene) -> Iterator[str]:
+    """Compare the extent of the observed points with that at rest."""
+    known = observations.there
+    rest = positions_at_rest(scene, observations)[known.any(axis=1)]
+    if observations.kind != "position" or len(rest) < 2:
         return
-    values = seen.values[known.any(axis=1)]
+    values = observations.values[known.any(axis=1)]
     middle = np.nanmedian(values, axis=1)[:, :2]
     spread, expected = (
         float(np.linalg.norm(points - points.mean(axis=0), axis=1).max()) for points in (middle, rest[:, :2])
     )
-    if expected > 0 and spread > 0 and not 1 / OFF < spread / expected < OFF:
+    if expected > 0 and spread > 0 and not 1 / MAX_EXTENT_RATIO < spread / expected < MAX_EXTENT_RATIO:
         said = f"the points are {spread:.3g} m from their middle, and {expected:.3g} m at rest; give metres"
         unit = {3: ": are they in mm? divide them by 1000", 2: ": are they in cm? divide them by 100"}
-        yield f"{seen.name}: position: {said}{unit.get(round(math.log10(spread / expected)), '')}"
+        yield f"{observations.name}: position: {said}{unit.get(round(math.log10(spread / expected)), '')}"
 
 
-def _lost(seen: Observations, scene: Scene) -> Iterator[str]:
-    """Find numbers that stand for points that were lost, and fractions of the frame in place of pixels."""
-    rest = seen_at_rest(scene, seen)
-    least = ASTRAY if seen.kind == "pixel" else ASIDE * max(scene.sheet.size)
-    alike = (seen.values == seen.values[..., :1]).all(axis=2)
-    alike &= ~(np.linalg.norm(rest - seen.values[..., :1], axis=-1) < least)
-    for mark, number in zip(*np.unique(seen.values[alike][:, 0], return_counts=True), strict=True):
+def _lost_markers(observations: Observations, scene: Scene) -> Iterator[str]:
+    """Yield repeated numbers that mark lost points, and fractions of the frame instead of pixels."""
+    rest = observe_at_rest(scene, observations)
+    least = MAX_OFFSET_PX if observations.kind == "pixel" else MAX_OFFSET_SHARE * max(scene.sheet.size)
+    error_correlation = (observations.values == observations.values[..., :1]).all(axis=2)
+    error_correlation &= ~(np.linalg.norm(rest - observations.values[..., :1], axis=-1) < least)
+    for mark, number in zip(*np.unique(observations.values[error_correlation][:, 0], return_counts=True), strict=True):
         if mark in (0, -1) or number > 1:
             said = f"{mark:g} in all numbers of {number} points and times; are they lost points? take NaN for them"
-            yield f"{seen.name}: {seen.kind}: {said}"
+            yield f"{observations.name}: {observations.kind}: {said}"
             return
-    if seen.kind == "pixel" and np.nanmax(np.abs(seen.values)) <= FRACTION < ASTRAY < np.nan_to_num(np.abs(rest)).max():
+    if (
+        observations.kind == "pixel"
+        and np.nanmax(np.abs(observations.values)) <= MAX_FRACTION < MAX_OFFSET_PX < np.nan_to_num(np.abs(rest)).max()
+    ):
         width, height = scene.render.size
         said = "are they fractions of the frame? multiply them by its width and height"
-        most = np.nanmax(np.abs(seen.values))
-        yield f"{seen.name}: pixel: up to {most:.3g}; {said}, {width} and {height} in the scene"
+        most = np.nanmax(np.abs(observations.values))
+        yield f"{observations.name}: pixel: up to {most:.3g}; {said}, {width} and {height} in the scene"
 
 
-def _elsewhere(seen: Observations, scene: Scene, first: Predicted) -> Iterator[str]:
-    """Compare where points are seen at the first time with where they are at rest."""
-    known = seen.there
+def _misplaced(observations: Observations, scene: Scene, first: Prediction) -> Iterator[str]:
+    """Compare the observed points at the first time with those at rest."""
+    known = observations.there
     begins = int(np.argmax(known.any(axis=0)))
-    rest = seen_at_rest(scene, seen)
-    far = np.linalg.norm((seen.values - rest)[:, begins], axis=1)[known[:, begins]]
+    rest = observe_at_rest(scene, observations)
+    far = np.linalg.norm((observations.values - rest)[:, begins], axis=1)[known[:, begins]]
     apart = float(np.median(np.where(np.isfinite(far), far, math.inf)))
     motion = float(np.nanmax(np.linalg.norm(first.values - rest, axis=2)))
-    least = ASTRAY if seen.kind == "pixel" else ASIDE * max(scene.sheet.size)
-    if apart <= max(least, 5 * (seen.sigma or 0.0), TIMES * max(motion, moved(seen, scene))):
+    least = MAX_OFFSET_PX if observations.kind == "pixel" else MAX_OFFSET_SHARE * max(scene.sheet.size)
+    if apart <= max(
+        least, 5 * (observations.sigma or 0.0), MAX_OFFSET_MOTIONS * max(motion, largest_motion(observations, scene))
+    ):
         return
     width, height = scene.render.size
     where, remedy = (
@@ -206,8 +222,8 @@ def _elsewhere(seen: Observations, scene: Scene, first: Predicted) -> Iterator[s
             f"the scene's camera sees them at rest in its {width} x {height} px",
             "give the scene that camera and size, and count from the picture's upper left corner, right and down",
         )
-        if seen.kind == "pixel"
+        if observations.kind == "pixel"
         else ("they are at rest in the scene", "count from the sheet's middle, x right, y up, z toward the viewer")
     )
-    said = f"half of the points are {apart:.3g} {seen.unit} or more from where {where}"
-    yield f"{seen.name}: {seen.kind}: {said}; {remedy}"
+    said = f"half of the points are {apart:.3g} {observations.unit} or more from where {where}"
+    yield f"{observations.name}: {observations.kind}: {said}; {remedy}"

@@ -1,6 +1,6 @@
-"""Read a forces.csv: the forces of tools on the sheet that were measured.
+"""Read a forces.csv of measured tool forces.
 
-An empty cell and NaN alone mean "not measured"; every other cell that is no number is an error.
+Only an empty cell and NaN mean "not measured"; every other cell that is not a number is an error.
 """
 
 from __future__ import annotations
@@ -20,11 +20,10 @@ from taichi_msm.scene.section import MAX_MAGNITUDE
 COLUMNS = {"time": "s", "probe": "", "force_x": "N", "force_y": "N", "force_z": "N"}
 EXPECTED = f"name a forces.csv, with the columns {', '.join(COLUMNS)}"
 
-# More bytes are no table of forces.
-MOST_BYTES = 2**26
+MAX_BYTES = 2**26
 
-# A byte order mark, and the encoding that it stands for.
-MARKS = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
+# Encodings by byte order mark.
+BYTE_ORDER_MARKS = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
 
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
@@ -35,13 +34,13 @@ def read_forces(path: str | Path, sigma: float, probes: int) -> Forces:
     Args:
         path: of the file.
         sigma: standard deviation of the error of each component [N].
-        probes: how many the scene has.
+        probes: number of the scene's tools.
 
     Returns:
         The forces of every row [N], NaN where not measured.
 
     Raises:
-        SceneError: when it is no such table, or names a probe that the scene lacks.
+        SceneError: when it is not such a table, or names a tool that the scene does not have.
     """
     name = str(path)
     if not 0 < sigma < math.inf:
@@ -62,14 +61,14 @@ def _text(name: str) -> str:
     """Return the text of a regular file of bounded size."""
     try:
         if not (reason := irregular_kind(Path(name))):
-            if (size := Path(name).stat().st_size) <= MOST_BYTES:
+            if (size := Path(name).stat().st_size) <= MAX_BYTES:
                 data = Path(name).read_bytes()
-                if data.startswith(b"PK") or (b"\0" in data and data[:2] not in MARKS):
+                if data.startswith(b"PK") or (b"\0" in data and data[:2] not in BYTE_ORDER_MARKS):
                     raise SceneError(
                         [f"{name}: a workbook, or UTF-16 without a byte order mark; save it as CSV in UTF-8"]
                     )
-                return data.decode(MARKS.get(data[:2], "utf-8-sig"))
-            reason = f"{size / 1e6:.0f} MB, more than the {MOST_BYTES / 1e6:.0f} MB of a table"
+                return data.decode(BYTE_ORDER_MARKS.get(data[:2], "utf-8-sig"))
+            reason = f"{size / 1e6:.0f} MB, more than the {MAX_BYTES / 1e6:.0f} MB of a table"
     except UnicodeDecodeError as error:
         reason = f"byte {error.start + 1} is not of UTF-8 text; save it as UTF-8"
     except OSError as error:
@@ -80,7 +79,7 @@ def _text(name: str) -> str:
 
 
 class _Reader:
-    """Reads the rows of a table, whose separator and decimal mark are those of its program."""
+    """Reader of a table with any separator and decimal mark."""
 
     def __init__(self, name: str, text: str) -> None:
         self._name, lines = name, text.splitlines()
@@ -138,7 +137,7 @@ class _Reader:
 
 
 def _header(where: str, cells: list[str]) -> list[str]:
-    """Return the names of the columns without their units; SceneError: one is missing, repeated or of another unit."""
+    """Return the column names without units; SceneError: a column is missing, repeated or in another unit."""
     split = [re.fullmatch(r"(.*?)\s*[\[(](.*)[\])]", cell) for cell in cells]
     names = [cell if found is None else found[1] for cell, found in zip(cells, split, strict=True)]
     names = [name.lower() for name in names]
@@ -154,7 +153,7 @@ def _header(where: str, cells: list[str]) -> list[str]:
 
 
 def _is_units(where: str, named: dict[str, str]) -> bool:
-    """Check whether a row has units in place of numbers; SceneError: units other than those of the columns."""
+    """Return whether a row has units instead of numbers; SceneError: other units."""
     units = {key: cell.strip("[]() ") for key, cell in named.items()}
     if not (units["time"].isalpha() and units["time"].lower() != "nan"):
         return False

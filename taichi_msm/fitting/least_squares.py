@@ -1,35 +1,30 @@
-"""Find the values with which a scene fits what was seen best: nonlinear least squares within bounds.
+"""Parameter estimation by nonlinear least squares, with confidence intervals and identifiability.
 
-The trust region method of SciPy, with differences of runs as derivatives: forward ones on the way, central ones where
-it ends. What is minimised is the sum of rho(r^2) over all r = (predicted - seen) / sigma, with rho(z) = z, or for
-robust fits SciPy's soft_l1, under which a number that is far off counts by |r|. Beside forces and in robust fits, a
-sigma that is not known is found in turn with the parameters.
+The sum of rho(r^2) over all residuals r = (predicted - observed) / sigma is minimised within bounds by SciPy's trust
+region method, with rho(z) = z, or soft_l1 in robust fits. The Jacobian is made of differences of runs: forward
+differences during the search, central ones at the solution. With forces, and in robust fits, an unknown sigma is
+estimated alternately with the parameters.
 
-How well the best values are known: their covariance from the derivatives where the search ends.
-
-With J the derivatives of r = (predicted - seen) / sigma by x, the covariance of x is
+Covariance. With J the Jacobian of r by x, the covariance of x is
 
     C = f (J^T W J)^-1 M (J^T W J)^-1,    M = J^T W^(1/2) K W^(1/2) J
 
-where W = 1 and K = 1, and f is the mean of r^2 per degree of freedom, but at least 1. In a robust fit W is the second
-derivative of half of rho, and f the mean of the squares of its first over that of W. If errors of neighbouring tracks
-are alike, K = exp(-distance / correlation) for two tracks in one frame; if tracks drift, K = exp(-apart / drift) for
-one track at two times; if both, their product. With the singular values W^(1/2) J = U S V^T,
+with W = 1 and K = 1, and f the mean of r^2 per degree of freedom, at least 1. In a robust fit W is the second
+derivative of rho / 2, and f the mean square of its first derivative over the mean of W. With correlated errors of
+tracks K = exp(-distance / correlation) for two tracks in a frame, with drifting tracks K = exp(-interval / drift) for
+one track at two times; with both, K is their product. With the singular values W^(1/2) J = U S V^T,
 
     C = f V S^-1 (U^T K U) S^-1 V^T
 
-which holds however little some direction is seen: nothing is squared.
+which squares nothing, so that poorly observed directions keep their digits.
 
-Intervals by profile: how far a parameter can go until the others can no longer make up for it.
+Profile intervals. A parameter is held, and the others are optimised within their bounds. The interval ends where the
+cost has risen by t^2 f / 2, with Student's t, times the widening by correlated errors. With J from the solution, the
+others need one run per step.
 
-The value of a parameter is held, and the others follow, within their bounds, to where the cost is least. The interval
-ends where the cost has risen by t^2 f / 2, as many standard deviations as Student's t asks for, or farther by as much
-as errors that are alike widen them. With J from the solution, the others take one run a step.
-
-What the data cannot tell: combinations of parameters that could change without anybody seeing it, in words.
-
-Parameters that are not seen each for itself may be seen together: pictures tell a stiffness over a force, but neither
-of them. The directions in which nothing is seen leave those combinations of the parameters known that are across them.
+Identifiability. Parameters can be identifiable in combinations only: images determine the ratio of a stiffness and a
+force, and neither of them. The singular vectors with large standard deviations span the unidentifiable directions; the
+combinations orthogonal to them are reported.
 """
 
 from __future__ import annotations
@@ -45,37 +40,35 @@ from numpy.typing import NDArray
 from taichi_msm.errors import SceneError
 from taichi_msm.fitting.observations import Observations
 from taichi_msm.fitting.parameters import Parameter, rounded
-from taichi_msm.fitting.predict import Predicted, Runs, difference
+from taichi_msm.fitting.predict import Prediction, Runs, difference_step
 
 Array = NDArray[np.float64]
 
-# Where the fit ends: the cost, or all parameters, change by less than these shares.
-ENOUGH_COST, ENOUGH = 1e-6, 1e-8
+# Relative changes of the cost and of the parameters at which the search ends.
+COST_TOLERANCE, STEP_TOLERANCE = 1e-6, 1e-8
+GRADIENT_TOLERANCE = 1e-12
 
-# Or the slope of the cost is no more than this.
-FLAT = 1e-12
+# Limits of one search, and of the alternation between sigma and the parameters.
+MAX_EVALUATIONS, MAX_SIGMA_ROUNDS = 40, 6
 
-# The most trials of one search, and the most times that sigma and the parameters are found in turn.
-MOST_TRIALS, MOST_ROUNDS = 40, 6
+# Relative change of sigma at which the alternation ends, and the smallest sigma as a share of the motion.
+SIGMA_TOLERANCE, MIN_SIGMA_SHARE = 0.02, 1e-9
 
-# Sigma is known once it changes by less than this share; it is at least this share of the motion.
-SIGMA_KNOWN, LEAST_SIGMA = 0.02, 1e-9
+# Residuals above this many sigma are weighted down in robust fits.
+OUTLIER_SIGMAS = 2.0
 
-# In a robust fit, what is farther off than so many sigma counts less.
-FAR = 2.0
+# Sigma of normal errors over the median of their magnitudes.
+SIGMA_PER_MEDIAN = 1.4826
 
-# Of normal errors, sigma over the median of their sizes.
-PER_MEDIAN = 1.4826
+# Larger residuals, as a share of the motion or in sigma, are a poor fit, which starts again elsewhere.
+MAX_RESIDUAL_SHARE, MAX_RESIDUAL_SIGMAS = 0.1, 2.0
 
-# A fit is tried from other starts where what is left is more than this share of the motion, or so many sigma.
-POOR_SHARE, POOR_SIGMAS = 0.1, 2.0
-
-# So many other starts are looked at for each parameter, within a factor of 10, or the bounds; the best are followed.
-LOOKED_AT, SPREAD, FOLLOWED = 8, np.log(10.0), 2
+# Alternative starts: number per parameter, largest log of their factor, and number of those that are minimised.
+STARTS_PER_PARAMETER, MAX_START_LOG, STARTS_FOLLOWED = 8, np.log(10.0), 2
 
 
 class Scales(NamedTuple):
-    """Standard deviations by which differences are divided."""
+    """Standard deviations of the residuals."""
 
     values: float  # [m] or [px]
     forces: float  # [N]
@@ -83,144 +76,155 @@ class Scales(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """The best values."""
+    """Solution of the least-squares problem."""
 
-    x: Array  # of the parameters
-    predicted: Predicted
+    x: Array  # parameters, shape (n,)
+    predicted: Prediction
     scales: Scales
     cost: float  # half the sum of rho
     converged: bool
 
 
 class Misfit:
-    """The differences between what is predicted and what was seen, as one row of numbers: the values, then the forces.
+    """Residuals of predictions, flattened to one axis: values first, forces last.
 
     Args:
-        seen: what was seen.
-        motion: of that, the root mean square [m] or [px].
-        robust: whether what is far off counts less.
+        observations: the observations.
+        motion: root mean square of the observed motion [m] or [px].
+        robust: whether outliers are weighted down.
 
     Attributes:
-        count: how many of the numbers are values, and how many are forces.
+        count: numbers of values and of force components.
     """
 
-    def __init__(self, seen: Observations, motion: float, *, robust: bool) -> None:
-        self.seen, self.motion, self.robust = seen, motion, robust
-        self._known = seen.known
-        self._values = seen.values[self._known]
-        forces = np.empty((0, 3)) if seen.forces is None else seen.forces.force
+    def __init__(self, observations: Observations, motion: float, *, robust: bool) -> None:
+        self.observations, self.motion, self.robust = observations, motion, robust
+        self._known = observations.known
+        self._values = observations.values[self._known]
+        forces = np.empty((0, 3)) if observations.forces is None else observations.forces.force
         self._known_forces = np.isfinite(forces)
         self._forces = forces[self._known_forces]
         self.count = self._values.size, self._forces.size
 
-    def row(self, predicted: Predicted) -> Array:
-        """Lay out what was predicted."""
+    def row(self, predicted: Prediction) -> Array:
+        """Return the predictions of all observed numbers, shape (numbers,)."""
         return np.concatenate([predicted.values[self._known], predicted.forces[self._known_forces]])
 
-    def of(self, predicted: Predicted) -> Array:
-        """Give predicted minus seen, in metres, pixels and newtons."""
+    def of(self, predicted: Prediction) -> Array:
+        """Return predicted minus observed [m] or [px], and [N], shape (numbers,)."""
         return self.row(predicted) - np.concatenate([self._values, self._forces])
 
-    def divided(self, rows: Array, scales: Scales) -> Array:
-        """Divide such rows, shape (numbers, ...), by the standard deviations."""
+    def scaled(self, rows: Array, scales: Scales) -> Array:
+        """Divide rows, shape (numbers, ...), by the standard deviations `scales`."""
         by = np.repeat(scales, self.count)
         return rows / by.reshape(-1, *(1,) * (rows.ndim - 1))
 
-    def residuals(self, predicted: Predicted, scales: Scales) -> Array:
-        """Give r."""
-        return self.divided(self.of(predicted), scales)
+    def residuals(self, predicted: Prediction, scales: Scales) -> Array:
+        """Return the residuals r, shape (numbers,)."""
+        return self.scaled(self.of(predicted), scales)
 
-    def far(self, residuals: Array) -> Array:
-        """Give d with which the derivatives of rho / 2 are r / d^(1/2) and d^(-3/2)."""
-        return 1 + (residuals / FAR) ** 2 if self.robust else np.ones_like(residuals)
+    def robust_factor(self, residuals: Array) -> Array:
+        """Return d, with the derivatives r / d^(1/2) and d^(-3/2) of rho / 2."""
+        return 1 + (residuals / OUTLIER_SIGMAS) ** 2 if self.robust else np.ones_like(residuals)
 
     def cost(self, residuals: Array) -> float:
-        """Give half the sum of rho, as SciPy does."""
-        rho = 2 * FAR**2 * (np.sqrt(self.far(residuals)) - 1) if self.robust else residuals**2
+        """Return half the sum of rho, as SciPy."""
+        rho = 2 * OUTLIER_SIGMAS**2 * (np.sqrt(self.robust_factor(residuals)) - 1) if self.robust else residuals**2
         return float(np.sum(rho)) / 2
 
-    def sigma(self, predicted: Predicted, parameters: int) -> float:
-        """Estimate the standard deviation of the values' errors from what is left of them, at least LEAST_SIGMA."""
+    def sigma(self, predicted: Prediction, parameters: int) -> float:
+        """Estimate the standard deviation of the values' errors [m] or [px] from their residuals."""
         left = self.of(predicted)[: self.count[0]]
         mean_square = np.sum(left**2) / max(1, len(left) - parameters)
-        found = PER_MEDIAN * np.median(np.abs(left)) if self.robust else np.sqrt(mean_square)
-        return max(float(found), LEAST_SIGMA * self.motion)
+        found = SIGMA_PER_MEDIAN * np.median(np.abs(left)) if self.robust else np.sqrt(mean_square)
+        return max(float(found), MIN_SIGMA_SHARE * self.motion)
 
 
 class Search:
-    """The search for the best values of a job's parameters.
+    """Nonlinear least squares with restarts.
 
     Args:
-        runs: that predict.
-        misfit: what is minimised; if sigma is not known, its motion stands for it at first.
+        runs: predictions.
+        misfit: residuals; an unknown sigma starts as the observed motion.
     """
 
     def __init__(self, runs: Runs, misfit: Misfit) -> None:
         self._runs, self._misfit = runs, misfit
-        self._delta = difference(runs.job.scene)
+        self._delta = difference_step(runs.job.scene)
         limits = np.array([one.limits for one in runs.job.parameters])
         self._limits = limits[:, 0], limits[:, 1]
-        self._known: dict[bytes, Predicted | None] = {}
-        self._beside: dict[bytes, Predicted | None] = {}
+        self._known: dict[bytes, Prediction | None] = {}
+        self._beside: dict[bytes, Prediction | None] = {}
 
     def best(self, start: Array) -> Solution:
-        """Find the best values from a start, and from others if that does not fit."""
-        solution = self._settled(start)
-        if self.fits(solution):
+        """Minimise from a start, and from alternative ones if the fit is poor."""
+        solution = self._solve(start)
+        if self.fits_well(solution):
             return solution
-        others = self._other_starts()
+        others = self._alternative_starts()
         self._runs.expected += len(others)
         tried = [
             (self._cost(predicted, solution.scales), n)
-            for n, predicted in enumerate(self._runs.several(others))
+            for n, predicted in enumerate(self._runs.predict_many(others))
             if predicted is not None
         ]
-        for _, n in sorted(tried)[:FOLLOWED]:
-            other = self._settled(others[n])
+        for _, n in sorted(tried)[:STARTS_FOLLOWED]:
+            other = self._solve(others[n])
             # Costs compare only for one sigma.
             if self._cost(other.predicted, solution.scales) < self._cost(solution.predicted, solution.scales):
                 solution = other
-            if self.fits(solution):
+            if self.fits_well(solution):
                 break
         return solution
 
-    def fits(self, solution: Solution) -> bool:
-        """Tell whether what is left is small."""
-        seen = self._misfit.seen
-        if seen.forces is not None:
-            left, most = solution.predicted.forces - seen.forces.force, POOR_SHARE**2 * np.nanmean(seen.forces.force**2)
-            if np.nanmean(left**2) > max(most, (POOR_SIGMAS * seen.forces.sigma) ** 2):
+    def fits_well(self, solution: Solution) -> bool:
+        """Return whether the residuals are small."""
+        observations = self._misfit.observations
+        if observations.forces is not None:
+            left, most = (
+                solution.predicted.forces - observations.forces.force,
+                MAX_RESIDUAL_SHARE**2 * np.nanmean(observations.forces.force**2),
+            )
+            if np.nanmean(left**2) > max(most, (MAX_RESIDUAL_SIGMAS * observations.forces.sigma) ** 2):
                 return False
         of_values = self._misfit.sigma(solution.predicted, len(solution.x))
-        return of_values <= (POOR_SHARE * self._misfit.motion if seen.sigma is None else POOR_SIGMAS * seen.sigma)
+        return of_values <= (
+            MAX_RESIDUAL_SHARE * self._misfit.motion
+            if observations.sigma is None
+            else MAX_RESIDUAL_SIGMAS * observations.sigma
+        )
 
-    def derivatives(self, solution: Solution) -> Array:
-        """Give the derivatives of what is predicted by x, by central differences, shape (numbers, parameters)."""
-        return self._derivatives(solution.x, solution.predicted, signs=(1, -1))
+    def jacobian(self, solution: Solution) -> Array:
+        """Return the Jacobian of the predictions by x, by central differences, shape (numbers, parameters)."""
+        return self._differences(solution.x, solution.predicted, signs=(1, -1))
 
-    def _predict(self, x: Array) -> Predicted | None:
-        """Predict, unless that was done already."""
+    def _predict(self, x: Array) -> Prediction | None:
+        """Predict, with a cache."""
         key = x.tobytes()
         if key not in self._known:
             self._known[key] = self._runs.one(x)
         return self._known[key]
 
-    def _settled(self, start: Array) -> Solution:
-        """Find the best values from a start, and sigma where it is not known."""
-        seen, robust = self._misfit.seen, self._misfit.robust
-        scales = Scales(seen.sigma or self._misfit.motion, seen.forces.sigma if seen.forces else 1.0)
-        if robust and seen.sigma is None and (predicted := self._predict(start)) is not None:
+    def _solve(self, start: Array) -> Solution:
+        """Minimise from a start, alternating with an unknown sigma."""
+        observations, robust = self._misfit.observations, self._misfit.robust
+        scales = Scales(
+            observations.sigma or self._misfit.motion, observations.forces.sigma if observations.forces else 1.0
+        )
+        if robust and observations.sigma is None and (predicted := self._predict(start)) is not None:
             scales = scales._replace(values=self._misfit.sigma(predicted, len(start)))
         solution = self._from(start, scales)
-        for _ in range(MOST_ROUNDS if seen.sigma is None and (seen.forces is not None or robust) else 0):
+        for _ in range(
+            MAX_SIGMA_ROUNDS if observations.sigma is None and (observations.forces is not None or robust) else 0
+        ):
             sigma = self._misfit.sigma(solution.predicted, len(start))
-            if abs(sigma / solution.scales.values - 1) < SIGMA_KNOWN:
+            if abs(sigma / solution.scales.values - 1) < SIGMA_TOLERANCE:
                 break
             solution = self._from(solution.x, scales._replace(values=sigma))
         return solution
 
     def _from(self, start: Array, scales: Scales) -> Solution:
-        """Find the best values from a start."""
+        """Minimise from a start with given standard deviations."""
         from scipy.optimize import least_squares
 
         def residuals(x: Array) -> Array:
@@ -233,7 +237,7 @@ class Search:
         def jacobian(x: Array) -> Array:
             predicted = self._predict(x)
             assert predicted is not None
-            return self._misfit.divided(self._derivatives(x, predicted, signs=(1,)), scales)
+            return self._misfit.scaled(self._differences(x, predicted, signs=(1,)), scales)
 
         with np.errstate(all="ignore"):  # SciPy divides by slopes that are 0.
             found = least_squares(
@@ -241,25 +245,26 @@ class Search:
                 start,
                 jacobian,
                 self._limits,
-                ftol=ENOUGH_COST,
-                xtol=ENOUGH,
-                gtol=FLAT,
+                ftol=COST_TOLERANCE,
+                xtol=STEP_TOLERANCE,
+                gtol=GRADIENT_TOLERANCE,
                 loss="soft_l1" if self._misfit.robust else "linear",
-                f_scale=FAR,
-                max_nfev=MOST_TRIALS,
+                f_scale=OUTLIER_SIGMAS,
+                max_nfev=MAX_EVALUATIONS,
             )
         predicted = self._predict(found.x)
         assert predicted is not None
         return Solution(found.x, predicted, scales, float(found.cost), bool(found.status > 0))
 
-    def _derivatives(self, x: Array, predicted: Predicted, *, signs: tuple[int, ...]) -> Array:
+    def _differences(self, x: Array, predicted: Prediction, *, signs: tuple[int, ...]) -> Array:
         places = [
-            [self._changed(x, n, sign) for sign in signs if sign == 1 or self._inside(x, n)] for n in range(len(x))
+            [self._shifted(x, n, sign) for sign in signs if sign == 1 or self._has_both_sides(x, n)]
+            for n in range(len(x))
         ]
         self._runs.expected = max(self._runs.expected, self._runs.count + 3 * len(x))
         # Where the search ends, half of them were predicted by its last derivatives.
         new = [place for several in places for place in several if place.tobytes() not in self._beside]
-        after = zip(new, self._runs.several(new, predicted.steps), strict=True)
+        after = zip(new, self._runs.predict_many(new, predicted.steps), strict=True)
         self._beside = {**self._beside, **{place.tobytes(): one for place, one in after}}
         self._beside = {place.tobytes(): self._beside[place.tobytes()] for several in places for place in several}
         columns = []
@@ -267,7 +272,7 @@ class Search:
             known = [(place[n], one) for place in places[n] if (one := self._beside[place.tobytes()]) is not None]
             if not known and len(signs) == 1:
                 # Perhaps downward.
-                return self._derivatives(x, predicted, signs=(1, -1))
+                return self._differences(x, predicted, signs=(1, -1))
             if not known:
                 remedy = "give --bounds or another start by --set"
                 raise SceneError([f"{parameter.key}: no run close to its value succeeds; {remedy}"])
@@ -275,43 +280,41 @@ class Search:
             columns.append((self._misfit.row(first) - self._misfit.row(second)) / (one - other))
         return np.stack(columns, axis=1)
 
-    def _inside(self, x: Array, n: int) -> bool:
-        """Tell whether a parameter can be changed to both sides."""
+    def _has_both_sides(self, x: Array, n: int) -> bool:
+        """Return whether both differences of parameter n are within its bounds."""
         return bool(self._limits[0][n] <= x[n] - self._delta and x[n] + self._delta <= self._limits[1][n])
 
-    def _changed(self, x: Array, n: int, sign: int) -> Array:
-        """Change a parameter, upward where that is within the bounds, else downward."""
+    def _shifted(self, x: Array, n: int, sign: int) -> Array:
+        """Return x with parameter n stepped, upward if that is within the bounds and `sign` is 1."""
         place = x.copy()
         place[n] += self._delta if sign == 1 and x[n] + self._delta <= self._limits[1][n] else -self._delta
         return place
 
-    def _cost(self, predicted: Predicted, scales: Scales) -> float:
+    def _cost(self, predicted: Prediction, scales: Scales) -> float:
         return self._misfit.cost(self._misfit.residuals(predicted, scales))
 
-    def _other_starts(self) -> list[Array]:
-        """Choose other starts, spread evenly over the bounds, at most a factor of 10 from the first."""
+    def _alternative_starts(self) -> list[Array]:
+        """Return a Sobol sequence of starts within the bounds, and within a factor of 10 of the first."""
         from scipy.stats import qmc
 
-        low, high = (np.clip(limit, -SPREAD, SPREAD) for limit in self._limits)
-        shares = qmc.Sobol(len(low), seed=1).random_base2((LOOKED_AT * len(low) - 1).bit_length())
+        low, high = (np.clip(limit, -MAX_START_LOG, MAX_START_LOG) for limit in self._limits)
+        shares = qmc.Sobol(len(low), seed=1).random_base2((STARTS_PER_PARAMETER * len(low) - 1).bit_length())
         return list(qmc.scale(shares, low, high))
 
 
-pass  # REMOVED
+# Singular values below this share of the largest are differences of rounding: their direction is unidentified, has this
+# standard deviation, and components below MIN_COMPONENT are 0.
+MIN_SINGULAR_SHARE, MIN_COMPONENT, UNIDENTIFIED_DEVIATION = 1e-8, 1e-3, 1e4
 
-# Of singular values, as a share of the largest: what is smaller, which differences hardly tell from 0, is not seen at
-# all. In such a direction the smallest parts of parameters are none, and this is its standard deviation.
-UNSEEN, LEAST_PART, AT_LARGE = 1e-8, 1e-3, 1e4
+# Largest standard deviation of an identified direction.
+MAX_DIRECTION_DEVIATION = 0.5
 
-# A direction with a larger standard deviation than this is not seen.
-NOT_SEEN = 0.5
-
-# Of the intervals.
+# Level of the confidence intervals.
 CONFIDENCE = 0.95
 
 
-class Alike(NamedTuple):
-    """How far apart errors of tracks are alike; None: they are independent."""
+class ErrorCorrelation(NamedTuple):
+    """Correlation lengths of the errors of tracks; None: independent."""
 
     correlation: float | None  # of two tracks [px]
     drift: float | None  # of two times [s]
@@ -319,10 +322,9 @@ class Alike(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """What the derivatives tell of the parameters' errors, in units of x.
+    """Uncertainty of n parameters, in units of x.
 
-    With n parameters, the columns of `directions` are combinations of x that are seen independently of each other, the
-    one that is seen best first.
+    The columns of `directions` are uncorrelated combinations of x, the most certain one first.
     """
 
     scales: Scales  # standard deviations of what was seen, found or given
@@ -333,7 +335,7 @@ class Uncertainty:
     weighted: Array  # W^(1/2) J, shape (numbers, n)
     directions: Array  # shape (n, n)
     root: Array  # F with C = F F^T, shape (n, n)
-    wider: Array  # how many times K makes the deviations wider, shape (n,)
+    widening: Array  # how many times K makes the deviations wider, shape (n,)
 
     @property
     def deviations(self) -> Array:
@@ -341,7 +343,7 @@ class Uncertainty:
         return np.linalg.norm(self.root, axis=1)
 
     @property
-    def along(self) -> Array:
+    def direction_deviations(self) -> Array:
         """Standard deviations of the directions, shape (n,)."""
         return np.linalg.norm(self.directions.T @ self.root, axis=1)
 
@@ -353,135 +355,139 @@ class Uncertainty:
 
     @property
     def quantile(self) -> float:
-        """So many standard deviations each side of a value are its interval, by Student's t."""
+        """Half width of the confidence interval in standard deviations, by Student's t."""
         from scipy.stats import t
 
         return float(t.ppf((1 + CONFIDENCE) / 2, self.freedom))
 
-    def of_combination(self, exponents: Array) -> float:
-        """Give the standard deviation of a combination of x."""
+    def combination_deviation(self, exponents: Array) -> float:
+        """Return the standard deviation of a combination of x, shape (n,)."""
         return float(np.linalg.norm(exponents @ self.root))
 
     @property
-    def dropped(self) -> NDArray[np.bool_]:
-        """Which of x have a part in a direction that is not seen, so that `shift` does not tell how far they move."""
-        return np.linalg.norm(self.directions[:, self.along > NOT_SEEN], axis=1) > LEAST_PART * 50
+    def unidentified(self) -> NDArray[np.bool_]:
+        """Mask of the x with a part in an unidentified direction, for which `shift` is not valid, shape (n,)."""
+        return (
+            np.linalg.norm(self.directions[:, self.direction_deviations > MAX_DIRECTION_DEVIATION], axis=1)
+            > MIN_COMPONENT * 50
+        )
 
     def shift(self, rows: Array) -> Array:
-        """Give how far x moves, as far as that is seen, if what is predicted is off by so much, in units of r."""
-        seen = self.directions[:, self.along <= NOT_SEEN]
-        return seen @ np.linalg.lstsq(self.weighted @ seen, rows, rcond=None)[0]
+        """Return the shift of x by an error of the predictions, in units of r, shape (numbers,)."""
+        observations = self.directions[:, self.direction_deviations <= MAX_DIRECTION_DEVIATION]
+        return observations @ np.linalg.lstsq(self.weighted @ observations, rows, rcond=None)[0]
 
 
-def uncertainty(misfit: Misfit, solution: Solution, derivatives: Array, alike: Alike) -> Uncertainty:
-    """Work out the uncertainty of a solution.
+def uncertainty(
+    misfit: Misfit, solution: Solution, derivatives: Array, error_correlation: ErrorCorrelation
+) -> Uncertainty:
+    """Compute the uncertainty of a solution.
 
     Args:
-        misfit: that was minimised.
-        solution: the best values.
-        derivatives: of what is predicted by x, shape (numbers, parameters).
-        alike: how far apart errors of tracks are alike.
+        misfit: the residuals.
+        solution: their minimum.
+        derivatives: Jacobian of the predictions by x, shape (numbers, parameters).
+        error_correlation: correlation lengths of the observation errors.
     """
     parameters = len(solution.x)
     freedom = max(1, sum(misfit.count) - parameters)
     scales = solution.scales
-    if misfit.seen.sigma is None:
+    if misfit.observations.sigma is None:
         scales = scales._replace(values=misfit.sigma(solution.predicted, parameters))
-    left, slope = misfit.residuals(solution.predicted, scales), misfit.divided(derivatives, scales)
-    far = misfit.far(left)
+    left, slope = misfit.residuals(solution.predicted, scales), misfit.scaled(derivatives, scales)
+    far = misfit.robust_factor(left)
     weighted = slope * far[:, None] ** (-0.75)
     factor = max(1.0, float(np.sum(left**2 / far)) / freedom / float(np.mean(far**-1.5)))
     singular = np.linalg.svd(weighted, full_matrices=False)
-    blind = UNSEEN * max(1.0, singular.S[0]) >= singular.S
-    held = np.where(blind, 1 / AT_LARGE, singular.S)
-    parts = np.where(blind & (np.abs(singular.Vh.T) < LEAST_PART), 0.0, singular.Vh.T)
+    blind = MIN_SINGULAR_SHARE * max(1.0, singular.S[0]) >= singular.S
+    held = np.where(blind, 1 / UNIDENTIFIED_DEVIATION, singular.S)
+    parts = np.where(blind & (np.abs(singular.Vh.T) < MIN_COMPONENT), 0.0, singular.Vh.T)
     plain = root = np.sqrt(factor) * parts / held
     independent = float(freedom)
-    if alike != (None, None):
-        around, independent = _with_neighbours(misfit, singular.U, alike)
+    if error_correlation != (None, None):
+        around, independent = _correlated(misfit, singular.U, error_correlation)
         independent = min(independent, freedom)
         values, vectors = np.linalg.eigh(around)
         root = plain @ (vectors * np.sqrt(np.maximum(values, 0.0)))
-    wider = np.linalg.norm(root, axis=1) / np.linalg.norm(plain, axis=1)
-    return Uncertainty(scales, factor, freedom, independent, left, weighted, singular.Vh.T, root, wider)
+    widening = np.linalg.norm(root, axis=1) / np.linalg.norm(plain, axis=1)
+    return Uncertainty(scales, factor, freedom, independent, left, weighted, singular.Vh.T, root, widening)
 
 
-def _with_neighbours(misfit: Misfit, rows: Array, alike: Alike) -> tuple[Array, float]:
-    """Compute U^T K U, and tr(K)^2 / tr(K^2), so many independent numbers as K leaves; forces are independent."""
-    values, seen = misfit.count[0], misfit.seen
+def _correlated(misfit: Misfit, rows: Array, error_correlation: ErrorCorrelation) -> tuple[Array, float]:
+    """Compute U^T K U, and the effective number of observations tr(K)^2 / tr(K^2); forces are independent."""
+    values, observations = misfit.count[0], misfit.observations
     # Tracks are where they were seen on the mean; those that never were have no errors.
-    ever: NDArray[np.bool_] = np.any(seen.there, axis=1)
-    space, time = _likeness(seen, ever, alike)
-    whole = np.zeros((*seen.values.shape, rows.shape[1]))
-    whole[seen.known] = rows[:values]
+    ever: NDArray[np.bool_] = np.any(observations.there, axis=1)
+    space, time = _correlations(observations, ever, error_correlation)
+    whole = np.zeros((*observations.values.shape, rows.shape[1]))
+    whole[observations.known] = rows[:values]
     whole = whole[ever]
     beside = np.einsum("st,ntcp->nscp", time, np.tensordot(space, whole, 1))
     every = len(rows) - values
-    there = seen.there[ever].astype(float)
-    square = every + seen.values.shape[2] * float(np.sum(space**2 * (there @ time**2 @ there.T)))
+    there = observations.there[ever].astype(float)
+    square = every + observations.values.shape[2] * float(np.sum(space**2 * (there @ time**2 @ there.T)))
     total = np.tensordot(whole, beside, ((0, 1, 2), (0, 1, 2))) + rows[values:].T @ rows[values:]
     return total, len(rows) ** 2 / square
 
 
-def _likeness(seen: Observations, ever: NDArray[np.bool_], alike: Alike) -> tuple[Array, Array]:
+def _correlations(
+    observations: Observations, ever: NDArray[np.bool_], error_correlation: ErrorCorrelation
+) -> tuple[Array, Array]:
     """Correlate the errors of tracks, shape (tracks, tracks), and those of times, shape (T, T)."""
     from scipy.spatial.distance import cdist
 
-    space, time = np.eye(int(ever.sum())), np.eye(len(seen.time))
-    if alike.correlation is not None:
-        pixels = np.nanmean(seen.values[ever], axis=1)
-        space = np.exp(-cdist(pixels, pixels) / alike.correlation)
-    if alike.drift is not None:
-        time = np.exp(-np.abs(seen.time[:, None] - seen.time) / alike.drift)
+    space, time = np.eye(int(ever.sum())), np.eye(len(observations.time))
+    if error_correlation.correlation is not None:
+        pixels = np.nanmean(observations.values[ever], axis=1)
+        space = np.exp(-cdist(pixels, pixels) / error_correlation.correlation)
+    if error_correlation.drift is not None:
+        time = np.exp(-np.abs(observations.time[:, None] - observations.time) / error_correlation.drift)
     return space, time
 
 
-pass  # REMOVED
-pass  # REMOVED
+# Limits of a profile: points per side, and steps of the other parameters at each.
+MAX_PROFILE_POINTS, MAX_PROFILE_STEPS = 8, 6
 
-# The most places that are tried on a side, and steps of the other parameters at each.
-MOST_PLACES, MOST_STEPS = 8, 6
+# Relative tolerance of an end, and the tolerance of the other parameters in standard deviations.
+PROFILE_TOLERANCE, PROFILE_STEP_TOLERANCE = 0.01, 0.02
 
-# How close an end is found, as a share of its distance, and where the others rest, in standard deviations.
-PROFILE_TOLERANCE, AT_REST = 0.01, 0.02
-
-Side = Generator[Array, "Predicted | None", "list[Place]"]
+Side = Generator[Array, "Prediction | None", "list[ProfilePoint]"]
 
 
-class Place(NamedTuple):
-    """A place on a profile."""
+class ProfilePoint(NamedTuple):
+    """Point of a profile."""
 
     x: float  # of the parameter
     deviations: float  # the root of twice the rise of the cost over f, and its sign; infinite: no run there
 
 
 class Profile(NamedTuple):
-    """The profile of a parameter."""
+    """Profile of a parameter."""
 
-    places: list[Place]  # sorted by x
+    places: list[ProfilePoint]  # sorted by x
     low: float | None  # the ends of the interval; None: there is none within the bounds
     high: float | None
 
 
 class Profiler:
-    """Draws the profiles of a solution's parameters."""
+    """Profile likelihood of a solution's parameters."""
 
     def __init__(
-        self, parameters: Sequence[Parameter], misfit: Misfit, solution: Solution, uncertain: Uncertainty
+        self, parameters: Sequence[Parameter], misfit: Misfit, solution: Solution, uncertainties: Uncertainty
     ) -> None:
-        self._misfit, self._solution, self._uncertain = misfit, solution, uncertain
-        self._least = misfit.cost(uncertain.left)
+        self._misfit, self._solution, self._uncertain = misfit, solution, uncertainties
+        self._least = misfit.cost(uncertainties.left)
         self._low, self._high = np.array([one.limits for one in parameters]).T
 
     def profiles(self, runs: Runs) -> list[Profile]:
-        """Draw the profile of every parameter, all sides at once."""
+        """Compute the profiles of all parameters, both sides in parallel."""
         number = len(self._low)
         sides = {(n, sign): self._side(n, sign) for n in range(number) for sign in (-1, 1)}
-        places: dict[tuple[int, int], list[Place]] = {which: [] for which in sides}
+        places: dict[tuple[int, int], list[ProfilePoint]] = {which: [] for which in sides}
         asked: dict[tuple[int, int], Array | None] = {which: next(side, None) for which, side in sides.items()}
         while waiting := [(which, place) for which, place in asked.items() if place is not None]:
             runs.expected = max(runs.expected, runs.count + 2 * len(waiting))
-            predicted = runs.several([place for _, place in waiting])
+            predicted = runs.predict_many([place for _, place in waiting])
             for (which, _), one in zip(waiting, predicted, strict=True):
                 try:
                     asked[which] = sides[which].send(one)
@@ -489,31 +495,31 @@ class Profiler:
                     asked[which], places[which] = None, stop.value
         return [self._profile(n, places[n, -1], places[n, 1]) for n in range(number)]
 
-    def _profile(self, n: int, below: list[Place], above: list[Place]) -> Profile:
+    def _profile(self, n: int, below: list[ProfilePoint], above: list[ProfilePoint]) -> Profile:
         quantile = self._uncertain.quantile
         ends = [
             side[-1].x if side and abs(abs(side[-1].deviations) / quantile - 1) < 5 * PROFILE_TOLERANCE else None
             for side in (below, above)
         ]
-        places = [*below, Place(float(self._solution.x[n]), 0.0), *above]
+        places = [*below, ProfilePoint(float(self._solution.x[n]), 0.0), *above]
         return Profile(sorted(place for place in places if math.isfinite(place.deviations)), ends[0], ends[1])
 
     def _side(self, n: int, sign: int) -> Side:
-        """Go from the best values to where the interval ends, or to a bound."""
+        """Search for the end of the interval on a side, or the bound."""
         x, root, quantile = self._solution.x, self._uncertain.root, self._uncertain.quantile
         variance = float(root[n] @ root[n])
         valley = root @ root[n] / variance
         most = float((self._high if sign > 0 else self._low)[n] - x[n]) * sign
-        places: list[Place] = []
+        places: list[ProfilePoint] = []
         # The end lies between distances, with the rise at each, which is nearly proportional to the distance.
         near, far = (0.0, 0.0), (math.inf, math.inf)
         away = min(quantile * math.sqrt(variance), most)
-        while away > 0 and len(places) < MOST_PLACES:
+        while away > 0 and len(places) < MAX_PROFILE_POINTS:
             place = np.clip(x + sign * away * valley, self._low, self._high)
             place[n] = x[n] + sign * away
             least = yield from self._least_at(n, place)
-            rise = math.sqrt(max(0.0, 2 * (least - self._least) / self._uncertain.factor)) / self._uncertain.wider[n]
-            places.append(Place(float(place[n]), sign * rise))
+            rise = math.sqrt(max(0.0, 2 * (least - self._least) / self._uncertain.factor)) / self._uncertain.widening[n]
+            places.append(ProfilePoint(float(place[n]), sign * rise))
             if abs(rise / quantile - 1) < PROFILE_TOLERANCE or (away == most and rise < quantile):
                 break
             near, far = ((away, rise), far) if rise < quantile else (near, (away, rise))
@@ -525,14 +531,14 @@ class Profiler:
                 away = min(away * min(3.0, quantile / max(rise, 1e-3)), most)
         return places
 
-    def _least_at(self, n: int, place: Array) -> Generator[Array, Predicted | None, float]:
-        """Let the other parameters follow; returns the least cost, infinite where there is no run."""
+    def _least_at(self, n: int, place: Array) -> Generator[Array, Prediction | None, float]:
+        """Minimise over the other parameters; returns the cost, infinite if the runs fail."""
         from scipy.optimize import lsq_linear
 
         others = np.delete(np.arange(len(place)), n)
         slope, deviations = self._uncertain.weighted[:, others], self._uncertain.deviations[others]
         least = math.inf
-        for _ in range(MOST_STEPS):
+        for _ in range(MAX_PROFILE_STEPS):
             predicted = yield place
             if predicted is None:
                 break
@@ -543,28 +549,26 @@ class Profiler:
             least = cost
             # The first derivatives over the roots of the second.
             bounds = (self._low - place)[others], (self._high - place)[others]
-            step = lsq_linear(slope, -left * self._misfit.far(left) ** 0.25, bounds).x
-            if np.all(np.abs(step) < AT_REST * deviations):
+            step = lsq_linear(slope, -left * self._misfit.robust_factor(left) ** 0.25, bounds).x
+            if np.all(np.abs(step) < PROFILE_STEP_TOLERANCE * deviations):
                 break
             place = place.copy()
             place[others] += step
         return least
 
 
-pass  # REMOVED
+# Largest standard error of an identifiable parameter, as a share of its value, or of a coordinate's range.
+MAX_RELATIVE_ERROR = 1.0
 
-# A parameter is not identifiable if its standard error is above this share of its value, of a place of its range.
-MOST_ERROR = 1.0
+# Smallest component of a parameter that belongs to a direction.
+MIN_GROUP_COMPONENT = 0.05
 
-# Parameters whose part in a direction is above this belong to it.
-PART = 0.05
-
-# Exponents this close to a half of a whole number are written as such.
-CLOSE = 0.06
+# Exponents this close to a multiple of 1/2 are rounded.
+EXPONENT_TOLERANCE = 0.06
 
 
 class Combination(NamedTuple):
-    """A product of powers of parameters that is known."""
+    """Identifiable product of powers of parameters."""
 
     exponents: dict[str, float]
     standard_error: float  # as a share
@@ -578,32 +582,37 @@ class Combination(NamedTuple):
         return text
 
 
-class Unseen(NamedTuple):
-    """Parameters that the data cannot tell from each other, or at all."""
+class UnidentifiedGroup(NamedTuple):
+    """Parameters that the data do not determine one by one."""
 
     parameters: list[str]
     known: list[Combination]  # what is known of them
     text: str
 
     def as_json(self) -> dict[str, Any]:
-        """Give it as plain data."""
+        """Return JSON data."""
         known = [{"combination": str(one), **one._asdict()} for one in self.known]
         return {"parameters": self.parameters, "known": known, "text": self.text}
 
 
-def unseen(parameters: Sequence[Parameter], x: Array, uncertain: Uncertainty, *, forces: bool) -> list[Unseen]:
-    """Find what the data cannot tell; forces: whether any were seen."""
-    blind = uncertain.directions[:, uncertain.along > NOT_SEEN]
-    pairs = zip(parameters, x.tolist(), uncertain.deviations.tolist(), strict=True)
+def unseen(
+    parameters: Sequence[Parameter], x: Array, uncertainties: Uncertainty, *, forces: bool
+) -> list[UnidentifiedGroup]:
+    """Return the groups of parameters that are not identifiable; `forces`: whether any were measured."""
+    blind = uncertainties.directions[:, uncertainties.direction_deviations > MAX_DIRECTION_DEVIATION]
+    pairs = zip(parameters, x.tolist(), uncertainties.deviations.tolist(), strict=True)
     alone = np.array([one.share(place, deviation) for one, place, deviation in pairs])
-    return [_in_words(parameters, uncertain, alone, part, blind[part], forces=forces) for part in _groups(blind)]
+    return [
+        _in_words(parameters, uncertainties, alone, part, blind[part], forces=forces)
+        for part in _unidentified_groups(blind)
+    ]
 
 
-def _groups(blind: Array) -> Iterator[Array]:
-    """Part the parameters that are not seen into groups that have no direction in common; gives their numbers."""
+def _unidentified_groups(blind: Array) -> Iterator[Array]:
+    """Yield the indices of parameters that share unidentified directions."""
     # The projection onto the directions does not depend on which of them were chosen.
-    together = np.abs(blind @ blind.T) > PART**2
-    left = set(np.flatnonzero(np.linalg.norm(blind, axis=1) > PART).tolist())
+    together = np.abs(blind @ blind.T) > MIN_GROUP_COMPONENT**2
+    left = set(np.flatnonzero(np.linalg.norm(blind, axis=1) > MIN_GROUP_COMPONENT).tolist())
     while left:
         group, new = set[int](), {min(left)}
         while new:
@@ -614,44 +623,55 @@ def _groups(blind: Array) -> Iterator[Array]:
 
 
 def _in_words(
-    parameters: Sequence[Parameter], uncertain: Uncertainty, alone: Array, group: Array, blind: Array, *, forces: bool
-) -> Unseen:
-    """Say what is known of some parameters.
+    parameters: Sequence[Parameter],
+    uncertainties: Uncertainty,
+    alone: Array,
+    group: Array,
+    blind: Array,
+    *,
+    forces: bool,
+) -> UnidentifiedGroup:
+    """Describe a group of parameters, and its identifiable combinations.
 
-    alone: every standard error as a share; group: which parameters; blind: their parts in what is not seen.
+    Args:
+        parameters: of the fit.
+        uncertainties: of the fit.
+        alone: standard error of each parameter as a share.
+        group: indices of the group.
+        blind: components of the group in the unidentified directions, shape (m, directions).
+        forces: whether forces were measured.
     """
     keys = [parameters[n].key for n in group]
     known = []
-    for exponents in _across(blind):
+    for exponents in _complement(blind):
         whole = np.zeros(len(parameters))
         nice = np.round(2 * exponents) / 2
-        exponents = np.where(np.abs(exponents - nice) < CLOSE, nice, exponents)
+        exponents = np.where(np.abs(exponents - nice) < EXPONENT_TOLERANCE, nice, exponents)
         whole[group] = exponents
         parts = {key: float(power) for key, power in zip(keys, exponents, strict=True) if power}
-        known.append(Combination(parts, uncertain.of_combination(whole)))
+        known.append(Combination(parts, uncertainties.combination_deviation(whole)))
     remedy = "" if forces else ", or give a force (--forces)"
     names = " and ".join([", ".join(keys[:-1]), keys[-1]] if len(keys) > 1 else keys)
-    known = [one for one in known if one.standard_error <= MOST_ERROR]
+    known = [one for one in known if one.standard_error <= MAX_RELATIVE_ERROR]
     if known and not all(parameters[n].is_log for n in group):
-        return Unseen(keys, [], f"{names} cannot be told apart by what was seen: fix one{remedy}")
+        return UnidentifiedGroup(keys, [], f"{names} cannot be told apart by what was seen: fix one{remedy}")
     if not known:
         it = "it" if len(keys) == 1 else "them"
-        if alone[group].max() <= MOST_ERROR:
-            return Unseen(keys, [], f"{names}: known only to {rounded(100 * float(alone[group].max()))} %: fix {it}")
-        return Unseen(keys, [], f"{names}: what was seen does not tell {it}: fix {it}")
+        if alone[group].max() <= MAX_RELATIVE_ERROR:
+            return UnidentifiedGroup(
+                keys, [], f"{names}: known only to {rounded(100 * float(alone[group].max()))} %: fix {it}"
+            )
+        return UnidentifiedGroup(keys, [], f"{names}: what was seen does not tell {it}: fix {it}")
     said = ", ".join(f"{one} is known to {rounded(100 * one.standard_error)} %" for one in known)
     most = float(alone[group].max())
-    each = "is not" if most > MOST_ERROR else f"only to {rounded(100 * most)} %"
-    return Unseen(keys, known, f"{said}, each alone {each}: fix one{remedy}")
+    each = "is not" if most > MAX_RELATIVE_ERROR else f"only to {rounded(100 * most)} %"
+    return UnidentifiedGroup(keys, known, f"{said}, each alone {each}: fix one{remedy}")
 
 
-def _across(blind: Array) -> Iterator[Array]:
-    """Give independent combinations that are orthogonal to all directions, each with a 1 that the others lack.
-
-    blind: parts of m parameters in the directions that are not seen, shape (m, directions).
-    """
+def _complement(blind: Array) -> Iterator[Array]:
+    """Yield a basis of the orthogonal complement of `blind`, shape (m, directions), in reduced echelon form."""
     vectors, singular, _ = np.linalg.svd(blind)
-    rank = int(np.sum(singular > PART * singular[0]))
+    rank = int(np.sum(singular > MIN_GROUP_COMPONENT * singular[0]))
     rows = vectors[:, rank:].T.copy()
     # Reduced to echelon form from the parameters that are seen best on.
     order = list(np.argsort(np.linalg.norm(blind, axis=1), kind="stable"))

@@ -1,14 +1,12 @@
-"""From where the mass points are to what is seen of them, and back: the derivative of a loss by the mass points.
-
-Each point that was seen lies on the surface that is drawn, so it is a weighted mean of four mass points; between two
-frames it goes in a straight line; and the camera sees it. The first two are linear, and going back is their transpose;
-how pixels change with points is found by differences, whatever the camera is.
-
-What was seen of a tissue: where some of its points were at some times, and the forces of tools.
+"""Observations of a tissue: positions or pixels of points in time, and tool forces.
 
 An .npz file has `time` (T,) [s], `coordinates` (N, 2), across and down, and `position` (N, T, 3) [m] or `pixel`
-(N, T, 2) [px], NaN where not seen, and may have `sigma`, the standard deviation of each number's error. A
-trajectory.npz and a tracks.npz of a run are taken as they are.
+(N, T, 2) [px], NaN where not observed, and may have `sigma`, the standard deviation of each number's error.
+trajectory.npz and tracks.npz of a run are accepted.
+
+`ObservationModel` maps the mass points of a scene to such observations. An observed point lies on the drawn surface and
+is a weighted mean of four mass points; between two frames it moves in a straight line; the camera projects it. The
+first two maps are linear, with their transposes as adjoints; the derivative of the projection is a central difference.
 """
 
 from __future__ import annotations
@@ -21,66 +19,64 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import SceneError, as_array
+from taichi_msm.errors import SceneError, as_array, did_you_mean
 from taichi_msm.fitting.archive import NEEDS, read_archive, require_understood
 from taichi_msm.model.surface import surface_weights
 from taichi_msm.render.camera import view
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_MAGNITUDE, MIN_MAGNITUDE
 
-pass  # REMOVED
-
 Array = NDArray[np.float64]
 
-# By how much of the larger side of the sheet points are moved for a difference.
-DIFFERENCE = 1e-6
+# Step of finite differences of the projection, as a share of the larger side of the sheet.
+DIFFERENCE_SHARE = 1e-6
 
 
-class Sight:
-    """What is seen of a scene's mass points.
+class ObservationModel:
+    """Observation model of a scene: from mass points to observations, and the adjoint.
 
     Args:
-        scene: whose camera sees.
-        seen: which points, and when.
-        frames: how many are looked at, from the first one.
+        scene: the scene, with its camera.
+        observations: the observed points and times.
+        frames: number of frames, from the first one.
     """
 
-    def __init__(self, scene: Scene, seen: Observations, frames: int) -> None:
+    def __init__(self, scene: Scene, observations: Observations, frames: int) -> None:
         from scipy.sparse import csr_matrix
 
-        self._scene, self._observations = scene, seen
-        corners, weights = surface_weights(seen.coordinates, scene.sheet, scene.render.refine)
+        self._scene, self._observations = scene, observations
+        corners, weights = surface_weights(observations.coordinates, scene.sheet, scene.render.refine)
         number, (rows, cols) = np.arange(len(corners)), scene.sheet.points
         self._surface = csr_matrix((weights.ravel(), (number.repeat(4), corners.ravel())), (len(corners), rows * cols))
-        self._between = between(scene, seen.time, frames)
+        self._time_weights = time_weights(scene, observations.time, frames)
 
-    def on_sheet(self, position: Array) -> Array:
-        """Give where the points are [m], shape (N, 3), for positions of one frame, shape (rows, cols, 3)."""
+    def points_on_sheet(self, position: Array) -> Array:
+        """Interpolate positions of one frame, shape (rows, cols, 3), at the observed points [m], shape (N, 3)."""
         return np.asarray(self._surface @ position.reshape(-1, 3))
 
-    def at_times(self, at_frames: Array) -> Array:
-        """Give where points are at the times, shape (N, T, 3), by where they are at frames, shape (frames, N, 3)."""
-        at_times = self._between @ at_frames.reshape(len(at_frames), -1)
+    def interpolate(self, at_frames: Array) -> Array:
+        """Interpolate points at frames, shape (frames, N, 3), at the observed times, shape (N, T, 3)."""
+        at_times = self._time_weights @ at_frames.reshape(len(at_frames), -1)
         return np.asarray(at_times.reshape(-1, *at_frames.shape[1:]).swapaxes(0, 1))
 
     def motion(self, at_frames: Array) -> Array:
-        """Give the farthest that any of the points is from rest at each frame [m], by where they are there."""
+        """Return the largest displacement of the points at each frame [m], shape (frames,)."""
         return np.asarray(
-            np.linalg.norm(at_frames - places_at_rest(self._scene, self._observations), axis=2).max(axis=1)
+            np.linalg.norm(at_frames - positions_at_rest(self._scene, self._observations), axis=2).max(axis=1)
         )
 
     def points(self, position: Array) -> Array:
-        """Give where the points are [m], shape (N, T, 3), for positions of shape (frames, rows, cols, 3)."""
-        return self.at_times(np.array([self.on_sheet(frame) for frame in position]))
+        """Interpolate positions [m], shape (frames, rows, cols, 3), in space and time, shape (N, T, 3)."""
+        return self.interpolate(np.array([self.points_on_sheet(frame) for frame in position]))
 
-    def seen(self, points: Array) -> Array:
-        """Give what is seen of points, as in the observations, shape (N, T, 3 or 2); NaN: not seen by the camera."""
+    def observe(self, points: Array) -> Array:
+        """Return points [m], shape (N, T, 3), as observations, shape (N, T, 3 or 2); NaN behind the camera."""
         if self._observations.kind == "position":
             return points
-        return seen_by_camera(self._scene, points, self._observations.time)
+        return project_points(self._scene, points, self._observations.time)
 
     def backward(self, points: Array, slope: Array) -> Array:
-        """Turn the derivative of a loss by what is seen into that by the positions of every frame.
+        """Return the derivative of a loss by the positions of every frame.
 
         Args:
             points: that were seen [m], shape (N, T, 3).
@@ -90,37 +86,37 @@ class Sight:
             The derivative by the positions, shape (frames, rows, cols, 3).
         """
         if self._observations.kind == "pixel":
-            by = DIFFERENCE * max(self._scene.sheet.size) * np.eye(3)
-            changes = ((self.seen(points + one) - self.seen(points - one)) / (2 * one.sum()) for one in by)
+            by = DIFFERENCE_SHARE * max(self._scene.sheet.size) * np.eye(3)
+            changes = ((self.observe(points + one) - self.observe(points - one)) / (2 * one.sum()) for one in by)
             slope = np.stack([(slope * change).sum(axis=-1) for change in changes], axis=-1)
-        at_frames = self._between.T @ slope.swapaxes(0, 1).reshape(slope.shape[1], -1)
+        at_frames = self._time_weights.T @ slope.swapaxes(0, 1).reshape(slope.shape[1], -1)
         shape = *self._scene.sheet.points, 3
         return np.array([(self._surface.T @ frame.reshape(-1, 3)).reshape(shape) for frame in at_frames])
 
 
-def in_frames(scene: Scene, time: Array) -> Array:
-    """Count times in frames, without the rounding of their product."""
+def time_in_frames(scene: Scene, time: Array) -> Array:
+    """Return times as frame numbers, whole where they are within rounding of a frame."""
     return np.round(time * scene.time.frames_per_second, 6)
 
 
-def between(scene: Scene, time: Array, frames: int) -> Any:
-    """Give the shares of frames in what is seen at times, linear between them: a sparse matrix, shape (T, frames)."""
+def time_weights(scene: Scene, time: Array, frames: int) -> Any:
+    """Return the weights of linear interpolation between frames, a sparse matrix of shape (T, frames)."""
     from scipy.sparse import csr_matrix
 
-    place, row = in_frames(scene, time), np.arange(len(time))
+    place, row = time_in_frames(scene, time), np.arange(len(time))
     before = np.clip(np.floor(place), 0, frames - 2).astype(int)
     shares, frame = np.stack([1 - place + before, place - before]), np.stack([before, before + 1])
     return csr_matrix((shares.ravel(), (np.tile(row, 2), frame.ravel())), (len(time), frames))
 
 
-def places_at_rest(scene: Scene, seen: Observations) -> Array:
-    """Give where points are at rest [m], shape (N, 3)."""
+def positions_at_rest(scene: Scene, observations: Observations) -> Array:
+    """Return the rest positions of the observed points [m], shape (N, 3)."""
     height, width = scene.sheet.size
-    across, down = seen.coordinates.T
+    across, down = observations.coordinates.T
     return np.stack([(across - 0.5) * width, (0.5 - down) * height, np.zeros_like(across)], axis=1)
 
 
-def seen_by_camera(scene: Scene, points: Array, time: Array) -> Array:
+def project_points(scene: Scene, points: Array, time: Array) -> Array:
     """Find where the scene's main camera sees points [m], shape (N, T, 3), at T times [s].
 
     Returns pixels from the picture's upper left corner, shape (N, T, 2); NaN: behind the eye, or beyond the lens.
@@ -128,14 +124,13 @@ def seen_by_camera(scene: Scene, points: Array, time: Array) -> Array:
     return np.stack([view(scene, each).pixels(points[:, n]) for n, each in enumerate(time.tolist())], axis=1)
 
 
-def seen_at_rest(scene: Scene, seen: Observations) -> Array:
-    """Give what would be seen if the sheet stayed at rest, shape (N, T, 3 or 2)."""
-    rest = np.repeat(places_at_rest(scene, seen)[:, None], len(seen.time), axis=1)
-    return rest if seen.kind == "position" else seen_by_camera(scene, rest, seen.time)
+def observe_at_rest(scene: Scene, observations: Observations) -> Array:
+    """Return the observations of the sheet at rest, shape (N, T, 3 or 2)."""
+    rest = np.repeat(positions_at_rest(scene, observations)[:, None], len(observations.time), axis=1)
+    return rest if observations.kind == "position" else project_points(scene, rest, observations.time)
 
 
-# A trajectory is thinned out to so many points a side.
-MOST_A_SIDE = 64
+MAX_POINTS_PER_SIDE = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +146,7 @@ class Forces:
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Where points were at some times, with NaN where that is not known."""
+    """Positions or pixels of points in time, NaN where not observed."""
 
     name: str  # of the file, in messages
     kind: Literal["position", "pixel"]
@@ -163,56 +158,62 @@ class Observations:
 
     @property
     def unit(self) -> str:
-        """Of the values and of sigma."""
+        """Unit of the values and of sigma."""
         return "m" if self.kind == "position" else "px"
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """Which values are known, of the shape of the values."""
+        """Mask of the observed values, of their shape."""
         return np.isfinite(self.values)
 
     @property
     def there(self) -> NDArray[np.bool_]:
-        """Which points were seen at which times, shape (N, T)."""
+        """Mask of the observed points in time, shape (N, T)."""
         return self.known[..., 0]
 
 
 def read_observations(observed: str | Path | Mapping[str, Any], rate: float) -> Observations:
-    """Read what was seen from a file, or take it from a mapping of such arrays.
+    """Read observations from a file, or from a mapping of the same arrays.
 
-    rate: the scene's frames per second, which tell the times of a tracks.npz.
+    Args:
+        observed: the path of an .npz, or a mapping.
+        rate: the scene's frames per second, for the times of a tracks.npz.
 
-    Raises a SceneError when it cannot be used by itself, whatever the scene is.
+    Raises:
+        SceneError: when the arrays are missing, of other shapes, or not understood.
     """
     if isinstance(observed, Mapping):
         filled = {
             key: np.ma.filled(1.0 * value, np.nan) if np.ma.isMA(value) else value for key, value in observed.items()
         }
-        require_understood("observed", [str(key) for key in filled])
-        return _checked("observed", {str(key): as_array(value, str(key)) for key, value in filled.items()}, rate)
-    return _checked(str(observed), read_archive(str(observed)), rate)
+        require_understood("observed", names := [str(key) for key in filled])
+        arrays = {str(key): as_array(value, str(key)) for key, value in filled.items()}
+        return _checked("observed", arrays, names, rate)
+    return _checked(str(observed), *read_archive(str(observed)), rate)
 
 
-def with_sigma(seen: Observations, sigma: Any) -> Observations:
-    """Give the errors another standard deviation, unless that is None; SceneError: it is none."""
+def with_sigma(observations: Observations, sigma: Any) -> Observations:
+    """Return the observations with another sigma [m] or [px], unless it is None; SceneError: not a positive number."""
     if sigma is None:
-        return seen
+        return observations
     array = np.asarray(sigma)
     is_number = array.dtype.kind in "fiu" and array.size == 1
     if not (is_number and MIN_MAGNITUDE <= (value := float(array.ravel()[0])) <= MAX_MAGNITUDE):
         shown = f"{value:g}" if is_number else f"{array.dtype} of shape {array.shape}"
-        said = f"take one number above 0, the standard deviation of the errors [{seen.unit}], or leave it out"
-        raise SceneError([f"{seen.name}: sigma: {shown}; {said}"])
-    return replace(seen, sigma=value)
+        said = f"take one number above 0, the standard deviation of the errors [{observations.unit}], or leave it out"
+        raise SceneError([f"{observations.name}: sigma: {shown}; {said}"])
+    return replace(observations, sigma=value)
 
 
-def _checked(name: str, arrays: dict[str, NDArray[Any]], rate: float) -> Observations:
-    """Make observations of arrays; SceneError: they are none."""
-    found, arrays = ", ".join(arrays) or "nothing", _thinned(_hidden(name, arrays, rate))
+def _checked(name: str, arrays: dict[str, NDArray[Any]], names: list[str], rate: float) -> Observations:
+    """Build observations from arrays, of a file or mapping with these names; SceneError: they are not valid."""
+    arrays = _thinned(_hidden(name, arrays, rate))
     kinds = [kind for kind in ("position", "pixel") if kind in arrays]
     missing = [key for key in ("time", "coordinates") if key not in arrays]
     if missing := missing + ([] if kinds else ["position or pixel"]):
-        raise SceneError([f"{name}: {missing[0]}: missing; expected {NEEDS}, and it has {found}"])
+        found = ", ".join(map(ascii, names[:20])) or "nothing"
+        near = did_you_mean(missing[0].partition(" ")[0], names).replace("; did you mean", "; is it")
+        raise SceneError([f"{name}: {missing[0]}: missing; expected {NEEDS}, and it has {found}{near}"])
     if len(kinds) == 2:
         raise SceneError([f"{name}: has both position and pixel; leave one of them out"])
     kind: Literal["position", "pixel"] = "position" if kinds[0] == "position" else "pixel"
@@ -245,7 +246,7 @@ def _checked(name: str, arrays: dict[str, NDArray[Any]], rate: float) -> Observa
 
 
 def _hidden(name: str, arrays: dict[str, NDArray[Any]], rate: float) -> dict[str, NDArray[Any]]:
-    """Put NaN where `visible` or `occluded` says that a point was not seen; `points` of a tracks.npz become pixels."""
+    """Apply the masks `visible` and `occluded`, and rename the `points` of a tracks.npz to `pixel`."""
     arrays = dict(arrays)
     flags = {key: arrays.pop(key) for key in ("visible", "occluded") if key in arrays}
     key = next((key for key in ("points", "pixel", "position") if key in arrays), "points")
@@ -264,11 +265,12 @@ def _hidden(name: str, arrays: dict[str, NDArray[Any]], rate: float) -> dict[str
 
 
 def _thinned(arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Turn the arrays of a trajectory.npz into those of our own files."""
+    """Convert the arrays of a trajectory.npz, thinned to at most MAX_POINTS_PER_SIDE points a side."""
     position = arrays.get("position")
     if position is not None and position.ndim == 4 and min(position.shape[:3]) > 0 and "coordinates" not in arrays:
         rows, cols = (
-            np.unique(np.linspace(0, n - 1, min(n, MOST_A_SIDE)).round().astype(int)) for n in position.shape[1:3]
+            np.unique(np.linspace(0, n - 1, min(n, MAX_POINTS_PER_SIDE)).round().astype(int))
+            for n in position.shape[1:3]
         )
         down, across = np.meshgrid(
             rows / max(position.shape[1] - 1, 1), cols / max(position.shape[2] - 1, 1), indexing="ij"

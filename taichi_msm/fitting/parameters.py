@@ -1,10 +1,8 @@
-"""The numbers of a scene that are fitted: which may be, on which scale, and between which bounds.
+"""Parameters of a fit: their keys, scales and bounds, and the types of the arguments of `fit`.
 
-A number whose size alone is open, such as a stiffness or a force, is fitted as the logarithm of its magnitude, so that
-it keeps its sign, and all such numbers change by the same share. Others, and those that start at 0, are fitted as they
-are, in units of their range.
-
-The arguments of `fit`, and the types that they must be of.
+A number of unknown magnitude, such as a stiffness or a force, is fitted as the logarithm of its magnitude: its sign is
+fixed, and all such parameters change by the same share. Other numbers, and those that start at 0, are fitted linearly,
+in units of their range.
 """
 
 from __future__ import annotations
@@ -27,19 +25,19 @@ from taichi_msm.scene.scene import Scene
 
 Array = NDArray[np.float64]
 
-# Where a number must be to be free; in these there are choices, sizes of arrays, or what the tissue does not feel.
+# Sections with fittable numbers, and keys in them that are choices, array sizes or without effect on the tissue.
 SECTIONS = ("tissue", "springs", "damping", "sheet", "probes", "render.camera", "render.cameras")
-HELD = ("tolerance", "grip", "shaft", "points")
+FIXED_KEYS = ("tolerance", "grip", "shaft", "points")
 
-# Keys of places and times, and a tool's offset, which are fitted as they are; so is all of a camera but what follows.
-PLACES = ("at", "path", "offset", "load")
-FOCAL_LENGTHS = ("fx", "fy")
+# Keys of coordinates and times, which are fitted linearly, as are all numbers of a camera except focal lengths.
+COORDINATE_KEYS = ("at", "path", "offset", "load")
+FOCAL_LENGTH_KEYS = ("fx", "fy")
 
-# Keys of a camera whose range is 1: degrees, coefficients and directions.
-UNITS = ("fov", "distortion", "rotation", "up")
+# Camera keys with a range of 1: degrees, coefficients and directions.
+UNIT_RANGE_KEYS = ("fov", "distortion", "rotation", "up")
 
-# Without bounds, a number that is fitted in the log stays within a factor of 1000 from where it starts.
-WIDEST = math.log(1000)
+# Bound of the log of a parameter without bounds: a factor of 1000 from the start.
+MAX_LOG = math.log(1000)
 
 MAPS = ("map", "foundation_map")
 
@@ -47,13 +45,13 @@ Bounds = tuple[float, float]
 
 
 def rounded(number: float) -> str:
-    """Write a number that is known roughly, in two digits."""
+    """Format a number with two digits."""
     return f"{float(f'{number:.2g}'):g}"
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A number of the scene that is fitted, as x, which is 0 where it starts."""
+    """Fitted number of the scene, with the coordinate x, 0 at the start."""
 
     key: str  # its dotted path
     start: float
@@ -63,37 +61,37 @@ class Parameter:
 
     @property
     def path(self) -> Key:
-        """The way to it in the data of a scene."""
+        """Path in the data of a scene."""
         return parse_key(self.key)
 
     @property
     def is_log(self) -> bool:
-        """Whether it is fitted in the log of its magnitude."""
+        """Whether x is the logarithm of value / start."""
         return self.scale == 0
 
     def value(self, x: float) -> float:
-        """Give the value at x; infinite where it overflows."""
+        """Return the value at x; infinite on overflow."""
         if not self.is_log:
             return self.start + x * self.scale
         return self.start * (math.exp(x) if x < 700 else math.inf)
 
     @property
     def limits(self) -> Bounds:
-        """The bounds of x."""
+        """Bounds of x."""
         if not self.is_log:
             return (self.low - self.start) / self.scale, (self.high - self.start) / self.scale
         shares = sorted((self.low / self.start, self.high / self.start))
         return (
-            math.log(shares[0]) if shares[0] > 0 else -WIDEST,
-            math.log(shares[1]) if shares[1] < math.inf else WIDEST,
+            math.log(shares[0]) if shares[0] > 0 else -MAX_LOG,
+            math.log(shares[1]) if shares[1] < math.inf else MAX_LOG,
         )
 
     def error(self, x: float, deviation: float) -> float:
-        """Turn a standard deviation of x into that of the value."""
+        """Return the standard deviation of the value for that of x."""
         return deviation * (abs(self.value(x)) if self.is_log else self.scale)
 
     def share(self, x: float, deviation: float) -> float:
-        """Give a standard deviation of x as a share of the value; of a place, of its range."""
+        """Return a standard deviation of x as a share of the value, or of a coordinate's range."""
         if self.is_log:
             return deviation
         natural = self.scale if _is_place(self.path) else abs(self.value(x))
@@ -101,7 +99,7 @@ class Parameter:
 
 
 def make_parameters(scene: Scene, free: Sequence[str], bounds: Mapping[str, Bounds]) -> tuple[Parameter, ...]:
-    """Find the numbers that are to be fitted; SceneError: with all that cannot be."""
+    """Build the parameters of the keys in `free`, with their bounds; SceneError: lists all faults."""
     data, faults, parameters = as_data(scene), [], []
     if not free:
         faults.append("--free: names no key; take one or more, such as --free tissue.young")
@@ -127,7 +125,7 @@ def _parameter(scene: Scene, data: dict[str, Any], key: str, bounds: Bounds | No
         )
     value = _look_up(named, data, path)
     inside = any(key == section or key.startswith(f"{section}.") for section in SECTIONS)
-    if not inside or not isinstance(value, float) or any(part in HELD for part in path):
+    if not inside or not isinstance(value, float) or any(part in FIXED_KEYS for part in path):
         if isinstance(value, list):
             raise SceneError([f"{named}: a list; name one of its numbers by its index, such as {key}.0"])
         what = "a section" if isinstance(value, dict) else f"{value!r}"
@@ -151,7 +149,7 @@ def _parameter(scene: Scene, data: dict[str, Any], key: str, bounds: Bounds | No
 
 
 def _look_up(named: str, data: Any, path: Key) -> Any:
-    """Give the value of a key; SceneError: there is none."""
+    """Return the value of a key; SceneError: it does not exist."""
     for part in path or ("",):
         known = (
             list(data) if isinstance(data, dict) else [str(n) for n in range(len(data))] if type(data) is list else []
@@ -164,17 +162,17 @@ def _look_up(named: str, data: Any, path: Key) -> Any:
 
 
 def _is_place(path: Key) -> bool:
-    """Tell whether a number is a place, a time or a percent, which may pass through 0."""
-    return path[-1] not in FOCAL_LENGTHS if path[0] == "render" else any(part in PLACES for part in path)
+    """Return whether a number is a coordinate, a time or a percentage, which may change sign."""
+    return path[-1] not in FOCAL_LENGTH_KEYS if path[0] == "render" else any(part in COORDINATE_KEYS for part in path)
 
 
 def _natural(scene: Scene, path: Key) -> float:
-    """Give the range of a place that has no bounds."""
+    """Return the range of a coordinate without bounds."""
     time, last = scene.time.duration, path[-1]
     if path[0] == "render":
         if last in ("cx", "cy"):
             return float(scene.render.size[last == "cy"])
-        return 1.0 if any(part in UNITS for part in path[2:]) else max(scene.sheet.size)
+        return 1.0 if any(part in UNIT_RANGE_KEYS for part in path[2:]) else max(scene.sheet.size)
     if "offset" in path:
         return 1.0
     if "load" in path:
@@ -186,12 +184,12 @@ def _natural(scene: Scene, path: Key) -> float:
 
 
 def as_data(scene: Scene) -> dict[str, Any]:
-    """Give the keys of a scene, with its defaults, as plain data."""
+    """Return a scene as plain data, with defaults."""
     return scene.model_dump(mode="json", exclude_none=True)
 
 
 def with_values(data: dict[str, Any], parameters: Sequence[Parameter], values: Sequence[float]) -> dict[str, Any]:
-    """Put the values of parameters into the data of a scene."""
+    """Return the data of a scene with the values of parameters."""
     changed = deepcopy(data)
     for parameter, value in zip(parameters, values, strict=True):
         holder: Any = changed
@@ -203,7 +201,7 @@ def with_values(data: dict[str, Any], parameters: Sequence[Parameter], values: S
 
 
 class Method(TypedDict, total=False):
-    """How a fit is made, as `fit` says."""
+    """Options of `fit`."""
 
     sigma: float | None
     robust: bool
@@ -214,7 +212,7 @@ class Method(TypedDict, total=False):
 
 
 def require_types(observed: Any, free: Any, method: Mapping[str, Any], **others: Any) -> None:
-    """Make sure that all arguments are of the types that `fit` takes; ArgumentError: one is not."""
+    """Check the types of the arguments of `fit`; ArgumentError: names the first fault."""
     known = Method.__annotations__
     if unknown := sorted(set(method) - set(known)):
         raise ArgumentError(f"{unknown[0]}: unknown; take {', '.join(known)}{did_you_mean(unknown[0], known)}")
@@ -237,7 +235,7 @@ def _is_pair(value: Any, first: Callable[[Any], bool]) -> bool:
     return isinstance(value, Sequence) and len(value) == 2 and first(value[0]) and _is_number(value[1])
 
 
-# What each argument must be, and that in words.
+# Check and description of each argument.
 _TYPES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "observed": (
         lambda it: _is_path(it) or isinstance(it, Mapping),

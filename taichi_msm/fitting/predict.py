@@ -1,8 +1,6 @@
-"""What a scene with certain numbers lets one see: where the observed points are at the observed times, and the forces.
+"""Forward model of a fit: predicted observations and forces, in this process or in a pool of processes.
 
-All runs are in f64 on one compiled kernel.
-
-The runs of a fit: one after another in this process, or side by side in processes of their own.
+All runs are in f64 with one compiled kernel.
 """
 
 from __future__ import annotations
@@ -19,7 +17,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.accuracy.mesh import coarser_plan, estimate_mesh_error
 from taichi_msm.errors import DivergedError, ExecutorError, Pause, SceneError, StageProgressCallback
-from taichi_msm.fitting.observations import Observations, Sight, between, in_frames
+from taichi_msm.fitting.observations import ObservationModel, Observations, time_in_frames, time_weights
 from taichi_msm.fitting.parameters import Parameter, as_data, with_values
 from taichi_msm.load import cost
 from taichi_msm.load.check import check_scene
@@ -33,12 +31,12 @@ from taichi_msm.system.process import available_memory, available_threads
 
 Array = NDArray[np.float64]
 
-# By how much a parameter is changed for a difference.
-SMOOTH, ROUGH = 1e-5, 1e-2
+# Steps of finite differences, in units of x.
+SMALL_STEP, LARGE_STEP = 1e-5, 1e-2
 
 
-class Predicted(NamedTuple):
-    """What would be seen."""
+class Prediction(NamedTuple):
+    """Predicted observations and forces."""
 
     values: Array  # as in the observations, shape (N, T, 3 or 2); NaN: not seen by the camera
     forces: Array  # shape (rows, 3)
@@ -47,8 +45,8 @@ class Predicted(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Job:
-    """What is predicted; each process that is given it keeps its own kernel."""
+class FitProblem:
+    """Scene, parameters and observations of a fit; each worker process keeps a kernel for it."""
 
     token: str  # tells jobs apart
     scene: Scene  # of which only the parameters change
@@ -56,27 +54,31 @@ class Job:
     observations: Observations
 
 
-def runnable(scene: Scene) -> Scene:
-    """Give the scene that is run for a fit: in f64, and without anything that is drawn or written."""
+def without_outputs(scene: Scene) -> Scene:
+    """Return the scene in f64, without image and outputs."""
     time = scene.time.model_copy(update={"precision": "f64"})
     return scene.model_copy(update={"image": None, "region": None, "output": (), "time": time})
 
 
-class Predictor:
-    """A simulation that is restarted for every prediction.
+class ForwardModel:
+    """Simulation that is restarted for every prediction.
 
     Attributes:
         job: what it predicts.
     """
 
-    def __init__(self, job: Job, threads: int | None) -> None:
+    def __init__(self, job: FitProblem, threads: int | None) -> None:
         self.job, self._data = job, as_data(job.scene)
         plan = check_scene(job.scene)
         self._maps, self._threads = plan.maps, threads
         self._simulation: Simulation | None = None
-        seen = job.observations
-        times = seen.time if seen.forces is None else np.concatenate([seen.time, seen.forces.time])
-        self._frames = max(2, math.ceil(in_frames(job.scene, times).max()) + 1)
+        observations = job.observations
+        times = (
+            observations.time
+            if observations.forces is None
+            else np.concatenate([observations.time, observations.forces.time])
+        )
+        self._frames = max(2, math.ceil(time_in_frames(job.scene, times).max()) + 1)
 
     def predict(
         self,
@@ -86,19 +88,18 @@ class Predictor:
         coarse: int = 0,
         whole: bool = False,
         pause: Pause = lambda: None,
-    ) -> Predicted:
+    ) -> Prediction:
         """Run the scene with the parameters at x.
 
         Args:
             x: of every parameter.
-            steps: of a frame, as of a run that this one is compared with, if it needs no more; None: so many that
-                runs with neighbouring values can have them too.
-            coarse: how many times to halve the cells a side; a SceneError where `mesh.coarser_plan` gives None.
-            whole: go on to the last frame, even if nothing was seen there.
-            pause: called some times a second; what it raises stops it.
+            steps: steps per frame, at least; None: enough for runs with neighbouring values.
+            coarse: number of halvings of the cells per side.
+            whole: whether to run to the last frame, also beyond the last observation.
+            pause: called several times a second; its exceptions end the run.
 
         Raises:
-            SceneError: when the values make no valid scene.
+            SceneError: when the scene with these values is not valid, or too coarse.
             DivergedError: when the run diverges.
         """
         plan = self.plan(x)
@@ -107,7 +108,7 @@ class Predictor:
                 raise SceneError(["sheet.points: too few to take half of them"])
             plan = half
         if plan.scene.time.step == "auto" and not plan.scene.time.at_rest:
-            plan = plan.with_grid(steps_per_frame=max(steps or _with_margin(plan), plan.grid.steps_per_frame))
+            plan = plan.with_grid(steps_per_frame=max(steps or _steps_with_margin(plan), plan.grid.steps_per_frame))
         if self._simulation is None:
             self._simulation = Simulation(plan, threads=self._threads)
         else:
@@ -115,12 +116,12 @@ class Predictor:
         return self._run(self._simulation, plan, whole, pause)
 
     def compile(self, x: Array, pause: Pause = lambda: None) -> None:
-        """Compile now what the first run would compile; raises a SceneError as `predict` does."""
+        """Compile the kernels for a run with the parameters at x; raises a SceneError as `predict` does."""
         self._simulation = Simulation(self.plan(x), threads=self._threads)
         self._simulation.compile(pause)
 
-    def attempt(self, x: Array, steps: int | None = None, **how: Any) -> Predicted | None:
-        """Predict; None where the values give no run, or a point that was seen would be behind the eye."""
+    def try_predict(self, x: Array, steps: int | None = None, **how: Any) -> Prediction | None:
+        """Predict; None if the scene is not valid, diverges, or has an observed point behind the camera."""
         try:
             predicted = self.predict(x, steps, **how)
         except (SceneError, DivergedError):
@@ -128,76 +129,77 @@ class Predictor:
         return predicted if np.isfinite(predicted.values[self.job.observations.known]).all() else None
 
     def plan(self, x: Array) -> Plan:
-        """Plan the scene with the parameters at x; SceneError: it is not valid."""
+        """Return the plan of the scene with the parameters at x; SceneError: it is not valid."""
         values = [one.value(each) for one, each in zip(self.job.parameters, x.tolist(), strict=True)]
         if not np.isfinite(values).all():
             raise SceneError(["the values are out of range"])
         data = with_values(self._data, self.job.parameters, values)
         return check_scene(Scene(**data), self._maps)
 
-    def _run(self, simulation: Simulation, plan: Plan, whole: bool, pause: Pause) -> Predicted:
-        seen, scene = self.job.observations, plan.scene
-        # A coarse run has other points than the others.
-        sight, points, forces = Sight(scene, seen, self._frames), [], []
+    def _run(self, simulation: Simulation, plan: Plan, whole: bool, pause: Pause) -> Prediction:
+        observations, scene = self.job.observations, plan.scene
+        # A coarse run has another mesh.
+        sight, points, forces = ObservationModel(scene, observations, self._frames), [], []
         for frame in range(max(self._frames, plan.grid.frames + 1) if whole else self._frames):
             simulation.advance(min(frame, 1), pause)
-            points.append(sight.on_sheet(simulation.positions()))
-            if seen.forces is not None:
+            points.append(sight.points_on_sheet(simulation.positions()))
+            if observations.forces is not None:
                 forces.append([one.force for one in simulation.forces()])
-        values, felt = sight.seen(sight.at_times(np.array(points[: self._frames]))), np.empty((0, 3))
-        if seen.forces is not None:
-            rows, shares = len(seen.forces.time), between(scene, seen.forces.time, self._frames)
+        values, felt = sight.observe(sight.interpolate(np.array(points[: self._frames]))), np.empty((0, 3))
+        if observations.forces is not None:
+            rows, shares = len(observations.forces.time), time_weights(scene, observations.forces.time, self._frames)
             every = shares @ np.array(forces[: self._frames]).reshape(self._frames, -1)
-            felt = every.reshape(rows, -1, 3)[np.arange(rows), seen.forces.probe]
-        return Predicted(values, felt, plan.grid.steps_per_frame, sight.motion(np.array(points)))
+            felt = every.reshape(rows, -1, 3)[np.arange(rows), observations.forces.probe]
+        return Prediction(values, felt, plan.grid.steps_per_frame, sight.motion(np.array(points)))
 
     def close(self) -> None:
-        """Free the memory."""
+        """Release the simulation."""
         if self._simulation is not None:
             self._simulation.close()
 
 
-def difference(scene: Scene) -> float:
-    """Give by how much a parameter is changed for a difference, in units of x.
+def difference_step(scene: Scene) -> float:
+    """Return the step of finite differences, in units of x.
 
-    At rest the shape is known to about 1e-6, and with contact it changes in small jumps.
+    Equilibria are solved to about 1e-6, and contact changes in small jumps: both need the larger step.
     """
-    return ROUGH if scene.time.at_rest or any(probe.moved for probe in scene.probes) else SMOOTH
+    return LARGE_STEP if scene.time.at_rest or any(probe.moved for probe in scene.probes) else SMALL_STEP
 
 
-def _with_margin(plan: Plan) -> int:
-    """Count the steps of a frame for this scene and for those with slightly other values."""
+def _steps_with_margin(plan: Plan) -> int:
+    """Return the steps per frame for a plan and its neighbours in parameter space."""
     frame = 1 / plan.grid.frames_per_second
-    return math.ceil(2 * frame / plan.stable_step * (1 + difference(plan.scene)))
+    return math.ceil(2 * frame / plan.stable_step * (1 + difference_step(plan.scene)))
 
 
-# The predictor of the job that this process was given last.
-_kept: dict[str, Predictor] = {}
+# The forward model of the last fit in this process.
+_kept: dict[str, ForwardModel] = {}
 
 
-def predict(job: Job, x: Array, steps: int | None) -> Predicted | None:
-    """Predict in a process of its own, on one thread; None where the values give no run."""
+def predict(job: FitProblem, x: Array, steps: int | None) -> Prediction | None:
+    """Predict in a worker process, on one thread; None as `ForwardModel.try_predict`."""
     if job.token not in _kept:
         for other in _kept.values():
             other.close()
         _kept.clear()
-        _kept[job.token] = Predictor(job, threads=1)
-    return _kept[job.token].attempt(x, steps)
+        _kept[job.token] = ForwardModel(job, threads=1)
+    return _kept[job.token].try_predict(x, steps)
 
 
-pass  # REMOVED
-
-# Processes are started where so many runs for each parameter take longer than this [s]; to start them takes a few.
-RUNS_EACH, WORTHWHILE = 8, 8.0
-
-# How long until the progress is told again while processes work [s].
-PATIENCE = 0.1
+# A pool is started if this number of runs for each parameter takes longer than MIN_PARALLEL_S; its start takes seconds.
+RUNS_PER_PARAMETER, MIN_PARALLEL_S = 8, 8.0
+PROGRESS_INTERVAL_S = 0.1
 
 
-def points_error(plan: Plan, pause: Pause) -> float | None:
-    """Estimate the error that the number of points makes, as a fraction of the largest displacement.
+def estimate_mesh_error(plan: Plan, pause: Pause) -> float | None:
+    """Estimate the mesh error, as a fraction of the largest displacement.
 
-    None: no tissue, too few points to tell, or no run with fewer points.
+    Args:
+        plan: of the scene.
+        pause: called several times a second; its exceptions end the runs.
+
+    Returns:
+        The error; None without tissue, with too few mass points, or if a coarser run fails.
     """
     if coarser_plan(plan) is None:
         return None
@@ -209,47 +211,47 @@ def points_error(plan: Plan, pause: Pause) -> float | None:
 
 
 class Runs:
-    """Predicts, and counts the runs. Usable in a with statement, which ends the processes.
+    """Predictions of a fit, counted, in this process or in a pool. A context manager, which ends the pool.
 
     Args:
-        job: what is predicted.
-        workers: how many processes take runs side by side; 1: none; None: chosen by how long the first run takes.
-        progress: called often, with the stage, the runs done and those that are expected; what it raises stops.
+        job: the fit.
+        workers: number of worker processes; 1: none; None: by the duration of the first run.
+        progress: called often, with the stage, the runs done and expected; its exceptions end the fit.
     """
 
-    def __init__(self, job: Job, workers: int | None, progress: StageProgressCallback) -> None:
+    def __init__(self, job: FitProblem, workers: int | None, progress: StageProgressCallback) -> None:
         self.job, self.count, self.expected = job, 0, 0
         self._workers, self._progress = workers, progress
-        self._predictor = Predictor(job, threads=None)
+        self._predictor = ForwardModel(job, threads=None)
         self._pool: Pool | None = None
         self._seconds = 0.0
 
-    def first(self, x: Array) -> Predicted:
-        """Run the scene to its end; raises as `Predictor.predict` does."""
+    def first(self, x: Array) -> Prediction:
+        """Predict to the last frame; raises as `ForwardModel.predict` does."""
         self._predictor.compile(x, self._tell)
         begun = time.perf_counter()
         predicted = self._predictor.predict(x, whole=True, pause=self._tell)
         self._seconds, self.count = time.perf_counter() - begun, self.count + 1
         return predicted
 
-    def coarse(self, x: Array, halvings: int) -> Predicted | None:
-        """Predict with half the cells a side, or half of those; None where that gives no run."""
+    def predict_coarse(self, x: Array, halvings: int) -> Prediction | None:
+        """Predict with the cells per side halved `halvings` times; None if that fails."""
         self.count += 1
-        return self._predictor.attempt(x, coarse=halvings, pause=self._tell)
+        return self._predictor.try_predict(x, coarse=halvings, pause=self._tell)
 
     def mesh_error(self, x: Array) -> float | None:
-        """Estimate the error that the number of points makes, as `points_error`."""
-        return points_error(self._predictor.plan(x), self._tell)
+        """Estimate the mesh error at x, as `estimate_mesh_error`."""
+        return estimate_mesh_error(self._predictor.plan(x), self._tell)
 
-    def one(self, x: Array, steps: int | None = None) -> Predicted | None:
-        """Predict; None where the parameters give no run."""
+    def one(self, x: Array, steps: int | None = None) -> Prediction | None:
+        """Predict at x; None if that fails."""
         self._tell()
-        predicted = self._predictor.attempt(x, steps, pause=self._tell)
+        predicted = self._predictor.try_predict(x, steps, pause=self._tell)
         self.count += 1
         return predicted
 
-    def several(self, places: Sequence[Array], steps: int | None = None) -> list[Predicted | None]:
-        """Predict at several x, side by side where that pays."""
+    def predict_many(self, places: Sequence[Array], steps: int | None = None) -> list[Prediction | None]:
+        """Predict at several x, in parallel if that is faster."""
         if self._pool is None and (workers := self._choose()) > 1:
             self._pool = Pool(workers)
         if self._pool is None or len(places) < 2:
@@ -260,17 +262,17 @@ class Runs:
         if self._workers is not None:
             return self._workers
         parameters = len(self.job.parameters)
-        if RUNS_EACH * parameters * self._seconds < WORTHWHILE:
+        if RUNS_PER_PARAMETER * parameters * self._seconds < MIN_PARALLEL_S:
             return 1
         needed = PROCESS_BYTES + cost.estimate_budget(check_scene(self.job.scene)).memory_bytes
         return max(1, min(available_threads(), available_memory() // needed, 2 * parameters))
 
-    def _side_by_side(self, pool: Pool, places: Sequence[Array], steps: int | None) -> list[Predicted | None]:
+    def _side_by_side(self, pool: Pool, places: Sequence[Array], steps: int | None) -> list[Prediction | None]:
         futures: list[Future[Any]] = [pool.submit(predict, self.job, x, steps) for x in places]
         waiting = set(futures)
         while waiting:
             self._tell()
-            done, waiting = wait(waiting, PATIENCE)
+            done, waiting = wait(waiting, PROGRESS_INTERVAL_S)
             self.count += len(done)
         try:
             return [future.result() for future in futures]

@@ -1,39 +1,21 @@
-"""The files of a fit: fit.json, the scene with what was found, copies of its pictures, and a picture of the fit.
-
-A fit as a picture: what was seen against what was fitted, what is left on the sheet, and how well each is known.
-
-A fitted map as panels: the stiffness, how well it is known, and how its smoothness was chosen.
-"""
+"""Files of a fit: fit.json, scene.yaml, copies of its pictures, fit.png, and the pictures of a map."""
 
 from __future__ import annotations
 
 import json
-import math
 import shutil
-import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import yaml
-from matplotlib import style
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import LogNorm, Normalize
-from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
-from matplotlib.patches import Rectangle
-from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, ScalarFormatter
 from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm.errors import printable
 from taichi_msm.fitting.result import FitResult, FittedMap, sixteen_bits
-from taichi_msm.fitting.tikhonov import Choice
-from taichi_msm.plot_style import BLUE, DPI, GREY, ORANGE, SILVER, STYLE, TWO_COLUMN_WIDTH, VERMILION
 from taichi_msm.runs.directory import IsListed, Publication, PublicationSpec, create_file, list_files, write_new_file
-from taichi_msm.scene.sheet import Sheet
 from taichi_msm.system.compiler import versions
 
 RECORD, SCENE, PLOT, PICTURES = "fit.json", "scene.yaml", "fit.png", "pictures"
@@ -42,7 +24,6 @@ MAP, ERRORS = FittedMap.FILE, "map-error.png"
 
 PATTERNS = (r"fit\.json", r"scene\.yaml", r"fit\.png", r"map\.png", r"map-error\.png", rf"{PICTURES}/.+")
 
-# What fit.png needs, and is left out without.
 NO_PLOT = 'fit.png is left out, as matplotlib is not installed; pip install "taichi-msm[report]"'
 
 
@@ -64,7 +45,7 @@ def write_report(result: FitResult, published: Publication) -> None:
         # White: unknown, or not even known to 100 %.
         _write(sixteen_bits(np.nan_to_num(result.map.errors, nan=1.0).clip(0, 1)), folder / ERRORS)
     try:
-        pass  # REMOVED
+        from taichi_msm.fitting.plots import plot
     except ImportError:
         result.notes.append(NO_PLOT)
     else:
@@ -106,182 +87,3 @@ def _scene_text(result: FitResult, folder: Path) -> str:
     text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)
     found = ", ".join(f"{key} {one.value:.6g}" for key, one in result.parameters.items()) or f"tissue.map, {MAP}"
     return f"# Fitted to {printable(result.observations.name)}: {printable(found)}; more in {RECORD}.\n{text}"
-
-
-pass  # REMOVED
-
-# Columns of panels, the height of one [in], and how many points are drawn in time and how many dots.
-COLUMNS, HEIGHT, FEW, MOST_DOTS = 3, 2.7, 3, 20000
-
-
-def plot(result: FitResult, file: BinaryIO) -> None:
-    """Draw a fit as a PNG."""
-    with style.context(STYLE, after_reset=True), warnings.catch_warnings():
-        # A name may contain characters that the font lacks; a point that was never seen has no mean.
-        warnings.filterwarnings("ignore", "Glyph .* missing")
-        warnings.filterwarnings("ignore", "Mean of empty slice")
-        # Without the version of Matplotlib.
-        _figure(result).savefig(file, format="png", metadata={"Software": None})
-
-
-def _figure(result: FitResult) -> Figure:
-    forces = result.observations.forces is not None
-    points, times = result.observations.there.any(axis=1).sum(), result.observations.there.any(axis=0).sum()
-    # One time has no motion, and one point no place where more is left than elsewhere.
-    drawn = [
-        draw for draw, some in ((_plot_motion, times > 1), (_plot_match, times > 1), (_plot_left, points > 1)) if some
-    ]
-    drawn += [_plot_forces] if forces else []
-    count = len(drawn) + len(result.parameters) + 3 * (result.map is not None)
-    rows = math.ceil(count / COLUMNS)
-    engine = ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1)
-    figure = Figure(figsize=(TWO_COLUMN_WIDTH, HEIGHT * rows + 0.5), dpi=DPI, layout=engine)
-    FigureCanvasAgg(figure)
-    figure.suptitle(f"Fit to {printable(result.observations.name)}", x=0.01, ha="left", parse_math=False)
-    panels = list(figure.subplots(rows, COLUMNS, squeeze=False).ravel())
-    if result.map is not None:
-        plot_map(panels[:COLUMNS], result.map, result.scene.sheet)
-        panels, count = panels[COLUMNS:], count - COLUMNS
-    for axes, draw in zip(panels, drawn, strict=False):
-        draw(axes, result)
-    for axes, key in zip(panels[len(drawn) :], result.parameters, strict=False):
-        _plot_parameter(axes, result, key)
-    for axes in panels[count:]:
-        axes.set_axis_off()
-    return figure
-
-
-def _unit(result: FitResult) -> tuple[float, str]:
-    return (1000.0, "mm") if result.unit == "m" else (1.0, "px")
-
-
-def _plot_motion(axes: Axes, result: FitResult) -> None:
-    """Draw how the points that move most go in time, along the direction in which they move most."""
-    seen, (scale, unit) = result.observations, _unit(result)
-    order, centre = np.argsort(seen.time), np.nanmean(result.fitted, axis=1, keepdims=True)
-    motion = np.nan_to_num(result.fitted - centre)
-    for number, n in enumerate(np.argsort(-np.linalg.norm(motion, axis=(1, 2)))[:FEW]):
-        along = np.linalg.svd(motion[n], full_matrices=False).Vh[0]
-        along = along if along[np.argmax(np.abs(along))] > 0 else -along
-        fitted, points = (scale * (values[n] - centre[n]) @ along for values in (result.fitted, seen.values))
-        axes.plot(seen.time[order], fitted[order], color=BLUE, label="fitted" if number == 0 else None)
-        label = "seen" if number == 0 else None
-        axes.plot(seen.time, points, ".", color=VERMILION, markersize=3, label=label)
-    axes.set(title="The points that move most", xlabel="time [s]", ylabel=f"place along the motion [{unit}]")
-    axes.legend()
-
-
-def _plot_match(axes: Axes, result: FitResult) -> None:
-    """Draw every number that was seen against the fitted one, both from their means."""
-    seen, (scale, unit) = result.observations, _unit(result)
-    middle = np.nanmean(result.fitted, axis=1, keepdims=True)
-    one, other = (scale * (values - middle)[seen.known] for values in (result.fitted, seen.values))
-    thinned = slice(None, None, math.ceil(len(one) / MOST_DOTS) or 1)
-    axes.scatter(one[thinned], other[thinned], 2, color=BLUE, alpha=0.4, linewidths=0)
-    if len(one):
-        ends = [float(one.min()), float(one.max())]
-        axes.plot(ends, ends, color=GREY, linewidth=0.8)
-    axes.set(title="Seen against fitted", xlabel=f"fitted, from the mean [{unit}]", ylabel=f"seen [{unit}]")
-
-
-def _plot_left(axes: Axes, result: FitResult) -> None:
-    """Draw what is left at every point, on the sheet."""
-    seen, (scale, unit) = result.observations, _unit(result)
-    left = scale * np.sqrt(np.nanmean(np.where(seen.known, result.fitted - seen.values, np.nan) ** 2, axis=(1, 2)))
-    across, down = seen.coordinates.T
-    dots = axes.scatter(across, down, 14, c=left, cmap="viridis", vmin=0)
-    height, width = result.scene.sheet.size
-    axes.set(title="What is left", xlim=(0, 1), ylim=(1, 0), xlabel="across", ylabel="down", aspect=height / width)
-    assert isinstance(axes.figure, Figure)
-    axes.figure.colorbar(dots, ax=axes, label=f"root mean square [{unit}]", shrink=0.8)
-
-
-def _plot_forces(axes: Axes, result: FitResult) -> None:
-    """Draw every tool's force in time."""
-    seen = result.observations.forces
-    assert seen is not None
-    for probe in np.unique(seen.probe):
-        rows = np.flatnonzero(seen.probe == probe)
-        rows = rows[np.argsort(seen.time[rows])]
-        label = len(axes.lines) == 0
-        for component in np.flatnonzero(np.isfinite(seen.force[rows]).any(axis=0)):
-            fitted, points = (force[rows, component] for force in (result.fitted_forces, seen.force))
-            axes.plot(seen.time[rows], fitted, color=BLUE, label="fitted" if label else None)
-            axes.plot(seen.time[rows], points, ".", color=VERMILION, markersize=3, label="seen" if label else None)
-            largest = np.argmax(np.abs(fitted))
-            if abs(fitted[largest]) > 0.1 * np.abs(result.fitted_forces).max():
-                axes.text(seen.time[rows[largest]], fitted[largest], f"  {'xyz'[component]}")
-            label = False
-    axes.set(title="Forces on the sheet", xlabel="time [s]", ylabel="force [N]")
-    axes.legend()
-
-
-def _plot_parameter(axes: Axes, result: FitResult, key: str) -> None:
-    """Draw how the misfit rises on both sides of a value, and its interval."""
-    one, places = result.parameters[key], result.curves[key]
-    axes.plot([place.x for place in places], [place.deviations**2 for place in places], ".-", color=BLUE)
-    ends = [end for end in one.interval if end is not None]
-    axes.axvline(one.value, color=GREY, linewidth=0.8)
-    for end in ends:
-        axes.axvline(end, color=ORANGE, linewidth=0.8, linestyle=(0, (4, 2)))
-    axes.set_xlim(min(place.x for place in places), max(place.x for place in places))
-    axes.set_ylim(0, 9)
-    axes.xaxis.set_major_locator(MaxNLocator(4))
-    axes.set_title(printable(key), parse_math=False)
-    axes.set(xlabel="value; dashed: 95 %", ylabel="rise of chi-square")
-
-
-Array = NDArray[np.float64]
-
-# The colours of stiffness and of errors are spread over so much at least.
-LEAST_SPREAD = 1.05
-
-
-def plot_map(panels: Sequence[Axes], found: FittedMap, sheet: Sheet) -> None:
-    """Draw a map on three panels."""
-    low, high = found.range
-    spread = max(high / low, LEAST_SPREAD)
-    middle = np.sqrt(low * high)
-    norm = LogNorm(middle / np.sqrt(spread), middle * np.sqrt(spread))
-    _plot_fields(panels[0], found, found.factors, sheet, norm, ("Stiffness", "factor of young", "viridis"))
-    errors = 100 * found.errors
-    top = float(np.nanmax(errors)) if not found.unknown.all() else 100.0
-    _plot_fields(panels[1], found, errors, sheet, Normalize(0, top), ("How well it is known", "error [%]", "cividis"))
-    _plot_choice(panels[2], found.choice)
-
-
-def _plot_fields(
-    axes: Axes, found: FittedMap, values: Array, sheet: Sheet, norm: Normalize, words: tuple[str, str, str]
-) -> None:
-    """Draw a number of every field where it is on the sheet, and hatch the unknown ones."""
-    title, label, colours = words
-    image = axes.imshow(
-        np.where(found.unknown, np.nan, values), colours, norm=norm, extent=(0, 1, 1, 0), interpolation="nearest"
-    )
-    side = 1 / len(values)
-    for row, col in np.argwhere(found.unknown) * side:
-        axes.add_patch(Rectangle((col, row), side, side, facecolor="none", edgecolor=SILVER, hatch="////", linewidth=0))
-    height, width = sheet.size
-    across = "across; hatched: unknown" if found.unknown.any() else "across"
-    axes.set(title=title, xlabel=across, ylabel="down", aspect=height / width)
-    axes.grid(visible=False)
-    assert isinstance(axes.figure, Figure)
-    bar = axes.figure.colorbar(image, ax=axes, label=label, shrink=0.8)
-    if isinstance(norm, LogNorm):
-        bar.ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 1.5, 2.0, 3.0, 5.0, 7.0)))
-        bar.ax.yaxis.set_major_formatter(ScalarFormatter())
-        bar.ax.yaxis.set_minor_formatter(NullFormatter())
-    else:
-        bar.locator = MaxNLocator(5)
-        bar.update_ticks()
-
-
-def _plot_choice(axes: Axes, choice: Choice) -> None:
-    """Draw what is left above the least, and what is expected, against the weight of the smoothness."""
-    axes.plot(choice.weights, choice.left, color=BLUE, label="left above the least")
-    axes.plot(choice.weights, choice.expected, color=GREY, linestyle=(0, (4, 2)), label="expected")
-    taken = np.abs(np.log(choice.weights / choice.weight)).argmin()
-    axes.plot(choice.weights[taken], choice.left[taken], "o", color=VERMILION, label="taken")
-    axes.set(title="How smooth it is", xlabel="weight of the smoothness", ylabel="chi-square")
-    axes.set(xscale="log", yscale="log")
-    axes.legend(loc="upper left")

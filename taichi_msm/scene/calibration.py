@@ -126,9 +126,12 @@ def read_calibration(path: str) -> Calibration:
         fault = "has a camera matrix, and no distortion that is known"
         remedy = "write distortion_coefficients, [0, 0, 0, 0] where there is none"
         raise CameraFileError(f"{path}: {fault}; found {keys.names}; {remedy}")
-    if len(values) not in ((4,) if fisheye else COEFFICIENT_COUNTS) or any(values[SUPPORTED_COEFFICIENTS:]):
-        expected = "4 of a fisheye" if fisheye else "k1, k2, p1, p2, k3, k4, k5, k6, and 0 after them"
-        raise CameraFileError(f"{path}: {len(values)} distortion coefficients that are not known; expected {expected}")
+    if len(values) not in ((4,) if fisheye else COEFFICIENT_COUNTS):
+        expected = "4 of a fisheye: k1, k2, k3, k4" if fisheye else "4, 5, 8, 12 or 14: k1, k2, p1, p2, k3, ..."
+        raise CameraFileError(f"{path}: {len(values)} distortion coefficients; expected {expected}")
+    if any(values[KNOWN:]):
+        said = f"distortion coefficient {1 + next(n for n in range(KNOWN, len(values)) if values[n])} is not 0"
+        raise CameraFileError(f"{path}: {said}; thin prisms and tilted sensors are not modelled, calibrate without")
     keys.check_no_unread_keys()
     coefficients = tuple(values[:SUPPORTED_COEFFICIENTS])
     return Calibration((matrix[0], matrix[4]), (matrix[2], matrix[5]), fisheye, coefficients, size)
@@ -165,7 +168,8 @@ def _size(keys: _Keys) -> tuple[int, int] | None:
     """Return the width and height of the pictures [px], or None if the file does not contain them."""
     width, height, both = (keys.numbers(spelling) for spelling in (WIDTH, HEIGHT, SIZE))
     if bool(width) != bool(height):
-        raise CameraFileError(f"{keys.path}: has only one of image_width and image_height; write both")
+        said = f"has only one of image_width and image_height; found {keys.found}; write both"
+        raise CameraFileError(f"{keys.path}: {said}")
     sizes = [width + height] if width and height else []
     sizes += [both] if both else []
     if any(len(size) != 2 or size != sizes[0] for size in sizes):
@@ -554,10 +558,16 @@ def _numbers(path: str, name: str, value: Any) -> list[float]:
         numbers = [math.nan if isinstance(item, bool) else float(item) for item in _flat(value)]
     except (TypeError, ValueError, OverflowError):
         numbers = [math.nan]
+    if isinstance(value, dict) and "data" not in value:
+        raise CameraFileError(f"{path}: {name}: has {_listed(value)}; expected a matrix with rows, cols and data")
     # The comparison is false for NaN.
     if not all(abs(number) <= MAX_NUMBER for number in numbers):
         fault = f"{truncate(str(value))} is not a list of numbers up to {MAX_NUMBER:g}"
         raise CameraFileError(f"{path}: {name}: {fault}; write it as OpenCV does")
+    rows, cols = (value.get(side) if isinstance(value, dict) else None for side in ("rows", "cols"))
+    if isinstance(rows, int) and isinstance(cols, int) and rows * cols != len(numbers):
+        said = f"has {len(numbers)} numbers, and {rows} rows of {cols}; write what belongs there"
+        raise CameraFileError(f"{path}: {name}: {said}")
     return numbers
 
 

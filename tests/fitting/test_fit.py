@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from taichi_msm import ArgumentError, SceneError, Simulation, fit, load_scene, run
-from taichi_msm.fitting.checks import MOVES, faults, moved
+from taichi_msm.fitting.checks import MIN_MOTION_SIGMAS, faults, largest_motion
 from taichi_msm.fitting.force_table import read_forces
-from taichi_msm.fitting.least_squares import Alike
-from taichi_msm.fitting.observations import Observations, read_observations, seen_by_camera
+from taichi_msm.fitting.least_squares import ErrorCorrelation
+from taichi_msm.fitting.observations import Observations, project_points, read_observations
 from taichi_msm.fitting.parameters import Method, make_parameters
-from taichi_msm.fitting.predict import Job, Predicted, Predictor, Runs, runnable
+from taichi_msm.fitting.predict import FitProblem, ForwardModel, Prediction, Runs, without_outputs
 from taichi_msm.fitting.rejection import by_pattern
 from taichi_msm.fitting.result import FitResult
 from taichi_msm.model.surface import surface_point, surface_positions, surface_weights
@@ -62,7 +62,7 @@ def one_device(device: Device) -> Iterator[None]:
     """A fit takes every core, and a process has one device."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(process, "available_threads", lambda: device.threads)
-        patch.setattr("taichi_msm.system.runtime.resources.available_threads", lambda: device.threads)
+        patch.setattr("taichi_msm.system.runtime.process_module.available_threads", lambda: device.threads)
         yield
 
 
@@ -126,7 +126,7 @@ def test_a_camera_that_moves_and_bends_lines_sees_what_is_predicted(motion: Arra
     with Simulation(made, threads=device.threads) as simulation:
         pixels = [simulation.locate(PLACES, positions=motion[n], time=n / 25).pixels for n in range(11)]
     points = np.stack([surface_positions(each, made.render.refine, PLACES) for each in motion], axis=1)
-    seen = seen_by_camera(made, points, np.arange(11) / 25)
+    seen = project_points(made, points, np.arange(11) / 25)
     np.testing.assert_allclose(seen, np.stack(pixels, axis=1), atol=1e-4)
 
 
@@ -403,7 +403,7 @@ def test_a_third_mesh_tells_the_order_of_the_mesh_error(
     tracks: dict[str, Array], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def told(order: int) -> float:
-        def coarse(runs: Runs, x: Array, halvings: int) -> Predicted:
+        def coarse(runs: Runs, x: Array, halvings: int) -> Prediction:
             fine = runs.one(x)
             assert fine is not None
             off = 1e-3 * (2 ** (order * halvings) - 1)
@@ -539,7 +539,7 @@ def test_motion_of_many_tracks_is_seen_though_it_is_smaller_than_their_errors(tr
     for moving in (True, False):
         pixel = tracks["pixel"][:, :1] + moving * motion + noise
         seen = read_observations({**tracks, "pixel": pixel, "sigma": 1.0}, 25)
-        assert moved(seen, changed()) < MOVES
+        assert largest_motion(seen, changed()) < MIN_MOTION_SIGMAS
         assert bool(list(faults(seen, changed(), 1))) != moving
 
 
@@ -547,12 +547,12 @@ def test_values_that_make_no_scene_give_no_run(device: Device, tracks: dict[str,
     scene = changed(tissue__damping=0)
     free = ["tissue.damping", "tissue.young"]
     parameters = make_parameters(scene, free, {"tissue.damping": (-100, 100)})
-    job = Job("token", runnable(scene), parameters, read_observations(tracks, 25))
-    predictor = Predictor(job, device.threads)
+    job = FitProblem("token", without_outputs(scene), parameters, read_observations(tracks, 25))
+    predictor = ForwardModel(job, device.threads)
     # Less than no damping; springs without length, as a tenth of young does not bear the pretension.
-    assert predictor.attempt(np.array([-0.1, 0.0])) is None
-    assert predictor.attempt(np.array([0.0, -np.log(10)])) is None
-    assert predictor.attempt(np.array([0.0, 0.0])) is not None
+    assert predictor.try_predict(np.array([-0.1, 0.0])) is None
+    assert predictor.try_predict(np.array([0.0, -np.log(10)])) is None
+    assert predictor.try_predict(np.array([0.0, 0.0])) is not None
     predictor.close()
 
 
@@ -756,7 +756,9 @@ def test_conventions_of_other_programs_are_asked_about(tracks: dict[str, Array])
     assert "are they frame numbers? divide time by the frames per second, 25" in answer(time=np.arange(11))
 
 
-@pytest.mark.parametrize(("factor", "unit"), [(1, None), (-1, None), (1000, "mN"), (101.97, "gf")])
+@pytest.mark.parametrize(
+    ("factor", "unit"), [(1, None), (1.1, None), (-1, None), (1000, "mN"), (101.97, "gf"), (0.001, "kN")]
+)
 def test_units_and_signs_of_forces_are_asked_about(
     tracks: dict[str, Array], device: Device, tmp_path: Path, factor: float, unit: str | None
 ) -> None:
@@ -769,10 +771,15 @@ def test_units_and_signs_of_forces_are_asked_about(
     # The force of the tool is given, so that no parameter scales it.
     given = changed(tissue__young=2e5), noisy(tracks, 0.1, sigma=0.1), ["tissue.young"]
     forces = tmp_path / "forces.csv", 0.01 * abs(factor)
-    if factor == 1:
+    if factor == 1.1:
+        first = fit(*given, forces=(forces[0], 0.01), workers=1).summary()[0]
+        assert ", mostly of the forces, which are 1.1 times the predicted ones; the intervals" in first
+    if abs(factor) < 1.2 and factor > 0.5:
         assert not any("times those of the scene" in note for note in fit(*given, forces=forces, workers=1).notes)
         return
     said = "is it the force on the tool" if factor < 0 else f"are they in {unit}\\? divide them by {factor:g}"
+    if unit == "kN":
+        said = "are they in kN\\? multiply them by 1000"
     with pytest.raises(SceneError, match=said):
         fit(*given, forces=forces, workers=1)
 
@@ -797,8 +804,8 @@ def test_offsets_of_half_a_pixel_and_turned_axes_are_asked_about(tracks: dict[st
 def test_an_exact_fit_has_errors_next_to_0(device: Device, robust: bool) -> None:
     free = ["tissue.young", "tissue.foundation"]
     empty = read_observations({"time": np.arange(11) / 25, "coordinates": PLACES, "position": np.ones((36, 11, 3))}, 25)
-    job = Job("token", runnable(changed()), make_parameters(changed(), free, {}), empty)
-    predictor = Predictor(job, device.threads)
+    job = FitProblem("token", without_outputs(changed()), make_parameters(changed(), free, {}), empty)
+    predictor = ForwardModel(job, device.threads)
     seen = {"time": empty.time, "coordinates": PLACES, "position": predictor.predict(np.zeros(2), whole=True).values}
     predictor.close()
     found = fit(changed(), seen, free, robust=robust, profile=True, workers=1)
@@ -920,8 +927,8 @@ def test_tracks_that_drift_widen_the_intervals(tracks: dict[str, Array]) -> None
     assert plain.model_rejected
     assert not drifting.model_rejected
     assert not any("--drift" in line for line in drifting.summary())
-    wider = drifting.parameters[free[1]].standard_error / plain.parameters[free[1]].standard_error
-    assert 1.2 < wider < 11**0.5
+    widening = drifting.parameters[free[1]].standard_error / plain.parameters[free[1]].standard_error
+    assert 1.2 < widening < 11**0.5
 
 
 def test_a_scene_that_cannot_move_as_was_seen_is_rejected_first_of_all(tracks: dict[str, Array]) -> None:
@@ -956,11 +963,11 @@ def test_what_is_far_off_counts_in_full_for_the_rejection_of_a_robust_fit(tracks
     assert found.summary()[0].startswith("the model is rejected: chi-square of the plain residuals ")
 
 
-NOISE = [Alike(None, None), Alike(5.0, None), Alike(None, 1.0)]
+NOISE = [ErrorCorrelation(None, None), ErrorCorrelation(5.0, None), ErrorCorrelation(None, 1.0)]
 
 
 @pytest.mark.parametrize("alike", NOISE, ids=["independent", "alike in space", "alike in time"])
-def test_noise_is_not_taken_for_a_wrong_model(alike: Alike) -> None:
+def test_noise_is_not_taken_for_a_wrong_model(alike: ErrorCorrelation) -> None:
     """Also where some jump, and some were not seen."""
     rng, wolves = np.random.default_rng(4), 0
     times = np.arange(9.0)

@@ -17,9 +17,9 @@ from PIL import Image
 
 from taichi_msm import FitResult, SceneError, fit, load_scene
 from taichi_msm.accuracy.mesh import estimate_mesh_error
-from taichi_msm.fitting.observations import Observations, Sight, read_observations
-from taichi_msm.fitting.predict import runnable
-from taichi_msm.fitting.tikhonov import Fields, Search
+from taichi_msm.fitting.observations import ObservationModel, Observations, read_observations
+from taichi_msm.fitting.predict import without_outputs
+from taichi_msm.fitting.tikhonov import MapGrid, MapSearch
 from taichi_msm.gradients.gradient import Adjoint
 from taichi_msm.load.check import check_scene
 from taichi_msm.model.sheet import read_map, rest_positions
@@ -60,9 +60,9 @@ def scene(**more: Any) -> Scene:
 def seen_in(truth: Scene, device: Device, factors: Array, times: Array, error: float) -> dict[str, Any]:
     """Positions of the places in a scene with a map, with errors of that standard deviation [m]."""
     plan = check_scene(truth)
-    position = Adjoint(plan, device).run(Fields(len(factors), (8, 8)).factors(np.log(factors).ravel()))
+    position = Adjoint(plan, device).run(MapGrid(len(factors), (8, 8)).factors(np.log(factors).ravel()))
     empty = Observations("", "position", times, PLACES, np.zeros((len(PLACES), len(times), 3)), None)
-    points = Sight(truth, empty, len(position)).points(position)
+    points = ObservationModel(truth, empty, len(position)).points(position)
     noise = np.random.default_rng(1).normal(0, error, points.shape)
     return {"time": times, "coordinates": PLACES, "position": points + noise, "sigma": error}
 
@@ -71,7 +71,7 @@ def seen_in(truth: Scene, device: Device, factors: Array, times: Array, error: f
 def one_device(device: Device) -> Iterator[None]:
     """A fit takes every core, and a process has one device."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("taichi_msm.system.runtime.resources.available_threads", lambda: device.threads)
+        patch.setattr("taichi_msm.system.runtime.process_module.available_threads", lambda: device.threads)
         patch.setattr(process_module, "available_threads", lambda: device.threads)
         yield
 
@@ -124,7 +124,7 @@ def test_the_files_give_what_was_fitted(result: FitResult, folder: Path) -> None
     assert written.tissue.map.range == pytest.approx((low, high), rel=1e-12)
     found = check_scene(written).material.factors
     assert found is not None
-    fields = Fields(4, (8, 8)).factors(np.log(result.map.factors).ravel())
+    fields = MapGrid(4, (8, 8)).factors(np.log(result.map.factors).ravel())
     np.testing.assert_allclose(found, fields, atol=(high - low) / 65535)
     assert read_map(written.tissue.map).grey.dtype == np.uint16
     errors = np.asarray(Image.open(folder / "map-error.png"), np.float64) / 65535
@@ -203,7 +203,7 @@ def test_bounds_must_leave_springs_a_length(device: Device) -> None:
 def test_the_mesh_error_is_that_of_the_map_that_was_found(result: FitResult, folder: Path, device: Device) -> None:
     # The lump of the truth, where the search begins with none, changes it by more than the last digit.
     found, even = (
-        estimate_mesh_error(check_scene(runnable(each)), device, lambda done, total: None).error
+        estimate_mesh_error(check_scene(without_outputs(each)), device, lambda done, total: None).error
         for each in (load_scene(folder / "scene.yaml"), scene())
     )
     assert result.mesh_error == pytest.approx(found, rel=1e-6)
@@ -218,8 +218,10 @@ def test_points_behind_the_eye_are_refused(device: Device) -> None:
         fit(low, seen, ["tissue.map"], resolution=2)
     # As where they get there while the map changes.
     there = read_observations(seen, 1)
-    plan, fields = check_scene(low), Fields(2, (8, 8))
-    search = Search(Adjoint(plan, device), Sight(plan.scene, there, 3), there, 1.0, fields, (-2, 2), lambda: None)
+    plan, fields = check_scene(low), MapGrid(2, (8, 8))
+    search = MapSearch(
+        Adjoint(plan, device), ObservationModel(plan.scene, there, 3), there, 1.0, fields, (-2, 2), lambda: None
+    )
     with pytest.raises(SceneError, match="pixel: a point that was seen gets behind the eye of the camera"):
         search.predict(np.zeros(4))
 
@@ -228,8 +230,10 @@ def test_points_behind_the_eye_are_refused(device: Device) -> None:
 def test_the_slope_of_the_misfit_is_that_of_differences(device: Device, kind: str) -> None:
     seen = read_observations(seen_in(scene(), device, TRUTH, np.array([0.7, 2.0]), 1e-4), 1)
     seen = Observations("", kind, seen.time, PLACES, seen.values[..., : 3 if kind == "position" else 2], 1e-4)  # type: ignore[arg-type]
-    plan, fields = check_scene(scene()), Fields(4, (8, 8))
-    search = Search(Adjoint(plan, device), Sight(plan.scene, seen, 3), seen, 1.0, fields, (-2, 2), lambda: None)
+    plan, fields = check_scene(scene()), MapGrid(4, (8, 8))
+    search = MapSearch(
+        Adjoint(plan, device), ObservationModel(plan.scene, seen, 3), seen, 1.0, fields, (-2, 2), lambda: None
+    )
     rng = np.random.default_rng(0)
     x, change = rng.normal(0, 0.2, (2, 16))
     after, before = (search.misfit(x + sign * 1e-3 * change)[0] for sign in (1, -1))
@@ -242,9 +246,9 @@ def test_going_back_is_the_transpose_of_seeing(device: Device) -> None:
     rng = np.random.default_rng(0)
     flat = rest_positions(scene().sheet)
     position, change = flat + rng.normal(0, 2e-3, (3, *flat.shape)), rng.normal(0, 1, (3, *flat.shape))
-    slope, sight = rng.normal(0, 1, (len(PLACES), 2, 2)), Sight(scene(), seen, 3)
+    slope, sight = rng.normal(0, 1, (len(PLACES), 2, 2)), ObservationModel(scene(), seen, 3)
     back = sight.backward(sight.points(position), slope)
-    after, before = (sight.seen(sight.points(position + sign * 1e-7 * change)) for sign in (1, -1))
+    after, before = (sight.observe(sight.points(position + sign * 1e-7 * change)) for sign in (1, -1))
     assert (back * change).sum() == pytest.approx((slope * (after - before)).sum() / 2e-7, rel=1e-7)
 
 

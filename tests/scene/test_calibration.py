@@ -173,13 +173,25 @@ def test_numbers_that_scaling_makes_too_large_are_refused(small: Path) -> None:
         ),
         (
             "K: [1, 0, 1, 0, 1, 1, 0, 0, 1]\nwidth: 40",
-            "camera.yml: has only one of image_width and image_height; write both",
+            "camera.yml: has only one of image_width and image_height; found K, width; write both",
         ),
         ("K: [x]", "camera.yml: K: ['x'] is not a list of numbers up to 1e+06; write it as OpenCV does"),
         (
             "K: [1, 0, 1, 0, 1, 1, 0, 0, 1]\nD: [1, 2, 3]",
-            "camera.yml: 3 distortion coefficients that are not known; expected k1, k2, p1, p2, k3, k4, k5, k6, and 0 "
-            "after them",
+            "camera.yml: 3 distortion coefficients; expected 4, 5, 8, 12 or 14: k1, k2, p1, p2, k3, ...",
+        ),
+        (
+            "K: [1, 0, 1, 0, 1, 1, 0, 0, 1]\nD: [0, 0, 0, 0, 0, 0, 0, 0, 0, 0.5, 0, 0]",
+            "camera.yml: distortion coefficient 10 is not 0; thin prisms and tilted sensors are not modelled, "
+            "calibrate without",
+        ),
+        (
+            "K: [1, 0, 1, 0, 1, 1, 0, 0, 1]\nD: {rows: 1, cols: 4, dt: d, data: [0.1, 0, 0, 0, 0.02]}",
+            "camera.yml: D: has 5 numbers, and 1 rows of 4; write what belongs there",
+        ),
+        (
+            "K: [1, 0, 1, 0, 1, 1, 0, 0, 1]\nD: {rows: 1, cols: 4, dta: [0.1, 0, 0, 0]}",
+            "camera.yml: D: has rows, cols, dta; expected a matrix with rows, cols and data",
         ),
         (
             "K: [1, 0, 1, 0, 1, 1, 0, 0, 1]\ndistortion_model: fov",
