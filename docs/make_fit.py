@@ -1,8 +1,8 @@
-"""Fit a measured table, and measure how well five numbers are found, for the page on fits.
+"""Run the code of docs/fit-indentation.md, and measure the errors of five parameters for docs/fit.md.
 
     python docs/make_fit.py
 
-Writes a picture, and prints the numbers that docs/fit.md shows. Takes about a minute and a half.
+Writes a picture, and prints the numbers of both pages. Takes about two minutes.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ Floats = NDArray[np.float64]
 ROOT = Path(__file__).parent.parent
 IMAGES = ROOT / "docs" / "images"
 
-# Indentation of a slice of beef, a sirloin: time [s], depth [mm] and force [N], as recorded by S. Iaquinta on 3 April
-# 2023; every third row, then every tenth, of the sheet 230403-FF2A of
+# The test of docs/fit-indentation.md with its hold: time [s], depth [mm] and force [N], as recorded by S. Iaquinta on
+# 3 April 2023; every third row, then every tenth, of the sheet 230403-FF2A of
 # indentation/experiments/zwick/raw_data/230403/230403_C_Indentation_relaxation_500N_force.xlsx
-# in https://github.com/SarahIaquinta/perineal_indentation at 167a964. Beside contact the force is 0.012 N; the distance
-# to the table is then 15.6 mm. The tool goes down at 1.5 mm/s until 3.9 s, slows down, and stands from 4.7 s.
+# in https://github.com/SarahIaquinta/perineal_indentation at 167a964. Without contact the force is 0.012 N, and the
+# distance to the table 15.6 mm. The tool descends at 1.5 mm/s until 3.9 s, slows down, and is held from 4.7 s.
 BEEF = """
     0.6 0.1844 0.0134   0.9 0.6343 0.0314   1.2 1.0843 0.0631   1.5 1.5344 0.1054   1.8 1.9844 0.1558
     2.1 2.4345 0.2164   2.4 2.8844 0.2922   2.7 3.3343 0.3861   3.0 3.7845 0.4988   3.3 4.2345 0.6322
@@ -37,50 +37,24 @@ BEEF = """
     8.6 5.8277 0.6580   9.4 5.8277 0.6354  10.2 5.8277 0.6142  11.0 5.8277 0.5968  11.8 5.8277 0.5829
    12.6 5.8277 0.5690  13.4 5.8277 0.5581  14.2 5.8277 0.5469  15.0 5.8277 0.5366
 """
-AT_REST, STEADY = 0.012, 12
+CONTACT, STEADY_ROWS = (0.6, 0.1844, 0.012), 12
 
-# A ball, of the radius that the model of the test in the same repository has (R_indent in
-# indentation/model/comsol/convergence/parameters.txt).
-RADIUS = 0.005
-
-# Standard deviation of the force [N].
-SIGMA = 0.005
-
-# Of the aim: Young's modulus of the tissue that is seen, and errors of tracks [px].
+# Young's modulus of the observed tissue [Pa], and errors of tracks [px].
 TRUTH, ERROR = 2e4, 1.0
 FIVE = ["tissue.young", "tissue.foundation", "tissue.damping", "probes.0.at.0", "probes.0.at.1"]
 
 
 def beef() -> tuple[FitResult, Floats]:
-    """Fit the force while the tool goes down steadily; returns the table too, time [s], depth [m] and force [N]."""
-    table = np.array(BEEF.split(), np.float64).reshape(-1, 3) - (0.6, 0.1844, AT_REST)
+    """Run the page's code; return its result, and the whole table: time [s], depth [m] and force [N]."""
+    table = np.array(BEEF.split(), np.float64).reshape(-1, 3) - CONTACT
     table[:, 1] /= 1000
-    times, depth, force = table[:STEADY].T
-    scene: dict[str, Any] = {
-        "sheet": {"points": [41, 41], "size": [0.06, 0.06], "fixed": "border"},
-        "tissue": {
-            "young": 1e5,
-            "thickness": 1e-3,
-            "foundation": {"young": 2e4, "depth": 0.0156},
-            "foundation_active": "always",
-        },
-        "probes": [
-            {
-                "path": [[t, 0.5, 0.5, -d] for t, d in zip(times.tolist(), depth.tolist(), strict=True)],
-                "instrument": {"radius": RADIUS, "shaft": [0, 0, 1], "length": 0.05},
-            }
-        ],
-        "time": {"duration": float(times[-1]), "frames_per_second": 1 / 0.3, "motion": "quasistatic"},
-        "output": [],
-    }
-    # What is below the tip is as deep as the tip.
-    below = {"time": times[-1:], "coordinates": [[0.5, 0.5]], "position": [[[0, 0, -depth[-1]]]], "sigma": 1e-4}
+    code = (ROOT / "docs" / "fit-indentation.md").read_text(encoding="utf-8").split("```python\n")[1].split("```")[0]
+    names: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as directory:
-        path = Path(directory) / "forces.csv"
-        rows = [f"{t},0,,,{-f}" for t, f in zip(times, force, strict=True)]
-        path.write_text("\n".join(["time,probe,force_x,force_y,force_z", *rows]))
-        free = ["tissue.foundation.young", "tissue.young"]
-        return fit(scene, below, free, forces=(path, SIGMA)), table
+        code = code.replace('"beef.csv"', repr(str(Path(directory) / "beef.csv")))
+        exec(compile(code, "fit-indentation.md", "exec"), names)
+    assert np.allclose(np.array([names["times"], names["depths"], names["forces"]]).T, table[:STEADY_ROWS])
+    return names["found"], table
 
 
 def draw_beef(found: FitResult, table: Floats) -> None:
@@ -95,7 +69,7 @@ def draw_beef(found: FitResult, table: Floats) -> None:
             simulation.advance(min(frame, 1))
             model.append((simulation.time, -simulation.forces()[0].tip[2], -simulation.forces()[0].force[2]))
     now, deep, felt = np.array(model).T
-    end = int(np.searchsorted(now, times[STEADY - 1] + 1e-6))
+    end = int(np.searchsorted(now, times[STEADY_ROWS - 1] + 1e-6))
     with plt.style.context(STYLE, after_reset=True):
         figure, (over, held) = plt.subplots(1, 2, figsize=(7.5, 2.9), sharey=True, layout="constrained")
         over.plot(1000 * deep[:end], felt[:end], color=BLUE, label="fitted")
@@ -132,7 +106,6 @@ def main() -> None:
     """Write the picture, and print the numbers."""
     found, table = beef()
     draw_beef(found, table)
-    print("\n".join(found.summary()))
     print(f"held, {table[-1, 2] / table[:, 2].max():.0%} of the largest force are left")
     for newtons, tracks in ((2, 16), (2, 32), (6, 16)):
         begun = time.perf_counter()

@@ -2,7 +2,7 @@
 
     python docs/make_map.py
 
-Writes a picture, and prints the numbers that docs/fit.md shows. Takes about two minutes.
+Writes a picture, and prints the numbers that docs/fit-map.md shows. Takes about two minutes.
 """
 
 from __future__ import annotations

@@ -1,18 +1,16 @@
-"""Write the tables that come from the program's own words into the pages: keys, outputs and names.
+"""Write the tables that come from the program's own words into the pages: keys and outputs.
 
 python docs/make_tables.py
 """
 
 from __future__ import annotations
 
-import inspect
 import json
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import taichi_msm
 from taichi_msm.load.scene_file import schema
 from taichi_msm.scene.outputs import OUTPUTS
 from taichi_msm.scene.section import Section
@@ -63,15 +61,6 @@ def outputs(*sources: str) -> str:
     return "| `output` | file (that of frame 0) | what it holds |\n|---|---|---|\n" + "\n".join(lines) + "\n"
 
 
-def names() -> str:
-    """Give the table of what the package exports, with the first line of each docstring."""
-    lines = []
-    for name in taichi_msm.__all__:
-        first = (inspect.getdoc(getattr(taichi_msm, name)) or "").split("\n")[0]
-        lines.append(f"| `{name}` | {first} |")
-    return "| name | what it is |\n|---|---|\n" + "\n".join(lines) + "\n"
-
-
 def model_keys(model: type[Section], *titles: str) -> str:
     """Give the table of the keys of a section that has none below it."""
     lines = []
@@ -85,12 +74,11 @@ def model_keys(model: type[Section], *titles: str) -> str:
 
 # What makes each table, by its page and its name there.
 TABLES: dict[tuple[str, str], Callable[[], str]] = {
-    ("scene", "keys"): scene_keys,
+    ("keys", "keys"): scene_keys,
     ("view", "hands"): window_keys,
-    ("python", "names"): names,
     ("sweep", "sweep keys"): partial(model_keys, SweepSettings, "key", "meaning", "value", "default"),
     ("sweep", "distributions"): partial(model_keys, Distribution, "way", "how the key varies", "value"),
-    ("command-line", "outputs"): partial(outputs, "picture", "positions", "forces"),
+    ("files", "outputs"): partial(outputs, "picture", "positions", "forces"),
     ("labels", "labels"): partial(outputs, "labels", "flow", "stereo", "tracks"),
 }
 

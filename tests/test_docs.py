@@ -43,11 +43,17 @@ PAGES = [README, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted(DOCS.g
 # Those with commands, in an order in which each finds the results that it reads.
 WITH_COMMANDS = [
     README,
-    *(DOCS / f"{name}.md" for name in ("scene", "labels", "sweep", "fit", "export", "error", "view", "study")),
+    *(
+        DOCS / f"{name}.md"
+        for name in (
+            *("first-scene", "own-tissue", "endoscope", "scene", "keys", "labels", "data-set"),
+            *("sweep", "fit", "export", "error", "view", "study"),
+        )
+    ),
 ]
 SCENES = sorted(path.stem for path in (ROOT / "scenes").glob("*.yaml"))
 
-README_LINES = 200
+README_LINES = 120
 
 # How the shipped scenes are made smaller, to run every command of the pages in little time.
 SMALLER = {
@@ -161,6 +167,12 @@ def test_tables_are_made_from_the_program() -> None:
         assert make_tables.with_table(text, name, make()) == text, "run docs/make_tables.py"
 
 
+def test_every_public_name_is_in_the_reference() -> None:
+    assert sorted(re.findall(r"^::: taichi_msm\.(\w+)$", read(DOCS / "api.md"), flags=re.MULTILINE)) == sorted(
+        taichi_msm.__all__
+    )
+
+
 def test_the_table_of_keys_has_their_limits() -> None:
     whole = schema()
     sections = [whole, *whole["$defs"].values()]
@@ -186,12 +198,12 @@ def test_all_parts_of_a_scene_are_exported() -> None:
 
 
 def test_every_output_has_its_row() -> None:
-    results, labels = table(DOCS / "command-line.md", "outputs"), table(DOCS / "labels.md", "labels")
+    results, labels = table(DOCS / "files.md", "outputs"), table(DOCS / "labels.md", "labels")
     assert words(results) + words(labels) == list(OUTPUTS)
 
 
 def test_every_key_of_the_record_has_its_row() -> None:
-    assert sorted(words(table(DOCS / "command-line.md", "record"))) == sorted(get_type_hints(RunRecord))
+    assert sorted(words(table(DOCS / "files.md", "record"))) == sorted(get_type_hints(RunRecord))
     assert words(table(DOCS / "error.md", "estimate")) == list(get_type_hints(ErrorRecord))
 
 
@@ -309,6 +321,15 @@ def test_the_fit_shown_is_what_it_finds(
     assert "each alone is not: fix one, or give a force (--forces)" in unseen[-1]
 
 
+@pytest.mark.slow
+def test_the_indentation_test_shown_is_what_it_finds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    page = DOCS / "fit-indentation.md"
+    done = subprocess.run([sys.executable, "-c", blocks(page, "python")[0]], check=True, capture_output=True, text=True)
+    # But for the runs and the seconds.
+    assert done.stdout.splitlines()[:-1] == blocks(page, "txt")[0].splitlines()
+
+
 def test_the_error_in_the_readme_is_that_of_the_run(device: Device, tmp_path: Path) -> None:
     (line,) = read(README).split("<!-- error: checked by tests/test_docs.py -->\n```text\n")[1].splitlines()[:1]
     press = load_scene(ROOT / "scenes" / "press.yaml", {"output": ["png"]})
@@ -373,7 +394,7 @@ def test_shipped_scenes_are_valid(name: str) -> None:
 
 
 def test_every_promise_has_its_test() -> None:
-    named = re.findall(r"`(tests/\w+\.py)::(\w+)`", read(DOCS / "trust.md"))
-    assert named
+    named = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", read(DOCS / "tests.md").split("\n## Mutants\n")[0])
+    assert len(named) > 100
     for file, test in named:
         assert f"\ndef {test}(" in read(ROOT / file), test

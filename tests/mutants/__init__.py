@@ -12,7 +12,7 @@ import yaml
 from tests.mutants.definitions import Definition, definitions, named, replaced
 
 ROOT = Path(__file__).parent.parent.parent
-DOCUMENT = ROOT / "docs" / "trust.md"
+DOCUMENT = ROOT / "docs" / "tests.md"
 START = "<!-- mutants: made by python -m tests.mutants --write -->\n"
 END = "<!-- end of mutants -->\n"
 
@@ -88,13 +88,13 @@ def table(killers: Mapping[str, str]) -> str:
     Args:
         killers: the tests by the names of the mutants.
     """
-    rows = [f"| {m.name} | {m.wrong} | `{killers[m.name]}` |\n" for m in mutants() if m.name in killers]
-    return "| mutant | what is wrong | killed by |\n|---|---|---|\n" + "".join(rows)
+    rows = [f"| {m.name} | `{killers[m.name]}` |\n" for m in mutants() if m.name in killers]
+    return "| mutant | killed by |\n|---|---|\n" + "".join(rows)
 
 
 def listed() -> dict[str, str]:
     """Read the table in the document: the tests by the names of the mutants."""
-    return dict(re.findall(r"^\| (\S+) \| .* \| `(\S+)` \|$", split_document()[1], flags=re.MULTILINE))
+    return dict(re.findall(r"^\| (\S+) \| `(\S+)` \|$", split_document()[1], flags=re.MULTILINE))
 
 
 def write(killers: Mapping[str, str]) -> None:

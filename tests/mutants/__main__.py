@@ -2,7 +2,7 @@
 
 python -m tests.mutants              all of them
 python -m tests.mutants bgr          some of them, by name
-python -m tests.mutants --write      and renew the table in docs/trust.md
+python -m tests.mutants --write      and renew the table in docs/tests.md
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ def main(arguments: list[str]) -> int:
     known = {mutant.name: mutant for mutant in mutants()}
     parser = argparse.ArgumentParser(prog="python -m tests.mutants", description="See that tests notice mistakes.")
     parser.add_argument("names", nargs="*", metavar="NAME", help="all, or some of: " + ", ".join(known))
-    parser.add_argument("--write", action="store_true", help="renew the table in docs/trust.md")
+    parser.add_argument("--write", action="store_true", help="renew the table in docs/tests.md")
     options = parser.parse_args(arguments)
     if unknown := [name for name in options.names if name not in known]:
         parser.error("no such mutant: " + ", ".join(unknown))
