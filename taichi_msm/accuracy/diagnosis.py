@@ -36,7 +36,7 @@ class Diagnosis:
     """
 
     message: str
-    last_sound_state: Saved | None
+    last_sound_state: Snapshot | None
 
 
 def diagnose(dynamics: Dynamics, start: Snapshot | None, pause: Pause) -> Diagnosis:

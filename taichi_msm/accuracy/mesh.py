@@ -171,7 +171,8 @@ def sampling_force_error(scene: Scene) -> float:
         return 0.0  # On so fine a mesh no tool is as narrow as a cell.
     probes = [probe for probe in scene.probes if probe.total is not None]
     pairs = [
-        (sum_probe_forces(probe, scene.sheet)[0], sum_probe_forces(probe, scene.sheet, refinement)[0]) for probe in probes
+        (sum_probe_forces(probe, scene.sheet)[0], sum_probe_forces(probe, scene.sheet, refinement)[0])
+        for probe in probes
     ]
     return max((abs(force / exact - 1) for force, exact in pairs if exact > 0), default=0.0)
 

@@ -89,7 +89,7 @@ class PathDependence:
     def affords(self, companion_cost: float) -> bool:
         """Return whether second solutions, in addition to companion runs of this cost, are a small part of the run."""
         second_cost = SECOND_SOLUTIONS * SECOND_SOLUTION_FRAMES / (self._plan.grid.frames + 1)
-        return affords_pilots(self._plan, companion_cost + second_cost)
+        return affords_companions(self._plan, companion_cost + second_cost)
 
     def finish(self, device: Device, cores: int | None, pause: Pause) -> None:
         """Solve the last frame, the most displaced frame and one after it a second time, from rest.

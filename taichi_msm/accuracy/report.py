@@ -205,7 +205,8 @@ class RunErrorEstimator:
         return ForceEstimate(min(max(relative, MIN_MESH_ERROR_SHARE * mesh.error), displacement_error))
 
 
-# The stability limit holds while no spring is compressed below this share of its rest length (see `SpringTerm.stiffness_bound`).
+# Compression of a spring, as a share of its rest length, up to which the stability limit holds (see
+# `SpringTerm.stiffness_bound`).
 MIN_SPRING_RATIO = 0.5
 
 # Tissue that is compressed by more than this share of its depth stiffens, which the elastic foundation does not.
@@ -264,14 +265,14 @@ def run_warnings(
         else:
             yield f"force error at most about {_percent(force.error, 2)} % of the greatest force"
     yield from tool_force.force_warnings(scene, probes)
-    path_warnings = list(path_warnings(scene, plan.tools))
-    yield from path_warnings
+    tool_warnings = list(path_warnings(scene, plan.tools))
+    yield from tool_warnings
     yield from tool_contact_warnings(plan, progress)
     yield from energy_growth_warnings(plan, progress)
     if mesh is not None and mesh.doubt and mesh.error < math.inf:
         yield f"the error due to the number of points may be larger: {mesh.doubt}"
     # The warning about a mesh that is too coarse for a tool already contains the remedy.
-    too_coarse_for_tool = any(TOO_FEW in warning for warning in path_warnings)
+    too_coarse_for_tool = any(COARSE_TIP_PHRASE in warning for warning in tool_warnings)
     if mesh is not None and REMEDY_THRESHOLD < mesh.error < math.inf and not too_coarse_for_tool:
         yield f"for a smaller error of the mesh, {_mesh_remedy(plan, mesh, affords)}"
     if progress.max_displacement == 0 and progress.frame > 0:

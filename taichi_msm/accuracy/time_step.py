@@ -84,7 +84,9 @@ def convergence_order(plan: Plan) -> int:
     return 1 if backward or plan.tools else 2
 
 
-def estimate_error(plan: Plan, device: Device, progress: ProgressCallback = lambda done, total: None) -> TimeStepEstimate:
+def estimate_error(
+    plan: Plan, device: Device, progress: ProgressCallback = lambda done, total: None
+) -> TimeStepEstimate:
     """Estimate the time-step error of a run.
 
     Args:

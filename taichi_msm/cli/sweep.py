@@ -109,7 +109,7 @@ def print_dry_run(loaded: Sweep, cost: SweepCost, shard: tuple[int, int], worker
     Returns:
         The exit code.
     """
-    from taichi_msm.sweeps.spec import format_value
+    from taichi_msm.sweeps.spec import format_override
     from taichi_msm.sweeps.tables import choose_worker_count, cost_line, csv_line
 
     (part, parts), values = shard, loaded.values()
@@ -122,7 +122,7 @@ def print_dry_run(loaded: Sweep, cost: SweepCost, shard: tuple[int, int], worker
         return DONE
     click.echo(csv_line(["run", *loaded.keys]))
     for run in runs:
-        click.echo(printable(csv_line([run, *map(format_value, values[run])])))
+        click.echo(printable(csv_line([run, *map(format_override, values[run])])))
     click.echo(cost_line(len(runs), cost, chosen))
     return DONE
 

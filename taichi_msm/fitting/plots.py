@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from taichi_msm.errors import printable
 from taichi_msm.fitting.result import FitResult, FittedMap
 from taichi_msm.fitting.tikhonov import SmoothnessWeight
-from taichi_msm.plot_style import BLUE, DPI, GREY, ORANGE, SILVER, STYLE, VERMILION, TWO_COLUMN_WIDTH
+from taichi_msm.plot_style import BLUE, DPI, GREY, ORANGE, SILVER, STYLE, TWO_COLUMN_WIDTH, VERMILION
 from taichi_msm.scene.sheet import Sheet
 
 COLUMN_COUNT, PANEL_HEIGHT_IN, MAX_DRAWN_POINTS, MAX_DOTS = 3, 2.7, 3, 20000

@@ -191,7 +191,7 @@ RUNS_PER_PARAMETER, MIN_PARALLEL_S = 8, 8.0
 PROGRESS_INTERVAL_S = 0.1
 
 
-def estimate_mesh_error(plan: Plan, pause: Pause) -> float | None:
+def mesh_error(plan: Plan, pause: Pause) -> float | None:
     """Estimate the mesh error, as a fraction of the largest displacement.
 
     Args:
@@ -240,8 +240,8 @@ class Runs:
         return self._predictor.try_predict(x, coarse=halvings, pause=self._tell)
 
     def mesh_error(self, x: Array) -> float | None:
-        """Estimate the mesh error at x, as `estimate_mesh_error`."""
-        return estimate_mesh_error(self._predictor.plan(x), self._tell)
+        """Estimate the mesh error at x, as the function of this name."""
+        return mesh_error(self._predictor.plan(x), self._tell)
 
     def one(self, x: Array, steps: int | None = None) -> Prediction | None:
         """Predict at x; None if that fails."""

@@ -14,7 +14,7 @@ from taichi_msm.errors import SceneError, StageProgressCallback
 from taichi_msm.fitting.checks import faults, faults_at_start
 from taichi_msm.fitting.observations import ObservationModel, Observations
 from taichi_msm.fitting.parameters import Bounds, rounded
-from taichi_msm.fitting.predict import Prediction, estimate_mesh_error, without_outputs
+from taichi_msm.fitting.predict import Prediction, mesh_error, without_outputs
 from taichi_msm.fitting.rejection import by_chi_square
 from taichi_msm.fitting.result import FitResult, FittedMap
 from taichi_msm.fitting.tikhonov import MapGrid, MapSearch, MapSolution, centres
@@ -95,7 +95,9 @@ def map_settings(
     return MapSettings(resolution, (low, high))
 
 
-def fit_map(given: Scene, observations: Observations, task: MapSettings, image: str, progress: StageProgressCallback) -> FitResult:
+def fit_map(
+    given: Scene, observations: Observations, task: MapSettings, image: str, progress: StageProgressCallback
+) -> FitResult:
     """Estimate a map.
 
     Args:
@@ -160,7 +162,7 @@ def fit_map(given: Scene, observations: Observations, task: MapSettings, image: 
         rejection=by_chi_square(chi_square, left.size, left.size),
         degrees_of_freedom=left.size,
         identifiable=not found.unknown.any(),
-        mesh_error=estimate_mesh_error(mapped, tell),
+        mesh_error=mesh_error(mapped, tell),
         runs=search.runs + 1,
         notes=list(_notes(observations, solution, found, by_points, limits, left)),
         scene=scene,

@@ -62,7 +62,9 @@ class SheetGradient:
         factors, material = plan.material.factors, plan.material
         assert factors is not None
         total = float(self.tensions @ material.tensions) + float(self.foundation.sum()) + self.bending
-        for by_spring, k, tension in zip(self.springs, spring_stiffness(material, factors), material.tensions, strict=True):
+        for by_spring, k, tension in zip(
+            self.springs, spring_stiffness(material, factors), material.tensions, strict=True
+        ):
             total += float((by_spring * (k - tension)).sum())
         return total
 

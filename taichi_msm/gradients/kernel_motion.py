@@ -65,7 +65,7 @@ class AdjointSheet(NamedTuple):
         by_column: As in `KernelSheet`, like the next five.
         stiffness: Stiffness of the springs.
         fields: Fields of the mass points.
-        numbers: Numbers of the sheet.
+        constants: Constants of the sheet.
         rows: Number of rows.
         width: Entries of a row.
         shapes: Displacements of the steps of a segment, three arrays.
@@ -76,7 +76,7 @@ class AdjointSheet(NamedTuple):
     by_column: Any
     stiffness: Any
     fields: Any
-    numbers: Any
+    constants: Any
     rows: Any
     width: Any
     shapes: Any

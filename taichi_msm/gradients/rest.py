@@ -120,8 +120,7 @@ class RestAdjoint:
             probe, at = scene.probes[slot.probe], at_frame.point[0, n]
             by_slot[0, n, :3] = np.einsum("ij,ijc->c", decay(probe, scene.sheet, at), p)
             by_decay = p @ at_frame.strength[0, n]
-            by_slot[0, n, 3:] = np.einsum(
-                "aij,ij->a", decay_gradient(probe, scene.sheet, at), by_decay)
+            by_slot[0, n, 3:] = np.einsum("aij,ij->a", decay_gradient(probe, scene.sheet, at), by_decay)
         time = frame / self.plan.grid.frames_per_second
         margin = 1e-3 / self.plan.grid.frames_per_second
         loads.add(lambda plan: evaluate_frame_loads(plan, frame), by_slot, (time - margin, time + margin))

@@ -24,7 +24,7 @@ class ResolvedPlan(NamedTuple):
     """
 
     plan: Plan
-    estimate: Estimate | None
+    estimate: TimeStepEstimate | None
     mesh: MeshEstimate | None
 
 

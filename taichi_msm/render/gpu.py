@@ -107,7 +107,8 @@ class Threads:
         parts = int(ends[-1])
         owners, bounds = launches.array(np.int32, 2 * parts), launches.array(np.int32, BOUNDS_STRIDE * parts)
         launches.launch(
-            self._bound, parts, pieces_per_part, *view, launches.upload(ends), self._nodes, self._pieces, owners, bounds,
+            self._bound, parts, pieces_per_part, *view, launches.upload(ends), self._nodes, self._pieces,
+            owners, bounds,
             rounds=SEARCH_ROUNDS + pieces_per_part,
         )  # fmt: skip
         bin_size = max(MIN_BIN_SIZE, round((samples_across * samples_down / self._cells) ** 0.5))

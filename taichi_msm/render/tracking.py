@@ -109,7 +109,9 @@ def _track(
     nodes, cell = (launches.array(np.float64, n) for n in (rows * cols * NODE_STRIDE, cells * CELL_STRIDE))
     bounds = launches.array(np.int32, cells * BOUNDS_STRIDE)
     with compilation_options(optimised=False):
-        _outline_cells(np.ascontiguousarray(position, np.float64), uniforms, launches.upload(sizes), nodes, cell, bounds)
+        _outline_cells(
+            np.ascontiguousarray(position, np.float64), uniforms, launches.upload(sizes), nodes, cell, bounds
+        )
     bins = build_bins(launches, bounds, cells, (width, height), bin_size)
     sizes[[uni.BIN_SIZE, uni.BINS_ACROSS, uni.WIDTH, uni.HEIGHT]] = bins.size, bins.columns, *scene.render.size
     is_simple = launches.array(np.uint8, bins.lengths.size)
@@ -120,7 +122,8 @@ def _track(
     pixels, hidden = launches.array(np.float32, 2 * total), launches.array(np.uint8, total)
     arguments = (
         launches.upload(np.ascontiguousarray(coordinates, np.float32).ravel()),
-        int(as_flow), uniforms, launches.upload(sizes), nodes, cell, bins.starts, bins.entries, is_simple, pixels, hidden,
+        int(as_flow), uniforms, launches.upload(sizes), nodes, cell, bins.starts, bins.entries, is_simple,
+        pixels, hidden,
     )  # fmt: skip
     # Rounds per point: one per cell, and one per triangle.
     rounds = 1 + 2 * (scene.render.refine + 1) ** 2

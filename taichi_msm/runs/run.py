@@ -251,7 +251,13 @@ class _Run:
     """Run in progress: the simulation, its companion runs and the writer of the results."""
 
     def __init__(
-        self, context: _RunContext, watch: Stopwatch, progress: StageProgressCallback, opened: ExitStack, *, resumes: bool
+        self,
+        context: _RunContext,
+        watch: Stopwatch,
+        progress: StageProgressCallback,
+        opened: ExitStack,
+        *,
+        resumes: bool,
     ) -> None:
         self._context, self._watch, self._progress = context, watch, progress
         plan, device, manifest = context.plan, context.device, context.manifest
@@ -433,7 +439,11 @@ def _choose_pilots(context: _RunContext, *, resumed: bool) -> CompanionRuns:
 
 
 def _record_facts(
-    context: _RunContext, progress: RunProgress, felt: ProbeForces, known: RunErrorEstimates, path_dependence: Iterable[str]
+    context: _RunContext,
+    progress: RunProgress,
+    felt: ProbeForces,
+    known: RunErrorEstimates,
+    path_dependence: Iterable[str],
 ) -> dict[str, Any]:
     """Build the entries of run.json that describe the scene, the last frame and the errors."""
     manifest, plan = context.manifest, context.plan

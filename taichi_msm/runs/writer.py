@@ -39,7 +39,11 @@ def _run_file_test(record: Mapping[str, Any]) -> IsListed:
 
 
 RUN_PUBLICATION = PublicationSpec(
-    "run", outputs.RUN_RECORD, outputs.RESULT_PATTERNS, _run_file_test, companion=(CHECKPOINT_FOLDER, CHECKPOINT_PATTERNS)
+    "run",
+    outputs.RUN_RECORD,
+    outputs.RESULT_PATTERNS,
+    _run_file_test,
+    companion=(CHECKPOINT_FOLDER, CHECKPOINT_PATTERNS),
 )
 
 

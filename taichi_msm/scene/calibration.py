@@ -129,9 +129,10 @@ def read_calibration(path: str) -> Calibration:
     if len(values) not in ((4,) if fisheye else COEFFICIENT_COUNTS):
         expected = "4 of a fisheye: k1, k2, k3, k4" if fisheye else "4, 5, 8, 12 or 14: k1, k2, p1, p2, k3, ..."
         raise CameraFileError(f"{path}: {len(values)} distortion coefficients; expected {expected}")
-    if any(values[KNOWN:]):
-        said = f"distortion coefficient {1 + next(n for n in range(KNOWN, len(values)) if values[n])} is not 0"
-        raise CameraFileError(f"{path}: {said}; thin prisms and tilted sensors are not modelled, calibrate without")
+    if any(others := values[SUPPORTED_COEFFICIENTS:]):
+        number = 1 + SUPPORTED_COEFFICIENTS + next(n for n, value in enumerate(others) if value)
+        fault = f"distortion coefficient {number} is not 0"
+        raise CameraFileError(f"{path}: {fault}; thin prisms and tilted sensors are not modelled, calibrate without")
     keys.check_no_unread_keys()
     coefficients = tuple(values[:SUPPORTED_COEFFICIENTS])
     return Calibration((matrix[0], matrix[4]), (matrix[2], matrix[5]), fisheye, coefficients, size)
@@ -168,7 +169,7 @@ def _size(keys: _Keys) -> tuple[int, int] | None:
     """Return the width and height of the pictures [px], or None if the file does not contain them."""
     width, height, both = (keys.numbers(spelling) for spelling in (WIDTH, HEIGHT, SIZE))
     if bool(width) != bool(height):
-        said = f"has only one of image_width and image_height; found {keys.found}; write both"
+        said = f"has only one of image_width and image_height; found {keys.names}; write both"
         raise CameraFileError(f"{keys.path}: {said}")
     sizes = [width + height] if width and height else []
     sizes += [both] if both else []

@@ -192,7 +192,9 @@ def _inputs(name: str) -> Inputs:
 
 
 @contextmanager
-def cluster_connection(address: str, sweep: Sweep, directory: Path, progress: StageProgressCallback) -> Iterator[Cluster]:
+def cluster_connection(
+    address: str, sweep: Sweep, directory: Path, progress: StageProgressCallback
+) -> Iterator[Cluster]:
     """Connect to a scheduler, and provide its workers with the inputs of a sweep until the block ends.
 
     Args:

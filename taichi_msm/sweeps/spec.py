@@ -134,7 +134,7 @@ class Sweep:
     def overrides(self, values: list[Any]) -> tuple[str, ...]:
         """Return the arguments of `run --set` for the run with these values."""
         pairs = [*self.settings.set.items(), *zip(self.keys, values, strict=True)]
-        return tuple(f"{name}={format_value(value)}" for name, value in pairs)
+        return tuple(f"{name}={format_override(value)}" for name, value in pairs)
 
     @cached_property
     def files(self) -> dict[str, str]:
@@ -237,7 +237,7 @@ def _normalised(path: Path) -> str:
         return str(path)
 
 
-def format_value(value: Any) -> str:
+def format_override(value: Any) -> str:
     """Format a value for `--set`."""
     if isinstance(value, str):
         with suppress(UnreadableError):
@@ -326,7 +326,7 @@ def _unknown_keys(scene: ParsedFile, data: dict[str, Any]) -> Iterator[Problem]:
         del trials[path]
     for path, value in trials.items():
         known = len(draft.problems)
-        draft.override(parse_override(f"{path[1]}={format_value(value)}"))
+        draft.override(parse_override(f"{path[1]}={format_override(value)}"))
         yield from (Problem(path, problem.message) for _, problem in draft.problems[known:])
     for problem in parse_model(Scene, draft.data)[1]:
         if not problem.message.startswith("unknown key"):

@@ -49,7 +49,7 @@ from taichi_msm.sweeps.runs import (
     Outcome,
     SweepResult,
 )
-from taichi_msm.sweeps.spec import Sweep, format_value
+from taichi_msm.sweeps.spec import Sweep, format_override
 from taichi_msm.system.compiler import versions
 from taichi_msm.system.files import read_regular
 from taichi_msm.system.process import available_memory, available_threads
@@ -132,7 +132,7 @@ def _write_plots(result: SweepResult) -> WrittenFiles:
 def write_table(result: SweepResult) -> None:
     """Write table.csv, with a row for each run."""
     with replacing(result.directory / TABLE) as file:
-        for row in [_names(result), *_rows(result, format_value)]:
+        for row in [_names(result), *_rows(result, format_override)]:
             file.write(f"{csv_line(row)}\n".encode("utf-8", "backslashreplace"))
 
 
@@ -150,7 +150,7 @@ def write_parquet(result: SweepResult) -> WrittenFiles:
         try:
             pyarrow.array(columns[name])
         except pyarrow.ArrowException:
-            columns[name] = list(map(format_value, columns[name]))
+            columns[name] = list(map(format_override, columns[name]))
     for name in result.columns():  # An explicit type is needed for columns without a value.
         kind = pyarrow.string() if name in ("status", "error") else pyarrow.float64()
         columns[name] = pyarrow.array(columns[name], kind)

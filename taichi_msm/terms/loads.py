@@ -122,8 +122,8 @@ class ProbeTerm(Term):
 
         Args:
             config: compile-time configuration.
-            first_slope: index of the first array of `decay_gradients` in `sheet.derivatives`, in multiples of the sheet's
-                rows.
+            first_slope: index of the first array of `decay_gradients` in `sheet.derivatives`, in multiples of the
+                sheet's rows.
         """
         ti = config.ti
         moves, by_area, first = self.moves, self.by_area, config.first_column(ProbeTerm)

@@ -19,7 +19,7 @@ from taichi_msm.errors import SceneError
 from taichi_msm.load.scene_file import ANY_CAMERA, CAMERA_FILE_KEYS, PICTURE_KEYS, load_plan
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_PATH
-from taichi_msm.sweeps.spec import Distribution, format_value, load_sweep, run_values, sample_run_values
+from taichi_msm.sweeps.spec import Distribution, format_override, load_sweep, run_values, sample_run_values
 from tests.scenes import speckle
 
 
@@ -105,7 +105,7 @@ def test_grids_give_every_combination_the_last_key_fastest() -> None:
 def test_a_cell_is_what_set_takes(value: Any) -> None:
     from taichi_msm.load.scene_file import parse_override
 
-    assert parse_override(f"key={format_value(value)}").value == value
+    assert parse_override(f"key={format_override(value)}").value == value
 
 
 @pytest.fixture
