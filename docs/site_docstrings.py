@@ -7,7 +7,7 @@ import re
 from griffe import Extension, Object
 
 
-class Examples(Extension):
+class Examples(Extension):  # type: ignore[misc]
     """Rename the section in every docstring."""
 
     def on_object(self, *, obj: Object, **_: object) -> None:
