@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,9 +10,6 @@ import yaml
 from tests.mutants.definitions import Definition, definitions, named, replaced
 
 ROOT = Path(__file__).parent.parent.parent
-DOCUMENT = ROOT / "docs" / "tests.md"
-START = "<!-- mutants: made by python -m tests.mutants --write -->\n"
-END = "<!-- end of mutants -->\n"
 
 
 class Mutant(NamedTuple):
@@ -80,31 +75,3 @@ def mutants() -> list[Mutant]:
     """Read the list of mistakes."""
     text = Path(__file__).with_name("mutants.yaml").read_text(encoding="utf-8")
     return [Mutant(**fields) for fields in yaml.safe_load(text)]
-
-
-def table(killers: Mapping[str, str]) -> str:
-    """Lay out which test kills which mutant.
-
-    Args:
-        killers: the tests by the names of the mutants.
-    """
-    rows = [f"| {m.name} | `{killers[m.name]}` |\n" for m in mutants() if m.name in killers]
-    return "| mutant | killed by |\n|---|---|\n" + "".join(rows)
-
-
-def listed() -> dict[str, str]:
-    """Read the table in the document: the tests by the names of the mutants."""
-    return dict(re.findall(r"^\| (\S+) \| `(\S+)` \|$", split_document()[1], flags=re.MULTILINE))
-
-
-def write(killers: Mapping[str, str]) -> None:
-    """Renew the table in the document; mutants that are not given keep their tests."""
-    before, _, after = split_document()
-    DOCUMENT.write_text(before + START + table({**listed(), **killers}) + END + after, encoding="utf-8")
-
-
-def split_document() -> tuple[str, str, str]:
-    """Take the document apart: what is before the table, the table, what is after it."""
-    before, rest = DOCUMENT.read_text(encoding="utf-8").split(START)
-    inside, after = rest.split(END)
-    return before, inside, after

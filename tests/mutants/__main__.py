@@ -1,8 +1,7 @@
 """Make one mistake at a time in a copy of the project, and see that a test fails.
 
 python -m tests.mutants              all of them
-python -m tests.mutants bgr          some of them, by name
-python -m tests.mutants --write      and renew the table in docs/tests.md
+python -m tests.mutants richardson   some of them, by name
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from tests.mutants import ROOT, Mutant, mutants, table, write
+from tests.mutants import ROOT, Mutant, mutants
 
 # What the tests of mutants need of the project.
 COPIED = ("pyproject.toml", "scenes", "taichi_msm", "tests")
@@ -98,7 +97,6 @@ def main(arguments: list[str]) -> int:
     known = {mutant.name: mutant for mutant in mutants()}
     parser = argparse.ArgumentParser(prog="python -m tests.mutants", description="See that tests notice mistakes.")
     parser.add_argument("names", nargs="*", metavar="NAME", help="all, or some of: " + ", ".join(known))
-    parser.add_argument("--write", action="store_true", help="renew the table in docs/tests.md")
     options = parser.parse_args(arguments)
     if unknown := [name for name in options.names if name not in known]:
         parser.error("no such mutant: " + ", ".join(unknown))
@@ -108,12 +106,7 @@ def main(arguments: list[str]) -> int:
     except NoVerdictError as error:
         print(error, file=sys.stderr)
         return 1
-    print(table(killers), end="")
-    if len(killers) < len(chosen):
-        return 1
-    if options.write:
-        write(killers)
-    return 0
+    return int(len(killers) < len(chosen))
 
 
 if __name__ == "__main__":
