@@ -357,7 +357,7 @@ def _mesh_remedy(plan: Plan, mesh: MeshEstimate, affords: Callable[[Plan], bool]
     allowed = rows * cols <= MAX_REFINEMENT * math.prod(scene.sheet.points) and max(rows, cols) < MAX_POINTS
     if allowed and affords(plan_variant(plan, with_points(scene, (rows, cols)))):
         return f"try sheet.points: {[rows, cols]}"
-    return "more than points, tissue.bending, tissue.pretension or a wider tip help"
+    return "tissue.bending, tissue.pretension or a wider tip help more than points do"
 
 
 def _bound_words(at_most: bool, at_least: bool) -> str:

@@ -269,7 +269,7 @@ def test_a_scene_that_is_all_right_has_no_notes() -> None:
     assert len(notes_of(scene(), RunProgress(1, 0.0, 0.49), None)) == 2
 
 
-HELPS = "more than points, tissue.bending, tissue.pretension or a wider tip help"
+HELPS = "tissue.bending, tissue.pretension or a wider tip help more than points do"
 
 
 @pytest.mark.parametrize(("error", "advice"), [(0.015, "try sheet.points: [15, 19]"), (0.04, HELPS), (2000.0, HELPS)])
