@@ -409,7 +409,7 @@ def test_a_third_mesh_tells_the_order_of_the_mesh_error(
             off = 1e-3 * (2 ** (order * halvings) - 1)
             return fine._replace(values=fine.values + off * (fine.values - tracks["pixel"][:, :1]))
 
-        monkeypatch.setattr(Runs, "coarse", coarse)
+        monkeypatch.setattr(Runs, "predict_coarse", coarse)
         error = fit(changed(), tracks, ["tissue.foundation"], workers=1).parameters["tissue.foundation"].mesh_error
         assert error is not None
         return error

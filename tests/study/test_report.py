@@ -314,11 +314,11 @@ def test_nothing_in_the_picture_covers_anything_else() -> None:
         figure = _figure(of_tissue())
     figure.canvas.draw()
     axes = {one.get_title(loc="left"): one for one in figure.axes}
-    assert list(axes) == ["Stepping", "Rasterizer", "Points", "Terms"]
+    assert list(axes) == ["Stepping", "Drawing", "Points", "Terms"]
     legends = {name: legend for name in axes if (legend := axes[name].get_legend())}
     words = {name: [text.get_text() for text in legend.texts] for name, legend in legends.items()}
     assert words["Points"][:4] == ["9 x 9", "16 x 16", "31 x 31 (the scene)", "61 x 61, at most"]
-    assert words["Rasterizer"] == [*(f"supersample {n}" for n in (1, 2, 4)), *(f"refine {n}" for n in (0, 1, 2, 5))]
+    assert words["Drawing"] == [*(f"supersample {n}" for n in (1, 2, 4)), *(f"refine {n}" for n in (0, 1, 2, 5))]
     texts = [text for legend in legends.values() for text in legend.texts]
     handles = [handle for legend in legends.values() for handle in legend.legend_handles if handle]
     labels = [one.get_window_extent() for one in [*texts, *figure.texts]]
