@@ -83,8 +83,8 @@ def fit(
             down, shape (N, 2); `position` [m], shape (N, T, 3), or `pixel` [px] of the scene's camera, shape (N, T, 2);
             NaN where not observed; optionally `sigma`, the standard deviation of their errors. Or a run's
             trajectory.npz or tracks.npz.
-        free: keys of the parameters, as dotted paths such as tissue.young or probes.0.total.2; or tissue.map alone, a
-            map of R x R cells.
+        free: keys of the parameters, as dotted paths such as tissue.young or probes.0.total.2; or tissue.map, a map
+            of R x R cells, alone or with a component of a force, whose factor all forces share.
         bounds: smallest and largest values by key; of tissue.map, of the factors.
         forces: a forces.csv of the same motion, and the standard deviation of its forces [N].
         directory: directory of fit.json, scene.yaml, fit.png and a map's pictures; None: nothing is written.

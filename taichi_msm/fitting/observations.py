@@ -44,7 +44,7 @@ class ObservationModel:
     def __init__(self, scene: Scene, observations: Observations, frames: int) -> None:
         from scipy.sparse import csr_matrix
 
-        self._scene, self._observations = scene, observations
+        self.scene, self._observations = scene, observations
         corners, weights = surface_weights(observations.coordinates, scene.sheet, scene.render.refine)
         number, (rows, cols) = np.arange(len(corners)), scene.sheet.points
         self._surface = csr_matrix((weights.ravel(), (number.repeat(4), corners.ravel())), (len(corners), rows * cols))
@@ -62,7 +62,7 @@ class ObservationModel:
     def motion(self, at_frames: Array) -> Array:
         """Return the largest displacement of the points at each frame [m], shape (frames,)."""
         return np.asarray(
-            np.linalg.norm(at_frames - positions_at_rest(self._scene, self._observations), axis=2).max(axis=1)
+            np.linalg.norm(at_frames - positions_at_rest(self.scene, self._observations), axis=2).max(axis=1)
         )
 
     def points(self, position: Array) -> Array:
@@ -73,7 +73,7 @@ class ObservationModel:
         """Return points [m], shape (N, T, 3), as observations, shape (N, T, 3 or 2); NaN behind the camera."""
         if self._observations.kind == "position":
             return points
-        return project_points(self._scene, points, self._observations.time)
+        return project_points(self.scene, points, self._observations.time)
 
     def backward(self, points: Array, slope: Array) -> Array:
         """Return the derivative of a loss by the positions of every frame.
@@ -86,11 +86,11 @@ class ObservationModel:
             The derivative by the positions, shape (frames, rows, cols, 3).
         """
         if self._observations.kind == "pixel":
-            by = DIFFERENCE_SHARE * max(self._scene.sheet.size) * np.eye(3)
+            by = DIFFERENCE_SHARE * max(self.scene.sheet.size) * np.eye(3)
             changes = ((self.observe(points + one) - self.observe(points - one)) / (2 * one.sum()) for one in by)
             slope = np.stack([(slope * change).sum(axis=-1) for change in changes], axis=-1)
         at_frames = self._time_weights.T @ slope.swapaxes(0, 1).reshape(slope.shape[1], -1)
-        shape = *self._scene.sheet.points, 3
+        shape = *self.scene.sheet.points, 3
         return np.array([(self._surface.T @ frame.reshape(-1, 3)).reshape(shape) for frame in at_frames])
 
 

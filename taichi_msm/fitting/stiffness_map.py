@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -12,12 +13,13 @@ from numpy.typing import NDArray
 from taichi_msm.accuracy.mesh import coarser_plan
 from taichi_msm.errors import SceneError, StageProgressCallback
 from taichi_msm.fitting.checks import faults, faults_at_start
+from taichi_msm.fitting.least_squares import MAX_RELATIVE_ERROR, ProfilePoint
 from taichi_msm.fitting.observations import ObservationModel, Observations
-from taichi_msm.fitting.parameters import Bounds, rounded
+from taichi_msm.fitting.parameters import Bounds, Parameter, make_parameters, rounded
 from taichi_msm.fitting.predict import Prediction, mesh_error, without_outputs
 from taichi_msm.fitting.rejection import by_chi_square
-from taichi_msm.fitting.result import FitResult, FittedMap
-from taichi_msm.fitting.tikhonov import MapGrid, MapSearch, MapSolution, centres
+from taichi_msm.fitting.result import Estimate, FitResult, FittedMap
+from taichi_msm.fitting.tikhonov import MapGrid, MapSearch, MapSolution, centres, with_scaled_forces
 from taichi_msm.gradients.gradient import Adjoint, require_differentiable
 from taichi_msm.load.check import check_scene
 from taichi_msm.model.plan import Plan
@@ -31,6 +33,12 @@ from taichi_msm.system.process import available_memory
 Array = NDArray[np.float64]
 
 KEY = "tissue.map"
+
+# A component of a force.
+FORCE_KEY = re.compile(r"probes\.\d+\.total\.[012]")
+
+# Standard deviations of the ends of a 95 % interval, and the standard deviation of an unknown log.
+NORMAL_QUANTILE, UNKNOWN_DEVIATION = 1.96, 3.0
 
 # Default bounds of the factors.
 DEFAULT_LOW, DEFAULT_HIGH = 0.1, 10.0
@@ -60,6 +68,7 @@ class MapSettings:
 
     resolution: int
     limits: Bounds  # of the factors
+    force: Parameter | None  # component of a force whose factor all forces share; None: all forces are known
 
 
 def map_settings(
@@ -71,10 +80,10 @@ def map_settings(
             raise SceneError([f"--resolution {resolution}: is that of a map; add --free {KEY}"])
         return None
     named = f"--free {KEY}"
-    if others := [key for key in free if key != KEY]:
-        raise SceneError(
-            [f"{named}: a map is found alone, as its level and {others[0]} can look alike; leave that out"]
-        )
+    others = [key for key in free if key != KEY]
+    if fixed := [key for key in others if not FORCE_KEY.fullmatch(key)] + others[1:]:
+        why = f"a map is found alone, as its level and {fixed[0]} can look alike; leave that out"
+        raise SceneError([f"{named}: {why}, or free one component of a force, whose factor all forces share"])
     if scene.tissue is None:
         raise SceneError([f"{named}: the scene has springs; describe them as tissue"])
     cells = min(scene.sheet.points) - 1
@@ -83,7 +92,7 @@ def map_settings(
     if not 2 <= resolution <= cells:
         said = f"take 2 to {cells}, as the sheet has {cells} cells along a side, or more sheet.points"
         raise SceneError([f"--resolution {resolution}: {said}"])
-    if wrong := [key for key in bounds if key != KEY]:
+    if wrong := [key for key in bounds if key not in free]:
         raise SceneError([f"--bounds {wrong[0]}: not among --free; take {KEY}=LOW,HIGH, factors of young"])
     low, high = bounds.get(KEY, (DEFAULT_LOW, DEFAULT_HIGH))
     low, high = (DEFAULT_LOW if low == -math.inf else low), (DEFAULT_HIGH if high == math.inf else high)
@@ -92,7 +101,8 @@ def map_settings(
     if low < 1 / MAX_FACTOR or high > MAX_FACTOR:
         said = f"take factors of young from {1 / MAX_FACTOR:g} to {MAX_FACTOR:g}"
         raise SceneError([f"--bounds {KEY}={low:g},{high:g}: {said}"])
-    return MapSettings(resolution, (low, high))
+    force = make_parameters(scene, others, {key: bounds[key] for key in others if key in bounds})[0] if others else None
+    return MapSettings(resolution, (low, high), force)
 
 
 def fit_map(
@@ -122,8 +132,9 @@ def fit_map(
         remedy = f"take a HIGH well above {low:.3g}, or less pretension"
         raise SceneError([f"--bounds {KEY}={task.limits[0]:g},{task.limits[1]:g}: {said}; {remedy}"])
     limits = math.log(low), math.log(task.limits[1])
-    fields = MapGrid(task.resolution, _cells(plan))
+    fields, cells = MapGrid(task.resolution, _cells(plan)), task.resolution**2
     start = np.clip(np.log(_start(plan, task.resolution)), *limits).ravel()
+    start = np.append(start, [0.0] * (task.force is not None))
     device = runtime.start("cpu")
     adjoint, sight = Adjoint(plan, device), ObservationModel(plan.scene, observations, plan.grid.frames + 1)
 
@@ -133,35 +144,49 @@ def fit_map(
 
     search: MapSearch | None = None
     tell()
-    position = adjoint.run(fields.factors(start), tell)
+    position = adjoint.run(fields.factors(start[:cells]), tell)
     points = _first(position, sight, observations, given)
     by_points = 0.0
     if (half := coarser_plan(plan)) is not None:
-        few = MapGrid(task.resolution, _cells(half)).factors(start)
+        few = MapGrid(task.resolution, _cells(half)).factors(start[:cells])
         other = ObservationModel(half.scene, observations, half.grid.frames + 1)
         moved = other.points(Adjoint(half, device).run(few, tell))
         apart = (other.observe(moved) - sight.observe(points))[observations.known] / RICHARDSON_DIVISOR
         by_points = float(np.sqrt(np.nanmean(apart**2)))
     sigma = math.hypot(observations.sigma, by_points)
-    search = MapSearch(adjoint, sight, observations, sigma, fields, limits, tell)
+    search = MapSearch(
+        adjoint,
+        sight,
+        observations,
+        sigma,
+        fields,
+        limits,
+        tell,
+        force_limits=task.force.limits if task.force else None,
+    )
     solution = search.best(start)
-    factors, errors = (each.reshape(task.resolution, -1) for each in (np.exp(solution.x), solution.errors))
+    factors, errors = (each[:cells].reshape(task.resolution, -1) for each in (np.exp(solution.x), solution.errors))
     found = FittedMap(factors, errors, solution.choice, sigma)
     fitted = search.predict(solution.x)[1]
     left = (fitted - observations.values)[observations.known]
     assert given.tissue is not None
     drawn = {"map": StiffnessMap(image=image, range=found.range)}
     scene = given.model_copy(update={"tissue": given.tissue.model_copy(update=drawn)})
+    scene = with_scaled_forces(scene, *np.exp(solution.x[cells:]).tolist())
+    parameters = {} if task.force is None else {task.force.key: _force(task.force, solution)}
     mapped = check_scene(without_outputs(scene), {**plan.maps, "map": MapImage(found.grey, "")})
     chi_square = float(np.sum((left / observations.sigma) ** 2))
     return FitResult(
+        parameters=parameters,
+        correlation=[[1.0]] * len(parameters),
+        curves={key: _curve(one, solution) for key, one in parameters.items()},
         residual=float(np.sqrt(np.mean(left**2))),
         sigma=observations.sigma,
         unit=observations.unit,
         chi_square=chi_square,
         rejection=by_chi_square(chi_square, left.size, left.size),
         degrees_of_freedom=left.size,
-        identifiable=not found.unknown.any(),
+        identifiable=not found.unknown.any() and all(one.identifiable for one in parameters.values()),
         mesh_error=mesh_error(mapped, tell),
         runs=search.runs + 1,
         notes=list(_notes(observations, solution, found, by_points, limits, left)),
@@ -170,6 +195,21 @@ def fit_map(
         fitted=fitted,
         map=found,
     )
+
+
+def _force(parameter: Parameter, solution: MapSolution) -> Estimate:
+    """Return the estimate of a component of a force."""
+    x, deviation = float(solution.x[-1]), float(np.nan_to_num(solution.errors[-1], nan=UNKNOWN_DEVIATION))
+    ends = sorted(parameter.value(x + side * NORMAL_QUANTILE * deviation) for side in (-1, 1))
+    is_identifiable = deviation <= MAX_RELATIVE_ERROR
+    error = parameter.error(x, deviation)
+    return Estimate(parameter.value(x), error, (ends[0], ends[1]), parameter.start, is_identifiable, None)
+
+
+def _curve(estimate: Estimate, solution: MapSolution) -> list[ProfilePoint]:
+    """Return the quadratic approximation of the profile of a force."""
+    deviation = float(np.nan_to_num(solution.errors[-1], nan=UNKNOWN_DEVIATION))
+    return [ProfilePoint(estimate.value * math.exp(n * deviation), float(n)) for n in np.linspace(-3, 3, 25)]
 
 
 def _unusable(observations: Observations, scene: Scene, task: MapSettings) -> Iterator[str]:
@@ -249,5 +289,6 @@ def _notes(
     if solution.excess > 1.5:
         times = rounded(math.sqrt(solution.excess))
         yield f"what is left is {times} times what is expected with any map, and the errors are widened by as much"
-    if bound := int((np.minimum(solution.x - limits[0], limits[1] - solution.x) < BOUND_TOLERANCE).sum()):
+    x = solution.x[: found.factors.size]
+    if bound := int((np.minimum(x - limits[0], limits[1] - x) < BOUND_TOLERANCE).sum()):
         yield f"{bound} fields ended at a bound, {math.exp(limits[0]):.3g} or {math.exp(limits[1]):.3g}; see --bounds"

@@ -24,7 +24,9 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import SceneError
 from taichi_msm.fitting.observations import ObservationModel, Observations
+from taichi_msm.fitting.parameters import Bounds
 from taichi_msm.gradients.gradient import Adjoint
+from taichi_msm.scene.scene import Scene
 
 Array = NDArray[np.float64]
 
@@ -55,6 +57,13 @@ class SmoothnessWeight(NamedTuple):
     weights: Array  # that were looked at, up to this one
     left: Array  # by how much chi-square is above the least, with each
     expected: Array  # and how much is expected
+
+
+def with_scaled_forces(scene: Scene, factor: float = 1.0) -> Scene:
+    """Return the scene with the forces of all tools scaled."""
+    totals = [None if probe.total is None else tuple(factor * part for part in probe.total) for probe in scene.probes]
+    probes = [probe.model_copy(update={"total": total}) for probe, total in zip(scene.probes, totals, strict=True)]
+    return scene.model_copy(update={"probes": tuple(probes)})
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +122,7 @@ class MapSearch:
         fields: cells of the map.
         limits: bounds of the logs of the factors.
         tell: called several times a second; its exceptions end the search.
+        force_limits: bounds of the log of a common factor of all forces, the last entry of x; None: there is none.
 
     Attributes:
         runs: number of runs.
@@ -127,17 +137,22 @@ class MapSearch:
         fields: MapGrid,
         limits: tuple[float, float],
         tell: Callable[[], None],
+        *,
+        force_limits: Bounds | None = None,
     ) -> None:
         self._adjoint, self._sight, self._observations, self._sigma = adjoint, sight, observations, sigma
-        self._fields, self._limits, self._tell = fields, limits, tell
-        self._rough = fields.roughness()
+        self._fields, self._tell, self._cells = fields, tell, fields.resolution**2
+        more = [] if force_limits is None else [force_limits]
+        self._rough = np.pad(fields.roughness(), (0, len(more)))
+        self._limits = np.array([limits] * self._cells + more).T
         self.runs = 0
 
     def predict(self, x: Array) -> tuple[Array, Array]:
         """Return the points [m], shape (N, T, 3), and the predicted observations of a map."""
         self._tell()
         self.runs += 1
-        points = self._sight.points(self._adjoint.run(self._fields.factors(x), self._tell))
+        cells, scene = x[: self._cells], with_scaled_forces(self._sight.scene, *np.exp(x[self._cells :]))
+        points = self._sight.points(self._adjoint.run(self._fields.factors(cells), self._tell, scene))
         predicted = self._sight.observe(points)
         if not np.isfinite(predicted[self._observations.known]).all():
             said = "a point that was seen gets behind the eye of the camera with some maps"
@@ -149,7 +164,12 @@ class MapSearch:
         points, predicted = self.predict(x)
         left = np.where(self._observations.known, predicted - self._observations.values, 0.0) / self._sigma
         slope = self._adjoint.backward(self._sight.backward(points, 2 * left / self._sigma), self._tell)
-        return float((left**2).sum()), self._fields.backward(x, slope.maps["tissue.map"])
+        by_cells = self._fields.backward(x[: self._cells], slope.maps["tissue.map"])
+        # A factor of 1 + e changes each force by e times itself.
+        scene = with_scaled_forces(self._sight.scene, *np.exp(x[self._cells :]))
+        totals = {f"probes.{n}.total": np.array(probe.total, np.float64) for n, probe in enumerate(scene.probes)}
+        by_forces = sum(float(np.sum(slope.numbers[key] * total)) for key, total in totals.items())
+        return float((left**2).sum()), np.append(by_cells, [by_forces] * (len(x) - self._cells))
 
     def best(self, start: Array) -> MapSolution:
         """Return the smoothest map that explains the observations."""
@@ -190,7 +210,7 @@ class MapSearch:
             return (chi_square + weight * float(x @ rough)) / 2, slope / 2 + weight * rough
 
         options = {"maxcor": LBFGS_MEMORY, "ftol": COST_TOLERANCE, "gtol": 0.0, "maxiter": MAX_ITERATIONS}
-        bounds = [self._limits] * len(start)
+        bounds = list(zip(*self._limits, strict=True))
         found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
         return np.asarray(found.x, np.float64)
 

@@ -89,12 +89,13 @@ class Adjoint:
             self._sheet = MotionAdjoint(self._plan, device, cores=cores)
         self._ran = False
 
-    def run(self, factors: Array | None = None, pause: Pause = lambda: None) -> Array:
+    def run(self, factors: Array | None = None, pause: Pause = lambda: None, scene: Scene | None = None) -> Array:
         """Run the scene.
 
         Args:
             factors: Stiffness factors of the cells, shape (rows - 1, cols - 1), which replace those of the scene.
             pause: Called several times a second; an exception from it ends the run, which has no derivatives then.
+            scene: The scene with other forces of its tools; None for its own.
 
         Returns:
             Positions at every frame [m], shape (F + 1, rows, cols, 3).
@@ -105,6 +106,7 @@ class Adjoint:
         """
         self._ran = False
         plan = self._plan if factors is None else self._with_factors(factors)
+        plan = plan if scene is None else replace(plan, scene=scene)
         self._sheet.restart(plan)
         displacements = self._sheet.run(pause)
         self._ran = True

@@ -57,6 +57,14 @@ def scene(**more: Any) -> Scene:
     return Scene.model_validate(data | more)
 
 
+def swinging() -> Scene:
+    """The same tools on a sheet in motion."""
+    data = scene().model_dump(mode="json", exclude_none=True)
+    time = {"duration": 0.2, "frames_per_second": 25, "precision": "f64"}
+    moving = [one | {"load": [[0, 0], [0.1, 100], [0.2, 0]]} for one in data["probes"]]
+    return scene(time=time, tissue=data["tissue"] | {"density": 1050, "damping": 50}, probes=moving)
+
+
 def seen_in(truth: Scene, device: Device, factors: Array, times: Array, error: float) -> dict[str, Any]:
     """Positions of the places in a scene with a map, with errors of that standard deviation [m]."""
     plan = check_scene(truth)
@@ -113,6 +121,36 @@ def test_a_map_in_a_wrong_scene_is_rejected(device: Device) -> None:
     assert found.summary()[0].startswith("the model is rejected: chi-square ")
     assert found.summary()[0].endswith("; the errors of the fields do not cover this")
     assert not fit(scene(), observed, ["tissue.map"], resolution=4).model_rejected
+
+
+def test_a_common_factor_of_the_forces_comes_back_with_the_map(device: Device) -> None:
+    """From forces that are 30 % too small, which would make the tissue too soft on its foundation."""
+    observed = seen_in(scene(), device, TRUTH, np.array([1.0, 2.0]), 3e-6)
+    quieter = [one | {"total": [0.7 * each for each in one["total"]]} for one in scene().model_dump()["probes"]]
+    key = "probes.0.total.0"
+    found = fit(scene(probes=quieter), observed, ["tissue.map", key], resolution=4)
+    force = found.parameters[key]
+    assert abs(force.value - 0.5) < 4 * force.standard_error < 0.1
+    assert force.interval[0] < force.value < force.interval[1]  # type: ignore[operator]
+    assert [max(probe.total) for probe in found.scene.probes if probe.total] == pytest.approx([force.value] * 4)
+    assert found.map is not None
+    assert np.abs(np.log(found.map.factors / TRUTH) / found.map.errors).max() < 4
+    assert not found.model_rejected
+    assert found.summary()[0].startswith(f"{key}: ")
+    assert fit(scene(probes=quieter), observed, ["tissue.map"], resolution=4).model_rejected
+
+
+@pytest.mark.parametrize("motion", [False, True])
+def test_the_gradient_by_the_factor_of_the_forces(device: Device, motion: bool) -> None:
+    made = swinging() if motion else scene()
+    times = np.array([0.08, 0.16] if motion else [1.0, 2.0])
+    seen = read_observations(seen_in(made, device, TRUTH, times, 1e-4), 1)
+    plan, fields, limits = check_scene(made), MapGrid(4, (8, 8)), (-2.0, 2.0)
+    model = ObservationModel(plan.scene, seen, plan.grid.frames + 1)
+    search = MapSearch(Adjoint(plan, device), model, seen, 1e-4, fields, limits, lambda: None, force_limits=limits)
+    x, step = np.append(np.zeros(16), 0.2), np.append(np.zeros(16), 1e-3)
+    (_, slope), (high, _), (low, _) = (search.misfit(x + each) for each in (0 * step, step, -step))
+    assert slope[-1] == pytest.approx((high - low) / 2e-3, rel=1e-3)
 
 
 def test_the_files_give_what_was_fitted(result: FitResult, folder: Path) -> None:
@@ -253,13 +291,9 @@ def test_going_back_is_the_transpose_of_seeing(device: Device) -> None:
 
 
 def test_a_map_is_found_in_motion(device: Device) -> None:
-    data = scene().model_dump(mode="json", exclude_none=True)
-    time = {"duration": 0.2, "frames_per_second": 25, "precision": "f64"}
-    moving = [one | {"load": [[0, 0], [0.1, 100], [0.2, 0]]} for one in data["probes"]]
-    swinging = scene(time=time, tissue=data["tissue"] | {"density": 1050, "damping": 50}, probes=moving)
     factors = np.array([[1.0, 1.5], [0.7, 1.0]])
-    observed = seen_in(swinging, device, factors, np.arange(1, 6) / 25, 1e-6)
-    found = fit(swinging, observed, ["tissue.map"], resolution=2, bounds={"tissue.map": (0.3, 3)}).map
+    observed = seen_in(swinging(), device, factors, np.arange(1, 6) / 25, 1e-6)
+    found = fit(swinging(), observed, ["tissue.map"], resolution=2, bounds={"tissue.map": (0.3, 3)}).map
     assert found is not None
     np.testing.assert_allclose(found.factors, factors, rtol=0.02)
 
