@@ -4,7 +4,7 @@ import os
 import shutil
 import signal
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -91,6 +91,15 @@ def stereo(seen_by_two: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(seen_by_two, tmp_path / "stereo"))
 
 
+@pytest.fixture(autouse=True)
+def handlers() -> Iterator[None]:
+    """Restore the handlers of signals, which the command line replaces, before the next test."""
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
 Program = Callable[..., subprocess.CompletedProcess[str]]
 
 
@@ -100,13 +109,8 @@ def program(device: runtime.Device, capfd: pytest.CaptureFixture[str]) -> Progra
 
     def call(*arguments: str) -> subprocess.CompletedProcess[str]:
         takes_threads = arguments[0] in ("run", "study", "view")
-        before = {number: signal.getsignal(number) for number in SIGNALS}
         capfd.readouterr()
-        try:
-            code = main([*arguments, *(("--threads", str(device.threads)) if takes_threads else ())])
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
+        code = main([*arguments, *(("--threads", str(device.threads)) if takes_threads else ())])
         said = capfd.readouterr()
         return subprocess.CompletedProcess(arguments, code, said.out, said.err)
 

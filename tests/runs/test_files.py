@@ -216,7 +216,7 @@ def test_an_interruption_while_a_picture_is_encoded_here_leaves_whole_frames(
 
     def interrupted(*arguments: Any, **keywords: Any) -> Any:
         interrupt_main()
-        time.sleep(1)  # until the main thread has heard of it
+        time.sleep(0.3)  # until the main thread has heard of it
         return original(*arguments, **keywords)
 
     with ResultWriter(tmp_path / "interrupted", *scene_and_grid(small_scene()), encode_in_subprocess=False) as writer:
