@@ -63,7 +63,7 @@ def animation(name: str, scene: str, size: int, *overrides: str, image: Path | N
 
 
 def endoscope(size: int) -> None:
-    """Keep the GIF of the scene endoscope, in another size, with every second frame."""
+    """Keep the GIF of the scene endoscope, in another size, with every fourth frame."""
     given = load_scene(SCENES / "endoscope.yaml")
     assert isinstance(given.render.camera, Camera)
     assert given.render.camera.intrinsics is not None
@@ -73,7 +73,7 @@ def endoscope(size: int) -> None:
         name: round((value + 0.5) * share - 0.5 if name in ("cx", "cy") else value * share, 2)
         for name, value in given.render.camera.intrinsics.model_dump().items()
     }
-    rate = given.time.frames_per_second / 2
+    rate = given.time.frames_per_second / 4
     smaller = (f"render.camera.intrinsics={json.dumps(values)}", f"time.frames_per_second={rate:g}")
     animation("endoscope", "endoscope", size, *smaller)
 
