@@ -31,14 +31,7 @@ MAX_LINE_CHARACTERS = 4096
 
 
 def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
-    """Write the forces and tracks of runs.
-
-    Args:
-        sources: the runs.
-        folder: destination, empty.
-
-    Yields:
-        Warnings about each run.
+    """Write the forces and tracks of runs; arguments as for `FormatWriter`.
 
     Raises:
         FilesError: when a run has neither forces nor tracks.

@@ -53,15 +53,7 @@ ALIGNMENT_BYTES = 4
 
 @one_folder_per_run
 def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    """Write the animated surface of a run with its picture.
-
-    Args:
-        run: the run.
-        folder: destination, empty.
-        progress: called with the finished frames and the total number of frames.
-
-    Returns:
-        Warnings.
+    """Write the animated surface of a run with its picture; arguments as for `one_folder_per_run`.
 
     Raises:
         FilesError: as for `FinishedRun.positions`.

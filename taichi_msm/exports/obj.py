@@ -27,15 +27,7 @@ MATERIAL_FILE = "surface.mtl"
 
 @one_folder_per_run
 def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    """Write the surface of every frame, the material and the picture.
-
-    Args:
-        run: the run.
-        folder: destination, empty.
-        progress: called with the finished frames and the total number of frames.
-
-    Returns:
-        Warnings.
+    """Write the surface of every frame, the material and the picture; arguments as for `one_folder_per_run`.
 
     Raises:
         FilesError: as for `FinishedRun.positions`.

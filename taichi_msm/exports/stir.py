@@ -58,14 +58,7 @@ Pixels = NDArray[np.int64]
 
 
 def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
-    """Write the videos, marked tracks and cameras of runs.
-
-    Args:
-        sources: the runs.
-        folder: destination, empty.
-
-    Yields:
-        Warnings about each run.
+    """Write the videos, marked tracks and cameras of runs; arguments as for `FormatWriter`.
 
     Raises:
         FilesError: as for `read_pinhole`, and when the cameras are not a rectified stereo pair.

@@ -42,14 +42,7 @@ class _Pickler(pickle.Pickler):
 
 
 def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
-    """Write the tracks and frames of runs.
-
-    Args:
-        sources: the runs.
-        folder: destination, empty.
-
-    Yields:
-        Warnings about each run.
+    """Write the tracks and frames of runs; arguments as for `FormatWriter`.
 
     Raises:
         FilesError: when the videos exceed the free memory.

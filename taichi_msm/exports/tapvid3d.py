@@ -38,14 +38,7 @@ FORMAT_NAME = "tapvid3d"
 
 
 def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
-    """Write the tracks and frames of runs.
-
-    Args:
-        sources: the runs.
-        folder: destination, empty.
-
-    Yields:
-        Warnings about each run.
+    """Write the tracks and frames of runs; arguments as for `FormatWriter`.
 
     Raises:
         FilesError: as for `read_pinhole` and `read_tracks`.

@@ -41,15 +41,7 @@ Array = NDArray[np.floating]
 
 @one_folder_per_run
 def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    """Write the surface of every frame, the collection and the picture.
-
-    Args:
-        run: the run.
-        folder: destination, empty.
-        progress: called with the finished frames and the total number of frames.
-
-    Returns:
-        Warnings.
+    """Write the surface of every frame, the collection and the picture; arguments as for `one_folder_per_run`.
 
     Raises:
         FilesError: as for `FinishedRun.positions`, and when a map has changed since the run.

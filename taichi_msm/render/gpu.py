@@ -80,20 +80,7 @@ class Threads:
     def draw(
         self, position: NDArray[np.float32], uniforms: NDArray[np.float32], sizes: NDArray[np.int32]
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Draw the picture, the labels or both, as configured.
-
-        Args:
-            position: positions of the mass points [m], shape (rows, cols, 3).
-            uniforms: constants of the view (uniforms.py).
-            sizes: sizes and counters (uniforms.py).
-
-        Returns:
-            Colours, shape (height, width, 3), and labels as expected by `labels_of`; each is undefined unless it is
-            drawn.
-
-        Raises:
-            DeviceError: if the device stopped threads early.
-        """
+        """Draw as the CPU backend (cpu.py) does; DeviceError: the device stopped threads early."""
         launches, factor = Launches(bounded=True), self._config.supersample
         (width, height), capsules = self._size, int(sizes[uni.CAPSULE_COUNT])
         samples_across, samples_down = width * factor, height * factor
