@@ -37,7 +37,7 @@ COLOUR_BYTES = 3
 # the normal and the light 30, four texels filtered in three colours 30.
 PIXEL_FLOPS = 200
 
-# Points of the smallest sheet, whose step takes next to nothing: what is left is the launch.
+# Points of the smallest sheet, whose step takes the residual is next to 0: what is left is the launch.
 SMALLEST = 11
 
 FLOATS = np.ctypeslib.ndpointer(np.float32, flags="C_CONTIGUOUS")

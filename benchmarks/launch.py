@@ -1,4 +1,4 @@
-"""What it takes to launch a kernel that does next to nothing, on every thread."""
+"""What it takes to launch a kernel that does the residual is next to 0, on every thread."""
 
 from __future__ import annotations
 

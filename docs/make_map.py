@@ -108,9 +108,9 @@ def draw(truth: Scene, result: FitResult) -> None:
     with plt.style.context(STYLE, after_reset=True):
         figure, panels = plt.subplots(1, 3, figsize=(8.0, 2.5), layout="constrained")
         shown: tuple[tuple[Floats, str, dict[str, Any]], ...] = (
-            (factors(truth), "The truth", {"norm": both}),
-            (result.map.factors, "What was found", {"norm": both}),
-            (errors, "How well it is known", {"cmap": "cividis", "vmin": 0}),
+            (factors(truth), "Truth", {"norm": both}),
+            (result.map.factors, "Estimate", {"norm": both}),
+            (errors, "Standard error", {"cmap": "cividis", "vmin": 0}),
         )
         for axes, (values, title, options) in zip(panels, shown, strict=True):
             image = axes.imshow(values, **options)

@@ -182,7 +182,7 @@ def _file(path: str, sha256: str | None) -> Iterator[BinaryIO]:
     with actual_path(path).open("rb") as file:
         if sha256 is not None:
             if _sha256(file) != sha256:
-                raise PictureError(f"{path} is not the file that was run, as its SHA-256 tells; put that one back")
+                raise PictureError(f"{path} is not the file of the run, by its SHA-256; put that one back")
             file.seek(0)
         yield file
 

@@ -43,7 +43,7 @@ class EnergyGrowth:
             return least, growth
         square = np.einsum("ijk,ijk->ij", reading.displacement, reading.displacement, dtype=np.float64)
         energy = reading.energy + float((self._stiffness * square).sum()) / 2
-        # An energy below 1e-3 of the largest one deserves no warning, and rounding may add as much.
+        # Rounding may add energy; below 1e-3 of the largest energy it does not affect the result.
         if least > 0 and energy > max(least, 1e-3 * before.peak):
             growth = max(growth, energy / least)
         return min(least or energy, energy), growth

@@ -30,9 +30,9 @@ from taichi_msm.system.process import Interruption
 @click.option(
     "--forces",
     metavar="FILE,SIGMA",
-    help="Forces of the tools that were seen too, as in forces.csv, and the standard deviation of their errors [N].",
+    help="Measured forces of the tools, as in forces.csv, and their standard deviation [N].",
 )
-@click.option("--sigma", type=float, metavar="SIGMA", help="Standard deviation of what was seen [m] or [px].")
+@click.option("--sigma", type=float, metavar="SIGMA", help="Standard deviation of the observations [m] or [px].")
 @click.option("--robust", is_flag=True, help="Let numbers that are far off count less.")
 @click.option(
     "--correlation", type=float, metavar="PX", help="How far apart in the picture errors of tracks are alike [px]."
@@ -41,7 +41,7 @@ from taichi_msm.system.process import Interruption
 @click.option("--profile", is_flag=True, help="Find intervals by going to their ends; takes more runs.")
 @click.option("--resolution", type=int, metavar="R", help="Fields along a side of a map that is fitted.")
 @click.option("--out", metavar="DIR", help="Directory for the fit.  [default: output/<name of the scene file>-fit]")
-@workers_option(help="Processes that take runs side by side.  [default: as many as pay]")
+@workers_option(help="Number of worker processes.  [default: by the duration of the first run]")
 @json_option
 def fit(
     scene: str,
@@ -61,7 +61,7 @@ def fit(
     workers: int | None,
     as_json: bool,
 ) -> int:
-    """Find numbers of SCENE from what was seen of the tissue, OBSERVED, and how well they are known."""
+    """Estimate parameters of SCENE from OBSERVED data, with confidence intervals."""
     from taichi_msm.load.scene_file import load_scene
 
     # Both options accept several words, of which click assigns all but the first to `more`.

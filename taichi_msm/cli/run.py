@@ -56,7 +56,7 @@ REPEAT_OPTIONS = ("again", "out", "arch", "threads", "estimate_error", "quiet", 
 )
 @quality_option
 @click.option("--resume", metavar="DIR", help="Continue the unfinished run in DIR, instead of running SCENE.")
-@click.option("--again", metavar="DIR", help="Repeat the run that run.json in DIR tells of, instead of running SCENE.")
+@click.option("--again", metavar="DIR", help="Repeat the run of DIR/run.json instead of running SCENE.")
 @click.option("--quiet", is_flag=True, help="Print no progress and no summary.")
 @json_option
 @click.pass_context

@@ -60,7 +60,7 @@ def study(
     quick: bool,
     as_json: bool,
 ) -> int:
-    """Measure how fast and how wrong every setting of SCENE is, and recommend one."""
+    """Measure the speed and error of every setting of SCENE, and recommend one."""
     from taichi_msm.load.scene_file import load_scene
     from taichi_msm.scene.section import MAX_TOLERANCE, MIN_TOLERANCE
 

@@ -34,7 +34,7 @@ MAX_UNCONFIRMED_RUNS = 10_000
 @workers_option(help="Processes that take the runs.  [default: one for each core, as far as memory goes]")
 @click.option("--dask", metavar="ADDRESS", help="Let the workers of a dask scheduler take the runs.")
 @click.option("--shard", type=ShardType(), metavar="I/N", help="Take only part I of N of the runs; write no table.")
-@click.option("--dry-run", is_flag=True, help="Print the values of all runs, and what they take; run nothing.")
+@click.option("--dry-run", is_flag=True, help="Print the values of all runs and their cost; run nothing.")
 @click.option("--yes", is_flag=True, help=f"Take more than {MAX_UNCONFIRMED_RUNS} runs, or longer than a day.")
 @json_option
 def sweep(

@@ -114,7 +114,7 @@ def export(
     exported = _write_export(views, format, directory, progress)
     if incomplete:
         count = f"{incomplete} of {incomplete + len(finished)} runs"
-        exported.notes.insert(0, f"left out, as not complete: {count}; table.csv of the sweep tells why")
+        exported.notes.insert(0, f"left out, as not complete: {count}; the sweep's table.csv has the reasons")
     return exported
 
 

@@ -103,13 +103,17 @@ class ExportSource(NamedTuple):
     progress: ProgressCallback  # called with the finished and total frames of this run
 
 
-# Writes the files of all runs to an empty folder. It is a generator that yields the warnings about each run in turn,
-# and then writes the files that combine runs.
+# Writes the files of all runs to an empty folder: a generator that yields the warnings about each run in turn, and then
+# writes the files that combine runs.
 FormatWriter = Callable[[Sequence[ExportSource], Path], Iterator[list[str]]]
 
 
 def one_folder_per_run(write: Callable[[FinishedRun, Path, ProgressCallback], list[str]]) -> FormatWriter:
-    """Build a format's `write` from a function that writes one run to an empty folder and returns warnings."""
+    """Build a format's `write` from a function that writes one run.
+
+    Args:
+        write: takes the run, its empty folder, and a callback for the finished and total frames; returns warnings.
+    """
 
     @wraps(write)
     def write_all(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
@@ -146,5 +150,5 @@ def read_runs(directories: Sequence[str | Path]) -> tuple[list[FinishedRun], int
         incomplete += count - len(complete)
         runs += complete
     if not runs:
-        raise FilesError(f"{', '.join(map(str, directories))}: no run is complete; table.csv there tells why")
+        raise FilesError(f"{', '.join(map(str, directories))}: no run is complete; table.csv there has the reasons")
     return runs, incomplete

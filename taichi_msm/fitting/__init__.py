@@ -1,1 +1,1 @@
-"""The numbers of a scene from what was seen of the tissue, with their uncertainty."""
+"""Parameter estimation from observations, with confidence intervals."""

@@ -42,7 +42,6 @@ def read_archive(name: str) -> tuple[dict[str, NDArray[Any]], list[str]]:
         SceneError: when the file is not an .npz, or an array cannot be used.
     """
     path, remedy = Path(name), f"name an .npz with {NEEDS}, or a run's trajectory.npz or tracks.npz"
-    reason = "not an .npz"
     try:
         if kind := irregular_kind(path):
             raise SceneError([f"{name}: {'a folder' if path.is_dir() else kind}; {remedy}"])
@@ -51,14 +50,13 @@ def read_archive(name: str) -> tuple[dict[str, NDArray[Any]], list[str]]:
         if begin.startswith(b"PK"):
             with zipfile.ZipFile(path) as archive:
                 return _members(name, archive)
-        if begin == b"\x93NUMPY":
-            reason = "a single array, as np.save writes"
+        reason = "a single array, as np.save writes" if begin == b"\x93NUMPY" else "not an .npz"
     except FileNotFoundError:
         reason = "no such file"
     except OSError as error:
         reason = (error.strerror or "cannot be read").lower()
     except (ValueError, NotImplementedError, zipfile.BadZipFile):
-        pass
+        reason = "not an .npz"
     raise SceneError([f"{name}: {reason}; {remedy}"])
 
 
@@ -66,7 +64,7 @@ def require_understood(name: str, keys: list[str]) -> None:
     """Check that no array with a meaning for observations stays unread; SceneError: lists such arrays."""
     unknown = [key for key in keys if key not in MEMBERS and any(word in key.lower() for word in MEANINGFUL_WORDS)]
     if unknown:
-        said = "not understood; take NaN for what was not seen, or visible or occluded (N, T), and sigma for errors"
+        said = "not understood; take NaN where not observed, or visible or occluded (N, T), and sigma for errors"
         raise SceneError([f"{name}: {', '.join(map(ascii, unknown))}: {said}"])
 
 
@@ -82,7 +80,7 @@ def _members(name: str, archive: zipfile.ZipFile) -> tuple[dict[str, NDArray[Any
         try:
             with archive.open(info) as member:
                 arrays[key] = np.lib.format.read_array(member, allow_pickle=False)
-        except Exception as error:  # zipfile, its decompressors and NumPy raise any kind for bytes that are none
+        except Exception as error:  # zipfile, its decompressors and NumPy raise any kind
             why = str(error).partition("\n")[0] or type(error).__name__
             why = "encrypted" if info.flag_bits & 1 else why
             why = "an array of Python objects" if why.startswith("Object arrays") else f"cannot be read: {why}"

@@ -42,7 +42,7 @@ def faults(observations: Observations, scene: Scene, parameters: int) -> Iterato
     numbers, name = int(observations.known.sum()), observations.name
     forces = 0 if observations.forces is None else int(np.isfinite(observations.forces.force).sum())
     if numbers + forces <= parameters:
-        said = f"{numbers + forces} numbers were seen, too few for {parameters} parameters and their errors"
+        said = f"{numbers + forces} numbers were observed, too few for {parameters} parameters and their errors"
         yield f"{name}: {said}; observe more points or times, or name fewer keys in --free"
         return
     yield from _times(observations.time, name, scene)
@@ -96,7 +96,7 @@ def faults_at_start(
         said = "are behind the eye of the scene's camera, or beyond its lens, where the search begins"
         remedy = "give the scene the camera that saw them, or NaN in their place"
         where = f"{observations.name}: {observations.kind}"
-        yield f"{where}: {lost} of the points that were seen {said}; {remedy}"
+        yield f"{where}: {lost} of the observed points {said}; {remedy}"
         return
     wrong = [*_faults_at_rest(observations, scene, first)] if same_camera else []
     yield from wrong

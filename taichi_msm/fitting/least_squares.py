@@ -327,15 +327,15 @@ class Uncertainty:
     The columns of `directions` are uncorrelated combinations of x, the most certain one first.
     """
 
-    scales: Scales  # standard deviations of what was seen, found or given
+    scales: Scales  # standard deviations of the observations, given or estimated
     factor: float  # f
     freedom: int  # degrees of freedom
-    independent: float  # so many independent numbers would tell as much of chi-square as these
+    independent: float  # effective number of independent observations
     left: Array  # r
     weighted: Array  # W^(1/2) J, shape (numbers, n)
     directions: Array  # shape (n, n)
     root: Array  # F with C = F F^T, shape (n, n)
-    widening: Array  # how many times K makes the deviations wider, shape (n,)
+    widening: Array  # factor of the deviations by K, shape (n,)
 
     @property
     def deviations(self) -> Array:
@@ -416,17 +416,17 @@ def uncertainty(
 def _correlated(misfit: Misfit, rows: Array, error_correlation: ErrorCorrelation) -> tuple[Array, float]:
     """Compute U^T K U, and the effective number of observations tr(K)^2 / tr(K^2); forces are independent."""
     values, observations = misfit.count[0], misfit.observations
-    # Tracks are where they were seen on the mean; those that never were have no errors.
+    # A track is at its mean observed position; tracks without observations are left out.
     ever: NDArray[np.bool_] = np.any(observations.there, axis=1)
     space, time = _correlations(observations, ever, error_correlation)
     whole = np.zeros((*observations.values.shape, rows.shape[1]))
     whole[observations.known] = rows[:values]
     whole = whole[ever]
-    beside = np.einsum("st,ntcp->nscp", time, np.tensordot(space, whole, 1))
+    correlated = np.einsum("st,ntcp->nscp", time, np.tensordot(space, whole, 1))
     every = len(rows) - values
     there = observations.there[ever].astype(float)
     square = every + observations.values.shape[2] * float(np.sum(space**2 * (there @ time**2 @ there.T)))
-    total = np.tensordot(whole, beside, ((0, 1, 2), (0, 1, 2))) + rows[values:].T @ rows[values:]
+    total = np.tensordot(whole, correlated, ((0, 1, 2), (0, 1, 2))) + rows[values:].T @ rows[values:]
     return total, len(rows) ** 2 / square
 
 
@@ -465,7 +465,7 @@ class Profile(NamedTuple):
     """Profile of a parameter."""
 
     places: list[ProfilePoint]  # sorted by x
-    low: float | None  # the ends of the interval; None: there is none within the bounds
+    low: float | None  # ends of the interval; None: beyond the bounds
     high: float | None
 
 
@@ -586,7 +586,7 @@ class UnidentifiedGroup(NamedTuple):
     """Parameters that the data do not determine one by one."""
 
     parameters: list[str]
-    known: list[Combination]  # what is known of them
+    known: list[Combination]  # identifiable combinations
     text: str
 
     def as_json(self) -> dict[str, Any]:
@@ -654,14 +654,14 @@ def _in_words(
     names = " and ".join([", ".join(keys[:-1]), keys[-1]] if len(keys) > 1 else keys)
     known = [one for one in known if one.standard_error <= MAX_RELATIVE_ERROR]
     if known and not all(parameters[n].is_log for n in group):
-        return UnidentifiedGroup(keys, [], f"{names} cannot be told apart by what was seen: fix one{remedy}")
+        return UnidentifiedGroup(keys, [], f"{names} are not identifiable one by one: fix one{remedy}")
     if not known:
         it = "it" if len(keys) == 1 else "them"
         if alone[group].max() <= MAX_RELATIVE_ERROR:
             return UnidentifiedGroup(
                 keys, [], f"{names}: known only to {rounded(100 * float(alone[group].max()))} %: fix {it}"
             )
-        return UnidentifiedGroup(keys, [], f"{names}: what was seen does not tell {it}: fix {it}")
+        return UnidentifiedGroup(keys, [], f"{names}: not identifiable: fix {it}")
     said = ", ".join(f"{one} is known to {rounded(100 * one.standard_error)} %" for one in known)
     most = float(alone[group].max())
     each = "is not" if most > MAX_RELATIVE_ERROR else f"only to {rounded(100 * most)} %"
@@ -673,7 +673,7 @@ def _complement(blind: Array) -> Iterator[Array]:
     vectors, singular, _ = np.linalg.svd(blind)
     rank = int(np.sum(singular > MIN_GROUP_COMPONENT * singular[0]))
     rows = vectors[:, rank:].T.copy()
-    # Reduced to echelon form from the parameters that are seen best on.
+    # Reduce to echelon form, starting with the best identified parameters.
     order = list(np.argsort(np.linalg.norm(blind, axis=1), kind="stable"))
     for n in range(len(rows)):
         pivot = max(order, key=lambda column: (abs(rows[n, column]) > 0.1, -order.index(column)))

@@ -79,8 +79,8 @@ class ObservationModel:
         """Return the derivative of a loss by the positions of every frame.
 
         Args:
-            points: that were seen [m], shape (N, T, 3).
-            slope: derivative of the loss by what is seen of them, shape (N, T, 3 or 2).
+            points: observed points [m], shape (N, T, 3).
+            slope: derivative of the loss by the observations, shape (N, T, 3 or 2).
 
         Returns:
             The derivative by the positions, shape (frames, rows, cols, 3).
@@ -235,13 +235,14 @@ def _checked(name: str, arrays: dict[str, NDArray[Any]], names: list[str], rate:
     if not ((coordinates >= 0) & (coordinates <= 1)).all():
         said = "give across and down as fractions of the sheet, 0 to 1, from its upper left corner"
         raise SceneError([f"{name}: coordinates: {coordinates.flat[np.abs(coordinates - 0.5).argmax()]:g}; {said}"])
-    # A point is seen in all its numbers or not at all.
+    # A point with a missing coordinate is not observed.
     values = np.where(np.isfinite(values).all(axis=2, keepdims=True), values, np.nan)
     if not np.isfinite(values).any():
         why = "is NaN or occluded"
-        raise SceneError([f"{name}: every one of the {points} points {why} at all {times} times; nothing was seen"])
+        fault = f"every one of the {points} points {why} at all {times} times; there are no observations"
+        raise SceneError([f"{name}: {fault}"])
     if (most := np.nanmax(np.abs(values))) > MAX_MAGNITUDE:
-        raise SceneError([f"{name}: {kind}: {most:g}; take NaN for what was not seen"])
+        raise SceneError([f"{name}: {kind}: {most:g}; take NaN where not observed"])
     return with_sigma(Observations(name, kind, time, coordinates, values, None), arrays.get("sigma"))
 
 

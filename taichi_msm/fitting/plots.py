@@ -30,7 +30,7 @@ COLUMN_COUNT, PANEL_HEIGHT_IN, MAX_DRAWN_POINTS, MAX_DOTS = 3, 2.7, 3, 20000
 def plot(result: FitResult, file: BinaryIO) -> None:
     """Write fit.png to a file."""
     with style.context(STYLE, after_reset=True), warnings.catch_warnings():
-        # A name may contain characters that the font lacks; a point that was never seen has no mean.
+        # A name may contain characters that the font lacks; a point without observations has no mean.
         warnings.filterwarnings("ignore", "Glyph .* missing")
         warnings.filterwarnings("ignore", "Mean of empty slice")
         # Without the version of Matplotlib.
@@ -80,7 +80,7 @@ def _plot_motion(axes: Axes, result: FitResult) -> None:
         along = along if along[np.argmax(np.abs(along))] > 0 else -along
         fitted, points = (scale * (values[n] - centre[n]) @ along for values in (result.fitted, observations.values))
         axes.plot(observations.time[order], fitted[order], color=BLUE, label="fitted" if number == 0 else None)
-        label = "seen" if number == 0 else None
+        label = "observed" if number == 0 else None
         axes.plot(observations.time, points, ".", color=VERMILION, markersize=3, label=label)
     axes.set(title="The points that move most", xlabel="time [s]", ylabel=f"place along the motion [{unit}]")
     axes.legend()
@@ -96,7 +96,7 @@ def _plot_match(axes: Axes, result: FitResult) -> None:
     if len(one):
         ends = [float(one.min()), float(one.max())]
         axes.plot(ends, ends, color=GREY, linewidth=0.8)
-    axes.set(title="Seen against fitted", xlabel=f"fitted, from the mean [{unit}]", ylabel=f"seen [{unit}]")
+    axes.set(title="Observed against fitted", xlabel=f"fitted, from the mean [{unit}]", ylabel=f"observed [{unit}]")
 
 
 def _plot_residuals(axes: Axes, result: FitResult) -> None:
@@ -108,7 +108,7 @@ def _plot_residuals(axes: Axes, result: FitResult) -> None:
     across, down = observations.coordinates.T
     dots = axes.scatter(across, down, 14, c=left, cmap="viridis", vmin=0)
     height, width = result.scene.sheet.size
-    axes.set(title="What is left", xlim=(0, 1), ylim=(1, 0), xlabel="across", ylabel="down", aspect=height / width)
+    axes.set(title="Residual", xlim=(0, 1), ylim=(1, 0), xlabel="across", ylabel="down", aspect=height / width)
     assert isinstance(axes.figure, Figure)
     axes.figure.colorbar(dots, ax=axes, label=f"root mean square [{unit}]", shrink=0.8)
 
@@ -125,7 +125,7 @@ def _plot_forces(axes: Axes, result: FitResult) -> None:
             fitted, points = (force[rows, component] for force in (result.fitted_forces, observations.force))
             axes.plot(observations.time[rows], fitted, color=BLUE, label="fitted" if label else None)
             axes.plot(
-                observations.time[rows], points, ".", color=VERMILION, markersize=3, label="seen" if label else None
+                observations.time[rows], points, ".", color=VERMILION, markersize=3, label="observed" if label else None
             )
             largest = np.argmax(np.abs(fitted))
             if abs(fitted[largest]) > 0.1 * np.abs(result.fitted_forces).max():
@@ -165,7 +165,7 @@ def plot_map(panels: Sequence[Axes], found: FittedMap, sheet: Sheet) -> None:
     _plot_cells(panels[0], found, found.factors, sheet, norm, ("Stiffness", "factor of young", "viridis"))
     errors = 100 * found.errors
     top = float(np.nanmax(errors)) if not found.unknown.all() else 100.0
-    _plot_cells(panels[1], found, errors, sheet, Normalize(0, top), ("How well it is known", "error [%]", "cividis"))
+    _plot_cells(panels[1], found, errors, sheet, Normalize(0, top), ("Standard error", "error [%]", "cividis"))
     _plot_weight(panels[2], found.choice)
 
 
@@ -197,10 +197,10 @@ def _plot_cells(
 
 def _plot_weight(axes: Axes, choice: SmoothnessWeight) -> None:
     """Plot the excess of chi-square and its expectation against the weight of the smoothness."""
-    axes.plot(choice.weights, choice.left, color=BLUE, label="left above the least")
+    axes.plot(choice.weights, choice.left, color=BLUE, label="excess")
     axes.plot(choice.weights, choice.expected, color=GREY, linestyle=(0, (4, 2)), label="expected")
     taken = np.abs(np.log(choice.weights / choice.weight)).argmin()
     axes.plot(choice.weights[taken], choice.left[taken], "o", color=VERMILION, label="taken")
-    axes.set(title="How smooth it is", xlabel="weight of the smoothness", ylabel="chi-square")
+    axes.set(title="Smoothness", xlabel="weight of the smoothness", ylabel="chi-square")
     axes.set(xscale="log", yscale="log")
     axes.legend(loc="upper left")

@@ -38,7 +38,7 @@ SMALL_STEP, LARGE_STEP = 1e-5, 1e-2
 class Prediction(NamedTuple):
     """Predicted observations and forces."""
 
-    values: Array  # as in the observations, shape (N, T, 3 or 2); NaN: not seen by the camera
+    values: Array  # as in the observations, shape (N, T, 3 or 2); NaN behind the camera
     forces: Array  # shape (rows, 3)
     steps: int  # of a frame
     motion: Array  # the farthest that any of the points is from rest, at every frame that was simulated [m]
@@ -48,7 +48,7 @@ class Prediction(NamedTuple):
 class FitProblem:
     """Scene, parameters and observations of a fit; each worker process keeps a kernel for it."""
 
-    token: str  # tells jobs apart
+    token: str  # identifies the fit
     scene: Scene  # of which only the parameters change
     parameters: tuple[Parameter, ...]
     observations: Observations

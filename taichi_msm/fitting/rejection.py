@@ -68,14 +68,15 @@ def by_pattern(
         one, other = _neighbours(observations)
         if _has_mean((cut[one] * cut[other]).sum(axis=(1, 2)), MIN_NEIGHBOUR_PRODUCTS):
             remedy = "give --correlation PX" if observations.kind == "pixel" else "give --sigma"
-            return f"what is left of neighbouring points is alike, which noise is not; if it is their errors, {remedy}"
+            fault = "the residuals of neighbouring points are correlated, unlike independent errors"
+            return f"{fault}; if the errors are, {remedy}"
     if error_correlation.drift is None:
         products = (cut[:, 1:] * cut[:, :-1]).sum(axis=2)
         if _has_mean(
             products.ravel() if error_correlation.correlation is None else products.sum(axis=0), MIN_TIME_PRODUCTS
         ):
-            said = "what is left of a point is alike from one time to the next, which noise is not"
-            return f"{said}; if it is the tracks that drift, give --drift SECONDS"
+            said = "the residuals of a point are correlated in time, unlike independent errors"
+            return f"{said}; if the tracks drift, give --drift SECONDS"
     return None
 
 

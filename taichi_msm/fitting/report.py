@@ -63,7 +63,7 @@ def _write(grey: NDArray[np.uint16], path: Path) -> None:
 
 
 def _scene_text(result: FitResult, folder: Path) -> str:
-    """Write the fitted scene, and copy its pictures beside it."""
+    """Write the fitted scene, and copy its pictures to its folder."""
     names: dict[str, str] = {}
 
     def copied(path: str) -> str:

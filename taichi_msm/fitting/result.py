@@ -244,7 +244,7 @@ def mesh_notes(
             if shifts[n] > wide[n]
         ]
     ):
-        said = "more than what was seen leaves open; take more sheet.points"
+        said = "farther than the interval; take more sheet.points"
         yield f"the number of points moves {', '.join(moved)}: {said}"
 
 
@@ -269,33 +269,33 @@ def residual_notes(
     """Yield notes on residuals above sigma, and on correlated ones."""
     if uncertainties.factor > 1.5:
         times = rounded(math.sqrt(uncertainties.factor))
-        yield f"what is left is {times} times sigma, and the intervals are widened by as much"
+        yield f"the residual is {times} times sigma, and the intervals are widened by this factor"
     left = solution.predicted.values - observations.values
     if np.sqrt(np.nanmean(left**2)) < max(
         MIN_RESIDUAL_SHARE * motion, MIN_RESIDUAL_SIGMAS * (observations.sigma or 0.0)
     ):
         if observations.sigma is None:
-            yield "next to nothing is left, and the intervals are those of so small errors; give their size by --sigma"
+            yield "the residual is next to 0, and so are the intervals; give the standard deviation by --sigma"
         return
-    beside, after = _alike(left, observations.coordinates)
-    if beside > MIN_ERROR_CORRELATION and error_correlation.correlation is None:
+    in_space, in_time = _residual_correlations(left, observations.coordinates)
+    if in_space > MIN_ERROR_CORRELATION and error_correlation.correlation is None:
         remedy = "; give --correlation PX" if observations.kind == "pixel" else ""
-        said = f"what is left of neighbouring points is alike (correlation {beside:.2f})"
+        said = f"the residuals of neighbouring points are correlated (by {in_space:.2f})"
         yield f"{said}, so that the intervals are too narrow{remedy}"
-    elif after > MIN_ERROR_CORRELATION and error_correlation.drift is None:
-        said = f"what is left of a point is alike from one time to the next (correlation {after:.2f})"
+    elif in_time > MIN_ERROR_CORRELATION and error_correlation.drift is None:
+        said = f"the residuals of a point are correlated in time (by {in_time:.2f})"
         yield f"{said}, so that the intervals are too narrow; give --drift SECONDS"
 
 
-def _alike(left: Array, coordinates: Array) -> tuple[float, float]:
+def _residual_correlations(left: Array, coordinates: Array) -> tuple[float, float]:
     """Return the correlations of residuals, shape (N, T, numbers), with the nearest neighbour, and in time."""
     from scipy.spatial import KDTree
 
-    def likeness_of(one: Array, other: Array) -> float:
+    def correlation(one: Array, other: Array) -> float:
         product, square = one * other, one**2 + other**2
         there = np.isfinite(product)
         return 2 * float(product[there].sum()) / max(float(square[there].sum()), 1e-300)
 
     # The nearest to a point but for itself.
-    beside = likeness_of(left, left[KDTree(coordinates).query(coordinates, 2)[1][:, 1]]) if len(left) > 1 else 0.0
-    return beside, likeness_of(left[:, 1:], left[:, :-1])
+    in_space = correlation(left, left[KDTree(coordinates).query(coordinates, 2)[1][:, 1]]) if len(left) > 1 else 0.0
+    return in_space, correlation(left[:, 1:], left[:, :-1])

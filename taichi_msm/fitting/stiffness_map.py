@@ -215,16 +215,16 @@ def _curve(estimate: Estimate, solution: MapSolution) -> list[ProfilePoint]:
 def _unusable(observations: Observations, scene: Scene, task: MapSettings) -> Iterator[str]:
     """Yield the faults that are known before any run."""
     if observations.sigma is None:
-        said = "a map is found as smooth as the errors of what was seen allow; give their standard deviation by --sigma"
+        said = "the errors of the observations decide how smooth a map is; give their standard deviation by --sigma"
         yield f"{observations.name}: sigma: missing: {said}"
         return
     if (known := int(observations.known.sum())) <= (needed := task.resolution**2):
-        said = f"{known} numbers were seen, too few for {needed} fields; observe more points, or take fewer fields"
+        said = f"{known} numbers were observed, too few for {needed} fields; observe more points, or take fewer fields"
         yield f"{observations.name}: {said}: --resolution {max(2, math.isqrt(max(known - 1, 0)))}"
         return
-    # What each field does to each number that was seen, twice while it is multiplied.
+    # The Jacobian, twice while it is multiplied.
     if (size := 16 * known * needed) > (free := available_memory()):
-        said = f"{needed} fields by {known} numbers that were seen take {size / 2**30:.3g} GiB of memory"
+        said = f"{needed} fields by {known} observed numbers take {size / 2**30:.3g} GiB of memory"
         yield f"--resolution {task.resolution}: {said}, and {free / 2**30:.3g} GiB is free; take fewer fields or points"
         return
     yield from faults(observations, scene, task.resolution**2)
@@ -279,16 +279,16 @@ def _notes(
     """Yield notes for the user; `left`: the residuals [m] or [px]."""
     assert observations.sigma is not None
     if (unknown := int(found.unknown.sum())) > 0:
-        yield f"{unknown} of {found.factors.size} fields are unknown: nothing moves there that would tell; press there"
+        yield f"{unknown} of {found.factors.size} fields are unknown: nothing moves there; press there"
     if by_points > observations.sigma / 2:
         said = f"about {rounded(by_points)} {observations.unit}, and sigma is {rounded(observations.sigma)}"
         remedy = "the map is as smooth as both require; take more sheet.points"
-        yield f"the number of points changes what is seen by {said}: {remedy}"
+        yield f"the mesh changes the observations by {said}: {remedy}"
     if (share := float(np.sqrt(np.mean(left**2))) / observations.sigma) < MIN_RESIDUAL_SIGMAS:
-        yield f"what is left is only {rounded(share)} times sigma: with a smaller one the map shows more"
+        yield f"the residual is only {rounded(share)} times sigma: with a smaller sigma the map shows more"
     if solution.excess > 1.5:
         times = rounded(math.sqrt(solution.excess))
-        yield f"what is left is {times} times what is expected with any map, and the errors are widened by as much"
+        yield f"the residual is {times} times the expected one with any map, and the errors are widened by this factor"
     x = solution.x[: found.factors.size]
     if bound := int((np.minimum(x - limits[0], limits[1] - x) < BOUND_TOLERANCE).sum()):
         yield f"{bound} fields ended at a bound, {math.exp(limits[0]):.3g} or {math.exp(limits[1]):.3g}; see --bounds"

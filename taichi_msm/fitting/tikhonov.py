@@ -53,10 +53,10 @@ class SmoothnessWeight(NamedTuple):
     """Weight of the smoothness, and the curve of the discrepancy principle."""
 
     weight: float
-    step: Array  # to the map with that weight, where what is seen is linear in it
+    step: Array  # to the map with this weight, by the linearised predictions
     weights: Array  # that were looked at, up to this one
-    left: Array  # by how much chi-square is above the least, with each
-    expected: Array  # and how much is expected
+    left: Array  # excess of chi-square above its minimum, for each weight
+    expected: Array  # expected excess, for each weight
 
 
 def with_scaled_forces(scene: Scene, factor: float = 1.0) -> Scene:
@@ -72,33 +72,33 @@ class Linearisation:
 
     Attributes:
         x: logs of the factors of the fields, shape (R^2,).
-        told: J^T J, shape (R^2, R^2).
+        information: J^T J, shape (R^2, R^2).
         slope: half of the derivative of chi-square by x.
-        excess: chi-square of the best map per degree of freedom, at least 1, by which told and slope are divided.
+        excess: chi-square of the best map per degree of freedom, at least 1; information and slope are divided by it.
     """
 
     x: Array
-    told: Array
+    information: Array
     slope: Array
     excess: float
 
     def choice(self, rough: Array) -> SmoothnessWeight:
         """Choose the weight of L by the discrepancy principle."""
         tried: list[tuple[float, float, float]] = []
-        to_least = float(self.slope @ np.linalg.pinv(self.told, hermitian=True) @ self.slope)
-        for weight in WEIGHTS * np.diag(self.told).max():
-            inverse = np.linalg.inv(self.told + weight * rough)
+        to_least = float(self.slope @ np.linalg.pinv(self.information, hermitian=True) @ self.slope)
+        for weight in WEIGHTS * np.diag(self.information).max():
+            inverse = np.linalg.inv(self.information + weight * rough)
             step = -inverse @ (self.slope + weight * (rough @ self.x))
-            left = to_least + float(2 * self.slope @ step + step @ self.told @ step)
-            tried.append((float(weight), left, len(step) - float(np.sum(inverse * self.told))))
+            left = to_least + float(2 * self.slope @ step + step @ self.information @ step)
+            tried.append((float(weight), left, len(step) - float(np.sum(inverse * self.information))))
             if left <= tried[-1][2]:
                 break
         return SmoothnessWeight(tried[-1][0], step, *np.array(tried).T)
 
     def errors(self, weight: float, rough: Array) -> Array:
         """Return the standard errors of x, shape (R^2,); NaN: unknown."""
-        deviations = np.sqrt(np.diag(np.linalg.inv(self.told + weight * rough)))
-        return np.where(np.diag(self.told) * MAX_KNOWN_ERROR**2 >= 1, deviations, np.nan)
+        deviations = np.sqrt(np.diag(np.linalg.inv(self.information + weight * rough)))
+        return np.where(np.diag(self.information) * MAX_KNOWN_ERROR**2 >= 1, deviations, np.nan)
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +155,7 @@ class MapSearch:
         points = self._sight.points(self._adjoint.run(self._fields.factors(cells), self._tell, scene))
         predicted = self._sight.observe(points)
         if not np.isfinite(predicted[self._observations.known]).all():
-            said = "a point that was seen gets behind the eye of the camera with some maps"
+            said = "an observed point gets behind the eye of the camera with some maps"
             raise SceneError([f"{self._observations.name}: pixel: {said}; give NaN in its place, or narrower --bounds"])
         return points, predicted
 
@@ -195,10 +195,10 @@ class MapSearch:
         jacobian = np.empty((left.size, len(x)))
         for n, change in enumerate(DIFFERENCE_STEP * np.eye(len(x))):
             jacobian[:, n] = (self.predict(x + change)[1] - before)[known] / (DIFFERENCE_STEP * self._sigma)
-        told, slope = jacobian.T @ jacobian, jacobian.T @ left
-        least = float(left @ left - slope @ np.linalg.pinv(told, hermitian=True) @ slope)
+        information, slope = jacobian.T @ jacobian, jacobian.T @ left
+        least = float(left @ left - slope @ np.linalg.pinv(information, hermitian=True) @ slope)
         excess = max(1.0, least / max(1, left.size - len(x)))
-        return Linearisation(x, told / excess, slope / excess, excess)
+        return Linearisation(x, information / excess, slope / excess, excess)
 
     def _at(self, start: Array, weight: float, excess: float) -> Array:
         """Minimise for one weight, with chi-square divided by `excess`."""

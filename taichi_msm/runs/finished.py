@@ -115,7 +115,7 @@ class FinishedRun:
         for key, path in self.scene.pictures.items():
             if key == "image" and not drawn:
                 continue
-            fault = f"{path} is not the file that was run, as its SHA-256 tells"
+            fault = f"{path} is not the file of the run, by its SHA-256"
             try:
                 if file_sha256(path) == self.sha256.get(key):
                     continue

@@ -238,7 +238,7 @@ class Simulation:
         if not (fits and len(saved.felt.forces) == len(self.scene.probes) and 0 <= steps_in_frame <= per_frame):
             raise ArgumentError(
                 f"saved at step {state.steps}, frame {saved.progress.frame}, {state.displacement.dtype} of shape "
-                f"{state.displacement.shape}; take what was saved with this scene's points, probes, precision and step"
+                f"{state.displacement.shape}; take a state saved with this scene's points, probes, precision and step"
             )
         if saved.probes:
             self._restore_paths(saved.probes)

@@ -248,7 +248,7 @@ class Camera(Section):
         except CameraFileError as error:
             raise scene_fault(str(error), "calibration") from None
         if self.scale and calibration.size is None:
-            fault = "tells no size of its pictures, so it cannot be scaled; add image_width and image_height"
+            fault = "has no size of its pictures, so it cannot be scaled; add image_width and image_height"
             raise scene_fault(f"{self.calibration}: {fault}, or remove scale", "calibration")
         scale_x, scale_y = (new / old for new, old in zip(size, calibration.size or size, strict=True))
         if (scale_x, scale_y) != (1, 1) and not self.scale:

@@ -262,7 +262,7 @@ class Dynamics:
 
     def _require_consistent(self) -> None:
         if self.inconsistent:
-            raise MsmError("interrupted while steps were taken; restore what was saved before, or restart the scene")
+            raise MsmError("interrupted while steps were taken; restore a saved state, or restart the scene")
 
     def close(self) -> None:
         """Release the memory of the device."""

@@ -289,7 +289,7 @@ def _meshes(study: Study) -> Iterator[str]:
         "The error is that made by the number of points, at the points and between them, where the displacement is "
         "interpolated by cubics: the largest anywhere at any frame, as a fraction of the largest displacement. The "
         f"reference is {reference}. All are stepped in f64 with the same "
-        "step. The estimate is that of `run`, by a sheet beside it with half the cells a side. "
+        "step. The estimate is that of `run`, by a companion run with half the cells per side. "
         "Times are those of each sheet's automatic step."
     )
     yield _meshes_table(study)

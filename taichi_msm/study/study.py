@@ -117,7 +117,7 @@ def run_study(
         measure_terms(plan, device, budget.sample, results, partial(progress, "terms"))
     except KeyboardInterrupt:
         results.status = "interrupted"
-        results.notes.append("interrupted: what was measured until then")
+        results.notes.append("interrupted: the measurements until then")
     results.finish()
     return results
 

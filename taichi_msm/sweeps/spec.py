@@ -65,7 +65,7 @@ class SweepSettings(Section):
         f"a whole number, 1 to {MAX_RUNS}",
     )
     seed: Annotated[Integer, Field(ge=0)] = key(
-        1, "what the samples, and the parts of a data set, are chosen by", "a whole number, 0 or more"
+        1, "seed of the samples and of the splits of a data set", "a whole number, 0 or more"
     )
     vary: dict[str, Distribution] = key(
         ...,

@@ -65,7 +65,7 @@ STRENGTH_STEP = 5.0
 POINTER = {
     "left button": "press; dragged, the tool moves",
     "shift + left button": "the opposite force, such as pull; by position: grip",
-    "wheel": f"press harder or deeper, by {STRENGTH_STEP:g} %; lift what is gripped",
+    "wheel": f"press harder or deeper, by {STRENGTH_STEP:g} %; lift the gripped tissue",
     "right button": "dragged, turn the picture",
 }
 
@@ -84,7 +84,7 @@ KEYS = {
     "r": "reset: put the tissue at rest, forget the session so far",
     "p": "save the tissue as PNG",
     "g": "start and stop a film (GIF)",
-    "w": "save what was done as a scene, which run repeats",
+    "w": "save the session as a scene, which run repeats",
     "i": "the figures on and off",
     "h": "the keys on and off",
     "q": "quit; so does Escape",

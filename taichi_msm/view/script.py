@@ -44,19 +44,19 @@ class ScriptEvent(Section):
 
     t: Seconds = key(..., description="when, or when it begins [s]", expects=SECONDS)
     do: Literal["press", "pull", "drag", "release", "turn", "percent", "key"] = key(
-        ..., description="what is done", expects=f"{', '.join(KINDS)} or {LAST_KIND}"
+        ..., description="action", expects=f"{', '.join(KINDS)} or {LAST_KIND}"
     )
     at: Pair | None = key(
         None, description="the pixel", expects="for press, pull and drag [x, y] in pixels from the top left"
     )
-    by: Pair | None = key(None, description="how far the picture is turned", expects="for turn [right, down] in pixels")
+    by: Pair | None = key(None, description="turn of the picture", expects="for turn [right, down] in pixels")
     to: Annotated[Number, Field(ge=-100, le=100)] | None = key(
         None,
         description="percent of the full force, or of the greatest depth",
         expects="for percent a number from -100 to 100",
     )
     name: str | None = key(None, description="a key of the window", expects="for key the name of one")
-    seconds: Seconds = key(0.0, description="how long it takes [s]", expects=SECONDS)
+    seconds: Seconds = key(0.0, description="duration [s]", expects=SECONDS)
 
     @model_validator(mode="after")
     def _complete(self) -> ScriptEvent:
@@ -84,7 +84,7 @@ class Script(Section):
         expects=f"two whole numbers, 1 to {MAX_PIXELS}: [width, height] in pixels",
     )
     events: tuple[ScriptEvent, ...] = key(
-        ..., description="what is done, in order", expects="a list of mappings with t and do"
+        ..., description="actions, in order", expects="a list of mappings with t and do"
     )
 
     @field_validator("events", mode="after")

@@ -290,7 +290,7 @@ def test_a_record_that_names_a_picture_elsewhere_gets_nothing_of_it(name: str, r
     pytest.importorskip("vtkmodules" if name == "vtk" else "numpy")
     path = secret(results)
     change_scene(results, image=path)
-    fault = f"{path} is not the file that was run, as its SHA-256 tells"
+    fault = f"{path} is not the file of the run, by its SHA-256"
     done = program("export", str(results), "--format", name)
     assert (done.returncode, done.stderr) == (4, f"{results}: image: {fault}; {RESTORE_PICTURE}\n")
     change(results, sha256={})
@@ -303,7 +303,7 @@ def test_a_record_that_names_a_map_elsewhere_gets_nothing_of_it_for_vtk(results:
     path = secret(results)
     change_scene(results, springs={"map": {"image": path, "range": [1.0, 2.0]}})
     done = program("export", str(results), "--format", "vtk")
-    fault = f"springs.map.image: {path} is not the file that was run, as its SHA-256 tells"
+    fault = f"springs.map.image: {path} is not the file of the run, by its SHA-256"
     assert (done.returncode, done.stderr) == (4, f"{results}: {fault}; {RESTORE_PICTURE}\n")
 
 

@@ -175,7 +175,7 @@ def test_complete_runs_of_a_sweep_are_exported(sweep: Path, program: Program) ->
     assert (done.returncode, done.stderr) == (0, "")
     told = json.loads(done.stdout)
     assert told["directory"] == "sweep/export-kitti"
-    assert told["notes"][0] == "left out, as not complete: 3 of 5 runs; table.csv of the sweep tells why"
+    assert told["notes"][0] == "left out, as not complete: 3 of 5 runs; the sweep's table.csv has the reasons"
     rows = [("sweep/runs/000001", frame) for frame in range(4)] + [("sweep/runs/1000000", frame) for frame in range(2)]
     expected = [[f"{number:06}", run, str(frame)] for number, (run, frame) in enumerate(rows)]
     assert index(sweep / "export-kitti")[1:] == expected
@@ -185,7 +185,7 @@ def test_sweeps_and_runs_go_together(sweep: Path, program: Program) -> None:
     """A run that is named is taken, whatever its status, and links are not followed."""
     (sweep / "runs" / "000003").symlink_to(Path("a").resolve())
     done = program("export", "./sweep/runs/000002", "sweep", "b/", "--format", "gltf")
-    left_out = "left out, as not complete: 3 of 7 runs; table.csv of the sweep tells why"
+    left_out = "left out, as not complete: 3 of 7 runs; the sweep's table.csv has the reasons"
     assert (done.returncode, done.stdout, done.stderr) == (0, f"output/export-gltf: 5 files\n{left_out}\n", "")
     runs = ["sweep/runs/000002", "sweep/runs/000001", "sweep/runs/1000000", "b"]
     assert index(Path("output/export-gltf"))[1:] == [[f"{number:06}", run] for number, run in enumerate(runs)]
@@ -205,7 +205,7 @@ def test_what_a_sweep_lacks_is_named_with_the_remedy(sweep: Path, program: Progr
     for folder in ("000001", "1000000"):
         shutil.rmtree(sweep / "runs" / folder)
     done = program("export", "sweep", "--format", "obj")
-    assert (done.returncode, done.stderr) == (4, "sweep: no run is complete; table.csv there tells why\n")
+    assert (done.returncode, done.stderr) == (4, "sweep: no run is complete; table.csv there has the reasons\n")
 
 
 def test_wrong_arguments_are_told_of(results: Path) -> None:

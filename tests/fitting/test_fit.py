@@ -306,7 +306,7 @@ def test_a_number_that_nothing_shows_is_not_identifiable(motion: Array) -> None:
     found = fit(changed(), seen, ["tissue.foundation", "render.camera.eye.2"])
     assert found.parameters["tissue.foundation"].identifiable
     assert not found.parameters["render.camera.eye.2"].identifiable
-    assert [one.text for one in found.unseen] == ["render.camera.eye.2: what was seen does not tell it: fix it"]
+    assert [one.text for one in found.unseen] == ["render.camera.eye.2: not identifiable: fix it"]
 
 
 def test_depths_and_forces_of_a_tool_tell_the_foundation(device: Device, tmp_path: Path) -> None:
@@ -375,7 +375,7 @@ def test_errors_that_are_alike_widen_the_intervals_and_are_told(tracks: dict[str
     seen["pixel"] += rng.normal(0, 0.5, (1, 11, 2))
     free = ["tissue.young", "tissue.foundation"]
     plain = fit(changed(), seen, free, workers=1)
-    assert any("neighbouring points is alike" in note and "--correlation PX" in note for note in plain.notes)
+    assert any("neighbouring points are correlated" in note and "--correlation PX" in note for note in plain.notes)
     alike = fit(changed(), seen, free, correlation=1000, workers=1, profile=True)
     assert alike.parameters[free[1]].standard_error > 2 * plain.parameters[free[1]].standard_error
     assert not any("--correlation" in note for note in alike.notes)
@@ -486,13 +486,13 @@ def bad(tracks: dict[str, Array], motion: Array) -> Iterator[tuple[str, dict[str
     hidden = np.full_like(tracks["pixel"], np.nan)
     lone = hidden.copy()
     lone[0, 3] = tracks["pixel"][0, 3]
-    yield "few", {**tracks, "pixel": lone}, "2 numbers were seen, too few for 3 parameters"
+    yield "few", {**tracks, "pixel": lone}, "2 numbers were observed, too few for 3 parameters"
     yield "hidden", {**tracks, "pixel": hidden}, "every one of the 36 points is NaN or occluded at all 11 times"
     still = np.repeat(tracks["pixel"][:, :1], 11, axis=1)
     yield "still", {**tracks, "pixel": still}, "no point moves at all; observe while a tool acts"
     rounded = still * (1 + 1e-13 * np.random.default_rng(1).normal(size=still.shape))
     yield "rounded", {**tracks, "pixel": rounded}, "no point moves at all; observe while a tool acts"
-    yield "huge", {**tracks, "pixel": 1e40 * tracks["pixel"]}, "e\\+42; take NaN for what was not seen"
+    yield "huge", {**tracks, "pixel": 1e40 * tracks["pixel"]}, "e\\+42; take NaN where not observed"
     yield "tiny", {**tracks, "sigma": 1e-300}, "sigma: 1e-300; take one number above 0"
     yield "noise", {**tracks, "sigma": 50.0}, "no point moves by more than its error, sigma 50 px"
     late = {**tracks, "time": np.linspace(0, 0.004, 11)}
@@ -813,11 +813,11 @@ def test_an_exact_fit_has_errors_next_to_0(device: Device, robust: bool) -> None
     assert values(found) == [2e4, 3e5]
     assert found.identifiable
     assert all(0 < one.standard_error < 1e-6 * one.value for one in found.parameters.values())
-    assert any("next to nothing is left" in note and "--sigma" in note for note in found.notes)
+    assert any("the residual is next to 0" in note and "--sigma" in note for note in found.notes)
     assert not any("nan" in line or "inf" in line for line in found.summary()[:-1])
     told = fit(changed(), seen, free, robust=robust, sigma=1e-5, workers=1)
     assert told.chi_square == 0
-    assert not any("next to nothing" in note for note in told.notes)
+    assert not any("the residual is next to 0" in note for note in told.notes)
 
 
 def near_the_sheet(motion: Array, device: Device) -> tuple[Scene, dict[str, Array]]:
@@ -848,7 +848,7 @@ def test_points_behind_the_eye_are_refused_where_they_were_seen(motion: Array, d
     scene, seen = near_the_sheet(motion, device)
     unseen = np.isnan(seen["pixel"])
     seen["pixel"][unseen] = np.arange(unseen.sum())
-    with pytest.raises(SceneError, match="pixel: 12 of the points that were seen are behind the eye") as caught:
+    with pytest.raises(SceneError, match="pixel: 12 of the observed points are behind the eye") as caught:
         fit(scene, seen, ["tissue.young"], workers=1)
     assert len(caught.value.lines) == 1
 
@@ -951,7 +951,7 @@ def test_a_wrong_scene_is_rejected_by_what_is_left_alone(tracks: dict[str, Array
     if few:
         seen |= {"time": seen["time"][5:7], "pixel": seen["pixel"][:, 5:7]}
     wrong = fit(changed(tissue__damping=600), seen, ["tissue.foundation"], workers=1)
-    assert wrong.summary()[0].startswith("the model is rejected: what is left of neighbouring points is alike")
+    assert wrong.summary()[0].startswith("the model is rejected: the residuals of neighbouring points are correlated")
     assert not fit(changed(), seen, ["tissue.foundation"], workers=1).model_rejected
 
 

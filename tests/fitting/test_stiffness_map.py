@@ -186,7 +186,7 @@ def test_a_map_is_as_smooth_as_the_errors_allow(device: Device) -> None:
     assert 100 * spreads[1] < spreads[0]
     # With a sigma four times too large little is followed, which is said.
     notes = fit(scene(), observed, ["tissue.map"], resolution=4, sigma=4e-4).notes
-    assert "what is left is only 0.25 times sigma: with a smaller one the map shows more" in notes
+    assert "the residual is only 0.25 times sigma: with a smaller sigma the map shows more" in notes
 
 
 def test_fields_that_do_not_move_are_unknown(device: Device, tmp_path: Path) -> None:
@@ -252,7 +252,7 @@ def test_points_behind_the_eye_are_refused(device: Device) -> None:
     low = scene(render={"camera": {"eye": [0, -0.02, 0.01], "target": [0, 0.05, 0]}})
     pixel = np.arange(2.0 * len(PLACES)).reshape(-1, 1, 2)
     seen = {"time": [1.0], "coordinates": PLACES, "pixel": pixel, "sigma": 1.0}
-    with pytest.raises(SceneError, match="of the points that were seen are behind the eye of the scene's camera"):
+    with pytest.raises(SceneError, match="of the observed points are behind the eye of the scene's camera"):
         fit(low, seen, ["tissue.map"], resolution=2)
     # As where they get there while the map changes.
     there = read_observations(seen, 1)
@@ -260,7 +260,7 @@ def test_points_behind_the_eye_are_refused(device: Device) -> None:
     search = MapSearch(
         Adjoint(plan, device), ObservationModel(plan.scene, there, 3), there, 1.0, fields, (-2, 2), lambda: None
     )
-    with pytest.raises(SceneError, match="pixel: a point that was seen gets behind the eye of the camera"):
+    with pytest.raises(SceneError, match="pixel: an observed point gets behind the eye of the camera"):
         search.predict(np.zeros(4))
 
 
@@ -308,7 +308,7 @@ def test_a_map_is_found_in_motion(device: Device) -> None:
         (["--free", "tissue.map", "--resolution", "4"], "sigma: missing"),
         (
             ["--free", "tissue.map", "--resolution", "8", "--sigma", "1e-5"],
-            "6 numbers were seen, too few for 64 fields",
+            "6 numbers were observed, too few for 64 fields",
         ),
         (["--free", "tissue.map", "--resolution", "4", "--profile"], "--profile is of fits of numbers; leave it out"),
         (["--free", "tissue.map", "--resolution", "4", "--bounds", "tissue.map=2,1"], "the smaller one first"),
@@ -345,7 +345,7 @@ def test_springs_and_contact_are_refused(device: Device) -> None:
 def test_a_map_that_takes_too_much_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("taichi_msm.fitting.stiffness_map.available_memory", lambda: 1000)
     seen = {"time": [1.0], "coordinates": PLACES, "position": np.zeros((len(PLACES), 1, 3)), "sigma": 1e-5}
-    with pytest.raises(SceneError, match="--resolution 4: 16 fields by 432 numbers that were seen take"):
+    with pytest.raises(SceneError, match="--resolution 4: 16 fields by 432 observed numbers take"):
         fit(scene(), seen, ["tissue.map"], resolution=4)
 
 

@@ -108,16 +108,16 @@ CHANGES: dict[str, tuple[Callable[[], object], str]] = {
     "picture gone": (Path("speckle.png").unlink, "image: speckle.png: no such file or directory"),
     "picture changed": (
         lambda: Image.fromarray(speckle(30, 40, 1)).save("speckle.png"),
-        "image: speckle.png is not the file that was run, as its SHA-256 tells",
+        "image: speckle.png is not the file of the run, by its SHA-256",
     ),
     "map gone": (Path("map.png").unlink, "springs.map.image: map.png: no such file or directory"),
     "map changed": (
         lambda: Image.new("L", (3, 3), 9).save("map.png"),
-        "springs.map.image: map.png is not the file that was run, as its SHA-256 tells",
+        "springs.map.image: map.png is not the file of the run, by its SHA-256",
     ),
     "SHA-256 forged": (
         lambda: change(Path("out"), sha256={"springs.map.image": sha256(Path("map.png"))}),
-        "image: speckle.png is not the file that was run, as its SHA-256 tells",
+        "image: speckle.png is not the file of the run, by its SHA-256",
     ),
 }
 

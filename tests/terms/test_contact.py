@@ -276,7 +276,7 @@ def test_a_rod_that_goes_through_the_sheet_is_noted(device: Device) -> None:
         progress = simulation.progress
     assert (progress.pierced_by, progress.pierced_frame) == (1, 2)
     (note,) = (note for note in notes_of(made, progress, None) if "went through" in note)
-    assert note.startswith("probes.0: the instrument went through the sheet, first seen at 0.08 s, frame 2")
+    assert note.startswith("probes.0: the instrument went through the sheet, first at 0.08 s, frame 2")
     # Exactly on the diagonal of a cell, without touching its corners.
     between = moved(
         [0, 0.525, 0.53125, 0.001], [0.2, 0.525, 0.53125, -0.03], instrument={"radius": 0.004, "shaft": [0, 0, 1]}
