@@ -19,7 +19,7 @@ class ResolvedPlan(NamedTuple):
 
     Attributes:
         plan: plan whose scene contains the chosen numbers of mass points, time step and precision.
-        estimate: TimeStepEstimate | None  # of the error due to the time step; None without `time.tolerance`.
+        estimate: estimate of the time-step error; None without `time.tolerance`.
         mesh: estimate of the discretisation error (mesh); None without `sheet.tolerance`.
     """
 

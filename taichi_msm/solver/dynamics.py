@@ -20,9 +20,9 @@ from taichi_msm.model.sheet import area_shares, axes, rest_positions, spacing
 from taichi_msm.model.surface import surface_point
 from taichi_msm.model.tool_force import probe_force
 from taichi_msm.solver.arrays import BYTES, InitialData, SheetLayout, StepKernel
+from taichi_msm.solver.contact_corrections import sum_corrections
 from taichi_msm.solver.kernel_cpu import ScatterKernel
 from taichi_msm.solver.kernel_gpu import STEPS_PER_LAUNCH, GatherKernel
-from taichi_msm.solver.pushes import sum_corrections
 from taichi_msm.solver.state import PeakForce, ProbeForces, Reading, State, TipForce
 from taichi_msm.system.process import available_threads
 from taichi_msm.system.runtime import Device, lanes
