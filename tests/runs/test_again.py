@@ -141,7 +141,7 @@ def test_a_record_that_names_a_picture_elsewhere_draws_nothing_of_it(results: Pa
     change(results, working_directory=str(results))
     done = program("run", "--again", str(results), "--out", str(results.parent / "second"))
     assert done.returncode == 4
-    assert "secret.png is not the file that was run" in done.stderr
+    assert "secret.png is not the file of the run" in done.stderr
     assert not (results.parent / "second").exists()
 
 
@@ -195,7 +195,7 @@ def test_a_picture_that_changes_while_a_run_starts_is_noticed(
         return found
 
     monkeypatch.setattr("taichi_msm.runs.run.input_digests", late)
-    with pytest.raises(SceneError, match=r"^image: speckle.png is not the file that was run"):
+    with pytest.raises(SceneError, match=r"^image: speckle.png is not the file of the run"):
         run(load_scene("small.yaml"), "out", threads=device.threads)
 
 
@@ -210,7 +210,7 @@ def test_a_playback_draws_the_picture_that_was_run(mapped: Path, device: Device)
         with pytest.raises(FilesError, match=r"^out: image: speckle.png: no such file or directory; put back"):
             playback.draw(1)
     Image.new("L", (3, 3), 9).save("map.png")
-    with pytest.raises(FilesError, match=r"^out: springs.map.image: map.png is not the file that was run"):
+    with pytest.raises(FilesError, match=r"^out: springs.map.image: map.png is not the file of the run"):
         Playback("out", threads=device.threads)
 
 

@@ -571,7 +571,7 @@ def test_a_sheet_that_was_interrupted_while_stepping_is_not_used(
         dynamics.advance(5)
     monkeypatch.undo()
     for use in (dynamics.state, dynamics.read, lambda: dynamics.advance(1)):
-        with pytest.raises(MsmError, match="restore what was saved before"):
+        with pytest.raises(MsmError, match="restore a saved state"):
             use()
     dynamics.restart(dynamics.plan, saved)
     dynamics.advance(5)

@@ -213,7 +213,7 @@ def test_a_run_is_recorded_and_repeated(program: Program) -> None:
     Path("deep.png").write_bytes(Path("other.png").read_bytes())
     changed = program("run", "--again", "first", "--out", "third")
     assert changed.returncode == 4
-    assert "tissue.foundation_map.image: deep.png is not the file that was run" in changed.stderr
+    assert "tissue.foundation_map.image: deep.png is not the file of the run" in changed.stderr
 
 
 @pytest.mark.usefixtures("here")
