@@ -16,10 +16,16 @@ from taichi_msm.runs.run import run
 from taichi_msm.system import runtime
 from taichi_msm.system.compiler import active_compiler
 from taichi_msm.system.process import SIGNALS
+from tests import golden
+from tests.golden import Messages
 from tests.scenes import SMALL, speckle
 
 # These files take longest.
 LONGEST = {f"test_{name}" for name in ("docs", "vulkan", "lens", "rest", "cluster", "sweep", "contact", "study", "fit")}
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--write-messages", action="store_true", help="write tests/messages.yaml in place of comparing")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -45,6 +51,23 @@ def own_kernel_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
     # All workers of pytest-xdist share one.
     shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
     os.environ[active_compiler().folder_variable] = str(shared / "kernels")
+
+
+@pytest.fixture(scope="session")
+def written_messages(request: pytest.FixtureRequest) -> Iterator[golden.Golden | None]:
+    """The messages that the session writes, or None where it compares."""
+    written: golden.Golden | None = {} if request.config.getoption("--write-messages") else None
+    yield written
+    if written:
+        golden.write(written)
+
+
+@pytest.fixture
+def message(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, written_messages: golden.Golden | None
+) -> Messages:
+    """Compare messages with the golden file, tests/messages.yaml."""
+    return Messages(request.node.nodeid, tmp_path_factory.getbasetemp(), written_messages)
 
 
 @pytest.fixture

@@ -1,0 +1,84 @@
+"""The golden file of messages: every message of the program under the test that provokes it.
+
+`python -m pytest --write-messages` writes the messages of the tests that run into tests/messages.yaml, to be read as a
+diff. Elsewhere tests assert the key, the place and a word at most, so the wording changes in that file alone.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+
+import pytest
+import yaml
+
+FILE = Path(__file__).parent / "messages.yaml"
+
+# Messages by file of tests and by test.
+Golden = dict[str, dict[str, list[str]]]
+
+
+@cache
+def read() -> Golden:
+    return yaml.load(FILE.read_text(encoding="utf-8"), Loader=yaml.CSafeLoader) or {}
+
+
+def write(changed: Golden) -> None:
+    """Put the messages of the tests that ran into the file; workers of pytest-xdist take turns."""
+    with FILE.open("r+", encoding="utf-8") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        golden: Golden = yaml.safe_load(file) or {}
+        for tests, messages in changed.items():
+            golden[tests] = {**golden.get(tests, {}), **messages}
+        golden = {tests: dict(sorted(golden[tests].items())) for tests in sorted(golden)}
+        file.seek(0)
+        yaml.safe_dump(golden, file, allow_unicode=True, width=120, sort_keys=False)
+        file.truncate()
+
+
+class Messages:
+    """The messages of one test, compared with the golden file in the order in which they come.
+
+    Args:
+        node: id of the test.
+        temporary: folder of the session's temporary folders; each of these is TMP in the file.
+        written: messages of the session to be written; None where they are compared.
+    """
+
+    def __init__(self, node: str, temporary: Path, written: Golden | None) -> None:
+        self._tests, self._test = node.removeprefix("tests/").split("::", 1)
+        self._temporary = re.compile(rf"{re.escape(str(temporary))}/[^/\s:;,'\"]+")
+        self._written, self._count = written, 0
+
+    def __call__(self, message: str | Iterable[str], *words: str, hide: str = r"(?!)") -> None:
+        """Compare a message, or its lines, with the golden file.
+
+        Args:
+            message: text, or lines.
+            words: key, place or word that it must contain whatever its wording.
+            hide: pattern of parts that differ between machines; an ellipsis in the file.
+        """
+        text = message if isinstance(message, str) else "\n".join(message)
+        text = re.sub(hide, "…", self._temporary.sub("TMP", text)).rstrip("\n")
+        for word in words:
+            assert word in text
+        if self._written is not None:
+            self._written.setdefault(self._tests, {}).setdefault(self._test, []).append(text)
+            return
+        known = read().get(self._tests, {}).get(self._test, [])
+        self._count += 1
+        assert self._count <= len(known), f"not in {FILE.name} (write it with --write-messages): {text}"
+        assert text == known[self._count - 1]
+
+    @contextmanager
+    def raises(
+        self, error: type[BaseException], *words: str, hide: str = r"(?!)"
+    ) -> Iterator[pytest.ExceptionInfo[BaseException]]:
+        """Expect an error, and compare its message; see `__call__`."""
+        with pytest.raises(error) as caught:
+            yield caught
+        self(str(caught.value), *words, hide=hide)
