@@ -32,7 +32,7 @@ def derive_material(scene: Scene, maps: Maps) -> Material:
 
     Args:
         scene: a scene without `material_key_problems`.
-        maps: images of its readable stiffness maps, by key.
+        maps: images of its stiffness maps, by key; missing keys are ignored.
     """
     (dx, dy), mass = spacing(scene.sheet), scene.sheet.mass
     readable = {key: (keys, maps[key], scene.sheet) for key, keys in scene.maps.items() if key in maps}
@@ -57,18 +57,10 @@ def build_terms(plan: Plan) -> tuple[Term, ...]:
 
 
 def fictitious_masses(plan: Plan) -> NDArray[np.float64]:
-    """Compute masses with which no angular frequency of the sheet exceeds 1 [N/m], shape (rows, cols)."""
+    """Compute fictitious masses [N/m] for which no angular frequency exceeds 1, shape (rows, cols)."""
     return np.sum([np.broadcast_to(term.node_stiffness_bounds(plan), plan.fixed.shape) for term in TERMS], axis=0)
 
 
 def highest_frequency(material: Material, sheet: Sheet) -> float:
-    """Bound the highest angular frequency of the sheet, as long as no spring is shorter than half its rest length.
-
-    Args:
-        material: coefficients of the sheet.
-        sheet: the sheet.
-
-    Returns:
-        The bound [rad/s].
-    """
+    """Bound the highest angular frequency [rad/s], as long as no spring is shorter than half its rest length."""
     return math.sqrt(sum(term.stiffness_bound(material, sheet) for term in TERMS) / material.mass)

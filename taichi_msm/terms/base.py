@@ -20,24 +20,24 @@ from taichi_msm.scene.sheet import Sheet
 # Rows of the array by_column. MOBILITY and AREA_SHARE have three each: for the first, a middle and the last row.
 MOBILITY, AREA_SHARE, REST_X, HAS_LEFT, HAS_RIGHT, COLUMN_ROWS = 0, 3, 6, 7, 8, 9
 
-# Constants of a sheet: dx, dy and y of the first row [m], followed by those of its terms.
-DX, DY, TOP_Y, GEOMETRY = range(4)
+# Indices of the constants of a sheet: dx, dy and y of the first row [m], followed by the constants of its terms.
+DX, DY, TOP_Y, GEOMETRY_COUNT = range(4)
 
-# The first column of the load table, the gain: change of the last difference per force [m/N]; those of terms follow.
+# The first column of the load table: the gain, change of the last difference per force [m/N]. Columns of terms follow.
 GAIN, STEP_COLUMNS = 0, 1
 
-# The first measure of a row: the sum of |d|^2 times the share of mass, followed by those of its terms.
+# The first measure of a row: the sum of |d|^2 times the share of a cell's mass. Measures of terms follow.
 SQUARED_MOTION, STEP_MEASURES = 0, 1
 
 
 class Term(ABC):
     """A term of the model, as a frozen dataclass of its compile-time configuration, without coefficients.
 
-    The kernels refer by name to the terms that act between mass points, springs and bending. All other terms are used
-    through this interface only.
+    The kernels call springs and bending, the terms between mass points, by name, and all others through this interface
+    only.
     """
 
-    reach: ClassVar[int] = 0  # number of neighbouring rows on either side on which the force depends
+    reach: ClassVar[int] = 0  # number of rows on either side on which the force on a row depends
     constant_count: ClassVar[int] = 0  # number of the sheet's constants that belong to the term
     reductions: ClassVar[tuple[str, ...]] = ()  # reduction of each measure over a row: "min", "max" or "sum"
 
@@ -53,20 +53,12 @@ class Term(ABC):
 
     @staticmethod
     def stiffness_bound(material: Material, sheet: Sheet) -> float:
-        """Bound the term's contribution to m w^2, for the angular frequency w of any mode.
-
-        Args:
-            material: coefficients of the sheet.
-            sheet: the sheet.
-
-        Returns:
-            The bound [N/m].
-        """
+        """Bound the term's contribution to m w^2 [N/m], for the angular frequency w of any mode."""
         return 0.0
 
     @classmethod
     def node_stiffness_bounds(cls, plan: Plan) -> NDArray[Any] | float:
-        """Bound the term's stiffness at each mass point [N/m], shape (rows, cols), or by one number for all."""
+        """Bound the term's stiffness at each mass point [N/m], shape (rows, cols) or ()."""
         return cls.stiffness_bound(plan.material, plan.scene.sheet)
 
     def constants(self, plan: Plan) -> tuple[float, ...]:
@@ -123,7 +115,7 @@ class Term(ABC):
     def build_tangents(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
         """Build Taichi functions add(force, sheet, entry, now), which add the linearised change of the force.
 
-        In them `entry` and `sheet` contain changes of displacements instead of displacements.
+        In them `entry` and `sheet` contain the changes of displacements instead of displacements.
         """
         return ()
 
@@ -132,7 +124,7 @@ class Term(ABC):
         return ()
 
     def build_measures(self, config: KernelConfig) -> Sequence[Callable[..., None]]:
-        """Build Taichi functions measure(measures, sheet, p, i, kind, b) for entry b of row i, stored in row p of u."""
+        """Build Taichi functions measure(measures, sheet, p, i, kind, b), for entry b of row i, which is row p of u."""
         return ()
 
 
@@ -144,7 +136,7 @@ class KernelConfig:
     """Compile-time configuration of the kernels of a sheet; everything else is an argument of a kernel."""
 
     precision: str  # f32 or f64
-    lanes: int  # of a vector, equal to the number of strips of columns
+    lanes: int  # number of lanes of a vector, and of strips of columns
     by_area: bool  # whether mass points at an open edge are lighter, because they belong to fewer cells
     terms: tuple[Term, ...]  # terms of the scene in the order of `terms.TERMS`, always with springs and probes
 
@@ -187,7 +179,7 @@ class KernelConfig:
 
     def first_constant(self, kind: type[Term] | None) -> int:
         """Return the index of a term's first constant; with None, the number of constants."""
-        return GEOMETRY + sum(term.constant_count for term in self._before(kind))
+        return GEOMETRY_COUNT + sum(term.constant_count for term in self._before(kind))
 
     def first_column(self, kind: type[Term] | None) -> int:
         """Return the index of a term's first column of the load table; with None, the number of columns."""
@@ -216,7 +208,7 @@ class KernelSheet(NamedTuple):
     stiffness: Any
     fields: Any
     constants: Any  # of the sheet and its terms, as a list of variables
-    rows: Any  # number of rows of mass points
+    rows: Any  # number of rows
     width: Any  # number of entries of a row
 
 

@@ -22,9 +22,9 @@ from taichi_msm.terms.base import DX, DY, HAS_LEFT, HAS_RIGHT, KernelConfig, Ter
 
 @dataclass(frozen=True)
 class BendingTerm(Term):
-    """Bending. Moments are stored in rows of u, one row ahead of the row that is stepped."""
+    """Bending. Moments are stored in additional rows of u, one row ahead of the row that is stepped."""
 
-    # The force depends on the moments of neighbours, which depend on one row more.
+    # The force on a row depends on the moments of the next rows, which depend on the displacements one row further.
     reach: ClassVar[int] = 2
     constant_count: ClassVar[int] = 1
     # The sum of the squared Laplacian.
@@ -46,12 +46,7 @@ class BendingTerm(Term):
 
     @staticmethod
     def stiffness_bound(material: Material, sheet: Sheet) -> float:
-        """Return (4 / dx^2 + 4 / dy^2)^2 D dx dy [N/m], from the largest eigenvalue of the discrete Laplacian.
-
-        Args:
-            material: coefficients of the sheet.
-            sheet: the sheet.
-        """
+        """Return (4 / dx^2 + 4 / dy^2)^2 D dx dy [N/m], from the largest eigenvalue of the discrete Laplacian."""
         dx, dy = spacing(sheet)
         return material.bending * (4 / dx**2 + 4 / dy**2) ** 2
 
@@ -60,26 +55,18 @@ class BendingTerm(Term):
         return (plan.material.bending,)
 
     def energy(self, sums: NDArray[Any], plan: Plan) -> float:
-        """Compute twice the energy.
-
-        Args:
-            sums: the term's measures, reduced over the sheet, shape (measures,).
-            plan: the plan.
-
-        Returns:
-            Twice the energy [J].
-        """
+        """Compute twice the energy [J], see `Term.energy`."""
         return plan.material.bending * float(sums[0])
 
     def build_store_moment(self, config: KernelConfig) -> Callable[..., None]:
-        """Build the function that stores the moment of an entry."""
+        """Build the Taichi function that stores the moment of an entry."""
         ti = config.ti
-        vector, number, laplacian = config.vector, config.first_constant(BendingTerm), build_laplacian(config)
+        vector, constant, laplacian = config.vector, config.first_constant(BendingTerm), build_laplacian(config)
 
         @ti.func
         def store_moment(sheet: ti.template(), i, before, row, after, b, target):
-            """Store the moment of entry b of row i in row `target` of u; `row` is the row of its displacement."""
-            dx, dy, stiffness = sheet.constants[DX], sheet.constants[DY], sheet.constants[number]
+            """Store the moment of entry b of row i, which is row `row` of u, in row `target` of u."""
+            dx, dy, stiffness = sheet.constants[DX], sheet.constants[DY], sheet.constants[constant]
             across, down = stiffness / (dx * dx), stiffness / (dy * dy)
             for c in ti.static(range(3)):
                 sheet.u[c][target * sheet.width + b] = vector(0)
@@ -135,12 +122,12 @@ class BendingTerm(Term):
 
 
 def build_laplacian(config: KernelConfig) -> Callable[..., Any]:
-    """Build the function that computes the five-point Laplacian of an array."""
+    """Build the Taichi function that computes the five-point Laplacian of an array."""
     ti = config.ti
 
     @ti.func
     def laplacian(field: ti.template(), width, before, row, after, b, across, down):
-        """Return the Laplacian at entry b of a row, between rows before and after; across: 1/dx^2, down: 1/dy^2."""
+        """Return the Laplacian at entry b of a row between `before` and `after`; across = 1/dx^2, down = 1/dy^2."""
         centre = field[row * width + b]
         horizontal = (field[row * width + b - 1] - centre) + (field[row * width + b + 1] - centre)
         vertical = (field[before * width + b] - centre) + (field[after * width + b] - centre)

@@ -55,7 +55,7 @@ class ContactTerm(Term):
     """Position-controlled tools."""
 
     tools: int  # number of tools
-    has_friction: tuple[bool, ...]  # of each tool
+    has_friction: tuple[bool, ...]  # whether each tool has friction
     grips: bool  # whether any tool can hold tissue
 
     @classmethod
@@ -67,7 +67,7 @@ class ContactTerm(Term):
 
     @property
     def field_count(self) -> int:
-        """The corrections of every tool, and with grips the held mass points."""
+        """Number of fields: the corrections of every tool, and with grips the held mass points."""
         return _field_count(self.tools, self.grips)
 
     def fields(self, plan: Plan) -> NDArray[Any]:
@@ -76,20 +76,11 @@ class ContactTerm(Term):
 
     @property
     def column_count(self) -> int:
-        """The weight, and the columns of each tool."""
+        """Number of columns: the weight, and the columns of each tool."""
         return COLUMNS + TOOL_COLUMNS * self.tools
 
     def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
-        """Compute the positions of the tools before and after every step and the states of their grips.
-
-        Args:
-            plan: the plan.
-            loads: loads of consecutive steps.
-            first: number of the first step.
-
-        Returns:
-            Columns, shape (steps, column_count).
-        """
+        """Compute the positions of the tools before and after every step and the states of their grips."""
         grid, steps = plan.grid, first + np.arange(len(loads.active) + 1)
         t, frame = steps / grid.steps_per_second, 1 / grid.frames_per_second
         _, gain, first_gain = coefficients(plan)
@@ -114,15 +105,15 @@ class ContactTerm(Term):
         return columns
 
     def is_compiled_in(self, compiled: Self) -> bool:
-        """Return whether a kernel compiled for another configuration supports these tools."""
+        """Return whether a kernel that was compiled for `compiled` supports these tools."""
         friction = zip(self.has_friction, compiled.has_friction, strict=True)
         return all(needed <= available for needed, available in friction) and self.grips <= compiled.grips
 
     def build_reaches(self, config: KernelConfig) -> Callable[..., Any]:
-        """Build the Taichi function reaches(sheet, i, low, high, now): whether a tool may touch or hold mass points.
+        """Build the Taichi function reaches(sheet, i, low, high, now).
 
-        In it `i` is the row, `low` and `high` bound its displacements along y and z, two numbers each, and `now` is a
-        row of the load table.
+        It returns whether a tool may touch or hold mass points of row `i`. In it `low` and `high` bound the
+        displacements of the row along y and z, two numbers each, and `now` is a row of the load table.
         """
         ti, real, vector, tools, grips = config.ti, config.real, config.vector, self.tools, self.grips
         max_lane = build_max_lane(config)
@@ -131,7 +122,7 @@ class ContactTerm(Term):
 
         @ti.func
         def cut(low, high, begin, end, start, inverse):
-            """Clip the interval of s from `begin` to `end` to where start + s / inverse is between low and high."""
+            """Clip the interval [begin, end] of s to the part in which low <= start + s / inverse <= high."""
             at_low, at_high = (low - start) * inverse, (high - start) * inverse
             return ti.max(begin, ti.min(at_low, at_high)), ti.min(end, ti.max(at_low, at_high))
 
@@ -249,7 +240,7 @@ class ContactTerm(Term):
 
 
 def build_max_lane(config: KernelConfig) -> Callable[..., Any]:
-    """Build the Taichi function max_lane(values), the maximum over lanes, by shuffles, unlike Taichi's `max()`."""
+    """Build the Taichi function max_lane(values), the maximum over lanes, with shuffles instead of Taichi's `max()`."""
     ti, vector, lanes = config.ti, config.vector, config.lanes
     halves = [lanes >> n for n in range(1, lanes.bit_length())]
 
@@ -264,7 +255,7 @@ def build_max_lane(config: KernelConfig) -> Callable[..., Any]:
 
 
 def build_penetration(config: KernelConfig) -> Callable[..., Any]:
-    """Build the Taichi function penetration(rest, u, now, base), the penetration depth of mass points in a tool.
+    """Build the Taichi function penetration(rest, u, now, base), the depth of mass points in a tool and the normals.
 
     In it `base` is the first column of the tool. It returns radius - |r'| and the three components of n.
     """
@@ -290,7 +281,7 @@ def build_penetration(config: KernelConfig) -> Callable[..., Any]:
 
 
 def contact_fields(probes: Sequence[Probe]) -> int:
-    """Return the number of contact fields that these probes require."""
+    """Return the number of contact fields of a scene with these probes."""
     return _field_count(sum(probe.moved for probe in probes), any(probe.grip for probe in probes))
 
 

@@ -27,12 +27,7 @@ from taichi_msm.terms.contact import (
 
 
 def build_remove_contact(config: KernelConfig, contact: ContactTerm) -> Callable[..., None]:
-    """Build the Taichi function remove_contact(force, sheet, at), which removes contact forces at an entry.
-
-    Args:
-        config: compile-time configuration.
-        contact: its contact term.
-    """
+    """Build the Taichi function remove_contact(force, sheet, at), which removes contact forces at an entry."""
     ti, vector, tools, grips = config.ti, config.vector, contact.tools, contact.grips
     first_field = config.first_field(ContactTerm)
     holding, iterations = first_field + CORRECTIONS * tools + HOLDER, _iterations(contact)
@@ -62,12 +57,8 @@ def build_remove_contact(config: KernelConfig, contact: ContactTerm) -> Callable
 def build_project_out(config: KernelConfig, contact: ContactTerm) -> Callable[..., None]:
     """Build the Taichi function project_out(sheet, i, kind, b, now) for entry b of row i of a `RestSheet`.
 
-    It projects mass points that have moved out of the tools, removes their momentum into the tools, and moves held mass
-    points with their tool.
-
-    Args:
-        config: compile-time configuration.
-        contact: its contact term.
+    It projects mass points out of the tools, removes their momentum into the tools, and moves held mass points with
+    their tool.
     """
     ti, vector, tools, grips = config.ti, config.vector, contact.tools, contact.grips
     first_field, first = config.first_field(ContactTerm), config.first_column(ContactTerm)
@@ -118,4 +109,5 @@ def build_project_out(config: KernelConfig, contact: ContactTerm) -> Callable[..
 
 
 def _iterations(contact: ContactTerm) -> int:
+    """Return the number of Gauss-Seidel iterations."""
     return 8 if contact.tools > 1 else 1

@@ -20,7 +20,7 @@ Window = tuple[slice, slice]
 class SpringFamily(NamedTuple):
     """All springs with the same offset between their ends."""
 
-    # start, end: slices of the mass points at the springs' ends; `end` is below or to the right of `start`
+    # start, end: slices of the mass points at both ends; `end` is below or to the right of `start`
     start: Window
     end: Window
     offset: Array  # vector from start to end at rest [m], shape (3,)
@@ -47,15 +47,15 @@ def spring_families(plan: Plan) -> Iterator[SpringFamily]:
     """Build the families of springs along rows, along columns and along both diagonals."""
     (rows, cols), (dx, dy), material = plan.scene.sheet.points, spacing(plan.scene.sheet), plan.material
     factors = np.ones((rows - 1, cols - 1)) if material.factors is None else material.factors
-    across, down_columns, shear = spring_stiffness(material, factors)
-    # The tension of a spring at rest does not depend on the map; at edges it is half, like the stiffness.
+    along_rows, along_columns, diagonals = spring_stiffness(material, factors)
+    # The tension of a spring at rest does not depend on the map; at an edge of tissue it is half, like the stiffness.
     shares = (np.where(np.isin(np.arange(count), (0, count - 1)), 0.5, 1.0) for count in (rows, cols))
-    of_rows, of_columns = np.ix_(*shares) if material.by_area else (1.0, 1.0)
+    row_shares, column_shares = np.ix_(*shares) if material.by_area else (1.0, 1.0)
     for down, right, stiffness, unmapped in (
-        (0, 1, across, material.across * of_rows),
-        (1, 0, down_columns, material.down * of_columns),
-        (1, 1, shear, material.shear),
-        (1, -1, shear, material.shear),
+        (0, 1, along_rows, material.across * row_shares),
+        (1, 0, along_columns, material.down * column_shares),
+        (1, 1, diagonals, material.shear),
+        (1, -1, diagonals, material.shear),
     ):
         start = slice(0, rows - down), slice(max(0, -right), cols - max(0, right))
         end = slice(down, rows), slice(max(0, right), cols - max(0, -right))
@@ -70,7 +70,7 @@ def elastic_force(families: Sequence[SpringFamily], displacement: Array) -> Arra
     """Sum k (L - L0) (Q - P) / L over the neighbours Q of every mass point P (eq. 2), without the tension at rest.
 
     Args:
-        families: of springs, from `spring_families`.
+        families: all springs, from `spring_families`.
         displacement: x - X [m], shape (rows, cols, 3).
 
     Returns:
@@ -88,10 +88,10 @@ def elastic_force(families: Sequence[SpringFamily], displacement: Array) -> Arra
 
 
 def energy_density(plan: Plan, displacement: Array) -> Array:
-    """Compute the elastic energy of the springs above that at rest, per area, without bending and foundation.
+    """Compute the energy density of the springs relative to the state at rest, without bending and foundation.
 
-    Each end of a spring is assigned half of the spring's energy. The sum of density times `area_shares` times the area
-    of a cell is therefore the energy of all springs.
+    Each end of a spring has half of its energy. The sum of density times `area_shares` times the area of a cell is
+    therefore the energy of all springs.
 
     Args:
         plan: the plan.
@@ -100,13 +100,13 @@ def energy_density(plan: Plan, displacement: Array) -> Array:
     Returns:
         Energy per area at rest [J/m2], shape (rows, cols).
     """
-    at_points, (dx, dy) = np.zeros(displacement.shape[:2]), spacing(plan.scene.sheet)
+    by_point, (dx, dy) = np.zeros(displacement.shape[:2]), spacing(plan.scene.sheet)
     for family in spring_families(plan):
         edges, length = family.edge_vectors(displacement)
         rest = family.length - family.unstretched_length
         # The linear part cancels in the sum over all springs, because the sheet is in equilibrium at rest.
         linear = (edges - family.offset) @ family.offset * rest / family.length
         energy = family.stiffness * ((length - family.unstretched_length) ** 2 / 2 - rest**2 / 2 - linear)
-        at_points[family.start] += energy / 2
-        at_points[family.end] += energy / 2
-    return at_points / (dx * dy * area_shares(plan.scene.sheet))
+        by_point[family.start] += energy / 2
+        by_point[family.end] += energy / 2
+    return by_point / (dx * dy * area_shares(plan.scene.sheet))

@@ -26,7 +26,7 @@ from taichi_msm.terms.base import AREA_SHARE, KernelConfig, Term
 class FoundationTerm(Term):
     """Virtual springs. Their energy is not measured; `accuracy.divergence` bounds it."""
 
-    by_area: bool  # whether K is smaller at an open edge, where less area belongs to a mass point
+    by_area: bool  # whether K is smaller at an open edge, because mass points have less area there
     mapped: bool  # whether the factor of K at each mass point is read from a field
 
     @staticmethod
@@ -50,12 +50,7 @@ class FoundationTerm(Term):
 
     @staticmethod
     def stiffness_bound(material: Material, sheet: Sheet) -> float:
-        """Return the largest K [N/m].
-
-        Args:
-            material: coefficients of the sheet.
-            sheet: the sheet.
-        """
+        """Return the largest K [N/m]."""
         factors = material.virtual_factors
         return material.virtual if factors is None else material.virtual * float(factors.max())
 
@@ -67,20 +62,11 @@ class FoundationTerm(Term):
 
     @property
     def column_count(self) -> int:
-        """One column: the active share of K."""
+        """One column: K times its active share."""
         return 1
 
     def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
-        """Return the active share of K at every step.
-
-        Args:
-            plan: the plan.
-            loads: loads of consecutive steps.
-            first: number of the first step.
-
-        Returns:
-            K times the activity [N/m], shape (steps, 1).
-        """
+        """Return K times its active share at every step [N/m], shape (steps, 1)."""
         return plan.material.virtual * loads.active[:, None]
 
     @property
@@ -120,7 +106,7 @@ class FoundationTerm(Term):
 
 
 def point_shares(plan: Plan) -> NDArray[Any]:
-    """Return the factor of K at each mass point: that of the map times the share of a cell's area, (rows, cols)."""
+    """Return the factor of K at each mass point, map times share of a cell's area, shape (rows, cols)."""
     material = plan.material
     shares = area_shares(plan.scene.sheet) if material.by_area else np.ones(plan.fixed.shape)
     return shares if material.virtual_factors is None else material.virtual_factors * shares

@@ -1,8 +1,8 @@
 """Loads: the forces of force-controlled probes on the mass points around their control points. Scene: `probes`.
 
-The force on a mass point at the distance d is F exp(-max(falloff d + shift, offset)) (see `probe_force`). The load
-table contains its parameters for every step and `ProbeSlot`. For a stationary control point the decay factors are a
-field.
+The force on a mass point at the distance d is F exp(-max(falloff d + shift, offset)), see `probe_force`. The load
+table contains its parameters for every step and `ProbeSlot`. The decay factors of a stationary control point, the
+exponentials, are stored in a field.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -43,26 +43,17 @@ class ProbeTerm(Term):
 
     @property
     def column_count(self) -> int:
-        """The columns of all slots."""
+        """Number of columns of all slots."""
         return SLOT_COLUMNS * len(self.moves)
 
     def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
-        """Compute the columns of all slots.
-
-        Args:
-            plan: the plan.
-            loads: loads of consecutive steps.
-            first: number of the first step.
-
-        Returns:
-            Columns, shape (steps, column_count).
-        """
+        """Compute the columns of all slots."""
         slots = np.empty((len(loads.active), len(self.moves), SLOT_COLUMNS))
         slots[..., FORCE:POINT] = loads.strength
         slots[..., POINT:FALLOFF] = loads.point
         for n, slot in enumerate(plan.slots):
-            law = probe_force(plan.scene.probes[slot.probe], plan.scene.sheet)
-            slots[:, n, FALLOFF:] = law.falloff, law.shift, law.offset
+            force = probe_force(plan.scene.probes[slot.probe], plan.scene.sheet)
+            slots[:, n, FALLOFF:] = force.falloff, force.shift, force.offset
         return slots.reshape(len(slots), self.column_count)
 
     @property
@@ -115,15 +106,15 @@ class ProbeTerm(Term):
         return np.array(gradients).reshape(-1, 2, *scene.sheet.points)
 
     def build_load_adjoint(self, config: KernelConfig, first_slope: int) -> Callable[..., None]:
-        """Build the function sense(sums, sheet, entry, now), the adjoint of the loads.
+        """Build the function add_adjoint(sums, sheet, entry, now), the adjoint of the loads.
 
-        It differentiates the work of all slots, the product of force and `entry.u`. For each slot it adds three
-        derivatives by the force and two by the control point to the list `sums`.
+        It differentiates the product of the force of each slot and `entry.u`, by the force (3) and by the control
+        point (2), and adds these derivatives to the list `sums`.
 
         Args:
             config: compile-time configuration.
-            first_slope: index of the first array of `decay_gradients` in `sheet.derivatives`, in multiples of the
-                sheet's rows.
+            first_slope: index of the first array of `decay_gradients` in `sheet.derivatives`, counted in arrays of the
+                sheet.
         """
         ti = config.ti
         moves, by_area, first = self.moves, self.by_area, config.first_column(ProbeTerm)
@@ -131,7 +122,7 @@ class ProbeTerm(Term):
         stationary = [moves[:n].count(False) for n in range(len(moves))]
 
         @ti.func
-        def sense(sums: ti.template(), sheet: ti.template(), entry: ti.template(), now: ti.template()):
+        def add_adjoint(sums: ti.template(), sheet: ti.template(), entry: ti.template(), now: ti.template()):
             i, b = entry.row.i, entry.b
             for n in ti.static(range(len(moves))):
                 column = ti.static(first + SLOT_COLUMNS * n)
@@ -141,14 +132,14 @@ class ProbeTerm(Term):
                     off_y = sheet.constants[TOP_Y] - i * sheet.constants[DY] - now[column + POINT + 1]
                     distance = ti.sqrt(off_x * off_x + off_y * off_y)
                     exponent = now[column + FALLOFF] * distance + now[column + SHIFT]
-                    # 0 under the flat end and at the control point.
-                    turned = now[column + FALLOFF] / ti.select(distance > 0, distance, vector(1))
-                    turned = ti.select(exponent > now[column + OFFSET], turned, vector(0))
+                    # The derivative is 0 where the force does not depend on the distance, and at the control point.
+                    falloff_per_distance = now[column + FALLOFF] / ti.select(distance > 0, distance, vector(1))
+                    falloff_per_distance = ti.select(exponent > now[column + OFFSET], falloff_per_distance, vector(0))
                     exponent = ti.max(exponent, now[column + OFFSET])
                     share = vector([ti.exp(-exponent[lane]) for lane in ti.static(range(lanes))])
                     if ti.static(by_area[n]):
                         share *= sheet.by_column[(AREA_SHARE + entry.row.kind) * sheet.width + b]
-                    slope[0], slope[1] = share * turned * off_x, share * turned * off_y
+                    slope[0], slope[1] = share * falloff_per_distance * off_x, share * falloff_per_distance * off_y
                 else:
                     share = sheet.fields[((first_field + stationary[n]) * sheet.rows + i) * sheet.width + b]
                     for axis in ti.static(range(2)):
@@ -161,11 +152,11 @@ class ProbeTerm(Term):
                 for axis in ti.static(range(2)):
                     sums[5 * n + 3 + axis] += work * slope[axis]
 
-        return sense
+        return add_adjoint
 
 
 def decay_parameters(plan: Plan) -> list[tuple[object, ...]]:
-    """Return all parameters on which the decay factors of the stationary slots depend."""
+    """Return the parameters of the decay factors of the stationary slots, to detect changes."""
     probes = [plan.scene.probes[slot.probe] for slot in plan.slots if not slot.moves]
     return [(probe.at, probe_force(probe, plan.scene.sheet)[1:]) for probe in probes]
 
@@ -181,16 +172,11 @@ def max_free_acceleration(plan: Plan) -> float:
 
 
 def force_norm(slot: ProbeSlot, scene: Scene) -> float:
-    """Bound the Euclidean norm of the forces on all mass points for a force of 1 N at the control point.
-
-    Args:
-        slot: slot of a probe.
-        scene: its scene.
-    """
+    """Bound the Euclidean norm of the forces on all mass points for a force of 1 N at the control point."""
     if not slot.moves:
         return float(np.linalg.norm(decay(scene.probes[slot.probe], scene.sheet)))
-    # The moving control point is within half a cell's diagonal of some mass point. Four sheets that meet at that mass
-    # point cover the sheet, and their norm is twice that of one of them with the mass point at its corner.
+    # The control point is within half a cell's diagonal of some mass point. Four copies of the sheet that meet at this
+    # mass point cover the sheet, and their norm is twice that of one copy with the mass point at its corner.
     x, y = axes(scene.sheet)
     nearest = np.maximum(np.hypot(x - x[0], y - y[0]) - math.hypot(*spacing(scene.sheet)) / 2, 0)
     return 2 * float(np.linalg.norm(probe_force(scene.probes[slot.probe], scene.sheet).decay(nearest)))

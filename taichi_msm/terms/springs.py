@@ -69,7 +69,7 @@ class SpringTerm(Term):
 
     @staticmethod
     def derive(scene: Scene) -> dict[str, Any]:
-        """Return the coefficients of `springs`, or assemble those of `tissue` as described above."""
+        """Return the coefficients of `springs`, or derive those of `tissue` as above."""
         tissue, springs = scene.tissue, scene.springs
         if tissue is None:
             assert springs is not None
@@ -98,7 +98,7 @@ class SpringTerm(Term):
 
     @staticmethod
     def stiffness_bound(material: Material, sheet: Sheet) -> float:
-        """Bound m w^2 of the springs, as long as no spring is shorter than half its rest length.
+        """Bound m w^2 of the springs [N/m], as long as no spring is shorter than half its rest length.
 
         The energy is a sum over cells. A spring of a cell has at most the energy k / 2 |q|^2. With a quarter of the
         mass of a mass point at each corner, every mode of a cell, and hence every mode of the sheet, satisfies
@@ -107,13 +107,6 @@ class SpringTerm(Term):
 
         With a map, the mass of each mass point is distributed over its cells in proportion to their stiffness. The
         bound is then multiplied by the largest mean of the factors around a mass point.
-
-        Args:
-            material: coefficients of the sheet.
-            sheet: the sheet.
-
-        Returns:
-            The bound [N/m].
         """
         largest = 1.0
         if material.factors is not None:
@@ -143,24 +136,17 @@ class SpringTerm(Term):
         return *stiffness, *material.tensions
 
     def energy(self, sums: NDArray[Any], plan: Plan) -> float:
-        """Compute twice the energy.
-
-        Args:
-            sums: the term's measures, reduced over the sheet, shape (measures,).
-            plan: the plan.
-
-        Returns:
-            Twice the energy [J].
-        """
+        """Compute twice the energy [J], see `Term.energy`."""
         dx, dy = spacing(plan.scene.sheet)
         squares = np.array([dx**2, dy**2, dx**2 + dy**2])
         return float((sums[STRETCH_SUMS:TENSION_SUMS] + plan.material.tensions * sums[TENSION_SUMS:]) @ squares)
 
     def build_spring_forces(self, config: KernelConfig) -> tuple[Callable[..., Any], ...]:
-        """Build the functions for the forces of springs within a row and between two rows, and for their stiffness.
+        """Build the Taichi functions that compute the forces of springs and their stiffness.
 
         Returns:
-            Taichi functions along, to_other_row, of_row, of_column and of_diagonal.
+            The functions along and to_other_row, the forces within a row and between two rows; of_row, of_column and
+            of_diagonal, the stiffness of a spring of each family.
         """
         ti = config.ti
         tense, mapped, by_area = self.tense, self.mapped, self.by_area and not self.mapped
@@ -169,7 +155,7 @@ class SpringTerm(Term):
 
         @ti.func
         def pull(weighted, square, length, to: ti.template(), tension, q: ti.template()):
-            """Return the force, from weighted = k (L^2 - L0^2), square = L^2 and length = L0."""
+            """Return the force for weighted = k (L^2 - L0^2), square = L^2 and length = L0."""
             share = weighted / (square + length * ti.sqrt(square))
             force = [share * to[c] for c in ti.static(range(3))]
             if ti.static(tense):
@@ -192,7 +178,7 @@ class SpringTerm(Term):
 
         @ti.func
         def to_other_row(sheet: ti.template(), entry, right: ti.template(), here: ti.template(), up, length, k, exists):
-            """Return the force of a mass point displaced by `here` on `entry`, `up` above and `right` columns on."""
+            """Return the force of a mass point displaced by `here` on `entry`, `up` [m] above, `right` columns on."""
             x, y, z = here[0] - sheet.u[0][entry], here[1] - sheet.u[1][entry], here[2] - sheet.u[2][entry]
             to_x = x
             to_y = y - up
@@ -210,7 +196,7 @@ class SpringTerm(Term):
 
         @ti.func
         def of_row(sheet: ti.template(), i, kind, b):
-            """Return the stiffness of the spring to the right of entry b of row i, which along an edge is half."""
+            """Return the stiffness of the spring to the right of entry b of row i; at an edge of tissue it is half."""
             if ti.static(mapped):
                 return sheet.stiffness[i * sheet.width + b]
             elif ti.static(by_area):  # noqa: RET505  # Taichi would compile the rest as well.
@@ -220,7 +206,7 @@ class SpringTerm(Term):
 
         @ti.func
         def of_column(sheet: ti.template(), lower, b):
-            """Return the stiffness of the spring between entry b of row `lower` and the row before."""
+            """Return the stiffness of the spring between entry b of row `lower` and the row above."""
             if ti.static(mapped):
                 return sheet.stiffness[(sheet.rows + lower) * sheet.width + b]
             elif ti.static(by_area):  # noqa: RET505
@@ -239,7 +225,7 @@ class SpringTerm(Term):
         return along, to_other_row, of_row, of_column, of_diagonal
 
     def build_spring_tangent(self, config: KernelConfig) -> Callable[..., Any]:
-        """Build the function that differentiates the force of a mass point P on its neighbour Q.
+        """Build the Taichi function that differentiates the force of a mass point P on its neighbour Q.
 
         If u_P - u_Q changes from q by p, the force changes by
 
@@ -252,7 +238,7 @@ class SpringTerm(Term):
 
         @ti.func
         def differentiate(q: ti.template(), p: ti.template(), x0, y0, length, k, tension):
-            """Return the change of the force, x, y and z, and the derivatives of its product with p."""
+            """Return the change of the force (3), and the derivatives of its product with p by k - tau and by tau."""
             to = [q[0] + x0, q[1] + y0, q[2]]
             square = to[0] * to[0] + to[1] * to[1] + (to[2] * to[2] + MIN_SQUARED_LENGTH)
             longer = q[0] * (to[0] + x0) + (q[1] * (to[1] + y0) + q[2] * q[2])
@@ -271,17 +257,17 @@ class SpringTerm(Term):
         return differentiate
 
     def build_max_spring_force(self, config: KernelConfig) -> Callable[..., Any]:
-        """Build the function that computes the squared largest force of the springs to the right and below."""
+        """Build the Taichi function that squares the largest force of the springs to the right and below."""
         ti = config.ti
         structural, shear, vector = self.structural, self.shear, config.vector
         along, to_other_row, of_row, of_column, of_diagonal = self.build_spring_forces(config)
 
         @ti.func
-        def stronger(largest, force: ti.template()):
+        def larger(largest, force: ti.template()):
             return ti.max(largest, force[0] * force[0] + force[1] * force[1] + force[2] * force[2])
 
         @ti.func
-        def pull(sheet: ti.template(), entry: ti.template()):
+        def max_force(sheet: ti.template(), entry: ti.template()):
             row = ti.static(entry.row)
             u = ti.static(entry.u)
             b, largest = entry.b, vector(0)
@@ -292,27 +278,27 @@ class SpringTerm(Term):
             here, below, lower = row.i * sheet.width + b, (row.i + 1) * sheet.width + b, row.i + 1
             if ti.static(structural):
                 k = vector(0) + of_row(sheet, row.i, row.kind, b)
-                largest = stronger(largest, along(sheet, here + 1, u, k * has_right, vector(1)))
+                largest = larger(largest, along(sheet, here + 1, u, k * has_right, vector(1)))
             if lower < sheet.rows:
                 if ti.static(structural):
                     k = vector(0) + of_column(sheet, lower, b)
-                    largest = stronger(largest, to_other_row(sheet, below, 0, u, 0 - dy, dy, k, vector(1)))
+                    largest = larger(largest, to_other_row(sheet, below, 0, u, 0 - dy, dy, k, vector(1)))
                 if ti.static(shear):
                     diagonal = ti.sqrt(dx * dx + dy * dy)
                     for right, exists in ti.static(((-1, has_left), (1, has_right))):
                         k = vector(0) + of_diagonal(sheet, lower, b + ti.static(min(right, 0)))
                         force = to_other_row(sheet, below + right, right, u, 0 - dy, diagonal, k * exists, vector(1))
-                        largest = stronger(largest, force)
+                        largest = larger(largest, force)
             return largest
 
-        return pull
+        return max_force
 
     def build_measures(self, config: KernelConfig) -> Sequence[Callable[..., None]]:
         """Build the function that measures the springs to the right of an entry and to the row below it."""
         ti = config.ti
         tense, open_edges, vector, first = self.tense, self.open_edges, config.vector, config.first_measure(SpringTerm)
         _, _, of_row, of_column, of_diagonal = self.build_spring_forces(config)
-        # For each family: its index, the rows and the columns from one end to the other.
+        # For each family: its index, and the offsets in rows and columns from one end to the other.
         structural = ((ALONG_ROW, 0, (1,)), (ALONG_COLUMN, 1, (0,))) if self.structural else ()
         families = structural + (((DIAGONAL, 1, (-1, 1)),) if self.shear else ())
 
@@ -337,7 +323,7 @@ class SpringTerm(Term):
             dx, dy = sheet.constants[DX], sheet.constants[DY]
             for family, down, rights in ti.static(families):
                 if i + down < sheet.rows:
-                    stretched, tense_part = vector(0), vector(0)
+                    stretch_sum, tension_sum = vector(0), vector(0)
                     for right in ti.static(rights):
                         k = vector(0)
                         if ti.static(family == ALONG_ROW):
@@ -349,21 +335,21 @@ class SpringTerm(Term):
                         share, squared = longer(sheet, p, p + down, b, right, right * dx, -down * dy)
                         measures[first + MIN_STRAIN] = ti.min(measures[first + MIN_STRAIN], share)
                         measures[first + MAX_STRAIN] = ti.max(measures[first + MAX_STRAIN], share)
-                        # L / L0 - 1; rounding can make the share smaller than -1.
+                        # L / L0 - 1; rounding can make `share` smaller than -1.
                         stretch = share / (1 + ti.sqrt(ti.max(share + 1, vector(0))))
-                        stretched += stretch * stretch * k
-                        tense_part += squared
-                    measures[first + STRETCH_SUMS + family] += stretched
+                        stretch_sum += stretch * stretch * k
+                        tension_sum += squared
+                    measures[first + STRETCH_SUMS + family] += stretch_sum
                     if ti.static(tense):
-                        measures[first + TENSION_SUMS + family] += tense_part
+                        measures[first + TENSION_SUMS + family] += tension_sum
 
         return (measure,)
 
     def stiffness_array(self, plan: Plan) -> NDArray[Any] | None:
         """Return the kernels' array of stiffnesses k - tau [N/m], shape (3 rows + 2, cols); None without a map.
 
-        It contains the springs along rows, one row per row of the sheet, followed by those along columns and by the
-        diagonals, with one row more each. Their first and last rows and the entries beyond the last column are 0.
+        It contains the springs along rows, in as many rows as the sheet has, followed by those along columns and by the
+        diagonals, with one row more each. The first and last rows of these, and entries beyond the last column, are 0.
         """
         material = plan.material
         if material.factors is None:
@@ -374,7 +360,7 @@ class SpringTerm(Term):
 
 
 def _unmapped_bound(material: Material) -> float:
-    """Return the bound of m w^2 for a factor of 1, see `SpringTerm.stiffness_bound` [N/m]."""
+    """Return `SpringTerm.stiffness_bound` for factors of 1 [N/m]."""
     across, down, shear = material.across, material.down, material.shear
     return 4 * max(across + down, across + 2 * shear, down + 2 * shear)
 
@@ -384,7 +370,7 @@ def spring_stiffness(material: Material, factors: NDArray[Any]) -> tuple[NDArray
 
     Args:
         material: coefficients of the sheet.
-        factors: of every cell, shape (rows - 1, cols - 1).
+        factors: factors of the map, shape (rows - 1, cols - 1).
 
     Returns:
         Stiffness [N/m] of springs along rows, shape (rows, cols - 1), along columns, shape (rows - 1, cols), and along
@@ -394,7 +380,7 @@ def spring_stiffness(material: Material, factors: NDArray[Any]) -> tuple[NDArray
     across = material.across / 2 * (above_and_below[:-1] + above_and_below[1:])
     down = material.down / 2 * (left_and_right[:, :-1] + left_and_right[:, 1:])
     if not material.by_area:
-        # The springs of `springs` at an edge have the full factor of their only cell.
+        # In scenes with `springs`, springs at an edge are as stiff as all others.
         across[[0, -1]] *= 2
         down[:, [0, -1]] *= 2
     return across, down, material.shear * factors
