@@ -129,12 +129,12 @@ class RestAdjoint:
 def _add_springs(gradient: SheetGradient, families: Sequence[SpringFamily], u: Array, p: Array) -> None:
     """Add the derivatives by the springs."""
     for number, family in enumerate(families):
-        vector, length = family.edge_vectors(u)
+        q, edges, longer, square = family.elongation(u)
+        straight, _ = family.law.slopes(longer, square, family.length)
         p_difference = p[family.start] - p[family.end]
-        u_difference = u[family.end] - u[family.start]
         index = min(number, 2)  # Both diagonals count as one family.
-        gradient.springs[index][...] += (1 - family.length / length) * (p_difference * vector).sum(axis=-1)
-        gradient.tensions[index] += (p_difference * u_difference).sum()
+        gradient.springs[index][...] += straight * (p_difference * edges).sum(axis=-1)
+        gradient.tensions[index] += (p_difference * q).sum()
 
 
 def _stiffness(plan: Plan, families: Sequence[SpringFamily], foundation: Array, laplacian: Any, u: Array) -> csc_matrix:

@@ -16,6 +16,7 @@ from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import Material
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
+from taichi_msm.terms.law import Law, LawFunctions, Operations
 
 # Rows of the array by_column. MOBILITY and AREA_SHARE have three each: for the first, a middle and the last row.
 MOBILITY, AREA_SHARE, REST_X, HAS_LEFT, HAS_RIGHT, COLUMN_ROWS = 0, 3, 6, 7, 8, 9
@@ -166,6 +167,24 @@ class KernelConfig:
     def vectors(self) -> Any:
         """Taichi type of an array of vectors."""
         return self.ti.types.ndarray(dtype=self.vector, ndim=1)
+
+    @property
+    def operations(self) -> Operations:
+        """The operations of Taichi for laws."""
+        ti, lanes = self.ti, self.lanes
+
+        @ti.func
+        def log(values):
+            result = values
+            for lane in ti.static(range(lanes)):
+                result[lane] = ti.log(values[lane])
+            return result
+
+        return Operations(ti.sqrt, log, ti.max, ti.min, ti.select, ti.func)
+
+    def compile_law(self, law: Law) -> LawFunctions:
+        """Wrap the functions of a law for kernels."""
+        return LawFunctions(*(self.ti.func(function) for function in law.build(self.operations)))
 
     def get(self, kind: type[AnyTerm]) -> AnyTerm | None:
         """Return the term of a class; None if the scene does not have it."""

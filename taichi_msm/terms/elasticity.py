@@ -11,10 +11,20 @@ from numpy.typing import NDArray
 
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import area_shares, spacing
-from taichi_msm.terms.springs import spring_stiffness
+from taichi_msm.terms.law import NUMPY, Law, LinearLaw
+from taichi_msm.terms.springs import MIN_SQUARED_LENGTH, spring_stiffness
 
 Array = NDArray[np.float64]
 Window = tuple[slice, slice]
+
+
+class Elongation(NamedTuple):
+    """The elongation of each spring of a family."""
+
+    difference: Array  # displacement of the end minus that of the start, q [m], shape (..., 3)
+    edge: Array  # vector from start to end [m], shape (..., 3)
+    longer: Array  # L^2 - L0^2 [m2]
+    square: Array  # L^2 [m2]
 
 
 class SpringFamily(NamedTuple):
@@ -25,22 +35,38 @@ class SpringFamily(NamedTuple):
     end: Window
     offset: Array  # vector from start to end at rest [m], shape (3,)
     length: float  # at rest [m]
-    stiffness: Array  # k of each spring [N/m], shape as selected by `start`
-    unstretched_length: Array  # length without force [m], as selected by `start`; below `length` under tension
+    stiffness: Array  # k - tau of each spring [N/m], shape as selected by `start`
+    tension: Array  # tau of each spring, its tension at rest divided by its length [N/m]
+    law: Law
 
-    def edge_vectors(self, displacement: Array) -> tuple[Array, Array]:
-        """Return the vectors from start to end of each spring and their lengths [m]."""
-        edges = displacement[self.end] - displacement[self.start] + self.offset
-        return edges, np.linalg.norm(edges, axis=-1)
+    def elongation(self, displacement: Array) -> Elongation:
+        """Compute the elongation of each spring; displacement: x - X [m], shape (rows, cols, 3)."""
+        q = displacement[self.end] - displacement[self.start]
+        edges = q + self.offset
+        return Elongation(q, edges, (q * (edges + self.offset)).sum(axis=-1), (edges**2).sum(axis=-1))
+
+    def force(self, displacement: Array) -> Array:
+        """Compute the force of each spring on its start without the tension at rest [N], shape (..., 3)."""
+        q, edges, longer, square = self.elongation(displacement)
+        pull = self.law.pull(self.stiffness, longer, square + MIN_SQUARED_LENGTH, self.length)
+        return pull[..., None] * edges + self.tension[..., None] * q
 
     def tangent(self, displacement: Array) -> Array:
-        """Return the symmetric derivative of each spring's force by the position of an end [N/m], shape (..., 3, 3)."""
-        edges, length = self.edge_vectors(displacement)
-        unit, slack = edges / length[..., None], self.unstretched_length / length
-        straight = self.stiffness * (1 - slack)
-        return straight[..., None, None] * np.eye(3) + (self.stiffness * slack)[..., None, None] * (
-            unit[..., :, None] * unit[..., None, :]
-        )
+        """Compute the symmetric derivative of each spring's force by the position of an end [N/m], (..., 3, 3)."""
+        _, edges, longer, square = self.elongation(displacement)
+        straight, turning = self.law.slopes(longer, square, self.length)
+        along = (self.stiffness * turning)[..., None, None] * edges[..., :, None] * edges[..., None, :]
+        return (self.stiffness * straight + self.tension)[..., None, None] * np.eye(3) + along
+
+    def energy(self, displacement: Array) -> Array:
+        """Compute the energy of each spring above that at rest [J].
+
+        The part that is linear in the displacement is left out. Its sum over all springs is 0, because the sheet is in
+        equilibrium at rest.
+        """
+        q, _, longer, _ = self.elongation(displacement)
+        stretched = self.stiffness * self.length**2 * self.law.energy(longer / self.length**2)
+        return (stretched + self.tension * (q**2).sum(axis=-1)) / 2
 
 
 def spring_families(plan: Plan) -> Iterator[SpringFamily]:
@@ -60,14 +86,13 @@ def spring_families(plan: Plan) -> Iterator[SpringFamily]:
         start = slice(0, rows - down), slice(max(0, -right), cols - max(0, right))
         end = slice(down, rows), slice(max(0, right), cols - max(0, -right))
         length = math.hypot(right * dx, down * dy)
-        tension = np.broadcast_to(material.tension * unmapped * length, stiffness.shape)
-        stretch = np.divide(tension, stiffness, out=np.zeros_like(stiffness), where=stiffness > 0)
+        tension = np.broadcast_to(material.tension * unmapped, stiffness.shape)
         offset = np.array([right * dx, -down * dy, 0.0])
-        yield SpringFamily(start, end, offset, length, stiffness, length - stretch)
+        yield SpringFamily(start, end, offset, length, stiffness - tension, tension, LinearLaw().build(NUMPY))
 
 
 def elastic_force(families: Sequence[SpringFamily], displacement: Array) -> Array:
-    """Sum k (L - L0) (Q - P) / L over the neighbours Q of every mass point P (eq. 2), without the tension at rest.
+    """Sum the forces of the springs of every mass point (eq. 2), without the tension at rest.
 
     Args:
         families: all springs, from `spring_families`.
@@ -78,10 +103,7 @@ def elastic_force(families: Sequence[SpringFamily], displacement: Array) -> Arra
     """
     force = np.zeros_like(displacement)
     for family in families:
-        edges, length = family.edge_vectors(displacement)
-        pull = np.divide(length - family.unstretched_length, length, out=np.zeros_like(length), where=length > 0)
-        at_rest = family.stiffness * (family.length - family.unstretched_length) / family.length
-        forward = (family.stiffness * pull)[..., None] * edges - at_rest[..., None] * family.offset
+        forward = family.force(displacement)
         force[family.start] += forward
         force[family.end] -= forward
     return force
@@ -102,11 +124,7 @@ def energy_density(plan: Plan, displacement: Array) -> Array:
     """
     by_point, (dx, dy) = np.zeros(displacement.shape[:2]), spacing(plan.scene.sheet)
     for family in spring_families(plan):
-        edges, length = family.edge_vectors(displacement)
-        rest = family.length - family.unstretched_length
-        # The linear part cancels in the sum over all springs, because the sheet is in equilibrium at rest.
-        linear = (edges - family.offset) @ family.offset * rest / family.length
-        energy = family.stiffness * ((length - family.unstretched_length) ** 2 / 2 - rest**2 / 2 - linear)
+        energy = family.energy(displacement)
         by_point[family.start] += energy / 2
         by_point[family.end] += energy / 2
     return by_point / (dx * dy * area_shares(plan.scene.sheet))

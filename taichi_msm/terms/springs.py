@@ -2,11 +2,7 @@
 
 Scene: `springs.structural`, `springs.shear` and `springs.map`, or `tissue.young`, `thickness`, `pretension` and `map`.
 
-With q = u_P - u_Q and the vector o from Q to P at rest, the force of P on its neighbour Q is
-
-    k (L - L0) (P - Q) / L = k (L^2 - L0^2) / (L^2 + L0 L) (o + q),    L^2 - L0^2 = q (q + 2 o)         (eq. 2)
-
-This form avoids cancellation for small displacements of a large sheet. The force of Q on P is exactly the opposite.
+`terms.law` contains the force of a spring; a mass point P pulls its neighbour Q exactly as Q pulls P.
 
 In tissue each cell of size dx by dy contributes to the springs along its edges and diagonals, with the map's factor f,
 
@@ -26,6 +22,7 @@ and its energy is ((k - tau) (L - L0)^2 + tau q^2) / 2.
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -39,6 +36,8 @@ from taichi_msm.model.sheet import Material, largest_mean, spacing
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.terms.base import AREA_SHARE, DX, DY, HAS_LEFT, HAS_RIGHT, KernelConfig, Term
+from taichi_msm.terms.law import Law, LinearLaw
+from taichi_msm.terms.locking import LockingLaw
 
 # Families of springs.
 ALONG_ROW, ALONG_COLUMN, DIAGONAL = range(3)
@@ -46,6 +45,9 @@ ALONG_ROW, ALONG_COLUMN, DIAGONAL = range(3)
 # Measures: the smallest and the largest (L^2 - L0^2) / L0^2; for each family the sum of (k - tau) (L / L0 - 1)^2; under
 # tension, for each family the sum of |q|^2 / L0^2.
 MIN_STRAIN, MAX_STRAIN, STRETCH_SUMS, TENSION_SUMS = 0, 1, 2, 5
+
+# Constants: k - tau of each family, followed by tau of each family, and by the numbers of the law for each family.
+FIRST_TENSION, FIRST_NUMBER = 3, 6
 
 # Prevents a division by 0 at L = 0, where the force then is 0. Literals in kernels are f32, which can represent it.
 MIN_SQUARED_LENGTH = 1e-36
@@ -61,11 +63,15 @@ class SpringTerm(Term):
     by_area: bool  # whether springs along an open edge are softer, because they belong to one cell
     mapped: bool  # whether each stiffness is read from an array, with 0 for springs beyond an edge
     tense: bool  # whether the sheet is under tension at rest
+    law: Law  # of the springs
 
     reach: ClassVar[int] = 1
-    # k - tau of each family, followed by tau of each family.
-    constant_count: ClassVar[int] = 6
     reductions: ClassVar[tuple[str, ...]] = ("min", "max", "sum", "sum", "sum", "sum", "sum", "sum")
+
+    @property
+    def constant_count(self) -> int:  # type: ignore[override]
+        """Number of the sheet's constants that belong to the term."""
+        return FIRST_NUMBER + 3 * self.law.number_count
 
     @staticmethod
     def derive(scene: Scene) -> dict[str, Any]:
@@ -94,6 +100,7 @@ class SpringTerm(Term):
             by_area=open_edges and material.by_area,
             mapped=material.factors is not None,
             tense=material.tension > 0,
+            law=spring_law(material),
         )
 
     @staticmethod
@@ -129,11 +136,12 @@ class SpringTerm(Term):
         return _unmapped_bound(material) * shares
 
     def constants(self, plan: Plan) -> tuple[float, ...]:
-        """Return k - tau and tau of each family [N/m], for a factor of 1."""
-        material = plan.material
+        """Return k - tau and tau of each family [N/m], for a factor of 1, and the numbers of the law."""
+        material, (dx, dy) = plan.material, spacing(plan.scene.sheet)
+        lengths = dx, dy, math.hypot(dx, dy)
         remainder = 1 - material.tension
         stiffness = material.across * remainder, material.down * remainder, material.shear * remainder
-        return *stiffness, *material.tensions
+        return *stiffness, *material.tensions, *(n for length in lengths for n in law_numbers(material, length))
 
     def energy(self, sums: NDArray[Any], plan: Plan) -> float:
         """Compute twice the energy [J], see `Term.energy`."""
@@ -151,30 +159,34 @@ class SpringTerm(Term):
         ti = config.ti
         tense, mapped, by_area = self.tense, self.mapped, self.by_area and not self.mapped
         masks_edges, real, first = self.open_edges and not self.mapped, config.real, config.first_constant(SpringTerm)
-        first_tension = first + 3
+        first_tension, first_number, count = first + FIRST_TENSION, first + FIRST_NUMBER, self.law.number_count
+        pull = config.compile_law(self.law).pull
 
         @ti.func
-        def pull(weighted, square, length, to: ti.template(), tension, q: ti.template()):
-            """Return the force for weighted = k (L^2 - L0^2), square = L^2 and length = L0."""
-            share = weighted / (square + length * ti.sqrt(square))
-            force = [share * to[c] for c in ti.static(range(3))]
+        def force(
+            sheet: ti.template(), family: ti.template(), k, longer, square, length, to: ti.template(), q: ti.template()
+        ):
+            """Return the force of a spring of a family, for k - tau, L^2 - L0^2, L^2 and L0."""
+            tension = sheet.constants[first_tension + family]
+            numbers = [sheet.constants[first_number + count * family + n] for n in ti.static(range(count))]
+            share = pull(k, tension, longer, square, length, *numbers)
+            total = [share * to[c] for c in ti.static(range(3))]
             if ti.static(tense):
                 for c in ti.static(range(3)):
-                    force[c] += tension * q[c]
-            return force
+                    total[c] += tension * q[c]
+            return total
 
         @ti.func
         def along(sheet: ti.template(), right, here: ti.template(), k, exists):
             """Return the force of a mass point displaced by `here` on its right neighbour, entry `right` of u."""
-            dx = sheet.constants[DX]
+            dx, stiffness = sheet.constants[DX], k
             x, y, z = here[0] - sheet.u[0][right], here[1] - sheet.u[1][right], here[2] - sheet.u[2][right]
             to_x = x - dx
             rest = y * y + z * z
-            weighted = k * (x * (to_x - dx) + rest)
             if ti.static(masks_edges):
-                weighted *= exists
-            tension = sheet.constants[first_tension + ALONG_ROW]
-            return pull(weighted, to_x * to_x + (rest + MIN_SQUARED_LENGTH), dx, [to_x, y, z], tension, [x, y, z])
+                stiffness = k * exists
+            longer, square = x * (to_x - dx) + rest, to_x * to_x + (rest + MIN_SQUARED_LENGTH)
+            return force(sheet, ALONG_ROW, stiffness, longer, square, dx, [to_x, y, z], [x, y, z])
 
         @ti.func
         def to_other_row(sheet: ti.template(), entry, right: ti.template(), here: ti.template(), up, length, k, exists):
@@ -183,16 +195,15 @@ class SpringTerm(Term):
             to_x = x
             to_y = y - up
             rest = z * z
-            longer = x * x + (y * (to_y - up) + rest)
+            longer, stiffness = x * x + (y * (to_y - up) + rest), k
             if ti.static(right != 0):
                 to_x = x - right * sheet.constants[DX]
                 longer = x * (to_x - right * sheet.constants[DX]) + (y * (to_y - up) + rest)
-            weighted = k * longer
             if ti.static(masks_edges):
-                weighted *= exists
-            tension = sheet.constants[first_tension + ti.static(DIAGONAL if right else ALONG_COLUMN)]
+                stiffness = k * exists
             square = to_x * to_x + to_y * to_y + (rest + MIN_SQUARED_LENGTH)
-            return pull(weighted, square, length, [to_x, to_y, z], tension, [x, y, z])
+            family = ti.static(DIAGONAL if right else ALONG_COLUMN)
+            return force(sheet, family, stiffness, longer, square, length, [to_x, to_y, z], [x, y, z])
 
         @ti.func
         def of_row(sheet: ti.template(), i, kind, b):
@@ -234,7 +245,7 @@ class SpringTerm(Term):
         The map from p to this change is symmetric. The product of the force with p has the derivative s (o + q) . p by
         k - tau and q . p by tau.
         """
-        ti, tense = config.ti, self.tense
+        ti, tense, slopes = config.ti, self.tense, config.compile_law(self.law).slopes
 
         @ti.func
         def differentiate(q: ti.template(), p: ti.template(), x0, y0, length, k, tension):
@@ -242,12 +253,9 @@ class SpringTerm(Term):
             to = [q[0] + x0, q[1] + y0, q[2]]
             square = to[0] * to[0] + to[1] * to[1] + (to[2] * to[2] + MIN_SQUARED_LENGTH)
             longer = q[0] * (to[0] + x0) + (q[1] * (to[1] + y0) + q[2] * q[2])
-            both = square + length * ti.sqrt(square)
-            # One division instead of two.
-            inverse = 1 / (square * both)
-            share = longer * square * inverse
+            share, turning = slopes(longer, square, length)
             along = to[0] * p[0] + to[1] * p[1] + to[2] * p[2]
-            straight, turned = k * share, k * ((1 - share) * both * inverse * along)
+            straight, turned = k * share, k * (turning * along)
             if ti.static(tense):
                 straight += tension
             change = [straight * p[c] + turned * to[c] for c in ti.static(range(3))]
@@ -297,7 +305,7 @@ class SpringTerm(Term):
         """Build the function that measures the springs to the right of an entry and to the row below it."""
         ti = config.ti
         tense, open_edges, vector, first = self.tense, self.open_edges, config.vector, config.first_measure(SpringTerm)
-        _, _, of_row, of_column, of_diagonal = self.build_spring_forces(config)
+        (_, _, of_row, of_column, of_diagonal), energy = self.build_spring_forces(config), config.compile_law(self.law).energy
         # For each family: its index, and the offsets in rows and columns from one end to the other.
         structural = ((ALONG_ROW, 0, (1,)), (ALONG_COLUMN, 1, (0,))) if self.structural else ()
         families = structural + (((DIAGONAL, 1, (-1, 1)),) if self.shear else ())
@@ -335,9 +343,7 @@ class SpringTerm(Term):
                         share, squared = longer(sheet, p, p + down, b, right, right * dx, -down * dy)
                         measures[first + MIN_STRAIN] = ti.min(measures[first + MIN_STRAIN], share)
                         measures[first + MAX_STRAIN] = ti.max(measures[first + MAX_STRAIN], share)
-                        # L / L0 - 1; rounding can make `share` smaller than -1.
-                        stretch = share / (1 + ti.sqrt(ti.max(share + 1, vector(0))))
-                        stretch_sum += stretch * stretch * k
+                        stretch_sum += energy(share) * k
                         tension_sum += squared
                     measures[first + STRETCH_SUMS + family] += stretch_sum
                     if ti.static(tense):
@@ -357,6 +363,16 @@ class SpringTerm(Term):
         pads = ((0, 0), (0, 1)), ((1, 1), (0, 0)), ((1, 1), (0, 1))
         families = zip(spring_stiffness(material, material.factors), material.tensions, pads, strict=True)
         return np.concatenate([np.pad(np.maximum(k - tension, 0), pad) for k, tension, pad in families])
+
+
+def spring_law(material: Material) -> Law:
+    """Return the law of the springs."""
+    return LinearLaw() if material.stiffening is None else LockingLaw()
+
+
+def law_numbers(material: Material, length: float) -> tuple[float, ...]:
+    """Return the numbers of the law for a spring of a length at rest [m]."""
+    return () if material.stiffening is None else material.stiffening.numbers(length)
 
 
 def _unmapped_bound(material: Material) -> float:

@@ -1,0 +1,98 @@
+"""Laws of springs: force, tangent and energy by the elongation, in plain arithmetic.
+
+A spring of stiffness k whose length L0 becomes L pulls with k L0 f(e), where e = (L - L0) / L0 and f'(0) = 1. The law of
+the spring is f. NumPy calls the functions of a law as they are; kernels call them wrapped by `KernelConfig.compile_law`.
+
+With q = u_P - u_Q and the vector o from Q to P at rest, the force of P on its neighbour Q is k L0 f(e) (o + q) / L, and
+for f(e) = e
+
+    k (L^2 - L0^2) / (L^2 + L0 L) (o + q),    L^2 - L0^2 = q (q + 2 o)                                  (eq. 2)
+
+This form avoids cancellation for small displacements of a large sheet.
+
+Under a pretension each spring has the tension tau L at rest, L0 is its length at rest, and the tensions cancel at every
+mass point. Without them, the force of a spring is
+
+    (k - tau) (1 - L0 / L) (o + q) + tau q + k L0 (f(e) - e) (o + q) / L
+
+and twice its energy is (k - tau) (L - L0)^2 + tau q^2, plus k L0^2 times twice the integral of f(e) - e.
+"""
+
+# No `from __future__ import annotations` here: Taichi reads the functions of a law.
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+
+class Operations(NamedTuple):
+    """Functions of NumPy or Taichi that laws use in addition to + - * /."""
+
+    sqrt: Callable[..., Any]
+    log: Callable[..., Any]
+    maximum: Callable[..., Any]
+    minimum: Callable[..., Any]
+    where: Callable[..., Any]
+    wrap: Callable[[Callable[..., Any]], Callable[..., Any]]  # makes a function callable by other functions of a law
+
+
+NUMPY = Operations(np.sqrt, np.log, np.maximum, np.minimum, np.where, lambda function: function)
+
+
+class LawFunctions(NamedTuple):
+    """The functions of a law.
+
+    In them `k` is k - tau and `tau` is tau [N/m], `longer` is L^2 - L0^2, `square` is L^2, `length` is L0 and
+    `numbers` are those of the law.
+
+    Attributes:
+        pull: pull(k, tau, longer, square, length, *numbers), the force divided by L, without tau q [N/m].
+        slopes: slopes(k, tau, longer, square, length, along, *numbers) for a displacement p of the end of a spring, with
+            along = (o + q) . p. It returns s, w and the derivatives of `pull` by k and by tau. The force changes by
+            s p + w (o + q), without tau p.
+        energy: energy(k, tau, share, length, *numbers) for share = (L^2 - L0^2) / L0^2, twice the energy divided by
+            L0^2, without tau q^2 [N/m].
+    """
+
+    pull: Callable[..., Any]
+    slopes: Callable[..., Any]
+    energy: Callable[..., Any]
+
+
+class Law(ABC):
+    """A law, as a frozen dataclass without numbers."""
+
+    number_count: ClassVar[int] = 0  # count of numbers of a spring
+
+    @abstractmethod
+    def build(self, operations: Operations) -> LawFunctions:
+        """Build the functions of the law."""
+
+
+@dataclass(frozen=True)
+class LinearLaw(Law):
+    """f(e) = e."""
+
+    def build(self, operations: Operations) -> LawFunctions:
+        """Build the functions of the law."""
+        sqrt, maximum = operations.sqrt, operations.maximum
+
+        def pull(k, tau, longer, square, length):
+            return k * longer / (square + length * sqrt(square))
+
+        def slopes(k, tau, longer, square, length, along):
+            both = square + length * sqrt(square)
+            # One division instead of two.
+            inverse = 1 / (square * both)
+            share = longer * square * inverse
+            return k * share, k * ((1 - share) * both * inverse * along), share, 0 * share
+
+        def energy(k, tau, share, length):
+            # L / L0 - 1; rounding can make `share` smaller than -1.
+            stretch = share / (1 + sqrt(maximum(share + 1, 0)))
+            return stretch * stretch * k
+
+        return LawFunctions(pull, slopes, energy)
