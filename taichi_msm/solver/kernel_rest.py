@@ -305,12 +305,10 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
 
 
 def _build_scale(config: KernelConfig) -> Callable[..., None]:
-    """Build the kernel that computes the squared largest force of a spring, a load or the foundation."""
+    """Build the kernel that squares the largest force of a spring, a load or the foundation on a mass point."""
     real, vector, vectors, columns = config.real, config.vector, config.vectors, config.first_column(None)
-    constant_count, max_spring_force = (
-        config.first_constant(None),
-        config.require(SpringTerm).build_max_spring_force(config),
-    )
+    constant_count = config.first_constant(None)
+    max_spring_force = config.require(SpringTerm).build_max_spring_force(config)
     forces = [
         force for term in config.terms if not isinstance(term, BendingTerm) for force in term.build_forces(config)
     ]
