@@ -266,10 +266,8 @@ def build_read(config: KernelConfig, *, parallel: bool, iterations: int) -> Call
     """
     real, vector, vectors, lanes = config.real, config.vector, config.vectors, config.lanes
     count = config.first_constant(None)
-    measure, reductions = (
-        build_measure(config),
-        ["sum", *(reduction for term in config.terms for reduction in term.reductions)],
-    )
+    measure = build_measure(config)
+    reductions = ["sum", *(reduction for term in config.terms for reduction in term.reductions)]
 
     @ti.kernel
     def read(
