@@ -147,8 +147,8 @@ class Dynamics:
             raise ArgumentError("probes: which of them have a path cannot change; restart with the new scene")
         if probes.moves != before.moves:
             raise ArgumentError(
-                f"probes: which control points move or jump cannot change (before: {_in_words(before.moves)}; now: "
-                f"{_in_words(probes.moves)}); restart with the new scene"
+                f"probes: which control points move or jump cannot change (before: {_format_flags(before.moves)}; now: "
+                f"{_format_flags(probes.moves)}); restart with the new scene"
             )
         if probes.by_area != before.by_area:
             raise ArgumentError("probes: one has total instead of force, or the reverse; restart with the new scene")
@@ -205,13 +205,13 @@ class Dynamics:
     def state(self) -> State:
         """Read the state on which the next steps depend."""
         self._require_consistent()
-        u, d = self._copy(differences=False)[0], self._copy(differences=True)[0]
-        return State(self.steps_done, u, d, self._contact())
+        u, d = self._read_arrays(differences=False)[0], self._read_arrays(differences=True)[0]
+        return State(self.steps_done, u, d, self._contact_fields())
 
     def read(self) -> Reading:
         """Read the displacements and measure the sheet, in the scene's precision."""
         self._require_consistent()
-        displacement, measures = self._copy(differences=False)
+        displacement, measures = self._read_arrays(differences=False)
         config, plan = self.layout.config, self.plan
         springs = measures[:, config.first_measure(SpringTerm) :]
         # The measures are (L^2 - L0^2) / L0^2.
@@ -228,7 +228,7 @@ class Dynamics:
         """Compute twice the kinetic energy [J] from the reduced measures."""
         return self.plan.material.mass * float(sums[SQUARED_MOTION]) / self.plan.grid.step**2
 
-    def _copy(self, *, differences: bool) -> tuple[NDArray[Any], NDArray[Any]]:
+    def _read_arrays(self, *, differences: bool) -> tuple[NDArray[Any], NDArray[Any]]:
         """Read displacements or last differences [m], shape (rows, cols, 3), and the measures of every row."""
         rows, cols, config = self.layout.rows, self.layout.cols, self.layout.config
         values, measures = (
@@ -251,7 +251,7 @@ class Dynamics:
         sums = sum_corrections(self.layout, self._moving.arrays, clear=False)
         return sums / (gain * self.plan.grid.steps_per_frame)
 
-    def _contact(self) -> NDArray[Any]:
+    def _contact_fields(self) -> NDArray[Any]:
         """Read the fields of contact, shape (fields, rows, cols)."""
         config = self.layout.config
         contact = config.get(ContactTerm)
@@ -337,7 +337,7 @@ class Dynamics:
         return kind(self.layout, start)
 
 
-def _in_words(moves: tuple[bool, ...]) -> str:
+def _format_flags(moves: tuple[bool, ...]) -> str:
     return ", ".join("yes" if slot_moves else "no" for slot_moves in moves) or "none"
 
 

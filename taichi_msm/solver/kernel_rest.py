@@ -216,18 +216,18 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
         for i in range(band.low, band.high):
             for b in range(1, sheet.width - 1):
                 at = i * sheet.width + b
-                every = [sheet.d[c][at] for c in ti.static(range(3))]
-                force = [every[c] for c in ti.static(range(3))]
+                full_force = [sheet.d[c][at] for c in ti.static(range(3))]
+                force = [full_force[c] for c in ti.static(range(3))]
                 for remove_contact in ti.static(removals):
                     remove_contact(force, sheet, at)
                 for c in ti.static(range(3)):
-                    before = sheet.q[c][at]
-                    q = keep * before + gain * force[c]
+                    old_q = sheet.q[c][at]
+                    q = keep * old_q + gain * force[c]
                     sheet.q[c][at] = q
-                    moved = dt * q - back * before
+                    shift = dt * q - back * old_q
                     if ti.static(len(removals) > 0):
-                        moved += every[c] - force[c]
-                    sheet.u[c][at] = sheet.u[c][at] + moved * sheet.work[at]
+                        shift += full_force[c] - force[c]
+                    sheet.u[c][at] = sheet.u[c][at] + shift * sheet.work[at]
             settle_row(sheet, row, i)
 
     @ti.func
@@ -296,8 +296,8 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
                     gain = dt
                     if power > 0:
                         # |q + dt F| / |F|, with norms weighted with 1 / M.
-                        turned = ti.sqrt((motion + 2 * dt * power + dt * dt * force_sum) / force_sum)
-                        gain = keep * dt + fire[SHARE] * turned
+                        norm_ratio = ti.sqrt((motion + 2 * dt * power + dt * dt * force_sum) / force_sum)
+                        gain = keep * dt + fire[SHARE] * norm_ratio
                     move_points(sheet, row, band, keep, gain, dt, back)
             fire[EVALUATIONS] = evaluations
 

@@ -100,8 +100,8 @@ class QuasiStatics(Dynamics):
             frame = self.steps_done + (self._last_frame is not None)
             self._settle(frame, pause)
             self.steps_done = frame
-            displacement = self._copy(differences=False)[0]
-            self._last_frame = State(frame, displacement, np.zeros_like(displacement), self._contact())
+            displacement = self._read_arrays(differences=False)[0]
+            self._last_frame = State(frame, displacement, np.zeros_like(displacement), self._contact_fields())
 
     def compile(self) -> None:
         """Compile all kernels without moving a mass point."""
@@ -125,11 +125,11 @@ class QuasiStatics(Dynamics):
         It is opposite to the sum of all other forces on the mass points that the tool touches or holds.
         """
         # Subtraction from 0 avoids -0.
-        return 0.0 - np.einsum("tij,ijk->tk", self._touched().astype(float), self._copy(differences=True)[0])
+        return 0.0 - np.einsum("tij,ijk->tk", self._touched().astype(float), self._read_arrays(differences=True)[0])
 
     def _touched(self) -> NDArray[np.bool_]:
         """Return whether each tool touches or holds each mass point, shape (tools, rows, cols)."""
-        tools, contact = len(self.plan.tools), self._contact()
+        tools, contact = len(self.plan.tools), self._contact_fields()
         normals = contact[: CORRECTIONS * tools].reshape(tools, CORRECTIONS, self.layout.rows, self.layout.cols)
         touched = (normals != 0).any(axis=1)
         if len(contact) > CORRECTIONS * tools:
@@ -188,12 +188,12 @@ class QuasiStatics(Dynamics):
 
     def _meets_tool(self, time: float) -> bool:
         """Return whether a tool at a time [s] touches the current sheet."""
-        position = rest_positions(self.plan.scene.sheet) + self._copy(differences=False)[0]
+        position = rest_positions(self.plan.scene.sheet) + self._read_arrays(differences=False)[0]
         return any(tool.touches(position[~self.plan.fixed], time) for tool in self.plan.tools)
 
     def _try_flat(self, row: NDArray[Any]) -> bool:
         """Return whether the flat shape is an equilibrium; if so, keep it."""
-        relaxation, shape = self._relaxation, self._copy(differences=False)[0]
+        relaxation, shape = self._relaxation, self._read_arrays(differences=False)[0]
         relaxation.place(np.zeros_like(shape))
         count, force = relaxation.relax(1, 0.0, row)
         self.evaluations += count
@@ -257,23 +257,25 @@ class QuasiStatics(Dynamics):
         points = self.layout.rows * self.layout.cols
         per_launch = max(1, min(EVALUATIONS_PER_LAUNCH, POINT_EVALUATIONS_PER_LAUNCH // points))
         limit, evaluations, perturbed = MAX_EVALUATIONS * longer, 0, tolerance >= PERTURBATION_TOLERANCE
-        scale, last = max(MIN_FORCE_N, relaxation.scale(row)), math.inf
+        scale, stability_limit = max(MIN_FORCE_N, relaxation.scale(row)), math.inf
         while True:
             # The first evaluation shows whether the sheet is already in equilibrium.
-            first = evaluations == 0
-            target = (tolerance if first or perturbed else PERTURBATION_TOLERANCE) * scale
-            count, force = relaxation.relax(1 if first else min(per_launch, limit - evaluations), target, row)
+            is_first = evaluations == 0
+            target = (tolerance if is_first or perturbed else PERTURBATION_TOLERANCE) * scale
+            count, force = relaxation.relax(1 if is_first else min(per_launch, limit - evaluations), target, row)
             evaluations += count
             scale = max(MIN_FORCE_N, relaxation.scale(row))
             if force <= min(target, tolerance * scale):
                 converged = tolerance == FORCE_TOLERANCE
-                if converged and not first and evaluations < last and self._may_be_unstable():
+                if converged and not is_first and evaluations < stability_limit and self._may_be_unstable():
                     # An unstable equilibrium shows within these evaluations.
-                    tolerance, last = STABILITY_TOLERANCE, 4 * evaluations
+                    tolerance, stability_limit = STABILITY_TOLERANCE, 4 * evaluations
                     continue
                 self.evaluations += evaluations
                 return force / scale
-            if tolerance == STABILITY_TOLERANCE and (force > 10 * FORCE_TOLERANCE * scale or evaluations >= last):
+            if tolerance == STABILITY_TOLERANCE and (
+                force > 10 * FORCE_TOLERANCE * scale or evaluations >= stability_limit
+            ):
                 tolerance = FORCE_TOLERANCE
             if not (force < np.inf and scale < np.inf) or evaluations >= limit:
                 raise self._diverged(frame, force / scale, evaluations)
@@ -296,12 +298,12 @@ class QuasiStatics(Dynamics):
         # This generator returns the same numbers in every version of NumPy.
         noise = 2 * np.random.RandomState(0).random_sample((rows, cols, 3)) - 1
         moves = (~self.plan.fixed / self._masses)[..., None]
-        self._relaxation.place(self._copy(differences=False)[0] + force * noise * moves)
+        self._relaxation.place(self._read_arrays(differences=False)[0] + force * noise * moves)
 
     def _diverged(self, frame: int, residual: float, evaluations: int) -> DivergedError:
         """Build the error of an iteration that did not converge."""
         plan, time = self.plan, frame / self.plan.grid.frames_per_second
-        row, column, *_ = largest_displacement(self._copy(differences=True)[0])
+        row, column, *_ = largest_displacement(self._read_arrays(differences=True)[0])
         remedy = (
             "the sheet may hang slack, fold or wrinkle; give it a foundation, pretension or bending, or take less load"
         )

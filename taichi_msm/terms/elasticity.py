@@ -36,9 +36,9 @@ class SpringFamily(NamedTuple):
     def tangent(self, displacement: Array) -> Array:
         """Return the symmetric derivative of each spring's force by the position of an end [N/m], shape (..., 3, 3)."""
         edges, length = self.edge_vectors(displacement)
-        unit, slack = edges / length[..., None], self.unstretched_length / length
-        straight = self.stiffness * (1 - slack)
-        return straight[..., None, None] * np.eye(3) + (self.stiffness * slack)[..., None, None] * (
+        unit, length_ratio = edges / length[..., None], self.unstretched_length / length
+        transverse = self.stiffness * (1 - length_ratio)
+        return transverse[..., None, None] * np.eye(3) + (self.stiffness * length_ratio)[..., None, None] * (
             unit[..., :, None] * unit[..., None, :]
         )
 
@@ -79,9 +79,9 @@ def elastic_force(families: Sequence[SpringFamily], displacement: Array) -> Arra
     force = np.zeros_like(displacement)
     for family in families:
         edges, length = family.edge_vectors(displacement)
-        pull = np.divide(length - family.unstretched_length, length, out=np.zeros_like(length), where=length > 0)
-        at_rest = family.stiffness * (family.length - family.unstretched_length) / family.length
-        forward = (family.stiffness * pull)[..., None] * edges - at_rest[..., None] * family.offset
+        stretch = np.divide(length - family.unstretched_length, length, out=np.zeros_like(length), where=length > 0)
+        rest_tension = family.stiffness * (family.length - family.unstretched_length) / family.length
+        forward = (family.stiffness * stretch)[..., None] * edges - rest_tension[..., None] * family.offset
         force[family.start] += forward
         force[family.end] -= forward
     return force
@@ -103,10 +103,10 @@ def energy_density(plan: Plan, displacement: Array) -> Array:
     by_point, (dx, dy) = np.zeros(displacement.shape[:2]), spacing(plan.scene.sheet)
     for family in spring_families(plan):
         edges, length = family.edge_vectors(displacement)
-        rest = family.length - family.unstretched_length
+        rest_stretch = family.length - family.unstretched_length
         # The linear part cancels in the sum over all springs, because the sheet is in equilibrium at rest.
-        linear = (edges - family.offset) @ family.offset * rest / family.length
-        energy = family.stiffness * ((length - family.unstretched_length) ** 2 / 2 - rest**2 / 2 - linear)
+        linear = (edges - family.offset) @ family.offset * rest_stretch / family.length
+        energy = family.stiffness * ((length - family.unstretched_length) ** 2 / 2 - rest_stretch**2 / 2 - linear)
         by_point[family.start] += energy / 2
         by_point[family.end] += energy / 2
     return by_point / (dx * dy * area_shares(plan.scene.sheet))

@@ -87,13 +87,13 @@ class FoundationTerm(Term):
         @ti.func
         def add(force: ti.template(), sheet: ti.template(), entry: ti.template(), now: ti.template()):
             if ti.static(mapped):
-                held = now[column] * sheet.fields[(field * sheet.rows + entry.row.i) * sheet.width + entry.b]
+                stiffness = now[column] * sheet.fields[(field * sheet.rows + entry.row.i) * sheet.width + entry.b]
                 for c in ti.static(range(3)):
-                    force[c] = force[c] - held * entry.u[c]
+                    force[c] = force[c] - stiffness * entry.u[c]
             elif ti.static(by_area):
-                held = now[column] * sheet.by_column[(AREA_SHARE + entry.row.kind) * sheet.width + entry.b]
+                stiffness = now[column] * sheet.by_column[(AREA_SHARE + entry.row.kind) * sheet.width + entry.b]
                 for c in ti.static(range(3)):
-                    force[c] = force[c] - held * entry.u[c]
+                    force[c] = force[c] - stiffness * entry.u[c]
             else:
                 for c in ti.static(range(3)):
                     force[c] = force[c] - now[column] * entry.u[c]

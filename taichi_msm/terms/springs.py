@@ -183,11 +183,11 @@ class SpringTerm(Term):
             to_x = x
             to_y = y - up
             rest = z * z
-            longer = x * x + (y * (to_y - up) + rest)
+            square_difference = x * x + (y * (to_y - up) + rest)
             if ti.static(right != 0):
                 to_x = x - right * sheet.constants[DX]
-                longer = x * (to_x - right * sheet.constants[DX]) + (y * (to_y - up) + rest)
-            weighted = k * longer
+                square_difference = x * (to_x - right * sheet.constants[DX]) + (y * (to_y - up) + rest)
+            weighted = k * square_difference
             if ti.static(masks_edges):
                 weighted *= exists
             tension = sheet.constants[first_tension + ti.static(DIAGONAL if right else ALONG_COLUMN)]
@@ -241,16 +241,16 @@ class SpringTerm(Term):
             """Return the change of the force (3), and the derivatives of its product with p by k - tau and by tau."""
             to = [q[0] + x0, q[1] + y0, q[2]]
             square = to[0] * to[0] + to[1] * to[1] + (to[2] * to[2] + MIN_SQUARED_LENGTH)
-            longer = q[0] * (to[0] + x0) + (q[1] * (to[1] + y0) + q[2] * q[2])
+            square_difference = q[0] * (to[0] + x0) + (q[1] * (to[1] + y0) + q[2] * q[2])
             both = square + length * ti.sqrt(square)
             # One division instead of two.
             inverse = 1 / (square * both)
-            share = longer * square * inverse
+            share = square_difference * square * inverse
             along = to[0] * p[0] + to[1] * p[1] + to[2] * p[2]
-            straight, turned = k * share, k * ((1 - share) * both * inverse * along)
+            isotropic, axial = k * share, k * ((1 - share) * both * inverse * along)
             if ti.static(tense):
-                straight += tension
-            change = [straight * p[c] + turned * to[c] for c in ti.static(range(3))]
+                isotropic += tension
+            change = [isotropic * p[c] + axial * to[c] for c in ti.static(range(3))]
             product = q[0] * p[0] + q[1] * p[1] + q[2] * p[2]
             return [change[0], change[1], change[2], share * along, product]
 
@@ -303,7 +303,7 @@ class SpringTerm(Term):
         families = structural + (((DIAGONAL, 1, (-1, 1)),) if self.shear else ())
 
         @ti.func
-        def longer(sheet: ti.template(), p, q, b, right: ti.template(), x0, y0):
+        def strains(sheet: ti.template(), p, q, b, right: ti.template(), x0, y0):
             """Return (L^2 - L0^2) / L0^2 and |q|^2 / L0^2 of the spring from entry b of row p to b + right of row q."""
             start, end = p * sheet.width + b, q * sheet.width + b + right
             x = sheet.u[0][end] - sheet.u[0][start]
@@ -332,7 +332,7 @@ class SpringTerm(Term):
                             k += of_column(sheet, i + 1, b)
                         else:
                             k += of_diagonal(sheet, i + 1, b + ti.static(min(right, 0)))
-                        share, squared = longer(sheet, p, p + down, b, right, right * dx, -down * dy)
+                        share, squared = strains(sheet, p, p + down, b, right, right * dx, -down * dy)
                         measures[first + MIN_STRAIN] = ti.min(measures[first + MIN_STRAIN], share)
                         measures[first + MAX_STRAIN] = ti.max(measures[first + MAX_STRAIN], share)
                         # L / L0 - 1; rounding can make `share` smaller than -1.
