@@ -1,8 +1,8 @@
 """Choice of the companion runs that estimate the error of a run, made from the scene alone.
 
 A companion run repeats the scene with another time step or another mesh, in parallel to the run. With half the steps
-it costs half a run, with twice the steps it costs two. Hence the first companion run is coarse, where twice the step is
-stable, and a finer one follows only if the first shows an error that is not negligible.
+it costs half a run, with twice the steps it costs two. Hence the first companion run is coarse if twice the step is
+stable, and a fine one follows only if the first shows an error that is not negligible.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ from typing import NamedTuple
 from taichi_msm.model.plan import Plan
 from taichi_msm.solver.planning import affords_companions, stable_steps
 
-# An error below this share of the largest displacement needs no finer companion run.
+# An error below this share of the largest displacement needs no fine companion run.
 NEGLIGIBLE_ERROR = 1e-3
 
-# The largest share of the run's steps that a coarse companion run may take; above it, it saves too little.
+# Largest number of steps of a coarse companion run, relative to the run; with more steps it saves too little.
 MAX_COARSE_RATIO = 0.6
 
-# The largest refinement of the step in a fine companion run. If it would have to be finer, the error is unknown.
+# Largest refinement of the step in a fine companion run. If the damping needs a larger one, the error is unknown.
 MAX_REFINEMENT = 64
 
-# Cost of the companion runs on coarser meshes, per step of the run that they are compared with, in steps of the full
-# sheet. They have half and a quarter of the cells per side and of the steps; with contact 1 / sqrt(2) of the cells per
-# side and half the steps.
+# Cost of the companion runs on coarser meshes, in steps of the full sheet per step of the run that they are compared
+# with. Without contact there are two, with half and a quarter of the cells per side and of the steps; with contact one,
+# with 1 / sqrt(2) of the cells per side and half the steps.
 MESH_COST, CONTACT_MESH_COST = 1 / 4 / 2 + 1 / 16 / 4, 1 / 2 / 2
 
 # Reason for the missing time-step error of a quasi-static scene.
@@ -35,11 +35,11 @@ class CompanionRuns(NamedTuple):
     """The companion runs of a run.
 
     Attributes:
-        concurrent_steps: Steps per frame of the companion run that accompanies the run; 0 without one.
-        subsequent_steps: Steps per frame of the companion run that follows if the first one shows too large an error; 0
+        concurrent_steps: Steps per frame of the companion run in parallel to the run; 0 without one.
+        subsequent_steps: Steps per frame of the companion run that follows if the first one shows a large error; 0
             without one.
-        mesh: Whether companion runs on coarser meshes accompany the run.
-        cost: Cost of the accompanying runs per step of the run, in steps of the full sheet.
+        mesh: Whether there are companion runs on coarser meshes.
+        cost: Cost of the parallel companion runs, in steps of the full sheet per step of the run.
         reason: Why the time-step error is not estimated; empty if it is.
     """
 
@@ -95,13 +95,10 @@ def coarse_steps(plan: Plan) -> int:
 
 
 def fine_steps(plan: Plan) -> int:
-    """Return the steps per frame of the fine companion run: twice the run's, or more where the damping needs it.
+    """Return the steps per frame of the fine companion run: twice the run's, or more with strong damping.
 
     If g h / r > 1, with g = C / m, central differences reverse velocities at every step, and the difference between
     runs with steps h and h / r underestimates the error. A coarse companion run overestimates it 2 to 4 times.
-
-    Args:
-        plan: Plan of the run.
 
     Returns:
         Steps per frame; 0 if the damping needs more than `MAX_REFINEMENT` times the run's.

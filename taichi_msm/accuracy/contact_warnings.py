@@ -13,20 +13,12 @@ from taichi_msm.model.sheet import rest_positions, spacing
 from taichi_msm.model.tools import Tool
 from taichi_msm.solver.state import RunProgress
 
-# Beyond this depth of a tip, as a share of its radius, the mass points of a soft sheet slide off sideways.
+# At a larger depth of a tip, in radii of the tip, the mass points of a soft sheet slide off sideways.
 MAX_INDENTATION_RATIO = 1 / 5
 
 
 def tool_contact_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
-    """Warn about tools that slide through a soft foundation, and about the first one that pierced the sheet.
-
-    Args:
-        plan: Plan of the run.
-        progress: Progress of the run.
-
-    Returns:
-        The warnings.
-    """
+    """Warn about tools that slide through a soft sheet, and about the first tool that pierced the sheet."""
     membrane, foundation = _stiffnesses(plan)
     for tool in plan.tools:
         depth, limit = _max_depth(tool, plan.scene.time.duration), MAX_INDENTATION_RATIO * tool.radius
@@ -52,9 +44,9 @@ def first_piercing_probe(plan: Plan, displacement: NDArray[np.floating], frame: 
     """Return the first position-controlled tool whose axis passes through the sheet.
 
     Args:
-        plan: Plan with the position-controlled tools.
+        plan: Plan of the run.
         displacement: Displacements of the mass points [m], shape (rows, cols, 3).
-        frame: Number of the frame with these displacements.
+        frame: Number of their frame.
 
     Returns:
         The index of its probe plus 1, or 0 if no tool pierces the sheet.
@@ -71,13 +63,13 @@ def _pierces(tool: Tool, position: NDArray[np.floating], time: float) -> bool:
     basis = np.linalg.svd(tool.axis[None])[2]
     basis[0] = tool.axis
     local = (position - tool.tip_centre(np.array([time]))[0]) @ basis.T
-    # A cell surrounds the axis only if it has corners on both sides of it in both orthogonal directions.
-    surrounds = np.ones([count - 1 for count in position.shape[:2]], dtype=bool)
+    # A cell can contain the axis only if it has corners on both sides of it in both orthogonal directions.
+    candidates = np.ones([count - 1 for count in position.shape[:2]], dtype=bool)
     for coordinate in (local[..., 1], local[..., 2]):
         for side in (coordinate <= 0, coordinate >= 0):
             pairs = side[:-1] | side[1:]
-            surrounds &= pairs[:, :-1] | pairs[:, 1:]
-    i, j = np.nonzero(surrounds)
+            candidates &= pairs[:, :-1] | pairs[:, 1:]
+    i, j = np.nonzero(candidates)
     for corner in (local[i, j + 1], local[i + 1, j]):
         triangle = np.stack([local[i, j], corner, local[i + 1, j + 1]], axis=1)
         x, y = triangle[..., 1], triangle[..., 2]

@@ -18,11 +18,8 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.dynamics import Dynamics, ForceRecorder
 from taichi_msm.solver.state import RunProgress, Snapshot, largest_displacement
 
-# Refinements of the step that are tried in turn.
-STEP_REFINEMENTS = (2, 4, 8, 16, 32, 64)
-
-# Budget of all trials together, in steps times mass points, about ten seconds. It is counted rather than timed, so that
-# the message is the same on every machine.
+# Budget of all trial runs together, in steps times mass points, about ten seconds. It is counted rather than timed, so
+# that the message is the same on every machine.
 MAX_NODE_STEPS = 5e9
 
 
@@ -31,8 +28,8 @@ class Diagnosis:
     """Diagnosis of a divergence.
 
     Attributes:
-        message: Time, step, mass point, the key that is the most likely cause, and the remedy.
-        last_sound_state: Last state of the run without a fault; None if only the start is known to be sound.
+        message: Time, step, mass point, likely cause and remedy.
+        last_sound_state: Last state of the run without a fault; None if it is the start.
     """
 
     message: str
@@ -40,7 +37,7 @@ class Diagnosis:
 
 
 def diagnose(dynamics: Dynamics, start: Snapshot | None, pause: Pause) -> Diagnosis:
-    """Diagnose a divergence within the current frame.
+    """Find the step, the mass point and the likely cause of a divergence within the current frame.
 
     Args:
         dynamics: Sheet that diverged; its state afterwards is arbitrary.
@@ -51,8 +48,8 @@ def diagnose(dynamics: Dynamics, start: Snapshot | None, pause: Pause) -> Diagno
         The diagnosis.
     """
     plan, grid, bad_step = dynamics.plan, dynamics.plan.grid, dynamics.steps_done
-    gauge = ForceRecorder(plan)
-    state, progress, felt = (None, RunProgress(), gauge.at_rest()) if start is None else start[:3]
+    recorder = ForceRecorder(plan)
+    state, progress, forces = (None, RunProgress(), recorder.at_rest()) if start is None else start[:3]
     monitor = DivergenceMonitor(plan, progress)
     dynamics.restart(plan, state)
     sound, fault = dynamics.state(), ""
@@ -64,7 +61,7 @@ def diagnose(dynamics: Dynamics, start: Snapshot | None, pause: Pause) -> Diagno
             break
         if monitor.progress.frame * grid.steps_per_frame == reading.steps:
             position = to_positions(reading.displacement, plan.scene.sheet)
-            felt = gauge.follow(felt, monitor.progress.frame, position, dynamics.tool_forces())
+            forces = recorder.follow(forces, monitor.progress.frame, position, dynamics.tool_forces())
         sound = dynamics.state()
     if not fault:
         reason = "but not when it was repeated, so the machine has made an error; continue with --resume"
@@ -82,16 +79,16 @@ def diagnose(dynamics: Dynamics, start: Snapshot | None, pause: Pause) -> Diagno
     reading = dynamics.read()
     cause = _likely_cause(dynamics, bad_step, largest_displacement(reading.displacement)[:2], pause)
     reason = f"{monitor.check(reading)}; {cause}"
-    last_sound_state = Snapshot(sound, monitor.progress, felt, plan.scene.probes)
+    last_sound_state = Snapshot(sound, monitor.progress, forces, plan.scene.probes)
     message = divergence.format_message(grid.time(bad_step), bad_step, reason, exact=True)
     return Diagnosis(message, last_sound_state)
 
 
 def _likely_cause(dynamics: Dynamics, bad_step: int, point: tuple[int, int], pause: Pause) -> str:
-    """Name the most likely cause: the step if a finer one does not diverge, else a force or a path."""
+    """Describe the likely cause: the time step if a finer one does not diverge, else a force or a path."""
     plan, grid = dynamics.plan, dynamics.plan.grid
     frames, finest_step, budget = -(-bad_step // grid.steps_per_frame), math.inf, MAX_NODE_STEPS
-    for refinement in STEP_REFINEMENTS:
+    for refinement in (2, 4, 8, 16, 32, 64):
         finer = plan.with_grid(steps_per_frame=refinement * grid.steps_per_frame)
         budget -= frames * finer.grid.steps_per_frame * math.prod(plan.scene.sheet.points)
         if budget < 0:

@@ -16,11 +16,11 @@ from taichi_msm.terms import TERMS
 from taichi_msm.terms.foundation import FoundationTerm
 from taichi_msm.terms.loads import force_norm, max_free_acceleration
 
-# No deformation displaces a mass point by more than this many sheet sizes. A free sheet may also fly away.
+# Largest displacement of a mass point by deformation, in sizes of the sheet. A free sheet may also fly away.
 MAX_SHEET_SIZES = 10.0
 
-# The energy of Verlet's method oscillates by 1 / (1 - (h / h_stable)^2) about the true energy, and somewhat more where
-# springs are compressed to a point. It may exceed the energy that the load explains by this factor.
+# Factor by which the energy may exceed the energy supplied by the loads. The energy of Verlet's method oscillates by
+# 1 / (1 - (h / h_stable)^2) about the true energy, and somewhat more where springs are compressed to a point.
 ENERGY_OSCILLATION = 4.0
 
 
@@ -32,24 +32,24 @@ def displacement_bound(
     Args:
         plan: Plan of the run.
         time: Time since the start of the run [s].
-        acceleration: Largest acceleration that the probes can have given to a free mass point so far [m/s^2]; None for
-            that of the scene's probes.
-        tool_energy: Largest energy that position-controlled tools can have supplied so far [J]; None for that of the
+        acceleration: Bound of the acceleration of a free mass point by the probes so far [m/s^2]; by default that of
+            the scene's probes.
+        tool_energy: Bound of the energy supplied by position-controlled tools so far [J]; by default that of the
             scene's tools.
 
     Returns:
         The bound [m], possibly infinite.
     """
-    # A tool takes along the tissue that it holds.
+    # A tool moves the tissue that it holds along its path.
     bound = MAX_SHEET_SIZES * max(plan.scene.sheet.size) + sum(tool.path_length + tool.radius for tool in plan.tools)
-    # Springs then connect every mass point to a fixed one; shear springs alone may skip every other mass point.
+    # Here springs connect every mass point to a fixed one; shear springs alone may skip every other mass point.
     if plan.scene.sheet.fixed not in ("none", ()) and min(plan.material.across, plan.material.down) > 0:
         return bound
     if plan.material.virtual > 0 and not plan.material.always_active:
         # The virtual springs may accelerate a mass point from far away, and release it when it is fast.
         return math.inf
     if plan.tools:
-        # No mass point is faster than with its share of all energy that the tools can have supplied.
+        # Speed of a mass point whose kinetic energy is its share of the supplied energy.
         supplied = _tool_energy_bound(plan) if tool_energy is None else tool_energy
         bound += math.sqrt(2 * supplied / plan.fixed.size / plan.material.mass) * time
     return bound + (max_free_acceleration(plan) if acceleration is None else acceleration) * time * time / 2
@@ -64,13 +64,13 @@ class DivergenceMonitor:
 
         E(b)^(1/2) <= E(a)^(1/2) + (2 m)^(-1/2) integral of |F| from a to b
 
-    Position-controlled tools add at most the energy E_T of displacing every mass point by the length of their path and
-    their radius, at their speed. Where the displacement is large already, it takes more, so E_T^(1/2) is added to the
-    right-hand side. The virtual springs store at most another K / 2 |u|^2, with the largest K; when they begin to act,
-    this is added for the current displacements.
+    Position-controlled tools add at most the energy E_T of displacing every mass point by the length of their path plus
+    their radius, at their speed. In a deformed sheet this takes more energy, so E_T^(1/2) is added to the right-hand
+    side. The virtual springs store at most another K / 2 |u|^2, with the largest K; when they become active, this is
+    added for the current displacements.
 
     Attributes:
-        progress: Progress at the last frame without a fault; at first, at the frame where the monitor begins.
+        progress: Progress at the last frame without a fault, initially at the first frame.
     """
 
     def __init__(self, plan: Plan, progress: RunProgress | None = None) -> None:
@@ -84,14 +84,14 @@ class DivergenceMonitor:
         self._underflow, self._growth = _underflow_energy(plan), EnergyGrowth(plan)
 
     def change_loads(self, plan: Plan) -> None:
-        """Replace the loads from now on; control points must move or stand as before."""
+        """Replace the loads from now on; the same control points must move as before."""
         self._plan, self._growth = plan, EnergyGrowth(plan)
         self._loads = LoadBounds(plan)
         self._acceleration = max(self._acceleration, max_free_acceleration(plan))
         self._tool_energy = max(self._tool_energy, _tool_energy_bound(plan))
 
     def check_frame(self, reading: Reading) -> str:
-        """Check the next frame like `check`, and record its progress if it has no fault."""
+        """Check the next frame like `check`; record its progress if it has no fault."""
         extreme, progress = largest_displacement(reading.displacement), self.progress
         frame, fault = reading.steps // self._grid.steps_per_frame, self._fault(reading, extreme)
         if not fault:
@@ -119,12 +119,12 @@ class DivergenceMonitor:
         return fault
 
     def check(self, reading: Reading) -> str:
-        """Describe the fault at a step since the last recorded frame; return an empty string without one."""
+        """Describe the fault at a step after the last recorded frame; return an empty string without a fault."""
         return self._fault(reading, largest_displacement(reading.displacement))
 
     def _fault(self, reading: Reading, extreme: LargestDisplacement) -> str:
         if self._plan.scene.time.at_rest:
-            return ""  # In equilibrium nothing has grown without bound.
+            return ""  # The solver itself reports a missing equilibrium.
         begin, end = self.progress.frame / self._grid.frames_per_second, self._grid.time(reading.steps)
         point, distance, energy = f"point ({extreme.row}, {extreme.column})", extreme.distance, reading.energy
         # The negated comparisons also detect NaN, for which every comparison is false.
@@ -163,16 +163,13 @@ def format_message(time: float, step: int, fault: str, *, exact: bool) -> str:
         time: Time of the divergence [s].
         step: Number of the step.
         fault: Fault reported by `DivergenceMonitor`.
-        exact: Whether the step before was still without a fault.
-
-    Returns:
-        The message, in one line.
+        exact: Whether the previous step is known to have no fault.
     """
     return f"diverged {'at' if exact else 'before'} {time:.6g} s, step {step}: {fault}"
 
 
 def _tool_energy_bound(plan: Plan) -> float:
-    """Bound the energy that position-controlled tools can have supplied to the mass points [J]."""
+    """Bound the energy that position-controlled tools can supply to the mass points [J]."""
     material, step, energy = plan.material, plan.grid.step, 0.0
     stiffness = sum(term.stiffness_bound(material, plan.scene.sheet) for term in TERMS)
     for tool in plan.tools:
@@ -182,10 +179,10 @@ def _tool_energy_bound(plan: Plan) -> float:
 
 
 def _underflow_energy(plan: Plan) -> float:
-    """Return the energy below which the squares that it is summed from underflow [J]."""
+    """Return the energy below which its squared terms may underflow [J]."""
     tiny = float(np.finfo(np.float32 if plan.grid.precision == "f32" else np.float64).tiny)
     (dx, dy), material = spacing(plan.scene.sheet), plan.material
     inertia = material.mass / plan.grid.step**2
-    # Both bare squares and squares times a stiffness are summed.
+    # The sums contain squares with and without a factor of stiffness.
     springs = max(1.0, sum(term.stiffness_bound(material, plan.scene.sheet) for term in TERMS)) * (dx**2 + dy**2)
     return math.prod(plan.scene.sheet.points) * tiny * (inertia + springs)

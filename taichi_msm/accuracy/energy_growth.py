@@ -1,7 +1,7 @@
-"""Growth of the energy after the last load, a sign of steps that are too long for compressed springs.
+"""Growth of the energy after the last load, a sign of time steps that are too long for compressed springs.
 
-The energy is measured at x_n and at the velocity half a step before. For a mode of frequency w it differs from the
-energy that Verlet's method conserves by a factor between 1 - w h / 2 and 1 + w h / 2, where w h / 2 is at most
+The energy is measured with the position x_n and the velocity half a step before. For a mode of frequency w it differs
+from the energy that Verlet's method conserves by a factor between 1 - w h / 2 and 1 + w h / 2, where w h / 2 is at most
 r = h / h_stable. Hence an energy more than (1 + r) / (1 - r) times an earlier one has grown (Hairer, Lubich and Wanner
 2003, Acta Numerica 12, 399-450, on the conserved energy).
 """
@@ -36,7 +36,7 @@ class EnergyGrowth:
             frame: Number of this frame.
 
         Returns:
-            The least energy of a frame since the release [J], 0 before it, and the largest growth factor since then.
+            The smallest energy of a frame since the release [J], 0 before it, and the largest growth factor since then.
         """
         least, growth = before.least_energy, before.energy_growth
         if frame / self._rate < self._released:
@@ -50,7 +50,7 @@ class EnergyGrowth:
 
 
 def release_time(plan: Plan) -> float:
-    """Return the time at which the last load and the last path end [s], infinite for a load without end."""
+    """Return the time at which all loads and paths have ended [s], infinite for a load without end."""
     ends = [tool.times[-1] for tool in plan.tools]
     for probe in plan.scene.probes:
         if not probe.moved and any(percent for _, percent in probe.load):
@@ -59,15 +59,7 @@ def release_time(plan: Plan) -> float:
 
 
 def energy_growth_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
-    """Warn of energy that grew without a load by more than its oscillation at this step.
-
-    Args:
-        plan: Plan of the run.
-        progress: Progress of the run.
-
-    Returns:
-        The warning, if any.
-    """
+    """Warn if the energy grew without a load by more than it oscillates with this time step."""
     ratio = plan.grid.step / plan.stable_step
     if progress.energy_growth * (1 - ratio) > 1 + ratio:
         yield (

@@ -5,23 +5,23 @@ If u_c is the displacement with cells r times as long, Richardson's extrapolatio
 at the rim of a tool's flat end, at an edge in a map, at a fixed edge without tension, and in wrinkles. Hence p is
 measured with three runs: the run, and two with half and a quarter of its cells per side. An order above 2 shows that
 the coarsest run is too coarse, and counts as somewhat less than 2. An order below 1 counts as 1, and so does an unknown
-order where there are too few mass points for a third run.
+order, if the mass points are too few for a third run.
 
-Each of the three runs takes steps twice as long as the previous one, as longer cells allow, so that the time-step error
-decreases together with the mesh error. If a coarse time-step companion accompanies the run, it is the first of the
-three. The estimate includes up to four times the time-step error, which is usually far smaller.
+Each of the three runs takes steps twice as long as the previous one, so that the time-step error decreases together
+with the mesh error. If there is a coarse time-step companion, it replaces the run as the first of the three. The
+estimate includes up to four times the time-step error, which is usually far smaller.
 
-The estimate is doubled and reported as "at least" where the error may be larger: where the three runs show no order,
-or where tissue without bending is compressed, and so wrinkles more on finer meshes.
+The estimate is doubled and reported as "at least" where the error may be larger: if the three runs do not converge, or
+if tissue without bending is compressed and therefore wrinkles more on finer meshes.
 
-A tool that is hardly wider than a cell exerts more or less than its total, depending on the positions of the mass
-points. The coarser runs exert the same force as the run, and its difference from the total is added to the error.
+The force of a tool that is hardly wider than a cell differs from its total, depending on the positions of the mass
+points. The coarser runs have the same force as the run, and its difference from the total is added to the error.
 
-Position-controlled tools touch more mass points one by one, and in a run on a coarse mesh few or none, which makes it
-useless. Hence there is one companion run with 1 / sqrt(2) of the cells per side and half the steps. It is compared with
-the run itself, because a coarse time-step companion may press differently, and the estimate is CONTACT_ERROR_FACTOR
-times the difference. A difference above SECOND_RUN_DIFFERENCE is unreliable, as the tool may have left one of the two
-sheets earlier; then a second companion run follows, with SECOND_CELL_RATIO of the cells per side
+Position-controlled tools come into contact with one mass point after another, and on a much coarser mesh with few or
+none. Hence there is one companion run with 1 / sqrt(2) of the cells per side and half the steps. It is compared with
+the run itself, because a coarse time-step companion may have other contacts, and the estimate is CONTACT_ERROR_FACTOR
+times the difference. A difference above SECOND_RUN_DIFFERENCE is unreliable, because the tool may have left one of the
+two sheets earlier; then a second companion run follows, with SECOND_CELL_RATIO of the cells per side
 (docs/decisions/0027).
 
 With `springs`, a sheet with another mesh is a different sheet, so its error is undefined.
@@ -74,22 +74,18 @@ MAX_DIFFERENCE = 1.0
 # - smallest radius of a tool for which the comparison is meaningful, in cells of the run.
 MIN_RADIUS_CELLS = 0.8
 
-# An order above 2 counts as 2 minus this share of the excess (docs/decisions/0022).
-EXCESS_ORDER_FACTOR = 1 / 4
-
-# Tissue counts as compressed if a spring is shorter than its unloaded length by more than this share.
+# Tissue counts as compressed if a spring is shorter than without force by more than this share of its length.
 COMPRESSION_TOLERANCE = 1e-4
 
-# The largest number of trial runs in a search; the largest and smallest refinement of the cells from one to the next.
+# Largest number of trial runs in a search; largest and smallest refinement of the cells from one to the next.
 MAX_TRIALS = 10
 MAX_CELL_REFINEMENT, MIN_CELL_REFINEMENT = 2.0, 1.1
 
-# The search aims at an error of this share of the tolerance, so its mesh is nearly the coarsest.
+# The search aims at this share of the tolerance, so that its mesh is nearly the coarsest.
 TOLERANCE_TARGET = 0.8
 
-# The fewest mass points per side for which half the cells still make a comparable sheet.
+# Smallest number of mass points per side for which a sheet with half the cells is comparable.
 MIN_POINTS_PER_SIDE = 7
-
 
 # Reasons for an unknown or underestimated error.
 NO_CONTACT = "a tool on a path meets no point"
@@ -129,11 +125,11 @@ def coarser_plan(plan: Plan, ratio: float = 0.5) -> Plan | None:
         return None
     cells = [ratio * (count - 1) for count in scene.sheet.points]
     if ratio == SECOND_CELL_RATIO:
-        # Equal parity, so that a tool above the middle meets a mass point in both meshes or in neither.
+        # Equal parity, so that a tool above the middle touches a mass point in both meshes or in neither.
         cells = [
             count - 1 - 2 * round((count - 1 - few) / 2) for count, few in zip(scene.sheet.points, cells, strict=True)
         ]
-    # Numbers of cells are rounded up or down, so that cells do not get too long.
+    # Numbers of cells are rounded up or down, to keep the aspect ratio of the cells below its limit.
     options = product(*({math.ceil(count) + 1, math.floor(count) + 1} for count in cells))
     scenes = [with_points(scene, (rows, cols)) for rows, cols in options]
     valid = [option for option in scenes if cell_aspect_ratio(option.sheet) <= MAX_CELL_ASPECT]
@@ -149,12 +145,12 @@ def coarser_plan(plan: Plan, ratio: float = 0.5) -> Plan | None:
 
 
 def mesh_companion_plan(plan: Plan) -> Plan | None:
-    """Plan the first companion run on a coarser mesh; return None without one, as `coarser_plan`."""
+    """Plan the first companion run on a coarser mesh; None as from `coarser_plan`."""
     return coarser_plan(plan, CONTACT_CELL_RATIO) if plan.tools else coarser_plan(plan)
 
 
 def _with_equal_force(probe: Probe, sheet: Sheet, coarse: Sheet) -> Probe:
-    """Scale the total of a probe, by less than 2, so that it exerts the same force on a coarse sheet."""
+    """Scale the total of a probe, by 1/2 to 2, so that its force on a coarse sheet is the same."""
     if probe.total is None:
         return probe
     force, coarse_force = sum_probe_forces(probe, sheet)[0], sum_probe_forces(probe, coarse)[0]
@@ -168,7 +164,7 @@ def sampling_force_error(scene: Scene) -> float:
     # The force of a tool is summed over at most 4 million mass points.
     refinement = min(8, math.isqrt(4_000_000 // math.prod(scene.sheet.points)))
     if refinement < 2:
-        return 0.0  # On so fine a mesh no tool is as narrow as a cell.
+        return 0.0  # With cells this small, no tool is as narrow as a cell.
     probes = [probe for probe in scene.probes if probe.total is not None]
     pairs = [
         (sum_probe_forces(probe, scene.sheet)[0], sum_probe_forces(probe, scene.sheet, refinement)[0])
@@ -184,7 +180,7 @@ class MeshCompanion:
 
     Args:
         plan: Plan of the run that they are compared with.
-        coarse: Result of `mesh_companion_plan` for it.
+        coarse: Plan of the first companion run, from `mesh_companion_plan`.
         device: Device to run on.
         cores: Number of CPU cores for stepping; None for all.
 
@@ -215,7 +211,7 @@ class MeshCompanion:
         self._second_run: MeshCompanion | None = None
 
     def compile(self) -> None:
-        """Compile the kernels that the first frame would compile."""
+        """Compile the kernels before the first frame."""
         self._sheets[0].compile()
 
     def compare_frame(self, displacement: NDArray[Any], pause: Pause) -> None:
@@ -241,11 +237,11 @@ class MeshCompanion:
             self._shortest_spring = min(self._shortest_spring, reading.shortest_spring)
 
     def tool_forces(self) -> NDArray[np.float64]:
-        """Return the forces of the tools in the first companion run, like `Dynamics.tool_forces`."""
+        """Return `Dynamics.tool_forces` of the first companion run [N], shape (tools, 3)."""
         return self._sheets[0].tool_forces()
 
     def build_second_run(self, plan: Plan, device: Device, cores: int | None = None) -> MeshCompanion | None:
-        """Build the second companion run, which follows from the first frame on.
+        """Build the second companion run, which follows the run from its first frame on.
 
         Args:
             plan: Plan of the run.
@@ -280,7 +276,8 @@ class MeshCompanion:
             order = math.log(others[0] / first) / math.log(self._ratio) if others[0] > 0 else -math.inf
         assumed = 1.0
         if order is not None:
-            assumed = max(1.0, min(order, 2 - EXCESS_ORDER_FACTOR * (order - 2)))
+            # An order above 2 counts as 2 minus a quarter of the excess (docs/decisions/0022).
+            assumed = max(1.0, min(order, 2 - (order - 2) / 4))
         relative = first / (self._ratio**assumed - 1) / self._largest
         if order is not None and not MIN_ORDER <= order <= MAX_ORDER:
             doubt = "runs with fewer points do not converge"
@@ -306,15 +303,7 @@ class MeshCompanion:
 
 
 def with_points(scene: Scene, points: tuple[int, int]) -> Scene:
-    """Replace the number of mass points of a scene, and remove the tolerance by which it would be chosen.
-
-    Args:
-        scene: Scene.
-        points: Rows and columns of mass points.
-
-    Returns:
-        The changed scene.
-    """
+    """Return a copy of a scene with other numbers of mass points (rows, columns) and without `sheet.tolerance`."""
     return scene.model_copy(update={"sheet": scene.sheet.model_copy(update={"points": points, "tolerance": None})})
 
 
@@ -326,12 +315,12 @@ def choose_points(
 ) -> tuple[Plan, MeshEstimate]:
     """Search for approximately the coarsest mesh whose error is within the sheet's tolerance.
 
-    The search begins with the plan's mesh, and cells keep their shape.
+    The search begins with the plan's mesh, and keeps the shape of the cells.
 
     Args:
         plan: Plan of a scene with a tolerance of the sheet.
         device: Device for the trial runs.
-        check: Plans a scene with another mesh and the given maps.
+        check: Function that validates and plans a scene with given maps.
         progress: Called with the number of finished frames of each trial run and their total.
 
     Returns:
@@ -417,7 +406,7 @@ class CubicInterpolation:
 
 
 def _cubic_weights(source: int, target: int) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Return the first of four source nodes, and their weights, for every target node; arguments count equal cells."""
+    """Return the first of four source nodes, and their weights, for every target node; arguments: numbers of cells."""
     position = np.arange(target + 1) * (source / target)
     first = np.clip(np.floor(position).astype(int) - 1, 0, source - 3)
     t, nodes = position - first, range(4)

@@ -1,9 +1,9 @@
 """Path dependence of quasi-static equilibria, shown by jumps and by second solutions on another loading path.
 
-A sheet that buckles or wrinkles has several equilibria under one load. Three signs show it: between two frames the
-sheet moves much farther, relative to the change of the loads, than between the frames before and after; two frames
-under equal loads differ, such as in loading and unloading; or the sheet reaches another equilibrium if the loads of a
-frame act at once on the flat sheet and tools move straight to their positions.
+A sheet that buckles or wrinkles has several equilibria under one load. There are three signs of this. Between two
+frames the sheet moves much farther, relative to the change of the loads, than between the frames before and after. Two
+frames under equal loads differ, for example in loading and unloading. The sheet reaches another equilibrium if the
+loads of a frame act at once on the flat sheet and tools move straight to their positions.
 """
 
 from __future__ import annotations
@@ -29,18 +29,17 @@ from taichi_msm.system.runtime import Device
 # Shapes that differ by more than this share of the largest displacement are different equilibria.
 DIFFERENCE_TOLERANCE = 0.01
 
-# In a jump the sheet moves this many times farther, for the same change of the loads, than between the frames before
-# and after it. A sheet without tension, which moves as the cube root of its load, reaches 4.5 where the load changes
-# its sign.
+# Smallest ratio of the movement in a jump to that between the frames before and after it, for the same change of the
+# loads. A sheet without tension, which moves as the cube root of its load, reaches 4.5 where the load changes its sign.
 JUMP_FACTOR = 6.0
 
-# Number of second solutions, and the cost of each, which starts from rest, in frames of the run.
+# Number of second solutions, and the cost of each, from rest, in frames of the run.
 SECOND_SOLUTIONS, SECOND_SOLUTION_FRAMES = 3, 3
 
-# Frames are compared with earlier ones under equal loads up to this number of mass points in all frames together.
+# Largest number of mass points in all frames together for which frames under equal loads are compared.
 MAX_COMPARED_NODES = 2_000_000
 
-# Loads that differ by less than this share are equal.
+# Loads that differ by less than this share of their largest values are equal.
 LOAD_TOLERANCE = 1e-9
 
 Array = NDArray[Any]
@@ -64,7 +63,7 @@ class PathDependence:
         self._by_load: dict[tuple[int, ...], Array] | None = {} if compares else None
 
     def check_frame(self, frame: int, displacement: Array) -> None:
-        """Compare the next frame with the frames before it.
+        """Compare the next frame with earlier frames.
 
         Args:
             frame: Number of the frame.
@@ -87,12 +86,12 @@ class PathDependence:
         self._previous = current
 
     def affords(self, companion_cost: float) -> bool:
-        """Return whether second solutions, in addition to companion runs of this cost, are a small part of the run."""
+        """Return whether second solutions, in addition to companion runs of a cost, are a small part of the run."""
         second_cost = SECOND_SOLUTIONS * SECOND_SOLUTION_FRAMES / (self._plan.grid.frames + 1)
         return affords_companions(self._plan, companion_cost + second_cost)
 
     def finish(self, device: Device, cores: int | None, pause: Pause) -> None:
-        """Solve the last frame, the most displaced frame and one after it a second time, from rest.
+        """Solve the most displaced frame, one after it and the last frame a second time, from rest.
 
         Args:
             device: Device to solve on.
@@ -136,7 +135,7 @@ class PathDependence:
 
 
 def second_solution(plan: Plan, frame: int, device: Device, cores: int | None, pause: Pause) -> Array | None:
-    """Solve a frame from rest: its loads act at once, then tools move straight from their first position to its own.
+    """Solve a frame from rest: its loads act at once, then tools move straight from their first positions.
 
     Args:
         plan: Plan of a quasi-static scene.
@@ -146,13 +145,13 @@ def second_solution(plan: Plan, frame: int, device: Device, cores: int | None, p
         pause: Called often; an exception from it ends the solution.
 
     Returns:
-        Displacements [m], shape (rows, cols, 3). None if a tool holds tissue at this frame, which it gripped on its
-        path, or if there is no equilibrium.
+        Displacements [m], shape (rows, cols, 3). None if a tool holds tissue at this frame, which depends on its path,
+        or if there is no equilibrium.
     """
     scene, rate = plan.scene, plan.grid.frames_per_second
     if any(frame in grip_frames(grip, rate) for tool in plan.tools for grip in tool.grips):
         return None
-    probes = tuple(_at_once(plan, probe, frame) for probe in scene.probes)
+    probes = tuple(_load_at_once(plan, probe, frame) for probe in scene.probes)
     time = scene.time.model_copy(update={"duration": 1.0, "frames_per_second": 1})
     sheet = build_dynamics(
         plan_variant(plan, scene.model_copy(update={"probes": probes, "time": time})), device, cores=cores
@@ -166,8 +165,8 @@ def second_solution(plan: Plan, frame: int, device: Device, cores: int | None, p
         sheet.close()
 
 
-def _at_once(plan: Plan, probe: Probe, frame: int) -> Probe:
-    """Return a probe with the load of a frame from 0 s on, or with its tool in the position of the frame at 1 s."""
+def _load_at_once(plan: Plan, probe: Probe, frame: int) -> Probe:
+    """Return a probe with the load of a frame from 0 s on, or with a straight path to its position at the frame."""
     rate, sheet = plan.grid.frames_per_second, plan.scene.sheet
     if probe.path is None:
         percent, (x, y) = FrameLoad(probe, sheet).at(frame, rate)
@@ -192,7 +191,7 @@ class _LoadingPath:
         self._size = max(scene.sheet.size)
 
     def key(self, frame: int) -> tuple[int, ...]:
-        """Return a key that is equal for frames under equal loads; empty while a tool holds tissue."""
+        """Return a key of the loads that is equal for equal loads; empty while a tool holds tissue."""
         rate = self._rate
         if any(frame in grip_frames(grip, rate) for tool in self._tools for grip in tool.grips):
             return ()

@@ -1,4 +1,4 @@
-"""Error estimates of a run from its companion runs, and the warnings to read before trusting its result."""
+"""Error estimates of a run from its companion runs, and all warnings about the run."""
 
 from __future__ import annotations
 
@@ -42,10 +42,20 @@ from taichi_msm.system.runtime import Device
 # frames with contact (docs/decisions/0027).
 FORCE_ERROR_FACTOR = 1.15
 
-# Smallest error of a tool's force, relative to the greatest force, as a multiple of the mesh error of the displacement:
-# where a grip holds mass points with about the same force by chance, the difference is too small. The largest is the
-# error of the displacement (docs/decisions/0027).
+# Lower bound of the relative error of a tool's force, as a multiple of the mesh error of the displacement. Without it,
+# a grip with about the same force in both runs by chance would have no error. The upper bound is the error of the
+# displacement (docs/decisions/0027).
 MIN_MESH_ERROR_SHARE = 0.5
+
+# Smallest length of a spring, relative to its rest length, for which the stability limit holds (see
+# `SpringTerm.stiffness_bound`), and largest length that tissue withstands.
+MIN_SPRING_RATIO, MAX_SPRING_RATIO = 0.5, 2.0
+
+# Tissue that is compressed by more than this share of its depth stiffens, unlike the elastic foundation.
+MAX_DEPTH_RATIO = 1 / 3
+
+# A remedy is suggested for an error above this share of the largest displacement.
+REMEDY_THRESHOLD = 0.01
 
 
 class ForceEstimate(NamedTuple):
@@ -81,7 +91,7 @@ class RunErrorEstimator:
 
     Args:
         plan: Plan of the run.
-        companions: Companion runs that were chosen for it.
+        companions: Companion runs of the run.
         known: Estimates from before the run, which are not repeated.
         device: Device to run on.
         cores: Number of CPU cores for stepping.
@@ -108,7 +118,7 @@ class RunErrorEstimator:
         self._all_forces = True
 
     def compile(self) -> None:
-        """Compile the kernels that the first frame would compile."""
+        """Compile the kernels before the first frame."""
         for companion in (self._time_step, self._mesh):
             if companion is not None:
                 companion.compile()
@@ -122,7 +132,7 @@ class RunErrorEstimator:
             displacement: Displacements of the run at that frame [m], shape (rows, cols, 3).
             pause: Called several times a second; after an exception from it the companion runs cannot continue.
             forces: Mean forces of the position-controlled tools since the previous frame [N], shape (tools, 3); None if
-                they were not kept.
+                unknown.
         """
         if self._time_step is not None:
             self._time_step.compare_frame(displacement, pause)
@@ -141,11 +151,11 @@ class RunErrorEstimator:
             self._max_force = np.maximum(self._max_force, np.linalg.norm(forces, axis=1))
 
     def finish(self, displacements: Iterator[NDArray[Any]] | None, progress: ProgressCallback) -> None:
-        """Run further companion runs after the last frame where the first ones show an error that is not negligible.
+        """After the last frame, run further companion runs if the first ones show an error that is not negligible.
 
         Args:
             displacements: Displacements of the run at all frames but the first [m], each of shape (rows, cols, 3); None
-                if they were not kept, and the run has to be repeated.
+                to repeat the run.
             progress: Called with the number of finished frames and their total.
         """
         first = self._time_step
@@ -165,7 +175,7 @@ class RunErrorEstimator:
             self._known = self._known._replace(estimate=combine_estimates(first.estimate, fine.estimate))
 
     def _repeated(self) -> Iterator[NDArray[Any]]:
-        """Repeat the run, and yield the displacements of its frames."""
+        """Repeat the run and yield the displacements of its frames."""
         dynamics = Dynamics(self._plan, self._device, cores=self._cores)
         for _ in range(self._plan.grid.frames):
             dynamics.advance(self._plan.grid.steps_per_frame)
@@ -205,20 +215,6 @@ class RunErrorEstimator:
         return ForceEstimate(min(max(relative, MIN_MESH_ERROR_SHARE * mesh.error), displacement_error))
 
 
-# Compression of a spring, as a share of its rest length, up to which the stability limit holds (see
-# `SpringTerm.stiffness_bound`).
-MIN_SPRING_RATIO = 0.5
-
-# Tissue that is compressed by more than this share of its depth stiffens, which the elastic foundation does not.
-MAX_DEPTH_RATIO = 1 / 3
-
-# No tissue can be stretched to more than this multiple of its rest length.
-MAX_SPRING_RATIO = 2.0
-
-# A remedy is suggested for an error above this share of the largest displacement.
-REMEDY_THRESHOLD = 0.01
-
-
 def run_warnings(
     plan: Plan,
     probes: Sequence[ProbeRecord],
@@ -236,11 +232,11 @@ def run_warnings(
         plan: Plan of the run.
         probes: Records of the probes' forces.
         progress: Progress of the run.
-        estimate: Error of the time step, like the next three as in `RunErrorEstimates`.
+        estimate: Error of the time step; this and the next three as in `RunErrorEstimates`.
         reason: Why it was not estimated.
         mesh: Discretisation error of the mesh.
         force: Error of the forces.
-        affords: Returns whether a plan can be run within an hour.
+        affords: Function that returns whether a plan can be run within an hour.
         scale: Pixels per metre at the middle of the sheet; None without a picture.
 
     Returns:

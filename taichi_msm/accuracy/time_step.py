@@ -4,8 +4,8 @@ The error of a displacement u_h is its distance from Richardson's extrapolation 
 
     u* = u_{h/r} + (u_{h/r} - u_h) / (r^p - 1)        p: order of the method, r: 2 or more (fine), or about 1/2 (coarse)
 
-So it includes the rounding of the run's own precision. An error is the largest of any mass point at any frame, relative
-to the largest displacement of any mass point at any frame.
+It includes the rounding of the run's precision. An error is the largest of any mass point at any frame, relative to the
+largest displacement of any mass point at any frame.
 
 Mass points come into contact with position-controlled tools from one step to the next, so the order is about 1, and the
 error falls irregularly with the step. The estimate is then a bound that is rarely exceeded, reported as "at most about"
@@ -37,15 +37,15 @@ from taichi_msm.system.runtime import Device
 # largest possible one.
 MIN_TOLERANCE_SHARE = 0.75
 
-# Safety factor of an error estimated by a coarse companion run, since the kinks of a load meet its steps at other times
-# than those of the run (docs/decisions/0021).
+# Safety factor of an error estimated by a coarse companion run, because the kinks of a load have other positions within
+# its steps than within those of the run (docs/decisions/0021).
 COARSE_MARGIN = 1.25
 
 # With contact, safety factor of an error estimated by a fine companion run at order 1, and the largest relative change
 # of this error that a coarse companion run can cause (docs/decisions/0027).
 CONTACT_MARGIN, COARSE_INFLUENCE = 1.5, 1 / 3
 
-# The largest number of trial runs in a search, and the largest refinement of the step from one to the next.
+# Largest number of trial runs in a search, and largest refinement of the step from one to the next.
 MAX_STEP_TRIALS = 12
 MAX_STEP_REFINEMENT = 8.0
 
@@ -55,7 +55,7 @@ class TimeStepEstimate:
     """Estimated error of the time step and of rounding.
 
     Attributes:
-        steps_per_frame: Number of steps per frame that the estimate is of.
+        steps_per_frame: Number of steps per frame of the run.
         error: Largest error, as a fraction of the largest displacement; infinite if it is unknown because a companion
             run diverged or the step does not resolve the damping.
         rounding: Part of the error that comes from f32, including positions in the trajectory; 0 in f64.
@@ -164,7 +164,7 @@ class TimeStepCompanion:
         coarse = 0 < steps < plan.grid.steps_per_frame
         self._parted = plan.grid.precision == "f64" or not coarse
         self._dynamics = Dynamics(exact, device, cores=cores)
-        # A run in f64 is itself the one in f64 with its own steps.
+        # A run in f64 is itself the second run.
         needs_same_step = plan.grid.precision != "f64" and not coarse
         self._same_step = Dynamics(exact, device, cores=cores) if needs_same_step else None
         self._margin = COARSE_MARGIN * CONTACT_MARGIN if plan.tools else 1.0
@@ -175,7 +175,7 @@ class TimeStepCompanion:
         self.restart(plan, steps)
 
     def restart(self, plan: Plan, steps: int) -> None:
-        """Restart for another run of the same scene; a fine companion must stay fine.
+        """Restart for another run of the same scene; a fine companion run must stay fine.
 
         Args:
             plan: Plan of the run.
@@ -190,7 +190,7 @@ class TimeStepCompanion:
         self._error = self._rounding = self._in_f64 = self._largest = 0.0
 
     def compile(self) -> None:
-        """Compile the kernels that the first frame would compile."""
+        """Compile the kernels before the first frame."""
         self._dynamics.compile()
 
     def compare_frame(self, displacement: NDArray[Any], pause: Pause) -> None:
@@ -244,15 +244,7 @@ class TimeStepCompanion:
 
 
 def combine_estimates(coarse: TimeStepEstimate, fine: TimeStepEstimate) -> TimeStepEstimate:
-    """Combine the estimates of both companion runs: the fine one, adjusted by the coarse one in contact.
-
-    Args:
-        coarse: Estimate of the coarse companion run.
-        fine: Estimate of the fine companion run.
-
-    Returns:
-        The combined estimate.
-    """
+    """Combine the estimates of both companion runs: the fine one, with contact adjusted by the coarse one."""
     if not fine.at_most or fine.error in (0, math.inf):
         return fine
     share = min(max(coarse.error / fine.error, 1 - COARSE_INFLUENCE), 1 + COARSE_INFLUENCE)
@@ -291,7 +283,7 @@ class TimeStepTrials:
         return self._companion.estimate
 
     def _as_stored(self, displacement: NDArray[Any]) -> NDArray[Any]:
-        """Round displacements like positions in a trajectory: in f32, relative to the size of the sheet."""
+        """Round displacements like the positions of a trajectory in f32, which lose digits to the size of the sheet."""
         if "trajectory" not in self._plan.scene.output or self._plan.grid.precision == "f64":
             return displacement
         rest = rest_positions(self._plan.scene.sheet)
@@ -316,7 +308,7 @@ def _next_steps(trial: TimeStepEstimate, tolerance: float) -> int:
     if trial.error == math.inf:
         refinement = MAX_STEP_REFINEMENT
     else:
-        # Both the allowed error of the step and the estimated one exclude the rounding.
+        # Allowed and estimated error of the step, both without the rounding.
         allowed = max((1 + MIN_TOLERANCE_SHARE) / 2 * tolerance - trial.rounding, tolerance / 16)
         error = max(trial.error - trial.rounding, 0.0)
         refinement = min((error / allowed) ** (1 / trial.order), MAX_STEP_REFINEMENT)
@@ -324,7 +316,7 @@ def _next_steps(trial: TimeStepEstimate, tolerance: float) -> int:
 
 
 def _stagnates(failures: list[TimeStepEstimate]) -> bool:
-    """Return whether smaller steps hardly reduced the error three times in a row."""
+    """Return whether smaller steps hardly reduced the error, three times in succession."""
     if len(failures) < 4:
         return False
     return all(

@@ -271,19 +271,18 @@ def _row_sweeping(code: KernelConfig) -> Callable[..., None]:
     )
     tangents = [add for term in code.terms for add in term.build_tangents(code)]
     reducing = [reduce for term in code.terms for reduce in term.build_damping(code)]
-    probes, has_foundation = code.require(ProbeTerm), code.get(FoundationTerm) is not None
+    probes, foundation_term = code.require(ProbeTerm), code.get(FoundationTerm)
     laplacians = [] if code.get(BendingTerm) is None else [build_laplacian(code)]
     sense, slots, standing = probes.build_load_adjoint(code, SUM_PARTS), len(probes.moves), probes.moves.count(False)
-    first_tension = code.first_constant(SpringTerm) + 3
-    foundation = code.first_column(FoundationTerm) if has_foundation else 0
+    foundation = code.first_column(FoundationTerm) if foundation_term else 0
+    foundation_works = [foundation_term.build_work(code)] if foundation_term else []
 
     @ti.func
     def spring_tangent(sheet: ti.template(), offset, p, q, x0, y0, length, k, family: ti.template()):
         """Differentiate the force of entry p on entry q; their shapes are `offset` entries further on."""
         p_difference = [sheet.u[c][p] - sheet.u[c][q] for c in ti.static(range(3))]
         u_difference = [sheet.shapes[c][p + offset] - sheet.shapes[c][q + offset] for c in ti.static(range(3))]
-        tau = sheet.constants[first_tension + family]
-        return differentiate(u_difference, p_difference, x0, y0, length, k, tau)
+        return differentiate(sheet, family, u_difference, p_difference, x0, y0, length, k)
 
     @ti.func
     def add(array: ti.template(), at, value):
@@ -338,7 +337,7 @@ def _row_sweeping(code: KernelConfig) -> Callable[..., None]:
                 if owned:
                     p = [sheet.u[c][entry_row + b] for c in ti.static(range(3))]
                     u = [sheet.shapes[c][entry_row + offset + b] for c in ti.static(range(3))]
-                    entry = ti.static(Entry(line, b, p))
+                    entry = ti.static(Entry(line, b, p, u))
                     for add_change in ti.static(tangents):
                         add_change(force, sheet, entry, now)
                     gain = now[GAIN] * sheet.by_column[(MOBILITY + kind) * width + b]
@@ -361,10 +360,9 @@ def _row_sweeping(code: KernelConfig) -> Callable[..., None]:
                     if ti.static(shear):
                         diagonals = falling[3] + rising[3]
                         add(sheet.derivatives, (DIAGONAL * sheet.rows + i) * width + b, diagonals * (-1.0))
-                    if ti.static(has_foundation):
-                        product = p[0] * u[0] + p[1] * u[1] + p[2] * u[2]
+                    for work in ti.static(foundation_works):
                         index = (FOUNDATION_PART * sheet.rows + i) * width + b
-                        add(sheet.derivatives, index, product * (0 - now[foundation]))
+                        add(sheet.derivatives, index, work(sheet, p, u) * (0 - now[foundation]))
                     if ti.static(tension):
                         sums[TENSION_SUMS + ALONG_ROW] = sums[TENSION_SUMS + ALONG_ROW] - right[4]
                         sums[TENSION_SUMS + ALONG_COLUMN] = sums[TENSION_SUMS + ALONG_COLUMN] - down[4]

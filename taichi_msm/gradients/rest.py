@@ -23,7 +23,7 @@ from taichi_msm.model.sheet import spacing
 from taichi_msm.solver.rest import QuasiStatics
 from taichi_msm.system.runtime import Device
 from taichi_msm.terms.elasticity import SpringFamily, spring_families
-from taichi_msm.terms.foundation import point_shares
+from taichi_msm.terms.foundation import foundation_force, foundation_tangent, point_shares
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_matrix
@@ -107,7 +107,7 @@ class RestAdjoint:
             if p is None:
                 continue  # The sheet is flat, and remains flat with any material.
             _add_springs(gradient, families, u, p)
-            gradient.foundation -= foundation * (u * p).sum(axis=-1)
+            gradient.foundation += (foundation_force(plan.material, foundation, u) * p).sum(axis=-1)
             curvatures = laplacian @ u.reshape(-1, 3), laplacian @ p.reshape(-1, 3)
             gradient.bending -= plan.material.bending * float((curvatures[0] * curvatures[1]).sum())
             self._add_loads(loads, n, at_frame, p)
@@ -129,12 +129,13 @@ class RestAdjoint:
 def _add_springs(gradient: SheetGradient, families: Sequence[SpringFamily], u: Array, p: Array) -> None:
     """Add the derivatives by the springs."""
     for number, family in enumerate(families):
-        q, edges, longer, square = family.elongation(u)
-        straight, _ = family.law.slopes(longer, square, family.length)
+        q, edges, square_difference, square = family.elongation(u)
         p_difference = p[family.start] - p[family.end]
+        along = (p_difference * edges).sum(axis=-1)
+        _, _, by_stiffness, by_tension = family.slopes(square_difference, square, along)
         index = min(number, 2)  # Both diagonals count as one family.
-        gradient.springs[index][...] += straight * (p_difference * edges).sum(axis=-1)
-        gradient.tensions[index] += (p_difference * q).sum()
+        gradient.springs[index][...] += by_stiffness * along
+        gradient.tensions[index] += (p_difference * q).sum() + (by_tension * along).sum()
 
 
 def _stiffness(plan: Plan, families: Sequence[SpringFamily], foundation: Array, laplacian: Any, u: Array) -> csc_matrix:
@@ -143,9 +144,9 @@ def _stiffness(plan: Plan, families: Sequence[SpringFamily], foundation: Array, 
 
     shape = plan.scene.sheet.points
     number, axis = np.arange(plan.fixed.size).reshape(shape), np.arange(3)
-    total = sparse.diags(np.repeat(foundation.ravel(), 3)) + plan.material.bending * sparse.kron(
-        laplacian.T @ laplacian, sparse.identity(3)
-    )
+    total = sparse.diags(
+        foundation_tangent(plan.material, foundation, u).ravel()
+    ) + plan.material.bending * sparse.kron(laplacian.T @ laplacian, sparse.identity(3))
     for family in families:
         blocks = family.tangent(u).reshape(-1, 3, 3)
         p, q = (3 * number[end].reshape(-1, 1, 1) for end in (family.start, family.end))

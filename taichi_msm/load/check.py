@@ -43,8 +43,8 @@ def validate(data: dict[str, Any]) -> tuple[Plan | None, list[Problem]]:
     """
     problems: list[Problem] = []
     plan = None
-    # Pydantic validates the whole scene only when all sections are valid, and combinations are checked only when that
-    # finds no problems, so there are up to three passes.
+    # Three passes: pydantic validates the whole scene only if all sections are valid, and combinations are checked only
+    # if the whole scene is valid.
     for _ in range(3):
         scene, new_problems = parse_model(Scene, data)
         problems += new_problems
@@ -118,10 +118,6 @@ def _replace_faulty(data: dict[str, Any], problems: list[Problem]) -> dict[str, 
 
 def parse_model(model: type[Model], data: dict[str, Any]) -> tuple[Model | None, list[Problem]]:
     """Validate the keys of a section separately.
-
-    Args:
-        model: type of the section.
-        data: plain data.
 
     Returns:
         The section, or None if there are problems; the problems.

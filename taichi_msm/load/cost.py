@@ -54,7 +54,7 @@ LABEL_PIXEL_BYTES = 60  # per pixel with labels
 NORMAL_PIXEL_BYTES = 24  # per pixel with a normal
 TRACK_BYTES = 21  # per tracked point and frame, until the run ends
 
-# Upper bounds of the overhead of a file, except for a byte per row of a PNG, and of run.json without its scene [bytes].
+# Upper bounds of the overhead of a file, without a byte per row of a PNG, and of run.json without its scene [bytes].
 FILE_BYTES = 1024
 RECORD_BYTES = 1 << 16
 
@@ -62,8 +62,8 @@ RECORD_BYTES = 1 << 16
 FORCE_ROW_BYTES = 180
 FORCE_BYTES = 6 * 8
 
-# Numbers per mass point: displacement and its difference in the state; with maps, the stiffness of three springs or the
-# factor of the foundation, with temporary arrays; and the copies at the start and for output.
+# Numbers in memory per mass point: displacement and last difference in the state; stiffness of three springs, or factor
+# of the foundation, with temporary arrays, for each map; copies at the start and for output.
 STATE_NUMBERS = 6
 MAP_NUMBERS = {"map": 6, "foundation_map": 4}
 OUTPUT_NUMBERS = 15
@@ -101,7 +101,7 @@ class Budget:
 
     @property
     def memory_bytes(self) -> int:
-        """Peak memory; positions are not included, as they are streamed to disk."""
+        """Peak memory, without the positions, which are streamed to disk."""
         return self.simulation_bytes + self.drawing_bytes + self.track_bytes
 
     @property
@@ -148,7 +148,7 @@ def estimate_budget(plan: Plan) -> Budget:
 
 
 def size_problems(plan: Plan) -> Iterator[Problem]:
-    """Check the number of steps and the memory of a run; each problem is at the key to change."""
+    """Report too many steps or too much memory of a run, each at the key to change."""
     scene, grid, budget, available = plan.scene, plan.grid, estimate_budget(plan), available_memory()
     if grid.steps > MAX_STEPS:
         count = f"{scene.time.duration:g} s in steps of {grid.step:.6g} s is {grid.steps:.3g} steps"
@@ -202,7 +202,7 @@ def require_disk(plan: Plan, directory: Path) -> None:
 
 
 def drawing_bytes(scene: Scene) -> int:
-    """Estimate the memory for drawing a frame [bytes], also of a scene whose output has no pictures."""
+    """Estimate the memory for drawing a frame [bytes], even if the scene has no such output."""
     rows, cols = scene.sheet.points
     width, height = scene.render.size
     # The whole image is decoded, even if only a region of it is used.
@@ -235,7 +235,7 @@ def _format_bytes(size: int) -> str:
     return f"{size / unit:.3g} {name}"
 
 
-# Times of a unit of work and of the calibration on two cores of an AMD EPYC of 2024 [s].
+# Durations of a unit of work and of the calibration on two cores of an AMD EPYC of 2024 [s].
 WORK_UNIT_S, CALIBRATION_S = 1.5e-9, 1e-4
 
 

@@ -29,12 +29,12 @@ class ResolvedPlan(NamedTuple):
 
 
 def resolve(plan: Plan, device: Device, progress: ProgressCallback = lambda done, total: None) -> ResolvedPlan:
-    """Choose the settings that a valid scene leaves open, by companion runs if it has tolerances.
+    """Choose the settings that a valid scene leaves open, by trial runs if it has tolerances.
 
     Args:
         plan: plan of the scene.
-        device: device of the run and of the companion runs.
-        progress: callback of the companion runs.
+        device: device of the run and of the trial runs.
+        progress: callback with the progress of the trial runs.
 
     Raises:
         SceneError: when a tolerance cannot be met.

@@ -103,12 +103,7 @@ def load_scene(
 def load_plan(
     path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = (), image: str | Path | None = None
 ) -> Plan:
-    """Read and validate a scene file, and plan the scene for a CPU.
-
-    Args:
-        path: path of the scene file.
-        overrides: values that replace those of the file, as in `load_scene`.
-        image: path of another image for the sheet, relative to the current directory.
+    """Read and validate a scene file, as `load_scene`, and plan the scene for a CPU.
 
     Raises:
         ArgumentError: when the path is a mapping, or the overrides are neither a sequence of texts nor a mapping from
@@ -123,12 +118,7 @@ def load_plan(
 def plan_file(
     file: ParsedFile, overrides: Sequence[str] | Mapping[str, Any] = (), image: str | Path | None = None
 ) -> Plan:
-    """Validate a parsed scene file, and plan the scene for a CPU.
-
-    Args:
-        file: parsed file.
-        overrides: values that replace those of the file, as in `load_scene`.
-        image: path of another image for the sheet, relative to the current directory.
+    """Validate a parsed scene file, with overrides and image as in `load_scene`, and plan the scene for a CPU.
 
     Raises:
         ArgumentError: when the overrides are neither a sequence of texts nor a mapping from texts.
@@ -187,7 +177,7 @@ def _value(data: Any, key: Key) -> Any:
 
 
 def schema() -> dict[str, Any]:
-    """Return the JSON Schema (draft 2020-12) of a scene, which has the rules for single keys, not for combinations."""
+    """Return the JSON Schema (draft 2020-12) of a scene, with the rules for single keys, not for combinations."""
     return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | Scene.model_json_schema()
 
 
@@ -198,7 +188,7 @@ class Override(NamedTuple):
         name: the override as in messages.
         path: path to the key.
         value: new value.
-        problems: problems of reading the override; if there are any, it is not applied.
+        problems: problems of the override; with any, it is not applied.
     """
 
     name: str
@@ -244,7 +234,7 @@ def parse_key(key: str) -> Key:
 
 
 class _Origin(NamedTuple):
-    """Location of a key in the file or the overrides, which sorts in the order of reading.
+    """Location of a key in the file or the overrides, sortable in the order of reading.
 
     Attributes:
         source: 0 for the file, or the number of the override.
@@ -359,12 +349,7 @@ class Draft:
 
 
 def is_below(path: Path, folder: Path) -> bool:
-    """Return whether a path is that of a folder or below it, with symbolic links resolved.
-
-    Args:
-        path: path, which need not exist.
-        folder: path of the folder.
-    """
+    """Return whether a path, which need not exist, is a folder or below it, with symbolic links resolved."""
     try:
         return path.resolve().is_relative_to(folder.resolve())
     except (OSError, RuntimeError, ValueError):

@@ -1,8 +1,8 @@
 """Parser of a safe subset of YAML 1.2, which records the line and column of each key.
 
 The data is built directly from the events of PyYAML. Anchors, aliases, tags, further documents and deep nesting, which
-no scene needs, are rejected at their events, so a text cannot cause unlimited recursion or expansion of aliases, or
-load anything. Scalars follow the core schema of YAML 1.2: 1e4 is a number, 010 is ten, `yes` is a text.
+no scene needs, are rejected as their events arrive. So a text cannot cause unlimited recursion or expansion of aliases,
+or load anything. Scalars follow the core schema of YAML 1.2: 1e4 is a number, 010 is ten, `yes` is a text.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ _TOO_DEEP = f"nested more than {MAX_DEPTH} deep; write it flatter"
 # Limit of the recorded faults, as a broken file may have tens of thousands.
 MAX_FAULTS = 1000
 
-# Longer plain scalars are texts, as Python cannot convert integers of several thousand digits.
+# Longer plain scalars are texts, because Python cannot convert integers of several thousand digits.
 MAX_NUMBER_LENGTH = 100
 
 # The C parser is twenty times faster than the one in Python, and returns the same data.
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
-# Characters that YAML excludes, and line breaks of YAML that editors do not count, so that line numbers would differ.
+# Characters that YAML excludes, and line breaks of YAML that editors do not count, which would shift line numbers.
 _NOT_ALLOWED = re.compile("[^\t\n\r\x20-\x7e\xa0-\u2027\u202a-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 _SURROGATE = re.compile("[\ud800-\udfff]")
@@ -181,7 +181,7 @@ class _DocumentBuilder:
         return self._mapping(path)
 
     def _check_allowed(self, event: Any, path: Key) -> None:
-        """Reject events that are outside the subset of YAML."""
+        """Reject events outside the subset of YAML."""
         self._nodes += 1
         if self._nodes > MAX_NODES:
             raise UnreadableError(_mark(event.start_mark), f"more than {MAX_NODES} values; write fewer")

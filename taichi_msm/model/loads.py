@@ -39,7 +39,7 @@ class Schedule(NamedTuple):
 
 
 def decay(probe: Probe, sheet: Sheet, at: Array | None = None) -> Array:
-    """Compute the factor by which a probe's force decays at each mass point.
+    """Compute the decay factor of a probe's force at each mass point.
 
     Args:
         probe: the probe.
@@ -47,7 +47,7 @@ def decay(probe: Probe, sheet: Sheet, at: Array | None = None) -> Array:
         at: control point, x and y at rest [m], shape (2,); by default the first keyframe of `probe.at`.
 
     Returns:
-        Decay factors, of a probe with `total` times the mass point's share of a cell's area, shape (rows, cols).
+        Decay factors, shape (rows, cols); with `total`, multiplied by the mass point's share of a cell's area.
     """
     law, (at_x, at_y) = probe_force(probe, sheet), control_points(probe, sheet)[1][0] if at is None else at
     x, y = axes(sheet)
@@ -112,7 +112,7 @@ def evaluate_loads(plan: Plan, t: Array) -> Schedule:
         t: times that differ from all keyframes [s], shape (n,).
 
     Returns:
-        Loads at these times; each time takes the place of a step.
+        Loads at these times, instead of at steps.
     """
     scene = plan.scene
     slots = plan.slots if scene.time.at_rest else probe_slots(scene.probes, scene.sheet, 0.0)
@@ -129,10 +129,6 @@ def evaluate_loads(plan: Plan, t: Array) -> Schedule:
 
 class FrameLoad:
     """The load of a force-controlled probe at frames, without averaging.
-
-    Args:
-        probe: the probe.
-        sheet: the sheet.
 
     Attributes:
         moves: whether the control point moves.
@@ -161,20 +157,11 @@ class FrameLoad:
 
 
 def evaluate_frame_loads(plan: Plan, frame: int) -> Schedule:
-    """Evaluate the loads at a frame.
+    """Evaluate the loads at a frame, as a schedule of one step.
 
-    At a jump the later value counts.
-
-    A keyframe within FRAME_TOLERANCE frames of the frame counts as at the frame. A
-    foundation that is active only under load is active while the percent of any probe differs from 0, and from the
-    first to the last keyframe of any path.
-
-    Args:
-        plan: the plan.
-        frame: number of the frame.
-
-    Returns:
-        Loads of one step.
+    At a jump the value after the jump counts. A keyframe within FRAME_TOLERANCE frames of the frame counts as at the
+    frame. A foundation that is active only under load is active while the percent of any probe differs from 0, and from
+    the first to the last keyframe of any path.
     """
     scene, rate = plan.scene, plan.grid.frames_per_second
     time = frame / rate
@@ -189,7 +176,7 @@ def evaluate_frame_loads(plan: Plan, frame: int) -> Schedule:
 
 
 def keyframe_times(scene: Scene) -> Array:
-    """Return the keyframe times between 0 and the end of the scene [s]; the loads are smooth everywhere else."""
+    """Return the keyframe times between 0 and the end of the scene [s], between which the loads are smooth."""
     times = _all_key_times(scene)
     return times[(times > 0) & (times < scene.time.duration)]
 
@@ -205,11 +192,7 @@ def _all_key_times(scene: Scene) -> Array:
 
 
 class LoadBounds:
-    """Bounds of the loads over time intervals.
-
-    Args:
-        plan: the plan.
-    """
+    """Bounds of the loads over time intervals."""
 
     def __init__(self, plan: Plan) -> None:
         scene, self._h = plan.scene, plan.grid.step
@@ -220,11 +203,7 @@ class LoadBounds:
         self._begins = self._activity.times[self._activity.before < self._activity.after]
 
     def between(self, begin: float, end: float) -> tuple[Array, bool, int]:
-        """Bound the loads of all steps in a closed time interval.
-
-        Args:
-            begin: start of the interval [s].
-            end: end of the interval [s].
+        """Bound the loads of all steps in the closed time interval from `begin` to `end` [s].
 
         Returns:
             The largest force at the control point of each slot [N], shape (slots,); whether the virtual springs are
@@ -243,8 +222,8 @@ class _PiecewiseLinear:
     It jumps where two keyframes have the same time.
 
     Args:
-        times: of the keyframes, ascending [s], shape (n,).
-        values: at the keyframes, shape (n,).
+        times: times of the keyframes, ascending [s], shape (n,).
+        values: values at the keyframes, shape (n,).
     """
 
     def __init__(self, times: Array, values: Array) -> None:
@@ -259,7 +238,7 @@ class _PiecewiseLinear:
         self.times, self.before, self.after = keys[needed], before[needed], after[needed]
 
     def values(self, t: Array) -> Array:
-        """Evaluate the function; at a keyframe, its limit from the right."""
+        """Evaluate the function; at a jump, its limit from the right."""
         return self._values(t, self.times.searchsorted(t, "right"))
 
     def averages(self, t: Array, h: float, begin: float = -math.inf, end: float = math.inf) -> Array:
@@ -287,12 +266,7 @@ class _PiecewiseLinear:
         return averages
 
     def max_abs(self, begin: float, end: float) -> float:
-        """Find the largest absolute value in a closed time interval.
-
-        Args:
-            begin: start of the interval [s].
-            end: end of the interval [s].
-        """
+        """Return the largest absolute value in the closed time interval from `begin` to `end` [s]."""
         first, last = self.times.searchsorted(begin, "left"), self.times.searchsorted(end, "right")
         ends = np.array([begin, end])
         return float(np.abs(np.concatenate([self.values(ends), self.before[first:last], self.after[first:last]])).max())
@@ -306,7 +280,7 @@ class _PiecewiseLinear:
         return np.where(after == 0, 0.0, self.after[low] + share * slope)
 
     def _average(self, t: float, h: float, begin: float, end: float) -> float:
-        """Integrate piece by piece, by Simpson's rule, which is exact for a product of linear functions."""
+        """Integrate each linear piece by Simpson's rule, which is exact for a product of linear functions."""
         low, high = max(t - h, 0.0 if t <= 0 else -math.inf, begin), min(t + h, end)
         inner = self.times[(self.times > low) & (self.times < high)]
         cuts = np.unique(np.concatenate([[low, high], inner, [t] if low < t < high else []]))
@@ -324,7 +298,7 @@ class _PiecewiseLinear:
 def _distribute_over_slots(
     load: _PiecewiseLinear, jumps: Array, slot_count: int, t: Array, h: float
 ) -> tuple[Array, NDArray[np.intp]]:
-    """Distribute the load of a probe that jumps over its slots: percent and number of the segment, (steps, slots)."""
+    """Return the percent and the segment of each slot of a probe with jumps, shape (steps, slots)."""
     bounds = np.concatenate([[-math.inf], jumps, [math.inf]])
     first = jumps.searchsorted(t - h * (1 - HAT_TOLERANCE), "right")
     last = jumps.searchsorted(t + h * (1 - HAT_TOLERANCE), "left")
@@ -350,7 +324,7 @@ def _load(probe: Probe) -> _PiecewiseLinear:
 
 
 def _pressing_keys(probe: Probe) -> Sequence[tuple[float, float]]:
-    """Return keyframes of a function that differs from 0 while a probe presses, or from first to last key of a path."""
+    """Return keyframes of a function that is not 0 while a probe presses, or between the ends of its path."""
     if probe.path is None:
         return probe.load
     begin, end = probe.path[0][0], probe.path[-1][0]

@@ -1,4 +1,4 @@
-"""The plan of a run: a scene resolved into arrays and a time grid, once, before the first step."""
+"""The plan of a run: a scene resolved into arrays and a time grid before the first step."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 class ProbeSegment(NamedTuple):
     """The path of a control point between two jumps, constant before its first and after its last keyframe."""
 
-    times: Array  # of the keyframes [s], shape (n,)
+    times: Array  # times of the keyframes [s], shape (n,)
     points: Array  # control point at the keyframes, x and y at rest [m], shape (n, 2)
 
 
@@ -36,9 +36,8 @@ class ProbeSlot:
     """One of the control points at which a probe can act in the same step.
 
     If the control point jumps within the hat, the probe acts in that step both at the point before the jump and at the
-    point after it. The segments of the control point are therefore distributed over two slots: the first, third, ... to
-    one, the second, fourth, ... to the other. If several jumps can fall within one hat, the probe has one slot more
-    than the largest number of jumps within a hat.
+    point after it. The segments of the control point are therefore distributed over two slots in turn. If several jumps
+    can fall within one hat, the probe has one slot more than the largest number of jumps within a hat.
     """
 
     probe: int  # index of the probe in the scene
@@ -81,12 +80,7 @@ def probe_slots(probes: Sequence[Probe], sheet: Sheet, h: float) -> tuple[ProbeS
 
 
 def build_slots(scene: Scene, grid: TimeGrid) -> tuple[ProbeSlot, ...]:
-    """Build the slots of a scene's probes.
-
-    Args:
-        scene: the scene; in a quasi-static scene loads are not averaged.
-        grid: its time grid.
-    """
+    """Build the slots of a scene's probes; in a quasi-static scene loads are not averaged."""
     return probe_slots(scene.probes, scene.sheet, 0.0 if scene.time.at_rest else grid.step)
 
 
@@ -95,10 +89,10 @@ class Plan:
     """A scene with its material, time grid and tools, built by `planning.make_plan`."""
 
     scene: Scene  # as read or built by the user
-    maps: Maps  # image files of its stiffness maps
+    maps: Maps  # images of its stiffness maps
     fixed: NDArray[np.bool_]  # whether each mass point is fixed, shape (rows, cols)
     material: Material  # coefficients of the sheet, with its maps as arrays
-    stable_step: float  # largest stable step [s]; infinite for a sheet without stiffness
+    stable_step: float  # largest stable step [s]; infinite without stiffness and damping
     grid: TimeGrid  # frames, steps and precision
     slots: tuple[ProbeSlot, ...]  # control points of the force-controlled probes
     tools: tuple[Tool, ...]  # position-controlled tools
@@ -110,11 +104,7 @@ class Plan:
         return not has_fixed_border(self.fixed)
 
     def with_grid(self, **changes: Any) -> Plan:
-        """Return a copy with another time grid.
-
-        Args:
-            changes: attributes of `TimeGrid`, such as `steps_per_frame` or `precision`.
-        """
+        """Return a copy with other attributes of the time grid, such as `steps_per_frame` or `precision`."""
         grid = replace(self.grid, **changes)
         if grid.step == self.grid.step:
             return replace(self, grid=grid)

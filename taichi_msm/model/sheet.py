@@ -22,6 +22,11 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_POINTS
 from taichi_msm.scene.sheet import Sheet, StiffnessMap
 
+# A larger ratio of the sides of a cell would require springs of negative stiffness.
+MAX_CELL_ASPECT = math.sqrt(3)
+
+Array = NDArray[np.float64]
+
 
 def spacing(sheet: Sheet) -> tuple[float, float]:
     """Return the distances between neighbouring columns and between neighbouring rows at rest, dx and dy [m]."""
@@ -60,26 +65,27 @@ def fixed_points(sheet: Sheet) -> NDArray[np.bool_]:
     return fixed
 
 
-# A larger ratio of the sides of a cell would require springs of negative stiffness.
-MAX_CELL_ASPECT = math.sqrt(3)
-
-Array = NDArray[np.float64]
-
-
 class MapImage(NamedTuple):
-    """The image of a stiffness map, read once, so that a file changed during a run has no effect."""
+    """The image of a stiffness map, read once, so that changes of the file during a run have no effect."""
 
     grey: NDArray[Any]  # 0 to 255, in 16-bit images 0 to 65535, shape (height, width)
     sha256: str  # of the file
 
 
-# Images of a scene's stiffness maps, by their keys, such as map and foundation_map.
+# Images of a scene's stiffness maps, by their keys, map and foundation_map.
 Maps = Mapping[str, MapImage]
+
+
+class Stiffening(NamedTuple):
+    """Numbers of a law that locks, see `terms.locking`."""
+
+    lock: float  # m: strain of a spring; of the foundation a depth [m]
+    factor: float  # largest tangent stiffness, relative to the initial one
 
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """The coefficients of a sheet; where a map applies, those for a factor of 1."""
+    """The coefficients of a sheet, for factors of 1 where it has a map."""
 
     mass: float  # of a mass point [kg]
     drag: float  # C / m [1/s]
@@ -91,9 +97,11 @@ class Material:
     virtual: float  # stiffness K of the virtual springs [N/m]; 0 if they are never active
     always_active: bool  # whether the virtual springs are always active; else only under load
     bending: float  # D dx dy [N m3]
+    stiffening: Stiffening | None  # of the springs; None if they are linear
+    virtual_stiffening: Stiffening | None  # of the virtual springs, its lock in metres; None if they are linear
     by_area: bool  # whether mass points and springs at an edge are lighter and softer, as in tissue
-    factors: Array | None  # of the stiffness, for every cell, shape (rows - 1, cols - 1); None without a map
-    virtual_factors: Array | None  # of K, for every mass point, shape (rows, cols); None without a map
+    factors: Array | None  # factor of the stiffness of every cell, shape (rows - 1, cols - 1); None without a map
+    virtual_factors: Array | None  # factor of K at every mass point, shape (rows, cols); None without a map
 
     @property
     def tensions(self) -> tuple[float, float, float]:
@@ -112,31 +120,13 @@ def read_map(stiffness_map: StiffnessMap) -> MapImage:
 
 
 def cell_factors(stiffness_map: StiffnessMap, image: MapImage, sheet: Sheet) -> Array:
-    """Interpolate the factors of a stiffness map at the centres of the cells.
-
-    Args:
-        stiffness_map: its keys in the scene.
-        image: its image.
-        sheet: the sheet.
-
-    Returns:
-        Factors, shape (rows - 1, cols - 1).
-    """
+    """Interpolate the factors of a stiffness map at the centres of the cells, shape (rows - 1, cols - 1)."""
     rows, cols = (count - 1 for count in sheet.points)
     return map_factors(stiffness_map, image, (np.arange(rows) + 0.5) / rows, (np.arange(cols) + 0.5) / cols)
 
 
 def point_factors(stiffness_map: StiffnessMap, image: MapImage, sheet: Sheet) -> Array:
-    """Interpolate the factors of a stiffness map at the mass points.
-
-    Args:
-        stiffness_map: its keys in the scene.
-        image: its image.
-        sheet: the sheet.
-
-    Returns:
-        Factors, shape (rows, cols).
-    """
+    """Interpolate the factors of a stiffness map at the mass points, shape (rows, cols)."""
     rows, cols = (np.arange(count) / (count - 1) for count in sheet.points)
     return map_factors(stiffness_map, image, rows, cols)
 
@@ -145,8 +135,8 @@ def map_factors(stiffness_map: StiffnessMap, image: MapImage, rows: Array, cols:
     """Interpolate the factors of a stiffness map bilinearly between pixel centres, constant beyond the outermost.
 
     Args:
-        stiffness_map: its keys in the scene.
-        image: its image.
+        stiffness_map: the map's keys in the scene.
+        image: the map's image.
         rows: distances of the sampled rows from the top, as fractions of the height, shape (m,).
         cols: distances of the sampled columns from the left, as fractions of the width, shape (n,).
 
@@ -170,10 +160,10 @@ def largest_mean(factors: Array) -> float:
     """Return the largest mean of the factors of the cells around a mass point."""
     factor_sums, cell_counts = np.pad(factors, 1), np.pad(np.ones_like(factors), 1)
 
-    def at_points(values: Array) -> Array:
+    def sum_around_points(values: Array) -> Array:
         return values[:-1, :-1] + values[:-1, 1:] + values[1:, :-1] + values[1:, 1:]
 
-    return float((at_points(factor_sums) / at_points(cell_counts)).max())
+    return float((sum_around_points(factor_sums) / sum_around_points(cell_counts)).max())
 
 
 def area_shares(sheet: Sheet) -> Array:
@@ -195,7 +185,7 @@ def has_fixed_border(fixed: NDArray[np.bool_]) -> bool:
 
 
 def material_key_problems(scene: Scene) -> Iterator[Problem]:
-    """Check a scene for missing and superfluous keys of springs and tissue."""
+    """Report missing and superfluous keys of springs and tissue."""
     sheet = scene.sheet
     if scene.tissue is None:
         if scene.springs is None:
@@ -222,28 +212,28 @@ def material_key_problems(scene: Scene) -> Iterator[Problem]:
 
 
 def tissue_problems(scene: Scene, fixed: NDArray[np.bool_], factors: Array | None) -> Iterator[Problem]:
-    """Check the keys of tissue for impossible values.
+    """Report impossible values of keys of tissue.
 
     Args:
         scene: a scene without `material_key_problems`.
         fixed: whether each mass point is fixed, shape (rows, cols).
-        factors: of the stiffness, for every cell; None if the scene has no map or its image is unreadable.
+        factors: factors of the stiffness, shape (rows - 1, cols - 1); None without a readable map.
     """
     tissue, sheet = scene.tissue, scene.sheet
     if tissue is None:
         return
-    longest = cell_aspect_ratio(sheet)
-    if longest > MAX_CELL_ASPECT * (1 + 1e-9):
+    aspect = cell_aspect_ratio(sheet)
+    if aspect > MAX_CELL_ASPECT * (1 + 1e-9):
         (dx, dy), (rows, cols), (height, width) = spacing(sheet), sheet.points, sheet.size
         candidates = (
             (rows, math.ceil(width / dy / MAX_CELL_ASPECT) + 1),
             (math.ceil(height / dx / MAX_CELL_ASPECT) + 1, cols),
         )
-        more = candidates[0] if dx > dy else candidates[1]
-        remedy = f"try {list(more)}" if max(more) <= MAX_POINTS else "take another sheet.size"
+        finer = candidates[0] if dx > dy else candidates[1]
+        remedy = f"try {list(finer)}" if max(finer) <= MAX_POINTS else "take another sheet.size"
         yield Problem(
             ("sheet", "points"),
-            f"{list(sheet.points)} make cells {longest:.3g} times as long as wide, and tissue allows "
+            f"{list(sheet.points)} make cells {aspect:.3g} times as long as wide, and tissue allows "
             f"{MAX_CELL_ASPECT:.3g} times; {remedy}",
         )
     if tissue.foundation_map is not None and tissue.foundation_stiffness == 0:
@@ -257,10 +247,10 @@ def tissue_problems(scene: Scene, fixed: NDArray[np.bool_], factors: Array | Non
                 yield Problem(("tissue", name), text)
     if tissue.pretension > 0:
         softest = 1.0 if factors is None else float(factors.min())
-        most = 1.5 * tissue.young * tissue.thickness * softest
-        if tissue.pretension >= most:
+        max_pretension = 1.5 * tissue.young * tissue.thickness * softest
+        if tissue.pretension >= max_pretension:
             yield Problem(
                 ("tissue", "pretension"),
                 f"{tissue.pretension:g} N/m is too much for young, {tissue.young:g} Pa, and thickness: without it the "
-                f"sheet would shrink to nothing; take less than {most:.3g} N/m, or a larger young",
+                f"sheet would shrink to nothing; take less than {max_pretension:.3g} N/m, or a larger young",
             )

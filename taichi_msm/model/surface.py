@@ -41,13 +41,13 @@ def surface_point(position: NDArray[np.floating], refine: int, sheet: Sheet, res
     A point outside the sheet moves with the nearest point of the sheet's edge.
 
     Args:
-        position: of the mass points [m], shape (rows, cols, 3).
+        position: positions of the mass points [m], shape (rows, cols, 3).
         refine: number of vertices inserted between neighbouring mass points.
         sheet: the sheet.
         rest: rest position, x and y [m], shape (2,).
 
     Returns:
-        The point [m], shape (3,), and the unit normal of its cell at this point, upward at rest, shape (3,).
+        The point [m], shape (3,), and the unit normal of the surface there, upward at rest, shape (3,).
     """
     height, width = sheet.size
     across = min(1.0, max(0.0, rest[0] / width + 0.5))
@@ -61,7 +61,7 @@ def surface_positions(position: NDArray[np.floating], refine: int, coordinates: 
     """Compute the positions of material points on the refined surface.
 
     Args:
-        position: of the mass points [m], shape (rows, cols, 3).
+        position: positions of the mass points [m], shape (rows, cols, 3).
         refine: number of vertices inserted between neighbouring mass points.
         coordinates: fractions of the sheet's width from its left and of its height from its top, shape (n, 2).
 
@@ -72,9 +72,7 @@ def surface_positions(position: NDArray[np.floating], refine: int, coordinates: 
 
 
 def surface_weights(coordinates: Array, sheet: Sheet, refine: int) -> tuple[NDArray[np.intp], Array]:
-    """Compute the interpolation weights with which mass points define points of the refined surface.
-
-    The weighted sums of positions are the results of `surface_positions`.
+    """Compute the weights of mass points in `surface_positions`.
 
     Args:
         coordinates: fractions of the sheet's width from its left and of its height from its top, shape (n, 2).
@@ -92,7 +90,7 @@ def surface_weights(coordinates: Array, sheet: Sheet, refine: int) -> tuple[NDAr
 
 
 def _interpolate(position: NDArray[np.floating], refine: int, coordinates: Array) -> tuple[Array, Array]:
-    """Return points of the surface and normals of their cells, not normalised, both of shape (n, 3)."""
+    """Return points of the surface and its normals, not normalised, both of shape (n, 3)."""
     rows, cols = position.shape[:2]
     i, j, *shares = _cell_coordinates(coordinates, (rows, cols), refine)
     s, t, twist = (share[:, None] for share in shares)
@@ -102,7 +100,7 @@ def _interpolate(position: NDArray[np.floating], refine: int, coordinates: Array
 
 
 def _cell_coordinates(coordinates: Array, points: tuple[int, int], refine: int) -> tuple[NDArray[Any], ...]:
-    """Return row i and column j of each coordinate's cell, s and t across and down in it, and a twist.
+    """Return row i and column j of the cell of each point, its coordinates s and t across and down in it, and a twist.
 
     The twist replaces s t of bilinear interpolation; in each small quad it is linear on either side of the diagonal.
     """
@@ -143,7 +141,7 @@ def refine_surface(position: NDArray[np.floating], refine: int) -> Surface:
     """Refine the sheet bilinearly (section 2 of the paper) and triangulate it.
 
     Args:
-        position: of the mass points [m], shape (rows, cols, 3).
+        position: positions of the mass points [m], shape (rows, cols, 3).
         refine: number of vertices inserted between neighbouring mass points.
 
     Returns:
@@ -169,7 +167,7 @@ def place_capsules(scene: Scene, position: NDArray[np.floating], time: float) ->
 
     Args:
         scene: the scene.
-        position: of the mass points [m], shape (rows, cols, 3).
+        position: positions of the mass points [m], shape (rows, cols, 3).
         time: the time [s].
 
     Returns:
@@ -192,7 +190,7 @@ def place_capsule(instrument: Instrument, scene: Scene, position: NDArray[np.flo
     Args:
         instrument: the instrument.
         scene: the scene.
-        position: of the mass points [m], shape (rows, cols, 3).
+        position: positions of the mass points [m], shape (rows, cols, 3).
         rest: rest position of the point that the tip touches, x and y [m], shape (2,).
     """
     axis = unit_vector(instrument.shaft)

@@ -55,8 +55,8 @@ def probe_force(probe: Probe, sheet: Sheet) -> ProbeForce:
     """Compute the force law of a probe.
 
     Args:
-        probe: a force-controlled probe, with `force` or `total`.
-        sheet: the sheet; its cell size scales a `total`.
+        probe: a force-controlled probe.
+        sheet: the sheet; the size of its cells scales a `total`.
     """
     rim = probe.falloff * probe.radius
     if probe.total is None:
@@ -71,10 +71,6 @@ def probe_force(probe: Probe, sheet: Sheet) -> ProbeForce:
 def control_points(probe: Probe, sheet: Sheet) -> tuple[Array, Array]:
     """Return the keyframes of a probe's control point.
 
-    Args:
-        probe: the probe.
-        sheet: the sheet.
-
     Returns:
         Times [s], shape (n,), and control points, x and y at rest [m], shape (n, 2).
     """
@@ -86,16 +82,7 @@ def control_points(probe: Probe, sheet: Sheet) -> tuple[Array, Array]:
 
 
 def control_point(probe: Probe, sheet: Sheet, time: float) -> Array:
-    """Return the control point of a probe at a time; at a jump, the point after the jump.
-
-    Args:
-        probe: the probe.
-        sheet: the sheet.
-        time: the time [s].
-
-    Returns:
-        x and y at rest [m], shape (2,).
-    """
+    """Return x and y of a probe's control point at a time [s], at rest [m]; at a jump, the point after the jump."""
     return point_at(*control_points(probe, sheet), time)
 
 
@@ -103,7 +90,7 @@ def point_at(times: Array, points: Array, time: float) -> Array:
     """Interpolate a control point between keyframes; at a jump, the point after the jump.
 
     Args:
-        times: of the keyframes [s], shape (n,).
+        times: times of the keyframes [s], shape (n,).
         points: control points at the keyframes [m], shape (n, 2).
         time: the time [s].
 
@@ -182,7 +169,7 @@ def probe_records(scene: Scene) -> list[ProbeRecord]:
 
 
 def describe_forces(record: ProbeRecord) -> str:
-    """Format the forces of a probe as one line, which is empty for an empty record."""
+    """Format the forces of a probe as one line; empty for an empty record."""
     if "total_force" not in record:
         known = "greatest_force" in record
         return f"at most {record['greatest_force']:.3g} N, at {record['greatest_force_time']:.3g} s" if known else ""
@@ -191,12 +178,7 @@ def describe_forces(record: ProbeRecord) -> str:
 
 
 def force_warnings(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str]:
-    """Warn of probes whose forces on this sheet do not add up to their `total`.
-
-    Args:
-        scene: a valid scene.
-        records: the forces of its probes, from `probe_records`.
-    """
+    """Warn of probes whose forces on this sheet do not add up to their `total`; records: from `probe_records`."""
     across, down = spacing(scene.sheet)
     cell = f"a cell of {across:.3g} x {down:.3g} m"
     for index, (probe, record) in enumerate(zip(scene.probes, records, strict=True)):

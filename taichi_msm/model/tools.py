@@ -43,7 +43,7 @@ class Tool:
     """A position-controlled tool: a probe with a path."""
 
     probe: int  # index of the probe in the scene
-    times: Array  # of the keyframes [s], shape (n,)
+    times: Array  # times of the keyframes [s], shape (n,)
     tip_centres: Array  # c at the keyframes [m], shape (n, 3)
     heights: Array  # z of the lowest point of the tip at the keyframes [m], shape (n,)
     axis: Array  # unit vector a from the tip along the shaft, shape (3,)
@@ -65,10 +65,10 @@ class Tool:
 
         Args:
             step: duration of the step [s].
-            first: index of the keyframe from which on the path is considered.
+            first: index of the keyframe at which the search begins.
 
         Returns:
-            The displacement [m], and the index of the keyframe that ends its path segment.
+            The displacement [m], and the index of the keyframe at the end of its path segment.
         """
         begin = np.maximum([0.0, *self.times, *(self.times - step)], max(0.0, self.times[first] if first else 0.0))
         strides = np.linalg.norm(self.tip_centre(begin + step) - self.tip_centre(begin), axis=1)
@@ -77,11 +77,11 @@ class Tool:
         return float(strides[longest]), key
 
     def tip_centre(self, t: Array) -> Array:
-        """Return the tip's centre c [m] at times t [s], constant before the first and after the last key, (n, 3)."""
+        """Return the tip's centre c [m] at times t [s], shape (n, 3), constant before and after the path."""
         return np.stack([np.interp(t, self.times, self.tip_centres[:, axis]) for axis in range(3)], axis=-1)
 
     def lowest_point(self, t: float) -> tuple[float, float, float]:
-        """Return x, y and z of the lowest point of the tip at a time t [s], in metres."""
+        """Return x, y and z [m] of the lowest point of the tip at a time t [s]."""
         x, y, z = (float(np.interp(t, self.times, each)) for each in (*self.tip_centres.T[:2], self.heights))
         return x, y, z
 
@@ -97,11 +97,7 @@ class Tool:
         return bool((np.linalg.norm(r - s[:, None] * self.axis, axis=1) < self.radius * (1 + 1e-6)).any())
 
     def substep_times(self, begin: float, end: float) -> Array:
-        """Divide a time interval so that the tool moves by at most MAX_STRIDE_RADII radii in each subinterval.
-
-        Args:
-            begin: start of the interval [s].
-            end: end of the interval [s].
+        """Divide a time interval [s] so that the tool moves by at most MAX_STRIDE_RADII radii in each subinterval.
 
         Returns:
             Ends of the subintervals [s].
@@ -157,13 +153,7 @@ def grip_frames(grip: tuple[float, float], rate: float) -> range:
 
 
 def path_problems(scene: Scene, tools: Sequence[Tool], grid: TimeGrid) -> Iterator[Problem]:
-    """Check for tools inside the sheet at the start, for tools too fast for the step, and for quasi-static friction.
-
-    Args:
-        scene: the scene.
-        tools: its position-controlled tools.
-        grid: its time grid.
-    """
+    """Report tools inside the sheet at the start, tools too fast for the time step, and quasi-static friction."""
     for tool in tools:
         key = ("probes", tool.probe, "path")
         depth = tool.radius - _distance_to_sheet(tool, scene.sheet)
@@ -183,11 +173,11 @@ def too_fast(tool: Tool, grid: TimeGrid, first: int = 0) -> tuple[int, str] | No
 
     Args:
         tool: the tool.
-        grid: the time grid.
-        first: index of the keyframe from which on the path is considered.
+        grid: the time grid, with the step.
+        first: index of the keyframe at which the check begins.
 
     Returns:
-        The index of the keyframe that ends the fastest path segment, and a message; None if the tool is slow enough.
+        The index of the keyframe at the end of the fastest segment, and a message; None if the tool is slow enough.
     """
     stride, key = tool.max_stride(grid.step, first)
     if stride <= MAX_STRIDE_RADII * tool.radius * (1 + 1e-9):
@@ -199,30 +189,25 @@ def too_fast(tool: Tool, grid: TimeGrid, first: int = 0) -> tuple[int, str] | No
 
 
 def min_steps_per_frame(tools: Sequence[Tool], grid: TimeGrid, least: int) -> int:
-    """Compute the fewest steps of a frame with which no tool is too fast.
+    """Compute the smallest number of steps per frame with which no tool is too fast.
 
     Args:
         tools: the position-controlled tools.
-        grid: the time grid; only its frame rate counts.
+        grid: the time grid, of which only the frame rate is used.
         least: lower bound of the result.
     """
 
     def speed_ratio(tool: Tool) -> float:
         return tool.max_stride(1 / grid.frames_per_second / least)[0] / (MAX_STRIDE_RADII * tool.radius)
 
-    # With n times as many steps, the largest displacement in a step is at least 1 / n of the former one.
+    # With n times the steps, the largest displacement in a step is at least 1 / n of the previous one.
     while (ratio := max(map(speed_ratio, tools), default=0.0)) > 1 + 1e-9:
         least = max(least + 1, math.ceil(least * ratio * (1 - 1e-9)))
     return least
 
 
 def path_warnings(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:
-    """Warn of implausible paths and grips, of tools too thin for the mesh, and of tools that intersect.
-
-    Args:
-        scene: the scene.
-        tools: its position-controlled tools.
-    """
+    """Warn of implausible paths and grips, of tools too thin for the mesh, and of tools that intersect."""
     spacing_max, side, end = max(spacing(scene.sheet)), max(scene.sheet.size), scene.time.duration
     for tool in tools:
         if (height_max := float(np.abs(tool.heights).max())) > side:
@@ -259,7 +244,7 @@ def overlap(tools: Sequence[Tool], duration: float) -> tuple[int, int, float] | 
 
     Args:
         tools: the position-controlled tools.
-        duration: of the scene [s].
+        duration: duration of the scene [s].
 
     Returns:
         The indices of their probes, and the first time [s]; None if no tools intersect.
@@ -274,17 +259,17 @@ def overlap(tools: Sequence[Tool], duration: float) -> tuple[int, int, float] | 
 
 
 def _axis_distance(a: Tool, b: Tool, offset: Array) -> Array:
-    """Return the distance of the axes of two tools [m], shape (n,); offset: tip of a minus tip of b, shape (n, 3)."""
+    """Return the distances of the axes of two tools [m], shape (n,), at offsets of tip a from tip b, shape (n, 3)."""
 
     def from_end(offset: Array, axis: Array, length: float) -> Array:
         return np.asarray(np.linalg.norm(offset - np.clip(offset @ axis, 0, length)[:, None] * axis, axis=1))
 
-    # From an end of either axis to any point of the other.
+    # Distance of an end of either axis from the other axis.
     distance = np.minimum(
         np.minimum(*(from_end(offset + s * a.axis, b.axis, b.length) for s in (0, a.length))),
         np.minimum(*(from_end(s * b.axis - offset, a.axis, a.length) for s in (0, b.length))),
     )
-    # Between the nearest points of both infinite lines, which minimise |offset + s a - t b|, if the axes contain them.
+    # Distance of the nearest points of both infinite lines, at the minimum of |offset + s a - t b|, if on the axes.
     normal = np.cross(a.axis, b.axis)
     if (square := float(normal @ normal)) > 1e-12:
         cosine, along_a, along_b = a.axis @ b.axis, offset @ a.axis, offset @ b.axis

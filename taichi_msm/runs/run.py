@@ -42,7 +42,7 @@ from taichi_msm.runs.manifest import Manifest, input_digests, read_manifest
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.runs.writer import ResultWriter, RunRecord
 from taichi_msm.scene.scene import Scene
-from taichi_msm.solver.planning import ENCODING
+from taichi_msm.solver.planning import ENCODING_WORK
 from taichi_msm.solver.state import ProbeForces, RunProgress
 from taichi_msm.system import process, runtime
 from taichi_msm.system.compiler import versions
@@ -500,7 +500,7 @@ def free_cores(plan: Plan) -> int:
     """Count the cores free for stepping: all, or all but one if the encoder is mostly busy."""
     width, height = plan.scene.render.size
     rows, cols = plan.scene.sheet.points
-    encoding = width * height * len(plan.scene.render.all_cameras) * ENCODING if plan.scene.draws else 0
+    encoding = width * height * len(plan.scene.render.all_cameras) * ENCODING_WORK if plan.scene.draws else 0
     busy = encoding > rows * cols * plan.grid.steps_per_frame
     return max(1, process.available_threads() - busy)
 

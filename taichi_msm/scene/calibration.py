@@ -38,20 +38,20 @@ SIZE = re.compile(r"(image|img|picture|frame|camera|cam)?(size|resolution|res|di
 LENS = re.compile(
     r"(camera|cam|lens|distortion|dist|projection|calibration|calib)?(model|type)(name|type)?|lens|projection"
 )
-LENS_ALONE = re.compile(r"lens|type|projection")
+LENS_OR_DEVICE = re.compile(r"lens|type|projection")
 FISHEYE = re.compile(r"(is|use)?fisheye(model)?")
 XI = re.compile(r"xi")
 ROI = re.compile(r"roi")
 
-# Keys that are not read but would change the projection, unless they are empty or 0.
-RELEVANT = re.compile(
+# Keys that are not read but change the projection, unless they are empty or 0.
+UNSUPPORTED_KEYS = re.compile(
     r"(?!right(cameramat|distortioncoeffs)$).*(distort(?!ed)|distorsion|coef|radial|tangential|prism|fisheye|omni|mirror|polynom|skew).*|kc|[kps][1-6]|"
     r"(?!new|opt|right).*(cameramat|intrinsic).*|(image|img|picture|frame|camera|cam)?(shape|dimensions?)|"
     r"(image|img|picture|frame|camera|cam)(size|resolution|width|height).*|alpha|beta|lambda|(lens|dist).*model.*|"
     r"binning|scale(factor)?|undistort(ed)?|rectified|roi|crop(ped)?"
 )
 
-# Whether a lens model is OpenCV's fisheye, by its name, reduced like a key; None for names that both models may have.
+# Whether a lens model, by its reduced name, is OpenCV's fisheye; None for names of both models.
 MODELS = {
     **dict.fromkeys(("pinhole", "perspective", "mono", "monocular"), None),
     **dict.fromkeys(("plumbbob", "rationalpolynomial", "rational", "radtan", "radialtangential", "opencv"), False),
@@ -63,10 +63,10 @@ NO_DISTORTION = ("none", "nodistortion", "undistorted")
 # Numbers of coefficients that OpenCV writes. Those after the first 8 are not supported and must be 0.
 COEFFICIENT_COUNTS, SUPPORTED_COEFFICIENTS = (0, 4, 5, 8, 12, 14), 8
 
-# Limit of all numbers of a calibration, and minimum of the focal lengths [px].
-MAX_NUMBER, MIN_FOCAL_LENGTH = 1e6, 1e-3
+# Largest number in a calibration, and smallest focal length [px].
+MAX_NUMBER, MIN_FOCAL_LENGTH_PX = 1e6, 1e-3
 
-# Relative difference below which two numbers are equal, rounded to different numbers of digits.
+# Largest relative difference of equal numbers that are rounded to different numbers of digits.
 ROUNDING_TOLERANCE = 1e-6
 
 # Limits of nesting and of the number of YAML events. Matrices are nested two or three deep.
@@ -75,7 +75,7 @@ MAX_DEPTH, MAX_VALUES = 20, 200_000
 # Spellings of the keys of the first camera of a stereo pair.
 LEFT_CAMERA = re.compile(r"left(.*)|(.*)(1|l|left)")
 
-# Deviation from 1 of the norm of a quaternion above which it is not a rotation.
+# Largest deviation from 1 of the norm of a quaternion.
 NORM_TOLERANCE = 1e-3
 
 _REMEDY = "write camera_matrix: [fx, 0, cx, 0, fy, cy, 0, 0, 1], distortion_coefficients: [k1, k2, p1, p2]"
@@ -116,8 +116,8 @@ def read_calibration(path: str) -> Calibration:
         raise CameraFileError(f"{path}: {_describe_unsupported(keys.data)}; {_REMEDY}")
     if len(matrix) != 9 or [matrix[n] for n in (1, 3, 6, 7, 8)] != [0, 0, 0, 0, 1] or min(matrix[0], matrix[4]) <= 0:
         raise CameraFileError(f"{path}: its camera matrix is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]; write it like that")
-    if (focal := min(matrix[0], matrix[4])) < MIN_FOCAL_LENGTH:
-        remedy = f"write it in pixels, {MIN_FOCAL_LENGTH:g} or more"
+    if (focal := min(matrix[0], matrix[4])) < MIN_FOCAL_LENGTH_PX:
+        remedy = f"write it in pixels, {MIN_FOCAL_LENGTH_PX:g} or more"
         raise CameraFileError(f"{path}: its focal length is {focal:g}; {remedy}")
     fisheye = _is_fisheye(keys, values)
     size = _size(keys)
@@ -140,11 +140,11 @@ def read_calibration(path: str) -> Calibration:
 
 def _is_fisheye(keys: _Keys, values: Sequence[float] | None) -> bool:
     """Return whether the lens model is OpenCV's fisheye; the names of models in the file must agree."""
-    sources: dict[bool, str] = {}  # names of keys that state a fisheye, or another model
+    sources: dict[bool, str] = {}  # names of the keys for a fisheye (True) and for another model (False)
     for name, value in keys.values(LENS).items():
         model = _folded(value)
-        if LENS_ALONE.fullmatch(_folded(name)) and model not in MODELS:
-            continue  # The name of the device.
+        if LENS_OR_DEVICE.fullmatch(_folded(name)) and model not in MODELS:
+            continue  # The name of a device.
         if model in NO_DISTORTION and not any(values or ()):
             keys.has_no_distortion = True
         elif model not in MODELS:
@@ -169,8 +169,8 @@ def _size(keys: _Keys) -> tuple[int, int] | None:
     """Return the width and height of the pictures [px], or None if the file does not contain them."""
     width, height, both = (keys.numbers(spelling) for spelling in (WIDTH, HEIGHT, SIZE))
     if bool(width) != bool(height):
-        said = f"has only one of image_width and image_height; found {keys.names}; write both"
-        raise CameraFileError(f"{keys.path}: {said}")
+        fault = f"has only one of image_width and image_height; found {keys.names}; write both"
+        raise CameraFileError(f"{keys.path}: {fault}")
     sizes = [width + height] if width and height else []
     sizes += [both] if both else []
     if any(len(size) != 2 or size != sizes[0] for size in sizes):
@@ -238,8 +238,10 @@ class _Keys:
         return next(iter(mappings.values()), {})
 
     def check_no_unread_keys(self) -> None:
-        """Raise a CameraFileError if a key was not read that would change the projection."""
-        unread = [name for name in self.data if name not in self._read_names and RELEVANT.fullmatch(_folded(name))]
+        """Raise a CameraFileError if an unread key changes the projection."""
+        unread = [
+            name for name in self.data if name not in self._read_names and UNSUPPORTED_KEYS.fullmatch(_folded(name))
+        ]
         if names := [name for name in unread if any(_flat(self.data[name]))]:
             fault = f"{_listed(names)}: not understood, and may change what the camera sees"
             remedy = f"{_REMEDY}, or remove what does not matter"
@@ -259,7 +261,7 @@ def _listed(names: Sequence[str] | Mapping[str, Any]) -> str:
 
 
 def _describe_unsupported(data: Mapping[str, Any]) -> str:
-    """Describe a file without a camera matrix, by its origin if that is known, with its keys."""
+    """Describe a file without a camera matrix by its format, if known, and its keys."""
     folded = {_folded(name): value for name, value in data.items()}
     inner = [{_folded(name) for name in value} for value in data.values() if isinstance(value, dict)]
     if any("intrinsics" in keys and {"cameramodel", "distortioncoeffs"} & keys for keys in inner):
@@ -273,9 +275,7 @@ def _describe_unsupported(data: Mapping[str, Any]) -> str:
 
 
 def read_poses(path: str) -> tuple[tuple[float, ...], ...]:
-    """Read a trajectory of a camera.
-
-    Without a header, the columns are those of TUM's format.
+    """Read a trajectory of a camera; without a header, its columns are those of TUM's format.
 
     Returns:
         Rows of time [s], position x, y, z [m] and quaternion x, y, z, w, from the camera to the world.
@@ -313,7 +313,7 @@ class _Columns(NamedTuple):
     Attributes:
         indices: columns of t, tx, ty, tz, qx, qy, qz, qw.
         column_count: number of all columns.
-        units_per_second: a second in the unit of t.
+        units_per_second: number of units of t in a second.
     """
 
     indices: tuple[int, ...]
@@ -326,7 +326,7 @@ MAX_HEADER_LENGTH, MAX_NAME_LENGTH = 2000, 80
 
 TUM = _Columns(tuple(range(8)), 8, 1.0)
 
-# Spellings of the names of columns in lower case, and of their units.
+# Lower-case spellings of the names of columns, and of their units.
 _POSITION = r"(t|p|pos|(.*[^a-z])?position|trans|translation|[tp][^a-z].*[^a-z])?"
 _ROTATION = r"(q|quat|quaternion|(.*[^a-z])?orientation|rot|rotation|q[^a-z].*)"
 ROLES = {
@@ -380,7 +380,7 @@ def _columns(line: str, names: Sequence[str]) -> _Columns:
 
 
 def _row(line: str, words: Sequence[str], columns: _Columns | None, *, separated: bool) -> tuple[float, ...]:
-    """Convert the words of a line to a pose; `separated` is whether commas separate them."""
+    """Convert the words of a line to a pose; `separated` states whether commas separate them."""
     expected = columns or TUM
     try:
         numbers = [math.nan if "_" in word else float(word) for word in words]
@@ -390,7 +390,7 @@ def _row(line: str, words: Sequence[str], columns: _Columns | None, *, separated
         needed = f"eight numbers up to {MAX_MAGNITUDE:g}: {' '.join(ROLES)}"
         if expected.column_count != TUM.column_count:
             needed = f"{expected.column_count} numbers up to {MAX_MAGNITUDE:g}, one a column of the header"
-        origin = ORIGINS.get(len(words), "") if columns is None else ""
+        origin = OTHER_FORMATS.get(len(words), "") if columns is None else ""
         if columns is None and separated and len(words) != EUROC_COLUMNS:
             origin = "; numbers with decimal commas need ; between them"
         raise CameraFileError(f"{line}: not a pose{origin}; expected {needed}")
@@ -403,8 +403,8 @@ def _row(line: str, words: Sequence[str], columns: _Columns | None, *, separated
 
 EUROC_COLUMNS = 17
 
-# Other formats, by the number of words of a row.
-ORIGINS = {
+# Endings of the message about other formats, by the number of words of a row.
+OTHER_FORMATS = {
     10: ", but ten words, as in COLMAP's images.txt, which is not read",
     12: ", but twelve numbers, as KITTI's, which are not read",
     EUROC_COLUMNS: ", but 17 numbers, as EuRoC's; keep their header",
@@ -483,8 +483,8 @@ def _parse(path: str, text: str) -> Mapping[str, Any]:
     return data
 
 
-# Comments and empty lines, followed by a section of an ini file, or by OpenCV's directive, which is not valid YAML; a
-# line of COLMAP.
+# A section of an ini file, OpenCV's directive, which is not valid YAML, both after comments and empty lines; a line of
+# COLMAP.
 _COMMENTS = r"((?:[ \t]*(?:[#;][^\n]*)?\r?\n)*)"
 _INI = re.compile(_COMMENTS + r"[ \t]*\[[^\]\n=,]*\][ \t]*\r?\n" + _COMMENTS + r"[^\n]*=")
 _DIRECTIVE = re.compile(_COMMENTS + r"%YAML[^\n]*")
@@ -534,7 +534,7 @@ def _yaml(text: str) -> Any:
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if isinstance(event, yaml.AliasEvent) or depth > MAX_DEPTH or count > MAX_VALUES:
             raise ValueError
-    # The output of a ROS topic has a document for every message, with equal content.
+    # The output of a ROS topic has a document for every message, all with equal content.
     return next(yaml.load_all(text, _Loader), None)
 
 
@@ -567,8 +567,8 @@ def _numbers(path: str, name: str, value: Any) -> list[float]:
         raise CameraFileError(f"{path}: {name}: {fault}; write it as OpenCV does")
     rows, cols = (value.get(side) if isinstance(value, dict) else None for side in ("rows", "cols"))
     if isinstance(rows, int) and isinstance(cols, int) and rows * cols != len(numbers):
-        said = f"has {len(numbers)} numbers, and {rows} rows of {cols}; write what belongs there"
-        raise CameraFileError(f"{path}: {name}: {said}")
+        fault = f"has {len(numbers)} numbers, and {rows} rows of {cols}; write what belongs there"
+        raise CameraFileError(f"{path}: {name}: {fault}")
     return numbers
 
 

@@ -224,7 +224,7 @@ class Camera(Section):
 
     @model_serializer(mode="wrap")
     def _dump_used_keys(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Omit the keys that the given keys replace, whose defaults would be invalid when the scene is read again."""
+        """Omit keys that others replace, because their defaults would be invalid when the scene is read again."""
         if self.beside is not None:
             return {name: value for name, value in dump(self).items() if name in ("beside", "baseline")}
         needed = {"eye", "target", "up"} if self.eye is not None else {"pose", "poses"} & self.model_fields_set
@@ -283,7 +283,7 @@ class Camera(Section):
 
 
 def _given(info: ValidationInfo) -> set[str]:
-    """Return the keys before the validated one that have a value, valid or not."""
+    """Return the keys before the validated key that have a value, valid or not."""
     fields = list(Camera.model_fields)
     previous = fields[: fields.index(str(info.field_name))]
     # The data lacks keys with an invalid value.

@@ -18,23 +18,22 @@ def is_pyav_installed() -> bool:
     return find_spec("av") is not None
 
 
-# Files of a run that belong to no entry of `output`: the record, and the matrices of a camera.
+# Files of a run without an entry of `output`: the record, and the matrices of a camera.
 RUN_RECORD, CAMERA_FILE = "run.json", "camera.json"
 
-# In the folder of a sweep: its record, and the folder that contains a folder for each run, named by its number.
+# Record in the folder of a sweep; its folder with a folder for each run; pattern of the names of these, run numbers.
 SWEEP_RECORD, RUNS_FOLDER = "sweep.json", "runs"
 NUMBER_PATTERN = r"[0-9]{6,}"
 
 # Prefix of the default folders of exports.
 EXPORT_PREFIX = "export-"
 
-# Pattern of the names of cameras. Each named camera has a folder.
+# Names of cameras, which are also names of folders.
 MAX_CAMERA_NAME = 64
 CAMERA_NAME = rf"[a-z0-9_-]{{1,{MAX_CAMERA_NAME}}}"
 
 # Number of the first frame in the name of its file, and the pattern of the numbers of all frames.
 FIRST_FRAME, FRAME_PATTERN = "0000", r"(?:[0-9]{4}|[1-9][0-9]{4,14})"
-
 
 # Columns of the table of forces.
 FORCES_HEADER = ("time", "probe", "tip_x", "tip_y", "tip_z", "force_x", "force_y", "force_z")
@@ -97,11 +96,11 @@ class Output(NamedTuple):
         return max(0, frames - self.is_frame_pair)
 
 
-def _rows() -> Iterator[Output]:
+def _all_outputs() -> Iterator[Output]:
     """Iterate over the outputs, in their order in messages and help.
 
-    The upper bounds of the size: PNG stores pixels of noise uncompressed, a code of a GIF has 12 bits, a pixel of
-    yuv420p has 12 bits before encoding, and a mask has two values. Most pictures take a half or a third of that.
+    Upper bounds of the size: PNG stores noise uncompressed, a code of a GIF has 12 bits, a pixel of yuv420p has 12 bits
+    before encoding, and a mask has two values. Most pictures take a half or a third of them.
     """
     yield Output("png", "frames/0000.png", "picture", "the picture", pixel_bytes=3.01)
     yield Output("gif", "animation.gif", "picture", "the pictures as an animation", pixel_bytes=1.51)
@@ -168,7 +167,7 @@ def zero_padded(number: int) -> str:
     return f"{number:06}"
 
 
-OUTPUTS = {output.name: output for output in _rows()}
+OUTPUTS = {output.name: output for output in _all_outputs()}
 
 # Outputs with a file for every frame, by their folders.
 SERIES_FOLDERS = {output.result: output for output in OUTPUTS.values() if output.is_series}
@@ -204,12 +203,7 @@ def result_names(folders: Mapping[str, Collection[str]]) -> list[str]:
 
 
 def file_names(results: Iterable[str], frames: int) -> list[str]:
-    """List the files of a run.
-
-    Args:
-        results: names of the results, as from `result_names`.
-        frames: number of frames.
-    """
+    """List the files of a run with a number of frames, for results from `result_names`."""
     names: list[str] = []
     for result in results:
         folder, slash, name = result.rpartition("/")
@@ -219,10 +213,10 @@ def file_names(results: Iterable[str], frames: int) -> list[str]:
 
 
 def is_result(results: Collection[str], frames: int, name: str) -> bool:
-    """Return whether a path is that of a file of a run, without listing the files.
+    """Return whether a path is in `file_names`, without listing them.
 
     Args:
-        results: names of the results, as from `result_names`.
+        results: names of the results, from `result_names`.
         frames: number of frames.
         name: path relative to the folder of the run.
     """

@@ -168,7 +168,7 @@ class Render(Section):
         return self.all_cameras[self.main]
 
     def with_main(self, camera: AnyCamera) -> Self:
-        """Return a copy with another main camera; cameras that are defined relative to it move with it."""
+        """Return a copy with another main camera; cameras `beside` it move with it."""
         if self.cameras is None:
             return self.model_copy(update={"camera": camera})
         return self.model_copy(update={"cameras": {**self.cameras, self.main: camera}})
@@ -207,7 +207,7 @@ def _check_beside(name: str, cameras: Mapping[str, AnyCamera]) -> None:
             raise scene_fault(f"goes round, {', '.join([*chain, reference])}; give one of them an eye", name, "beside")
         if reference not in cameras:
             if len(chain) > 1:
-                return  # The fault is reported at the camera with this key.
+                return  # The fault is reported at the camera that has this key.
             names = [other for other in cameras if other != name]
             hint = did_you_mean(reference, names) or f"; the others are {', '.join(names)}"
             raise scene_fault(f"{reference}: no camera has this name{hint}", name, "beside")

@@ -152,7 +152,7 @@ class Scene(Section):
 
     @property
     def folders(self) -> dict[str, tuple[str, ...]]:
-        """Names of the outputs by folder: those of a camera in its own folder, the others in that of the run, ""."""
+        """Names of the outputs by folder: a folder for each camera, and "" for the run."""
         selected = [output for name, output in OUTPUTS.items() if name in self.output]
         folders = {"": tuple(output.name for output in selected if not output.is_camera_output)}
         for camera in self.render.all_cameras:
@@ -208,11 +208,7 @@ class Scene(Section):
         return image | {f"{self.kind}.{name}.image": value.image for name, value in self.maps.items()}
 
     def with_pictures(self, path: Callable[[str], str]) -> Scene:
-        """Return a copy of the scene with other paths of the image and the maps.
-
-        Args:
-            path: function from a present path to the new one.
-        """
+        """Return a copy of the scene in which `path` maps the paths of the image and the maps to new ones."""
         maps = {name: value.model_copy(update={"image": path(value.image)}) for name, value in self.maps.items()}
         image = None if self.image is None else path(self.image)
         material = self.tissue or self.springs

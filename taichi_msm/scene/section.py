@@ -24,7 +24,7 @@ from typing_extensions import Self
 from taichi_msm.errors import ArgumentError, Key, Problem, SceneError, did_you_mean
 from taichi_msm.scene.outputs import OUTPUTS
 
-# Limits of a number's magnitude, beyond which the product or quotient of two numbers could overflow or underflow.
+# Limits of a number's magnitude, so that products and quotients of two numbers neither overflow nor underflow.
 MAX_MAGNITUDE = 1e30
 MIN_MAGNITUDE = 1e-30
 
@@ -94,7 +94,7 @@ class _Fault(NamedTuple):
 
 
 def _fault(error: Any, section: type[BaseModel]) -> _Fault:
-    """Translate an error: follow its location through the models, without pydantic's names of the kinds of a value."""
+    """Translate an error, by its location in the models without pydantic's names of union members."""
     path: Key = ()
     expects = ""
     branches: tuple[tuple[Key, str], ...] = ()
@@ -169,9 +169,9 @@ def _sections(annotation: Any) -> Iterator[type[BaseModel]]:
 
 
 def _choose_kinds(faults: Sequence[_Fault]) -> Iterator[_Fault]:
-    """Of the faults of a value that may be of several kinds, keep those of the most probable kind.
+    """Keep only the faults of the most probable kind of a value that may be of several kinds.
 
-    That is the kind with the deepest fault; if two kinds are equally deep, the value as a whole is at fault.
+    That is the kind with the deepest fault; if two faults are equally deep, the value as a whole is at fault.
     """
     depths: dict[Key, dict[str, int]] = defaultdict(dict)
     for fault in faults:
@@ -244,8 +244,7 @@ DEFAULT_OFFSET = 10.0
 # Times that differ by less than this fraction of a frame are equal, so that 0.1 s at 30 frames/s is 3 frames.
 FRAME_TOLERANCE = 1e-6
 
-# Below the minimum, the error is no longer large compared with rounding in f64; above the maximum, the result is
-# meaningless.
+# Below the minimum, the error would be comparable to rounding in f64; above the maximum, the result is meaningless.
 MIN_TOLERANCE = 1e-10
 MAX_TOLERANCE = 0.5
 
@@ -258,6 +257,7 @@ NodeCount = Annotated[Integer, Field(ge=2, le=MAX_POINTS)]
 Pixels = Annotated[Integer, Field(ge=1, le=MAX_PIXELS)]
 Byte = Annotated[Integer, Field(ge=0, le=255)]
 FilePath = Annotated[str, Field(strict=True, min_length=1, max_length=MAX_PATH)]
+StiffnessRatio = Annotated[Number, Field(ge=1, le=1000)]
 UnitInterval = Annotated[Number, Field(ge=0, le=1)]
 Side = Literal["top", "bottom", "left", "right"]
 Vector = tuple[Number, Number, Number]

@@ -14,6 +14,7 @@ from taichi_msm.scene.section import (
     Positive,
     Section,
     Side,
+    StiffnessRatio,
     Tolerance,
     key,
 )
@@ -73,6 +74,13 @@ class Springs(Section):
     map: StiffnessMap | None = key(None, "map of a factor of structural and shear", "a mapping with image and range")
 
 
+class Locking(Section):
+    """Tissue that locks when it is stretched: its stiffness grows with the strain, up to a factor."""
+
+    lock: Positive = key(..., "strain at which the springs lock", "a number above 0, a strain without a unit")
+    factor: StiffnessRatio = key(10.0, "largest stiffness, relative to that at rest", "a number from 1 to 1000")
+
+
 class Foundation(Section):
     """Elastic (Winkler) foundation: a layer of tissue below the sheet.
 
@@ -81,6 +89,12 @@ class Foundation(Section):
 
     young: Positive = key(..., "Young's modulus of the tissue below the sheet [Pa]", "a number above 0, in Pa")
     depth: Positive = key(..., "depth of the tissue below the sheet [m]", "a number above 0, in metres")
+    lock: Positive | None = key(
+        None, "depth of indentation at which the foundation locks [m]", "a number above 0, in metres"
+    )
+    factor: StiffnessRatio = key(
+        10.0, "largest stiffness of a foundation that locks, relative to that at rest", "a number from 1 to 1000"
+    )
 
 
 class Tissue(Section):
@@ -108,6 +122,9 @@ class Tissue(Section):
         0.0,
         "bending stiffness D [N m]; plate: E t^3 / (12 (1 - nu^2)); all sides must be fixed, and are hinged",
         "plate, or a number, 0 or more, in N m",
+    )
+    stiffening: Locking | None = key(
+        None, "sheet that locks when it is stretched", "a mapping: {lock: [a strain], factor: [default 10]}"
     )
     map: StiffnessMap | None = key(None, "map of a factor of young", "a mapping with image and range")
     foundation_map: StiffnessMap | None = key(

@@ -6,8 +6,8 @@ strip, and a halo of one entry at both ends. One-dimensional arrays save a few i
 
     u, d         displacements and last differences [m], as three arrays each, for x, y and z
     by_column    for the first, a middle and the last row: the inverse of the mass points' share of a cell's mass, 0 if
-                 fixed; and their share of a cell's area. For all rows: x at rest [m]; 1 if there is a left neighbour,
-                 else 0; 1 if there is a right neighbour, else 0
+                 fixed; and their share of a cell's area. For all rows: x at rest [m]; 1 with a left neighbour, else 0;
+                 1 with a right neighbour, else 0
     fields       one number per mass point, for every field of every term in turn
     stiffness    with a map, k - tau of every spring, see `SpringTerm.stiffness_array`
     constants    of the sheet and its terms, each in the first lane of an entry
@@ -31,8 +31,7 @@ from taichi_msm.solver.state import State
 from taichi_msm.system.runtime import Memory, ti, write_vectors
 from taichi_msm.terms.base import AREA_SHARE, GAIN, MOBILITY, SQUARED_MOTION, KernelConfig, KernelSheet
 
-# Bytes per number.
-BYTES = {"f32": 4, "f64": 8}
+NUMBER_BYTES = {"f32": 4, "f64": 8}
 
 
 @dataclass(frozen=True)
@@ -42,9 +41,9 @@ class SheetLayout:
     # rows, cols: numbers of mass points
     rows: int
     cols: int
-    workers: int  # number of bands of rows that are stepped in parallel; 0 on a GPU
+    workers: int  # number of bands of rows, which are stepped in parallel; 0 on a GPU
     depth: int  # number of steps that a band takes in one pass
-    fixed_rows: tuple[bool, bool]  # whether the whole first row is fixed, and the whole last row
+    fixed_rows: tuple[bool, bool]  # whether all mass points of the first and of the last row are fixed
     config: KernelConfig
 
     @property
@@ -72,7 +71,7 @@ def to_lanes(layout: SheetLayout, values: NDArray[Any]) -> NDArray[Any]:
     """Arrange rows of values in lanes with halo, in the precision of the kernels.
 
     Args:
-        layout: of the sheet.
+        layout: layout of the sheet.
         values: shape (..., cols); values too large for the precision become infinite.
 
     Returns:
@@ -87,10 +86,10 @@ def to_lanes(layout: SheetLayout, values: NDArray[Any]) -> NDArray[Any]:
 
 
 def from_lanes(layout: SheetLayout, entries: NDArray[Any], rows: int) -> NDArray[Any]:
-    """Invert `to_lanes`.
+    """Arrange entries in rows, the inverse of `to_lanes`.
 
     Args:
-        layout: of the sheet.
+        layout: layout of the sheet.
         entries: shape (entries, lanes).
         rows: number of rows to return.
 
@@ -105,8 +104,8 @@ class SheetArrays:
     """The arrays of a sheet in the memory of a device.
 
     Args:
-        layout: of the sheet.
-        stored: for every stored row of u the row of the sheet that it contains, or -1, shape (stored rows,).
+        layout: layout of the sheet.
+        stored: row of the sheet in each row of the array u, or -1 for other content, shape (rows of u,).
         start: initial values.
     """
 
@@ -165,7 +164,7 @@ class SheetArrays:
         self.fields.from_numpy(entries)
 
     def _set(self, array: Any, values: NDArray[Any]) -> None:
-        """Set the first rows of an array to values, shape (..., cols), and all others to 0."""
+        """Set the first rows of an array to values of shape (..., cols), and all other rows to 0."""
         write_vectors(array, to_lanes(self._layout, values))
 
     def rows(self, count: int) -> Any:
@@ -174,7 +173,7 @@ class SheetArrays:
 
 
 class StepKernel(Protocol):
-    """A sheet in the memory of a device, and its kernels."""
+    """A sheet in the memory of a device, with the kernels that step and read it."""
 
     arrays: SheetArrays
 
@@ -202,29 +201,29 @@ class StepKernel(Protocol):
 
 
 def point_forces(config: KernelConfig) -> list[Callable[..., Any]]:
-    """Build the functions that add the forces of all terms except springs."""
+    """Build the Taichi functions that add the forces of all terms except springs."""
     # The order of summation determines the last bits.
     ordered = sorted(config.terms, key=lambda term: -term.reach)
     return [force for term in ordered for force in term.build_forces(config)]
 
 
 def build_point_step(config: KernelConfig) -> Callable[..., None]:
-    """Build the function that adds the forces of all other terms to those of springs, and steps an entry.
+    """Build the Taichi function that adds the forces of all other terms to those of springs, and steps an entry.
 
     d_{n+1} = keep d_n + gain F_n,    u_{n+1} = u_n + d_{n+1}                                  (eq. 6 to 9)
     """
     forces = point_forces(config)
-    reducing = [reduce for term in config.terms for reduce in term.build_damping(config)]
+    damping = [reduce for term in config.terms for reduce in term.build_damping(config)]
 
     @ti.func
     def move(sheet: ti.template(), entry: ti.template(), target, force: ti.template(), now: ti.template()):
-        """Step an entry and store it in row `target` of u; force: of springs; now: row of the load table."""
+        """Step an entry with the force of its springs and a row of the load table; store it in row `target` of u."""
         for add in ti.static(forces):
             add(force, sheet, entry, now)
         gain = now[GAIN] * sheet.by_column[(MOBILITY + entry.row.kind) * sheet.width + entry.b]
         at = entry.row.i * sheet.width + entry.b
         d = [sheet.d[c][at] for c in ti.static(range(3))]
-        for reduce in ti.static(reducing):
+        for reduce in ti.static(damping):
             reduce(d, sheet)
         for c in ti.static(range(3)):
             d[c] += gain * force[c]
@@ -236,7 +235,7 @@ def build_point_step(config: KernelConfig) -> Callable[..., None]:
 
 
 def build_measure(config: KernelConfig) -> Callable[..., Any]:
-    """Build the function that adds the measures of an entry, its motion and those of terms, to a list of vectors."""
+    """Build the Taichi function that adds the measures of an entry, motion first, to a list of vectors."""
     vector = config.vector
     measuring_terms = [measure for term in config.terms for measure in term.build_measures(config)]
 
@@ -263,11 +262,12 @@ def build_read(config: KernelConfig, *, parallel: bool, iterations: int) -> Call
     Args:
         config: compile-time configuration.
         parallel: whether the rows are distributed over threads.
-        iterations: number of loop iterations per row, of which one has work.
+        iterations: number of loop iterations per row, of which only the first does work.
     """
     real, vector, vectors, lanes = config.real, config.vector, config.vectors, config.lanes
     count = config.first_constant(None)
-    measure, reductions = build_measure(config), ["sum", *(how for term in config.terms for how in term.reductions)]
+    measure = build_measure(config)
+    reductions = ["sum", *(reduction for term in config.terms for reduction in term.reductions)]
 
     @ti.kernel
     def read(
@@ -298,10 +298,10 @@ def build_read(config: KernelConfig, *, parallel: bool, iterations: int) -> Call
                         for lane in ti.static(range(lanes)):
                             if lane * strip + b <= cols:
                                 values[i, lane * strip + b - 1, c] = value[lane]
-                for m, how in ti.static(enumerate(reductions)):
-                    if ti.static(how == "min"):
+                for m, reduction in ti.static(enumerate(reductions)):
+                    if ti.static(reduction == "min"):
                         measures[i, m] = sums[m].min()
-                    elif ti.static(how == "max"):
+                    elif ti.static(reduction == "max"):
                         measures[i, m] = sums[m].max()
                     else:
                         measures[i, m] = sums[m].sum()

@@ -1,7 +1,7 @@
 """Parallel stepping on a CPU: one band of rows per worker, passes over the bands, and copies of rows at their borders.
 
 Passes. A step can follow the previous step at a distance of one row. A pass therefore takes `depth` steps while the
-rows are in the cache: round k takes row k from step n to n + 1, row k - 1 from n + 1 to n + 2, and so on.
+rows are in the cache: round k steps row k from n to n + 1, row k - 1 from n + 1 to n + 2, and so on.
 
 Bands. Neighbouring workers both move away from their common border or both toward it, so that they reach it at the
 same time. Each needs the neighbour's row at the border as it was before the step. After every step, a worker therefore
@@ -28,7 +28,7 @@ from taichi_msm.terms.base import DY, KernelConfig, KernelRow, KernelSheet
 from taichi_msm.terms.bending import BendingTerm
 from taichi_msm.terms.contact import ContactTerm
 
-# Integer arguments of a launch: steps taken before; steps to take; workers; steps of a pass; rows of `carried` per
+# Integer arguments of a launch: steps taken before it; steps to take; workers; steps of a pass; rows of `carried` per
 # worker; rows of the sheet; columns of a strip; the first row that is not fixed, and the row after the last; the first
 # row of moments in u; the number of checks after which a waiting worker ends.
 FIRST, COUNT, WORKERS, DEPTH, CARRIED_ROWS, ROWS, STRIP, FIRST_ROW, END_ROW, MOMENT_ROW, MAX_CHECKS, SIZES = range(12)
@@ -37,7 +37,7 @@ FIRST, COUNT, WORKERS, DEPTH, CARRIED_ROWS, ROWS, STRIP, FIRST_ROW, END_ROW, MOM
 BEGIN, END = 0, 1
 
 # Integers of a worker in the array `progress`: for each border, in a separate cache line, the number of steps taken at
-# the border; after the first of them the worker's pass, round, and step of the round.
+# the border. The first of these lines also contains the worker's pass, round, and step of the round.
 COUNTER_STRIDE = 16
 WORKER_STRIDE = 2 * COUNTER_STRIDE
 PASS_INDEX, ROUND, STEP, PLACE_END = 1, 2, 3, 4
@@ -53,14 +53,14 @@ class RowBand(NamedTuple):
     workers: Any  # number of workers
     low: Any  # first row of the band
     high: Any  # row after the last of the band
-    direction: Any  # 1 if the worker goes down, -1 if up
+    direction: Any  # 1 if the worker ready down, -1 if up
     rows: Any  # number of rows of the sheet
     max_checks: Any  # number of checks after which a waiting worker ends
     progress: Any  # array of all workers
 
 
 def build_join_strips(config: KernelConfig) -> Callable[..., None]:
-    """Build the function that fills the halo of a row."""
+    """Build the Taichi function that fills the halo of a row."""
     vector, lanes = config.vector, config.lanes
 
     @ti.func
@@ -78,7 +78,7 @@ def build_join_strips(config: KernelConfig) -> Callable[..., None]:
 def build_step_row(
     config: KernelConfig, move: Callable[..., None], *, touches: bool, parallel: bool
 ) -> Callable[..., Any]:
-    """Build the function that takes a step with a row of a band, as soon as the neighbours' rows are available.
+    """Build the Taichi function that steps a row of a band, as soon as the neighbours' rows are available.
 
     Args:
         config: compile-time configuration.
@@ -94,12 +94,12 @@ def build_step_row(
 
     @ti.func
     def copy_row(rows, worker, border, n, behind):
-        """Return the row of u with a worker's copy of the row `behind` rows from a border after n steps."""
+        """Return the index in u of a worker's copy of the row `behind` rows inside a border, after n steps."""
         return rows + copied * (4 * worker + 2 * border + ti.cast(n % 2, ti.i32)) + behind
 
     @ti.func
     def row_at(band: ti.template(), row, n):
-        """Return the row of u with a row of a band, or one beyond its ends, after n steps; any row if none exists."""
+        """Return the index in u of a row in or next to a band, after n steps; arbitrary beyond the sheet."""
         i = ti.select(band.direction > 0, band.low, band.high - 1) + row * band.direction
         stored = ti.max(0, ti.min(i, band.rows - 1))
         if ti.static(parallel):
@@ -121,7 +121,7 @@ def build_step_row(
 
     @ti.func
     def publish(sheet: ti.template(), band: ti.template(), border, i, inward, n):
-        """Copy row i, and with bending the next row inward, for the neighbour at a border, after n steps."""
+        """Copy row i, and with bending the next row inward, after n steps for the neighbour at a border."""
         for behind in ti.static(range(copied)):
             copy = copy_row(band.rows, band.worker, border, n, behind)
             for b in range(sheet.width):
@@ -131,7 +131,7 @@ def build_step_row(
 
     @ti.func
     def store_moments(sheet: ti.template(), band: ti.template(), row, moments, n):
-        """Store the moments of the next row; at the start of a band also those of row 0 and of the row before it."""
+        """Store the moments of the next row; at the start of a band also those of the rows -1 and 0."""
         begin = ti.select(band.direction > 0, band.low, band.high - 1)
         for ahead in range(ti.select(row < 0, -1, row + 1), row + 2):
             before, here = row_at(band, ahead - 1, n), row_at(band, ahead, n)
@@ -146,7 +146,7 @@ def build_step_row(
         sheet: ti.template(), carried: ti.template(), loads: ti.template(), band: ti.template(),
         row, n, at, carry, moments,
     ):  # fmt: skip
-        """Perform step n of the launch, after `at` steps of the run, on a row of the band; return its success.
+        """Perform step n of the launch, after `at` steps of the run, on a row of a band; return False after a timeout.
 
         Row -1 is the row before the band. Its forces are computed, but it is not stepped.
         """
@@ -157,17 +157,17 @@ def build_step_row(
         here = i
         next_row = i + band.direction
         exists = ti.cast(0 <= next_row < band.rows, config.real)
-        goes = True
+        ready = True
         if ti.static(parallel):
             if row == -1 and 0 <= begin_worker < band.workers:
-                goes = wait_for(band, begin_worker, BEGIN, at)
+                ready = wait_for(band, begin_worker, BEGIN, at)
                 here = copy_row(band.rows, begin_worker, BEGIN, at, 0)
             # With bending, the step depends on one more row.
-            if goes and row > last - copied and 0 <= end_worker < band.workers:
-                goes = wait_for(band, end_worker, END, at)
+            if ready and row > last - copied and 0 <= end_worker < band.workers:
+                ready = wait_for(band, end_worker, END, at)
             if row == last and 0 <= end_worker < band.workers:
                 next_row = copy_row(band.rows, end_worker, END, at, 0)
-        if goes:
+        if ready:
             if ti.static(len(storing) > 0):
                 store_moments(sheet, band, row, moments, at)
             next_row = ti.select(exists > 0, next_row, i)
@@ -193,7 +193,7 @@ def build_step_row(
                     publish(sheet, band, BEGIN, begin, band.direction, at + 1)
                 if row == last:
                     publish(sheet, band, END, i, -band.direction, at + 1)
-        return goes
+        return ready
 
     return step_row
 
@@ -213,7 +213,7 @@ def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None
     def step_band(
         sheet: ti.template(), carried: ti.template(), loads: ti.template(), band: ti.template(), sizes: ti.template()
     ):
-        """Perform the steps of a launch on a band, from the worker's recorded progress on, and record it at the end."""
+        """Perform the steps of a launch on a band, from the worker's recorded progress on, and record it again."""
         first, place = sizes[FIRST], WORKER_STRIDE * band.worker
         count, depth = ti.cast(sizes[COUNT], ti.i32), ti.cast(sizes[DEPTH], ti.i32)
         carried_rows = ti.cast(sizes[CARRIED_ROWS], ti.i32)
@@ -222,23 +222,23 @@ def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None
         k = ti.cast(band.progress[place + ROUND], ti.i32)
         step = ti.cast(band.progress[place + STEP], ti.i32)
         # A vector with a variable index makes the compiler align the stack, and with it all spilled vectors, which
-        # saves up to 7 % of a step. `goes` is always True here.
+        # saves up to 7 % of a step. `ready` is always True here.
         aligned = vector(0)
         aligned[band.workers % lanes] = 1
-        goes = aligned[count % lanes] >= 0
-        while goes and pass_index * depth < count:
+        ready = aligned[count % lanes] >= 0
+        while ready and pass_index * depth < count:
             steps = ti.min(depth, count - pass_index * depth)
-            while goes and k < band.high - band.low + steps - 1:
-                while goes and step < ti.min(steps, k + 2):
+            while ready and k < band.high - band.low + steps - 1:
+                while ready and step < ti.min(steps, k + 2):
                     n = pass_index * depth + step
                     carry = band.worker * carried_rows + step
-                    goes = step_row(sheet, carried, loads, band, k - step, n, first + n, carry, moments)
-                    if goes:
+                    ready = step_row(sheet, carried, loads, band, k - step, n, first + n, carry, moments)
+                    if ready:
                         step += 1
-                if goes:
+                if ready:
                     k += 1
                     step = ti.max(0, k - (band.high - band.low) + 1)
-            if goes:
+            if ready:
                 pass_index += 1
                 k = -1
                 step = 0

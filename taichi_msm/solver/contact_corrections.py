@@ -1,4 +1,4 @@
-"""Sums of the contact corrections over the mass points, from which the forces of tools follow."""
+"""Sums of the contact corrections over the mass points, which determine the forces of tools."""
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
@@ -18,8 +18,8 @@ def sum_corrections(layout: SheetLayout, arrays: SheetArrays, *, clear: bool) ->
     """Sum the contact corrections over the mass points, weighted with their shares of a cell's mass.
 
     Args:
-        layout: of the sheet.
-        arrays: of the sheet.
+        layout: layout of the sheet.
+        arrays: arrays of the sheet.
         clear: whether to set the fields of corrections to 0 afterwards.
 
     Returns:
@@ -38,11 +38,8 @@ def sum_corrections(layout: SheetLayout, arrays: SheetArrays, *, clear: bool) ->
 def _build_sum(config: KernelConfig) -> Callable[..., None]:
     """Build the kernel that sums the corrections in every row from left to right, per tool and component."""
     vector, vectors, lanes, serial = config.vector, config.vectors, config.lanes, config.lanes > 1
-    first, count, by_area = (
-        config.first_field(ContactTerm),
-        CORRECTIONS * config.require(ContactTerm).tools,
-        config.by_area,
-    )
+    first, count = config.first_field(ContactTerm), CORRECTIONS * config.require(ContactTerm).tools
+    by_area = config.by_area
 
     @ti.kernel
     def add_up(

@@ -19,7 +19,7 @@ from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import area_shares, axes, rest_positions, spacing
 from taichi_msm.model.surface import surface_point
 from taichi_msm.model.tool_force import probe_force
-from taichi_msm.solver.arrays import BYTES, InitialData, SheetLayout, StepKernel
+from taichi_msm.solver.arrays import NUMBER_BYTES, InitialData, SheetLayout, StepKernel
 from taichi_msm.solver.contact_corrections import sum_corrections
 from taichi_msm.solver.kernel_cpu import ScatterKernel
 from taichi_msm.solver.kernel_gpu import STEPS_PER_LAUNCH, GatherKernel
@@ -46,16 +46,15 @@ from taichi_msm.terms.springs import MAX_STRAIN, MIN_STRAIN, SpringTerm
 # With fewer mass points per worker, an additional worker costs more waiting time than it saves.
 POINTS_PER_WORKER = 450
 
-# Passes over bands that exceed this size take DEPTH steps each, so that the rows stay in the cache.
+# A pass over a larger band takes several steps, so that the rows stay in the cache.
 CACHE_BYTES = 3 << 17
-DEPTH = 8
 
-# Limits of a launch, because Ctrl-C is handled only between launches: steps times mass points, about 0.1 s of one core,
-# and steps.
+# Largest numbers of steps times mass points, about 0.1 s of one core, and of steps in a launch. Ctrl-C is handled only
+# between launches.
 POINT_STEPS_PER_LAUNCH = 40_000_000
 MAX_STEPS_PER_LAUNCH = 8192
 
-# Number of rows of a load table; NumPy hardly takes less time for the steps of a few frames.
+# Number of rows of a load table; fewer rows hardly take less time to compute.
 STEPS_PER_TABLE = 4096
 
 
@@ -89,8 +88,8 @@ def choose_layout(plan: Plan, device: Device, cores: int | None = None) -> Sheet
             "tolerance or an estimate of the error, or --arch cpu"
         )
     # Per mass point a pass reads displacement, last difference and carried force, with three components each.
-    fits = workers == 0 or rows // workers * cols * 9 * BYTES[precision] <= CACHE_BYTES
-    depth = 1 if fits or config.reach > 1 else DEPTH
+    fits = workers == 0 or rows // workers * cols * 9 * NUMBER_BYTES[precision] <= CACHE_BYTES
+    depth = 1 if fits or config.reach > 1 else 8
     return SheetLayout(rows, cols, workers, depth, fixed_rows, config)
 
 
@@ -134,7 +133,7 @@ class Dynamics:
         self.inconsistent = False
 
     def steer(self, plan: Plan) -> None:
-        """Continue with other probes that use the same kernels and the same steps.
+        """Continue with other probes, with the same kernels and the same steps.
 
         Args:
             plan: a plan that differs in its probes only.
@@ -148,8 +147,8 @@ class Dynamics:
             raise ArgumentError("probes: which of them have a path cannot change; restart with the new scene")
         if probes.moves != before.moves:
             raise ArgumentError(
-                f"probes: which control points move or jump cannot change (before: {_in_words(before.moves)}; now: "
-                f"{_in_words(probes.moves)}); restart with the new scene"
+                f"probes: which control points move or jump cannot change (before: {_format_flags(before.moves)}; now: "
+                f"{_format_flags(probes.moves)}); restart with the new scene"
             )
         if probes.by_area != before.by_area:
             raise ArgumentError("probes: one has total instead of force, or the reverse; restart with the new scene")
@@ -165,7 +164,7 @@ class Dynamics:
         self._tabulate(plan.grid.steps_per_frame)
 
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
-        """Advance the sheet by a number of steps; a call at a frame resets the sums of contact corrections.
+        """Advance the sheet by a number of steps. A call at a frame resets the sums of contact corrections.
 
         Args:
             steps: number of steps.
@@ -175,17 +174,17 @@ class Dynamics:
             MsmError: when the sheet is inconsistent.
         """
         points = self.layout.rows * self.layout.cols
-        most, depth = max(1, min(MAX_STEPS_PER_LAUNCH, POINT_STEPS_PER_LAUNCH // points)), self.layout.depth
+        max_steps, depth = max(1, min(MAX_STEPS_PER_LAUNCH, POINT_STEPS_PER_LAUNCH // points)), self.layout.depth
         # A launch takes whole passes; a single pass may exceed the limit up to four times.
-        most = most // depth * depth or min(depth, 4 * most)
+        max_steps = max_steps // depth * depth or min(depth, 4 * max_steps)
         if self.layout.workers == 0:
-            most = STEPS_PER_LAUNCH
+            max_steps = STEPS_PER_LAUNCH
         self._require_consistent()
         if steps and self.steps_done % self.plan.grid.steps_per_frame == 0:
             sum_corrections(self.layout, self._moving.arrays, clear=True)
         end = self.steps_done + steps
         while self.steps_done < end:
-            count = min(most, end - self.steps_done)
+            count = min(max_steps, end - self.steps_done)
             self.inconsistent = True
             self._moving.advance(count, self._next_loads(count))
             self.steps_done += count
@@ -204,32 +203,32 @@ class Dynamics:
         return self.read().displacement
 
     def state(self) -> State:
-        """Read the complete state on which the next steps depend."""
+        """Read the state on which the next steps depend."""
         self._require_consistent()
-        u, d = self._copy(differences=False)[0], self._copy(differences=True)[0]
-        return State(self.steps_done, u, d, self._contact())
+        u, d = self._read_arrays(differences=False)[0], self._read_arrays(differences=True)[0]
+        return State(self.steps_done, u, d, self._contact_fields())
 
     def read(self) -> Reading:
         """Read the displacements and measure the sheet, in the scene's precision."""
         self._require_consistent()
-        displacement, measures = self._copy(differences=False)
+        displacement, measures = self._read_arrays(differences=False)
         config, plan = self.layout.config, self.plan
         springs = measures[:, config.first_measure(SpringTerm) :]
         # The measures are (L^2 - L0^2) / L0^2.
         extremes = springs[:, MIN_STRAIN].min(), springs[:, MAX_STRAIN].max()
         shortest, longest = (math.sqrt(max(0.0, 1.0 + float(extreme))) for extreme in extremes)
         sums = measures.sum(axis=0, dtype=np.float64)
-        energy = self._of_motion(sums)
+        energy = self._kinetic_energy(sums)
         for term in config.terms:
             first = config.first_measure(type(term))
             energy += term.energy(sums[first : first + len(term.reductions)], plan)
         return Reading(self.steps_done, displacement, shortest, longest, energy / 2)
 
-    def _of_motion(self, sums: NDArray[Any]) -> float:
+    def _kinetic_energy(self, sums: NDArray[Any]) -> float:
         """Compute twice the kinetic energy [J] from the reduced measures."""
         return self.plan.material.mass * float(sums[SQUARED_MOTION]) / self.plan.grid.step**2
 
-    def _copy(self, *, differences: bool) -> tuple[NDArray[Any], NDArray[Any]]:
+    def _read_arrays(self, *, differences: bool) -> tuple[NDArray[Any], NDArray[Any]]:
         """Read displacements or last differences [m], shape (rows, cols, 3), and the measures of every row."""
         rows, cols, config = self.layout.rows, self.layout.cols, self.layout.config
         values, measures = (
@@ -242,8 +241,8 @@ class Dynamics:
     def tool_forces(self) -> NDArray[np.float64]:
         """Compute at a frame the mean force of each position-controlled tool since the previous frame.
 
-        It is the sum of m (1 + g h / 2) / h^2 times the contact corrections over mass points and steps, or of m / h^2
-        times the corrections with backward differences, divided by the number of steps; m is the mass of a mass point.
+        It is the sum over mass points, and the mean over steps, of m (1 + g h / 2) / h^2 times the contact correction,
+        or of m / h^2 times the correction with backward differences of the damping; m is the mass of a mass point.
 
         Returns:
             Forces on the sheet [N], shape (tools, 3).
@@ -252,7 +251,7 @@ class Dynamics:
         sums = sum_corrections(self.layout, self._moving.arrays, clear=False)
         return sums / (gain * self.plan.grid.steps_per_frame)
 
-    def _contact(self) -> NDArray[Any]:
+    def _contact_fields(self) -> NDArray[Any]:
         """Read the fields of contact, shape (fields, rows, cols)."""
         config = self.layout.config
         contact = config.get(ContactTerm)
@@ -295,7 +294,7 @@ class Dynamics:
         return table
 
     def _columns(self, loads: Schedule, first: int) -> NDArray[Any]:
-        """Compute the load table from step `first` on without the gain, shape (steps, columns)."""
+        """Compute the load table from step `first` on, with a gain of 0, shape (steps, columns)."""
         config = self.layout.config
         table = np.zeros((len(loads.active), config.first_column(None)))
         for term in config.terms:
@@ -309,7 +308,7 @@ class Dynamics:
         """Allocate and fill the arrays of the sheet."""
         layout, plan, sheet = self.layout, self.plan, self.plan.scene.sheet
         moves, column, areas = ~plan.fixed, np.arange(layout.cols), area_shares(sheet)
-        # The three kinds of rows: first, middle, last.
+        # One row of each kind: first, middle, last.
         kinds = [0, layout.rows // 2, -1]
         shares = areas[kinds] if layout.config.by_area else np.ones((3, layout.cols))
         by_column = np.empty((COLUMN_ROWS, layout.cols))
@@ -329,16 +328,16 @@ class Dynamics:
             first = layout.config.first_field(ContactTerm)
             fields[first : first + len(state.contact)] = state.contact
         stiffness = layout.config.require(SpringTerm).stiffness_array(plan)
-        self._sheet = None  # Frees its memory before another sheet takes some.
-        self._sheet = self._started(InitialData(np.array(constants), by_column, fields, stiffness, state))
+        self._sheet = None  # Frees its memory before the new sheet is allocated.
+        self._sheet = self._build_kernel(InitialData(np.array(constants), by_column, fields, stiffness, state))
 
-    def _started(self, start: InitialData) -> StepKernel:
-        """Allocate the kernel for the device."""
+    def _build_kernel(self, start: InitialData) -> StepKernel:
+        """Build the kernel for the device."""
         kind: type[StepKernel] = ScatterKernel if self.layout.workers else GatherKernel
         return kind(self.layout, start)
 
 
-def _in_words(moves: tuple[bool, ...]) -> str:
+def _format_flags(moves: tuple[bool, ...]) -> str:
     return ", ".join("yes" if slot_moves else "no" for slot_moves in moves) or "none"
 
 
@@ -349,7 +348,7 @@ class ForceRecorder:
     """Computes the forces of all probes on the sheet at the frames of a run, and their maxima.
 
     The force of a force-controlled probe at a frame is (percent(t) / 100) force times the sum of its decay factors over
-    the mass points that are not fixed. That of a position-controlled tool is `Dynamics.tool_forces`.
+    the mass points that are not fixed. `Dynamics.tool_forces` computes the force of a position-controlled tool.
 
     Args:
         plan: the plan.
@@ -374,7 +373,7 @@ class ForceRecorder:
         Args:
             before: forces at the previous frame.
             frame: number of the frame.
-            position: of the mass points [m], shape (rows, cols, 3).
+            position: positions of the mass points [m], shape (rows, cols, 3).
             tools: forces of the position-controlled tools [N], shape (tools, 3).
         """
         forces, time = self._forces(frame, position, tools), frame / self._plan.grid.frames_per_second
@@ -390,14 +389,14 @@ class ForceRecorder:
                 forces.append(TipForce(index, tool.lowest_point(frame / rate), (x, y, z)))
                 continue
             percent, at = self._loads[index].at(frame, rate)
-            share = percent / 100 * self._decays(index, at) if percent else 0.0
+            share = percent / 100 * self._decay_sum(index, at) if percent else 0.0
             x, y, z = probe_force(probe, sheet).force
             tip, _ = surface_point(position, plan.scene.render.refine, sheet, at)
             # Adding 0 turns -0 into 0.
             forces.append(TipForce(index, tuple(tip.tolist()), (share * x + 0.0, share * y + 0.0, share * z + 0.0)))
         return tuple(forces)
 
-    def _decays(self, index: int, at: Array) -> float:
+    def _decay_sum(self, index: int, at: Array) -> float:
         """Sum the decay factors of a probe over the mass points that are not fixed."""
         probe, sheet = self._plan.scene.probes[index], self._plan.scene.sheet
         if self._loads[index].moves:

@@ -1,7 +1,7 @@
 """Kernel 1 on a CPU: passes over the rows that evaluate every spring once and step the rows in place.
 
-A launch takes several steps with one worker or with several (`bands`). If a worker ends before its neighbour arrives,
-further launches continue until all workers have taken the same steps. A single worker then steps for a back-off period.
+A launch takes several steps with one worker or with several (`bands`). After the timeout of a worker, further launches
+continue until all workers have taken the same steps. A single worker then steps for a back-off period.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.solver.arrays import BYTES, InitialData, SheetArrays, SheetLayout, build_read
+from taichi_msm.solver.arrays import NUMBER_BYTES, InitialData, SheetArrays, SheetLayout, build_read
 from taichi_msm.solver.bands import (
     COUNTER_STRIDE,
     MOMENT_ROWS,
@@ -31,15 +31,15 @@ from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, compilation_options
 from taichi_msm.terms.base import KernelConfig
 from taichi_msm.terms.bending import BendingTerm
 
-# Bytes of a memory page.
+# Size of a memory page [bytes].
 PAGE = 4096
 
-# Number of checks after which a worker stops waiting for its neighbour, after about 1.3 ms.
+# Number of checks, in about 1.3 ms, after which a worker stops waiting for its neighbour.
 MAX_CHECKS = round(1.32e-3 / active_compiler().poll_s)
 
 # Back-off period in which a single worker steps after a timeout [s]. If other programs compete for the cores, it is
-# four times the last period, halved for every BACKOFF_HALF_LIFE_S in which all workers have stepped since; otherwise it
-# is the minimum.
+# four times the last period, halved for every BACKOFF_HALF_LIFE_S of parallel steps since then; otherwise it is the
+# minimum.
 MIN_BACKOFF_S, MAX_BACKOFF_S, BACKOFF_HALF_LIFE_S = 0.002, 0.2, 0.02
 
 # Other programs compete for the cores if threads have waited for a core for more than this share of their CPU time.
@@ -47,21 +47,16 @@ MAX_WAIT_SHARE = 0.2
 
 
 class ScatterKernel:
-    """A sheet in the memory of a CPU: a `StepKernel`.
-
-    Args:
-        layout: of the sheet.
-        start: initial values.
-    """
+    """A `StepKernel` in the memory of a CPU."""
 
     def __init__(self, layout: SheetLayout, start: InitialData) -> None:
         self._layout = layout
-        self._advance, self._read = _kernels(layout.config, parallel=layout.workers > 1)
-        self._alone, _ = _kernels(layout.config, parallel=False)
+        self._parallel_kernel, self._read = _kernels(layout.config, parallel=layout.workers > 1)
+        self._serial_kernel, _ = _kernels(layout.config, parallel=False)
         self._steps = 0
         self._backoff = self._backoff_until = 0.0
-        # Time in which all workers have stepped without a timeout since the last back-off [s].
-        self._together = 0.0
+        # Duration of parallel steps since the last back-off [s].
+        self._parallel_s = 0.0
         # CPU time of this process, and time waited for a core, at the end of the last back-off [s].
         self._cpu_time, self._wait_time = 0.0, 0.0
         self._first_row, self._end_row = int(layout.fixed_rows[0]), layout.rows - int(layout.fixed_rows[1])
@@ -71,19 +66,14 @@ class ScatterKernel:
         sheet_rows = np.arange(layout.rows, dtype=np.int32), self._borders, np.full(moments, -1, np.int32)
         self.arrays = SheetArrays(layout, np.concatenate(sheet_rows), start)
         # Rows of `carried` per worker: one per step of a pass, and one page, which no prefetcher crosses.
-        row_bytes = layout.width * layout.config.lanes * BYTES[layout.config.precision]
+        row_bytes = layout.width * layout.config.lanes * NUMBER_BYTES[layout.config.precision]
         self._carried_rows = layout.depth - (-PAGE // row_bytes)
         # Forces carried to the next row, per worker and step of a pass.
         self._carried = [self.arrays.rows(layout.workers * self._carried_rows) for _ in range(3)]
         self._progress = np.zeros(layout.workers * WORKER_STRIDE, np.int64)
 
     def advance(self, count: int, table: NDArray[Any]) -> None:
-        """Advance the sheet by a number of steps.
-
-        Args:
-            count: number of steps.
-            table: rows of the load table, shape (count, columns).
-        """
+        """Advance the sheet by a number of steps, see `StepKernel.advance`."""
         if self._layout.workers == 1:
             self._advance_alone(0, count, table)
             return
@@ -102,20 +92,14 @@ class ScatterKernel:
             self._copy_borders()
 
     def read(self, differences: bool, values: NDArray[Any], measures: NDArray[Any]) -> None:
-        """Read displacements or last differences, and measure every row.
-
-        Args:
-            differences: whether to read last differences instead of displacements.
-            values: output [m], shape (rows, cols, 3).
-            measures: output, shape (rows, measures).
-        """
+        """Read displacements or last differences, and measure every row, see `StepKernel.read`."""
         with compilation_options():
             self._read(0, self._layout.rows, self._layout.cols, differences, values, measures, *self.arrays.all)
 
     def _advance_alone(self, first: int, end: int, table: NDArray[Any]) -> None:
         """Advance with a single worker from step `first` to step `end`."""
         self._start_pass()
-        self._launch(self._alone, 1, end - first, table[first:])
+        self._launch(self._serial_kernel, 1, end - first, table[first:])
 
     def _advance_in_backoff(self, first: int, end: int, table: NDArray[Any]) -> int:
         """Advance with a single worker until the back-off ends; return the number of the next step."""
@@ -131,22 +115,22 @@ class ScatterKernel:
     def _advance_together(self, first: int, end: int, table: NDArray[Any]) -> int:
         """Advance with all workers; return the number of the next step, below `end` after a timeout."""
         if self._backoff_until:
-            # The back-off itself is excluded, because a single worker rarely waits for a core.
+            # The measurement excludes the back-off, because a single worker rarely waits for a core.
             self._cpu_time, self._wait_time = time.process_time(), process.core_wait_s() or 0.0
             self._backoff_until = 0.0
         start = time.perf_counter()
         count, timed_out = self._launch_together(first, end, table)
         now = time.perf_counter()
         if timed_out:
-            backoff = 4 * self._backoff * 0.5 ** (self._together / BACKOFF_HALF_LIFE_S) if self._is_crowded() else 0.0
+            backoff = 4 * self._backoff * 0.5 ** (self._parallel_s / BACKOFF_HALF_LIFE_S) if self._is_crowded() else 0.0
             self._backoff = min(max(backoff, MIN_BACKOFF_S), MAX_BACKOFF_S)
-            self._together, self._backoff_until = 0.0, now + self._backoff
+            self._parallel_s, self._backoff_until = 0.0, now + self._backoff
         else:
-            self._together += now - start
+            self._parallel_s += now - start
         return first + count
 
     def _is_crowded(self) -> bool:
-        """Return whether other programs compete for the cores since the last back-off; True if unknown."""
+        """Return whether other programs have competed for the cores since the last back-off; True if unknown."""
         cpu_time, wait_time = time.process_time(), process.core_wait_s()
         return wait_time is None or wait_time - self._wait_time > MAX_WAIT_SHARE * (cpu_time - self._cpu_time)
 
@@ -154,15 +138,15 @@ class ScatterKernel:
         """Launch all workers; return the number of steps taken, and whether a worker timed out."""
         workers, depth, count, steps_before = self._layout.workers, self._layout.depth, end - first, self._steps
         self._start_pass()
-        self._launch(self._advance, workers, count, table[first:])
+        self._launch(self._parallel_kernel, workers, count, table[first:])
         passes, rounds = self._progress[PASS_INDEX::WORKER_STRIDE], self._progress[ROUND::WORKER_STRIDE]
         timed_out = not (passes * depth >= count).all()
         if timed_out:
-            # All continue to the end of the pass of the foremost worker.
+            # All workers continue to the end of the pass that the foremost worker has begun.
             count = min(count, int((passes + (rounds >= 0)).max()) * depth)
             while not (passes * depth >= count).all():
                 self._steps = steps_before
-                self._launch(self._advance, workers, count, table[first:])
+                self._launch(self._parallel_kernel, workers, count, table[first:])
             self._steps = steps_before + count
         return count, timed_out
 
@@ -189,7 +173,7 @@ class ScatterKernel:
         self._steps += count
 
     def _border_rows(self) -> NDArray[np.int32]:
-        """Return the row of the sheet of every copy at a border of a band."""
+        """Return the row of the sheet that each copy at a border of a band contains."""
         rows: list[int] = []
         first, end, workers = self._first_row, self._end_row, self._layout.workers
         for worker in range(workers):

@@ -1,7 +1,7 @@
 """Kernel 1 on a GPU: one thread per mass point gathers the forces of its eight springs; one loop per step.
 
-Vectors have one lane, rows have one entry per column, and the sheet has a halo. Two buffers contain u_n and u_{n+1},
-alternately; with bending, a third buffer contains the moments.
+Vectors have one lane, rows have one entry per column, and the sheet has a halo. Two buffers alternately contain u_n and
+u_{n+1}; with bending, a third buffer contains the moments.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -20,17 +20,12 @@ from taichi_msm.terms.bending import BendingTerm
 from taichi_msm.terms.contact import ContactTerm
 from taichi_msm.terms.springs import SpringTerm
 
-# A launch is a sequence of this many kernels, one per step.
+# Number of loops of a launch, one per step.
 STEPS_PER_LAUNCH = 8
 
 
 class GatherKernel:
-    """A sheet in the memory of a GPU: a `StepKernel`.
-
-    Args:
-        layout: of the sheet.
-        start: initial values.
-    """
+    """A `StepKernel` in the memory of a GPU."""
 
     def __init__(self, layout: SheetLayout, start: InitialData) -> None:
         self._layout = layout
@@ -42,12 +37,7 @@ class GatherKernel:
         self.arrays = SheetArrays(layout, np.concatenate([buffer, buffer, moments]), start)
 
     def advance(self, count: int, table: NDArray[Any]) -> None:
-        """Advance the sheet by a number of steps.
-
-        Args:
-            count: number of steps, at most STEPS_PER_LAUNCH.
-            table: rows of the load table, shape (count, columns).
-        """
+        """Advance the sheet by at most STEPS_PER_LAUNCH steps, see `StepKernel.advance`."""
         with compilation_options():
             self._advance(self._now, count, self._layout.rows, self._layout.cols, table, *self.arrays.all)
         self._now = (self._now + count) % 2
@@ -57,13 +47,7 @@ class GatherKernel:
         self.advance(0, table)
 
     def read(self, differences: bool, values: NDArray[Any], measures: NDArray[Any]) -> None:
-        """Read displacements or last differences, and measure every row.
-
-        Args:
-            differences: whether to read last differences instead of displacements.
-            values: output [m], shape (rows, cols, 3).
-            measures: output, shape (rows, measures).
-        """
+        """Read displacements or last differences, and measure every row, see `StepKernel.read`."""
         first, layout = self._now * (self._layout.rows + 2) + 1, self._layout
         with compilation_options():
             self._read(first, layout.rows, layout.cols, differences, values, measures, *self.arrays.all)
@@ -76,7 +60,7 @@ def _kernels(config: KernelConfig) -> tuple[Callable[..., None], Callable[..., N
 
 
 def _build_step(config: KernelConfig) -> Callable[..., None]:
-    """Build the function that steps a mass point."""
+    """Build the Taichi function that steps a mass point."""
     real, vector, columns, springs = config.real, config.vector, config.first_column(None), config.require(SpringTerm)
     structural, shear = springs.structural, springs.shear
     masks_edges = springs.open_edges and not springs.mapped
@@ -86,7 +70,7 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
 
     @ti.func
     def by_row(sheet: ti.template(), p, q, lower, b, row_exists, up):
-        """Return the force of entry b of row p on row q, which is `up` above, summed in the order of the CPU kernel."""
+        """Return the force of entry b of row p on row q, `up` [m] above, summed in the order of the CPU kernel."""
         u, dx = [sheet.u[c][p * sheet.width + b] for c in ti.static(range(3))], sheet.constants[DX]
         force = [vector(0) for _ in ti.static(range(3))]
         for right in ti.static((-1, 0, 1)):
@@ -115,7 +99,7 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
 
     @ti.func
     def step(sheet: ti.template(), loads: ti.template(), now, i, b, n):
-        """Step mass point (i, b - 1); now: index of the buffer of u_n; n: row of the load table."""
+        """Step mass point (i, b - 1) from buffer `now`, with row n of the load table."""
         rows, width = sheet.rows, sheet.width
         p = now * (rows + 2) + i + 1
         kind = ti.select(i == rows - 1, 2, ti.select(i == 0, 0, 1))

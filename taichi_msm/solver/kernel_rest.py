@@ -10,12 +10,12 @@ the velocities v toward the forces, and resets them if the power F v is not posi
 The norms are taken over all mass points and weighted with M. M bounds the stiffness at each mass point, so no angular
 frequency exceeds 1, and the largest step dt = 1 is stable. The kernel stores the momentum q = M v.
 
-Contact forces of position-controlled tools are removed from the forces, and mass points that have moved are projected
-out of the tools (`terms.contact_rest`). A mass point that presses on a tool also moves by F / M into the tool before
-the projection, so that it stays in contact.
+Contact forces of position-controlled tools are removed from the forces, and mass points are projected out of the tools
+(`terms.contact_rest`). Before the projection a mass point that presses on a tool moves by F / M into it, so that it
+stays in contact.
 
 An evaluation of the forces passes over the rows like a step; a second loop moves the mass points. Sums over mass points
-are accumulated along columns first and then over the columns in their order, so their bits do not depend on lanes.
+run down the columns first and then over the columns in their order, so their bits do not depend on the lanes.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -75,14 +75,14 @@ class Relaxation:
     """A sheet in the memory of a CPU, and the kernels that find its equilibrium.
 
     Args:
-        layout: of the sheet.
+        layout: layout of the sheet.
         start: initial values.
         masses: M of every mass point [N/m], shape (rows, cols).
     """
 
     def __init__(self, layout: SheetLayout, start: InitialData, masses: NDArray[Any]) -> None:
         self._layout = layout
-        self._relax, self._compare, self._read = _kernels(layout.config)
+        self._relax, self._scale_kernel, self._read = _kernels(layout.config)
         moments = 0 if layout.config.get(BendingTerm) is None else MOMENT_ROWS
         # The sheet's rows, moments, and the forces carried to the next row.
         self._stored = np.concatenate([np.arange(layout.rows, dtype=np.int32), np.full(moments + 1, -1, np.int32)])
@@ -108,7 +108,7 @@ class Relaxation:
             write_vectors(self.arrays.u[c], to_lanes(self._layout, np.where(held, displacement[self._stored, :, c], 0)))
 
     def relax(self, count: int, tolerance: float, row: NDArray[Any]) -> tuple[int, float]:
-        """Evaluate the forces repeatedly and move the mass points after each evaluation, until all forces are small.
+        """Evaluate the forces and move the mass points, repeatedly, until all forces are small.
 
         Args:
             count: largest number of evaluations.
@@ -126,10 +126,10 @@ class Relaxation:
         return int(fire[EVALUATIONS]), largest
 
     def scale(self, row: NDArray[Any]) -> float:
-        """Return the largest force of a spring, a load or the foundation on a mass point [N]."""
+        """Return the largest force of a spring, a load or the foundation on a mass point [N], the unit of residuals."""
         largest = np.zeros(1)
         with compilation_options():
-            self._compare(self._layout.rows, self._layout.width, largest, row, *self.arrays.all)
+            self._scale_kernel(self._layout.rows, self._layout.width, largest, row, *self.arrays.all)
         return float(np.sqrt(largest[0]))
 
     def read(self, differences: bool, values: NDArray[Any], measures: NDArray[Any]) -> None:
@@ -147,11 +147,11 @@ class Relaxation:
 @cache
 def _kernels(config: KernelConfig) -> tuple[Callable[..., None], Callable[..., None], Callable[..., None]]:
     """Build the kernels of a configuration, which are compiled at their first launch."""
-    return _build_relax(config), _build_compare(config), build_read(config, parallel=False, iterations=1)
+    return _build_relax(config), _build_scale(config), build_read(config, parallel=False, iterations=1)
 
 
 def _build_store(config: KernelConfig) -> Callable[..., None]:
-    """Build the function that stores the force on an entry and adds to the reductions of FIRE."""
+    """Build the Taichi function that stores the force on an entry and adds to the reductions of FIRE."""
     vector, forces, contact = config.vector, point_forces(config), config.get(ContactTerm)
     removals = [build_remove_contact(config, contact)] if contact else []
 
@@ -212,27 +212,27 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
 
     @ti.func
     def move_points(sheet: ti.template(), row: ti.template(), band: ti.template(), keep, gain, dt, back):
-        """Update q = keep q + gain F, and move the mass points by dt q / M minus `back` times the old q / M."""
+        """Update q = keep q + gain F, and move the mass points by (dt q - back q_before) / M."""
         for i in range(band.low, band.high):
             for b in range(1, sheet.width - 1):
                 at = i * sheet.width + b
-                every = [sheet.d[c][at] for c in ti.static(range(3))]
-                force = [every[c] for c in ti.static(range(3))]
+                full_force = [sheet.d[c][at] for c in ti.static(range(3))]
+                force = [full_force[c] for c in ti.static(range(3))]
                 for remove_contact in ti.static(removals):
                     remove_contact(force, sheet, at)
                 for c in ti.static(range(3)):
-                    before = sheet.q[c][at]
-                    q = keep * before + gain * force[c]
+                    old_q = sheet.q[c][at]
+                    q = keep * old_q + gain * force[c]
                     sheet.q[c][at] = q
-                    moved = dt * q - back * before
+                    shift = dt * q - back * old_q
                     if ti.static(len(removals) > 0):
-                        moved += every[c] - force[c]
-                    sheet.u[c][at] = sheet.u[c][at] + moved * sheet.work[at]
+                        shift += full_force[c] - force[c]
+                    sheet.u[c][at] = sheet.u[c][at] + shift * sheet.work[at]
             settle_row(sheet, row, i)
 
     @ti.func
     def settle_row(sheet: ti.template(), row: ti.template(), i):
-        """Project a row that has moved out of the tools, and fill its halo."""
+        """Project the mass points of row i out of the tools, and fill its halo."""
         kind = ti.select(i == sheet.rows - 1, 2, ti.select(i == 0, 0, 1))
         if ti.static(len(projections) > 0):
             now = [row[0, c] for c in ti.static(range(columns))]
@@ -296,24 +296,25 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
                     gain = dt
                     if power > 0:
                         # |q + dt F| / |F|, with norms weighted with 1 / M.
-                        turned = ti.sqrt((motion + 2 * dt * power + dt * dt * force_sum) / force_sum)
-                        gain = keep * dt + fire[SHARE] * turned
+                        norm_ratio = ti.sqrt((motion + 2 * dt * power + dt * dt * force_sum) / force_sum)
+                        gain = keep * dt + fire[SHARE] * norm_ratio
                     move_points(sheet, row, band, keep, gain, dt, back)
             fire[EVALUATIONS] = evaluations
 
     return relax
 
 
-def _build_compare(config: KernelConfig) -> Callable[..., None]:
-    """Build the kernel that computes the squared largest force of a spring, a load or the foundation."""
+def _build_scale(config: KernelConfig) -> Callable[..., None]:
+    """Build the kernel that squares the largest force of a spring, a load or the foundation on a mass point."""
     real, vector, vectors, columns = config.real, config.vector, config.vectors, config.first_column(None)
-    constant_count, pull = config.first_constant(None), config.require(SpringTerm).build_max_spring_force(config)
+    constant_count = config.first_constant(None)
+    max_spring_force = config.require(SpringTerm).build_max_spring_force(config)
     forces = [
         force for term in config.terms if not isinstance(term, BendingTerm) for force in term.build_forces(config)
     ]
 
     @ti.kernel
-    def compare(
+    def compute_scale(
         rows: ti.i32,
         width: ti.i32,
         result: ti.types.ndarray(dtype=real, ndim=1),
@@ -336,7 +337,7 @@ def _build_compare(config: KernelConfig) -> Callable[..., None]:
                 for b in range(1, width - 1):
                     here = [u[c][i * width + b] for c in ti.static(range(3))]
                     entry = ti.static(Entry(line, b, here))
-                    largest = ti.max(largest, pull(sheet, entry))
+                    largest = ti.max(largest, max_spring_force(sheet, entry))
                     moves = sheet.by_column[(MOBILITY + kind) * width + b] > 0
                     for add in ti.static(forces):
                         force = [vector(0) for _ in ti.static(range(3))]
@@ -345,4 +346,4 @@ def _build_compare(config: KernelConfig) -> Callable[..., None]:
                         largest = ti.max(largest, ti.select(moves, square, vector(0)))
             result[0] = largest.max()
 
-    return compare
+    return compute_scale

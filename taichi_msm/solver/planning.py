@@ -40,7 +40,7 @@ from taichi_msm.scene.tools import Probe
 from taichi_msm.terms import derive_material, highest_frequency
 
 # Work of starting Python and Taichi and compiling the kernels.
-START = 4e8
+START_WORK = 4e8
 
 # Work of a step of a mass point in f64.
 F64_WORK = 2.0
@@ -49,16 +49,22 @@ F64_WORK = 2.0
 MOVING_LOAD_WORK, BENDING_WORK, CONTACT_WORK = 1.2, 1.0, 0.5
 
 # Work of encoding a pixel, and of drawing a sample of a pixel.
-ENCODING, SAMPLE = 40.0, 6.0
+ENCODING_WORK, SAMPLE_WORK = 40.0, 6.0
 
-# Evaluations of the forces for a quasi-static frame, divided by the number of rows plus columns.
+# Number of evaluations of the forces for a quasi-static frame, per row and column.
 EVALUATIONS_PER_LINE = 2.0
 
-# `auto` chooses f64 if stepping takes at most this share of the work of everything else.
+# `precision: auto` chooses f64 if stepping takes at most this share of the work of everything else.
 MAX_F64_SHARE = 0.25
 
 # Largest share of companion runs in the work of a run, unless the user requests them.
 MAX_COMPANION_SHARE = 2 / 5
+
+# Range of lengths whose squares, and products of squares, f32 can represent [m].
+MIN_F32_LENGTH_M, MAX_F32_LENGTH_M = 1e-15, 1e17
+
+# Prevents n + 1 steps due to rounding in a frame of exactly n stable steps.
+ROUNDING_MARGIN = 1 - 1e-12
 
 
 class Work(NamedTuple):
@@ -75,16 +81,16 @@ def count_work(plan: Plan, companions: float) -> Work:
 
     Args:
         plan: the plan.
-        companions: f64 steps of companion runs per step of the run, in steps of the whole sheet.
+        companions: work of the companion runs [f64 steps of the whole sheet per step of the run].
     """
-    steps = _steps(plan)
+    steps = _stepping_work(plan)
     stepping = F64_WORK * steps if plan.grid.precision == "f64" else steps
-    return Work(START, stepping, F64_WORK * companions * steps, _other(plan.scene) - START)
+    return Work(START_WORK, stepping, F64_WORK * companions * steps, _other_work(plan.scene) - START_WORK)
 
 
 def is_f64_cheap(plan: Plan) -> bool:
     """Return whether stepping in f64 is a small part of the work of a run."""
-    return F64_WORK * _steps(plan) <= MAX_F64_SHARE * _other(plan.scene)
+    return F64_WORK * _stepping_work(plan) <= MAX_F64_SHARE * _other_work(plan.scene)
 
 
 def affords_companions(plan: Plan, companions: float) -> bool:
@@ -92,13 +98,13 @@ def affords_companions(plan: Plan, companions: float) -> bool:
 
     Args:
         plan: the plan.
-        companions: f64 steps of companion runs per step of the run, in steps of the whole sheet.
+        companions: work of the companion runs [f64 steps of the whole sheet per step of the run].
     """
     work = count_work(plan, companions)
     return work.companions <= MAX_COMPANION_SHARE * sum(work)
 
 
-def _steps(plan: Plan) -> float:
+def _stepping_work(plan: Plan) -> float:
     """Estimate the work of stepping in f32, or of the equilibrium of every frame."""
     moving, points = sum(slot.moves for slot in plan.slots), plan.scene.sheet.points
     cost = 1 + MOVING_LOAD_WORK * moving + BENDING_WORK * (plan.material.bending > 0) + CONTACT_WORK * len(plan.tools)
@@ -109,17 +115,10 @@ def _steps(plan: Plan) -> float:
     return cost * steps * math.prod(points)
 
 
-def _other(scene: Scene) -> float:
+def _other_work(scene: Scene) -> float:
     """Estimate the work of everything except stepping."""
     pixels = (scene.time.frames + 1) * math.prod(scene.render.size) * len(scene.render.all_cameras) * scene.renders
-    return START + pixels * (ENCODING + SAMPLE * scene.render.supersample**2)
-
-
-# Range of lengths whose squares and their products f32 can represent [m].
-MIN_F32_LENGTH, MAX_F32_LENGTH = 1e-15, 1e17
-
-# Prevents n + 1 steps due to rounding in a frame of exactly n stable steps.
-ROUNDING_MARGIN = 1 - 1e-12
+    return START_WORK + pixels * (ENCODING_WORK + SAMPLE_WORK * scene.render.supersample**2)
 
 
 def make_plan(scene: Scene, maps: Maps | None = None) -> Plan:
@@ -167,7 +166,7 @@ def plan_variant(plan: Plan, scene: Scene) -> Plan:
 
     Args:
         plan: the plan of a valid scene with the same maps.
-        scene: the modified scene, which must be valid.
+        scene: the modified scene, also valid.
     """
     return _plan(scene, plan.maps, fixed_points(scene.sheet), derive_material(scene, plan.maps))
 
@@ -224,7 +223,7 @@ def stable_step(material: Material, sheet: Sheet, difference: str) -> float:
         difference: "central" or "backward".
 
     Returns:
-        The step [s]; infinite for a sheet without stiffness and damping.
+        The step [s]; infinite without stiffness and damping.
     """
     w = highest_frequency(material, sheet)
     g = material.drag if difference == "backward" else 0.0
@@ -233,7 +232,7 @@ def stable_step(material: Material, sheet: Sheet, difference: str) -> float:
 
 
 def stable_steps(plan: Plan) -> int:
-    """Return the fewest stable steps per frame."""
+    """Return the smallest stable number of steps per frame."""
     return max(1, math.ceil(1 / plan.grid.frames_per_second / plan.stable_step * ROUNDING_MARGIN))
 
 
@@ -259,12 +258,7 @@ def steps_per_frame(time: Time, limit: float) -> int:
 
 
 def with_time(scene: Scene, **changes: Any) -> Scene:
-    """Return a copy of a scene with other time keys.
-
-    Args:
-        scene: the scene.
-        changes: keys of `time` and their values.
-    """
+    """Return a copy of a scene with other values of keys of `time`."""
     return scene.model_copy(update={"time": scene.time.model_copy(update=changes)})
 
 
@@ -280,7 +274,7 @@ def freeze_grid(plan: Plan) -> Plan:
 
 
 def _step_problems(plan: Plan) -> Iterator[Problem]:
-    """Check for a given step that is unstable or does not divide a frame, and for values outside the range of f32."""
+    """Check that a given step is stable and divides a frame, and that lengths and gain are in the range of f32."""
     if plan.scene.time.at_rest:
         return
     given, limit, frame = plan.scene.time.step, plan.stable_step, 1 / plan.grid.frames_per_second
@@ -296,14 +290,14 @@ def _step_problems(plan: Plan) -> Iterator[Problem]:
     if plan.grid.precision == "f64":
         return
     cells, size, step, mass = spacing(plan.scene.sheet), plan.scene.sheet.size, plan.grid.step, plan.material.mass
-    if min(cells) < MIN_F32_LENGTH or max(size) > MAX_F32_LENGTH:
+    if min(cells) < MIN_F32_LENGTH_M or max(size) > MAX_F32_LENGTH_M:
         yield Problem(
             ("sheet", "size"),
             f"cells of {min(cells):g} m in a sheet of {max(size):g} m leave the range of f32, "
-            f"{MIN_F32_LENGTH:g} to {MAX_F32_LENGTH:g} m; take time.precision: f64",
+            f"{MIN_F32_LENGTH_M:g} to {MAX_F32_LENGTH_M:g} m; take time.precision: f64",
         )
     gain = step**2 / mass
-    if not MIN_F32_LENGTH**2 < gain < MAX_F32_LENGTH**2:
+    if not MIN_F32_LENGTH_M**2 < gain < MAX_F32_LENGTH_M**2:
         yield Problem(
             ("time", "precision"),
             f"f32 cannot hold the {gain:g} m by which a step of {step:g} s moves a mass of "
@@ -311,7 +305,7 @@ def _step_problems(plan: Plan) -> Iterator[Problem]:
         )
 
 
-Key = tuple[float, float, float, float]
+Keyframe = tuple[float, float, float, float]
 
 
 def steer_plan(plan: Plan, probes: Sequence[Probe | Mapping[str, Any] | None], now: float) -> Plan:
@@ -331,7 +325,7 @@ def steer_plan(plan: Plan, probes: Sequence[Probe | Mapping[str, Any] | None], n
     before = plan.scene.probes
     if len(probes) != len(before):
         raise ArgumentError(f"probes: {len(probes)} are given, and the scene has {len(before)}; give all of them")
-    given = [_completed(*pair) for pair in zip(before, probes, strict=True)]
+    given = [_fill_omitted_keys(*pair) for pair in zip(before, probes, strict=True)]
     after = plan.with_probes(given)
     changes = [
         _PathChange(plan, index, *pair, now)
@@ -347,19 +341,14 @@ def steer_plan(plan: Plan, probes: Sequence[Probe | Mapping[str, Any] | None], n
 
 
 def with_current_paths(plan: Plan, probes: Sequence[Probe]) -> Plan:
-    """Replace the position-controlled tools of a plan by those of other probes.
-
-    Args:
-        plan: the plan.
-        probes: one per probe of the plan.
-    """
+    """Replace the position-controlled tools of a plan by those of other probes, one per probe of the plan."""
     if not plan.tools:
         return plan
     pairs = zip(plan.scene.probes, probes, strict=True)
     return plan.with_probes([new if old.moved and new.moved else old for old, new in pairs])
 
 
-def _completed(before: Probe, given: Probe | Mapping[str, Any] | None) -> Probe | Mapping[str, Any]:
+def _fill_omitted_keys(before: Probe, given: Probe | Mapping[str, Any] | None) -> Probe | Mapping[str, Any]:
     if given is None:
         return before
     if not (before.moved and isinstance(given, Mapping) and "path" in given):
@@ -384,11 +373,11 @@ class _PathChange:
 
     def __init__(self, plan: Plan, index: int, before: Probe, given: Probe, now: float) -> None:
         self.index, self._plan, self._before, self._given, self._now = index, plan, before, given, now
-        # Times that differ by less are equal up to rounding [s].
+        # Times that differ by less count as equal [s].
         self._time_tolerance = FRAME_TOLERANCE / plan.grid.frames_per_second
         assert before.path is not None
         assert given.path is not None
-        self._past, h = _past(before.path, now, self._time_tolerance), plan.grid.step
+        self._past, h = _past_keyframes(before.path, now, self._time_tolerance), plan.grid.step
         begun = [begin for begin, end in given.grip if begin < now < end]
         if before.path[-1][0] < now - self._time_tolerance and not begun:
             self._past = self._past[-1:]  # The tool has not pressed since its last keyframe.
@@ -398,7 +387,7 @@ class _PathChange:
         self.probe = given.model_copy(update={"path": (*self._past, *given.path)}) if self._is_later() else given
 
     def problems(self) -> Iterator[Problem]:
-        """Check the change for keyframes in the past, jumps of position or shape, and grips that begin in the past."""
+        """Report keyframes in the past, jumps of position or shape, and grips that begin in the past."""
         now, tolerance, key = self._now, self._time_tolerance, ("probes", self.index)
         assert self._given.path is not None
         if not self._is_later():
@@ -430,8 +419,8 @@ class _PathChange:
         return self._given.path[0][0] > self._now + self._time_tolerance
 
 
-def _past(path: Sequence[Key], now: float, tolerance: float) -> list[Key]:
-    """Return the keyframes of a path up to a time, with an interpolated one at this time if necessary."""
+def _past_keyframes(path: Sequence[Keyframe], now: float, tolerance: float) -> list[Keyframe]:
+    """Return the keyframes of a path up to a time, with an interpolated one at this time if it has none."""
     past = [key for key in path if key[0] <= now + tolerance]
     if past and past[-1][0] >= now - tolerance:
         return past
@@ -441,6 +430,6 @@ def _past(path: Sequence[Key], now: float, tolerance: float) -> list[Key]:
 
 
 def _shape_change(before: Tool, after: Tool) -> float:
-    """Bound the displacement of any point of a capsule by a change of its shape with a fixed lowest point [m]."""
+    """Bound the displacement [m] of points of a capsule whose shape changes while its lowest point is fixed."""
     ends = np.linalg.norm(after.length * after.axis - before.length * before.axis)
     return float(ends) + 2 * abs(after.radius - before.radius)

@@ -2,15 +2,15 @@
 
 A frame has converged when the largest residual force on a mass point is at most FORCE_TOLERANCE of the largest force of
 a spring, a load or the foundation. FIRE (`kernel_rest`) minimises the energy from the previous frame with fictitious
-masses, so a buckled sheet stays on its branch. Between two shapes, position-controlled tools move by at most half a
-radius; intermediate shapes are computed with a larger tolerance.
+masses, so a buckled sheet stays on its branch. If position-controlled tools move by more than half a radius between two
+frames, intermediate shapes are found first, with a larger tolerance.
 
 An equilibrium can be unstable: a flat sheet compressed in its plane stays flat without a perturbation. Each frame is
 therefore perturbed once, when the residual reaches PERTURBATION_TOLERANCE: every mass point is displaced at random, at
 most by the displacement that the residual force would cause. In a stable equilibrium the perturbation decays. In an
 unstable one it grows, and FIRE converges to the buckled shape. Only a sheet with compressed springs or in contact with
-a tool can be unstable. In these cases the iteration continues to STABILITY_TOLERANCE, for up to four times the
-evaluations. Weak instabilities can remain undetected, at 1 % above a critical load but not at 3 %
+a tool can be unstable. For such a sheet the iteration continues to STABILITY_TOLERANCE, for up to four times the
+evaluations. Weak instabilities can remain undetected, for example 1 % but not 3 % above a critical load
 (tests/solver/test_rest.py).
 
 A sheet without load and contact is set to the flat shape. Without tension the flat sheet has no stiffness out of its
@@ -49,18 +49,18 @@ from taichi_msm.terms.contact import (
     ContactTerm,
 )
 
-# Residual forces relative to the largest force: at convergence, at the perturbation, and at convergence of an
-# equilibrium that may be unstable.
+# Residual forces, relative to the largest force: at convergence, at the perturbation, and at convergence of a sheet
+# that can be unstable.
 FORCE_TOLERANCE, PERTURBATION_TOLERANCE, STABILITY_TOLERANCE = 1e-7, 1e-3, 1e-9
 
 # Smaller forces count as 0 [N].
 MIN_FORCE_N = 1e-30
 
-# Largest number of evaluations per mass point of the longer side; a sheet that buckles takes up to 200.
+# Largest number of evaluations per mass point along the longer side; a sheet that buckles takes up to 200.
 MAX_EVALUATIONS = 2000
 
-# Limits of a launch: evaluations, and evaluations times mass points, about 0.1 s of one core.
-EVALUATIONS_PER_LAUNCH, POINTS_PER_LAUNCH = 64, 40_000_000
+# Largest numbers of evaluations, and of evaluations times mass points, about 0.1 s of one core, in a launch.
+EVALUATIONS_PER_LAUNCH, POINT_EVALUATIONS_PER_LAUNCH = 64, 40_000_000
 
 Array = NDArray[np.float64]
 
@@ -85,7 +85,7 @@ class QuasiStatics(Dynamics):
         super().restart(plan, state)
 
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
-        """Find the equilibrium of a number of frames, and of the first frame if it is still missing.
+        """Find the equilibria of the next frames, and of the first frame if it is still missing.
 
         Args:
             steps: number of frames.
@@ -100,8 +100,8 @@ class QuasiStatics(Dynamics):
             frame = self.steps_done + (self._last_frame is not None)
             self._settle(frame, pause)
             self.steps_done = frame
-            displacement = self._copy(differences=False)[0]
-            self._last_frame = State(frame, displacement, np.zeros_like(displacement), self._contact())
+            displacement = self._read_arrays(differences=False)[0]
+            self._last_frame = State(frame, displacement, np.zeros_like(displacement), self._contact_fields())
 
     def compile(self) -> None:
         """Compile all kernels without moving a mass point."""
@@ -122,21 +122,21 @@ class QuasiStatics(Dynamics):
     def tool_forces(self) -> Array:
         """Compute the force of each position-controlled tool on the sheet [N], shape (tools, 3).
 
-        It is minus the sum of all other forces on the mass points that the tool touches or holds.
+        It is opposite to the sum of all other forces on the mass points that the tool touches or holds.
         """
         # Subtraction from 0 avoids -0.
-        return 0.0 - np.einsum("tij,ijk->tk", self._touched().astype(float), self._copy(differences=True)[0])
+        return 0.0 - np.einsum("tij,ijk->tk", self._touched().astype(float), self._read_arrays(differences=True)[0])
 
     def _touched(self) -> NDArray[np.bool_]:
         """Return whether each tool touches or holds each mass point, shape (tools, rows, cols)."""
-        tools, contact = len(self.plan.tools), self._contact()
+        tools, contact = len(self.plan.tools), self._contact_fields()
         normals = contact[: CORRECTIONS * tools].reshape(tools, CORRECTIONS, self.layout.rows, self.layout.cols)
         touched = (normals != 0).any(axis=1)
         if len(contact) > CORRECTIONS * tools:
             touched |= contact[CORRECTIONS * tools + HOLDER] == np.arange(1, tools + 1)[:, None, None]
         return np.asarray(touched)
 
-    def _started(self, start: InitialData) -> Any:
+    def _build_kernel(self, start: InitialData) -> Any:
         self._interrupted = False
         # A mass point without stiffness would have mass 0.
         self._masses = np.maximum(fictitious_masses(self.plan), MIN_MAGNITUDE)
@@ -159,14 +159,14 @@ class QuasiStatics(Dynamics):
     def _tabulate(self, count: int) -> None:
         """Do nothing, because the loads of a frame are evaluated for each frame."""
 
-    def _of_motion(self, _sums: NDArray[Any]) -> float:
+    def _kinetic_energy(self, _sums: NDArray[Any]) -> float:
         return 0.0
 
     def _settle(self, frame: int, pause: Pause) -> None:
         """Find the equilibrium of a frame."""
         self.evaluations = 0
         relaxation, before, loads = self._relaxation, self._last_state, evaluate_frame_loads(self.plan, frame)
-        contact = self._gripping(frame, before)
+        contact = self._contact_after_grips(frame, before)
         held = CORRECTIONS * len(self.plan.tools) + HOLDER
         held_before, holds = (len(fields) > held and bool(fields[held].any()) for fields in (before.contact, contact))
         if len(contact):
@@ -174,9 +174,9 @@ class QuasiStatics(Dynamics):
         if self._interrupted:
             relaxation.place(before.displacement)
         self._interrupted, residual = True, 0.0
-        *intermediate, end = self._times(frame)
+        *intermediate, end = self._shape_times(frame)
         for time in (*intermediate, end):
-            row = self._at(time, frame, self._columns(loads, frame))
+            row = self._set_tools(time, frame, self._columns(loads, frame))
             # After a release the flat shape is tried even if a tool is in the way.
             free = not loads.strength.any() and not holds and (held_before or not self._meets_tool(time))
             if free and self._try_flat(row):
@@ -188,12 +188,12 @@ class QuasiStatics(Dynamics):
 
     def _meets_tool(self, time: float) -> bool:
         """Return whether a tool at a time [s] touches the current sheet."""
-        position = rest_positions(self.plan.scene.sheet) + self._copy(differences=False)[0]
+        position = rest_positions(self.plan.scene.sheet) + self._read_arrays(differences=False)[0]
         return any(tool.touches(position[~self.plan.fixed], time) for tool in self.plan.tools)
 
     def _try_flat(self, row: NDArray[Any]) -> bool:
-        """Set the flat shape if it is an equilibrium; return whether it is."""
-        relaxation, shape = self._relaxation, self._copy(differences=False)[0]
+        """Return whether the flat shape is an equilibrium; if so, keep it."""
+        relaxation, shape = self._relaxation, self._read_arrays(differences=False)[0]
         relaxation.place(np.zeros_like(shape))
         count, force = relaxation.relax(1, 0.0, row)
         self.evaluations += count
@@ -201,14 +201,14 @@ class QuasiStatics(Dynamics):
             relaxation.place(shape)
         return force == 0
 
-    def _times(self, frame: int) -> list[float]:
+    def _shape_times(self, frame: int) -> list[float]:
         """Return the times of the intermediate shapes before a frame, and the time of the frame [s]."""
         rate = self.plan.grid.frames_per_second
         begin, end = max(0, frame - 1) / rate, frame / rate
         return sorted({end, *(float(time) for tool in self.plan.tools for time in tool.substep_times(begin, end))})
 
-    def _at(self, time: float, frame: int, row: NDArray[Any]) -> NDArray[Any]:
-        """Write the positions of the tools at a time up to a frame into a row of the load table."""
+    def _set_tools(self, time: float, frame: int, row: NDArray[Any]) -> NDArray[Any]:
+        """Write the positions of the tools at a time, up to that of a frame, into a row of the load table."""
         for n, tool in enumerate(self.plan.tools):
             first = self.layout.config.first_column(ContactTerm) + COLUMNS + TOOL_COLUMNS * n
             centre = tool.tip_centre(np.array([time]))[0]
@@ -228,7 +228,7 @@ class QuasiStatics(Dynamics):
         """Return the tip's centre [m] at the frame before a grip begins, whose displacements the grip stores."""
         return tool.tip_centre(np.array([max(0, frame - 1) / self.plan.grid.frames_per_second]))[0]
 
-    def _gripping(self, frame: int, before: State) -> NDArray[Any]:
+    def _contact_after_grips(self, frame: int, before: State) -> NDArray[Any]:
         """Return the contact fields at the start of a frame, after grips have ended and begun."""
         tools, contact = self.plan.tools, before.contact.copy()
         if len(contact) == CORRECTIONS * len(tools):
@@ -251,29 +251,31 @@ class QuasiStatics(Dynamics):
         return contact
 
     def _relax(self, frame: int, row: NDArray[Any], tolerance: float, pause: Pause) -> float:
-        """Iterate until the residual force is below a tolerance, relative to the largest force; return the residual."""
+        """Iterate until the residual, relative to the largest force, is below a tolerance; return it."""
         relaxation, longer = self._relaxation, max(self.layout.rows, self.layout.cols)
         relaxation.stop()
         points = self.layout.rows * self.layout.cols
-        per_launch = max(1, min(EVALUATIONS_PER_LAUNCH, POINTS_PER_LAUNCH // points))
+        per_launch = max(1, min(EVALUATIONS_PER_LAUNCH, POINT_EVALUATIONS_PER_LAUNCH // points))
         limit, evaluations, perturbed = MAX_EVALUATIONS * longer, 0, tolerance >= PERTURBATION_TOLERANCE
-        scale, last = max(MIN_FORCE_N, relaxation.scale(row)), math.inf
+        scale, stability_limit = max(MIN_FORCE_N, relaxation.scale(row)), math.inf
         while True:
             # The first evaluation shows whether the sheet is already in equilibrium.
-            first = evaluations == 0
-            target = (tolerance if first or perturbed else PERTURBATION_TOLERANCE) * scale
-            count, force = relaxation.relax(1 if first else min(per_launch, limit - evaluations), target, row)
+            is_first = evaluations == 0
+            target = (tolerance if is_first or perturbed else PERTURBATION_TOLERANCE) * scale
+            count, force = relaxation.relax(1 if is_first else min(per_launch, limit - evaluations), target, row)
             evaluations += count
             scale = max(MIN_FORCE_N, relaxation.scale(row))
             if force <= min(target, tolerance * scale):
                 converged = tolerance == FORCE_TOLERANCE
-                if converged and not first and evaluations < last and self._may_be_unstable():
+                if converged and not is_first and evaluations < stability_limit and self._may_be_unstable():
                     # An unstable equilibrium shows within these evaluations.
-                    tolerance, last = STABILITY_TOLERANCE, 4 * evaluations
+                    tolerance, stability_limit = STABILITY_TOLERANCE, 4 * evaluations
                     continue
                 self.evaluations += evaluations
                 return force / scale
-            if tolerance == STABILITY_TOLERANCE and (force > 10 * FORCE_TOLERANCE * scale or evaluations >= last):
+            if tolerance == STABILITY_TOLERANCE and (
+                force > 10 * FORCE_TOLERANCE * scale or evaluations >= stability_limit
+            ):
                 tolerance = FORCE_TOLERANCE
             if not (force < np.inf and scale < np.inf) or evaluations >= limit:
                 raise self._diverged(frame, force / scale, evaluations)
@@ -291,17 +293,17 @@ class QuasiStatics(Dynamics):
         return compressed or bool(self._touched().any())
 
     def _perturb(self, force: float) -> None:
-        """Displace every mass point at random but reproducibly, at most by the displacement due to a force [N]."""
+        """Displace every mass point at random, reproducibly, by at most the displacement due to a force [N]."""
         rows, cols = self.layout.rows, self.layout.cols
         # This generator returns the same numbers in every version of NumPy.
         noise = 2 * np.random.RandomState(0).random_sample((rows, cols, 3)) - 1
         moves = (~self.plan.fixed / self._masses)[..., None]
-        self._relaxation.place(self._copy(differences=False)[0] + force * noise * moves)
+        self._relaxation.place(self._read_arrays(differences=False)[0] + force * noise * moves)
 
     def _diverged(self, frame: int, residual: float, evaluations: int) -> DivergedError:
-        """Build the error for an iteration that did not converge, with the residual and a remedy."""
+        """Build the error of an iteration that did not converge."""
         plan, time = self.plan, frame / self.plan.grid.frames_per_second
-        row, column, *_ = largest_displacement(self._copy(differences=True)[0])
+        row, column, *_ = largest_displacement(self._read_arrays(differences=True)[0])
         remedy = (
             "the sheet may hang slack, fold or wrinkle; give it a foundation, pretension or bending, or take less load"
         )

@@ -20,12 +20,12 @@ from taichi_msm.terms.springs import SpringTerm
 
 
 def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[..., None]:
-    """Build the function that computes the forces on a row and steps it.
+    """Build the Taichi function that computes the forces on a row and steps it.
 
     Args:
         config: compile-time configuration.
-        move: function move(sheet, entry, target, force, now) that steps an entry with the force of its springs, as
-            built by `build_point_step`.
+        move: Taichi function move(sheet, entry, target, force, now) that steps an entry with the force of its springs,
+            see `build_point_step`.
     """
     vector, columns, springs = config.vector, config.first_column(None), config.require(SpringTerm)
     structural, shear = springs.structural, springs.shear
@@ -39,8 +39,8 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
     ):  # fmt: skip
         """Compute the forces on row `line`, which is row `here` of u, and step it if `moving`.
 
-        The next row of the pass, `next_row` of u, is `up` above this one [m]; exists: 1, or 0 if the sheet ends here.
-        `carried_row` is the row of `carried` with the forces from row to row, and n the row of the load table.
+        The next row of the pass, `next_row` of u, is `up` [m] above this one; `exists` is 0 if the sheet ends here,
+        otherwise 1. `carried_row` is the row of `carried` with the forces between rows, n the row of the load table.
         """
         width, strip, i, kind = sheet.width, sheet.width - 2, line.i, line.kind
         diagonal = ti.sqrt(sheet.constants[DX] * sheet.constants[DX] + sheet.constants[DY] * sheet.constants[DY])
@@ -126,12 +126,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
 
 
 def build_touch_row(config: KernelConfig, contact: ContactTerm) -> Callable[..., None]:
-    """Build the function that resolves the contact of a row with all tools, if any tool can reach it.
-
-    Args:
-        config: compile-time configuration.
-        contact: its contact term.
-    """
+    """Build the Taichi function that resolves the contact of a row with all tools, if any tool can reach it."""
     columns, resolve, reaches = config.first_column(None), contact.build_resolve(config), contact.build_reaches(config)
     max_lane = build_max_lane(config)
 

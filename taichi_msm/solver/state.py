@@ -13,17 +13,17 @@ from taichi_msm.scene.tools import Probe
 
 
 class LargestDisplacement(NamedTuple):
-    """The largest displacement of a mass point; one that is not finite counts as the largest."""
+    """The largest displacement of a mass point; NaN and infinity count as the largest."""
 
     # row, column: indices of the mass point
     row: int
     column: int
     distance: float  # of the mass point from its rest position [m]
-    reach: float  # root of the sum of the squared displacements of all mass points [m]
+    reach: float  # Euclidean norm of all displacements [m]
 
 
 def largest_displacement(displacement: NDArray[np.floating]) -> LargestDisplacement:
-    """Find the largest displacement; displacement: x - X [m], shape (rows, cols, 3)."""
+    """Find the largest of the displacements x - X [m], shape (rows, cols, 3)."""
     with np.errstate(over="ignore", invalid="ignore"):
         square = np.einsum("ijk,ijk->ij", displacement, displacement, dtype=np.float64)
         # If any value is NaN, argmax returns its index.
@@ -33,7 +33,7 @@ def largest_displacement(displacement: NDArray[np.floating]) -> LargestDisplacem
 
 
 class State(NamedTuple):
-    """The complete state on which the next steps depend."""
+    """The state on which the next steps depend."""
 
     steps: int  # number of steps taken, n
     displacement: NDArray[Any]  # u_n [m], shape (rows, cols, 3)
@@ -48,7 +48,7 @@ class Reading(NamedTuple):
     displacement: NDArray[Any]  # u_n = x - X [m], shape (rows, cols, 3)
     shortest_spring: float  # smallest ratio of a spring's length to its rest length
     longest_spring: float  # largest ratio of a spring's length to its rest length
-    energy: float  # kinetic energy and that of springs and bending, without the virtual springs [J]
+    energy: float  # kinetic energy and energy of springs and bending, without virtual springs [J]
     residual: float = 0.0  # quasi-static: largest residual force, relative to the largest force
     evaluations: int = 0  # quasi-static: number of evaluations of the forces
 
@@ -63,7 +63,7 @@ class RunProgress:
     shortest_spring: float = 1.0
     longest_spring: float = 1.0
     energy: float = 0.0  # as in a `Reading`, at this frame [J]
-    reach: float = 0.0  # root of the sum of all squared displacements at this frame [m]
+    reach: float = 0.0  # Euclidean norm of all displacements at this frame [m]
     deepest: float = 0.0  # largest depth of a mass point below its rest position at any frame so far [m]
     peak: float = 0.0  # largest energy at any frame so far [J]
     residual: float = 0.0  # as in a `Reading`, the largest of all frames so far
@@ -71,8 +71,8 @@ class RunProgress:
     # least_energy, energy_growth: as `EnergyGrowth.follow` returns them
     least_energy: float = 0.0
     energy_growth: float = 0.0
-    pierced_by: int = 0  # number of the first probe reported by `piercing`, counted from 1; 0 before any report
-    pierced_frame: int = 0  # frame of this report
+    pierced_by: int = 0  # number, from 1, of the first probe reported by `piercing`; 0 without a report
+    pierced_frame: int = 0  # frame of the report
 
 
 Vector = tuple[float, float, float]
@@ -86,7 +86,7 @@ class TipForce(NamedTuple):
         tip: of a position-controlled tool the lowest point of its round tip, otherwise the control point on the
             deformed sheet [m].
         force: on the mass points that are not fixed [N]. Of a position-controlled tool in motion it is the mean over
-            the steps since the frame before, and 0 at the first frame.
+            the steps since the previous frame, and 0 at the first frame.
     """
 
     probe: int

@@ -54,6 +54,7 @@ from taichi_msm.study.result import (
 from taichi_msm.system import process
 from taichi_msm.system.runtime import Device
 from taichi_msm.terms.elasticity import elastic_force, spring_families
+from taichi_msm.terms.foundation import foundation_force
 
 PRECISIONS: tuple[Precision, ...] = ("f64", "f32")
 DIFFERENCES = ("central", "backward")
@@ -647,7 +648,8 @@ def acceleration_function(plan: Plan) -> Callable[[Array, Array, Schedule], Arra
         return (u[1:-1, 2:] - 2 * inner + u[1:-1, :-2]) / dx**2 + (u[2:, 1:-1] - 2 * inner + u[:-2, 1:-1]) / dy**2
 
     def accelerate(u: Array, v: Array, loads: Schedule) -> Array:
-        force = elastic_force(families, u) - (loads.active[0] * material.virtual * foundation)[..., None] * u
+        force = elastic_force(families, u)
+        force += foundation_force(material, loads.active[0] * material.virtual * foundation, u)
         for slot, strength, (at_x, at_y) in zip(loads.slots, loads.strength[0], loads.point[0], strict=True):
             probe = probes[slot.probe]
             decay = probe.decay(np.hypot(x - at_x, y - at_y)) * (shares if probe.by_area else 1)

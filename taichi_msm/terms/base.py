@@ -116,7 +116,7 @@ class Term(ABC):
     def build_tangents(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
         """Build Taichi functions add(force, sheet, entry, now), which add the linearised change of the force.
 
-        In them `entry` and `sheet` contain the changes of displacements instead of displacements.
+        In them `entry.u` and `sheet.u` contain changes of displacements, and `entry.shape` the displacement.
         """
         return ()
 
@@ -247,4 +247,5 @@ class Entry(NamedTuple):
 
     row: KernelRow
     b: Any  # index of the entry in its row
-    u: Any  # displacement, a list of x, y and z
+    u: Any  # displacement, a list of x, y and z; for tangents its change
+    shape: Any = None  # for tangents, the displacement

@@ -65,7 +65,7 @@ class BendingTerm(Term):
 
         @ti.func
         def store_moment(sheet: ti.template(), i, before, row, after, b, target):
-            """Store the moment of entry b of row i, which is row `row` of u, in row `target` of u."""
+            """Store the curved of entry b of row i, which is row `row` of u, in row `target` of u."""
             dx, dy, stiffness = sheet.constants[DX], sheet.constants[DY], sheet.constants[constant]
             across, down = stiffness / (dx * dx), stiffness / (dy * dy)
             for c in ti.static(range(3)):
@@ -112,11 +112,11 @@ class BendingTerm(Term):
             before, after = p - ti.cast(kind == 1, ti.i32), p + ti.cast(kind == 1, ti.i32)
             dx, dy = sheet.constants[DX], sheet.constants[DY]
             across, down = 1 / (dx * dx), 1 / (dy * dy)
-            bent = vector(0)
+            squared_curvature = vector(0)
             for c in ti.static(range(3)):
-                curved = inside * laplacian(sheet.u[c], sheet.width, before, p, after, b, across, down)
-                bent += curved * curved
-            measures[first] += bent
+                curvature = inside * laplacian(sheet.u[c], sheet.width, before, p, after, b, across, down)
+                squared_curvature += curvature * curvature
+            measures[first] += squared_curvature
 
         return (measure,)
 

@@ -88,20 +88,20 @@ class ContactTerm(Term):
         # The first step has another gain, so the force of its corrections differs.
         columns[:, WEIGHT] = np.where(steps[:-1] == 0, gain / first_gain, 1.0)
         for n, tool in enumerate(plan.tools):
-            of_tool = columns[:, COLUMNS + TOOL_COLUMNS * n : COLUMNS + TOOL_COLUMNS * (n + 1)]
+            tool_columns = columns[:, COLUMNS + TOOL_COLUMNS * n : COLUMNS + TOOL_COLUMNS * (n + 1)]
             centres = tool.tip_centre(t)
-            of_tool[:, TIP_AFTER:TIP_BEFORE], of_tool[:, TIP_BEFORE:GRIP_STATE] = centres[1:], centres[:-1]
+            tool_columns[:, TIP_AFTER:TIP_BEFORE], tool_columns[:, TIP_BEFORE:GRIP_STATE] = centres[1:], centres[:-1]
             inverse = [1 / slope if abs(slope) > MIN_DISTANCE_M else 1 / MIN_DISTANCE_M for slope in tool.axis[1:]]
-            of_tool[:, AXIS:] = *tool.axis, tool.length, tool.radius, tool.friction, *inverse
+            tool_columns[:, AXIS:] = *tool.axis, tool.length, tool.radius, tool.friction, *inverse
             for begin, end in tool.grips:
                 # The first steps at or after these times, up to rounding.
                 start, stop = (
                     max(0, math.ceil((time - FRAME_TOLERANCE * frame) * grid.steps_per_second)) for time in (begin, end)
                 )
-                held = (steps[:-1] >= start) & (steps[:-1] < stop)
-                of_tool[held, GRIP_STATE] = np.where(steps[:-1] == start, GRIP_BEGINS, GRIP_CONTINUES)[held]
+                active = (steps[:-1] >= start) & (steps[:-1] < stop)
+                tool_columns[active, GRIP_STATE] = np.where(steps[:-1] == start, GRIP_BEGINS, GRIP_CONTINUES)[active]
                 centre_at_start = tool.tip_centre(np.array([start / grid.steps_per_second]))
-                of_tool[held, GRIP_SHIFT:AXIS] = (centres[1:] - centre_at_start)[held]
+                tool_columns[active, GRIP_SHIFT:AXIS] = (centres[1:] - centre_at_start)[active]
         return columns
 
     def is_compiled_in(self, compiled: Self) -> bool:
@@ -166,17 +166,17 @@ class ContactTerm(Term):
 
         @ti.func
         def resolve(sheet: ti.template(), i, kind, at, b, now: ti.template()):
-            row, entry, here = sheet.rows, at * sheet.width + b, i * sheet.width + b
+            rows, entry, point = sheet.rows, at * sheet.width + b, i * sheet.width + b
             rest = [
                 sheet.by_column[REST_X * sheet.width + b],
                 vector(sheet.constants[TOP_Y] - i * sheet.constants[DY]),
                 vector(0),
             ]
-            u, d = [sheet.u[c][entry] for c in ti.static(range(3))], [sheet.d[c][here] for c in ti.static(range(3))]
+            u, d = [sheet.u[c][entry] for c in ti.static(range(3))], [sheet.d[c][point] for c in ti.static(range(3))]
             free = ti.select(sheet.by_column[(MOBILITY + kind) * sheet.width + b] > 0, vector(1), vector(0))
             held = vector(0)
             if ti.static(grips):
-                held = sheet.fields[(grip_field + HOLDER) * row * sheet.width + here]
+                held = sheet.fields[(grip_field + HOLDER) * rows * sheet.width + point]
                 # All grips that end release their mass points before any other grip begins.
                 for tool in ti.static(range(tools)):
                     if now[base[tool] + GRIP_STATE] != GRIP_CONTINUES:
@@ -185,17 +185,17 @@ class ContactTerm(Term):
                     if now[base[tool] + GRIP_STATE] == GRIP_BEGINS:
                         squared = vector(0)
                         for c in ti.static(range(3)):
-                            off = rest[c] + (u[c] - d[c]) - now[base[tool] + TIP_BEFORE + c]
-                            squared += off * off
+                            offset = rest[c] + (u[c] - d[c]) - now[base[tool] + TIP_BEFORE + c]
+                            squared += offset * offset
                         radius = GRIP_RADII * now[base[tool] + RADIUS]
                         gripped = ti.select(squared <= radius * radius, free, vector(0)) * ti.select(
                             held == 0, vector(1), vector(0)
                         )
                         held += gripped * (tool + 1)
                         for c in ti.static(range(3)):
-                            stored = (grip_field + HOLD_DISPLACEMENT + c) * row * sheet.width + here
+                            stored = (grip_field + HOLD_DISPLACEMENT + c) * rows * sheet.width + point
                             sheet.fields[stored] = ti.select(gripped > 0, u[c] - d[c], sheet.fields[stored])
-                sheet.fields[(grip_field + HOLDER) * row * sheet.width + here] = held
+                sheet.fields[(grip_field + HOLDER) * rows * sheet.width + point] = held
                 free = ti.select(held == 0, free, vector(0))
             for tool in ti.static(range(tools)):
                 inside, normal_x, normal_y, normal_z = penetration(rest, u, now, base[tool])
@@ -211,28 +211,28 @@ class ContactTerm(Term):
                             d[c] + correction[c] - (now[base[tool] + TIP_AFTER + c] - now[base[tool] + TIP_BEFORE + c])
                             for c in ti.static(range(3))
                         ]
-                        along = vector(0)
+                        normal_slip = vector(0)
                         for c in ti.static(range(3)):
-                            along += slip[c] * normal[c]
-                        speed = vector(0)
+                            normal_slip += slip[c] * normal[c]
+                        squared_slip = vector(0)
                         for c in ti.static(range(3)):
-                            slip[c] = slip[c] - along * normal[c]
-                            speed += slip[c] * slip[c]
-                        stopped = now[base[tool] + FRICTION] * depth / ti.max(ti.sqrt(speed), MIN_DISTANCE_M)
+                            slip[c] = slip[c] - normal_slip * normal[c]
+                            squared_slip += slip[c] * slip[c]
+                        stopped = now[base[tool] + FRICTION] * depth / ti.max(ti.sqrt(squared_slip), MIN_DISTANCE_M)
                         stopped = ti.min(stopped, 1)
                         for c in ti.static(range(3)):
                             correction[c] = correction[c] - slip[c] * stopped
                     if ti.static(grips):
                         for c in ti.static(range(3)):
-                            target = sheet.fields[(grip_field + HOLD_DISPLACEMENT + c) * row * sheet.width + here]
+                            target = sheet.fields[(grip_field + HOLD_DISPLACEMENT + c) * rows * sheet.width + point]
                             target += now[base[tool] + GRIP_SHIFT + c]
                             correction[c] = ti.select(held == tool + 1, target - u[c], correction[c])
                     for c in ti.static(range(3)):
                         # Lanes without a correction keep their bits, including the sign of zero.
                         u[c] = ti.select(corrected > 0, u[c] + correction[c], u[c])
                         d[c] = ti.select(corrected > 0, d[c] + correction[c], d[c])
-                        sheet.u[c][entry], sheet.d[c][here] = u[c], d[c]
-                        index = (first_field + CORRECTIONS * tool + c) * row * sheet.width + here
+                        sheet.u[c][entry], sheet.d[c][point] = u[c], d[c]
+                        index = (first_field + CORRECTIONS * tool + c) * rows * sheet.width + point
                         # `+=` would be atomic, which does not compile for vectors.
                         sheet.fields[index] = sheet.fields[index] + correction[c] * now[first + WEIGHT]
 
@@ -246,10 +246,10 @@ def build_max_lane(config: KernelConfig) -> Callable[..., Any]:
 
     @ti.func
     def max_lane(values: ti.template()):
-        most = values + vector(0)
+        largest = values + vector(0)
         for half in ti.static(halves):
-            most = ti.max(most, vector([most[(lane + half) % lanes] for lane in ti.static(range(lanes))]))
-        return most[0]
+            largest = ti.max(largest, vector([largest[(lane + half) % lanes] for lane in ti.static(range(lanes))]))
+        return largest[0]
 
     return max_lane
 

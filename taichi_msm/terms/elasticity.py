@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import area_shares, spacing
-from taichi_msm.terms.law import NUMPY, Law, LinearLaw
-from taichi_msm.terms.springs import MIN_SQUARED_LENGTH, spring_stiffness
+from taichi_msm.terms.law import NUMPY, LawFunctions
+from taichi_msm.terms.locking import law_numbers
+from taichi_msm.terms.springs import MIN_SQUARED_LENGTH, spring_law, spring_stiffness
 
 Array = NDArray[np.float64]
 Window = tuple[slice, slice]
@@ -23,7 +24,7 @@ class Elongation(NamedTuple):
 
     difference: Array  # displacement of the end minus that of the start, q [m], shape (..., 3)
     edge: Array  # vector from start to end [m], shape (..., 3)
-    longer: Array  # L^2 - L0^2 [m2]
+    square_difference: Array  # L^2 - L0^2 [m2]
     square: Array  # L^2 [m2]
 
 
@@ -37,7 +38,8 @@ class SpringFamily(NamedTuple):
     length: float  # at rest [m]
     stiffness: Array  # k - tau of each spring [N/m], shape as selected by `start`
     tension: Array  # tau of each spring, its tension at rest divided by its length [N/m]
-    law: Law
+    law: LawFunctions
+    numbers: tuple[float, ...]  # of the law
 
     def elongation(self, displacement: Array) -> Elongation:
         """Compute the elongation of each spring; displacement: x - X [m], shape (rows, cols, 3)."""
@@ -47,16 +49,24 @@ class SpringFamily(NamedTuple):
 
     def force(self, displacement: Array) -> Array:
         """Compute the force of each spring on its start without the tension at rest [N], shape (..., 3)."""
-        q, edges, longer, square = self.elongation(displacement)
-        pull = self.law.pull(self.stiffness, longer, square + MIN_SQUARED_LENGTH, self.length)
+        q, edges, square_difference, square = self.elongation(displacement)
+        pull = self.law.pull(
+            self.stiffness, self.tension, square_difference, square + MIN_SQUARED_LENGTH, self.length, *self.numbers
+        )
         return pull[..., None] * edges + self.tension[..., None] * q
 
     def tangent(self, displacement: Array) -> Array:
         """Compute the symmetric derivative of each spring's force by the position of an end [N/m], (..., 3, 3)."""
-        _, edges, longer, square = self.elongation(displacement)
-        straight, turning = self.law.slopes(longer, square, self.length)
-        along = (self.stiffness * turning)[..., None, None] * edges[..., :, None] * edges[..., None, :]
-        return (self.stiffness * straight + self.tension)[..., None, None] * np.eye(3) + along
+        _, edges, square_difference, square = self.elongation(displacement)
+        isotropic, axial, *_ = self.slopes(square_difference, square, 1.0)
+        along = axial[..., None, None] * edges[..., :, None] * edges[..., None, :]
+        return (isotropic + self.tension)[..., None, None] * np.eye(3) + along
+
+    def slopes(self, square_difference: Array, square: Array, along: Array | float) -> tuple[Array, ...]:
+        """Apply the slopes of the law."""
+        return self.law.slopes(
+            self.stiffness, self.tension, square_difference, square, self.length, along, *self.numbers
+        )
 
     def energy(self, displacement: Array) -> Array:
         """Compute the energy of each spring above that at rest [J].
@@ -64,9 +74,10 @@ class SpringFamily(NamedTuple):
         The part that is linear in the displacement is left out. Its sum over all springs is 0, because the sheet is in
         equilibrium at rest.
         """
-        q, _, longer, _ = self.elongation(displacement)
-        stretched = self.stiffness * self.length**2 * self.law.energy(longer / self.length**2)
-        return (stretched + self.tension * (q**2).sum(axis=-1)) / 2
+        q, _, square_difference, _ = self.elongation(displacement)
+        share = square_difference / self.length**2
+        stretched = self.law.energy(self.stiffness, self.tension, share, *self.numbers)
+        return (stretched * self.length**2 + self.tension * (q**2).sum(axis=-1)) / 2
 
 
 def spring_families(plan: Plan) -> Iterator[SpringFamily]:
@@ -74,6 +85,7 @@ def spring_families(plan: Plan) -> Iterator[SpringFamily]:
     (rows, cols), (dx, dy), material = plan.scene.sheet.points, spacing(plan.scene.sheet), plan.material
     factors = np.ones((rows - 1, cols - 1)) if material.factors is None else material.factors
     along_rows, along_columns, diagonals = spring_stiffness(material, factors)
+    law = spring_law(material).build(NUMPY)
     # The tension of a spring at rest does not depend on the map; at an edge of tissue it is half, like the stiffness.
     shares = (np.where(np.isin(np.arange(count), (0, count - 1)), 0.5, 1.0) for count in (rows, cols))
     row_shares, column_shares = np.ix_(*shares) if material.by_area else (1.0, 1.0)
@@ -88,7 +100,8 @@ def spring_families(plan: Plan) -> Iterator[SpringFamily]:
         length = math.hypot(right * dx, down * dy)
         tension = np.broadcast_to(material.tension * unmapped, stiffness.shape)
         offset = np.array([right * dx, -down * dy, 0.0])
-        yield SpringFamily(start, end, offset, length, stiffness - tension, tension, LinearLaw().build(NUMPY))
+        numbers = law_numbers(material.stiffening, length)
+        yield SpringFamily(start, end, offset, length, stiffness - tension, tension, law, numbers)
 
 
 def elastic_force(families: Sequence[SpringFamily], displacement: Array) -> Array:

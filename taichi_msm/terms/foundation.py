@@ -1,5 +1,7 @@
 """The elastic (Winkler) foundation, or virtual springs: the force -K u pulls each mass point to its rest position.
 
+A foundation that locks resists the depth w = -u_z > 0 by K f(w) instead of K w, see `terms.locking`.
+
 Scene: `springs.virtual` and `virtual_active`, or `tissue.foundation`, `foundation_active` and `foundation_map`.
 """
 
@@ -18,8 +20,10 @@ from taichi_msm.model.loads import Schedule
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import Material, area_shares, spacing
 from taichi_msm.scene.scene import Scene
-from taichi_msm.scene.sheet import Sheet
+from taichi_msm.scene.sheet import Foundation, Sheet
 from taichi_msm.terms.base import AREA_SHARE, KernelConfig, Term
+from taichi_msm.terms.law import NUMPY
+from taichi_msm.terms.locking import LockingLaw, build_locking, law_numbers, make_stiffening
 
 
 @dataclass(frozen=True)
@@ -28,37 +32,44 @@ class FoundationTerm(Term):
 
     by_area: bool  # whether K is smaller at an open edge, because mass points have less area there
     mapped: bool  # whether the factor of K at each mass point is read from a field
+    locks: bool  # whether it stiffens when it is pressed in
 
     @staticmethod
     def derive(scene: Scene) -> dict[str, Any]:
         """Derive K [N/m], 0 if the foundation is never active, and whether it is always active."""
+        stiffening = None
         if scene.tissue is not None:
             k = scene.tissue.foundation_stiffness * math.prod(spacing(scene.sheet))
-            active = scene.tissue.foundation_active
+            active, keys = scene.tissue.foundation_active, scene.tissue.foundation
+            if isinstance(keys, Foundation):
+                stiffening = make_stiffening(keys.lock, keys.factor)
         else:
             assert scene.springs is not None
             k, active = scene.springs.virtual, scene.springs.virtual_active
         always = active == "always"
-        return {"virtual": k if always or scene.probes else 0.0, "always_active": always}
+        virtual = k if always or scene.probes else 0.0
+        return {"virtual": virtual, "always_active": always, "virtual_stiffening": stiffening}
 
     @classmethod
     def from_plan(cls, plan: Plan) -> Self | None:
         """Return the term's configuration; None if the foundation is never active."""
         material = plan.material
         mapped = material.virtual_factors is not None
-        return cls(plan.open_edges and material.by_area and not mapped, mapped) if material.virtual > 0 else None
+        if material.virtual == 0:
+            return None
+        return cls(plan.open_edges and material.by_area and not mapped, mapped, material.virtual_stiffening is not None)
 
     @staticmethod
     def stiffness_bound(material: Material, sheet: Sheet) -> float:
         """Return the largest K [N/m]."""
         factors = material.virtual_factors
-        return material.virtual if factors is None else material.virtual * float(factors.max())
+        return _steepest(material) * (1.0 if factors is None else float(factors.max()))
 
     @classmethod
     def node_stiffness_bounds(cls, plan: Plan) -> NDArray[Any] | float:
         """Return K at each mass point without the reduction at edges [N/m]."""
         factors = plan.material.virtual_factors
-        return plan.material.virtual * (1.0 if factors is None else factors)
+        return _steepest(plan.material) * (1.0 if factors is None else factors)
 
     @property
     def column_count(self) -> int:
@@ -78,31 +89,123 @@ class FoundationTerm(Term):
         """Return the factors of K at the mass points, shape (1, rows, cols)."""
         return point_shares(plan)[None] if self.mapped else super().fields(plan)
 
+    @property
+    def constant_count(self) -> int:  # type: ignore[override]
+        """The numbers of the law."""
+        return LockingLaw.number_count if self.locks else 0
+
+    def constants(self, plan: Plan) -> tuple[float, ...]:
+        """Return the numbers of the law for a depth in metres."""
+        return law_numbers(plan.material.virtual_stiffening, 1.0)
+
     def build_forces(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
-        """Build the function that adds -K u."""
-        ti = config.ti
-        by_area, mapped, column = self.by_area, self.mapped, config.first_column(FoundationTerm)
-        field = config.first_field(FoundationTerm)
+        """Build the Taichi function that adds -K u, or with a law -K u_x, -K u_y and K f(-u_z)."""
+        ti, locks, column, share = config.ti, self.locks, config.first_column(FoundationTerm), self._build_share(config)
+        secant, _ = self._build_law(config)
 
         @ti.func
         def add(force: ti.template(), sheet: ti.template(), entry: ti.template(), now: ti.template()):
-            if ti.static(mapped):
-                held = now[column] * sheet.fields[(field * sheet.rows + entry.row.i) * sheet.width + entry.b]
-                for c in ti.static(range(3)):
-                    force[c] = force[c] - held * entry.u[c]
-            elif ti.static(by_area):
-                held = now[column] * sheet.by_column[(AREA_SHARE + entry.row.kind) * sheet.width + entry.b]
-                for c in ti.static(range(3)):
-                    force[c] = force[c] - held * entry.u[c]
-            else:
-                for c in ti.static(range(3)):
-                    force[c] = force[c] - now[column] * entry.u[c]
+            k = share(sheet, entry, now[column])
+            for c in ti.static(range(3)):
+                if ti.static(locks and c == 2):
+                    force[c] = force[c] - k * (entry.u[c] * secant(sheet, entry.u[c]))
+                else:
+                    force[c] = force[c] - k * entry.u[c]
 
         return (add,)
 
     def build_tangents(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
-        """Return `build_forces`, because the force is linear in the displacements."""
-        return self.build_forces(config)
+        """Build the Taichi function that adds the linearised change of the force."""
+        ti, locks, column, share = config.ti, self.locks, config.first_column(FoundationTerm), self._build_share(config)
+        _, tangent = self._build_law(config)
+
+        @ti.func
+        def add(force: ti.template(), sheet: ti.template(), entry: ti.template(), now: ti.template()):
+            k = share(sheet, entry, now[column])
+            for c in ti.static(range(3)):
+                if ti.static(locks and c == 2):
+                    force[c] = force[c] - k * (entry.u[c] * tangent(sheet, entry.shape[c]))
+                else:
+                    force[c] = force[c] - k * entry.u[c]
+
+        return (add,)
+
+    def build_work(self, config: KernelConfig) -> Callable[..., Any]:
+        """Build the Taichi function work(sheet, p, u), minus the product of p with the force for K = 1."""
+        ti, locks = config.ti, self.locks
+        secant, _ = self._build_law(config)
+
+        @ti.func
+        def work(sheet: ti.template(), p: ti.template(), u: ti.template()):
+            down = u[2]
+            if ti.static(locks):
+                down = u[2] * secant(sheet, u[2])
+            return p[0] * u[0] + p[1] * u[1] + p[2] * down
+
+        return work
+
+    def _build_share(self, config: KernelConfig) -> Callable[..., Any]:
+        """Build the Taichi function share(sheet, entry, k), the stiffness at an entry."""
+        ti, mapped, by_area, field = config.ti, self.mapped, self.by_area, config.first_field(FoundationTerm)
+
+        @ti.func
+        def share(sheet: ti.template(), entry: ti.template(), k):
+            if ti.static(mapped):
+                return k * sheet.fields[(field * sheet.rows + entry.row.i) * sheet.width + entry.b]
+            elif ti.static(by_area):  # noqa: RET505  # Taichi would compile the rest as well.
+                return k * sheet.by_column[(AREA_SHARE + entry.row.kind) * sheet.width + entry.b]
+            else:
+                return k
+
+        return share
+
+    def _build_law(self, config: KernelConfig) -> tuple[Callable[..., Any], Callable[..., Any]]:
+        """Build the Taichi functions secant(sheet, u_z) and tangent(sheet, u_z) of a foundation that locks."""
+        ti, first, law = config.ti, config.first_constant(FoundationTerm), build_locking(config.operations)
+        secant_of, tangent_of = ti.func(law.secant), ti.func(law.tangent)
+
+        @ti.func
+        def secant(sheet: ti.template(), u):
+            return secant_of(0 - u * sheet.constants[first], sheet.constants[first + 1])
+
+        @ti.func
+        def tangent(sheet: ti.template(), u):
+            return tangent_of(0 - u * sheet.constants[first], sheet.constants[first + 1])
+
+        return secant, tangent
+
+
+def _steepest(material: Material) -> float:
+    """Return the largest tangent stiffness for a factor of 1 [N/m]."""
+    stiffening = material.virtual_stiffening
+    return material.virtual * (1.0 if stiffening is None else stiffening.factor)
+
+
+def foundation_force(material: Material, k: NDArray[Any] | float, displacement: NDArray[Any]) -> NDArray[Any]:
+    """Compute the force of the foundation.
+
+    Args:
+        material: coefficients of the sheet.
+        k: stiffness at the mass points [N/m], shape (rows, cols) or one number.
+        displacement: x - X [m], shape (rows, cols, 3).
+
+    Returns:
+        Forces [N], shape (rows, cols, 3).
+    """
+    force = -np.asarray(k)[..., None] * displacement
+    if material.virtual_stiffening is not None:
+        scale, end, _ = law_numbers(material.virtual_stiffening, 1.0)
+        force[..., 2] *= build_locking(NUMPY).secant(-displacement[..., 2] * scale, end)
+    return force
+
+
+def foundation_tangent(material: Material, k: NDArray[Any], displacement: NDArray[Any]) -> NDArray[Any]:
+    """Compute the derivative of minus `foundation_force` along x, y and z [N/m], shape (rows, cols, 3)."""
+    tangent = np.repeat(k[..., None], 3, axis=-1)
+    if material.virtual_stiffening is not None:
+        scale, end, _ = law_numbers(material.virtual_stiffening, 1.0)
+        tangent[..., 2] *= build_locking(NUMPY).tangent(-displacement[..., 2] * scale, end)
+    return tangent
 
 
 def point_shares(plan: Plan) -> NDArray[Any]:

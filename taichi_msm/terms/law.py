@@ -1,7 +1,7 @@
 """Laws of springs: force, tangent and energy by the elongation, in plain arithmetic.
 
-A spring of stiffness k whose length L0 becomes L pulls with k L0 f(e), where e = (L - L0) / L0 and f'(0) = 1. The law of
-the spring is f. NumPy calls the functions of a law as they are; kernels call them wrapped by `KernelConfig.compile_law`.
+A spring of stiffness k whose length L0 becomes L pulls with k L0 f(e), where e = (L - L0) / L0 and f'(0) = 1; f is its
+law. NumPy calls the functions of a law as they are, and kernels call them wrapped by `KernelConfig.compile_law`.
 
 With q = u_P - u_Q and the vector o from Q to P at rest, the force of P on its neighbour Q is k L0 f(e) (o + q) / L, and
 for f(e) = e
@@ -45,15 +45,15 @@ NUMPY = Operations(np.sqrt, np.log, np.maximum, np.minimum, np.where, lambda fun
 class LawFunctions(NamedTuple):
     """The functions of a law.
 
-    In them `k` is k - tau and `tau` is tau [N/m], `longer` is L^2 - L0^2, `square` is L^2, `length` is L0 and
-    `numbers` are those of the law.
+    In them `k` is k - tau and `tau` is tau [N/m], `square_difference` is L^2 - L0^2, `square` is L^2, `length` is L0,
+    and `numbers` are those of the law.
 
     Attributes:
-        pull: pull(k, tau, longer, square, length, *numbers), the force divided by L, without tau q [N/m].
-        slopes: slopes(k, tau, longer, square, length, along, *numbers) for a displacement p of the end of a spring, with
+        pull: pull(k, tau, square_difference, square, length, *numbers), the force divided by L, without tau q [N/m].
+        slopes: slopes(k, tau, square_difference, square, length, along, *numbers) for a displacement p of an end, with
             along = (o + q) . p. It returns s, w and the derivatives of `pull` by k and by tau. The force changes by
             s p + w (o + q), without tau p.
-        energy: energy(k, tau, share, length, *numbers) for share = (L^2 - L0^2) / L0^2, twice the energy divided by
+        energy: energy(k, tau, share, *numbers) for share = (L^2 - L0^2) / L0^2, twice the energy divided by
             L0^2, without tau q^2 [N/m].
     """
 
@@ -80,17 +80,17 @@ class LinearLaw(Law):
         """Build the functions of the law."""
         sqrt, maximum = operations.sqrt, operations.maximum
 
-        def pull(k, tau, longer, square, length):
-            return k * longer / (square + length * sqrt(square))
+        def pull(k, tau, square_difference, square, length):
+            return k * square_difference / (square + length * sqrt(square))
 
-        def slopes(k, tau, longer, square, length, along):
+        def slopes(k, tau, square_difference, square, length, along):
             both = square + length * sqrt(square)
             # One division instead of two.
             inverse = 1 / (square * both)
-            share = longer * square * inverse
+            share = square_difference * square * inverse
             return k * share, k * ((1 - share) * both * inverse * along), share, 0 * share
 
-        def energy(k, tau, share, length):
+        def energy(k, tau, share):
             # L / L0 - 1; rounding can make `share` smaller than -1.
             stretch = share / (1 + sqrt(maximum(share + 1, 0)))
             return stretch * stretch * k

@@ -133,13 +133,13 @@ class ProbeTerm(Term):
                     distance = ti.sqrt(off_x * off_x + off_y * off_y)
                     exponent = now[column + FALLOFF] * distance + now[column + SHIFT]
                     # The derivative is 0 where the force does not depend on the distance, and at the control point.
-                    falloff_per_distance = now[column + FALLOFF] / ti.select(distance > 0, distance, vector(1))
-                    falloff_per_distance = ti.select(exponent > now[column + OFFSET], falloff_per_distance, vector(0))
+                    falloff_by_distance = now[column + FALLOFF] / ti.select(distance > 0, distance, vector(1))
+                    falloff_by_distance = ti.select(exponent > now[column + OFFSET], falloff_by_distance, vector(0))
                     exponent = ti.max(exponent, now[column + OFFSET])
                     share = vector([ti.exp(-exponent[lane]) for lane in ti.static(range(lanes))])
                     if ti.static(by_area[n]):
                         share *= sheet.by_column[(AREA_SHARE + entry.row.kind) * sheet.width + b]
-                    slope[0], slope[1] = share * falloff_per_distance * off_x, share * falloff_per_distance * off_y
+                    slope[0], slope[1] = share * falloff_by_distance * off_x, share * falloff_by_distance * off_y
                 else:
                     share = sheet.fields[((first_field + stationary[n]) * sheet.rows + i) * sheet.width + b]
                     for axis in ti.static(range(2)):

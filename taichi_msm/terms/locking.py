@@ -15,21 +15,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
+from taichi_msm.model.sheet import Stiffening
 from taichi_msm.terms.law import Law, LawFunctions, Operations
 
 # Up to this y, atanh(y) - y is computed by its series.
 MAX_SERIES_Y = 0.1
-
-
-class Stiffening(NamedTuple):
-    """Numbers of a law that locks."""
-
-    lock: float  # m: the strain of a spring; for a foundation a length [m]
-    factor: float  # largest tangent
-
-    def numbers(self, length: float) -> tuple[float, float]:
-        """Return 1 / (m L0) and x0 for a spring of length L0, or with 1 for the foundation."""
-        return 1 / (self.lock * length), 1 - self.factor**-0.5
 
 
 class LockingFunctions(NamedTuple):
@@ -72,35 +62,46 @@ def build_locking(operations: Operations) -> LockingFunctions:
     return LockingFunctions(secant, tangent, energy)
 
 
+def make_stiffening(lock: float | None, factor: float) -> Stiffening | None:
+    """Return the numbers of a law that locks; None for a linear law."""
+    return None if lock is None or factor == 1 else Stiffening(lock, factor)
+
+
+def law_numbers(stiffening: Stiffening | None, length: float) -> tuple[float, ...]:
+    """Return 1 / (m L0), x0 and m for a spring of length L0 [m]; none for a linear law. For the foundation L0 is 1."""
+    if stiffening is None:
+        return ()
+    return 1 / (stiffening.lock * length), 1 - stiffening.factor**-0.5, stiffening.lock
+
+
 @dataclass(frozen=True)
 class LockingLaw(Law):
-    """The law of springs that lock; its numbers are those of `Stiffening.numbers`."""
+    """The law of springs that lock; its numbers are `law_numbers`."""
 
-    number_count: ClassVar[int] = 2
+    number_count: ClassVar[int] = 3
 
     def build(self, operations: Operations) -> LawFunctions:
         """Build the functions of the law."""
         sqrt, maximum = operations.sqrt, operations.maximum
         secant, tangent, integral = (operations.wrap(function) for function in build_locking(operations))
 
-        def pull(k, tau, longer, square, length, scale, end):
+        def pull(k, tau, square_difference, square, length, scale, end, lock):
             root = sqrt(square)
-            share = longer / (square + length * root)
+            share = square_difference / (square + length * root)
             ratio = secant(share * root * scale, end)
             return share * ((k + tau) * ratio - tau)
 
-        def slopes(k, tau, longer, square, length, along, scale, end):
+        def slopes(k, tau, square_difference, square, length, along, scale, end, lock):
             root = sqrt(square)
-            share = longer / (square + length * root)
+            share = square_difference / (square + length * root)
             x = share * root * scale
             ratio = secant(x, end)
-            straight = share * ((k + tau) * ratio - tau)
-            turned = ((k + tau) * tangent(x, end) - tau - straight) / square * along
-            return straight, turned, share * ratio, share * (ratio - 1)
+            isotropic = share * ((k + tau) * ratio - tau)
+            axial = ((k + tau) * tangent(x, end) - tau - isotropic) / square * along
+            return isotropic, axial, share * ratio, share * (ratio - 1)
 
-        def energy(k, tau, share, length, scale, end):
+        def energy(k, tau, share, scale, end, lock):
             stretch = share / (1 + sqrt(maximum(share + 1, 0)))
-            m = 1 / (scale * length)
-            return (k + tau) * (m * m) * integral(stretch / m, end) - tau * stretch * stretch
+            return (k + tau) * (lock * lock) * integral(stretch / lock, end) - tau * stretch * stretch
 
         return LawFunctions(pull, slopes, energy)

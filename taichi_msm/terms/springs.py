@@ -37,7 +37,7 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.terms.base import AREA_SHARE, DX, DY, HAS_LEFT, HAS_RIGHT, KernelConfig, Term
 from taichi_msm.terms.law import Law, LinearLaw
-from taichi_msm.terms.locking import LockingLaw
+from taichi_msm.terms.locking import LockingLaw, law_numbers, make_stiffening
 
 # Families of springs.
 ALONG_ROW, ALONG_COLUMN, DIAGONAL = range(3)
@@ -79,7 +79,8 @@ class SpringTerm(Term):
         tissue, springs = scene.tissue, scene.springs
         if tissue is None:
             assert springs is not None
-            return {"across": springs.structural, "down": springs.structural, "shear": springs.shear, "tension": 0.0}
+            stiffness = {"across": springs.structural, "down": springs.structural, "shear": springs.shear}
+            return {**stiffness, "tension": 0.0, "stiffening": None}
         dx, dy = spacing(scene.sheet)
         membrane = tissue.young * tissue.thickness
         return {
@@ -87,6 +88,7 @@ class SpringTerm(Term):
             "down": membrane * (9 / 8 * dx / dy - 3 / 8 * dy / dx),
             "shear": 3 / 16 * membrane * (dx * dx + dy * dy) / (dx * dy),
             "tension": tissue.pretension / (1.5 * membrane),
+            "stiffening": tissue.stiffening and make_stiffening(tissue.stiffening.lock, tissue.stiffening.factor),
         }
 
     @classmethod
@@ -138,16 +140,27 @@ class SpringTerm(Term):
     def constants(self, plan: Plan) -> tuple[float, ...]:
         """Return k - tau and tau of each family [N/m], for a factor of 1, and the numbers of the law."""
         material, (dx, dy) = plan.material, spacing(plan.scene.sheet)
-        lengths = dx, dy, math.hypot(dx, dy)
         remainder = 1 - material.tension
         stiffness = material.across * remainder, material.down * remainder, material.shear * remainder
-        return *stiffness, *material.tensions, *(n for length in lengths for n in law_numbers(material, length))
+        lengths = dx, dy, math.hypot(dx, dy)
+        numbers = (number for length in lengths for number in law_numbers(material.stiffening, length))
+        return *stiffness, *material.tensions, *numbers
 
     def energy(self, sums: NDArray[Any], plan: Plan) -> float:
         """Compute twice the energy [J], see `Term.energy`."""
         dx, dy = spacing(plan.scene.sheet)
         squares = np.array([dx**2, dy**2, dx**2 + dy**2])
         return float((sums[STRETCH_SUMS:TENSION_SUMS] + plan.material.tensions * sums[TENSION_SUMS:]) @ squares)
+
+    def build_numbers(self, config: KernelConfig) -> Callable[..., Any]:
+        """Build the Taichi function that returns the numbers of the law for a family of springs, as a list."""
+        ti, count, first = config.ti, self.law.number_count, config.first_constant(SpringTerm) + FIRST_NUMBER
+
+        @ti.func
+        def numbers_of(sheet: ti.template(), family: ti.template()):
+            return [sheet.constants[first + count * family + n] for n in ti.static(range(count))]
+
+        return numbers_of
 
     def build_spring_forces(self, config: KernelConfig) -> tuple[Callable[..., Any], ...]:
         """Build the Taichi functions that compute the forces of springs and their stiffness.
@@ -159,17 +172,18 @@ class SpringTerm(Term):
         ti = config.ti
         tense, mapped, by_area = self.tense, self.mapped, self.by_area and not self.mapped
         masks_edges, real, first = self.open_edges and not self.mapped, config.real, config.first_constant(SpringTerm)
-        first_tension, first_number, count = first + FIRST_TENSION, first + FIRST_NUMBER, self.law.number_count
+        first_tension, numbers_of = first + FIRST_TENSION, self.build_numbers(config)
         pull = config.compile_law(self.law).pull
 
         @ti.func
         def force(
-            sheet: ti.template(), family: ti.template(), k, longer, square, length, to: ti.template(), q: ti.template()
-        ):
+            sheet: ti.template(), family: ti.template(), k, square_difference, square, length,
+            to: ti.template(), q: ti.template(),
+        ):  # fmt: skip
             """Return the force of a spring of a family, for k - tau, L^2 - L0^2, L^2 and L0."""
             tension = sheet.constants[first_tension + family]
-            numbers = [sheet.constants[first_number + count * family + n] for n in ti.static(range(count))]
-            share = pull(k, tension, longer, square, length, *numbers)
+            numbers = numbers_of(sheet, family)
+            share = pull(k, tension, square_difference, square, length, *numbers)
             total = [share * to[c] for c in ti.static(range(3))]
             if ti.static(tense):
                 for c in ti.static(range(3)):
@@ -185,8 +199,9 @@ class SpringTerm(Term):
             rest = y * y + z * z
             if ti.static(masks_edges):
                 stiffness = k * exists
-            longer, square = x * (to_x - dx) + rest, to_x * to_x + (rest + MIN_SQUARED_LENGTH)
-            return force(sheet, ALONG_ROW, stiffness, longer, square, dx, [to_x, y, z], [x, y, z])
+            square_difference = x * (to_x - dx) + rest
+            square = to_x * to_x + (rest + MIN_SQUARED_LENGTH)
+            return force(sheet, ALONG_ROW, stiffness, square_difference, square, dx, [to_x, y, z], [x, y, z])
 
         @ti.func
         def to_other_row(sheet: ti.template(), entry, right: ti.template(), here: ti.template(), up, length, k, exists):
@@ -195,15 +210,15 @@ class SpringTerm(Term):
             to_x = x
             to_y = y - up
             rest = z * z
-            longer, stiffness = x * x + (y * (to_y - up) + rest), k
+            square_difference, stiffness = x * x + (y * (to_y - up) + rest), k
             if ti.static(right != 0):
                 to_x = x - right * sheet.constants[DX]
-                longer = x * (to_x - right * sheet.constants[DX]) + (y * (to_y - up) + rest)
+                square_difference = x * (to_x - right * sheet.constants[DX]) + (y * (to_y - up) + rest)
             if ti.static(masks_edges):
                 stiffness = k * exists
             square = to_x * to_x + to_y * to_y + (rest + MIN_SQUARED_LENGTH)
             family = ti.static(DIAGONAL if right else ALONG_COLUMN)
-            return force(sheet, family, stiffness, longer, square, length, [to_x, to_y, z], [x, y, z])
+            return force(sheet, family, stiffness, square_difference, square, length, [to_x, to_y, z], [x, y, z])
 
         @ti.func
         def of_row(sheet: ti.template(), i, kind, b):
@@ -242,25 +257,27 @@ class SpringTerm(Term):
 
             (k - tau) (s p + (1 - s) ((o + q) . p) (o + q) / L^2) + tau p,    s = 1 - L0 / L
 
-        The map from p to this change is symmetric. The product of the force with p has the derivative s (o + q) . p by
-        k - tau and q . p by tau.
+        with a linear law. The map from p to this change is symmetric.
         """
         ti, tense, slopes = config.ti, self.tense, config.compile_law(self.law).slopes
+        first_tension, numbers_of = config.first_constant(SpringTerm) + FIRST_TENSION, self.build_numbers(config)
 
         @ti.func
-        def differentiate(q: ti.template(), p: ti.template(), x0, y0, length, k, tension):
+        def differentiate(
+            sheet: ti.template(), family: ti.template(), q: ti.template(), p: ti.template(), x0, y0, length, k
+        ):
             """Return the change of the force (3), and the derivatives of its product with p by k - tau and by tau."""
             to = [q[0] + x0, q[1] + y0, q[2]]
             square = to[0] * to[0] + to[1] * to[1] + (to[2] * to[2] + MIN_SQUARED_LENGTH)
-            longer = q[0] * (to[0] + x0) + (q[1] * (to[1] + y0) + q[2] * q[2])
-            share, turning = slopes(longer, square, length)
+            square_difference = q[0] * (to[0] + x0) + (q[1] * (to[1] + y0) + q[2] * q[2])
             along = to[0] * p[0] + to[1] * p[1] + to[2] * p[2]
-            straight, turned = k * share, k * (turning * along)
+            tension, numbers = sheet.constants[first_tension + family], numbers_of(sheet, family)
+            isotropic, axial, by_k, by_tau = slopes(k, tension, square_difference, square, length, along, *numbers)
             if ti.static(tense):
-                straight += tension
-            change = [straight * p[c] + turned * to[c] for c in ti.static(range(3))]
-            product = q[0] * p[0] + q[1] * p[1] + q[2] * p[2]
-            return [change[0], change[1], change[2], share * along, product]
+                isotropic += tension
+            change = [isotropic * p[c] + axial * to[c] for c in ti.static(range(3))]
+            product = q[0] * p[0] + q[1] * p[1] + q[2] * p[2] + by_tau * along
+            return [change[0], change[1], change[2], by_k * along, product]
 
         return differentiate
 
@@ -305,13 +322,15 @@ class SpringTerm(Term):
         """Build the function that measures the springs to the right of an entry and to the row below it."""
         ti = config.ti
         tense, open_edges, vector, first = self.tense, self.open_edges, config.vector, config.first_measure(SpringTerm)
-        (_, _, of_row, of_column, of_diagonal), energy = self.build_spring_forces(config), config.compile_law(self.law).energy
+        _, _, of_row, of_column, of_diagonal = self.build_spring_forces(config)
+        first_tension, numbers_of = config.first_constant(SpringTerm) + FIRST_TENSION, self.build_numbers(config)
+        energy = config.compile_law(self.law).energy
         # For each family: its index, and the offsets in rows and columns from one end to the other.
         structural = ((ALONG_ROW, 0, (1,)), (ALONG_COLUMN, 1, (0,))) if self.structural else ()
         families = structural + (((DIAGONAL, 1, (-1, 1)),) if self.shear else ())
 
         @ti.func
-        def longer(sheet: ti.template(), p, q, b, right: ti.template(), x0, y0):
+        def strains(sheet: ti.template(), p, q, b, right: ti.template(), x0, y0):
             """Return (L^2 - L0^2) / L0^2 and |q|^2 / L0^2 of the spring from entry b of row p to b + right of row q."""
             start, end = p * sheet.width + b, q * sheet.width + b + right
             x = sheet.u[0][end] - sheet.u[0][start]
@@ -332,6 +351,7 @@ class SpringTerm(Term):
             for family, down, rights in ti.static(families):
                 if i + down < sheet.rows:
                     stretch_sum, tension_sum = vector(0), vector(0)
+                    tension, numbers = sheet.constants[first_tension + family], numbers_of(sheet, family)
                     for right in ti.static(rights):
                         k = vector(0)
                         if ti.static(family == ALONG_ROW):
@@ -340,10 +360,10 @@ class SpringTerm(Term):
                             k += of_column(sheet, i + 1, b)
                         else:
                             k += of_diagonal(sheet, i + 1, b + ti.static(min(right, 0)))
-                        share, squared = longer(sheet, p, p + down, b, right, right * dx, -down * dy)
+                        share, squared = strains(sheet, p, p + down, b, right, right * dx, -down * dy)
                         measures[first + MIN_STRAIN] = ti.min(measures[first + MIN_STRAIN], share)
                         measures[first + MAX_STRAIN] = ti.max(measures[first + MAX_STRAIN], share)
-                        stretch_sum += energy(share) * k
+                        stretch_sum += energy(k, tension, share, *numbers)
                         tension_sum += squared
                     measures[first + STRETCH_SUMS + family] += stretch_sum
                     if ti.static(tense):
@@ -370,15 +390,11 @@ def spring_law(material: Material) -> Law:
     return LinearLaw() if material.stiffening is None else LockingLaw()
 
 
-def law_numbers(material: Material, length: float) -> tuple[float, ...]:
-    """Return the numbers of the law for a spring of a length at rest [m]."""
-    return () if material.stiffening is None else material.stiffening.numbers(length)
-
-
 def _unmapped_bound(material: Material) -> float:
     """Return `SpringTerm.stiffness_bound` for factors of 1 [N/m]."""
     across, down, shear = material.across, material.down, material.shear
-    return 4 * max(across + down, across + 2 * shear, down + 2 * shear)
+    steepest = 1.0 if material.stiffening is None else material.stiffening.factor
+    return steepest * 4 * max(across + down, across + 2 * shear, down + 2 * shear)
 
 
 def spring_stiffness(material: Material, factors: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:

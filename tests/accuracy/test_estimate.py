@@ -135,7 +135,7 @@ def test_a_small_run_is_in_f64_and_a_large_one_in_f32() -> None:
     steps = 30 * plan_of(made(edge, 30)).grid.steps_per_frame * edge**2
     assert (
         planning.F64_WORK * steps
-        > planning.MAX_F64_SHARE * planning.START
+        > planning.MAX_F64_SHARE * planning.START_WORK
         >= planning.F64_WORK * steps * (1 - 3 / edge)
     )
 

@@ -10,7 +10,7 @@ import pytest
 from taichi_msm.accuracy.companions import choose_companion_runs
 from taichi_msm.load import cost
 from taichi_msm.load.cost import CALIBRATION_S, WORK_UNIT_S
-from taichi_msm.solver.planning import START, count_work
+from taichi_msm.solver.planning import START_WORK, count_work
 from taichi_msm.system import process
 from tests.conftest import Program
 from tests.scenes import plan_of
@@ -29,7 +29,7 @@ def test_the_estimate_is_the_work_at_the_speed_of_the_machine(cores: int, monkey
     plan = plan_of(small_scene(image="none.png", output=["gif"]))
     parts = count_work(plan, choose_companion_runs(plan).cost)
     assert min(parts) > 0
-    assert cost.estimate_duration(plan) == pytest.approx((2 * WORK_UNIT_S * sum(parts), 2 * WORK_UNIT_S * START))
+    assert cost.estimate_duration(plan) == pytest.approx((2 * WORK_UNIT_S * sum(parts), 2 * WORK_UNIT_S * START_WORK))
 
 
 def test_check_says_how_long_a_run_takes(small: Path, program: Program) -> None:
