@@ -176,14 +176,20 @@ class SpringTerm(Term):
         pull = config.compile_law(self.law).pull
 
         @ti.func
+        def masked(k, exists):
+            if ti.static(masks_edges):
+                return k * exists
+            else:  # noqa: RET505
+                return k
+
+        @ti.func
         def force(
-            sheet: ti.template(), family: ti.template(), k, square_difference, square, length,
+            sheet: ti.template(), family: ti.template(), k, exists, square_difference, square, length,
             to: ti.template(), q: ti.template(),
         ):  # fmt: skip
-            """Return the force of a spring of a family, for k - tau, L^2 - L0^2, L^2 and L0."""
-            tension = sheet.constants[first_tension + family]
-            numbers = numbers_of(sheet, family)
-            share = pull(k, tension, square_difference, square, length, *numbers)
+            """Return the force of a spring of a family, for k - tau, 0 beyond an edge, L^2 - L0^2, L^2 and L0."""
+            tension, numbers = sheet.constants[first_tension + family], numbers_of(sheet, family)
+            share = pull(masked(k, exists), tension, square_difference, square, length, *numbers)
             total = [share * to[c] for c in ti.static(range(3))]
             if ti.static(tense):
                 for c in ti.static(range(3)):
@@ -193,15 +199,13 @@ class SpringTerm(Term):
         @ti.func
         def along(sheet: ti.template(), right, here: ti.template(), k, exists):
             """Return the force of a mass point displaced by `here` on its right neighbour, entry `right` of u."""
-            dx, stiffness = sheet.constants[DX], k
+            dx = sheet.constants[DX]
             x, y, z = here[0] - sheet.u[0][right], here[1] - sheet.u[1][right], here[2] - sheet.u[2][right]
             to_x = x - dx
             rest = y * y + z * z
-            if ti.static(masks_edges):
-                stiffness = k * exists
             square_difference = x * (to_x - dx) + rest
             square = to_x * to_x + (rest + MIN_SQUARED_LENGTH)
-            return force(sheet, ALONG_ROW, stiffness, square_difference, square, dx, [to_x, y, z], [x, y, z])
+            return force(sheet, ALONG_ROW, k, exists, square_difference, square, dx, [to_x, y, z], [x, y, z])
 
         @ti.func
         def to_other_row(sheet: ti.template(), entry, right: ti.template(), here: ti.template(), up, length, k, exists):
@@ -210,15 +214,13 @@ class SpringTerm(Term):
             to_x = x
             to_y = y - up
             rest = z * z
-            square_difference, stiffness = x * x + (y * (to_y - up) + rest), k
+            square_difference = x * x + (y * (to_y - up) + rest)
             if ti.static(right != 0):
                 to_x = x - right * sheet.constants[DX]
                 square_difference = x * (to_x - right * sheet.constants[DX]) + (y * (to_y - up) + rest)
-            if ti.static(masks_edges):
-                stiffness = k * exists
             square = to_x * to_x + to_y * to_y + (rest + MIN_SQUARED_LENGTH)
             family = ti.static(DIAGONAL if right else ALONG_COLUMN)
-            return force(sheet, family, stiffness, square_difference, square, length, [to_x, to_y, z], [x, y, z])
+            return force(sheet, family, k, exists, square_difference, square, length, [to_x, to_y, z], [x, y, z])
 
         @ti.func
         def of_row(sheet: ti.template(), i, kind, b):

@@ -11,6 +11,7 @@ from taichi_msm.model.loads import Schedule, average_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions, spacing
 from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.sheet import Foundation
 from taichi_msm.solver.planning import make_plan
 from tests.reference.contact import Contact
 from tests.reference.sheet import Springs, sheet
@@ -35,8 +36,29 @@ def elastic_force(scene: Scene, displacement: Array) -> Array:
         found = (springs.stiffness * pull)[..., None] * between
         at_rest = springs.stiffness * (springs.length - springs.unstretched) / springs.length
         found -= at_rest[..., None] * springs.offset
+        if scene.tissue is not None and scene.tissue.stiffening is not None:
+            keys, strain = scene.tissue.stiffening, length / springs.length - 1
+            more = springs.stiffness * springs.length * (lock(strain, keys.lock, keys.factor) - strain)
+            found += (more / length)[..., None] * between
         force[springs.here] += found
         force[springs.there] -= found
+    return force
+
+
+def lock(e: Array, m: float, factor: float) -> Array:
+    """Return the law of tissue that locks: e / (1 - e / m) where e > 0, straight where its slope reaches the factor."""
+    c = m * (1 - factor**-0.5)
+    curved = np.where(e > 0, e / (1 - np.clip(e, 0, c) / m), e)
+    return np.where(e > c, c / (1 - c / m) + (e - c) * factor, curved)
+
+
+def foundation_force(scene: Scene, displacement: Array) -> Array:
+    """Return the force of the virtual springs while they are active [N], shape (rows, cols, 3)."""
+    k, force = sheet(scene).virtual, -sheet(scene).virtual[..., None] * displacement
+    foundation = None if scene.tissue is None else scene.tissue.foundation
+    if isinstance(foundation, Foundation) and foundation.lock is not None:
+        depth = -displacement[..., 2]
+        force[..., 2] = k * np.where(depth > 0, lock(depth, foundation.lock, foundation.factor), depth)
     return force
 
 
@@ -108,7 +130,15 @@ def _held(scene: Scene, displacement: Array) -> Iterator[tuple[Springs, Array]]:
         rest = springs.length - springs.unstretched
         # The part that is linear in the displacements cancels in the sum, as the sheet is in equilibrium at rest.
         linear = (between - springs.offset) @ springs.offset * rest / springs.length
-        yield springs, springs.stiffness * ((length - springs.unstretched) ** 2 / 2 - rest**2 / 2 - linear)
+        held = springs.stiffness * ((length - springs.unstretched) ** 2 / 2 - rest**2 / 2 - linear)
+        if scene.tissue is not None and scene.tissue.stiffening is not None:
+            keys, strain = scene.tissue.stiffening, length / springs.length - 1
+            # The integral of lock(e) - e from 0 to the strain, by Gauss and Legendre.
+            nodes, weights = np.polynomial.legendre.leggauss(60)
+            at = strain[..., None] * (nodes + 1) / 2
+            more = ((lock(at, keys.lock, keys.factor) - at) * weights).sum(axis=-1) * strain / 2
+            held = held + springs.stiffness * springs.length**2 * more
+        yield springs, held
 
 
 def surgical_force(scene: Scene, loads: Schedule, n: int) -> Array:
@@ -153,7 +183,7 @@ def force(scene: Scene, displacement: Array, loads: Schedule, n: int) -> Array:
         elastic_force(scene, displacement)
         + bending_force(scene, displacement)
         + surgical_force(scene, loads, n)
-        - loads.active[n] * sheet(scene).virtual[..., None] * displacement
+        + loads.active[n] * foundation_force(scene, displacement)
     )
 
 
