@@ -28,7 +28,7 @@ from taichi_msm.scene.outputs import OUTPUTS
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.planning import count_work
 from taichi_msm.system.process import available_memory
-from taichi_msm.terms.contact import contact_fields
+from taichi_msm.terms import memory_names
 
 
 def format_rough_time(seconds: float) -> str:
@@ -123,8 +123,8 @@ def estimate_budget(plan: Plan) -> Budget:
     track_bytes = scene.render.tracks**2 * (frames * TRACK_BYTES + 16) + FILE_BYTES if "tracks" in scene.output else 0
     track_bytes *= cameras
     force_rows = frames * len(scene.probes) if "forces" in scene.output else 0
-    contact_numbers = contact_fields(scene.probes)
-    numbers = STATE_NUMBERS + OUTPUT_NUMBERS + contact_numbers + sum(MAP_NUMBERS[name] for name in scene.maps)
+    memory_numbers = len(memory_names(plan))
+    numbers = STATE_NUMBERS + OUTPUT_NUMBERS + memory_numbers + sum(MAP_NUMBERS[name] for name in scene.maps)
     numbers += sum(not probe.moved for probe in scene.probes)  # the load of each force-controlled tool
     # Companion runs add up to two sheets in f64, and with tissue two smaller ones.
     has_companions = scene.time.tolerance is not None or choose_companion_runs(plan).planned
@@ -141,7 +141,7 @@ def estimate_budget(plan: Plan) -> Budget:
         force_bytes=force_rows * FORCE_ROW_BYTES + FILE_BYTES if "forces" in scene.output else 0,
         record_bytes=2 * len(scene.model_dump_json(indent=2)) + RECORD_BYTES,
         # Two checkpoints, and all positions and forces so far.
-        working_bytes=2 * points * (STATE_NUMBERS + contact_numbers) * number_bytes
+        working_bytes=2 * points * (STATE_NUMBERS + memory_numbers) * number_bytes
         + (position_bytes if scene.output else 0)
         + force_rows * FORCE_BYTES,
     )

@@ -22,6 +22,9 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_POINTS
 from taichi_msm.scene.sheet import Sheet, StiffnessMap
 
+# Largest number of branches of the stress relaxation.
+MAX_BRANCHES = 4
+
 # A larger ratio of the sides of a cell would require springs of negative stiffness.
 MAX_CELL_ASPECT = math.sqrt(3)
 
@@ -98,6 +101,7 @@ class Material:
     always_active: bool  # whether the virtual springs are always active; else only under load
     bending: float  # D dx dy [N m3]
     stiffening: Stiffening | None  # of the springs; None if they are linear
+    relaxation: tuple[tuple[float, float], ...]  # share and time [s] of every branch
     virtual_stiffening: Stiffening | None  # of the virtual springs, its lock in metres; None if they are linear
     by_area: bool  # whether mass points and springs at an edge are lighter and softer, as in tissue
     factors: Array | None  # factor of the stiffness of every cell, shape (rows - 1, cols - 1); None without a map
@@ -239,6 +243,16 @@ def tissue_problems(scene: Scene, fixed: NDArray[np.bool_], factors: Array | Non
     if tissue.foundation_map is not None and tissue.foundation_stiffness == 0:
         text = "needs a foundation; set tissue.foundation, such as {young: 15e3, depth: 0.05}, or remove foundation_map"
         yield Problem(("tissue", "foundation_map"), text)
+    if len(tissue.relaxation) > MAX_BRANCHES:
+        text = f"{len(tissue.relaxation)} branches are too many; take at most {MAX_BRANCHES}"
+        yield Problem(("tissue", "relaxation"), text)
+    total = sum(branch.share for branch in tissue.relaxation)
+    if total >= 1:
+        text = f"shares of {total:g} in all leave no elastic force; take shares whose sum is below 1"
+        yield Problem(("tissue", "relaxation"), text)
+    if tissue.relaxation and tissue.foundation_stiffness and tissue.foundation_active == "loaded":
+        text = "loaded, but tissue that relaxes needs a foundation at all times; set foundation_active: always"
+        yield Problem(("tissue", "foundation_active"), text)
     if not has_fixed_border(fixed):
         bending = "plate" if tissue.bending == "plate" else f"{tissue.bending:g} N m"
         for name, value in (("pretension", f"{tissue.pretension:g} N/m"), ("bending", bending)):

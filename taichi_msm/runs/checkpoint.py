@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import DamagedError, FilesError, ForeignError
-from taichi_msm.model.time_grid import TimeGrid
+from taichi_msm.model.plan import Plan
 from taichi_msm.runs.arrays import read_array, write_arrays
 from taichi_msm.runs.directory import (
     DRAFT_FILE,
@@ -39,9 +39,8 @@ from taichi_msm.runs.directory import (
     replacing,
     require_kind,
 )
-from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.state import PeakForce, ProbeForces, RunProgress, Snapshot, State, TipForce
-from taichi_msm.terms.contact import contact_fields
+from taichi_msm.terms import memory_names
 
 # A folder without the manifest is not a checkpoint.
 CHECKPOINT_FOLDER, MANIFEST_FILE, POSITIONS_FILE, FORCES_FILE, STATE_FILE = (
@@ -68,8 +67,7 @@ class Checkpoint:
 
     Args:
         folder: the folder; `begin` creates it.
-        scene: the scene of the run.
-        grid: the time grid of the run.
+        plan: the plan of the run.
 
     Raises:
         DamagedError: from the methods that read, when a part is damaged; the message names the part.
@@ -79,12 +77,13 @@ class Checkpoint:
         precision: dtype of the positions.
     """
 
-    def __init__(self, folder: Path, scene: Scene, grid: TimeGrid) -> None:
+    def __init__(self, folder: Path, plan: Plan) -> None:
+        scene, grid = plan.scene, plan.grid
         self.frames = 0
         self._folder = folder
         self._grid = grid
         self._shape, self._probes = (*scene.sheet.points, 3), len(scene.probes)
-        self._contact_shape = (contact_fields(scene.probes), *scene.sheet.points)
+        self._memory_shape = (len(memory_names(plan)), *scene.sheet.points)
         self.precision = np.dtype(np.float32 if grid.precision == "f32" else np.float64)
         self._next_save = 0.0
         # Checksums of all parts include this digest, so that parts of different runs do not mix.
@@ -177,7 +176,7 @@ class Checkpoint:
         types["forces"] = types["forces"][0], (self._probes, FORCE_COLUMNS)
         types["greatest"] = types["greatest"][0], (self._probes, PEAK_FORCE_COLUMNS)
         types |= dict.fromkeys(("displacement", "difference"), (self.precision, self._shape))
-        types["contact"] = self.precision, self._contact_shape
+        types["memory"] = self.precision, self._memory_shape
         try:
             with (self._folder / STATE_FILE).open("rb") as file, zipfile.ZipFile(file) as archive:
                 arrays = {name: read_array(archive, name, *expected) for name, expected in types.items()}
@@ -186,7 +185,7 @@ class Checkpoint:
         except Exception:  # zipfile raises almost any type for a forged archive
             raise damaged_checkpoint(self._folder / STATE_FILE) from None
         progress = RunProgress(**{field.name: arrays[field.name].item() for field in fields(RunProgress)})
-        state = State(int(arrays["steps"]), arrays["displacement"], arrays["difference"], arrays["contact"])
+        state = State(int(arrays["steps"]), arrays["displacement"], arrays["difference"], arrays["memory"])
         greatest = tuple(PeakForce(time, (x, y, z)) for time, x, y, z in arrays["greatest"].tolist())
         saved = Snapshot(state, progress, ProbeForces(_tip_forces(arrays["forces"]), greatest))
         steps_per_frame = self._grid.steps_per_frame

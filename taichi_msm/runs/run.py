@@ -268,8 +268,7 @@ class _Run:
         self._writer = opened.enter_context(
             ResultWriter(
                 context.directory,
-                plan.scene,
-                plan.grid,
+                plan,
                 manifest.as_json(),
                 resumes=resumes,
                 encode_in_subprocess=device.threads > 1,  # with one thread, no core is free for it

@@ -17,8 +17,8 @@ from PIL import Image
 from typing_extensions import NotRequired
 
 from taichi_msm.errors import Pause, writing
+from taichi_msm.model.plan import Plan
 from taichi_msm.model.surface import surface_positions
-from taichi_msm.model.time_grid import TimeGrid
 from taichi_msm.model.tool_force import ProbeRecord
 from taichi_msm.render.camera import calibration, is_moving, pose, view_at
 from taichi_msm.render.labels import FrameOutputs, track_grid
@@ -56,8 +56,7 @@ class ResultWriter:
 
     Args:
         directory: destination of the results.
-        scene: the resolved scene.
-        grid: its time grid.
+        plan: plan of the resolved scene.
         manifest: manifest of the run for its checkpoint; None for a run that cannot be resumed.
         resumes: whether to continue from the checkpoint in the directory.
         encode_in_subprocess: whether pictures are encoded in a separate process; otherwise, `add` encodes them.
@@ -75,8 +74,7 @@ class ResultWriter:
     def __init__(
         self,
         directory: Path,
-        scene: Scene,
-        grid: TimeGrid,
+        plan: Plan,
         manifest: Mapping[str, Any] | None = None,
         *,
         resumes: bool = False,
@@ -86,14 +84,14 @@ class ResultWriter:
         self.frames = 0
         self.encode_seconds = 0.0
         self._directory = directory
-        self._scene = scene
+        self._scene = scene = plan.scene
         self._manifest = manifest
         self._resumes = resumes
         self._encodes_in_subprocess = encode_in_subprocess
         names = outputs.file_names(outputs.result_names(scene.folders), scene.time.frames + 1)
         self._publication = Publication(directory, RUN_PUBLICATION, names)
         folder = self._publication.staging_folder / CHECKPOINT_FOLDER
-        self._checkpoint = Checkpoint(folder, scene, grid)
+        self._checkpoint = Checkpoint(folder, plan)
         staged = self._publication.new_folder
         self._labels = {name: LabelWriter(staged / name, scene, name) for name in scene.render.all_cameras}
         self._encoder: Encoder | PictureWriter | None = None

@@ -11,6 +11,7 @@ from taichi_msm.scene.section import (
     FilePath,
     NodeCount,
     NotNegative,
+    OpenUnitInterval,
     Positive,
     Section,
     Side,
@@ -81,6 +82,13 @@ class Locking(Section):
     factor: StiffnessRatio = key(10.0, "largest stiffness, relative to that at rest", "a number from 1 to 1000")
 
 
+class Branch(Section):
+    """Branch of the stress relaxation."""
+
+    share: OpenUnitInterval = key(..., "share of the elastic forces that relaxes", "a number above 0 and below 1")
+    time: Positive = key(..., "relaxation time [s]", "a number above 0, in s")
+
+
 class Foundation(Section):
     """Elastic (Winkler) foundation: a layer of tissue below the sheet.
 
@@ -125,6 +133,12 @@ class Tissue(Section):
     )
     stiffening: Locking | None = key(
         None, "sheet that locks when it is stretched", "a mapping: {lock: [a strain], factor: [default 10]}"
+    )
+    relaxation: tuple[Branch, ...] = key(
+        (),
+        "stress relaxation of all elastic forces, in up to 4 branches with shares below 1 in all; a foundation must "
+        "always be active",
+        "a list of up to 4 mappings: [{share: [0 to 1], time: [s]}, ...]",
     )
     map: StiffnessMap | None = key(None, "map of a factor of young", "a mapping with image and range")
     foundation_map: StiffnessMap | None = key(

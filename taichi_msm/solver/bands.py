@@ -22,11 +22,10 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from taichi_msm.solver.arrays import build_point_step
-from taichi_msm.solver.row import build_pass_row, build_touch_row
+from taichi_msm.solver.row import build_correct_row, build_pass_row
 from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, ti
 from taichi_msm.terms.base import DY, KernelConfig, KernelRow, KernelSheet
 from taichi_msm.terms.bending import BendingTerm
-from taichi_msm.terms.contact import ContactTerm
 
 # Integer arguments of a launch: steps taken before it; steps to take; workers; steps of a pass; rows of `carried` per
 # worker; rows of the sheet; columns of a strip; the first row that is not fixed, and the row after the last; the first
@@ -76,21 +75,21 @@ def build_join_strips(config: KernelConfig) -> Callable[..., None]:
 
 
 def build_step_row(
-    config: KernelConfig, move: Callable[..., None], *, touches: bool, parallel: bool
+    config: KernelConfig, move: Callable[..., None], *, corrects: bool, parallel: bool
 ) -> Callable[..., Any]:
     """Build the Taichi function that steps a row of a band, as soon as the neighbours' rows are available.
 
     Args:
         config: compile-time configuration.
         move: function that steps an entry, as for `build_pass_row`.
-        touches: whether contact with tools is resolved after the step.
+        corrects: whether the corrections of terms are applied after the step.
         parallel: whether the band has neighbours.
     """
     vector, bending, copied = config.vector, config.get(BendingTerm), config.reach
     join_strips = build_join_strips(config)
     pass_row, storing = build_pass_row(config, move), [bending.build_store_moment(config)] if bending else []
-    contact = config.get(ContactTerm) if touches else None
-    touching = [build_touch_row(config, contact)] if contact else []
+    corrections = [term.build_correction(config) for term in config.terms if corrects]
+    correcting = [build_correct_row(config, correction) for correction in corrections if correction]
 
     @ti.func
     def copy_row(rows, worker, border, n, behind):
@@ -179,8 +178,8 @@ def build_step_row(
                 line = ti.static(KernelRow(i, kind, before, middle, after))
                 pass_row(sheet, carried, carry, line, here, next_row, exists, up, loads, n, row >= 0)
                 if row >= 0:
-                    for touch_row in ti.static(touching):
-                        touch_row(sheet, i, kind, loads, n)
+                    for correct_row in ti.static(correcting):
+                        correct_row(sheet, i, kind, loads, n)
             else:
                 for b in range(1, sheet.width - 1):
                     for c in ti.static(range(3)):
@@ -207,7 +206,7 @@ def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None
     """
     real, vector, vectors, lanes = config.real, config.vector, config.vectors, config.lanes
     constant_count = config.first_constant(None)
-    step_row = build_step_row(config, build_point_step(config), touches=True, parallel=parallel)
+    step_row = build_step_row(config, build_point_step(config), corrects=True, parallel=parallel)
 
     @ti.func
     def step_band(

@@ -38,7 +38,6 @@ from taichi_msm.terms.base import (
     SQUARED_MOTION,
     KernelConfig,
 )
-from taichi_msm.terms.contact import ContactTerm
 from taichi_msm.terms.damping import coefficients
 from taichi_msm.terms.loads import ProbeTerm, decay_parameters
 from taichi_msm.terms.springs import MAX_STRAIN, MIN_STRAIN, SpringTerm
@@ -141,22 +140,14 @@ class Dynamics:
         Raises:
             ArgumentError: when the new probes require other kernels.
         """
-        probes, before = ProbeTerm.from_plan(plan), self.layout.config.require(ProbeTerm)
-        tools, compiled = ContactTerm.from_plan(plan), self.layout.config.get(ContactTerm)
+        config, terms = self.layout.config, build_terms(plan)
+        probes = next(term for term in terms if isinstance(term, ProbeTerm))
         if [tool.probe for tool in plan.tools] != [tool.probe for tool in self.plan.tools]:
             raise ArgumentError("probes: which of them have a path cannot change; restart with the new scene")
-        if probes.moves != before.moves:
-            raise ArgumentError(
-                f"probes: which control points move or jump cannot change (before: {_format_flags(before.moves)}; now: "
-                f"{_format_flags(probes.moves)}); restart with the new scene"
-            )
-        if probes.by_area != before.by_area:
-            raise ArgumentError("probes: one has total instead of force, or the reverse; restart with the new scene")
-        if tools and compiled and not tools.is_compiled_in(compiled):
-            raise ArgumentError(
-                "probes: friction and grips cannot be added where there were none; restart with the new scene, such as "
-                "with a friction of 1e-9, or with a grip that ends before the start"
-            )
+        for term in terms:
+            compiled = config.get(type(term))
+            if compiled and (reason := term.supports(compiled)):
+                raise ArgumentError(f"probes: {reason}")
         if decay_parameters(plan) != decay_parameters(self.plan):
             self._moving.arrays.set_fields(self.layout.config.first_field(ProbeTerm), probes.fields(plan))
         self.plan = plan
@@ -206,7 +197,7 @@ class Dynamics:
         """Read the state on which the next steps depend."""
         self._require_consistent()
         u, d = self._read_arrays(differences=False)[0], self._read_arrays(differences=True)[0]
-        return State(self.steps_done, u, d, self._contact_fields())
+        return State(self.steps_done, u, d, self._memory())
 
     def read(self) -> Reading:
         """Read the displacements and measure the sheet, in the scene's precision."""
@@ -251,13 +242,10 @@ class Dynamics:
         sums = sum_corrections(self.layout, self._moving.arrays, clear=False)
         return sums / (gain * self.plan.grid.steps_per_frame)
 
-    def _contact_fields(self) -> NDArray[Any]:
-        """Read the fields of contact, shape (fields, rows, cols)."""
-        config = self.layout.config
-        contact = config.get(ContactTerm)
-        if contact is None:
-            return np.empty((0, self.layout.rows, self.layout.cols), self._real)
-        return self._moving.arrays.get_fields(config.first_field(ContactTerm), contact.field_count)
+    def _memory(self) -> NDArray[Any]:
+        """Read the numbers that terms remember, shape (numbers, rows, cols)."""
+        fields = [self._moving.arrays.get_fields(n, 1) for n in self.layout.config.memory_fields]
+        return np.concatenate([np.empty((0, self.layout.rows, self.layout.cols), self._real), *fields])
 
     def _require_consistent(self) -> None:
         if self.inconsistent:
@@ -324,9 +312,8 @@ class Dynamics:
             *(n for term in layout.config.terms for n in term.constants(plan)),
         )
         fields = np.concatenate([term.fields(plan) for term in layout.config.terms])
-        if state is not None and len(state.contact):
-            first = layout.config.first_field(ContactTerm)
-            fields[first : first + len(state.contact)] = state.contact
+        if state is not None and len(state.memory):
+            fields[layout.config.memory_fields] = state.memory
         stiffness = layout.config.require(SpringTerm).stiffness_array(plan)
         self._sheet = None  # Frees its memory before the new sheet is allocated.
         self._sheet = self._build_kernel(InitialData(np.array(constants), by_column, fields, stiffness, state))
@@ -335,10 +322,6 @@ class Dynamics:
         """Build the kernel for the device."""
         kind: type[StepKernel] = ScatterKernel if self.layout.workers else GatherKernel
         return kind(self.layout, start)
-
-
-def _format_flags(moves: tuple[bool, ...]) -> str:
-    return ", ".join("yes" if slot_moves else "no" for slot_moves in moves) or "none"
 
 
 Array = NDArray[np.float64]

@@ -17,7 +17,6 @@ from taichi_msm.solver.arrays import InitialData, SheetArrays, SheetLayout, buil
 from taichi_msm.system.runtime import compilation_options, ti
 from taichi_msm.terms.base import DX, DY, HAS_LEFT, HAS_RIGHT, Entry, KernelConfig, KernelRow, KernelSheet
 from taichi_msm.terms.bending import BendingTerm
-from taichi_msm.terms.contact import ContactTerm
 from taichi_msm.terms.springs import SpringTerm
 
 # Number of loops of a launch, one per step.
@@ -65,8 +64,8 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
     structural, shear = springs.structural, springs.shear
     masks_edges = springs.open_edges and not springs.mapped
     along, to_other_row, of_row, of_column, of_diagonal = springs.build_spring_forces(config)
-    move, contact = build_point_step(config), config.get(ContactTerm)
-    build_resolve = [contact.build_resolve(config)] if contact else []
+    move, corrections = build_point_step(config), [term.build_correction(config) for term in config.terms]
+    resolving = [correction.resolve for correction in corrections if correction]
 
     @ti.func
     def by_row(sheet: ti.template(), p, q, lower, b, row_exists, up):
@@ -120,7 +119,7 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
         entry = ti.static(Entry(line, b, u))
         target = (1 - now) * (rows + 2) + i + 1
         move(sheet, entry, target, force, row)
-        for resolve in ti.static(build_resolve):
+        for resolve in ti.static(resolving):
             resolve(sheet, i, kind, target, b, row)
 
     return step

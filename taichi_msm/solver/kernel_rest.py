@@ -30,10 +30,8 @@ from numpy.typing import NDArray
 from taichi_msm.solver.arrays import InitialData, SheetArrays, SheetLayout, build_read, point_forces, to_lanes
 from taichi_msm.solver.bands import MOMENT_ROWS, RowBand, build_join_strips, build_step_row
 from taichi_msm.system.runtime import compilation_options, ti, write_vectors
-from taichi_msm.terms.base import MOBILITY, Entry, KernelConfig, KernelRow, KernelSheet
+from taichi_msm.terms.base import MOBILITY, Entry, KernelConfig, KernelRow, KernelSheet, RestCorrection
 from taichi_msm.terms.bending import BendingTerm
-from taichi_msm.terms.contact import ContactTerm
-from taichi_msm.terms.contact_rest import build_project_out, build_remove_contact
 from taichi_msm.terms.springs import SpringTerm
 
 # Arguments of a launch: rows of the sheet; columns of a strip; the first row that is not fixed, and the row after the
@@ -150,10 +148,15 @@ def _kernels(config: KernelConfig) -> tuple[Callable[..., None], Callable[..., N
     return _build_relax(config), _build_scale(config), build_read(config, parallel=False, iterations=1)
 
 
+def _corrections(config: KernelConfig) -> list[RestCorrection]:
+    """Build the corrections of all terms."""
+    return [correction for term in config.terms if (correction := term.build_rest_correction(config)) is not None]
+
+
 def _build_store(config: KernelConfig) -> Callable[..., None]:
     """Build the Taichi function that stores the force on an entry and adds to the reductions of FIRE."""
-    vector, forces, contact = config.vector, point_forces(config), config.get(ContactTerm)
-    removals = [build_remove_contact(config, contact)] if contact else []
+    vector, forces = config.vector, point_forces(config)
+    removals = [correction.remove for correction in _corrections(config)]
 
     @ti.func
     def store(sheet: ti.template(), entry: ti.template(), _target, force: ti.template(), now: ti.template()):
@@ -166,8 +169,8 @@ def _build_store(config: KernelConfig) -> Callable[..., None]:
         for c in ti.static(range(3)):
             force[c] = ti.select(moves, force[c], vector(0))
             sheet.d[c][at] = force[c]
-        for remove_contact in ti.static(removals):
-            remove_contact(force, sheet, at)
+        for remove in ti.static(removals):
+            remove(force, sheet, at)
         for c in ti.static(range(3)):
             q = sheet.q[c][at]
             power += force[c] * q
@@ -187,11 +190,10 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
     """Build the kernel that evaluates forces and moves mass points."""
     real, vector, vectors, lanes = config.real, config.vector, config.vectors, config.lanes
     constant_count, join_strips = config.first_constant(None), build_join_strips(config)
-    pass_row = build_step_row(config, _build_store(config), touches=False, parallel=False)
+    pass_row = build_step_row(config, _build_store(config), corrects=False, parallel=False)
     moments = 0 if config.get(BendingTerm) is None else MOMENT_ROWS
-    columns, contact = config.first_column(None), config.get(ContactTerm)
-    removals = [build_remove_contact(config, contact)] if contact else []
-    projections = [build_project_out(config, contact)] if contact else []
+    columns, corrections = config.first_column(None), _corrections(config)
+    removals, projections = [each.remove for each in corrections], [each.project for each in corrections]
 
     @ti.func
     def add_up(sheet: ti.template(), n: ti.template()):
@@ -218,8 +220,8 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
                 at = i * sheet.width + b
                 full_force = [sheet.d[c][at] for c in ti.static(range(3))]
                 force = [full_force[c] for c in ti.static(range(3))]
-                for remove_contact in ti.static(removals):
-                    remove_contact(force, sheet, at)
+                for remove in ti.static(removals):
+                    remove(force, sheet, at)
                 for c in ti.static(range(3)):
                     old_q = sheet.q[c][at]
                     q = keep * old_q + gain * force[c]

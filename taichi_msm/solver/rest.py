@@ -20,7 +20,6 @@ plane, so the iteration would not converge to it.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -30,7 +29,6 @@ from taichi_msm.errors import DivergedError, Pause
 from taichi_msm.model.loads import evaluate_frame_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.model.tools import GRIP_RADII, Tool, grip_frames
 from taichi_msm.scene.section import MIN_MAGNITUDE
 from taichi_msm.solver.arrays import InitialData, SheetLayout
 from taichi_msm.solver.dynamics import Dynamics
@@ -38,16 +36,8 @@ from taichi_msm.solver.kernel_rest import Relaxation
 from taichi_msm.solver.state import Reading, State, largest_displacement
 from taichi_msm.system.runtime import Device
 from taichi_msm.terms import fictitious_masses
-from taichi_msm.terms.contact import (
-    COLUMNS,
-    CORRECTIONS,
-    GRIP_SHIFT,
-    HOLD_DISPLACEMENT,
-    HOLDER,
-    TIP_AFTER,
-    TOOL_COLUMNS,
-    ContactTerm,
-)
+from taichi_msm.terms.contact import ContactTerm
+from taichi_msm.terms.contact_rest import holds, memory_after_grips, set_tools, touched_points
 
 # Residual forces, relative to the largest force: at convergence, at the perturbation, and at convergence of a sheet
 # that can be unstable.
@@ -101,7 +91,7 @@ class QuasiStatics(Dynamics):
             self._settle(frame, pause)
             self.steps_done = frame
             displacement = self._read_arrays(differences=False)[0]
-            self._last_frame = State(frame, displacement, np.zeros_like(displacement), self._contact_fields())
+            self._last_frame = State(frame, displacement, np.zeros_like(displacement), self._memory())
 
     def compile(self) -> None:
         """Compile all kernels without moving a mass point."""
@@ -129,12 +119,12 @@ class QuasiStatics(Dynamics):
 
     def _touched(self) -> NDArray[np.bool_]:
         """Return whether each tool touches or holds each mass point, shape (tools, rows, cols)."""
-        tools, contact = len(self.plan.tools), self._contact_fields()
-        normals = contact[: CORRECTIONS * tools].reshape(tools, CORRECTIONS, self.layout.rows, self.layout.cols)
-        touched = (normals != 0).any(axis=1)
-        if len(contact) > CORRECTIONS * tools:
-            touched |= contact[CORRECTIONS * tools + HOLDER] == np.arange(1, tools + 1)[:, None, None]
-        return np.asarray(touched)
+        return touched_points(len(self.plan.tools), self._memory()[self._contact])
+
+    @property
+    def _contact(self) -> slice:
+        """The part of the memory that belongs to contact."""
+        return self.layout.config.memory_slice(ContactTerm)
 
     def _build_kernel(self, start: InitialData) -> Any:
         self._interrupted = False
@@ -152,9 +142,9 @@ class QuasiStatics(Dynamics):
         """The state of the last frame found; before the first one, the flat sheet."""
         if self._last_frame is not None:
             return self._last_frame
-        shape, contact = (self.layout.rows, self.layout.cols), self.layout.config.get(ContactTerm)
-        fields = np.zeros((0 if contact is None else contact.field_count, *shape))
-        return State(0, np.zeros((*shape, 3)), np.zeros((*shape, 3)), fields)
+        shape = self.layout.rows, self.layout.cols
+        memory = np.zeros((len(self.layout.config.memory_fields), *shape))
+        return State(0, np.zeros((*shape, 3)), np.zeros((*shape, 3)), memory)
 
     def _tabulate(self, count: int) -> None:
         """Do nothing, because the loads of a frame are evaluated for each frame."""
@@ -166,25 +156,34 @@ class QuasiStatics(Dynamics):
         """Find the equilibrium of a frame."""
         self.evaluations = 0
         relaxation, before, loads = self._relaxation, self._last_state, evaluate_frame_loads(self.plan, frame)
-        contact = self._contact_after_grips(frame, before)
-        held = CORRECTIONS * len(self.plan.tools) + HOLDER
-        held_before, holds = (len(fields) > held and bool(fields[held].any()) for fields in (before.contact, contact))
-        if len(contact):
+        tools, contact_before = len(self.plan.tools), before.memory[self._contact]
+        contact = memory_after_grips(self.plan, frame, before.displacement, contact_before)
+        held_before, held = holds(tools, contact_before), holds(tools, contact)
+        if tools:
             relaxation.arrays.set_fields(self.layout.config.first_field(ContactTerm), contact)
         if self._interrupted:
             relaxation.place(before.displacement)
         self._interrupted, residual = True, 0.0
         *intermediate, end = self._shape_times(frame)
         for time in (*intermediate, end):
-            row = self._set_tools(time, frame, self._columns(loads, frame))
+            row = self._columns(loads, frame)
+            set_tools(self.plan, frame, time, row[0, self.layout.config.first_column(ContactTerm) :])
             # After a release the flat shape is tried even if a tool is in the way.
-            free = not loads.strength.any() and not holds and (held_before or not self._meets_tool(time))
+            free = not loads.strength.any() and not held and (held_before or not self._meets_tool(time))
             if free and self._try_flat(row):
                 residual = 0.0
             else:
                 tolerance = FORCE_TOLERANCE if time == end else PERTURBATION_TOLERANCE
                 residual = self._relax(frame, row, tolerance, pause)
+        self._update_memory(row)
         self._interrupted, self.residual = False, residual
+
+    def _update_memory(self, row: NDArray[Any]) -> None:
+        """Evaluate the forces once more, if they change what terms remember."""
+        config = self.layout.config
+        changing = [term for term in config.terms if term.mark_update(row[0, config.first_column(type(term)) :])]
+        if changing:
+            self._relaxation.relax(1, math.inf, row)
 
     def _meets_tool(self, time: float) -> bool:
         """Return whether a tool at a time [s] touches the current sheet."""
@@ -206,49 +205,6 @@ class QuasiStatics(Dynamics):
         rate = self.plan.grid.frames_per_second
         begin, end = max(0, frame - 1) / rate, frame / rate
         return sorted({end, *(float(time) for tool in self.plan.tools for time in tool.substep_times(begin, end))})
-
-    def _set_tools(self, time: float, frame: int, row: NDArray[Any]) -> NDArray[Any]:
-        """Write the positions of the tools at a time, up to that of a frame, into a row of the load table."""
-        for n, tool in enumerate(self.plan.tools):
-            first = self.layout.config.first_column(ContactTerm) + COLUMNS + TOOL_COLUMNS * n
-            centre = tool.tip_centre(np.array([time]))[0]
-            row[0, first + TIP_AFTER : first + TIP_AFTER + 3] = centre
-            for start in self._grip_start(tool, frame):
-                row[0, first + GRIP_SHIFT : first + GRIP_SHIFT + 3] = centre - self._centre_at_grip(tool, start)
-        return row
-
-    def _grip_start(self, tool: Tool, frame: int) -> Iterator[int]:
-        """Return the first frame of the grip that is active at a frame, if any."""
-        for grip in tool.grips:
-            frames = grip_frames(grip, self.plan.grid.frames_per_second)
-            if frame in frames:
-                yield frames.start
-
-    def _centre_at_grip(self, tool: Tool, frame: int) -> Array:
-        """Return the tip's centre [m] at the frame before a grip begins, whose displacements the grip stores."""
-        return tool.tip_centre(np.array([max(0, frame - 1) / self.plan.grid.frames_per_second]))[0]
-
-    def _contact_after_grips(self, frame: int, before: State) -> NDArray[Any]:
-        """Return the contact fields at the start of a frame, after grips have ended and begun."""
-        tools, contact = self.plan.tools, before.contact.copy()
-        if len(contact) == CORRECTIONS * len(tools):
-            return contact
-        held, displacement = (
-            contact[CORRECTIONS * len(tools) + HOLDER],
-            contact[CORRECTIONS * len(tools) + HOLD_DISPLACEMENT :],
-        )
-        position = rest_positions(self.plan.scene.sheet) + before.displacement
-        begins = [frame in self._grip_start(tool, frame) for tool in tools]
-        for n, tool in enumerate(tools):
-            if begins[n] or not list(self._grip_start(tool, frame)):
-                held[held == n + 1] = 0
-        for n, tool in enumerate(tools):
-            if begins[n]:
-                distance = np.linalg.norm(position - self._centre_at_grip(tool, frame), axis=-1)
-                gripped = (distance <= GRIP_RADII * tool.radius) & ~self.plan.fixed & (held == 0)
-                held[gripped] = n + 1
-                displacement[:, gripped] = before.displacement[gripped].T
-        return contact
 
     def _relax(self, frame: int, row: NDArray[Any], tolerance: float, pause: Pause) -> float:
         """Iterate until the residual, relative to the largest force, is below a tolerance; return it."""

@@ -14,8 +14,7 @@ Contact with position-controlled tools is resolved afterwards, in the rows that 
 from collections.abc import Callable
 
 from taichi_msm.system.runtime import ti
-from taichi_msm.terms.base import DX, DY, HAS_LEFT, HAS_RIGHT, Entry, KernelConfig
-from taichi_msm.terms.contact import ContactTerm, build_max_lane
+from taichi_msm.terms.base import DX, DY, HAS_LEFT, HAS_RIGHT, Correction, Entry, KernelConfig, build_max_lane
 from taichi_msm.terms.springs import SpringTerm
 
 
@@ -125,14 +124,13 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
     return pass_row
 
 
-def build_touch_row(config: KernelConfig, contact: ContactTerm) -> Callable[..., None]:
-    """Build the Taichi function that resolves the contact of a row with all tools, if any tool can reach it."""
-    columns, resolve, reaches = config.first_column(None), contact.build_resolve(config), contact.build_reaches(config)
-    max_lane = build_max_lane(config)
+def build_correct_row(config: KernelConfig, correction: Correction) -> Callable[..., None]:
+    """Build the Taichi function that applies the correction of a term to a row, if the row may need it."""
+    columns, (reaches, resolve), max_lane = config.first_column(None), correction, build_max_lane(config)
 
     @ti.func
-    def touch_row(sheet: ti.template(), i, kind, loads: ti.template(), n):
-        """Resolve the contact of row i after step n of the launch."""
+    def correct_row(sheet: ti.template(), i, kind, loads: ti.template(), n):
+        """Correct row i after step n of the launch."""
         now = [loads[n, c] for c in ti.static(range(columns))]
         at = i * sheet.width
         # Smallest and largest displacements along y and z.
@@ -147,4 +145,4 @@ def build_touch_row(config: KernelConfig, contact: ContactTerm) -> Callable[...,
             for b in range(1, sheet.width - 1):
                 resolve(sheet, i, kind, i, b, now)
 
-    return touch_row
+    return correct_row

@@ -38,7 +38,7 @@ class State(NamedTuple):
     steps: int  # number of steps taken, n
     displacement: NDArray[Any]  # u_n [m], shape (rows, cols, 3)
     difference: NDArray[Any]  # d_n = u_n - u_{n-1} [m], shape (rows, cols, 3)
-    contact: NDArray[Any] = np.empty((0, 0, 0))  # fields of `terms.contact`, shape (fields, rows, cols)
+    memory: NDArray[Any] = np.empty((0, 0, 0))  # `Term.memory` of all terms, shape (numbers, rows, cols)
 
 
 class Reading(NamedTuple):

@@ -22,9 +22,18 @@ from taichi_msm.terms.damping import DampingTerm
 from taichi_msm.terms.foundation import FoundationTerm
 from taichi_msm.terms.loads import ProbeTerm
 from taichi_msm.terms.springs import SpringTerm
+from taichi_msm.terms.viscoelasticity import ViscoelasticTerm
 
 # All terms, in the order of summation, on which the last bits of results depend.
-TERMS: tuple[type[Term], ...] = (SpringTerm, FoundationTerm, DampingTerm, BendingTerm, ProbeTerm, ContactTerm)
+TERMS: tuple[type[Term], ...] = (
+    SpringTerm,
+    FoundationTerm,
+    DampingTerm,
+    BendingTerm,
+    ViscoelasticTerm,
+    ProbeTerm,
+    ContactTerm,
+)
 
 
 def derive_material(scene: Scene, maps: Maps) -> Material:
@@ -54,6 +63,11 @@ def derive_material(scene: Scene, maps: Maps) -> Material:
 def build_terms(plan: Plan) -> tuple[Term, ...]:
     """Build the terms of a scene."""
     return tuple(term for kind in TERMS if (term := kind.from_plan(plan)) is not None)
+
+
+def memory_names(plan: Plan) -> tuple[str, ...]:
+    """Return the names of the numbers that the terms of a scene remember at every mass point."""
+    return tuple(name for term in build_terms(plan) for name in term.memory)
 
 
 def fictitious_masses(plan: Plan) -> NDArray[np.float64]:

@@ -72,9 +72,14 @@ class Term(ABC):
         return 0
 
     @property
+    def memory(self) -> tuple[str, ...]:
+        """Names of the numbers that the term remembers at every mass point: its last fields, which steps change."""
+        return ()
+
+    @property
     def field_count(self) -> int:
         """Number of fields that belong to the term."""
-        return 0
+        return len(self.memory)
 
     def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
         """Compute the term's columns of the load table.
@@ -91,7 +96,7 @@ class Term(ABC):
 
     def fields(self, plan: Plan) -> NDArray[Any]:
         """Return the initial values of the term's fields, shape (field_count, rows, cols)."""
-        return np.empty((0, *plan.scene.sheet.points))
+        return np.zeros((self.field_count, *plan.scene.sheet.points))
 
     def energy(self, sums: NDArray[Any], plan: Plan) -> float:
         """Compute twice the term's energy.
@@ -124,9 +129,57 @@ class Term(ABC):
         """Build Taichi functions reduce(d, sheet), which scale the last difference d of an entry, a list of 3."""
         return ()
 
+    def build_correction(self, config: KernelConfig) -> Correction | None:
+        """Build the functions that correct the displacements after a step; None if the term corrects nothing."""
+        return None
+
+    def build_rest_correction(self, config: KernelConfig) -> RestCorrection | None:
+        """Build the functions that correct forces and displacements at rest; None if the term corrects nothing."""
+        return None
+
+    def supports(self, compiled: Self) -> str:
+        """Return the reason why kernels compiled for another configuration of the term do not support this one."""
+        return ""
+
+    def mark_update(self, columns: NDArray[Any]) -> bool:
+        """Mark the columns of a frame at rest, if the term changes its memory once the frame is in equilibrium.
+
+        Args:
+            columns: row of the load table, from the first column of the term on.
+
+        Returns:
+            Whether the term changes its memory in the next evaluation of the forces.
+        """
+        return False
+
     def build_measures(self, config: KernelConfig) -> Sequence[Callable[..., None]]:
         """Build Taichi functions measure(measures, sheet, p, i, kind, b), for entry b of row i, which is row p of u."""
         return ()
+
+
+class Correction(NamedTuple):
+    """Taichi functions that correct the displacements of a row after its step; `now` is a row of the load table.
+
+    Attributes:
+        reaches: reaches(sheet, i, low, high, now) returns whether row i may need a correction; `low` and `high` bound
+            its displacements along y and z, two numbers each.
+        resolve: resolve(sheet, i, kind, at, b, now) corrects entry b of row i, which is row `at` of u.
+    """
+
+    reaches: Callable[..., Any]
+    resolve: Callable[..., None]
+
+
+class RestCorrection(NamedTuple):
+    """Taichi functions that correct a `RestSheet`.
+
+    Attributes:
+        remove: remove(force, sheet, at) removes from the force on an entry the part that the term carries.
+        project: project(sheet, i, kind, b, now) corrects entry b of row i after it moved.
+    """
+
+    remove: Callable[..., None]
+    project: Callable[..., None]
 
 
 AnyTerm = TypeVar("AnyTerm", bound=Term)
@@ -208,13 +261,40 @@ class KernelConfig:
         """Return the index of a term's first field; with None, the number of fields."""
         return sum(term.field_count for term in self._before(kind))
 
+    @property
+    def memory_fields(self) -> list[int]:
+        """Indices of the fields that steps change, in the order of `State.memory`."""
+        ends = [self.first_field(type(term)) + term.field_count for term in self.terms]
+        return [n for term, end in zip(self.terms, ends, strict=True) for n in range(end - len(term.memory), end)]
+
+    def memory_slice(self, kind: type[Term]) -> slice:
+        """Return the part of `State.memory` that belongs to a term."""
+        begin = sum(len(term.memory) for term in self._before(kind))
+        term = self.get(kind)
+        return slice(begin, begin + (len(term.memory) if term else 0))
+
     def first_measure(self, kind: type[Term] | None) -> int:
         """Return the index of a term's first measure; with None, the number of measures."""
         return STEP_MEASURES + sum(len(term.reductions) for term in self._before(kind))
 
     def _before(self, kind: type[Term] | None) -> tuple[Term, ...]:
         kinds = [type(term) for term in self.terms]
-        return self.terms if kind is None else self.terms[: kinds.index(kind)]
+        return self.terms if kind not in kinds else self.terms[: kinds.index(kind)]
+
+
+def build_max_lane(config: KernelConfig) -> Callable[..., Any]:
+    """Build the Taichi function max_lane(values), the maximum over lanes, with shuffles instead of Taichi's `max()`."""
+    ti, vector, lanes = config.ti, config.vector, config.lanes
+    halves = [lanes >> n for n in range(1, lanes.bit_length())]
+
+    @ti.func
+    def max_lane(values: ti.template()):
+        most = values + vector(0)
+        for half in ti.static(halves):
+            most = ti.max(most, vector([most[(lane + half) % lanes] for lane in ti.static(range(lanes))]))
+        return most[0]
+
+    return max_lane
 
 
 class KernelSheet(NamedTuple):

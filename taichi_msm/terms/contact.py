@@ -16,7 +16,7 @@ all corrections therefore yields the force of the tool.
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,26 +28,41 @@ from taichi_msm.model.loads import Schedule
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.tools import GRIP_RADII
 from taichi_msm.scene.section import FRAME_TOLERANCE
-from taichi_msm.scene.tools import Probe
-from taichi_msm.terms.base import DY, MOBILITY, REST_X, TOP_Y, KernelConfig, Term
+from taichi_msm.terms.base import (
+    DY,
+    MOBILITY,
+    REST_X,
+    TOP_Y,
+    Correction,
+    KernelConfig,
+    RestCorrection,
+    Term,
+    build_max_lane,
+)
+from taichi_msm.terms.contact_layout import (
+    AXIS,
+    COLUMNS,
+    CORRECTIONS,
+    FRICTION,
+    GRIP_BEGINS,
+    GRIP_CONTINUES,
+    GRIP_SHIFT,
+    GRIP_STATE,
+    HOLD_DISPLACEMENT,
+    HOLDER,
+    INVERSE_AXIS,
+    LENGTH,
+    MIN_DISTANCE_M,
+    RADIUS,
+    TIP_AFTER,
+    TIP_BEFORE,
+    TOOL_COLUMNS,
+    WEIGHT,
+    ContactLayout,
+    build_penetration,
+)
+from taichi_msm.terms.contact_rest import build_project_out, build_remove_contact
 from taichi_msm.terms.damping import coefficients
-
-# Columns of the load table. For all tools: the weight of the step's corrections. For each tool: the tip's centre after
-# and before the step; the state of its grip, and the tool's displacement since the grip began; axis, length, radius and
-# friction; the inverse y and z components of the axis.
-WEIGHT, COLUMNS = 0, 1
-TIP_AFTER, TIP_BEFORE, GRIP_STATE, GRIP_SHIFT, AXIS = 0, 3, 6, 7, 10
-LENGTH, RADIUS, FRICTION, INVERSE_AXIS, TOOL_COLUMNS = 13, 14, 15, 16, 18
-
-# States of a grip in a step.
-GRIP_IDLE, GRIP_BEGINS, GRIP_CONTINUES = 0.0, 1.0, 2.0
-
-# Fields: for every tool the three components of the summed corrections; with grips, the index of the tool that holds a
-# mass point plus 1, and the displacement of the mass point when the grip began.
-CORRECTIONS, HOLDER, HOLD_DISPLACEMENT, GRIP_FIELDS = 3, 0, 1, 4
-
-# Distances below this count as 0; the square is representable in f32.
-MIN_DISTANCE_M = 1e-18
 
 
 @dataclass(frozen=True)
@@ -66,13 +81,10 @@ class ContactTerm(Term):
         return cls(len(tools), tuple(tool.friction > 0 for tool in tools), grips) if tools else None
 
     @property
-    def field_count(self) -> int:
-        """Number of fields: the corrections of every tool, and with grips the held mass points."""
-        return _field_count(self.tools, self.grips)
-
-    def fields(self, plan: Plan) -> NDArray[Any]:
-        """Return zeros: no corrections and no held mass points."""
-        return np.zeros((self.field_count, *plan.scene.sheet.points))
+    def memory(self) -> tuple[str, ...]:
+        """The corrections of every tool, and with grips the held mass points."""
+        names = tuple(f"correction {tool} {axis}" for tool in range(self.tools) for axis in "xyz")
+        return (*names, "holder", *(f"held {axis}" for axis in "xyz")) if self.grips else names
 
     @property
     def column_count(self) -> int:
@@ -104,12 +116,30 @@ class ContactTerm(Term):
                 tool_columns[active, GRIP_SHIFT:AXIS] = (centres[1:] - centre_at_start)[active]
         return columns
 
-    def is_compiled_in(self, compiled: Self) -> bool:
-        """Return whether a kernel that was compiled for `compiled` supports these tools."""
+    def supports(self, compiled: Self) -> str:
+        """Return the reason why kernels compiled for other tools do not support these tools."""
         friction = zip(self.has_friction, compiled.has_friction, strict=True)
-        return all(needed <= available for needed, available in friction) and self.grips <= compiled.grips
+        if all(needed <= available for needed, available in friction) and self.grips <= compiled.grips:
+            return ""
+        return (
+            "friction and grips cannot be added where there were none; restart with the new scene, such as with a "
+            "friction of 1e-9, or with a grip that ends before the start"
+        )
 
-    def build_reaches(self, config: KernelConfig) -> Callable[..., Any]:
+    def build_correction(self, config: KernelConfig) -> Correction:
+        """Build the functions that project mass points out of the tools, and move held ones, after a step."""
+        return Correction(self._build_reaches(config), self._build_resolve(config))
+
+    def build_rest_correction(self, config: KernelConfig) -> RestCorrection:
+        """Build the functions that remove the forces carried by tools, and project mass points out of them."""
+        layout = self.layout(config)
+        return RestCorrection(build_remove_contact(config, layout), build_project_out(config, layout))
+
+    def layout(self, config: KernelConfig) -> ContactLayout:
+        """Return the columns and fields of the term."""
+        return ContactLayout(self.tools, self.grips, config.first_field(ContactTerm), config.first_column(ContactTerm))
+
+    def _build_reaches(self, config: KernelConfig) -> Callable[..., Any]:
         """Build the Taichi function reaches(sheet, i, low, high, now).
 
         It returns whether a tool may touch or hold mass points of row `i`. In it `low` and `high` bound the
@@ -117,8 +147,7 @@ class ContactTerm(Term):
         """
         ti, real, vector, tools, grips = config.ti, config.real, config.vector, self.tools, self.grips
         max_lane = build_max_lane(config)
-        first = config.first_column(ContactTerm) + COLUMNS
-        holding = (config.first_field(ContactTerm) + CORRECTIONS * tools + HOLDER) if grips else 0
+        bases, holding = self.layout(config).bases, self.layout(config).grip_field + HOLDER
 
         @ti.func
         def cut(low, high, begin, end, start, inverse):
@@ -130,7 +159,7 @@ class ContactTerm(Term):
         def reaches(sheet: ti.template(), i, low: ti.template(), high: ti.template(), now: ti.template()):
             y, reached = sheet.constants[TOP_Y] - i * sheet.constants[DY], False
             for tool in ti.static(range(tools)):
-                base = ti.static(first + TOOL_COLUMNS * tool)
+                base = ti.static(bases[tool])
                 # Slightly more than the radius, because of rounding.
                 reach = 1.001 * now[base + RADIUS]
                 begin, end = cut(
@@ -152,16 +181,15 @@ class ContactTerm(Term):
 
         return reaches
 
-    def build_resolve(self, config: KernelConfig) -> Callable[..., None]:
+    def _build_resolve(self, config: KernelConfig) -> Callable[..., None]:
         """Build the Taichi function resolve(sheet, i, kind, at, b, now), which corrects entry b of row i.
 
         It is called after the step of the row. In it `kind` is that of a `KernelRow`, `at` the row of u, and `now` a
         row of the load table.
         """
         ti, vector, tools, has_friction, grips = config.ti, config.vector, self.tools, self.has_friction, self.grips
-        first_field, first = config.first_field(ContactTerm), config.first_column(ContactTerm)
-        grip_field = first_field + CORRECTIONS * tools
-        base, penetration = [first + COLUMNS + TOOL_COLUMNS * tool for tool in range(tools)], build_penetration(config)
+        layout, penetration = self.layout(config), build_penetration(config)
+        first_field, first, grip_field, base = layout.first_field, layout.first_column, layout.grip_field, layout.bases
         max_lane = build_max_lane(config)
 
         @ti.func
@@ -237,53 +265,3 @@ class ContactTerm(Term):
                         sheet.fields[index] = sheet.fields[index] + correction[c] * now[first + WEIGHT]
 
         return resolve
-
-
-def build_max_lane(config: KernelConfig) -> Callable[..., Any]:
-    """Build the Taichi function max_lane(values), the maximum over lanes, with shuffles instead of Taichi's `max()`."""
-    ti, vector, lanes = config.ti, config.vector, config.lanes
-    halves = [lanes >> n for n in range(1, lanes.bit_length())]
-
-    @ti.func
-    def max_lane(values: ti.template()):
-        largest = values + vector(0)
-        for half in ti.static(halves):
-            largest = ti.max(largest, vector([largest[(lane + half) % lanes] for lane in ti.static(range(lanes))]))
-        return largest[0]
-
-    return max_lane
-
-
-def build_penetration(config: KernelConfig) -> Callable[..., Any]:
-    """Build the Taichi function penetration(rest, u, now, base), the depth of mass points in a tool and the normals.
-
-    In it `base` is the first column of the tool. It returns radius - |r'| and the three components of n.
-    """
-    ti, vector = config.ti, config.vector
-
-    @ti.func
-    def penetration(rest: ti.template(), u: ti.template(), now: ti.template(), base: ti.template()):
-        r = [rest[c] - now[base + TIP_AFTER + c] + u[c] for c in ti.static(range(3))]
-        s = vector(0)
-        for c in ti.static(range(3)):
-            s += r[c] * now[base + AXIS + c]
-        s = ti.max(ti.min(s, now[base + LENGTH]), 0)
-        square = vector(0)
-        for c in ti.static(range(3)):
-            r[c] = r[c] - s * now[base + AXIS + c]
-            square += r[c] * r[c]
-        distance = ti.sqrt(square)
-        normal = [r[c] / ti.max(distance, MIN_DISTANCE_M) for c in ti.static(range(3))]
-        normal[2] = ti.select(distance > 0, normal[2], vector(1))
-        return now[base + RADIUS] - distance, normal[0], normal[1], normal[2]
-
-    return penetration
-
-
-def contact_fields(probes: Sequence[Probe]) -> int:
-    """Return the number of contact fields of a scene with these probes."""
-    return _field_count(sum(probe.moved for probe in probes), any(probe.grip for probe in probes))
-
-
-def _field_count(tools: int, grips: bool) -> int:
-    return CORRECTIONS * tools + (GRIP_FIELDS if grips else 0)

@@ -13,24 +13,32 @@ iteration.
 
 from collections.abc import Callable
 
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.model.plan import Plan
+from taichi_msm.model.sheet import rest_positions
+from taichi_msm.model.tools import GRIP_RADII, Tool, grip_frames
 from taichi_msm.terms.base import DY, MOBILITY, REST_X, TOP_Y, KernelConfig
-from taichi_msm.terms.contact import (
+from taichi_msm.terms.contact_layout import (
     COLUMNS,
     CORRECTIONS,
     GRIP_SHIFT,
     HOLD_DISPLACEMENT,
     HOLDER,
+    TIP_AFTER,
     TOOL_COLUMNS,
-    ContactTerm,
+    ContactLayout,
     build_penetration,
 )
 
+Array = NDArray[np.float64]
 
-def build_remove_contact(config: KernelConfig, contact: ContactTerm) -> Callable[..., None]:
+
+def build_remove_contact(config: KernelConfig, layout: ContactLayout) -> Callable[..., None]:
     """Build the Taichi function remove_contact(force, sheet, at), which removes contact forces at an entry."""
-    ti, vector, tools, grips = config.ti, config.vector, contact.tools, contact.grips
-    first_field = config.first_field(ContactTerm)
-    holding, iterations = first_field + CORRECTIONS * tools + HOLDER, _iterations(contact)
+    ti, vector, tools, grips, first_field = config.ti, config.vector, layout.tools, layout.grips, layout.first_field
+    holding, iterations = layout.grip_field + HOLDER, _iterations(tools)
 
     @ti.func
     def remove_contact(force: ti.template(), sheet: ti.template(), at):
@@ -54,17 +62,15 @@ def build_remove_contact(config: KernelConfig, contact: ContactTerm) -> Callable
     return remove_contact
 
 
-def build_project_out(config: KernelConfig, contact: ContactTerm) -> Callable[..., None]:
+def build_project_out(config: KernelConfig, layout: ContactLayout) -> Callable[..., None]:
     """Build the Taichi function project_out(sheet, i, kind, b, now) for entry b of row i of a `RestSheet`.
 
     It projects mass points out of the tools, removes their momentum into the tools, and moves held mass points with
     their tool.
     """
-    ti, vector, tools, grips = config.ti, config.vector, contact.tools, contact.grips
-    first_field, first = config.first_field(ContactTerm), config.first_column(ContactTerm)
-    grip_field = first_field + CORRECTIONS * tools
-    base, penetration = [first + COLUMNS + TOOL_COLUMNS * tool for tool in range(tools)], build_penetration(config)
-    iterations = _iterations(contact)
+    ti, vector, tools, grips = config.ti, config.vector, layout.tools, layout.grips
+    first_field, grip_field, base = layout.first_field, layout.grip_field, layout.bases
+    penetration, iterations = build_penetration(config), _iterations(tools)
 
     @ti.func
     def project_out(sheet: ti.template(), i, kind, b, now: ti.template()):
@@ -108,6 +114,77 @@ def build_project_out(config: KernelConfig, contact: ContactTerm) -> Callable[..
     return project_out
 
 
-def _iterations(contact: ContactTerm) -> int:
+def _iterations(tools: int) -> int:
     """Return the number of Gauss-Seidel iterations."""
-    return 8 if contact.tools > 1 else 1
+    return 8 if tools > 1 else 1
+
+
+def touched_points(tools: int, memory: Array) -> NDArray[np.bool_]:
+    """Return whether each tool touches or holds each mass point.
+
+    Args:
+        tools: number of tools.
+        memory: memory of the term, shape (numbers, rows, cols).
+
+    Returns:
+        Shape (tools, rows, cols).
+    """
+    normals = memory[: CORRECTIONS * tools].reshape(tools, CORRECTIONS, *memory.shape[1:])
+    touched = (normals != 0).any(axis=1)
+    if len(memory) > CORRECTIONS * tools:
+        touched |= memory[CORRECTIONS * tools + HOLDER] == np.arange(1, tools + 1)[:, None, None]
+    return np.asarray(touched)
+
+
+def holds(tools: int, memory: Array) -> bool:
+    """Return whether any tool holds a mass point; see `touched_points`."""
+    return len(memory) > CORRECTIONS * tools and bool(memory[CORRECTIONS * tools + HOLDER].any())
+
+
+def set_tools(plan: Plan, frame: int, time: float, columns: Array) -> None:
+    """Write the positions of the tools at a time [s], up to that of a frame, into the columns of the term."""
+    for n, tool in enumerate(plan.tools):
+        of_tool, centre = columns[COLUMNS + TOOL_COLUMNS * n :], tool.tip_centre(np.array([time]))[0]
+        of_tool[TIP_AFTER : TIP_AFTER + 3] = centre
+        start = _grip_start(plan, tool, frame)
+        if start is not None:
+            of_tool[GRIP_SHIFT : GRIP_SHIFT + 3] = centre - _centre_at_grip(plan, tool, start)
+
+
+def memory_after_grips(plan: Plan, frame: int, displacement: Array, before: Array) -> Array:
+    """Return the memory at the start of a frame, after grips have ended and begun.
+
+    Args:
+        plan: the plan.
+        frame: number of the frame.
+        displacement: x - X at the frame before [m], shape (rows, cols, 3).
+        before: memory of the term at the frame before, shape (numbers, rows, cols).
+    """
+    tools, memory = plan.tools, before.copy()
+    if len(memory) == CORRECTIONS * len(tools):
+        return memory
+    grips = memory[CORRECTIONS * len(tools) :]
+    holder, held_displacement = grips[HOLDER], grips[HOLD_DISPLACEMENT:]
+    position = rest_positions(plan.scene.sheet) + displacement
+    starts = [_grip_start(plan, tool, frame) for tool in tools]
+    for n, start in enumerate(starts):
+        if start is None or start == frame:
+            holder[holder == n + 1] = 0
+    for n, (tool, start) in enumerate(zip(tools, starts, strict=True)):
+        if start == frame:
+            distance = np.linalg.norm(position - _centre_at_grip(plan, tool, frame), axis=-1)
+            gripped = (distance <= GRIP_RADII * tool.radius) & ~plan.fixed & (holder == 0)
+            holder[gripped] = n + 1
+            held_displacement[:, gripped] = displacement[gripped].T
+    return memory
+
+
+def _grip_start(plan: Plan, tool: Tool, frame: int) -> int | None:
+    """Return the first frame of the grip that is active at a frame; None without one."""
+    frames = (grip_frames(grip, plan.grid.frames_per_second) for grip in tool.grips)
+    return next((active.start for active in frames if frame in active), None)
+
+
+def _centre_at_grip(plan: Plan, tool: Tool, frame: int) -> Array:
+    """Return the tip's centre [m] at the frame before a grip begins, whose displacements the grip stores."""
+    return tool.tip_centre(np.array([max(0, frame - 1) / plan.grid.frames_per_second]))[0]

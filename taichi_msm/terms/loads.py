@@ -95,6 +95,17 @@ class ProbeTerm(Term):
 
         return (add,)
 
+    def supports(self, compiled: Self) -> str:
+        """Return the reason why kernels compiled for other probes do not support these probes."""
+        if self.moves != compiled.moves:
+            return (
+                f"which control points move or jump cannot change (before: {_format_flags(compiled.moves)}; now: "
+                f"{_format_flags(self.moves)}); restart with the new scene"
+            )
+        if self.by_area != compiled.by_area:
+            return "one has total instead of force, or the reverse; restart with the new scene"
+        return ""
+
     def decay_gradients(self, plan: Plan) -> NDArray[Any]:
         """Differentiate the decay factors of the stationary slots by x and y of the control point.
 
@@ -180,3 +191,7 @@ def force_norm(slot: ProbeSlot, scene: Scene) -> float:
     x, y = axes(scene.sheet)
     nearest = np.maximum(np.hypot(x - x[0], y - y[0]) - math.hypot(*spacing(scene.sheet)) / 2, 0)
     return 2 * float(np.linalg.norm(probe_force(scene.probes[slot.probe], scene.sheet).decay(nearest)))
+
+
+def _format_flags(moves: tuple[bool, ...]) -> str:
+    return ", ".join("yes" if slot_moves else "no" for slot_moves in moves) or "none"

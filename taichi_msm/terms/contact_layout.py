@@ -1,0 +1,70 @@
+"""Columns, fields and penetration depth of position-controlled tools, for motion and equilibrium."""
+
+# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from taichi_msm.terms.base import KernelConfig
+
+# Columns of the load table. For all tools: the weight of the step's corrections. For each tool: the tip's centre after
+# and before the step; the state of its grip, and the tool's displacement since the grip began; axis, length, radius and
+# friction; the inverse y and z components of the axis.
+WEIGHT, COLUMNS = 0, 1
+TIP_AFTER, TIP_BEFORE, GRIP_STATE, GRIP_SHIFT, AXIS = 0, 3, 6, 7, 10
+LENGTH, RADIUS, FRICTION, INVERSE_AXIS, TOOL_COLUMNS = 13, 14, 15, 16, 18
+
+# States of a grip in a step.
+GRIP_IDLE, GRIP_BEGINS, GRIP_CONTINUES = 0.0, 1.0, 2.0
+
+# Fields: for every tool the three components of the summed corrections; with grips, the index of the tool that holds a
+# mass point plus 1, and the displacement of the mass point when the grip began.
+CORRECTIONS, HOLDER, HOLD_DISPLACEMENT = 3, 0, 1
+
+# Distances below this count as 0; the square is representable in f32.
+MIN_DISTANCE_M = 1e-18
+
+
+class ContactLayout(NamedTuple):
+    """The columns and fields of contact in a load table and in the fields of a sheet."""
+
+    tools: int  # number of tools
+    grips: bool  # whether any tool can hold tissue
+    first_field: int
+    first_column: int
+
+    @property
+    def grip_field(self) -> int:
+        """Index of the first field of grips."""
+        return self.first_field + CORRECTIONS * self.tools
+
+    @property
+    def bases(self) -> list[int]:
+        """The first column of every tool."""
+        return [self.first_column + COLUMNS + TOOL_COLUMNS * tool for tool in range(self.tools)]
+
+
+def build_penetration(config: KernelConfig) -> Callable[..., Any]:
+    """Build the Taichi function penetration(rest, u, now, base), the depth of mass points in a tool and the normals.
+
+    In it `base` is the first column of the tool. It returns radius - |r'| and the three components of n.
+    """
+    ti, vector = config.ti, config.vector
+
+    @ti.func
+    def penetration(rest: ti.template(), u: ti.template(), now: ti.template(), base: ti.template()):
+        r = [rest[c] - now[base + TIP_AFTER + c] + u[c] for c in ti.static(range(3))]
+        s = vector(0)
+        for c in ti.static(range(3)):
+            s += r[c] * now[base + AXIS + c]
+        s = ti.max(ti.min(s, now[base + LENGTH]), 0)
+        square = vector(0)
+        for c in ti.static(range(3)):
+            r[c] = r[c] - s * now[base + AXIS + c]
+            square += r[c] * r[c]
+        distance = ti.sqrt(square)
+        normal = [r[c] / ti.max(distance, MIN_DISTANCE_M) for c in ti.static(range(3))]
+        normal[2] = ti.select(distance > 0, normal[2], vector(1))
+        return now[base + RADIUS] - distance, normal[0], normal[1], normal[2]
+
+    return penetration

@@ -1,0 +1,104 @@
+"""Stress relaxation: quasi-linear viscoelasticity (Fung) of all elastic forces. Scene: `tissue.relaxation`.
+
+Let f_n be the force of springs, bending and foundation on a mass point at step n, and h the step. Every branch has a
+share and a time, x_i = h / time_i and phi_i = (1 - exp(-x_i)) / x_i. With G, the sum of the shares, the force
+
+    (1 - G) f_n + sum of (s_i + share_i phi_i f_n)
+
+acts in place of f_n, and then s_i becomes exp(-x_i) s_i - share_i phi_i (1 - exp(-x_i)) f_n. Initially s_i = 0. This is
+exact for forces that are linear in time between the steps.
+
+In quasi-static scenes h is the time between frames, and the memory s_i changes at frames only. Frame 0 takes f as it
+is, and then s_i = share_i (exp(-x_i) - phi_i) f.
+"""
+
+# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from typing_extensions import Self
+
+from taichi_msm.model.loads import Schedule
+from taichi_msm.model.plan import Plan
+from taichi_msm.scene.scene import Scene
+from taichi_msm.terms.base import KernelConfig, Term
+
+# Columns of the load table: the factor of f; at rest, whether the memory changes; for each branch the factors of s and
+# of f in its next memory.
+FACTOR, UPDATE, BRANCHES, BRANCH_COLUMNS = 0, 1, 2, 2
+
+
+@dataclass(frozen=True)
+class ViscoelasticTerm(Term):
+    """Stress relaxation. It changes the sum of the elastic forces, so it follows them in `terms.TERMS`."""
+
+    branches: int  # count
+    at_rest: bool  # whether the memory changes only where the load table says so
+
+    @staticmethod
+    def derive(scene: Scene) -> dict[str, Any]:
+        """Derive the share and the time [s] of every branch."""
+        branches = () if scene.tissue is None else scene.tissue.relaxation
+        return {"relaxation": tuple((branch.share, branch.time) for branch in branches)}
+
+    @classmethod
+    def from_plan(cls, plan: Plan) -> Self | None:
+        """Return the term's configuration; None without relaxation."""
+        branches = len(plan.material.relaxation)
+        return cls(branches, plan.scene.time.at_rest) if branches else None
+
+    @property
+    def memory(self) -> tuple[str, ...]:
+        """Three components of s for every branch."""
+        return tuple(f"relaxation {n} {axis}" for n in range(self.branches) for axis in "xyz")
+
+    @property
+    def column_count(self) -> int:
+        """The columns of all branches, and two more."""
+        return BRANCHES + BRANCH_COLUMNS * self.branches
+
+    def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
+        """Compute the factors of every step, or of the frame; see `Term.columns`."""
+        h = 1 / plan.grid.frames_per_second if self.at_rest else plan.grid.step
+        shares, times = np.array(plan.material.relaxation).T
+        decay = np.exp(-h / times)
+        phi = -np.expm1(-h / times) / (h / times)
+        columns = np.empty((len(loads.active), self.column_count))
+        columns[:, FACTOR], columns[:, UPDATE] = 1 - shares.sum() + (shares * phi).sum(), 0
+        columns[:, BRANCHES::2], columns[:, BRANCHES + 1 :: 2] = decay, -shares * phi * (1 - decay)
+        if self.at_rest and first == 0:
+            columns[:, FACTOR], columns[:, BRANCHES + 1 :: 2] = 1, shares * (decay - phi)
+        return columns
+
+    def mark_update(self, columns: NDArray[Any]) -> bool:
+        """Let the next evaluation change the memory; see `Term.mark_update`."""
+        columns[UPDATE] = 1
+        return True
+
+    def build_forces(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
+        """Build the Taichi function that relaxes the sum of the elastic forces."""
+        ti, first, branches, at_rest = config.ti, config.first_column(ViscoelasticTerm), self.branches, self.at_rest
+        first_field = config.first_field(ViscoelasticTerm)
+
+        @ti.func
+        def relax(force: ti.template(), sheet: ti.template(), entry: ti.template(), now: ti.template()):
+            at = entry.row.i * sheet.width + entry.b
+            for c in ti.static(range(3)):
+                elastic = force[c]
+                force[c] = elastic * now[first + FACTOR]
+                for n in ti.static(range(branches)):
+                    place = (first_field + 3 * n + c) * sheet.rows * sheet.width + at
+                    column = ti.static(first + BRANCHES + BRANCH_COLUMNS * n)
+                    s = sheet.fields[place]
+                    force[c] += s
+                    if ti.static(at_rest):
+                        if now[first + UPDATE] > 0:
+                            sheet.fields[place] = now[column] * s + now[column + 1] * elastic
+                    else:
+                        sheet.fields[place] = now[column] * s + now[column + 1] * elastic
+
+        return (relax,)
