@@ -43,9 +43,6 @@ def diagnose(dynamics: Dynamics, start: Snapshot | None, pause: Pause) -> Diagno
         dynamics: Sheet that diverged; its state afterwards is arbitrary.
         start: Sound state to repeat the run from; None for the state of rest.
         pause: Called several times a second; an exception from it ends the diagnosis.
-
-    Returns:
-        The diagnosis.
     """
     plan, grid, bad_step = dynamics.plan, dynamics.plan.grid, dynamics.steps_done
     recorder = ForceRecorder(plan)

@@ -27,7 +27,7 @@ ENERGY_OSCILLATION = 4.0
 def displacement_bound(
     plan: Plan, time: float, acceleration: float | None = None, tool_energy: float | None = None
 ) -> float:
-    """Bound the displacement of a mass point [m]; a simulation that exceeds the bound has diverged.
+    """Bound the displacement of a mass point [m], possibly by infinity; a run that exceeds the bound has diverged.
 
     Args:
         plan: Plan of the run.
@@ -36,9 +36,6 @@ def displacement_bound(
             the scene's probes.
         tool_energy: Bound of the energy supplied by position-controlled tools so far [J]; by default that of the
             scene's tools.
-
-    Returns:
-        The bound [m], possibly infinite.
     """
     # A tool moves the tissue that it holds along its path.
     bound = MAX_SHEET_SIZES * max(plan.scene.sheet.size) + sum(tool.path_length + tool.radius for tool in plan.tools)

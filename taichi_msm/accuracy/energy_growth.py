@@ -28,12 +28,7 @@ class EnergyGrowth:
             self._stiffness = plan.material.virtual * point_shares(plan)
 
     def update(self, before: RunProgress, reading: Reading, frame: int) -> tuple[float, float]:
-        """Compare the energy of a frame with that of earlier ones.
-
-        Args:
-            before: Progress at the previous frame.
-            reading: Reading of this frame.
-            frame: Number of this frame.
+        """Compare the energy of a frame with that of earlier frames; `before` is the progress at the previous frame.
 
         Returns:
             The smallest energy of a frame since the release [J], 0 before it, and the largest growth factor since then.

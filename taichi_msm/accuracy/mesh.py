@@ -241,16 +241,7 @@ class MeshCompanion:
         return self._sheets[0].tool_forces()
 
     def build_second_run(self, plan: Plan, device: Device, cores: int | None = None) -> MeshCompanion | None:
-        """Build the second companion run, which follows the run from its first frame on.
-
-        Args:
-            plan: Plan of the run.
-            device: Device to run on.
-            cores: Number of CPU cores for stepping; None for all.
-
-        Returns:
-            The second companion run; None if the first one suffices.
-        """
+        """Build the second companion run, which begins at the first frame; return None if the first one suffices."""
         if self._contact and not self._narrow and self._relative_difference > SECOND_RUN_DIFFERENCE:
             coarse = coarser_plan(plan, SECOND_CELL_RATIO)
             self._second_run = None if coarse is None else MeshCompanion(plan, coarse, device, cores)
@@ -361,16 +352,7 @@ def choose_points(
 
 
 def estimate_mesh_error(plan: Plan, device: Device, progress: ProgressCallback) -> MeshEstimate:
-    """Run a scene and its companion runs in f64, and estimate the mesh error.
-
-    Args:
-        plan: Plan for which `mesh_companion_plan` returns one.
-        device: Device to run on.
-        progress: Called with the number of finished frames of each run and their total.
-
-    Returns:
-        The estimate.
-    """
+    """Run a scene, for which `mesh_companion_plan` exists, and its companion runs in f64; estimate the mesh error."""
     exact, coarse, grid = plan.with_grid(precision="f64"), mesh_companion_plan(plan), plan.grid
     assert coarse is not None
     first = MeshCompanion(exact, coarse, device)

@@ -63,12 +63,7 @@ class PathDependence:
         self._by_load: dict[tuple[int, ...], Array] | None = {} if compares else None
 
     def check_frame(self, frame: int, displacement: Array) -> None:
-        """Compare the next frame with earlier frames.
-
-        Args:
-            frame: Number of the frame.
-            displacement: Displacements [m], shape (rows, cols, 3).
-        """
+        """Compare the displacements of the next frame [m], shape (rows, cols, 3), with those of earlier frames."""
         size, current = max_norm(displacement), (frame, displacement)
         if size > self._largest:
             self._largest, self._most_displaced, self._unloaded = size, current, None
@@ -91,13 +86,7 @@ class PathDependence:
         return affords_companions(self._plan, companion_cost + second_cost)
 
     def finish(self, device: Device, cores: int | None, pause: Pause) -> None:
-        """Solve the most displaced frame, one after it and the last frame a second time, from rest.
-
-        Args:
-            device: Device to solve on.
-            cores: Number of CPU cores; None for all.
-            pause: Called often; an exception from it ends the solution.
-        """
+        """Solve the most displaced frame, one after it and the last frame a second time, see `second_solution`."""
         if self._largest == 0:
             return
         for frame, displacement in dict(filter(None, (self._most_displaced, self._unloaded, self._previous))).items():

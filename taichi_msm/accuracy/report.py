@@ -311,9 +311,6 @@ def error_line(
         mesh: Discretisation error of the mesh; None if not estimated.
         max_displacement: Largest displacement of the run [m].
         scale: Pixels per metre; None without a picture.
-
-    Returns:
-        The line.
     """
     if estimate is not None and estimate.error == math.inf:
         return "error not known: a pilot run diverged, or steps do not resolve the damping"

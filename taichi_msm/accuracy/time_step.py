@@ -87,16 +87,7 @@ def convergence_order(plan: Plan) -> int:
 def estimate_error(
     plan: Plan, device: Device, progress: ProgressCallback = lambda done, total: None
 ) -> TimeStepEstimate:
-    """Estimate the time-step error of a run.
-
-    Args:
-        plan: Plan of the run.
-        device: Device to run it on.
-        progress: Called with the number of finished frames and their total.
-
-    Returns:
-        The estimate.
-    """
+    """Estimate the time-step error of a run by repeating it with a companion run."""
     return TimeStepTrials(plan, device).estimate(plan.grid.steps_per_frame, progress)
 
 
@@ -175,12 +166,7 @@ class TimeStepCompanion:
         self.restart(plan, steps)
 
     def restart(self, plan: Plan, steps: int) -> None:
-        """Restart for another run of the same scene; a fine companion run must stay fine.
-
-        Args:
-            plan: Plan of the run.
-            steps: Steps per frame of the companion run.
-        """
+        """Restart for another run of the same scene; a fine companion run must stay fine."""
         self._plan, self._steps = plan, steps
         exact = plan.with_grid(precision="f64")
         if steps:
@@ -262,15 +248,7 @@ class TimeStepTrials:
         self._dynamics = Dynamics(plan, device)
 
     def estimate(self, steps: int, progress: ProgressCallback) -> TimeStepEstimate:
-        """Run the scene and estimate its error.
-
-        Args:
-            steps: Number of steps per frame.
-            progress: Called with the number of finished frames and their total.
-
-        Returns:
-            The estimate.
-        """
+        """Run the scene with a number of steps per frame and estimate its error."""
         plan = self._plan.with_grid(steps_per_frame=steps)
         fine, frames = fine_steps(plan), plan.grid.frames
         self._companion.restart(plan, fine)

@@ -358,11 +358,7 @@ def is_below(path: Path, folder: Path) -> bool:
 
 
 def read_file(name: str, kind: FileKind) -> ParsedFile:
-    """Read and parse a YAML file.
-
-    Args:
-        name: path of the file.
-        kind: expected kind of the file, for messages.
+    """Read and parse a YAML file of an expected kind.
 
     Raises:
         SceneError: when the file cannot be read or does not contain a mapping.

@@ -56,16 +56,7 @@ def decay(probe: Probe, sheet: Sheet, at: Array | None = None) -> Array:
 
 
 def decay_gradient(probe: Probe, sheet: Sheet, at: Array | None = None) -> Array:
-    """Differentiate `decay` with respect to the control point.
-
-    Args:
-        probe: the probe.
-        sheet: the sheet.
-        at: control point, as in `decay`.
-
-    Returns:
-        Derivatives by x and y [1/m], shape (2, rows, cols); 0 at the control point itself.
-    """
+    """Differentiate `decay` by x and y of the control point [1/m], shape (2, rows, cols); 0 at the control point."""
     law, (at_x, at_y) = probe_force(probe, sheet), control_points(probe, sheet)[1][0] if at is None else at
     x, y = axes(sheet)
     off = np.stack(np.broadcast_arrays(x - at_x, y - at_y))
@@ -75,16 +66,7 @@ def decay_gradient(probe: Probe, sheet: Sheet, at: Array | None = None) -> Array
 
 
 def average_loads(plan: Plan, first: int, count: int) -> Schedule:
-    """Average the loads of a plan over its steps.
-
-    Args:
-        plan: the plan.
-        first: number of the first step.
-        count: number of steps.
-
-    Returns:
-        Averaged loads of the steps first, ..., first + count - 1.
-    """
+    """Average the loads of a plan over each of the steps first, ..., first + count - 1."""
     scene, slots = plan.scene, plan.slots
     t, h = np.arange(first, first + count) / plan.grid.steps_per_second, plan.grid.step
     strength, point = np.zeros((count, len(slots), 3)), np.zeros((count, len(slots), 2))
@@ -140,11 +122,7 @@ class FrameLoad:
         self._keys = np.unique(np.concatenate([self._line.times, self._times]))
 
     def at(self, frame: int, rate: float) -> tuple[float, Array]:
-        """Evaluate the load at a frame; at a jump, the value after the jump counts.
-
-        Args:
-            frame: number of the frame.
-            rate: frames per second [1/s].
+        """Evaluate the load at a frame, for a frame rate [1/s]; at a jump, the value after the jump counts.
 
         Returns:
             The load [%], and the control point, x and y at rest [m], shape (2,).

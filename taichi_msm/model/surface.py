@@ -163,15 +163,12 @@ def refine_surface(position: NDArray[np.floating], refine: int) -> Surface:
 
 
 def place_capsules(scene: Scene, position: NDArray[np.floating], time: float) -> list[Capsule]:
-    """Place all instruments of a scene.
+    """Return a capsule for every probe with an instrument, in the order of the probes.
 
     Args:
         scene: the scene.
         position: positions of the mass points [m], shape (rows, cols, 3).
         time: the time [s].
-
-    Returns:
-        A capsule for every probe with an instrument, in the order of the probes.
     """
     moved = {tool.probe: tool for tool in build_tools(scene.probes, scene.sheet)}
     placed = []

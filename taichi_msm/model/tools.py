@@ -139,15 +139,7 @@ def unit_vector(shaft: Sequence[float]) -> Array:
 
 
 def grip_frames(grip: tuple[float, float], rate: float) -> range:
-    """Return the frames of a quasi-static scene at which a grip holds.
-
-    Args:
-        grip: its start and end [s].
-        rate: frames per second [1/s].
-
-    Returns:
-        The frames at or after the start, up to rounding, and before the end.
-    """
+    """Return the frames of a quasi-static scene at which a grip (start and end [s]) holds, up to rounding."""
     begin, end = (max(0, math.ceil(time * rate - FRAME_TOLERANCE)) for time in grip)
     return range(begin, end)
 

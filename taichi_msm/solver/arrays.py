@@ -137,27 +137,14 @@ class SheetArrays:
         return *self.u, *self.d, self.constants, self.by_column, self.stiffness, self.fields
 
     def get_fields(self, first: int, count: int) -> NDArray[Any]:
-        """Read consecutive fields.
-
-        Args:
-            first: index of the first field.
-            count: number of fields.
-
-        Returns:
-            Fields, shape (count, rows, cols).
-        """
+        """Read the fields first, ..., first + count - 1, shape (count, rows, cols)."""
         layout = self._layout
         entries = self.fields.to_numpy()[first * layout.rows * layout.width :]
         values = from_lanes(layout, entries, count * layout.rows)
         return np.ascontiguousarray(values.reshape(count, layout.rows, layout.cols))
 
     def set_fields(self, first: int, values: NDArray[Any]) -> None:
-        """Replace consecutive fields.
-
-        Args:
-            first: index of the first field.
-            values: shape (fields, rows, cols).
-        """
+        """Replace the fields from `first` on by values of shape (fields, rows, cols)."""
         entries, laid = self.fields.to_numpy(), to_lanes(self._layout, values)
         at = first * self._layout.rows * self._layout.width
         entries[at : at + len(laid)] = laid

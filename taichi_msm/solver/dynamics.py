@@ -332,9 +332,6 @@ class ForceRecorder:
 
     The force of a force-controlled probe at a frame is (percent(t) / 100) force times the sum of its decay factors over
     the mass points that are not fixed. `Dynamics.tool_forces` computes the force of a position-controlled tool.
-
-    Args:
-        plan: the plan.
     """
 
     def __init__(self, plan: Plan) -> None:

@@ -122,11 +122,7 @@ def _other_work(scene: Scene) -> float:
 
 
 def make_plan(scene: Scene, maps: Maps | None = None) -> Plan:
-    """Build the plan of a scene for a CPU.
-
-    Args:
-        scene: a scene whose keys are valid individually.
-        maps: images of its stiffness maps; by default they are read.
+    """Build the plan of a scene for a CPU, as `try_plan`.
 
     Raises:
         SceneError: when sheet, steps or paths are invalid; it lists all problems.
@@ -162,12 +158,7 @@ def try_plan(scene: Scene, maps: Maps | None = None) -> tuple[Plan | None, list[
 
 
 def plan_variant(plan: Plan, scene: Scene) -> Plan:
-    """Build the plan of a modified scene without checks.
-
-    Args:
-        plan: the plan of a valid scene with the same maps.
-        scene: the modified scene, also valid.
-    """
+    """Build the plan of a modified scene, which must be valid and have the maps of `plan`, without checks."""
     return _plan(scene, plan.maps, fixed_points(scene.sheet), derive_material(scene, plan.maps))
 
 
@@ -190,17 +181,10 @@ def _plan(scene: Scene, maps: Maps, fixed: NDArray[np.bool_], material: Material
 
 
 def choose_precision(plan: Plan, arch: str) -> Plan:
-    """Choose the precision of the steps.
+    """Return a plan with the precision chosen for an arch: cpu, cuda or vulkan.
 
     Quasi-static scenes always use f64. With `auto`, a CPU uses f64 if the scene has a tolerance or if stepping is a
     small part of the work; GPUs use f32, because f64 is slow or missing there.
-
-    Args:
-        plan: the plan.
-        arch: cpu, cuda or vulkan.
-
-    Returns:
-        The plan with the precision in its grid.
     """
     time = plan.scene.time
     if time.at_rest:

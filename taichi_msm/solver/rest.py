@@ -276,12 +276,5 @@ class QuasiStatics(Dynamics):
 
 
 def build_dynamics(plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> Dynamics:
-    """Build the dynamic or quasi-static solver of a plan.
-
-    Args:
-        plan: the plan.
-        device: the device.
-        layout: replaces the layout chosen by `choose_layout`, for tests.
-        cores: largest number of CPU cores; by default all available cores.
-    """
+    """Build the dynamic or quasi-static solver of a plan, with the arguments of `Dynamics`."""
     return (QuasiStatics if plan.scene.time.at_rest else Dynamics)(plan, device, layout, cores)
