@@ -97,14 +97,9 @@ def store_bounds(cell, left, right, top, bottom, width, height, bounds: ti.templ
     """Store the bounding box of a cell, clipped to the picture.
 
     Args:
-        cell: index of the cell.
-        left: left edge of the bounding box [px or samples].
-        right: right edge of the bounding box [px or samples].
-        top: top edge of the bounding box [px or samples].
-        bottom: bottom edge of the bounding box [px or samples].
-        width: width of the picture, in the same unit.
-        height: height of the picture, in the same unit.
-        bounds: destination, `BOUNDS_STRIDE` integers per cell.
+        left, right, top, bottom: edges of the bounding box [px or samples].
+        width, height: size of the picture, in the same unit.
+        bounds: bounding boxes of the cells, written; `BOUNDS_STRIDE` integers per cell.
     """
     entry = cell * BOUNDS_STRIDE
     bounds[entry + FIRST_X] = ti.cast(ti.floor(ti.math.clamp(left, 0.0, MAX_BOUND)), ti.i32)
@@ -115,14 +110,7 @@ def store_bounds(cell, left, right, top, bottom, width, height, bounds: ti.templ
 
 @ti.func
 def is_in_bounds(cell, x, y, bounds: ti.template()):
-    """Return whether (x, y) is within the bounding box of a cell.
-
-    Args:
-        cell: index of the cell.
-        x: column, in the unit of the bounds.
-        y: row, in the unit of the bounds.
-        bounds: bounding boxes as stored by `store_bounds`.
-    """
+    """Return whether column x and row y are within the bounding box of a cell, as stored by `store_bounds`."""
     entry = cell * BOUNDS_STRIDE
     return (
         bounds[entry + FIRST_X] <= x
@@ -169,7 +157,7 @@ def _list_cells(cells: ti.i32, size: ti.i32, columns: ti.i32, bounds: Integers, 
 
 @ti.func
 def owner_of(item, owners, ends: ti.template()):
-    """Return the owner of an item by binary search.
+    """Return the index of an item's owner, by binary search.
 
     Args:
         item: index of the item.

@@ -115,12 +115,8 @@ def max_edge(p_x, p_y, q_x, q_y, box: ti.template(), facing):
     It is rounded as `geometry.edge` is, so that no tile with a sample inside is skipped.
 
     Args:
-        p_x: x of the edge's first end [samples].
-        p_y: y of the edge's first end [samples].
-        q_x: x of the edge's second end [samples].
-        q_y: y of the edge's second end [samples].
+        p_x, p_y, q_x, q_y: ends of the edge [samples].
         box: left, right, top and bottom [samples].
-        facing: 1 or -1, as for `geometry.edge`.
     """
     left, right, top, bottom = ti.static(box)
     x = ti.select((q_y - p_y) * facing > 0.0, left, right)
@@ -130,13 +126,7 @@ def max_edge(p_x, p_y, q_x, q_y, box: ti.template(), facing):
 
 @ti.func
 def may_cover(box: ti.template(), facing, outline: ti.template()):
-    """Return whether a cell may cover samples within a box.
-
-    Args:
-        box: left, right, top and bottom [samples].
-        facing: 1 if the front of the cell is visible, -1 for its back.
-        outline: outline of the cell.
-    """
+    """Return whether a cell may cover samples within a box: left, right, top and bottom [samples]."""
     p, q = ti.static((outline.x, outline.y))
     return (
         max_edge(p[0], q[0], p[2], q[2], box, -facing) >= 0.0
@@ -154,17 +144,9 @@ def cover_tile(
     """Cover a tile of samples with sub-quads of a cell, one per sample.
 
     Args:
-        entry: first entry of the tile in the G-buffer.
-        x: column of the undistorted samples.
-        y: row of the undistorted samples.
         inside: mask of the samples that the cell covers.
-        quad_column: column of the sub-quads in the cell.
-        quad_row: row of the sub-quads in the cell.
         lower: whether the triangle below the diagonal is drawn, if the cell is drawn triangle by triangle.
         enlargement: fraction of its side by which that triangle is enlarged.
-        cell: the cell.
-        sheet: the sheet.
-        band: the band.
     """
     config = ti.static(band.config)
     plane = ti.static(config.plane)
@@ -195,11 +177,8 @@ def cover_cell(i, j, part: ti.template(), sheet: ti.template(), band: ti.templat
     """Cover the samples of a band with a cell.
 
     Args:
-        i: row of the upper left mass point of the cell.
-        j: column of the upper left mass point of the cell.
+        i, j: row and column of the upper left mass point of the cell.
         part: part of the cell that is drawn, on a GPU; ignored on a CPU.
-        sheet: the sheet.
-        band: the band.
     """
     config, float_vector = ti.static((band.config, band.config.float_vector))
     corner = (i * sheet.cols + j) * geometry.NODE_STRIDE
@@ -297,12 +276,6 @@ def _dot(a_x, a_y, a_z, b_x, b_y, b_z):
 def intersect_capsule(x, y, index, uniforms: ti.template()):
     """Intersect lines of sight with an instrument.
 
-    Args:
-        x: column of the undistorted samples.
-        y: row of the undistorted samples.
-        index: index of the instrument.
-        uniforms: constants of the view.
-
     Returns:
         Depth of the first intersection [m], INFINITY without one; three components of the normal times the radius.
     """
@@ -348,15 +321,7 @@ def intersect_capsule(x, y, index, uniforms: ti.template()):
 
 @ti.func
 def cover_tile_with_capsule(entry, x, y, index, band: ti.template()):
-    """Cover a tile of samples with an instrument.
-
-    Args:
-        entry: first entry of the tile in the G-buffer.
-        x: column of the undistorted samples.
-        y: row of the undistorted samples.
-        index: index of the instrument.
-        band: the band.
-    """
+    """Cover a tile of samples with an instrument."""
     plane, samples = ti.static((band.config.plane, band.samples))
     depth, n_x, n_y, n_z = intersect_capsule(x, y, index, band.uniforms)
     visible = (w_at(depth, band.uniforms) > band.near) & (depth < samples[entry + plane.depth])
@@ -375,12 +340,7 @@ def cover_tile_with_capsule(entry, x, y, index, band: ti.template()):
 
 @ti.func
 def cover_capsules(count, band: ti.template()):
-    """Cover a band with the instruments.
-
-    Args:
-        count: number of instruments.
-        band: the band.
-    """
+    """Cover a band with the instruments."""
     config, uniforms = ti.static((band.config, band.uniforms))
     for index in range(count):
         capsule = uni.CAPSULES + index * uni.CAPSULE_STRIDE
@@ -410,14 +370,7 @@ def cover_capsules(count, band: ti.template()):
 
 @ti.func
 def cell_at(i, j, patch: ti.template(), sheet: ti.template()):
-    """Return the cell with a mass point as its upper left corner.
-
-    Args:
-        i: row of the mass point.
-        j: column of the mass point.
-        patch: surface of the cell.
-        sheet: the sheet.
-    """
+    """Return the cell with a mass point as its upper left corner."""
     # In f64, for the accuracy of a fraction of a texel on any sheet.
     texel_x = ti.cast(j, ti.f64) * sheet.texture_width / (sheet.cols - 1) - 0.5
     texel_y = ti.cast(i, ti.f64) * sheet.texture_height / (sheet.rows - 1) - 0.5
@@ -441,18 +394,7 @@ def cell_at(i, j, patch: ti.template(), sheet: ti.template()):
 def store_normal(
     position: ti.template(), i, j, rows, cols, config: ti.template(), uniforms: ti.template(), nodes: ti.template()
 ):
-    """Store the normal of the sheet at a mass point, if the shading uses it; for tissue in the camera's frame.
-
-    Args:
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        i: row of the mass point.
-        j: column of the mass point.
-        rows: number of rows of mass points.
-        cols: number of columns of mass points.
-        config: compile-time configuration.
-        uniforms: constants of the view.
-        nodes: destination, after the numbers of all mass points.
-    """
+    """Store the normal of the sheet at a mass point in `nodes`, if the shading uses it; for tissue in camera axes."""
     if ti.static(config.headlit or config.tissue):
         i0, i1 = ti.max(i - 1, 0), ti.min(i + 1, rows - 1)
         j0, j1 = ti.max(j - 1, 0), ti.min(j + 1, cols - 1)
@@ -480,10 +422,7 @@ def normal_at(across, along, cell: ti.template(), sheet: ti.template()):
     """Interpolate the normals of the mass points bilinearly.
 
     Args:
-        across: horizontal coordinate in the cell, from 0 to 1.
-        along: vertical coordinate in the cell, from 0 to 1.
-        cell: the cell.
-        sheet: the sheet.
+        across, along: coordinates in the cell, to the right and down, from 0 to 1.
 
     Returns:
         A list of three components; not normalised.
@@ -507,12 +446,7 @@ def absolute(values):
 
 @ti.func
 def headlight(normal: ti.template(), uniforms: ti.template()):
-    """Return the reflected share of the headlight: the absolute cosine between normal and direction to the light.
-
-    Args:
-        normal: list of three components, of any length.
-        uniforms: constants of the view.
-    """
+    """Return the reflected share of the headlight: the absolute cosine between normal and direction to the light."""
     length = ti.sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2])
     light = uni.HEADLIGHT
     cosine = absolute(normal[0] * uniforms[light] + normal[1] * uniforms[light + 1] + normal[2] * uniforms[light + 2])
@@ -529,18 +463,10 @@ def footprint(entry, x, y, s, t, texels_x, texels_y, triangle: ti.template(), ba
     those of (s, t) by (x, y) are the inverse.
 
     Args:
-        entry: first entry of the tile in the G-buffer.
-        x: column of the undistorted samples.
-        y: row of the undistorted samples.
-        s: horizontal coordinate on the triangle.
-        t: vertical coordinate on the triangle.
-        texels_x: width of the sub-quad [texels].
-        texels_y: height of the sub-quad [texels].
-        triangle: the triangle.
-        band: the band.
+        texels_x, texels_y: width and height of the sub-quad [texels].
 
     Returns:
-        Square of the larger of width and height, in units of `uniforms.SHARP` texels; and 1 where the front of the
+        Squared size, in units of `uniforms.SHARP` texels: the larger of width and height; and 1 where the front of the
         triangle is visible, else -1.
     """
     p, r, d = ti.static((triangle.p, triangle.r, triangle.d))
@@ -580,22 +506,7 @@ def store_surface(
     entry, visible, x, y, s, t, quad_column, quad_row,
     triangle: ti.template(), cell: ti.template(), sheet: ti.template(), band: ti.template(),
 ):  # fmt: skip
-    """Store the attributes of the visible samples of a tile.
-
-    Args:
-        entry: first entry of the tile in the G-buffer.
-        visible: mask of the samples.
-        x: column of the undistorted samples.
-        y: row of the undistorted samples.
-        s: horizontal coordinate on the triangle.
-        t: vertical coordinate on the triangle.
-        quad_column: column of the sub-quad in the cell.
-        quad_row: row of the sub-quad in the cell.
-        triangle: the triangle.
-        cell: the cell.
-        sheet: the sheet.
-        band: the band.
-    """
+    """Store the attributes of the visible samples of a tile; `visible` is their mask."""
     config, samples = ti.static((band.config, band.samples))
     plane = ti.static(config.plane)
     quad_side = 1.0 / sheet.subdivisions

@@ -107,17 +107,7 @@ def _map_vectors(config: DrawingConfig, width: int) -> int:
 def project_row(
     position: ti.template(), i, rows, cols, config: ti.template(), uniforms: ti.template(), nodes: ti.template()
 ):
-    """Project a row of mass points, and store the first and last row of the picture that it reaches.
-
-    Args:
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        i: row of mass points.
-        rows: number of rows of mass points.
-        cols: number of columns of mass points.
-        config: compile-time configuration.
-        uniforms: constants of the view.
-        nodes: destination.
-    """
+    """Project a row of mass points, and store the first and last row of the picture that it reaches."""
     first_row, last_row = INFINITY, -INFINITY
     for j in range(cols):
         project(position, i, j, cols, uniforms, nodes, False)
@@ -144,15 +134,6 @@ def project_all(
     """Project all mass points, row by row and shared among the workers; return when every row is finished.
 
     A worker waits only for rows that a running worker has taken, so a worker that starts late delays nobody.
-
-    Args:
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        rows: number of rows of mass points.
-        cols: number of columns of mass points.
-        config: compile-time configuration.
-        uniforms: constants of the view.
-        sizes: sizes and counters.
-        nodes: destination.
     """
     has_row = True
     while has_row:
@@ -168,12 +149,7 @@ def project_all(
 
 @ti.func
 def cover_band(sheet: ti.template(), band: ti.template()):
-    """Cover the samples of a band with the sheet.
-
-    Args:
-        sheet: the sheet.
-        band: the band.
-    """
+    """Cover the samples of a band with the sheet."""
     config, nodes = ti.static((band.config, sheet.nodes))
     lines = (band.bottom - band.top + config.tile_height - 1) // config.tile_height
     for tile in range(lines * band.tiles_across):

@@ -140,13 +140,6 @@ def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable
         """Project the mass points, and count the pieces of each cell.
 
         A cell has 1 piece if its bilinear map is inverted, otherwise one per triangle, and 0 behind the eye.
-
-        Args:
-            position: positions of the mass points [m], shape (rows, cols, 3).
-            uniforms: constants of the view.
-            sizes: sizes and counters.
-            nodes: projected mass points, written.
-            pieces: number of pieces of each cell, written.
         """
         for index in range(sizes[uni.ROWS] * sizes[uni.COLS]):
             rows, cols = sizes[uni.ROWS], sizes[uni.COLS]
@@ -171,14 +164,8 @@ def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable
         """Compute the cell, the first piece and the bounding box [samples] of parts.
 
         Args:
-            first: first part of the launch.
-            end: part after the last one.
-            ended: counter of finished threads.
             pieces_per_part: maximum number of pieces in a part.
-            uniforms: constants of the view.
-            sizes: sizes and counters.
             ends: cumulative number of parts up to and including each cell.
-            nodes: projected mass points.
             pieces: number of pieces of each cell.
             owners: cell and first piece of each part, written.
             bounds: bounding box of each part, written.
@@ -234,22 +221,15 @@ def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callab
         """Cover the samples of a strip with some parts of their lists.
 
         Args:
-            first: first sample of the launch, counted in the strip.
-            end: sample after the last one.
-            ended: counter of finished threads.
             top: first row of samples of the strip.
-            listed: position in the lists of the first part.
+            listed: position of the first part in its list.
             count: number of parts.
             pieces_per_part: maximum number of pieces in a part.
-            uniforms: constants of the view.
-            sizes: sizes and counters.
-            nodes: projected mass points.
             pieces: number of pieces of each cell.
             owners: cell and first piece of each part.
             bounds: bounding box of each part.
             starts: start of the list of each bin.
             entries: parts of all lists.
-            samples: undistortion map and G-buffer, written.
         """
         for index in range(first, end):
             rows, cols, subdivisions = sizes[uni.ROWS], sizes[uni.COLS], uniforms[uni.SUBDIVISIONS]
@@ -282,20 +262,7 @@ def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callab
         first: ti.i32, end: ti.i32, ended: Integers, row: ti.i32, uniforms: Floats, sizes: Integers, texels: Floats,
         samples: ti.types.ndarray(dtype=config.float_vector, ndim=1), colours: Bytes, labels: Floats,
     ):  # fmt: skip
-        """Cover the pixels of a strip with the instruments, and write them.
-
-        Args:
-            first: first pixel of the launch, counted in the strip.
-            end: pixel after the last one.
-            ended: counter of finished threads.
-            row: first row of pixels of the strip.
-            uniforms: constants of the view.
-            sizes: sizes and counters.
-            texels: levels of the texture.
-            samples: undistortion map and G-buffer.
-            colours: colours of all pixels, written.
-            labels: labels of all pixels, written.
-        """
+        """Cover the pixels of a strip, which begins at `row`, with the instruments; write their colours and labels."""
         for index in range(first, end):
             width, height, capsule_count = sizes[uni.WIDTH], sizes[uni.HEIGHT], sizes[uni.CAPSULE_COUNT]
             x, y = index % width, row + index // width

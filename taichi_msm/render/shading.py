@@ -72,15 +72,10 @@ def shade(entry, left, top, map_entry, samples: ti.template(), appearance: ti.te
     """Shade a tile: light the texture, then draw the mesh and the instruments.
 
     Args:
-        entry: first entry of the tile in the G-buffer.
-        left: left edge of the tile [samples].
-        top: top edge of the tile [samples].
         map_entry: first entry of the tile in the undistortion map, with lens distortion.
-        samples: G-buffer and undistortion map.
-        appearance: texture, light and instruments.
 
     Returns:
-        Red, green and blue.
+        Red, green and blue, 0 to 255.
     """
     config, uniforms = ti.static((appearance.config, appearance.uniforms))
     plane = ti.static(config.plane)
@@ -120,12 +115,9 @@ def write_colours(
 
     Args:
         colour: red, green and blue, 0 to 255.
-        row: first row of pixels of the tile.
-        end_row: end of the rows that are written.
+        row, end_row: first row of pixels of the tile; end of the rows that are written.
         tile: column of the tile.
-        tiles_across: number of tiles in a row.
-        colours: destination.
-        config: compile-time configuration.
+        colours: colours of the picture, written.
     """
     packed = ti.floor(colour[0] + 0.5) + ti.floor(colour[1] + 0.5) * 256.0 + ti.floor(colour[2] + 0.5) * 65536.0
     width = ti.static(config.tile_width)
@@ -154,15 +146,9 @@ def write_means(
 
     Args:
         first: first entry of the band in the G-buffer.
-        row: first row of pixels.
-        end_row: row after the last one.
-        left: first column of pixels.
-        right: column after the last one.
-        tiles_across: number of tiles in a row.
-        width: width of the picture [px].
-        samples: G-buffer.
-        colours: destination.
-        config: compile-time configuration.
+        row, end_row: first row of pixels, and the row after the last one.
+        left, right: first column of pixels, and the column after the last one.
+        colours: colours of the picture, written.
     """
     factor, tile_width, tile_height = ti.static((config.supersample, config.tile_width, config.tile_height))
     for y in range(row, end_row):
@@ -184,14 +170,9 @@ def write_labels(
     """Write the labels of the pixels of a tile.
 
     Args:
-        entry: first entry of the tile in the G-buffer.
         left: first column of pixels.
-        row: first row of pixels.
-        end_row: end of the rows that are written.
-        width: width of the picture [px].
-        samples: G-buffer.
-        output: destination.
-        config: compile-time configuration.
+        row, end_row: first row of pixels; end of the rows that are written.
+        output: arrays of the picture, written.
     """
     plane, channels = ti.static((config.plane, label_channels(config.plane)))
     is_covered = samples[entry + plane.depth] < INFINITY
@@ -221,16 +202,10 @@ def resolve(
 
     Args:
         first: first entry of the band in the G-buffer, at the left edge of the picture.
-        row: first row of pixels.
-        end_row: row after the last one.
-        left: first column of pixels.
-        right: column after the last one.
-        tiles_across: number of tiles in a row.
-        width: width of the picture [px].
+        row, end_row: first row of pixels, and the row after the last one.
+        left, right: first column of pixels, and the column after the last one.
         map_start: first entry of the band in the undistortion map, with lens distortion.
-        samples: G-buffer and undistortion map.
-        appearance: texture, light and instruments.
-        output: destination.
+        output: arrays of the picture, written.
     """
     config = ti.static(appearance.config)
     factor, tile_width, tile_height = ti.static((config.supersample, config.tile_width, config.tile_height))
@@ -256,13 +231,6 @@ def resolve(
 @ti.func
 def illuminate(x, y, depth, normal: ti.template(), uniforms: ti.template()):
     """Compute the illumination of samples.
-
-    Args:
-        x: column of the undistorted samples.
-        y: row of the undistorted samples.
-        depth: depth [m].
-        normal: list of three components.
-        uniforms: constants of the view.
 
     Returns:
         N L; M V; d0 / d; the upward component of the direction of ideal reflection of V.
@@ -305,16 +273,7 @@ def specular(mirror):
 
 @ti.func
 def light_transmission(x, y, depth, capsule_count, uniforms: ti.template(), config: ti.template()):
-    """Return the share of the light that is not shaded by the instruments.
-
-    Args:
-        x: column of the undistorted samples.
-        y: row of the undistorted samples.
-        depth: depth [m].
-        capsule_count: number of instruments.
-        uniforms: constants of the view.
-        config: compile-time configuration.
-    """
+    """Return the share of the light that is not shaded by the instruments."""
     offset_x, offset_y = line_of_sight(x, y, uniforms)
     w = w_at(depth, uniforms)
     right, up = offset_x * w, offset_y * w
@@ -336,10 +295,7 @@ def apply_relief(normal: ti.template(), slope_x, slope_y, uniforms: ti.template(
     """Tilt normals by the relief, in place: they lean away from rising grey levels.
 
     Args:
-        normal: list of three components.
-        slope_x: rise of the grey level per texel, to the right.
-        slope_y: rise of the grey level per texel, downward.
-        uniforms: constants of the view.
+        slope_x, slope_y: gradient of the grey level, to the right and down [1/texel].
     """
     n_x, n_y, n_z = ti.static((normal[0], normal[1], normal[2]))
     length = 1.0 / ti.max(ti.sqrt(n_x * n_x + n_y * n_y + n_z * n_z), 1e-30)
@@ -359,18 +315,11 @@ def light_tissue(x, y, depth, normal: ti.template(), slope_x, slope_y, column, r
     """Light wet tissue.
 
     Args:
-        x: column of the undistorted samples.
-        y: row of the undistorted samples.
-        depth: depth [m].
-        normal: list of three components.
-        slope_x: rise of the grey level per texel, to the right.
-        slope_y: rise of the grey level per texel, downward.
-        column: column of the samples in the picture.
-        row: row of the samples in the picture.
-        appearance: texture, light and instruments.
+        slope_x, slope_y: gradient of the grey level, to the right and down [1/texel].
+        column, row: column and row of the samples in the picture.
 
     Returns:
-        The factor of the colours, and the summand.
+        The factor of the colours, and the gloss that is added to them, 0 to 255.
     """
     config, uniforms = ti.static((appearance.config, appearance.uniforms))
     tilted = [normal[n] for n in ti.static(range(3))]
@@ -396,13 +345,6 @@ def light_tissue(x, y, depth, normal: ti.template(), slope_x, slope_y, column, r
 @ti.func
 def light_metal(x, y, depth, normal: ti.template(), uniforms: ti.template()):
     """Light metal, which reflects a room that is bright above and dark below.
-
-    Args:
-        x: column of the undistorted samples.
-        y: row of the undistorted samples.
-        depth: depth [m].
-        normal: list of three components.
-        uniforms: constants of the view.
 
     Returns:
         Red, green and blue.
@@ -452,26 +394,13 @@ def downsample(colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 @ti.func
 def to_integers(values, config: ti.template()):
-    """Convert to integers, lane by lane, because casting a vector crashes.
-
-    Args:
-        values: vector of floating-point numbers.
-        config: compile-time configuration.
-    """
+    """Convert to integers, lane by lane, because casting a vector crashes."""
     return config.integer_vector([ti.cast(values[lane], ti.i32) for lane in ti.static(range(config.lanes))])
 
 
 @ti.func
 def fetch_rgb(index, appearance: ti.template()):
-    """Gather texels and unpack them.
-
-    Args:
-        index: indices of the texels.
-        appearance: the texture.
-
-    Returns:
-        Red, green and blue.
-    """
+    """Gather the texels at some indices; return their red, green and blue."""
     config, texels = ti.static((appearance.config, appearance.texels))
     texel = config.float_vector([texels[index[lane]] for lane in ti.static(range(config.lanes))])
     blue = ti.floor(texel * (1.0 / 65536.0))
@@ -482,16 +411,7 @@ def fetch_rgb(index, appearance: ti.template()):
 
 @ti.func
 def bilinear(upper_left, upper_right, lower_left, lower_right, u, v):
-    """Interpolate bilinearly.
-
-    Args:
-        upper_left: value at u = v = 0.
-        upper_right: value at u = 1, v = 0.
-        lower_left: value at u = 0, v = 1.
-        lower_right: value at u = v = 1.
-        u: horizontal fraction between the values.
-        v: vertical fraction between the values.
-    """
+    """Interpolate bilinearly, at fractions u to the right and v down."""
     upper = upper_left + (upper_right - upper_left) * u
     lower = lower_left + (lower_right - lower_left) * u
     return upper + (lower - upper) * v
@@ -503,14 +423,11 @@ def fetch(first, width, height, x, y, appearance: ti.template()):
 
     Args:
         first: first texel of the level.
-        width: width of the level [texels].
-        height: height of the level [texels].
-        x: column, in the level [texels].
-        y: row, in the level [texels].
-        appearance: the texture.
+        width, height: size of the level [texels].
+        x, y: column and row in the level [texels].
 
     Returns:
-        The colour; and with a relief the rise of the grey level per texel, to the right and downward.
+        The colour; and with a relief the gradient of the grey level, to the right and down [1/texel].
     """
     config = ti.static(appearance.config)
     # Beyond the centres of its outermost texels the texture is constant.
@@ -535,16 +452,10 @@ def fetch(first, width, height, x, y, appearance: ti.template()):
 
 @ti.func
 def filter_texture(entry, is_covered, samples: ti.template(), appearance: ti.template()):
-    """Filter the texture for a tile.
-
-    Args:
-        entry: first entry of the tile in the G-buffer.
-        is_covered: mask of the samples with a visible surface.
-        samples: G-buffer.
-        appearance: the texture.
+    """Filter the texture for the samples of a tile that show a surface, the mask `is_covered`.
 
     Returns:
-        The colour; and with a relief the rise of the grey level per texel, to the right and downward.
+        As for `fetch`.
     """
     config, sizes = ti.static((appearance.config, appearance.sizes))
     float_vector, integer_vector, plane = ti.static((config.float_vector, config.integer_vector, config.plane))

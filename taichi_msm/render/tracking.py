@@ -278,17 +278,10 @@ def _kernel(lens: str) -> Callable[..., None]:
         """Locate material points, and compare them with some cells of the lists of their bins.
 
         Args:
-            first: first point of the launch.
-            end: point after the last one.
-            ended: counter of finished threads.
-            listed: position in the lists of the first cell.
+            listed: position of the first cell in its list.
             count: number of cells.
             coordinates: coordinates of the points on the sheet.
-            as_flow: 0 to return pixels; otherwise the points are those of the pixels of another frame, and their
-                displacements from these pixels' centres are returned.
-            uniforms: constants of the view.
-            sizes: sizes and counters.
-            nodes: projected mass points.
+            as_flow: 0 for pixels; 1 for displacements from the pixel centres of another frame, whose points these are.
             cell: outlines of the cells.
             starts: start of the list of each bin.
             entries: cells of all lists.
