@@ -39,14 +39,14 @@ class SheetGradient:
     """Derivatives of a loss by the numbers of a sheet.
 
     Attributes:
-        springs: By k - tau of every spring along rows, along columns, and of both diagonals of a cell, with shapes as
+        springs: by k - tau of every spring along rows, along columns, and of both diagonals of a cell, with shapes as
             in `springs.stiffness`.
-        tensions: By tau of each family at constant k - tau, shape (3,).
-        foundation: By the logarithm of the foundation stiffness K of every mass point, shape (rows, cols).
-        bending: By the logarithm of the bending stiffness.
-        keep: By the factor `keep` of the steps.
-        gain: By the logarithm of the gain of all steps but step 0.
-        first_gain: By the logarithm of the gain of step 0.
+        tensions: by tau of each family at constant k - tau, shape (3,).
+        foundation: by the logarithm of the foundation stiffness K of every mass point, shape (rows, cols).
+        bending: by the logarithm of the bending stiffness.
+        keep: by the factor `keep` of the steps.
+        gain: by the logarithm of the gain of all steps but step 0.
+        first_gain: by the logarithm of the gain of step 0.
     """
 
     springs: tuple[Array, Array, Array]
@@ -74,10 +74,10 @@ class Derivatives:
     """Derivatives of a loss by the numbers of a scene.
 
     Attributes:
-        numbers: Derivatives by the paths of keys, such as tissue.young, probes.0.total (of shape (3,), by component),
+        numbers: derivatives by the paths of keys, such as tissue.young, probes.0.total (of shape (3,), by component),
             probes.0.load (by the percent of each keyframe), and probes.0.at (by across and down; shape (keyframes, 2)
             for a moving control point). Material numbers that are 0 are left out.
-        maps: Derivatives by the factor of every cell, `tissue.map` or `springs.map`, shape (rows - 1, cols - 1), and
+        maps: derivatives by the factor of every cell, `tissue.map` or `springs.map`, shape (rows - 1, cols - 1), and
             with a foundation by the factor of every mass point, `tissue.foundation_map`, shape (rows, cols). A scene
             without such a map has the factor 1 everywhere.
     """
@@ -90,9 +90,9 @@ def scene_derivatives(plan: Plan, gradient: SheetGradient, loads: LoadGradient) 
     """Apply the chain rule from the numbers of a sheet to those of its scene.
 
     Args:
-        plan: Plan of the scene.
-        gradient: Derivatives by the numbers of the sheet.
-        loads: Derivatives by the loads.
+        plan: plan of the scene.
+        gradient: derivatives by the numbers of the sheet.
+        loads: derivatives by the loads.
 
     Returns:
         Derivatives by the numbers of the scene.
@@ -193,7 +193,7 @@ class LoadGradient:
     """Derivatives of a loss by the loads of the probes, accumulated over blocks of steps.
 
     Attributes:
-        by_key: Derivatives by the paths of keys, as in `Derivatives`.
+        by_key: derivatives by the paths of keys, as in `Derivatives`.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -213,9 +213,9 @@ class LoadGradient:
         """Add the derivatives by the loads of some steps.
 
         Args:
-            schedule_of: Returns the schedule of these steps for a plan with other loads.
-            by_slot: Derivatives by the force and by the control point of every slot, shape (steps, slots, 5).
-            times: Interval that contains all loads of these steps [s].
+            schedule_of: returns the schedule of these steps for a plan with other loads.
+            by_slot: derivatives by the force and by the control point of every slot, shape (steps, slots, 5).
+            times: interval that contains all loads of these steps [s].
         """
         height, width = self._plan.scene.sheet.size
         for index, slots in self._slots.items():

@@ -39,7 +39,7 @@ def require_differentiable(plan: Plan) -> None:
     """Check that a scene has a gradient.
 
     Raises:
-        SceneError: When it has position-controlled tools.
+        SceneError: when it has position-controlled tools.
     """
     for tool in plan.tools:
         reason = "a tool with a path has no gradient, as points meet and leave it; fit such scenes by differences"
@@ -70,12 +70,12 @@ class Adjoint:
     """Compiled sheet in f64 that can be run and differentiated repeatedly, also with another stiffness map.
 
     Args:
-        plan: Plan of the scene.
-        device: Device to run on, a CPU.
-        cores: Number of CPU cores; None for all.
+        plan: plan of the scene.
+        device: device to run on, a CPU.
+        cores: number of CPU cores; None for all.
 
     Raises:
-        SceneError: When a probe has a path, or the memory does not suffice.
+        SceneError: when a probe has a path, or the memory does not suffice.
     """
 
     def __init__(self, plan: Plan, device: Device, cores: int | None = None) -> None:
@@ -93,16 +93,16 @@ class Adjoint:
         """Run the scene.
 
         Args:
-            factors: Stiffness factors of the cells, shape (rows - 1, cols - 1), which replace those of the scene.
-            pause: Called several times a second; an exception from it ends the run, which has no derivatives then.
-            scene: The scene with other forces of its tools; None for its own.
+            factors: stiffness factors of the cells, shape (rows - 1, cols - 1), which replace those of the scene.
+            pause: called several times a second; an exception from it ends the run, which has no derivatives then.
+            scene: the scene with other forces of its tools; None for its own.
 
         Returns:
             Positions at every frame [m], shape (F + 1, rows, cols, 3).
 
         Raises:
-            ArgumentError: When the factors are not positive numbers of that shape, or too large for the step.
-            DivergedError: When the simulation diverges.
+            ArgumentError: when the factors are not positive numbers of that shape, or too large for the step.
+            DivergedError: when the simulation diverges.
         """
         self._ran = False
         plan = self._plan if factors is None else self._with_factors(factors)
@@ -116,15 +116,15 @@ class Adjoint:
         """Differentiate a loss at the last `run`.
 
         Args:
-            by_position: Derivative of the loss by the positions at every frame, shape (F + 1, rows, cols, 3).
-            pause: Called several times a second; an exception from it ends the differentiation.
+            by_position: derivative of the loss by the positions at every frame, shape (F + 1, rows, cols, 3).
+            pause: called several times a second; an exception from it ends the differentiation.
 
         Returns:
             Derivatives by the numbers of the scene.
 
         Raises:
-            ArgumentError: When it is not an array of finite numbers of that shape.
-            MsmError: When nothing has run.
+            ArgumentError: when it is not an array of finite numbers of that shape.
+            MsmError: when nothing has run.
         """
         if not self._ran:
             raise MsmError("nothing has run yet that could be differentiated; call run first")
@@ -163,14 +163,14 @@ class Gradient(Derivatives):
     """Value of a loss, and its derivatives by the numbers of a scene.
 
     Attributes:
-        numbers: Derivatives by the paths of keys: by material numbers other than 0, such as tissue.young; by the
+        numbers: derivatives by the paths of keys: by material numbers other than 0, such as tissue.young; by the
             components of a force, such as probes.0.total, shape (3,); by the percents of a load, such as probes.0.load,
             shape (keyframes,); and by across and down of a control point, such as probes.0.at, shape (2,), or
             (keyframes, 2) for a moving one.
-        maps: Derivatives by the factors of maps, where a scene without a map has the factor 1 everywhere: tissue.map or
+        maps: derivatives by the factors of maps, where a scene without a map has the factor 1 everywhere: tissue.map or
             springs.map, by cell, shape (rows - 1, cols - 1); with a foundation also tissue.foundation_map, by mass
             point, shape (rows, cols).
-        value: Value of the loss.
+        value: value of the loss.
     """
 
     value: float
@@ -183,19 +183,19 @@ def gradient(scene: Scene | Mapping[str, Any], loss: Loss, threads: int | None =
     scene with tolerances is resolved first.
 
     Args:
-        scene: Scene from `load_scene`, or the same as a mapping.
-        loss: Function of the positions at every frame [m], shape (F + 1, rows, cols, 3), that returns its value and its
+        scene: scene from `load_scene`, or the same as a mapping.
+        loss: function of the positions at every frame [m], shape (F + 1, rows, cols, 3), that returns its value and its
             derivative by them, an array of the same shape.
-        threads: Number of CPU threads; None for every core.
+        threads: number of CPU threads; None for every core.
 
     Returns:
         The value of the loss and its derivatives.
 
     Raises:
-        SceneError: When the scene cannot be run, or a tool has a path.
-        ArgumentError: When the loss returns something else.
-        DivergedError: When the simulation diverges.
-        MsmError: When a quasi-static sheet has no stiffness against some motion.
+        SceneError: when the scene cannot be run, or a tool has a path.
+        ArgumentError: when the loss returns something else.
+        DivergedError: when the simulation diverges.
+        MsmError: when a quasi-static sheet has no stiffness against some motion.
 
     Example:
         >>> from taichi_msm import gradient, load_scene

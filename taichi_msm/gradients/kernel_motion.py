@@ -62,14 +62,14 @@ class AdjointSheet(NamedTuple):
 
     Attributes:
         u: p, q and the derivative of the loss, and with bending moments of p.
-        by_column: As in `KernelSheet`, like the next five.
-        stiffness: Stiffness of the springs.
-        fields: Fields of the mass points.
-        constants: Constants of the sheet.
-        rows: Number of rows.
-        width: Entries of a row.
-        shapes: Displacements of the steps of a segment, three arrays.
-        derivatives: Accumulated derivatives.
+        by_column: as in `KernelSheet`, like the next five.
+        stiffness: stiffness of the springs.
+        fields: fields of the mass points.
+        constants: constants of the sheet.
+        rows: number of rows.
+        width: entries of a row.
+        shapes: displacements of the steps of a segment, three arrays.
+        derivatives: accumulated derivatives.
     """
 
     u: Any
@@ -87,15 +87,15 @@ class AdjointBand(NamedTuple):
     """A worker's band of rows at a step, within a kernel.
 
     Attributes:
-        low: First row.
-        high: Row after the last one.
-        source: Row where the buffer that is read begins.
-        target: Row where the buffer that is written begins.
-        shape: Row where the displacements begin.
-        carry: Row of the forces that are carried to the next row.
-        moments: Row where the moments begin.
-        n: Index of the step in the table of loads.
-        with_loss: Whether the derivative of the loss is added.
+        low: first row.
+        high: row after the last one.
+        source: row where the buffer that is read begins.
+        target: row where the buffer that is written begins.
+        shape: row where the displacements begin.
+        carry: row of the forces that are carried to the next row.
+        moments: row where the moments begin.
+        n: index of the step in the table of loads.
+        with_loss: whether the derivative of the loss is added.
     """
 
     low: Any
@@ -121,8 +121,8 @@ def adjoint_kernels(code: KernelConfig, *, parallel: bool) -> tuple[Callable[...
     """Build the kernel that steps forward and stores every shape, and the one that sweeps backward.
 
     Args:
-        code: Compile-time configuration of the steps.
-        parallel: Whether the workers run in parallel.
+        code: compile-time configuration of the steps.
+        parallel: whether the workers run in parallel.
 
     Returns:
         Both kernels, which share the arguments `sizes` (int64, in the order of `COUNT`) and `progress` (int64, `STRIDE`

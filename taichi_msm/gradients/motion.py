@@ -64,8 +64,8 @@ def segment_steps(steps: int, shape_bytes: int) -> int:
     """Return the number of steps of a segment, whose shapes take about as much memory as all checkpoints.
 
     Args:
-        steps: Number of steps of the run.
-        shape_bytes: Memory of the displacements of a step [bytes]; a checkpoint takes twice as much.
+        steps: number of steps of the run.
+        shape_bytes: memory of the displacements of a step [bytes]; a checkpoint takes twice as much.
 
     Returns:
         Number of steps.
@@ -84,13 +84,13 @@ class _Arrays(NamedTuple):
     """Arrays of the adjoint; a list holds three, for x, y and z.
 
     Attributes:
-        checkpoints: Displacements at the beginning of every segment.
-        checkpoint_differences: Last differences at the beginning of every segment.
-        shapes: Displacements in a segment, step by step.
-        differences: Last difference in a segment.
-        adjoint: Adjoint state, see `kernel_motion`.
-        loss: Derivative of the loss by the displacements of a frame.
-        derivatives: Accumulated derivatives, see `kernel_motion`.
+        checkpoints: displacements at the beginning of every segment.
+        checkpoint_differences: last differences at the beginning of every segment.
+        shapes: displacements in a segment, step by step.
+        differences: last difference in a segment.
+        adjoint: adjoint state, see `kernel_motion`.
+        loss: derivative of the loss by the displacements of a frame.
+        derivatives: accumulated derivatives, see `kernel_motion`.
     """
 
     checkpoints: list[Any]
@@ -112,8 +112,8 @@ class MotionAdjoint(Dynamics):
         """Restart with the same scene or another, like `Dynamics`.
 
         Args:
-            plan: Plan of the scene.
-            state: State to start from; None for the state of rest.
+            plan: plan of the scene.
+            state: state to start from; None for the state of rest.
         """
         super().restart(plan, state)
         self._decay_slopes = self.layout.config.require(ProbeTerm).decay_gradients(plan)
@@ -151,13 +151,13 @@ class MotionAdjoint(Dynamics):
         """Run all steps and store the checkpoints.
 
         Args:
-            pause: Called several times a second; an exception from it ends the run.
+            pause: called several times a second; an exception from it ends the run.
 
         Returns:
             Displacements at every frame [m], shape (F + 1, rows, cols, 3).
 
         Raises:
-            DivergedError: When the sheet diverges.
+            DivergedError: when the sheet diverges.
         """
         plan, grid = self.plan, self.plan.grid
         monitor, frames = DivergenceMonitor(plan), np.zeros((grid.frames + 1, *plan.scene.sheet.points, 3))
@@ -179,8 +179,8 @@ class MotionAdjoint(Dynamics):
         """Sweep the adjoint of the last `run` backward in time.
 
         Args:
-            by_frame: Derivative of the loss by the displacements at every frame, shape (F + 1, rows, cols, 3).
-            pause: Called several times a second; an exception from it ends the sweep.
+            by_frame: derivative of the loss by the displacements at every frame, shape (F + 1, rows, cols, 3).
+            pause: called several times a second; an exception from it ends the sweep.
 
         Returns:
             Derivatives by the numbers of the sheet and by its loads.

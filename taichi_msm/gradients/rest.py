@@ -54,13 +54,13 @@ class RestAdjoint:
         """Solve all frames.
 
         Args:
-            pause: Called several times a second; an exception from it ends the run.
+            pause: called several times a second; an exception from it ends the run.
 
         Returns:
             Displacements at every frame [m], shape (F + 1, rows, cols, 3).
 
         Raises:
-            DivergedError: When a frame has no equilibrium.
+            DivergedError: when a frame has no equilibrium.
         """
         self._sheet.restart(self.plan)
         frames = []
@@ -74,14 +74,14 @@ class RestAdjoint:
         """Differentiate a loss at the last `run`.
 
         Args:
-            by_frame: Derivative of the loss by the displacements at every frame, shape (F + 1, rows, cols, 3).
-            pause: Called several times a second; an exception from it ends the differentiation.
+            by_frame: derivative of the loss by the displacements at every frame, shape (F + 1, rows, cols, 3).
+            pause: called several times a second; an exception from it ends the differentiation.
 
         Returns:
             Derivatives by the numbers of the sheet and by its loads.
 
         Raises:
-            MsmError: When the sheet has no stiffness against some motion, and so no derivative.
+            MsmError: when the sheet has no stiffness against some motion, and so no derivative.
         """
         plan, (rows, cols) = self.plan, self.plan.scene.sheet.points
         families, laplacian = list(spring_families(plan)), _laplacian(plan)

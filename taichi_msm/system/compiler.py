@@ -35,7 +35,7 @@ class Compiler:
         cache: directory of compiled kernels, relative to the home directory.
         lock: lock file of the cache, relative to that directory.
         tested_version: version whose results on a CPU have the same bits as those of the other compiler's.
-        python_versions: Python versions for which it can be installed.
+        python_versions: python versions for which it can be installed.
         poll_s: time to poll a counter that another thread writes [s], measured on Zen 4. Taichi's LLVM fences the read
             by `mfence`, that of Quadrants by a locked `or`.
     """
