@@ -9,14 +9,14 @@ from taichi_msm.render.config import Integers
 from taichi_msm.system.launches import Launches, end_thread
 from taichi_msm.system.runtime import compilation_options, ti
 
-# Offsets in the bounding box of a cell: its first and last column and row, clipped to the picture. The box of an
-# invisible cell is empty: its last column or row is before the first.
+# Offsets in the bounding box of a cell: its first and last column and row, clipped to the picture. For an invisible
+# cell, the last column or row is before the first one.
 FIRST_X, FIRST_Y, LAST_X, LAST_Y, BOUNDS_STRIDE = range(5)
 
-# Larger coordinates are clipped, so that they fit into an integer.
+# Limit of coordinates, so that they fit into an integer.
 MAX_BOUND = 1e6
 
-# Maximum number of entries in all lists, per cell and bin.
+# Maximum number of entries of all lists, per cell and per bin.
 MAX_MEAN_ENTRIES = 64
 
 # Maximum number of rounds of a binary search among the cells of a sheet.
@@ -27,7 +27,7 @@ class Bins(NamedTuple):
     """Lists of the cells that overlap each bin.
 
     Attributes:
-        size: width and height of a bin [px or samples, as the bounds].
+        size: width and height of a bin [px or samples].
         columns: number of bins in a row.
         lengths: number of cells in each list, shape (rows of bins, columns).
         starts: first entry of each list, then the end of the last one; on the device.
@@ -45,14 +45,11 @@ def build_bins(launches: Launches, bounds: Any, cells: int, extent: tuple[int, i
     """List the cells that overlap each bin: sequentially on a CPU, in parallel on a GPU.
 
     Args:
-        launches: launches on the device; a bounded one selects the parallel kernels.
+        launches: launches on the device; bounded ones, of a GPU, select the parallel kernels.
         bounds: bounding boxes as stored by `store_bounds`, on the device.
         cells: number of cells.
         extent: width and height of the picture, in the unit of the bounds.
-        size: width and height of a bin; doubled until the lists fit into `MAX_MEAN_ENTRIES` per cell and bin.
-
-    Returns:
-        The lists.
+        size: width and height of a bin; doubled until the lists have at most `MAX_MEAN_ENTRIES` per cell and bin.
     """
     if launches.bounded:
         return _build_in_parallel(launches, bounds, cells, extent, size)

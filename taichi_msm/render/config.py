@@ -1,9 +1,9 @@
 """Compile-time configuration and G-buffer layout of the rasteriser (kernel 2).
 
-A sample is a pixel, or one of several per pixel with supersampling. A tile of samples is one vector: 4 x 4 samples for
-the 16 lanes of AVX-512, 4 x 2 for 8 lanes, 4 x 1 for 4 lanes, and a single sample on a GPU. The G-buffer has several
-vectors per tile, its planes. On a CPU a band of rows of tiles is the unit of parallel work; each worker stores one
-band.
+A sample is a pixel, or with supersampling one of several per pixel. The samples of a tile form a vector: 4 x 4 samples
+for the 16 lanes of AVX-512, 4 x 2 for 8 lanes, 4 x 1 for 4 lanes, and a single sample on a GPU. The G-buffer has
+several vectors per tile, its planes. On a CPU a band of rows of tiles is the unit of parallel work, and each worker has
+memory for one band.
 
 Arguments that the functions of kernel 2 share, and that their docstrings omit:
 
@@ -35,7 +35,7 @@ from typing import Any, NamedTuple
 from taichi_msm.render.labels import LABELS
 from taichi_msm.system.runtime import ti
 
-# Approximate number of rows of samples in a band on a CPU.
+# Approximate number of rows of samples in a band, on a CPU.
 BAND_ROWS = 16
 
 # Maximum number of samples in a row of a tile.
@@ -98,7 +98,7 @@ class DrawingConfig(NamedTuple):
 
     @property
     def unordered(self) -> bool:
-        """Whether the cells of a sample are processed in arbitrary order, as on a GPU, and not row by row."""
+        """Whether the cells at a sample are processed in arbitrary order, as on a GPU, instead of row by row."""
         return self.lanes == 1
 
     @property
@@ -120,7 +120,7 @@ class DrawingConfig(NamedTuple):
     def map_planes(self) -> int:
         """Vectors per tile of the undistortion map; 0 without lens distortion.
 
-        They are x and y, the steps to the next samples (`lens_table.undistortion_map`), and on a CPU a bounding box.
+        They are x and y, the steps to the next samples (`lens_table.undistortion_map`), and on a CPU the bounding box.
         """
         return (6 if self.map_has_steps else 2) + (not self.unordered) if self.lens else 0
 
@@ -131,7 +131,7 @@ class DrawingConfig(NamedTuple):
 
     @property
     def band_map_vectors(self) -> int:
-        """Vectors of the undistortion map per column of tiles in a band on a CPU, without the bounds."""
+        """Vectors of the undistortion map per column of tiles in a band on a CPU, without the band's bounding box."""
         return self.band_lines * self.map_planes
 
     @property
@@ -184,7 +184,7 @@ def _planes(config: DrawingConfig) -> Any:
 
 
 class Band(NamedTuple):
-    """A band of the picture, or a part of a band, with the view; all lengths in samples.
+    """Band of the picture, or a part of one, with the view; lengths are in samples.
 
     Attributes:
         config: compile-time configuration.
@@ -299,7 +299,7 @@ def tile_box(entry, left, top, band: ti.template()):
 
 @ti.func
 def map_steps(entry, band: ti.template()):
-    """Return the undistorted steps from the samples of a tile to the next ones on the right and below [samples].
+    """Return the steps from the samples of a tile to the next ones on the right and below, undistorted [samples].
 
     Returns:
         x and y of the step to the right, x and y of the step downward.

@@ -1,13 +1,13 @@
 """Coverage: the nearest surface at every sample, of the sheet and of the instruments.
 
-Vertices are not stored. For a sample inside the outline of a cell, the two equations of geometry.py yield the sub-quad;
-the side of the sub-quad's diagonal yields the triangle; and the two linear equations of the triangle yield the point on
-it. A cell that is folded or extends behind the camera is drawn triangle by triangle instead.
+Vertices are not stored. For a sample inside the outline of a cell, the two equations of geometry.py yield the sub-quad,
+the side of the sub-quad's diagonal the triangle, and the two linear equations of the triangle the point on it. A cell
+that is folded or extends behind the camera is drawn triangle by triangle instead.
 
-An instrument is a capsule: all points within its radius of the line segment from the centre A of its tip to A + U
-length. The line of sight through a sample is P = O + D t, where t is the depth. On the cylinder the component of P - A
-perpendicular to U has the radius as its length, which is a quadratic equation for t. Where its solution lies beyond an
-end of the segment, the line of sight is intersected with the sphere around that end instead.
+An instrument is a capsule: all points within a radius of the line segment from the centre A of its tip to A + length U.
+The line of sight through a sample is P = O + D t, where t is the depth. On the cylinder the component of P - A
+perpendicular to U is as long as the radius, a quadratic equation for t. Where its solution is beyond an end of the
+segment, the line of sight is intersected with the sphere around that end.
 
 To add an output per pixel, add its planes in labels.py or config.py and its values in `store_surface`.
 """
@@ -33,23 +33,21 @@ from taichi_msm.render.lens_kernels import DISTORTED_STRIDE
 from taichi_msm.render.lens_table import INVALID_COORDINATE
 from taichi_msm.system.runtime import ti
 
-# Numbers per unit normal; the normals are stored after the other numbers of all mass points.
+# Numbers per unit normal; in `nodes` the normals follow the projected mass points.
 NORMAL_STRIDE = 3
 
-# Maximum footprint: covers any texture [texels squared].
+# Maximum footprint, above that of any texture.
 MAX_FOOTPRINT = 1e12
 
 
 class DrawnSheet(NamedTuple):
-    """The projected mass points and the size of the sheet.
+    """Projected mass points and texture size of the sheet.
 
     Attributes:
-        nodes: numbers of every mass point, `NODE_STRIDE` each, then the normals.
-        rows: number of rows of mass points.
-        cols: number of columns of mass points.
+        nodes: projected mass points, `NODE_STRIDE` numbers each; then the normals.
+        rows, cols: number of rows and columns of mass points.
         subdivisions: number of sub-quads along a side of a cell.
-        texture_width: width of the texture [texels].
-        texture_height: height of the texture [texels].
+        texture_width, texture_height: size of the texture [texels].
         distorted_start: entry of `nodes` at which the distorted mass points begin, with lens distortion.
     """
 
@@ -63,20 +61,15 @@ class DrawnSheet(NamedTuple):
 
 
 class Cell(NamedTuple):
-    """A cell and its position on the sheet and on the texture.
+    """Cell with its position on the sheet and on the texture.
 
     Attributes:
         patch: surface of the cell.
-        i: row of the cell.
-        j: column of the cell.
-        rows: number of rows of cells of the sheet.
-        cols: number of columns of cells of the sheet.
-        texel_x: integer part of the texture coordinate of the upper left mass point, horizontal [texels].
-        texel_y: integer part of that coordinate, vertical [texels].
-        fraction_x: fractional part of that coordinate, horizontal.
-        fraction_y: fractional part of that coordinate, vertical.
-        texels_across: width of the cell [texels].
-        texels_down: height of the cell [texels].
+        i, j: row and column of the cell.
+        rows, cols: number of rows and columns of cells of the sheet.
+        texel_x, texel_y: integer part of the texture coordinates of the upper left mass point [texels].
+        fraction_x, fraction_y: fractional part of these coordinates [texels].
+        texels_across, texels_down: width and height of the cell [texels].
         normal: entry of the normal at the upper left mass point.
     """
 
@@ -95,12 +88,11 @@ class Cell(NamedTuple):
 
 
 class Part(NamedTuple):
-    """The part of a cell that a thread of a GPU covers.
+    """Part of a cell that a thread of a GPU covers.
 
     Attributes:
-        invertible: whether the cell is drawn by inverting its bilinear map; the part is then the whole cell.
-        first: otherwise, the first triangle of the part.
-        end: otherwise, the triangle after the last one.
+        invertible: whether the cell is drawn by inverting its bilinear map; the part is then the entire cell.
+        first, end: otherwise, the first triangle of the part, and the triangle after the last one.
     """
 
     invertible: Any
@@ -228,7 +220,7 @@ def cover_cell(i, j, part: ti.template(), sheet: ti.template(), band: ti.templat
             x, y = sample_centres(tile_x, tile_y, config)
             inside = float_vector(1) > 0.0
             quad_column, quad_row = float_vector(quad_s), float_vector(quad_t)
-            # The last round only covers the pending tile.
+            # The last iteration only covers the pending tile.
             overlaps = True
             if n < tiles:
                 if ti.static(config.has_distortion):
@@ -459,8 +451,8 @@ def headlight(normal: ti.template(), uniforms: ti.template()):
 def footprint(entry, x, y, s, t, texels_x, texels_y, triangle: ti.template(), band: ti.template()):
     """Return the squared size of samples on the texture, for mipmapping.
 
-    With x = X / w the derivatives of (x, y) by (s, t) are (R_1, D_1; R_2, D_2) / w, where R_1 = R_x - x R_w and so on;
-    those of (s, t) by (x, y) are the inverse.
+    With x = X / w the Jacobian of (x, y) with respect to (s, t) is (R_1, D_1; R_2, D_2) / w, where R_1 = R_x - x R_w
+    and so on; that of (s, t) with respect to (x, y) is its inverse.
 
     Args:
         texels_x, texels_y: width and height of the sub-quad [texels].
@@ -493,8 +485,7 @@ def distance_to_line(coordinate, right_coordinate, lower_coordinate):
 
     Args:
         coordinate: coordinate across the lines [cells].
-        right_coordinate: the same of the next samples on the right, on the same triangle.
-        lower_coordinate: the same of the next samples below, on the same triangle.
+        right_coordinate, lower_coordinate: that of the next samples on the right and below, on the same triangle.
     """
     step_right, step_down = right_coordinate - coordinate, lower_coordinate - coordinate
     slope = ti.sqrt(step_right * step_right + step_down * step_down)
@@ -506,7 +497,7 @@ def store_surface(
     entry, visible, x, y, s, t, quad_column, quad_row,
     triangle: ti.template(), cell: ti.template(), sheet: ti.template(), band: ti.template(),
 ):  # fmt: skip
-    """Store the attributes of the visible samples of a tile; `visible` is their mask."""
+    """Store the attributes of the visible samples of a tile, which `visible` masks."""
     config, samples = ti.static((band.config, band.samples))
     plane = ti.static(config.plane)
     quad_side = 1.0 / sheet.subdivisions
@@ -526,7 +517,7 @@ def store_surface(
         size, front = footprint(
             entry, x, y, s, t, cell.texels_across * quad_side, cell.texels_down * quad_side, triangle, band
         )
-        # On the visible side of the triangle: at a fold, the interpolated normal may point away from the camera.
+        # At a fold, the interpolated normal may point away from the camera; `front` moves it to the visible side.
         normal = normal_at(across, along, cell, sheet)
         store_visible(entry + plane.normal_x, visible, normal[0] * front, samples)
         store_visible(entry + plane.normal_y, visible, normal[1] * front, samples)

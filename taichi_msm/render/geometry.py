@@ -1,8 +1,8 @@
 """Projected mass points, cells and triangles, for one sample or a vector of samples, in f32 or f64.
 
 A point of the surface is represented by (X, Y, w, depth), the product of the camera's matrix and the point. This map is
-linear, so subdividing the projected cells is the same as subdividing the surface, also in perspective. With s to the
-right and t down, the surface between the four mass points of a cell is
+linear, so projected cells can be subdivided like the surface, also in perspective. With s to the right and t down, the
+surface between the four mass points of a cell is
 
     P(s, t) = A + B s + C t + D s t,    projected to sample (x, y) where    X - x w = 0,  Y - y w = 0.
 
@@ -20,28 +20,23 @@ from taichi_msm.system.runtime import ti
 # Numbers per mass point: X, Y, w, depth, and at SCREEN its x and y in the picture [samples].
 SCREEN, NODE_STRIDE = uni.SCREEN, 6
 
-# Triangles of cells that are not inverted are enlarged, to close the gaps between them: by this fraction of their side,
-# and by this fraction of the picture's side, the resolution of f32.
+# Triangles of cells that are not inverted are enlarged to close gaps between them: by this fraction of their side, and
+# by this fraction of the picture's side, the resolution of f32.
 ENLARGEMENT = 1e-5
 SCREEN_ENLARGEMENT = 2e-6
 
-# The bilinear map of a cell is inverted in f32 only if its outline is within this distance [samples].
+# Limit of the corners' coordinates up to which the bilinear map of a cell is inverted in f32 [samples].
 MAX_COORDINATE = float(1 << 16)
 
 
 class Outline(NamedTuple):
-    """The projected corners of a cell, and their bounding box [samples].
+    """Projected corners of a cell, and their bounding box [samples].
 
     Attributes:
-        x: x of the corners, a list.
-        y: y of the corners, a list.
-        left: left edge of the bounding box.
-        right: right edge of the bounding box.
-        top: top edge of the bounding box.
-        bottom: bottom edge of the bounding box.
+        x, y: lists of the corners' coordinates.
+        left, right, top, bottom: edges of the bounding box.
         facing: 1 if the front is visible, -1 for the back, 0 if the cell is folded.
-        in_front: whether all corners are in front of the near plane.
-        behind: whether all corners are behind it.
+        in_front, behind: whether all corners are in front of the near plane; whether all are behind it.
     """
 
     x: Any
@@ -56,15 +51,12 @@ class Outline(NamedTuple):
 
 
 class Patch(NamedTuple):
-    """The bilinear surface between four mass points.
+    """Bilinear surface between four mass points.
 
     Attributes:
-        a: coefficient A, a vector (X, Y, w, depth).
-        b: coefficient B.
-        c: coefficient C.
-        d: coefficient D.
+        a, b, c, d: coefficients A to D, vectors (X, Y, w, depth).
         facing: as in `Outline`.
-        invertible: whether the cell is drawn by inverting the bilinear map, and not triangle by triangle.
+        invertible: whether the cell is drawn by inverting the bilinear map, instead of triangle by triangle.
     """
 
     a: Any
@@ -76,12 +68,11 @@ class Patch(NamedTuple):
 
 
 class Triangle(NamedTuple):
-    """A triangle P + R s + D t of a sub-quad.
+    """Triangle P + R s + D t of a sub-quad.
 
     Attributes:
-        p: origin P, a list of X, Y, w and depth.
-        r: direction R, to the right.
-        d: direction D, down.
+        p: corner P, a list of X, Y, w and depth.
+        r, d: sides R to the right and D down.
         below: whether it is the triangle below the diagonal, where t > s.
     """
 
@@ -176,8 +167,8 @@ def cell_patch(corner, cols, facing, invertible, nodes: ti.template(), double: t
 def edge(p_x, p_y, q_x, q_y, x, y, facing):
     """Return twice the signed area of the triangle p, q, (x, y), times `facing`.
 
-    Its sign is the side of the line p q on which (x, y) lies. Both cells of an edge compute the same bits up to the
-    sign.
+    Its sign is the side of the line p q on which (x, y) lies. Both cells at an edge compute the same bits except for
+    the sign.
 
     Args:
         p_x, p_y, q_x, q_y: ends of the edge [samples].
@@ -188,7 +179,7 @@ def edge(p_x, p_y, q_x, q_y, x, y, facing):
 
 @ti.func
 def edges(x, y, facing, outline: ti.template()):
-    """Return `edge` for the left, right, upper and lower edge of a cell; all are non-negative inside the cell."""
+    """Return `edge` for the left, right, upper and lower edge of a cell; none is negative inside the cell."""
     p, q = ti.static((outline.x, outline.y))
     return (
         edge(p[0], q[0], p[2], q[2], x, y, -facing),
@@ -267,7 +258,7 @@ def triangle_at(x, y, quad_column, quad_row, quad_side, lower, patch: ti.templat
 
 @ti.func
 def on_triangle(x, y, triangle: ti.template()):
-    """Return (s, t) of a triangle at samples."""
+    """Return s and t on a triangle at samples."""
     coefficients = ti.static((triangle.p, triangle.r, triangle.d))
     p_1, r_1, d_1 = [k[0] - x * k[2] for k in coefficients]
     p_2, r_2, d_2 = [k[1] - y * k[2] for k in coefficients]
@@ -380,7 +371,8 @@ def distorted_cell_bounds(distorted_entry, cols, outline: ti.template(), uniform
 def is_off_screen(corners: ti.template(), left, right, top, bottom):
     """Return whether a polygon, possibly partly behind the camera, is beyond an edge of the picture.
 
-    For each edge x of the picture, X = x w is a plane, also behind the camera; beyond it, X is larger or smaller.
+    For an edge x of the picture, X = x w is a plane that extends behind the camera; points beyond it have a larger X,
+    or a smaller one at the left edge.
 
     Args:
         corners: corners of the polygon, vectors (X, Y, w, ...).

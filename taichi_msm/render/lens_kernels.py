@@ -8,12 +8,12 @@ from taichi_msm.render import uniforms as uni
 from taichi_msm.render.lens_table import INVALID_COORDINATE
 from taichi_msm.system.runtime import ti
 
-# Numbers per distorted mass point: x and y [samples], and 1 if it is in front of the camera and within the radius of
-# the lens.
+# Numbers per distorted mass point: x and y [samples]; 1 if it is in front of the camera and within the limit of the
+# lens, else 0.
 DISTORTED_STRIDE = 3
 
-# An angle is computed by a power series in the tangent of an eighth of it. The list has the divisors of the terms, the
-# smallest term first.
+# An angle is computed by a power series in the tangent of an eighth of it. The list contains the divisors of the terms,
+# the smallest term first.
 HALVINGS = 3
 SERIES = [(-1.0) ** n * (2 * n + 1) for n in reversed(range(12))]
 
@@ -38,8 +38,8 @@ def distorted_point(x, y, uniforms: ti.template(), lens: ti.template()):
     """Distort a point.
 
     Returns:
-        x and y of the distorted point [samples], and whether the undistorted one is within the radius of the lens; if
-        it is not, the nearest point within it is distorted.
+        x and y of the distorted point [samples]; and whether the undistorted one is within the limit of the lens.
+        Otherwise, the nearest point within the limit is distorted.
     """
     a = (x - uniforms[uni.CENTRE_X]) * uniforms[uni.SPREAD_X]
     b = (y - uniforms[uni.CENTRE_Y]) * uniforms[uni.SPREAD_Y]
@@ -93,7 +93,7 @@ def distorted_bounds(
     Args:
         x, y: lists of the coordinates of the undistorted vertices [samples].
         distorted_x, distorted_y: lists of those of the distorted vertices [samples].
-        is_valid: whether all vertices are within the radius of the lens.
+        is_valid: whether all vertices are within the limit of the lens.
         squared_length: square of the longest side [samples^2].
 
     Returns:

@@ -1,6 +1,6 @@
 """Shading: texture filtering and lighting of samples, then the colours and labels of pixels.
 
-Wet tissue and metal are lit by the light of an endoscope, which is next to the main camera and weakens with distance.
+Wet tissue and metal are lit by an endoscope: its light is next to the main camera, and weakens with distance.
 
 All vectors are in the camera's frame: the eye at 0, x right, y up, z toward the camera. P is the surface point of a
 sample, N its normal on the camera's side, L the unit vector from P to the light, V that from P to the eye, and
@@ -9,14 +9,12 @@ M = 2 (N L) N - L the direction of ideal reflection of the light:
     light    = ambient + (1 - ambient) (N L + wrap) / (1 + wrap) d0 / d / the same at the centre of the picture
     colour   = texture light + 255 gloss (M V)^shininess d0 / d
 
-d is the distance from P to the light, and d0 that from the centre of the picture; there, a flat sheet that faces the
-camera keeps its colours. Wrapped diffuse light approximates scattering in tissue, so no side of a dent is black. An
+d is the distance from P to the light, and d0 that from the centre of the picture, where a flat sheet that faces the
+camera keeps its colours. Wrapped diffuse light approximates scattering in tissue; no side of a dent is black. An
 instrument shades the tissue near it: at r times its radius from its axis it removes the share uniforms.SHADE / r^2 of
 the light.
 
-Normals are lists of three components, of any length.
-
-The texture is filtered with mipmaps, at 1, 1/2, 1/4, ... of its size, so that a sample of many texels has their mean.
+The texture is filtered with mipmaps, at 1, 1/2, 1/4, ... of its size, so that a sample of many texels is their mean.
 """
 
 from typing import Any, NamedTuple
@@ -32,14 +30,13 @@ from taichi_msm.system.runtime import ti
 
 
 class Appearance(NamedTuple):
-    """The texture of the sheet, and the light and the instruments.
+    """Texture, light and instruments.
 
     Attributes:
         config: compile-time configuration.
         texels: levels of the texture, as returned by `pyramid`.
         sizes: sizes and counters.
-        width: width of the first level [texels].
-        height: height of the first level [texels].
+        width, height: size of the first level [texels].
         uniforms: constants of the view.
         capsule_count: number of instruments.
     """
@@ -54,7 +51,7 @@ class Appearance(NamedTuple):
 
 
 class PixelArrays(NamedTuple):
-    """The output arrays of the kernel.
+    """Output arrays of kernel 2.
 
     Attributes:
         colours: colours of the pixels, as words or bytes.
@@ -344,7 +341,7 @@ def light_tissue(x, y, depth, normal: ti.template(), slope_x, slope_y, column, r
 
 @ti.func
 def light_metal(x, y, depth, normal: ti.template(), uniforms: ti.template()):
-    """Light metal, which reflects a room that is bright above and dark below.
+    """Light metal, which reflects a room with a bright ceiling and a dark floor.
 
     Returns:
         Red, green and blue.
