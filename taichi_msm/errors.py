@@ -107,7 +107,7 @@ class ForeignError(FilesError):
 
     @classmethod
     def at(cls, path: object, kind: str) -> ForeignError:
-        """Return the error for a path of a kind, such as "a file"."""
+        """Build the error for a path and the kind of its entry, such as "a file"."""
         return cls(f"{path}: {kind} that no run has put there; move it away or choose another folder")
 
 

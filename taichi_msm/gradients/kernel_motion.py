@@ -126,7 +126,7 @@ def adjoint_kernels(code: KernelConfig, *, parallel: bool) -> tuple[Callable[...
 
 
 def _build_run_worker(step_band: Callable[..., None], *, parallel: bool) -> Callable[..., None]:
-    """Build the function that runs the steps of a launch for one worker, or unless parallel for all workers."""
+    """Build the function that runs the steps of a launch: of one worker if parallel, otherwise of all workers."""
 
     @ti.func
     def wait_for(progress: ti.template(), sizes: ti.template(), worker, k):

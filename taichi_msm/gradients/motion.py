@@ -61,7 +61,7 @@ Array = NDArray[np.float64]
 
 
 def segment_steps(steps: int, shape_bytes: int) -> int:
-    """Return the number of steps of a segment, at which its displacements take as much memory as all checkpoints.
+    """Return the length of a segment [steps], whose displacements take about as much memory as all checkpoints.
 
     Args:
         steps: number of steps of the run.
@@ -78,7 +78,7 @@ def motion_bytes(plan: Plan) -> int:
 
 
 class _Arrays(NamedTuple):
-    """Arrays of the adjoint; a list holds three, for x, y and z.
+    """Arrays of the adjoint; each list contains three arrays, for x, y and z.
 
     Attributes:
         checkpoints: displacements at the beginning of every segment.

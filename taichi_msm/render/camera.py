@@ -521,7 +521,7 @@ def pinhole(scene: Scene, time: float = 0.0) -> Camera:
 
 
 def frozen_camera(camera: Camera, time: float) -> Camera:
-    """Return the static camera with eye, target and up that equals a camera at a time [s]."""
+    """Return a camera at a time [s] as a static camera with eye, target and up."""
     if camera.pose is None and not camera.moves:
         return camera
     eye, axes, distance = extrinsics(camera, time)

@@ -103,7 +103,7 @@ def project(position: ti.template(), i, j, cols, uniforms: ti.template(), nodes:
 
 @ti.func
 def w_at(depth, uniforms: ti.template()):
-    """Return w at a depth."""
+    """Return w at a depth: for a pinhole camera the depth, otherwise 1."""
     return depth * uniforms[uni.PINHOLE] + (1.0 - uniforms[uni.PINHOLE])
 
 

@@ -218,7 +218,7 @@ def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callab
         bounds: Integers, starts: Integers, entries: Integers,
         samples: ti.types.ndarray(dtype=config.float_vector, ndim=1),
     ):  # fmt: skip
-        """Cover the samples of a strip with some parts of their lists.
+        """Cover the samples of a strip with a chunk of the parts in their bins.
 
         Args:
             top: first row of samples of the strip.

@@ -73,7 +73,10 @@ def label_width(*, normals: bool) -> int:
 
 
 def label_channels(plane: Any) -> list[tuple[int, int, int, Label]]:
-    """List the G-buffer planes, numbered by `plane`, from which labels are written; other labels are 0.
+    """List the G-buffer planes that contain labels; a label without planes is 0.
+
+    Args:
+        plane: index of each plane of the G-buffer, by name.
 
     Returns:
         For each plane its index, its position in the label, the number of planes of the label, and the label.

@@ -71,7 +71,7 @@ def distorted_point(x, y, uniforms: ti.template(), lens: ti.template()):
 
 @ti.func
 def store_distorted(distorted_entry, entry, uniforms: ti.template(), nodes: ti.template(), lens: ti.template()):
-    """Distort a projected mass point at `entry` of `nodes`, and store `DISTORTED_STRIDE` numbers at the other entry."""
+    """Distort the projected mass point at `entry` of `nodes`, and store it at `distorted_entry`."""
     x, y, is_valid = distorted_point(nodes[entry + uni.SCREEN], nodes[entry + uni.SCREEN + 1], uniforms, lens)
     nodes[distorted_entry], nodes[distorted_entry + 1] = x, y
     nodes[distorted_entry + 2] = ti.cast(is_valid and nodes[entry + 2] > uniforms[uni.NEAR], ti.f32)

@@ -120,7 +120,7 @@ def undistortion_map(view: View, supersample: int, *, with_steps: bool) -> NDArr
 
 
 def bounds(coordinates: NDArray[np.float32]) -> Array:
-    """Return left, right, top and bottom of the valid ones of coordinates, shape (..., 2); an empty box without any."""
+    """Return left, right, top and bottom of the valid points, shape (..., 2); an empty box if none is valid."""
     valid = coordinates[coordinates[..., 0] < INVALID_COORDINATE]
     if not len(valid):
         return np.array([INVALID_COORDINATE, -INVALID_COORDINATE, INVALID_COORDINATE, -INVALID_COORDINATE])

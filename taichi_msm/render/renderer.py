@@ -138,7 +138,7 @@ class Renderer:
         return compute_flow(self.scene, points, *shot)
 
     def locate(self, coordinates: Array, shot: Shot) -> Sight:
-        """Locate material points in a shot.
+        """Project material points into a shot, and determine their occlusion.
 
         Args:
             coordinates: coordinates on the sheet, from 0 to 1, shape (n, 2).

@@ -289,7 +289,7 @@ def light_transmission(x, y, depth, capsule_count, uniforms: ti.template(), conf
 
 @ti.func
 def apply_relief(normal: ti.template(), slope_x, slope_y, uniforms: ti.template()):
-    """Tilt normals by the relief, in place: they lean away from rising grey levels.
+    """Tilt normals by the relief, in place, against the gradient of the grey level.
 
     Args:
         slope_x, slope_y: gradient of the grey level, to the right and down [1/texel].
@@ -309,7 +309,7 @@ def apply_relief(normal: ti.template(), slope_x, slope_y, uniforms: ti.template(
 
 @ti.func
 def light_tissue(x, y, depth, normal: ti.template(), slope_x, slope_y, column, row, appearance: ti.template()):
-    """Light wet tissue.
+    """Compute the lighting of wet tissue.
 
     Args:
         slope_x, slope_y: gradient of the grey level, to the right and down [1/texel].
@@ -341,7 +341,7 @@ def light_tissue(x, y, depth, normal: ti.template(), slope_x, slope_y, column, r
 
 @ti.func
 def light_metal(x, y, depth, normal: ti.template(), uniforms: ti.template()):
-    """Light metal, which reflects a room with a bright ceiling and a dark floor.
+    """Compute the colour of metal, which reflects a room with a bright ceiling and a dark floor.
 
     Returns:
         Red, green and blue.

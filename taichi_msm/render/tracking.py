@@ -42,7 +42,7 @@ NOT_VISIBLE = math.nan
 
 
 def locate_points(scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Capsule] = ()) -> Sight:
-    """Locate material points in the picture.
+    """Project material points into the picture, and determine their occlusion.
 
     Args:
         scene: the scene.
@@ -263,7 +263,7 @@ def _kernel(lens: str) -> Callable[..., None]:
         as_flow: ti.i32, uniforms: Doubles, sizes: Integers, nodes: Doubles, cell: Doubles,
         starts: Integers, entries: Integers, is_simple: Bytes, pixels: Floats, hidden: Bytes,
     ):  # fmt: skip
-        """Locate material points, and compare them with some cells of the lists of their bins.
+        """Project material points, and test their occlusion by a chunk of the cells in their bins.
 
         Args:
             listed: position of the first cell in its list.

@@ -233,7 +233,7 @@ def entry_kind(path: Path) -> str | None:
 
 
 def require_kind(path: Path, wanted: str) -> Path:
-    """Return a path; raise a ForeignError if it exists and is not of a kind, FILE or FOLDER."""
+    """Return a path; raise a ForeignError if it exists and is not of the `wanted` kind, FILE or FOLDER."""
     if (actual := entry_kind(path)) not in (None, wanted):
         raise ForeignError.at(path, str(actual))
     return path
@@ -385,7 +385,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 
 
 def move_to_free_name(draft: Path, folder: Path, stem: str, suffix: str) -> Path:
-    """Move a file to the first free name in a folder: stem-1.suffix, stem-2.suffix and so on; return its path."""
+    """Move a file to the first free name of stem-1, stem-2 and so on plus suffix; return the new path."""
     number = 1
     while os.path.lexists(path := folder / f"{stem}-{number}{suffix}") or not link_without_replacing(draft, path):
         number += 1

@@ -210,7 +210,7 @@ class ResultWriter:
             write_arrays(file, arrays)
 
     def _write_forces(self) -> None:
-        """Write the forces of all frames; the numbers have as many digits as float64 needs."""
+        """Write the forces of all frames, as decimals that round-trip to float64."""
         with (
             create_file(self._publication.new_folder / outputs.OUTPUTS["forces"].path()) as file,
             io.TextIOWrapper(file, encoding="ascii", newline="") as text,
