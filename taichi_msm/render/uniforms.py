@@ -71,9 +71,8 @@ ACROSS, UP, SLOPE_X, SLOPE_Y = 44, 47, 50, 51
 # Offset of a mass point's x and y in the picture, after its X, Y, w and depth.
 SCREEN = 4
 
-# Surfaces that are less than this nearer than a point do not occlude it [m].
+# The depth by which an occluding surface must be nearer than a point [m].
 DEPTH_TOLERANCE = 52
-RELATIVE_DEPTH_TOLERANCE = 1e-9  # as a fraction of the sheet's larger side
 
 # The lens: its coefficients; its radius at w = 1 [m]; the principal point [samples]; samples per metre at w = 1; the
 # numbers of `lens_table.VisibleRegion`, in samples.
@@ -138,7 +137,7 @@ def view_uniforms(
     uniforms[ACROSS:UP], uniforms[UP:SLOPE_X] = view.axes[:, 0], view.axes[:, 1]
     height = light.relief / 100 / 255 * max(sheet)
     uniforms[SLOPE_X:DEPTH_TOLERANCE] = height * texture[0] / sheet[1], -height * texture[1] / sheet[0]
-    uniforms[DEPTH_TOLERANCE] = RELATIVE_DEPTH_TOLERANCE * max(sheet)
+    uniforms[DEPTH_TOLERANCE] = 1e-9 * max(sheet)
     if view.lens is not None:
         region = visible_region(view)
         set_lens(uniforms, view, factor, region.radius)
