@@ -11,15 +11,15 @@ from taichi_msm.system import process
 
 def main() -> int:
     """Run the command line, and return its exit code."""
-    # Imports create half a million permanent objects. With Python's default threshold, the garbage collector would
-    # search them so often that it takes 5 % of a short run.
+    # Imports create half a million permanent objects. At the default threshold, the garbage collector takes 5 % of a
+    # short run to search them.
     gc.set_threshold(100_000)
     # PYTHONWARNINGS=error is for a user's own code; a warning in a library must not end a command or a child process.
     if any(option and "error".startswith(option.partition(":")[0]) for option in sys.warnoptions):
         warnings.simplefilter("ignore")
         os.environ.pop("PYTHONWARNINGS", None)
-    # OpenBLAS starts a spinning thread for every core, but our matrices are too small for two threads. NumPy loads it
-    # later, in this process and in the encoder's.
+    # OpenBLAS starts a spinning thread per core, but the matrices here are too small for two threads. NumPy loads it
+    # later, in this process and in the encoder.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     process.open_standard_streams()
     process.exit_on_signals()
@@ -31,8 +31,8 @@ def main() -> int:
     try:
         return main()
     finally:
-        # Taichi writes its kernel cache when its program is destroyed, so this is done explicitly. At exit the
-        # interpreter searches all objects for cycles, which takes 0.2 s unless they are frozen.
+        # Taichi writes its kernel cache only when it is stopped. At exit the interpreter searches all objects for
+        # cycles, which takes 0.2 s unless they are frozen.
         if runtime := sys.modules.get("taichi_msm.system.runtime"):
             runtime.stop()
         gc.freeze()

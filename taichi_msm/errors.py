@@ -107,12 +107,7 @@ class ForeignError(FilesError):
 
     @classmethod
     def at(cls, path: object, kind: str) -> ForeignError:
-        """Return the error for a file or folder.
-
-        Args:
-            path: path of the file or folder.
-            kind: its kind for the message, such as "a file".
-        """
+        """Build the error for a path and the kind of its entry, such as "a file"."""
         return cls(f"{path}: {kind} that no run has put there; move it away or choose another folder")
 
 
@@ -126,52 +121,37 @@ def printable(text: str) -> str:
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return a hint to append to the message of an unknown name.
-
-    Args:
-        name: the unknown name.
-        known: valid names.
-
-    Returns:
-        A question with the most similar valid name, or an empty text if none is similar.
-    """
+    """Return a hint for a message about an unknown name: the most similar of the known names, or an empty text."""
     # Imported here, as it is needed only for a message.
     from difflib import get_close_matches
 
-    # Matching takes time in proportion to the length, and a name of a file may be of any length.
+    # Matching takes time in proportion to the length of the name.
     matches = get_close_matches(name[:60].lower(), list(known), n=1)
     return f"; did you mean '{matches[0]}'?" if matches and matches[0] != name else ""
 
 
 @contextmanager
-def writing(place: object, option: str = "--out") -> Iterator[None]:
+def writing(path: object, option: str = "--out") -> Iterator[None]:
     """Convert an OSError of the block to a FilesError.
 
     Args:
-        place: path that the block writes to, for the message.
-        option: command-line option that selects another path, for the remedy.
-
-    Raises:
-        FilesError: when the block raises an OSError.
+        path: file or folder that the block writes to, for the message.
+        option: command-line option that selects another one, for the remedy.
     """
     try:
         yield
     except OSError as error:
         full = error.errno in (errno.ENOSPC, getattr(errno, "EDQUOT", None))
         remedy = f"free some space or choose another {option}" if full else f"choose another {option}"
-        raise FilesError(f"{place}: cannot write: {error.strerror or error}; {remedy}") from error
+        raise FilesError(f"{path}: cannot write: {error.strerror or error}; {remedy}") from error
 
 
-# Limit of processes and threads.
+# Limit of the numbers of processes and threads.
 MAX_WORKERS = 1024
 
 
 def as_array(values: Any, name: str) -> NDArray[Any]:
-    """Convert an argument to an array.
-
-    Args:
-        values: array or nested sequences.
-        name: name of the argument, for the message.
+    """Convert the argument `name` to an array.
 
     Raises:
         ArgumentError: when conversion fails, such as for rows of different lengths.
@@ -186,32 +166,18 @@ def as_array(values: Any, name: str) -> NDArray[Any]:
 
 
 def is_real_array(array: NDArray[Any], shape: tuple[int, ...]) -> bool:
-    """Return whether an array has a real dtype and a given shape.
-
-    Args:
-        array: array of any dtype.
-        shape: required shape.
-    """
+    """Return whether an array has a real dtype and the given shape."""
     return array.dtype.kind in "fiu" and array.shape == shape
 
 
 def require_frame_count(frames: int) -> None:
-    """Check that a number of frames is a whole number, 0 or more; raise an ArgumentError otherwise."""
+    """Raise an ArgumentError unless a number of frames is a whole number, 0 or more."""
     if isinstance(frames, bool) or not isinstance(frames, Integral) or frames < 0:
         raise ArgumentError(f"{frames!r} frames cannot be simulated; take a whole number, 0 or more")
 
 
 def require_path(path: str | Path, name: str = "directory", remedy: str = "take a path") -> None:
-    """Check that an argument can be a path.
-
-    Args:
-        path: value of the argument.
-        name: name of the argument, for the message.
-        remedy: remedy, for the message.
-
-    Raises:
-        ArgumentError: when it is neither a text nor a Path, or contains a null character.
-    """
+    """Raise an ArgumentError unless an argument is a path: a text or a Path without null characters."""
     if not isinstance(path, (str, Path)) or "\0" in str(path):
         raise ArgumentError(f"{name}: {path!r}; {remedy}")
 

@@ -24,24 +24,11 @@ PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 _MODES_16_BIT = ("I;16", "I;16L", "I;16B", "I;16N")
 _MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCbCr", *_MODES_16_BIT)
 
-# Limit of a side, as Pillow needs memory and time for every row, even of a picture with a single column.
+# Limit of a side: Pillow needs memory and time for every row, even of a picture with a single column.
 MAX_SIDE_PX = 65535
 
-# Limit of a file's size, above that of Pillow's largest picture with four channels of 16 bits.
+# Limit of a file's size [bytes], above that of Pillow's largest picture with four channels of 16 bits.
 MAX_BYTES = 2**31
-
-# A colour profile that changes no 8-bit colour by more than this is treated as sRGB.
-SRGB_TOLERANCE = 2
-
-# Every scan of a JPEG visits all pixels, and encoders write about ten. A small picture may have more scans, up to a
-# number of visited pixels that takes a few seconds.
-USUAL_SCANS = 16
-MAX_SCANNED_PIXELS = 2 * 10**8
-
-# EXIF's tag of the orientation, and its values for pictures rotated by 90 degrees.
-_ORIENTATION = 0x0112
-_ROTATED = (5, 6, 7, 8)
-
 
 # Copies that are read instead of the original files, by the paths of the originals.
 _copies: Mapping[str, Path] = {}
@@ -53,11 +40,7 @@ class PictureError(Exception):
 
 @contextmanager
 def use_copies(copies: Mapping[str, Path]) -> Iterator[None]:
-    """Read copies instead of the original files within the block.
-
-    Args:
-        copies: paths of the copies, by the paths of the originals.
-    """
+    """Read copies, by the paths of the originals, instead of the original files within the block."""
     global _copies
     previous, _copies = _copies, copies
     try:
@@ -117,9 +100,9 @@ def picture_size(path: str) -> tuple[int, int]:
     from PIL import Image
 
     with _open(path) as image:
-        # Of a TIFF, Pillow returns the upright size. The base class's getexif() reads only the header, whereas PNG's
-        # decodes the whole picture.
-        if image.format != "TIFF" and Image.Image.getexif(image).get(_ORIENTATION) in _ROTATED:
+        # Pillow's size of a TIFF is upright already. The base class's getexif() reads only the header, whereas PNG's
+        # decodes the whole picture. Values 5 to 8 of the orientation, 0x0112, are rotations by 90 degrees.
+        if image.format != "TIFF" and Image.Image.getexif(image).get(0x0112) in (5, 6, 7, 8):
             return image.height, image.width
         return image.size
 
@@ -146,7 +129,7 @@ def _open(path: str, sha256: str | None = None) -> Iterator[Image.Image]:
     from PIL import Image, UnidentifiedImageError
 
     _require_file(path)
-    # libtiff and Pillow also print their errors, which would repeat the exception.
+    # libtiff and Pillow also print their errors, which repeats the exception.
     with discarded_output(2), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.simplefilter("error", Image.DecompressionBombWarning)
@@ -156,8 +139,10 @@ def _open(path: str, sha256: str | None = None) -> Iterator[Image.Image]:
                     reason = f"has {image.width} x {image.height} pixels; a side may have at most {MAX_SIDE_PX}, cut it"
                     raise PictureError(f"{path} {reason}")
                 if image.format in ("JPEG", "MPO"):
-                    scans = _scans(file)
-                    limit = max(USUAL_SCANS, MAX_SCANNED_PIXELS // (image.width * image.height))
+                    scans = _count_scans(file)
+                    # Every scan visits all pixels, and encoders write about ten. A small picture may have more, up to
+                    # a number of visits that takes a few seconds.
+                    limit = max(16, 200_000_000 // (image.width * image.height))
                     if scans > limit:
                         raise PictureError(f"{path} has {scans} scans, and {limit} are allowed; save it again")
                 if image.mode not in _MODES:
@@ -194,7 +179,7 @@ def _sha256(file: BinaryIO) -> str:
     return digest.hexdigest()
 
 
-def _scans(file: BinaryIO) -> int:
+def _count_scans(file: BinaryIO) -> int:
     """Count the scans of a JPEG, which may be broken."""
     offset, scans = 2, 0
     with mmap(file.fileno(), 0, access=ACCESS_READ) as data:
@@ -266,7 +251,7 @@ def _to_srgb(path: str, image: Image.Image, profile: bytes | None) -> Image.Imag
     try:
         source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
         space = source.profile.xcolor_space.strip()
-        # A profile of another space than grey and CMYK is one of RGB.
+        # Profiles of other spaces than grey and CMYK apply to RGB.
         mode = {"GRAY": "L", "CMYK": "CMYK"}.get(space, "RGB")
         pixels = {"L": ("1", "L", "LA"), "CMYK": ("CMYK",)}.get(mode, tuple(m for m in _MODES if m != "CMYK"))
         if image.mode not in pixels:
@@ -288,13 +273,13 @@ def _to_srgb(path: str, image: Image.Image, profile: bytes | None) -> Image.Imag
 
 
 def _is_identity(transform: Any) -> bool:
-    """Return whether a transform from RGB to sRGB keeps all combinations of 16 values of each channel."""
+    """Return whether a transform from RGB to sRGB changes colours by at most 2 of 255, at 16 values per channel."""
     import numpy as np
     from PIL import Image, ImageCms
 
     colours = np.stack(np.meshgrid(*3 * [np.arange(0, 256, 17, dtype=np.uint8)]), axis=-1).reshape(1, -1, 3)
     converted = np.asarray(ImageCms.applyTransform(Image.fromarray(colours), transform))
-    return int(np.abs(converted.astype(int) - colours).max()) <= SRGB_TOLERANCE
+    return int(np.abs(converted.astype(int) - colours).max()) <= 2
 
 
 def _to_rgb(image: Image.Image, background: tuple[int, int, int]) -> Image.Image:
@@ -303,5 +288,5 @@ def _to_rgb(image: Image.Image, background: tuple[int, int, int]) -> Image.Image
 
     if not image.has_transparency_data:
         return image.convert("RGB")
-    below = Image.new("RGBA", image.size, (*background, 255))
-    return Image.alpha_composite(below, image.convert("RGBA")).convert("RGB")
+    backdrop = Image.new("RGBA", image.size, (*background, 255))
+    return Image.alpha_composite(backdrop, image.convert("RGBA")).convert("RGB")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-# The palette of Okabe and Ito, which colour-blind readers can distinguish.
+# The palette of Okabe and Ito, safe for colour-blind readers.
 BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9"
 INK, GREY, SILVER, PALE = "#222222", "#767676", "#A0A0A0", "#E6E6E6"
 

@@ -1,10 +1,10 @@
-"""Chain rule from the derivatives of a loss by the numbers of a sheet to those by the numbers of its scene.
+"""Chain rule from the coefficients of a sheet to the numbers of its scene.
 
-Short closed forms lead from the scene to a `Material`, and on to the factors of a step (`derive` of every term,
+Closed forms lead from the scene to a `Material`, and on to the coefficients of a time step (`derive` of every term,
 `damping.coefficients`). They are differentiated by complex steps, exactly but for rounding: f(x + i h) is
 f(x) + i h f'(x) with an h so small that its square vanishes. Loads are linear in the percents of the load and in the
-components of the force, and control points are linear in their keyframes. Hence the derivative by one of these values
-follows from the schedule in which it is 1 and all others are 0.
+components of the force, and control points are linear in their keyframes. Hence the derivative with respect to one of
+these values follows from the schedule in which it is 1 and all others are 0.
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ from taichi_msm.terms.springs import spring_stiffness
 
 Array = NDArray[np.float64]
 
-# Imaginary part of a complex step.
+# Imaginary part of the complex steps.
 COMPLEX_STEP = 1e-60
 
 
 @dataclass
 class SheetGradient:
-    """Derivatives of a loss by the numbers of a sheet.
+    """Derivatives of a loss with respect to the coefficients of a sheet.
 
     Attributes:
-        springs: By k - tau of every spring along rows, along columns, and of both diagonals of a cell, with shapes as
-            in `springs.stiffness`.
-        tensions: By tau of each family at constant k - tau, shape (3,).
-        foundation: By the logarithm of the foundation stiffness K of every mass point, shape (rows, cols).
-        bending: By the logarithm of the bending stiffness.
-        keep: By the factor `keep` of the steps.
-        gain: By the logarithm of the gain of all steps but step 0.
-        first_gain: By the logarithm of the gain of step 0.
+        springs: with respect to k - tau of every spring along rows, along columns, and of both diagonals of a cell,
+            with shapes as in `springs.stiffness`.
+        tensions: with respect to tau of each family at constant k - tau, shape (3,).
+        foundation: with respect to log K, the foundation stiffness of every mass point, shape (rows, cols).
+        bending: with respect to the logarithm of the bending stiffness.
+        keep: with respect to the factor `keep` of the steps.
+        gain: with respect to the logarithm of the gain of all steps but step 0.
+        first_gain: with respect to the logarithm of the gain of step 0.
     """
 
     springs: tuple[Array, Array, Array]
@@ -58,7 +58,7 @@ class SheetGradient:
     first_gain: float = 0.0
 
     def work(self, plan: Plan) -> float:
-        """Return the derivative by the logarithm of all internal forces of the sheet together."""
+        """Return the derivative with respect to the logarithm of a common factor of all internal forces."""
         factors, material = plan.material.factors, plan.material
         assert factors is not None
         total = float(self.tensions @ material.tensions) + float(self.foundation.sum()) + self.bending
@@ -71,15 +71,15 @@ class SheetGradient:
 
 @dataclass(frozen=True)
 class Derivatives:
-    """Derivatives of a loss by the numbers of a scene.
+    """Derivatives of a loss with respect to the numbers of a scene.
 
     Attributes:
-        numbers: Derivatives by the paths of keys, such as tissue.young, probes.0.total (of shape (3,), by component),
-            probes.0.load (by the percent of each keyframe), and probes.0.at (by across and down; shape (keyframes, 2)
-            for a moving control point). Material numbers that are 0 are left out.
-        maps: Derivatives by the factor of every cell, `tissue.map` or `springs.map`, shape (rows - 1, cols - 1), and
-            with a foundation by the factor of every mass point, `tissue.foundation_map`, shape (rows, cols). A scene
-            without such a map has the factor 1 everywhere.
+        numbers: derivatives by key: material numbers other than 0, such as tissue.young; the components of a force,
+            such as probes.0.total, shape (3,); the percents of a load, such as probes.0.load, shape (keyframes,); and
+            across and down of a control point, such as probes.0.at, shape (2,), or (keyframes, 2) for a moving one.
+        maps: derivatives by map: with respect to the factor of every cell, `tissue.map` or `springs.map`, shape
+            (rows - 1, cols - 1); with a foundation also to that of every mass point, `tissue.foundation_map`, shape
+            (rows, cols). A scene without such a map has the factor 1 everywhere.
     """
 
     numbers: dict[str, float | Array]
@@ -87,24 +87,24 @@ class Derivatives:
 
 
 def scene_derivatives(plan: Plan, gradient: SheetGradient, loads: LoadGradient) -> Derivatives:
-    """Apply the chain rule from the numbers of a sheet to those of its scene.
+    """Apply the chain rule.
 
     Args:
-        plan: Plan of the scene.
-        gradient: Derivatives by the numbers of the sheet.
-        loads: Derivatives by the loads.
+        plan: plan of the scene.
+        gradient: derivatives with respect to the coefficients of the sheet.
+        loads: derivatives with respect to the loads.
 
     Returns:
-        Derivatives by the numbers of the scene.
+        Derivatives with respect to the numbers of the scene.
     """
     material, kind = plan.material, plan.scene.kind
     assert material.factors is not None
-    by_sheet_number = _gradient_by_numbers(plan, gradient)
+    by_coefficient = _coefficient_gradient(plan, gradient)
     numbers: dict[str, float | Array] = {}
-    for path in _paths(plan.scene):
+    for path in _material_paths(plan.scene):
         value = _value(plan.scene, path)
-        perturbed = _sheet_numbers(plan, _with_value(plan.scene, path, value + 1j * COMPLEX_STEP))
-        numbers[".".join(path)] = float(by_sheet_number @ perturbed.imag) / COMPLEX_STEP
+        perturbed = _sheet_coefficients(plan, _with_value(plan.scene, path, value + 1j * COMPLEX_STEP))
+        numbers[".".join(path)] = float(by_coefficient @ perturbed.imag) / COMPLEX_STEP
     maps = {f"{kind}.map": _gradient_by_factors(plan, gradient)}
     if kind == "tissue" and material.virtual > 0:
         factors = material.virtual_factors
@@ -112,16 +112,16 @@ def scene_derivatives(plan: Plan, gradient: SheetGradient, loads: LoadGradient) 
     return Derivatives(numbers | loads.by_key, maps)
 
 
-def _sheet_numbers(plan: Plan, scene: Scene) -> NDArray[Any]:
-    """Return the numbers of a sheet, in the order of `_gradient_by_numbers`; they may be complex."""
+def _sheet_coefficients(plan: Plan, scene: Scene) -> NDArray[Any]:
+    """Return the coefficients of a sheet, real or complex, in the order of `_coefficient_gradient`."""
     material = derive_material(scene, {})
     springs = [material.across, material.down, material.shear, material.tension]
     steps = () if scene.time.at_rest else coefficients(replace(plan, scene=scene, material=material))
     return np.array([*springs, material.virtual, material.bending, *steps])
 
 
-def _gradient_by_numbers(plan: Plan, gradient: SheetGradient) -> Array:
-    """Return the derivatives by across, down, shear, tension, virtual, bending, keep, gain and the first gain."""
+def _coefficient_gradient(plan: Plan, gradient: SheetGradient) -> Array:
+    """Return the derivatives with respect to across, down, shear, tension, virtual, bending, keep and both gains."""
     material = plan.material
     assert material.factors is not None
     unit = spring_stiffness(replace(material, across=1.0, down=1.0, shear=1.0), material.factors)
@@ -143,12 +143,12 @@ def _gradient_by_numbers(plan: Plan, gradient: SheetGradient) -> Array:
 
 
 def _from_logarithm(derivative: float, value: float) -> float:
-    """Convert a derivative by the logarithm of a value to that by the value."""
+    """Convert a derivative with respect to the logarithm of a value to that with respect to the value."""
     return derivative / value if value else 0.0
 
 
 def _gradient_by_factors(plan: Plan, gradient: SheetGradient) -> Array:
-    """Return the derivatives by the factors of the cells: the transpose of `springs.stiffness`."""
+    """Return the derivatives with respect to the factors of the cells: the transpose of `springs.stiffness`."""
     material = plan.material
     along_rows, along_columns = gradient.springs[0].copy(), gradient.springs[1].copy()
     if not material.by_area:
@@ -159,8 +159,8 @@ def _gradient_by_factors(plan: Plan, gradient: SheetGradient) -> Array:
     return across + down + material.shear * gradient.springs[2]
 
 
-def _paths(scene: Scene) -> Iterator[tuple[str, ...]]:
-    """List the keys of the material that have a derivative."""
+def _material_paths(scene: Scene) -> Iterator[tuple[str, ...]]:
+    """List the material keys that have a derivative."""
     names = ["young", "thickness", "foundation", "pretension", "bending"]
     dynamic: list[tuple[str, ...]] = [("tissue", "density"), ("tissue", "damping")]
     static: list[tuple[str, ...]] = [("tissue", name) for name in names]
@@ -190,10 +190,10 @@ def _with_value(section: Any, path: tuple[str, ...], value: complex) -> Any:
 
 
 class LoadGradient:
-    """Derivatives of a loss by the loads of the probes, accumulated over blocks of steps.
+    """Derivatives of a loss with respect to the loads of the probes, accumulated over blocks of steps.
 
     Attributes:
-        by_key: Derivatives by the paths of keys, as in `Derivatives`.
+        by_key: derivatives by key, as in `Derivatives`.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -210,12 +210,12 @@ class LoadGradient:
             self.by_key[f"probes.{index}.at"] = np.zeros((*np.shape(probe.at)[:-1], 2))
 
     def add(self, schedule_of: Callable[[Plan], Schedule], by_slot: Array, times: tuple[float, float]) -> None:
-        """Add the derivatives by the loads of some steps.
+        """Add the derivatives of a block of steps.
 
         Args:
-            schedule_of: Returns the schedule of these steps for a plan with other loads.
-            by_slot: Derivatives by the force and by the control point of every slot, shape (steps, slots, 5).
-            times: Interval that contains all loads of these steps [s].
+            schedule_of: returns the schedule of these steps for a plan with other loads.
+            by_slot: derivatives with respect to the force and the control point of every slot, shape (steps, slots, 5).
+            times: interval that contains all loads of these steps [s].
         """
         height, width = self._plan.scene.sheet.size
         for index, slots in self._slots.items():
@@ -229,7 +229,7 @@ class LoadGradient:
                 self._derivatives(index, "load")[n] += (by_force * unit).sum()
             by_position = self._derivatives(index, "at").reshape(-1, 2)
             keys = control_points(probe, self._plan.scene.sheet)[0].tolist()
-            # The first position also holds before its keyframe.
+            # The control point is constant before the first keyframe, too.
             for n in _active_keys(keys, times, before=True):
                 share = schedule_of(self._with_unit_position(index, n)).point
                 by_position[n] += (by_point * share).sum(axis=(0, 1)) * (width, -height)
@@ -240,7 +240,7 @@ class LoadGradient:
         return derivatives
 
     def _with_probe(self, index: int, changes: dict[str, Any]) -> Plan:
-        """Change a probe, and remove the slots of all others."""
+        """Change a probe, and remove the slots of the others."""
         scene, slots = self._plan.scene, self._plan.slots
         probes = list(scene.probes)
         probes[index] = probes[index].model_copy(update=changes)
@@ -267,7 +267,7 @@ def _force_key(probe: Probe) -> str:
 
 
 def _active_keys(keys: list[float], times: tuple[float, float], *, before: bool = False) -> Iterator[int]:
-    """List the keyframes that affect a piecewise linear function in an interval; the last value holds on."""
+    """List the keyframes that affect a piecewise linear function in an interval; it is constant after the last."""
     for n in range(len(keys)):
         begin = keys[max(0, n - 1)] if n or not before else -np.inf
         end = keys[n + 1] if n + 1 < len(keys) else np.inf

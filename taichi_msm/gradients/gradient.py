@@ -1,4 +1,4 @@
-"""Gradient of a loss by the numbers of a scene: the loss depends on the positions of all frames."""
+"""Gradient of a loss, a function of the positions at all frames, with respect to the numbers of a scene."""
 
 from __future__ import annotations
 
@@ -26,38 +26,28 @@ from taichi_msm.system.runtime import Device
 
 Array = NDArray[np.float64]
 
-# Number of arrays of the size of all positions that exist at a time: displacements, positions, the derivative of the
-# loss, and their copies.
-FRAME_COPIES = 4
-
-# Memory of a sparse solution per mass point [bytes]: measured were 10,400 for 81 x 81 mass points and 13,600 for
-# 161 x 161.
-SOLUTION_BYTES_PER_NODE = 14_000
-
 
 def require_differentiable(plan: Plan) -> None:
-    """Check that a scene has a gradient.
-
-    Raises:
-        SceneError: When it has position-controlled tools.
-    """
+    """Raise a SceneError if a scene has position-controlled tools, and thus no gradient."""
     for tool in plan.tools:
         reason = "a tool with a path has no gradient, as points meet and leave it; fit such scenes by differences"
         raise SceneError([f"probes.{tool.probe}.path: {reason}"])
 
 
 def with_stiffness_map(plan: Plan) -> Plan:
-    """Return a plan in f64 with a stiffness map, whose factors are 1 for a scene without a map."""
+    """Return a plan in f64 with a stiffness map; its factors are 1 for a scene without a map."""
     material, (rows, cols) = plan.material, plan.scene.sheet.points
     factors = np.ones((rows - 1, cols - 1)) if material.factors is None else material.factors
     return replace(plan.with_grid(precision="f64"), material=replace(material, factors=factors))
 
 
 def _require_memory(plan: Plan) -> None:
-    """Raise SceneError unless the adjoint and the positions of all frames fit in memory."""
+    """Raise a SceneError unless the adjoint and the positions of all frames fit in memory."""
     frames, points = plan.grid.frames + 1, math.prod(plan.scene.sheet.points)
-    needed = FRAME_COPIES * 3 * 8 * frames * points
-    needed += SOLUTION_BYTES_PER_NODE * points if plan.scene.time.at_rest else motion_bytes(plan)
+    # Four arrays of all positions: displacements, positions, the derivative of the loss, and a copy.
+    needed = 4 * 3 * 8 * frames * points
+    # A sparse solution takes 10,400 bytes per mass point for 81 x 81 mass points, and 13,600 for 161 x 161.
+    needed += 14_000 * points if plan.scene.time.at_rest else motion_bytes(plan)
     if needed > (free := available_memory()):
         raise SceneError([
             f"a gradient by {points} points in {frames} frames and {plan.grid.steps} steps takes about "
@@ -67,15 +57,15 @@ def _require_memory(plan: Plan) -> None:
 
 
 class Adjoint:
-    """Compiled sheet in f64 that can be run and differentiated repeatedly, also with another stiffness map.
+    """Differentiable simulation in f64, compiled once for repeated runs, also with another stiffness map.
 
     Args:
-        plan: Plan of the scene.
-        device: Device to run on, a CPU.
-        cores: Number of CPU cores; None for all.
+        plan: plan of the scene.
+        device: a CPU.
+        cores: number of CPU cores; None for all.
 
     Raises:
-        SceneError: When a probe has a path, or the memory does not suffice.
+        SceneError: when a probe has a path, or the memory does not suffice.
     """
 
     def __init__(self, plan: Plan, device: Device, cores: int | None = None) -> None:
@@ -93,16 +83,16 @@ class Adjoint:
         """Run the scene.
 
         Args:
-            factors: Stiffness factors of the cells, shape (rows - 1, cols - 1), which replace those of the scene.
-            pause: Called several times a second; an exception from it ends the run, which has no derivatives then.
-            scene: The scene with other forces of its tools; None for its own.
+            factors: stiffness factors of the cells, shape (rows - 1, cols - 1), which replace those of the scene.
+            pause: called several times a second; an exception from it ends the run, which has no derivatives then.
+            scene: the scene with other forces of its tools; None for the scene of the plan.
 
         Returns:
             Positions at every frame [m], shape (F + 1, rows, cols, 3).
 
         Raises:
-            ArgumentError: When the factors are not positive numbers of that shape, or too large for the step.
-            DivergedError: When the simulation diverges.
+            ArgumentError: when the factors are not positive numbers of that shape, or too large for the step.
+            DivergedError: when the simulation diverges.
         """
         self._ran = False
         plan = self._plan if factors is None else self._with_factors(factors)
@@ -116,15 +106,16 @@ class Adjoint:
         """Differentiate a loss at the last `run`.
 
         Args:
-            by_position: Derivative of the loss by the positions at every frame, shape (F + 1, rows, cols, 3).
-            pause: Called several times a second; an exception from it ends the differentiation.
+            by_position: derivative of the loss with respect to the positions at every frame, shape (F + 1, rows, cols,
+                3).
+            pause: called several times a second; an exception from it ends the differentiation.
 
         Returns:
-            Derivatives by the numbers of the scene.
+            Derivatives with respect to the numbers of the scene.
 
         Raises:
-            ArgumentError: When it is not an array of finite numbers of that shape.
-            MsmError: When nothing has run.
+            ArgumentError: when `by_position` is not an array of finite numbers of that shape.
+            MsmError: when `run` has not been called.
         """
         if not self._ran:
             raise MsmError("nothing has run yet that could be differentiated; call run first")
@@ -154,48 +145,47 @@ class Adjoint:
         return replace(plan, material=material, stable_step=limit)
 
 
-# Function of the positions at every frame that returns the value of a loss and its derivative by them.
+# Function of the positions at every frame that returns the value of a loss and its derivative with respect to them.
 Loss = Callable[[Array], tuple[float, Array]]
 
 
 @dataclass(frozen=True)
 class Gradient(Derivatives):
-    """Value of a loss, and its derivatives by the numbers of a scene.
+    """Value of a loss, and its derivatives with respect to the numbers of a scene.
 
     Attributes:
-        numbers: Derivatives by the paths of keys: by material numbers other than 0, such as tissue.young; by the
-            components of a force, such as probes.0.total, shape (3,); by the percents of a load, such as probes.0.load,
-            shape (keyframes,); and by across and down of a control point, such as probes.0.at, shape (2,), or
-            (keyframes, 2) for a moving one.
-        maps: Derivatives by the factors of maps, where a scene without a map has the factor 1 everywhere: tissue.map or
-            springs.map, by cell, shape (rows - 1, cols - 1); with a foundation also tissue.foundation_map, by mass
-            point, shape (rows, cols).
-        value: Value of the loss.
+        numbers: derivatives by key: material numbers other than 0, such as tissue.young; the components of a force,
+            such as probes.0.total, shape (3,); the percents of a load, such as probes.0.load, shape (keyframes,); and
+            across and down of a control point, such as probes.0.at, shape (2,), or (keyframes, 2) for a moving one.
+        maps: derivatives with respect to the factors of maps: tissue.map or springs.map, of cells, shape (rows - 1,
+            cols - 1); with a foundation also tissue.foundation_map, of mass points, shape (rows, cols). A scene without
+            such a map has the factor 1 everywhere.
+        value: value of the loss.
     """
 
     value: float
 
 
 def gradient(scene: Scene | Mapping[str, Any], loss: Loss, threads: int | None = None) -> Gradient:
-    """Differentiate a loss of the positions of all frames by the numbers of a scene, in f64, exactly but for rounding.
+    """Differentiate a loss with respect to the numbers of a scene, in f64, exactly but for rounding.
 
-    The time step follows from the scene and is held constant. There are no derivatives by sizes, times or radii. A
-    scene with tolerances is resolved first.
+    The time step follows from the scene and is held constant. There are no derivatives with respect to sizes, times or
+    radii. A scene with tolerances is resolved first.
 
     Args:
-        scene: Scene from `load_scene`, or the same as a mapping.
-        loss: Function of the positions at every frame [m], shape (F + 1, rows, cols, 3), that returns its value and its
-            derivative by them, an array of the same shape.
-        threads: Number of CPU threads; None for every core.
+        scene: scene from `load_scene`, or the same as a mapping.
+        loss: function of the positions at every frame [m], shape (F + 1, rows, cols, 3). It returns its value and its
+            derivative with respect to the positions, an array of the same shape.
+        threads: number of CPU threads; None for every core.
 
     Returns:
         The value of the loss and its derivatives.
 
     Raises:
-        SceneError: When the scene cannot be run, or a tool has a path.
-        ArgumentError: When the loss returns something else.
-        DivergedError: When the simulation diverges.
-        MsmError: When a quasi-static sheet has no stiffness against some motion.
+        SceneError: when the scene cannot be run, or a tool has a path.
+        ArgumentError: when the loss returns anything else.
+        DivergedError: when the simulation diverges.
+        MsmError: when the stiffness of a quasi-static sheet is singular.
 
     Example:
         >>> from taichi_msm import gradient, load_scene

@@ -1,14 +1,14 @@
-"""Kernels of the adjoint of the time stepping: one steps forward and stores every shape, one sweeps backward.
+"""Kernels of the adjoint of the time stepping: one steps forward and stores all displacements, one sweeps backward.
 
 A step is d' = keep d + G F(u), u' = u + d', where G is the gain over the area share of a mass point, 0 where it is
-fixed. Let e be the derivative of the loss by d'. Then p = G e follows, from the last step to the first,
+fixed. Let e be the derivative of the loss with respect to d'. Then p = G e follows, from the last step to the first,
 
     p_n = p_{n+1} + q_n,    q_n = keep q_{n+1} + G (F'(u_n) p_{n+1} + l_n)
 
-where F' is the tangent stiffness, which is symmetric, and l_n the derivative of the loss by u_n itself. These are the
-steps of a sheet whose springs are the tangents of the springs, so the adjoint is swept like the sheet. A number that
-enters the force of step n changes the loss by the product of p_{n+1} with the change of the force; these products are
-accumulated during the sweep.
+where F' is the Jacobian of the forces, which is symmetric, and l_n the partial derivative of the loss with respect to
+u_n. These are the steps of a sheet with linearised springs, so the adjoint is swept like the sheet. If a coefficient
+changes the force of step n, the loss changes by the product of p_{n+1} with the change of the force; these products
+are accumulated during the sweep.
 
 Every worker has a band of rows, and steps it from one buffer into another as soon as its neighbours have reached the
 same step. A row is swept from left to right, cell by cell. Each spring is evaluated once, except that both workers
@@ -32,28 +32,29 @@ from taichi_msm.terms.foundation import FoundationTerm
 from taichi_msm.terms.loads import ProbeTerm
 from taichi_msm.terms.springs import ALONG_COLUMN, ALONG_ROW, DIAGONAL, SpringTerm
 
-# Indices of the sizes of a launch: number of steps; number of workers; rows of the sheet; columns of a strip; first of
-# the shapes, or in the sweep the last; row of the arrays where the moments begin, and where the forces carried to the
-# next row begin; rows of carried forces per worker; number of times that a worker checks its neighbour before it gives
-# up; which of two buffers contains p; whether the last step adds the derivative of the loss.
-COUNT, WORKERS, ROWS, STRIP, SHAPE, MOMENT_ROW, CARRY, CARRIED_ROWS, PATIENCE, BUFFER, WITH_LOSS, SIZES = range(12)
+# Indices into the sizes of a launch: number of steps; number of workers; rows of the sheet; columns of a strip; index
+# of the first step's displacements, or in the sweep of the last step's; row of the arrays where the moments begin, and
+# where the forces carried to the next row begin; rows of carried forces per worker; number of times that a worker
+# checks its neighbour before it gives up; buffer that contains p, 0 or 1; whether the last step adds the derivative of
+# the loss.
+COUNT, WORKERS, ROWS, STRIP, SHAPE, MOMENT_ROW, CARRY, CARRIED_ROWS, MAX_CHECKS, BUFFER, WITH_LOSS, SIZES = range(12)
 
-# Integers per worker in the array `progress`, of which the first is the number of its finished steps.
+# Integers per worker in the array `progress`; the first is the number of its finished steps, the others are padding.
 STRIDE = 16
 
 # Parts of the adjoint's arrays, in multiples of the sheet's rows: p in two buffers, q, and the derivative of the loss.
 BUFFERS, ADJOINT_CHANGE, LOSS, ADJOINT_PARTS = 0, 2, 3, 4
 
-# Parts of the accumulated derivatives, in multiples of the sheet's rows: by k - tau of springs along rows, along
-# columns and of diagonals; and by the logarithm of K, for an area share of 1. The derivatives of the decays of standing
-# slots follow.
+# Parts of the accumulated derivatives, in multiples of the sheet's rows: with respect to k - tau of springs along rows,
+# along columns and of diagonals; and to log K, for an area share of 1. The derivatives of the decays of standing slots
+# follow.
 SPRING_PARTS, FOUNDATION_PART, SUM_PARTS = 0, 3, 4
 
-# Indices of the sums of a row, which follow the parts: of q u, for the derivative by keep; the derivatives by tau of
-# each family; the derivative by the logarithm of D.
+# Indices of the sums of a row, which follow the parts: the sum of q u, for the derivative with respect to keep; the
+# derivatives with respect to tau of each family; that with respect to log D.
 KEEP_SUM, TENSION_SUMS, BENDING_SUM, ROW_SUMS = 0, 1, 4, 5
 
-# Number of derivatives by the force and by the control point of a slot, in every step and row.
+# Number of derivatives of a slot in every step and row: 3 with respect to its force, 2 to its control point.
 LOAD_DERIVATIVES = 5
 
 
@@ -61,15 +62,10 @@ class AdjointSheet(NamedTuple):
     """Arrays of a `KernelSheet`, extended for the adjoint.
 
     Attributes:
-        u: p, q and the derivative of the loss, and with bending moments of p.
-        by_column: As in `KernelSheet`, like the next five.
-        stiffness: Stiffness of the springs.
-        fields: Fields of the mass points.
-        constants: Constants of the sheet.
-        rows: Number of rows.
-        width: Entries of a row.
-        shapes: Displacements of the steps of a segment, three arrays.
-        derivatives: Accumulated derivatives.
+        u: p, q and the derivative of the loss; with bending also the moments of p.
+        by_column, stiffness, fields, constants, rows, width: as in `KernelSheet`.
+        shapes: displacements at the steps of a segment, three arrays.
+        derivatives: accumulated derivatives.
     """
 
     u: Any
@@ -87,15 +83,13 @@ class AdjointBand(NamedTuple):
     """A worker's band of rows at a step, within a kernel.
 
     Attributes:
-        low: First row.
-        high: Row after the last one.
-        source: Row where the buffer that is read begins.
-        target: Row where the buffer that is written begins.
-        shape: Row where the displacements begin.
-        carry: Row of the forces that are carried to the next row.
-        moments: Row where the moments begin.
-        n: Index of the step in the table of loads.
-        with_loss: Whether the derivative of the loss is added.
+        low, high: first row, and the row after the last one.
+        source, target: rows where the buffers begin that are read and written.
+        shape: row where the displacements begin.
+        carry: row of the forces that are carried to the next row.
+        moments: row where the moments begin.
+        n: index of the step in the table of loads.
+        with_loss: whether the derivative of the loss is added.
     """
 
     low: Any
@@ -110,7 +104,7 @@ class AdjointBand(NamedTuple):
 
 
 class LoadTables(NamedTuple):
-    """Loads of every step, and the derivatives by them."""
+    """Loads of every step, and the derivatives with respect to them."""
 
     loads: Any
     by_load: Any
@@ -118,21 +112,21 @@ class LoadTables(NamedTuple):
 
 @cache
 def adjoint_kernels(code: KernelConfig, *, parallel: bool) -> tuple[Callable[..., None], Callable[..., None]]:
-    """Build the kernel that steps forward and stores every shape, and the one that sweeps backward.
+    """Build the kernel that steps forward and stores all displacements, and the one that sweeps backward.
 
     Args:
-        code: Compile-time configuration of the steps.
-        parallel: Whether the workers run in parallel.
+        code: compile-time configuration of the steps.
+        parallel: whether the workers run in parallel.
 
     Returns:
-        Both kernels, which share the arguments `sizes` (int64, in the order of `COUNT`) and `progress` (int64, `STRIDE`
-        per worker).
+        Both kernels. They share the arguments `sizes` (int64, shape (11,), at the indices from `COUNT` on) and
+        `progress` (int64, `STRIDE` per worker).
     """
-    return _storing_kernel(code, parallel=parallel), _sweeping_kernel(code, parallel=parallel)
+    return _build_store(code, parallel=parallel), _build_sweep(code, parallel=parallel)
 
 
-def _banded(step_band: Callable[..., None], *, parallel: bool) -> Callable[..., None]:
-    """Build the function that runs the steps of a launch for a worker, or for all workers in a single one."""
+def _build_run_worker(step_band: Callable[..., None], *, parallel: bool) -> Callable[..., None]:
+    """Build the function that runs the steps of a launch: of one worker if parallel, otherwise of all workers."""
 
     @ti.func
     def wait_for(progress: ti.template(), sizes: ti.template(), worker, k):
@@ -140,7 +134,7 @@ def _banded(step_band: Callable[..., None], *, parallel: bool) -> Callable[..., 
         finished = True
         if 0 <= worker < sizes[WORKERS]:
             steps, checks = ti.atomic_add(progress[STRIDE * worker], 0), 0
-            while steps < k and checks < sizes[PATIENCE]:
+            while steps < k and checks < sizes[MAX_CHECKS]:
                 steps = ti.atomic_add(progress[STRIDE * worker], 0)
                 checks += 1
             finished = steps >= k
@@ -166,8 +160,11 @@ def _banded(step_band: Callable[..., None], *, parallel: bool) -> Callable[..., 
     return run_worker
 
 
-def _moment_storing(code: KernelConfig) -> list[Callable[..., None]]:
-    """Build the function that stores the moments for row i of a band: first those of three rows, then of one more."""
+def _build_store_moments(code: KernelConfig) -> list[Callable[..., None]]:
+    """Build the function that stores the moments that row i of a band needs; none without bending.
+
+    At the first row these are the moments of three rows, and then of one more row each.
+    """
     bending, join_strips = code.get(BendingTerm), build_join_strips(code)
     if bending is None:
         return []
@@ -187,7 +184,7 @@ def _moment_storing(code: KernelConfig) -> list[Callable[..., None]]:
     return [store_moments]
 
 
-def _row_clearing(code: KernelConfig) -> Callable[..., None]:
+def _build_clear(code: KernelConfig) -> Callable[..., None]:
     """Build the function that sets a row of u to 0."""
     vector = code.vector
 
@@ -200,11 +197,11 @@ def _row_clearing(code: KernelConfig) -> Callable[..., None]:
     return clear
 
 
-def _storing_kernel(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
-    """Build the kernel that steps forward and stores every shape."""
+def _build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
+    """Build the kernel that steps forward and stores all displacements."""
     real, vector, vectors = code.real, code.vector, code.vectors
     count_of_numbers, join_strips, step = code.first_constant(None), build_join_strips(code), build_point_step(code)
-    clear, storing = _row_clearing(code), _moment_storing(code)
+    clear, storing = _build_clear(code), _build_store_moments(code)
 
     @ti.func
     def move(sheet: ti.template(), entry: ti.template(), target, force: ti.template(), now: ti.template()):
@@ -237,7 +234,7 @@ def _storing_kernel(code: KernelConfig, *, parallel: bool) -> Callable[..., None
             if i >= low:
                 join_strips(sheet.u, shape + sheet.rows + i, sheet.width)
 
-    run_worker = _banded(step_band, parallel=parallel)
+    run_worker = _build_run_worker(step_band, parallel=parallel)
 
     @ti.kernel
     def store(
@@ -261,7 +258,7 @@ def _storing_kernel(code: KernelConfig, *, parallel: bool) -> Callable[..., None
     return store
 
 
-def _row_sweeping(code: KernelConfig) -> Callable[..., None]:
+def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
     """Build the function that sweeps a row of the adjoint by a step."""
     vector, columns, springs = code.vector, code.first_column(None), code.require(SpringTerm)
     structural, shear, tension = springs.structural, springs.shear, springs.tense
@@ -273,13 +270,17 @@ def _row_sweeping(code: KernelConfig) -> Callable[..., None]:
     reducing = [reduce for term in code.terms for reduce in term.build_damping(code)]
     probes, foundation_term = code.require(ProbeTerm), code.get(FoundationTerm)
     laplacians = [] if code.get(BendingTerm) is None else [build_laplacian(code)]
-    sense, slots, standing = probes.build_load_adjoint(code, SUM_PARTS), len(probes.moves), probes.moves.count(False)
+    add_load_derivatives, slots, standing = (
+        probes.build_load_adjoint(code, SUM_PARTS),
+        len(probes.moves),
+        probes.moves.count(False),
+    )
     foundation = code.first_column(FoundationTerm) if foundation_term else 0
     foundation_works = [foundation_term.build_work(code)] if foundation_term else []
 
     @ti.func
     def spring_tangent(sheet: ti.template(), offset, p, q, x0, y0, length, k, family: ti.template()):
-        """Differentiate the force of entry p on entry q; their shapes are `offset` entries further on."""
+        """Differentiate the spring force between entries p and q; their displacements are `offset` entries later."""
         p_difference = [sheet.u[c][p] - sheet.u[c][q] for c in ti.static(range(3))]
         u_difference = [sheet.shapes[c][p + offset] - sheet.shapes[c][q + offset] for c in ti.static(range(3))]
         return differentiate(sheet, family, u_difference, p_difference, x0, y0, length, k)
@@ -370,7 +371,7 @@ def _row_sweeping(code: KernelConfig) -> Callable[..., None]:
                     if ti.static(code.by_area):
                         keep_sum *= sheet.by_column[(AREA_SHARE + kind) * width + b]
                     sums[KEEP_SUM] += keep_sum
-                    sense(load_sums, sheet, entry, now)
+                    add_load_derivatives(load_sums, sheet, entry, now)
                     for laplacian in ti.static(laplacians):
                         if kind == 1:
                             # The moments of p are D times its Laplacian, and 0 at the border.
@@ -394,11 +395,15 @@ def _row_sweeping(code: KernelConfig) -> Callable[..., None]:
     return sweep_row
 
 
-def _sweeping_kernel(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
+def _build_sweep(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
     """Build the kernel that sweeps the adjoint, from the last step to the first."""
     real, vector, vectors = code.real, code.vector, code.vectors
-    count_of_numbers, join_strips, storing = code.first_constant(None), build_join_strips(code), _moment_storing(code)
-    clear, sweep_row = _row_clearing(code), _row_sweeping(code)
+    count_of_numbers, join_strips, storing = (
+        code.first_constant(None),
+        build_join_strips(code),
+        _build_store_moments(code),
+    )
+    clear, sweep_row = _build_clear(code), _build_sweep_row(code)
 
     @ti.func
     def step_band(sheet: ti.template(), tables: ti.template(), sizes: ti.template(), worker, k):
@@ -423,7 +428,7 @@ def _sweeping_kernel(code: KernelConfig, *, parallel: bool) -> Callable[..., Non
             if i >= low:
                 join_strips(sheet.u, target + i, sheet.width)
 
-    run_worker = _banded(step_band, parallel=parallel)
+    run_worker = _build_run_worker(step_band, parallel=parallel)
 
     @ti.kernel
     def sweep(
@@ -451,7 +456,7 @@ def _sweeping_kernel(code: KernelConfig, *, parallel: bool) -> Callable[..., Non
 
 @cache
 def copy_kernel(code: KernelConfig) -> Callable[..., None]:
-    """Build the kernel that copies a number of entries between three arrays, from and to given first entries."""
+    """Build the kernel that copies entries from three arrays to three others, beginning at given entries."""
     vectors = code.vectors
 
     @ti.kernel

@@ -1,8 +1,8 @@
 """Adjoint of the time stepping, with checkpoints.
 
-The forward run stores its state at the beginning of every segment. A segment has about as many steps as the square root
-of their number, or more if the sheet is small. Backward in time, each segment is run again with all shapes stored, and
-the adjoint is swept over them (`kernel_motion`).
+The forward run stores a checkpoint at the beginning of every segment; N steps have about sqrt(N / 2) segments, or fewer
+if the sheet is small. Backward in time, each segment is repeated with the displacements of all steps stored, and the
+adjoint is swept over them (`kernel_motion`).
 """
 
 from __future__ import annotations
@@ -47,11 +47,11 @@ from taichi_msm.terms.damping import coefficients
 from taichi_msm.terms.foundation import point_shares
 from taichi_msm.terms.loads import ProbeTerm
 
-# Memory that the shapes of a segment may always take [bytes], since each segment costs some launches.
+# Memory that the displacements of a segment may always take [bytes], since each segment costs some launches.
 SEGMENT_BYTES = 64 * 2**20
 
-# Number of times that a worker checks its neighbour before it gives up. It is larger than forward in time, because the
-# rest of the launch then falls to a single worker, whose kernel may have to be compiled.
+# Number of times that a worker checks its neighbour before it gives up; larger than in the forward run, because a
+# single worker then finishes the launch, and its kernel may have to be compiled first.
 MAX_WAIT_CHECKS = 8 * MAX_CHECKS
 
 # Largest number of steps times mass points in a launch of the adjoint, about 0.1 s of one core.
@@ -61,36 +61,33 @@ Array = NDArray[np.float64]
 
 
 def segment_steps(steps: int, shape_bytes: int) -> int:
-    """Return the number of steps of a segment, whose shapes take about as much memory as all checkpoints.
+    """Return the length of a segment [steps], whose displacements take about as much memory as all checkpoints.
 
     Args:
-        steps: Number of steps of the run.
-        shape_bytes: Memory of the displacements of a step [bytes]; a checkpoint takes twice as much.
-
-    Returns:
-        Number of steps.
+        steps: number of steps of the run.
+        shape_bytes: memory of the displacements of a step [bytes]; a checkpoint takes twice as much.
     """
     return min(steps, max(math.ceil(math.sqrt(2 * steps)), SEGMENT_BYTES // shape_bytes))
 
 
 def motion_bytes(plan: Plan) -> int:
-    """Estimate the memory of the adjoint of a dynamic sheet, except that of the frames [bytes]."""
+    """Estimate the memory of the adjoint of a dynamic sheet, without the positions at the frames [bytes]."""
     steps, shape_bytes = plan.grid.steps, 3 * 8 * math.prod(plan.scene.sheet.points)
     segment = segment_steps(steps, shape_bytes)
     return shape_bytes * (segment + 2 * -(-steps // segment) + ADJOINT_PARTS + SUM_PARTS)
 
 
 class _Arrays(NamedTuple):
-    """Arrays of the adjoint; a list holds three, for x, y and z.
+    """Arrays of the adjoint; each list contains three arrays, for x, y and z.
 
     Attributes:
-        checkpoints: Displacements at the beginning of every segment.
-        checkpoint_differences: Last differences at the beginning of every segment.
-        shapes: Displacements in a segment, step by step.
-        differences: Last difference in a segment.
-        adjoint: Adjoint state, see `kernel_motion`.
-        loss: Derivative of the loss by the displacements of a frame.
-        derivatives: Accumulated derivatives, see `kernel_motion`.
+        checkpoints: displacements at the beginning of every segment.
+        checkpoint_differences: differences d at the beginning of every segment.
+        shapes: displacements at every step of a segment.
+        differences: difference d at the current step of a segment.
+        adjoint: adjoint state, see `kernel_motion`.
+        loss: derivative of the loss with respect to the displacements of a frame.
+        derivatives: accumulated derivatives, see `kernel_motion`.
     """
 
     checkpoints: list[Any]
@@ -105,19 +102,19 @@ class _Arrays(NamedTuple):
 class MotionAdjoint(Dynamics):
     """Dynamic sheet and its adjoint; the plan must be in f64 and have a stiffness map."""
 
-    # Layout, number of steps and number of standing slots that memory was allocated for.
+    # Layout, number of steps and number of standing slots of the allocated arrays.
     _allocated: tuple[Any, ...] = ()
 
     def restart(self, plan: Plan, state: State | None = None) -> None:
-        """Restart with the same scene or another, like `Dynamics`.
+        """Restart with the same scene or another.
 
         Args:
-            plan: Plan of the scene.
-            state: State to start from; None for the state of rest.
+            plan: plan of the scene.
+            state: initial state; None for the state of rest.
         """
         super().restart(plan, state)
-        self._decay_slopes = self.layout.config.require(ProbeTerm).decay_gradients(plan)
-        key = self.layout, plan.grid.steps, len(self._decay_slopes)
+        self._decay_gradients = self.layout.config.require(ProbeTerm).decay_gradients(plan)
+        key = self.layout, plan.grid.steps, len(self._decay_gradients)
         if key != self._allocated:
             self._allocate()
             self._allocated = key
@@ -144,20 +141,20 @@ class MotionAdjoint(Dynamics):
             vector(checkpoint_rows), vector(checkpoint_rows),
             vector(self._segment * layout.rows + self._worker_rows), vector(layout.rows),
             vector(ADJOINT_PARTS * layout.rows + self._worker_rows), vector(layout.rows),
-            scalar((SUM_PARTS + 2 * len(self._decay_slopes)) * layout.rows + row_sums),
+            scalar((SUM_PARTS + 2 * len(self._decay_gradients)) * layout.rows + row_sums),
         )  # fmt: skip
 
     def run(self, pause: Pause = lambda: None) -> Array:
         """Run all steps and store the checkpoints.
 
         Args:
-            pause: Called several times a second; an exception from it ends the run.
+            pause: called several times a second; an exception from it ends the run.
 
         Returns:
             Displacements at every frame [m], shape (F + 1, rows, cols, 3).
 
         Raises:
-            DivergedError: When the sheet diverges.
+            DivergedError: when the sheet diverges.
         """
         plan, grid = self.plan, self.plan.grid
         monitor, frames = DivergenceMonitor(plan), np.zeros((grid.frames + 1, *plan.scene.sheet.points, 3))
@@ -179,11 +176,12 @@ class MotionAdjoint(Dynamics):
         """Sweep the adjoint of the last `run` backward in time.
 
         Args:
-            by_frame: Derivative of the loss by the displacements at every frame, shape (F + 1, rows, cols, 3).
-            pause: Called several times a second; an exception from it ends the sweep.
+            by_frame: derivative of the loss with respect to the displacements at every frame, shape (F + 1, rows, cols,
+                3).
+            pause: called several times a second; an exception from it ends the sweep.
 
         Returns:
-            Derivatives by the numbers of the sheet and by its loads.
+            Derivatives with respect to the coefficients of the sheet, and to its loads.
         """
         grid, layout, arrays = self.plan.grid, self.layout, self._arrays
         _, gain, _ = coefficients(self.plan)
@@ -194,8 +192,8 @@ class MotionAdjoint(Dynamics):
             parts = start[..., c], 0 * start[..., c], start[..., c]
             write_vectors(arrays.adjoint[c], to_lanes(layout, np.concatenate(parts)))
         zeros = np.zeros((SUM_PARTS * layout.rows, layout.cols))
-        decay_slopes = self._decay_slopes.reshape(-1, layout.cols)
-        write_vectors(arrays.derivatives, to_lanes(layout, np.concatenate([zeros, decay_slopes])))
+        decay_gradients = self._decay_gradients.reshape(-1, layout.cols)
+        write_vectors(arrays.derivatives, to_lanes(layout, np.concatenate([zeros, decay_gradients])))
         loads, self._buffer, work = LoadGradient(self.plan), BUFFERS, np.zeros(2)
         block = max(1, STEPS_PER_TABLE // self._segment) * self._segment
         for first in reversed(range(0, grid.steps, block)):
@@ -203,7 +201,7 @@ class MotionAdjoint(Dynamics):
         return self._sheet_gradient(gain, work), loads
 
     def _sweep_block(self, first: int, end: int, by_frame: Array, loads: LoadGradient, pause: Pause) -> Array:
-        """Sweep backward over some segments; return the work of the loads on the adjoint after and in step 0."""
+        """Sweep backward over a block of segments; return the work of the loads on p after step 0 and in step 0."""
         table, h = self._table(first, end - first), self.plan.grid.step
         by_slot = np.zeros((end - first, len(self.plan.slots), LOAD_DERIVATIVES))
         at = end
@@ -238,7 +236,7 @@ class MotionAdjoint(Dynamics):
             copy_kernel(self.layout.config)(self._shape_entries, from_entry, to_entry, *source, *target)
 
     def _store_shapes(self, first: int, table: Array, pause: Pause) -> None:
-        """Run a segment from its checkpoint with the given table of loads, and store every shape."""
+        """Repeat a segment from its checkpoint with a table of loads, and store the displacements of all steps."""
         layout, arrays, count = self.layout, self._arrays, len(table) - 1
         checkpoint = first // self._segment * self._shape_entries
         self._copy_shape(checkpoint, 0, arrays.checkpoints, arrays.shapes)
@@ -251,12 +249,12 @@ class MotionAdjoint(Dynamics):
             pause()
 
     def _launch_begin(self, first: int, end: int) -> int:
-        """Return the first step of the launch that ends at step `end` of a segment; it never crosses a frame."""
+        """Return the first step of a launch that ends at step `end`; a launch is within a segment and a frame."""
         frame = (end - 1) // self.plan.grid.steps_per_frame * self.plan.grid.steps_per_frame
         return max(first, frame, end - self._max_launch_steps())
 
     def _sweep(self, first: int, end: int, by_frame: Array, table: Array) -> Array:
-        """Sweep a segment backward from step `end`; return the derivatives by its loads, shape (steps, slots, 5)."""
+        """Sweep backward from step `end` of a segment; return the derivatives by load, shape (steps, slots, 5)."""
         layout, arrays, grid, count = self.layout, self._arrays, self.plan.grid, len(table)
         frame, steps_after_frame = divmod(end - count, grid.steps_per_frame)
         if not steps_after_frame:
@@ -269,7 +267,7 @@ class MotionAdjoint(Dynamics):
         return by_row[..., :columns].sum(axis=1).reshape(count, -1, LOAD_DERIVATIVES)
 
     def _write_loss(self, by_displacement: Array) -> None:
-        """Write the derivative by the displacements of a frame for the kernel."""
+        """Copy the derivative with respect to the displacements of a frame to the device."""
         for c in range(3):
             write_vectors(self._arrays.loss[c], to_lanes(self.layout, by_displacement[..., c]))
         self._copy_shape(0, LOSS * self._shape_entries, self._arrays.loss, self._arrays.adjoint)
@@ -279,7 +277,7 @@ class MotionAdjoint(Dynamics):
         layout = self.layout
         rows, cols, derivatives = layout.rows, layout.cols, self._arrays.derivatives.to_numpy()
         parts = from_lanes(layout, derivatives, SUM_PARTS * rows).reshape(SUM_PARTS, rows, cols)
-        first = (SUM_PARTS + 2 * len(self._decay_slopes)) * rows * layout.width
+        first = (SUM_PARTS + 2 * len(self._decay_gradients)) * rows * layout.width
         # The sums of a row are added lane by lane, and then row by row.
         row_sums = derivatives[first : first + ROW_SUMS * rows].reshape(rows, ROW_SUMS, -1)
         sums = row_sums.sum(axis=2).sum(axis=0)
@@ -309,11 +307,11 @@ class MotionAdjoint(Dynamics):
             MAX_WAIT_CHECKS, self._buffer if moment_row == ADJOINT_PARTS * layout.rows else 0, with_loss,
         ])  # fmt: skip
 
-    def _launch(self, which: int, sizes: NDArray[np.int64], *arguments: Any) -> None:
-        """Launch the storing or the sweeping kernel; if a worker gives up, one worker finishes alone."""
+    def _launch(self, kernel: int, sizes: NDArray[np.int64], *arguments: Any) -> None:
+        """Launch a kernel of `adjoint_kernels`; if a worker gives up, a single worker finishes the launch."""
         code, workers = self.layout.config, self.layout.workers
         progress = np.zeros(STRIDE * workers, np.int64)
         for parallel in (True, False) if workers > 1 else (False,):
             if (progress[::STRIDE] < sizes[0]).any():
                 with compilation_options():
-                    adjoint_kernels(code, parallel=parallel)[which](sizes, progress, *arguments)
+                    adjoint_kernels(code, parallel=parallel)[kernel](sizes, progress, *arguments)

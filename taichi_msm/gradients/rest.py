@@ -1,7 +1,7 @@
 """Adjoint of the quasi-static equilibrium: one linear solution per frame.
 
-In equilibrium the forces vanish, F(u) = 0. A number that changes the forces by f thus changes u by K^-1 f, where
-K = -F'(u) is the tangent stiffness of the sheet, and the loss by p . f, where K p is the derivative of the loss by u.
+At equilibrium F(u) = 0. A change f of the forces changes u by K^-1 f, where K = -F'(u) is the tangent stiffness, and
+the loss by p . f, where p solves K p = l with the derivative l of the loss with respect to u.
 """
 
 from __future__ import annotations
@@ -30,11 +30,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-# The largest error of a solution, relative to the right-hand side.
+# Largest residual of a linear solution, relative to the right-hand side.
 RESIDUAL_TOLERANCE = 1e-6
-
-# Time between pauses during a solution [s].
-PAUSE_INTERVAL_S = 0.1
 
 
 class RestAdjoint:
@@ -54,13 +51,13 @@ class RestAdjoint:
         """Solve all frames.
 
         Args:
-            pause: Called several times a second; an exception from it ends the run.
+            pause: called several times a second; an exception from it ends the run.
 
         Returns:
             Displacements at every frame [m], shape (F + 1, rows, cols, 3).
 
         Raises:
-            DivergedError: When a frame has no equilibrium.
+            DivergedError: when a frame has no equilibrium.
         """
         self._sheet.restart(self.plan)
         frames = []
@@ -74,14 +71,15 @@ class RestAdjoint:
         """Differentiate a loss at the last `run`.
 
         Args:
-            by_frame: Derivative of the loss by the displacements at every frame, shape (F + 1, rows, cols, 3).
-            pause: Called several times a second; an exception from it ends the differentiation.
+            by_frame: derivative of the loss with respect to the displacements at every frame, shape (F + 1, rows, cols,
+                3).
+            pause: called several times a second; an exception from it ends the differentiation.
 
         Returns:
-            Derivatives by the numbers of the sheet and by its loads.
+            Derivatives with respect to the coefficients of the sheet, and to its loads.
 
         Raises:
-            MsmError: When the sheet has no stiffness against some motion, and so no derivative.
+            MsmError: when the tangent stiffness is singular.
         """
         plan, (rows, cols) = self.plan, self.plan.scene.sheet.points
         families, laplacian = list(spring_families(plan)), _laplacian(plan)
@@ -105,7 +103,7 @@ class RestAdjoint:
                     "pretension or bending"
                 )
             if p is None:
-                continue  # The sheet is flat, and remains flat with any material.
+                continue  # a flat sheet remains flat with any material
             _add_springs(gradient, families, u, p)
             gradient.foundation += (foundation_force(plan.material, foundation, u) * p).sum(axis=-1)
             curvatures = laplacian @ u.reshape(-1, 3), laplacian @ p.reshape(-1, 3)
@@ -114,7 +112,7 @@ class RestAdjoint:
         return gradient, loads
 
     def _add_loads(self, loads: LoadGradient, frame: int, at_frame: Schedule, p: Array) -> None:
-        """Add the derivatives by the loads of a frame."""
+        """Add the derivatives with respect to the loads of a frame."""
         scene, by_slot = self.plan.scene, np.zeros((1, len(at_frame.slots), 5))
         for n, slot in enumerate(at_frame.slots):
             probe, at = scene.probes[slot.probe], at_frame.point[0, n]
@@ -127,19 +125,19 @@ class RestAdjoint:
 
 
 def _add_springs(gradient: SheetGradient, families: Sequence[SpringFamily], u: Array, p: Array) -> None:
-    """Add the derivatives by the springs."""
-    for number, family in enumerate(families):
+    """Add the derivatives with respect to stiffness and tension of the springs."""
+    for n, family in enumerate(families):
         q, edges, square_difference, square = family.elongation(u)
         p_difference = p[family.start] - p[family.end]
         along = (p_difference * edges).sum(axis=-1)
         _, _, by_stiffness, by_tension = family.slopes(square_difference, square, along)
-        index = min(number, 2)  # Both diagonals count as one family.
+        index = min(n, 2)  # both diagonals count as one family
         gradient.springs[index][...] += by_stiffness * along
         gradient.tensions[index] += (p_difference * q).sum() + (by_tension * along).sum()
 
 
 def _stiffness(plan: Plan, families: Sequence[SpringFamily], foundation: Array, laplacian: Any, u: Array) -> csc_matrix:
-    """Assemble the tangent stiffness K for x, y and z of all mass points in turn [N/m]."""
+    """Assemble the tangent stiffness K [N/m], in the order x, y, z of each mass point."""
     from scipy import sparse
 
     shape = plan.scene.sheet.points
@@ -174,7 +172,7 @@ def _laplacian(plan: Plan) -> Any:
 
 
 def _run_interruptibly(work: Callable[[], Array | None], pause: Pause) -> Array | None:
-    """Run a function in a thread, with pauses meanwhile; an exception from a pause abandons the thread."""
+    """Run a function in a thread and call `pause` meanwhile; an exception from it abandons the thread."""
     future: Future[Array | None] = Future()
 
     def finish() -> None:
@@ -184,7 +182,7 @@ def _run_interruptibly(work: Callable[[], Array | None], pause: Pause) -> Array 
             future.set_exception(error)
 
     Thread(target=finish, daemon=True).start()
-    while wait([future], PAUSE_INTERVAL_S).not_done:
+    while wait([future], timeout=0.1).not_done:
         pause()
     return future.result()
 

@@ -9,14 +9,14 @@ from taichi_msm.render.config import Integers
 from taichi_msm.system.launches import Launches, end_thread
 from taichi_msm.system.runtime import compilation_options, ti
 
-# Offsets in the bounding box of a cell: its first and last column and row, clipped to the picture. The box of an
-# invisible cell is empty: its last column or row is before the first.
+# Offsets in the bounding box of a cell: its first and last column and row, clipped to the picture. For an invisible
+# cell, the last column or row is before the first one.
 FIRST_X, FIRST_Y, LAST_X, LAST_Y, BOUNDS_STRIDE = range(5)
 
-# Larger coordinates are clipped, so that they fit into an integer.
+# Limit of coordinates, so that they fit into an integer.
 MAX_BOUND = 1e6
 
-# Maximum number of entries in all lists, per cell and bin.
+# Maximum number of entries of all lists, per cell and per bin.
 MAX_MEAN_ENTRIES = 64
 
 # Maximum number of rounds of a binary search among the cells of a sheet.
@@ -27,7 +27,7 @@ class Bins(NamedTuple):
     """Lists of the cells that overlap each bin.
 
     Attributes:
-        size: width and height of a bin [px or samples, as the bounds].
+        size: width and height of a bin [px or samples].
         columns: number of bins in a row.
         lengths: number of cells in each list, shape (rows of bins, columns).
         starts: first entry of each list, then the end of the last one; on the device.
@@ -45,14 +45,11 @@ def build_bins(launches: Launches, bounds: Any, cells: int, extent: tuple[int, i
     """List the cells that overlap each bin: sequentially on a CPU, in parallel on a GPU.
 
     Args:
-        launches: launches on the device; a bounded one selects the parallel kernels.
+        launches: launches on the device; bounded ones, of a GPU, select the parallel kernels.
         bounds: bounding boxes as stored by `store_bounds`, on the device.
         cells: number of cells.
         extent: width and height of the picture, in the unit of the bounds.
-        size: width and height of a bin; doubled until the lists fit into `MAX_MEAN_ENTRIES` per cell and bin.
-
-    Returns:
-        The lists.
+        size: width and height of a bin; doubled until the lists have at most `MAX_MEAN_ENTRIES` per cell and bin.
     """
     if launches.bounded:
         return _build_in_parallel(launches, bounds, cells, extent, size)
@@ -97,14 +94,9 @@ def store_bounds(cell, left, right, top, bottom, width, height, bounds: ti.templ
     """Store the bounding box of a cell, clipped to the picture.
 
     Args:
-        cell: index of the cell.
-        left: left edge of the bounding box [px or samples].
-        right: right edge of the bounding box [px or samples].
-        top: top edge of the bounding box [px or samples].
-        bottom: bottom edge of the bounding box [px or samples].
-        width: width of the picture, in the same unit.
-        height: height of the picture, in the same unit.
-        bounds: destination, `BOUNDS_STRIDE` integers per cell.
+        left, right, top, bottom: edges of the bounding box [px or samples].
+        width, height: size of the picture, in the same unit.
+        bounds: bounding boxes of the cells, written; `BOUNDS_STRIDE` integers per cell.
     """
     entry = cell * BOUNDS_STRIDE
     bounds[entry + FIRST_X] = ti.cast(ti.floor(ti.math.clamp(left, 0.0, MAX_BOUND)), ti.i32)
@@ -115,14 +107,7 @@ def store_bounds(cell, left, right, top, bottom, width, height, bounds: ti.templ
 
 @ti.func
 def is_in_bounds(cell, x, y, bounds: ti.template()):
-    """Return whether (x, y) is within the bounding box of a cell.
-
-    Args:
-        cell: index of the cell.
-        x: column, in the unit of the bounds.
-        y: row, in the unit of the bounds.
-        bounds: bounding boxes as stored by `store_bounds`.
-    """
+    """Return whether column x and row y are within the bounding box of a cell, as stored by `store_bounds`."""
     entry = cell * BOUNDS_STRIDE
     return (
         bounds[entry + FIRST_X] <= x
@@ -169,7 +154,7 @@ def _list_cells(cells: ti.i32, size: ti.i32, columns: ti.i32, bounds: Integers, 
 
 @ti.func
 def owner_of(item, owners, ends: ti.template()):
-    """Return the owner of an item by binary search.
+    """Return the index of an item's owner, by binary search.
 
     Args:
         item: index of the item.

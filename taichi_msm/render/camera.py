@@ -34,28 +34,20 @@ Array = NDArray[np.float64]
 # Maximum valid radius of any lens.
 MAX_RADIUS = math.tan(math.radians(88))
 
-# Smaller coefficients have no effect within the maximum radius, and dividing by them may overflow.
+# Smaller coefficients have no effect within the maximum radius, and division by them may overflow.
 MIN_COEFFICIENT = 1e-100
 
 # Maximum residual of the undistortion, in normalised image coordinates; well below 1e-6 px.
 UNDISTORTION_TOLERANCE = 1e-11
-MAX_NEWTON_STEPS = 50
 
-# Number of radii that are tested for the first fold due to tangential distortion.
-FOLD_SAMPLES = 4096
-
-# At smaller radii a fisheye's quotient t / r is 1 to rounding.
+# At smaller radii the quotient t / r of a fisheye is rounded to 1.
 MIN_RADIUS = 1e-8
 
-# The oblique preset: 50 degrees above the sheet, from its lower edge, with a field of view in degrees.
+# The oblique preset: direction of the eye, 50 degrees above the sheet at its lower edge; field of view [degrees].
 OBLIQUE_DIRECTION = np.array([0.0, -0.64, 0.77])
 OBLIQUE_FOV = 32.0
-OBLIQUE_MARGIN = 1.04
 
-# Distance of the near plane, as a fraction of the sheet's diagonal.
-NEAR = 1e-6
-
-# Kernels multiply the matrix by the samples along a pixel, and hold the product in f32.
+# Kernels multiply the matrix by the samples along a side of a pixel, in f32.
 MAX_MATRIX_ENTRY = float(np.finfo(np.float32).max) / MAX_SUPERSAMPLE
 
 # Maximum baseline of a stereo pair, in units of the sheet's larger side.
@@ -64,14 +56,8 @@ MAX_BASELINE_RATIO = 1e6
 # Maximum time between the first two poses [s]; for more than two poses also in units of the scene's duration.
 MAX_GAP_S, MAX_GAP_RATIO = 1e5, 5
 
-# Maximum deviation of a rotation matrix from orthonormality.
-ROTATION_TOLERANCE = 1e-3
-
-# The keys of a camera that do not affect its extrinsics.
-OPTICAL_KEYS = {"fov", "intrinsics", "distortion", "outside"}
-
-# Signs between the axes right, up, toward the camera and OpenCV's right, down, forward.
-OPENCV = np.array([[1.0], [-1.0], [-1.0]])
+# Signs that convert the axes right, up, toward the camera to OpenCV's right, down, forward.
+OPENCV_SIGNS = np.array([[1.0], [-1.0], [-1.0]])
 
 
 class Lens(NamedTuple):
@@ -95,7 +81,7 @@ class Lens(NamedTuple):
         return self._distort_with_jacobian(points)[0]
 
     def jacobian(self, points: Array) -> Array:
-        """Return the derivatives of the distorted coordinates (rows) by the undistorted ones, shape (..., 2, 2)."""
+        """Return the Jacobian of `distort`, shape (..., 2, 2); the rows are those of the distorted coordinates."""
         return self._distort_with_jacobian(points)[1]
 
     def undistort(self, distorted: Array) -> Array:
@@ -105,7 +91,7 @@ class Lens(NamedTuple):
             distorted: distorted normalised image coordinates, shape (..., 2).
 
         Returns:
-            Undistorted coordinates, shape (..., 2); NaN beyond the limit of the lens.
+            Undistorted coordinates, shape (..., 2); NaN without a solution within the limit of the lens.
         """
         limit = self.limit
         # Without the limit itself, which may be a pole.
@@ -115,7 +101,7 @@ class Lens(NamedTuple):
         with np.errstate(invalid="ignore", divide="ignore"):
             points = np.where(distorted_radius > 0, distorted * (radius / distorted_radius), 0.0)
         error = np.full(distorted_radius.shape[:-1], np.inf)
-        for _ in range(MAX_NEWTON_STEPS):
+        for _ in range(50):
             image, jacobian = self._distort_with_jacobian(points)
             residual = distorted - image
             error = np.abs(residual).max(axis=-1)
@@ -133,7 +119,7 @@ class Lens(NamedTuple):
         return np.where(is_converged[..., None], points, np.nan)
 
     def _radial_distortion(self, r: Array) -> tuple[Array, Array]:
-        """Return R r, the distorted radius without tangential distortion, and its derivative by r."""
+        """Return the distorted radius R r without tangential distortion, and its derivative with respect to r."""
         if self.fisheye:
             t = np.arctan(r)
             polynomial = _fisheye_polynomial(self)
@@ -152,7 +138,7 @@ class Lens(NamedTuple):
         is_central = r < MIN_RADIUS
         safe_radius = np.where(is_central, 1.0, r)
         ratio = np.where(is_central, 1.0, distorted_radius / safe_radius)
-        # The derivative of the ratio by r, divided by r.
+        # The derivative of the ratio with respect to r, divided by r.
         slope = np.where(is_central, 0.0, (growth - ratio) / (safe_radius * safe_radius))
         p1, p2 = (0.0, 0.0) if self.fisheye else self.coefficients[2:4]
         distorted = np.stack(
@@ -179,7 +165,7 @@ def _fisheye_polynomial(lens: Lens) -> Polynomial:
 
 @lru_cache(maxsize=16)
 def _limit(lens: Lens) -> float:
-    """Compute the first radius at which the distorted radius stops increasing, or has a pole."""
+    """Compute the least radius at which the distortion folds or has a pole, at most `MAX_RADIUS`."""
     if lens.fisheye:
         fold_angles = _positive_roots(_fisheye_polynomial(lens).deriv())
         return min(MAX_RADIUS, math.tan(min([*fold_angles, math.radians(88)])))
@@ -190,7 +176,8 @@ def _limit(lens: Lens) -> float:
     tangential = math.hypot(*lens.coefficients[2:4])
     if tangential <= MIN_COEFFICIENT:
         return radial
-    radii = radial * np.linspace(0, 1, FOLD_SAMPLES + 1)[:-1]
+    # The first fold due to tangential distortion is searched among these radii, and then refined.
+    radii = radial * np.linspace(0, 1, 4097)[:-1]
     folded_indices = np.flatnonzero(_min_determinant(lens, radii, tangential) <= 0)
     if not len(folded_indices):
         return radial
@@ -205,8 +192,8 @@ def _min_determinant(lens: Lens, r: Any, tangential: float) -> Any:
     """Return the minimum of the Jacobian's determinant over all points at a radius r.
 
     With a = `tangential` r, and g the derivative of R r, the determinant is g R - 4 a^2 + 2 a (g + 3 R) c + 16 a^2 c^2,
-    where c is the cosine of the angle between the point and (p2, p1). The Jacobian is symmetric, and the identity on
-    the axis; so the lens does not fold within a circle where the minimum is positive.
+    where c is the cosine of the angle between the point and (p2, p1). The Jacobian is symmetric, and on the axis it is
+    the identity; so the lens does not fold within a circle where the minimum is positive.
     """
     r = np.maximum(r, MIN_RADIUS)
     distorted_radius, g = lens._radial_distortion(r)
@@ -226,28 +213,28 @@ IDENTITY_LENS = Lens(fisheye=False, coefficients=(0.0,) * 8)
 
 
 class View(NamedTuple):
-    """A resolved camera: the map from the world to pixels.
+    """Resolved camera: the map from the world to pixels.
 
     A point in the camera's frame is (right, up, -depth) [m] from the eye. Without lens distortion its pixel is
 
         x = centre_x + right / w scale_x,    y = centre_y - up / w scale_y    [px]
 
-    from the top-left corner, with w = depth for a pinhole camera, and w = 1 for the orthographic one, whose eye may be
-    anywhere on its plane. Lens distortion is applied to these pixels.
+    from the top-left corner, with w = depth for a pinhole camera, and w = 1 for the orthographic one. Lens distortion
+    is applied to these pixels.
 
     Attributes:
         matrix: maps (x, y, z, 1) [m] to (X, Y, w, depth) with x = X / w, y = Y / w, shape (4, 4).
         near: near plane [m]; only surfaces with a larger w are drawn.
-        axes: unit vectors right, up and toward the camera and its headlight, as rows, shape (3, 3).
+        axes: unit vectors right, up and toward the camera, as rows, shape (3, 3).
         eye: origin of the camera's frame and of depth [m], shape (3,).
         scale: pixels per metre at w = 1, horizontal and vertical, shape (2,).
         centre: principal point [px], shape (2,).
         size: width and height of the picture [px], shape (2,).
-        distance: from the eye to the target [m]; of a moving camera at the start.
+        distance: distance of the eye from the target [m]; for a moving camera that at the start.
         pinhole: whether the projection is perspective.
         lens: lens distortion; None if there is none.
-        baseline: distance to the companion camera of a stereo pair, along its x axis [m]; 0 without one.
-        light_view: view of the camera that carries the light; None if it is this one.
+        baseline: distance to the companion camera of a stereo pair, along the x axis [m]; 0 without one.
+        light_view: view of the camera at the light; None if it is this one.
     """
 
     matrix: Array
@@ -291,7 +278,7 @@ class View(NamedTuple):
         return self.distort(np.stack([x / w, y / w], axis=-1))
 
     def distort(self, pixels: Array) -> Array:
-        """Return the distorted pixels of undistorted ones [px], shape (..., 2); NaN beyond the limit of the lens."""
+        """Return distorted pixels [px], shape (..., 2); NaN beyond the limit of the lens."""
         if self.lens is None:
             return pixels
         points = (pixels - self.centre) / self.scale
@@ -306,7 +293,7 @@ class View(NamedTuple):
         return self.centre + self.scale * self.lens.undistort((pixels - self.centre) / self.scale)
 
     def disparity(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the disparity between this camera and its companion of a stereo pair, both without lens distortion.
+        """Return the disparity to the companion camera of a stereo pair without lens distortion.
 
         Args:
             depth: depths [m], any shape; 0 where no surface is visible.
@@ -318,7 +305,7 @@ class View(NamedTuple):
         return (self.scale[0] * self.baseline / w).astype(np.float32)
 
     def centred_at(self, pixel: tuple[float, float]) -> View:
-        """Return a view with X = Y = 0 on the line of sight through the centre of a pixel, counted from (0, 0)."""
+        """Return a view with X = Y = 0 on the line of sight through a pixel's centre; the first pixel is (0, 0)."""
         matrix, centre = self.matrix.copy(), self.undistort(np.array(pixel) + 0.5)
         for row in (0, 1):
             matrix[row] -= centre[row] * matrix[2]
@@ -328,14 +315,12 @@ class View(NamedTuple):
 def calibration(camera: View) -> dict[str, Any]:
     """Return the matrices of a camera in the conventions of other programs.
 
-    Args:
-        camera: the camera.
-
     Returns:
-        "projection", 3 x 4, with pixel = (P [x y z 1])_12 / (P [x y z 1])_3 from the picture's upper left corner,
-        without lens distortion. For a pinhole camera also, in OpenCV's axes (x right, y down, z forward): "intrinsics",
-        3 x 3, and "pose", 3 x 4, from the world to the camera. With OpenCV's pixel coordinates, where the centre of the
-        first pixel is (0, 0): "calibration", 3 x 3, with "model" and "distortion", the coefficients in OpenCV's order.
+        "projection": 3 x 4 matrix P from the world to pixels, counted from the picture's upper left corner, without
+        lens distortion. For a pinhole camera also, in OpenCV's axes (x right, y down, z forward), "pose": 3 x 4 matrix
+        from the world to the camera; "intrinsics": 3 x 3 matrix to the same pixels; "calibration": 3 x 3 matrix to
+        OpenCV's pixels, where the centre of the first one is (0, 0); "model" and "distortion": lens model and its
+        coefficients in OpenCV's order.
     """
     matrices: dict[str, Any] = {"projection": camera.matrix[:3].tolist()}
     if camera.pinhole:
@@ -350,23 +335,16 @@ def calibration(camera: View) -> dict[str, Any]:
 
 
 def pose(camera: View) -> list[list[float]]:
-    """Return rotation and translation from the world to the camera, in OpenCV's axes, 3 x 4."""
-    rotation = camera.axes * OPENCV
+    """Return rotation and translation from the world to a camera, in OpenCV's axes, shape (3, 4)."""
+    rotation = camera.axes * OPENCV_SIGNS
     return np.concatenate([rotation, -rotation @ camera.eye[:, None]], axis=1).tolist()
 
 
 def view(scene: Scene, time: float = 0.0) -> View:
-    """Resolve the main camera of a scene.
-
-    Args:
-        scene: the scene.
-        time: time [s].
-
-    Returns:
-        The view.
+    """Resolve the main camera of a scene at a time [s].
 
     Raises:
-        SceneError: if any camera of the scene is invalid.
+        SceneError: when any camera of the scene is invalid.
     """
     if problems := [str(problem) for problem in camera_problems(scene)]:
         raise SceneError(problems)
@@ -374,16 +352,7 @@ def view(scene: Scene, time: float = 0.0) -> View:
 
 
 def view_at(scene: Scene, time: float, name: str = "") -> View:
-    """Resolve a camera of a scene, which must be valid.
-
-    Args:
-        scene: the scene.
-        time: time [s].
-        name: name of the camera; empty for the main camera.
-
-    Returns:
-        The view.
-    """
+    """Resolve a valid camera of a scene at a time [s]; without a name, the main camera."""
     render = scene.render
     name = name or render.main
     camera, baseline = render.origin(name)
@@ -400,21 +369,16 @@ def view_at(scene: Scene, time: float, name: str = "") -> View:
 
 
 def is_moving(scene: Scene, name: str = "") -> bool:
-    """Return whether a camera moves.
-
-    Args:
-        scene: the scene.
-        name: name of the camera; empty for the main camera.
-    """
+    """Return whether a camera moves; without a name, the main camera."""
     camera, _ = scene.render.origin(name or scene.render.main)
     return isinstance(camera, Camera) and camera.moves
 
 
 def camera_problems(scene: Scene) -> Iterator[Problem]:
-    """List the reasons why cameras of a scene are invalid, and why a requested disparity is impossible."""
+    """List the problems of the cameras of a scene and of a requested disparity."""
     is_valid = True
     for name, camera in scene.render.all_cameras.items():
-        problem = next(_problems_of(camera, scene, name), None) if isinstance(camera, Camera) else None
+        problem = next(_single_camera_problems(camera, scene, name), None) if isinstance(camera, Camera) else None
         if problem is not None:
             key: Key = ("render", "cameras", name) if name else ("render", "camera")
             yield Problem(key + problem.path, problem.message)
@@ -423,10 +387,10 @@ def camera_problems(scene: Scene) -> Iterator[Problem]:
         yield from _disparity_problems(scene)
 
 
-def _problems_of(camera: Camera, scene: Scene, name: str) -> Iterator[Problem]:
+def _single_camera_problems(camera: Camera, scene: Scene, name: str) -> Iterator[Problem]:
     """List the problems of a camera; keys are relative to its section."""
     if camera.beside is None:
-        yield from _place_problems(camera, scene)
+        yield from _extrinsics_problems(camera, scene)
         if camera.distortion is not None and camera.outside == "refuse":
             yield from _lens_problems(view_at(scene, 0.0, name))
     elif abs(scene.render.origin(name)[1]) > MAX_BASELINE_RATIO * max(scene.sheet.size):
@@ -451,11 +415,11 @@ def _disparity_problems(scene: Scene) -> Iterator[Problem]:
             return
 
 
-def _place_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
+def _extrinsics_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
     """List the problems of a camera's extrinsics at any frame; keys are relative to its section."""
     if camera.pose is not None:
         rotation = np.array(camera.pose.rotation)
-        if not (np.abs(rotation @ rotation.T - np.eye(3)).max() <= ROTATION_TOLERANCE and np.linalg.det(rotation) > 0):
+        if not (np.abs(rotation @ rotation.T - np.eye(3)).max() <= 1e-3 and np.linalg.det(rotation) > 0):
             deviation = np.abs(rotation @ rotation.T - np.eye(3)).max()
             fault = f"no rotation: products of its rows are off by {deviation:.2g}"
             if np.linalg.det(rotation) < 0:
@@ -484,7 +448,7 @@ def _place_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
             return
     if camera.eye is None and extrinsics(camera, 0.0).distance < MIN_MAGNITUDE:
         message = "puts the eye on the middle of the sheet, which the light's strength depends on; move it away"
-        yield Problem((_place_key(camera),), message)
+        yield Problem((_extrinsics_key(camera),), message)
         return
     rate = scene.time.frames_per_second
     for time in [frame / rate for frame in range(scene.time.frames + 1)] if camera.moves else [0.0]:
@@ -506,17 +470,17 @@ def _place_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
                 message = f"{eye} is too far away for {camera.fov:g} degrees{when}; move it nearer or widen fov"
             else:
                 message = f"is too far away for its focal length{when}; move it nearer"
-            yield Problem((_place_key(camera),), message)
+            yield Problem((_extrinsics_key(camera),), message)
             return
 
 
-def _place_key(camera: Camera) -> str:
+def _extrinsics_key(camera: Camera) -> str:
     """Return the key that defines the extrinsics of a camera."""
     return next(name for name in ("eye", "pose", "poses") if getattr(camera, name) is not None)
 
 
 def _lens_problems(camera: View) -> Iterator[Problem]:
-    """List folds of the lens distortion within the picture; keys are relative to the camera's section."""
+    """Report a fold of the lens distortion within the picture; keys are relative to the camera's section."""
     if camera.lens is None or not np.isnan(camera.undistort(border_points(camera.size))).any():
         return
     fault = "folds back" if camera.lens.limit < MAX_RADIUS else "reaches 88 degrees"
@@ -543,16 +507,9 @@ def border_points(size: Array) -> Array:
 
 
 def pinhole(scene: Scene, time: float = 0.0) -> Camera:
-    """Return the main camera of a scene at a time as a static pinhole camera.
+    """Return the main camera of a scene at a time [s] as a static pinhole camera.
 
     An orthographic camera becomes a pinhole camera above the sheet, at the same scale.
-
-    Args:
-        scene: the scene.
-        time: time [s].
-
-    Returns:
-        The camera.
     """
     camera = scene.render.main_camera
     if isinstance(camera, Camera):
@@ -564,19 +521,12 @@ def pinhole(scene: Scene, time: float = 0.0) -> Camera:
 
 
 def frozen_camera(camera: Camera, time: float) -> Camera:
-    """Return a static camera with eye, target and up, equal to another one at a time.
-
-    Args:
-        camera: the camera.
-        time: time [s].
-
-    Returns:
-        The static camera; the same object if it has no pose and does not move.
-    """
+    """Return a camera at a time [s] as a static camera with eye, target and up."""
     if camera.pose is None and not camera.moves:
         return camera
     eye, axes, distance = extrinsics(camera, time)
-    optics = {name: getattr(camera, name) for name in camera.model_fields_set & OPTICAL_KEYS}
+    optical_keys = camera.model_fields_set & {"fov", "intrinsics", "distortion", "outside"}
+    optics = {name: getattr(camera, name) for name in optical_keys}
     target = eye - distance * axes[2]
     return Camera(eye=tuple(eye.tolist()), target=tuple(target.tolist()), up=tuple(axes[1].tolist()), **optics)
 
@@ -588,9 +538,6 @@ def orbit_camera(camera: Camera, right: float, up: float) -> Camera:
         camera: the camera.
         right: angle about the normal of the sheet [rad].
         up: angle about the camera's horizontal axis [rad].
-
-    Returns:
-        The rotated camera.
     """
     eye, (across, _, toward), _ = extrinsics(camera, 0.0)
     rotation = _rotation(np.array([0.0, 0.0, 1.0]), right) @ _rotation(across, -up)
@@ -607,7 +554,7 @@ def _rotation(axis: Array, angle: float) -> Array:
 
 
 def _top_scale(scene: Scene) -> float:
-    """Return the pixels per metre at which the sheet at rest fits into the picture."""
+    """Return the scale at which the sheet at rest fits the picture [px/m]."""
     (height, width), (columns, lines) = scene.sheet.size, scene.render.size
     return min(columns / width, lines / height)
 
@@ -627,7 +574,7 @@ def _top(scene: Scene) -> View:
 def _pinhole(camera: Camera, scene: Scene, time: float) -> View:
     columns, lines = scene.render.size
     eye, axes, distance = extrinsics(camera, time)
-    # The intensity of the light is constant while the camera moves.
+    # The intensity of the light does not change while the camera moves.
     distance = extrinsics(camera, 0.0).distance if camera.moves else distance
     right, up, depth = axes * np.array([[1.0], [1.0], [-1.0]])
     if (intrinsics := camera.intrinsics) is not None:
@@ -638,7 +585,7 @@ def _pinhole(camera: Camera, scene: Scene, time: float) -> View:
         x, y = columns / 2, lines / 2
     rows = [focal_x * right + x * depth, -focal_y * up + y * depth, depth, depth]
     matrix = np.array([[*row, -row @ eye] for row in rows])
-    near, size = NEAR * math.hypot(*scene.sheet.size), np.array([columns, lines], float)
+    near, size = 1e-6 * math.hypot(*scene.sheet.size), np.array([columns, lines], float)
     distortion = camera.distortion
     lens = None if distortion is None else Lens(distortion.model == "fisheye", distortion.coefficients)
     scale, centre = np.array([focal_x, focal_y]), np.array([x, y])
@@ -647,14 +594,14 @@ def _pinhole(camera: Camera, scene: Scene, time: float) -> View:
 
 
 def _oblique(scene: Scene) -> Camera:
-    """Return the oblique preset, as close as the whole sheet at rest allows."""
+    """Return the oblique preset, at a distance where the sheet at rest fits the picture with a margin of 4 %."""
     (height, width), (columns, lines) = scene.sheet.size, scene.render.size
     toward = OBLIQUE_DIRECTION / np.linalg.norm(OBLIQUE_DIRECTION)
     axes = extrinsics(Camera(eye=tuple(toward), fov=OBLIQUE_FOV), 0.0).axes
     corners = np.array([[x, y, 0.0] for x in (-width / 2, width / 2) for y in (-height / 2, height / 2)]) @ axes.T
     half_height = np.tan(np.radians(OBLIQUE_FOV) / 2)
     half = np.array([half_height * columns / lines, half_height])
-    distance = float((corners[:, 2:] + np.abs(corners[:, :2]) / half).max()) * OBLIQUE_MARGIN
+    distance = float((corners[:, 2:] + np.abs(corners[:, :2]) / half).max()) * 1.04
     return Camera(eye=tuple(distance * toward), fov=OBLIQUE_FOV)
 
 
@@ -664,7 +611,7 @@ class Extrinsics(NamedTuple):
     Attributes:
         eye: position [m], shape (3,).
         axes: unit vectors right, up and toward the camera, as rows, shape (3, 3).
-        distance: from the eye to the target, for a pose to the centre of the sheet at rest [m].
+        distance: distance of the eye from the target, for a pose from the centre of the sheet at rest [m].
     """
 
     eye: Array
@@ -673,34 +620,26 @@ class Extrinsics(NamedTuple):
 
 
 def extrinsics(camera: Camera, time: float) -> Extrinsics:
-    """Evaluate the extrinsics of a camera.
-
-    Args:
-        camera: the camera.
-        time: time [s].
-
-    Returns:
-        Position and orientation at this time.
-    """
+    """Return the extrinsics of a camera at a time [s]."""
     if camera.pose is not None:
         rotation = nearest_rotation(np.array(camera.pose.rotation))
         eye = -rotation.T @ np.array(camera.pose.translation)
-        return Extrinsics(eye, rotation * OPENCV, float(np.linalg.norm(eye)))
+        return Extrinsics(eye, rotation * OPENCV_SIGNS, float(np.linalg.norm(eye)))
     if camera.poses is not None:
         assert not isinstance(camera.poses, str)
         eye, rotation = _interpolate(camera.poses, time)
-        return Extrinsics(eye, rotation.T * OPENCV, float(np.linalg.norm(eye)))
+        return Extrinsics(eye, rotation.T * OPENCV_SIGNS, float(np.linalg.norm(eye)))
     assert camera.eye is not None
     eye, target, up = (interpolate_keyframes(value, time) for value in (camera.eye, camera.target, camera.up))
     return Extrinsics(np.array(eye), look_at_axes(eye, target, up), math.dist(eye, target))
 
 
 def look_at_axes(eye: Sequence[float], target: Sequence[float], up: Sequence[float]) -> Array:
-    """Return the look-at axes of a camera: unit vectors right, up and toward the eye, as rows, shape (3, 3).
+    """Return the axes of a camera: unit vectors right, up and toward the eye, as rows, shape (3, 3).
 
     Args:
         eye: position [m].
-        target: point in the centre of the picture [m].
+        target: point at the centre of the picture [m].
         up: direction that appears vertical in the picture; any length, not along the line of sight.
     """
     toward = normalised(np.subtract(eye, target))
@@ -715,25 +654,22 @@ def normalised(vector: Array) -> Array:
 
 
 def rescaled(vector: Array) -> Array:
-    """Multiply a vector by a power of 2, which is exact, so that its squares neither overflow nor vanish."""
+    """Scale a vector by a power of 2, which is exact, so that its squares neither overflow nor underflow."""
     return np.ldexp(vector, -math.frexp(float(np.abs(vector).max()))[1])
 
 
 def nearest_rotation(matrix: Array) -> Array:
-    """Return the orthonormal matrix nearest to a matrix."""
+    """Return the nearest orthonormal matrix."""
     left, _, right = np.linalg.svd(matrix)
     return np.asarray(left @ right)
 
 
 def interpolate_keyframes(value: Sequence[float] | Sequence[Sequence[float]], time: float) -> Sequence[float]:
-    """Interpolate keyframes of a vector linearly; outside them it is constant.
+    """Interpolate keyframes of a vector linearly; it is constant outside of them.
 
     Args:
         value: a constant vector, shape (3,), or keyframes (time [s], x, y, z), shape (n, 4).
         time: time [s].
-
-    Returns:
-        The vector, shape (3,).
     """
     keys = np.array(value)
     if keys.ndim == 1:

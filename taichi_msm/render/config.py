@@ -1,13 +1,29 @@
 """Compile-time configuration and G-buffer layout of the rasteriser (kernel 2).
 
-A sample is a pixel, or one of several per pixel with supersampling. A tile of samples is one vector: 4 x 4 samples for
-the 16 lanes of AVX-512, 4 x 2 for 8 lanes, 4 x 1 for 4 lanes, and a single sample on a GPU. The G-buffer has several
-vectors per tile, its planes. On a CPU a band of rows of tiles is the unit of parallel work; each worker stores one
-band.
+A sample is a pixel, or with supersampling one of several per pixel. The samples of a tile form a vector: 4 x 4 samples
+for the 16 lanes of AVX-512, 4 x 2 for 8 lanes, 4 x 1 for 4 lanes, and a single sample on a GPU. The G-buffer has
+several vectors per tile, its planes. On a CPU a band of rows of tiles is the unit of parallel work, and each worker has
+memory for one band.
 
-Arguments that the functions of kernel 2 share: `x` and `y` are the column and row of a tile's samples, one number per
-lane; `entry` is the first entry of a tile in `samples`; `uniforms` and `sizes` are the arrays of uniforms.py; `nodes`
-holds the projected mass points as stored by `project`.
+Arguments that the functions of kernel 2 share, and that their docstrings omit:
+
+    config                compile-time configuration
+    uniforms, sizes       constants of the view; sizes and counters (uniforms.py)
+    position              positions of the mass points [m], shape (rows, cols, 3)
+    rows, cols; i, j      number of rows and columns of mass points; row and column of one
+    nodes                 projected mass points, as stored by `project`
+    corner                first entry of a cell's upper left mass point in `nodes`
+    near, depth           near plane [m]; depth [m]
+    facing                1 if the front of a cell is visible, -1 for its back
+    quad_column, quad_row column and row of sub-quads in their cell
+    s, t                  coordinates on a triangle, to the right and down
+    normal                list of three components, of any length
+    samples               G-buffer; with lens distortion also the undistortion map
+    entry                 first entry of a tile in the G-buffer
+    left, top             first column and row of a tile [samples]
+    x, y                  columns and rows of the undistorted samples of a tile, one number per lane
+    lens                  lens model, "pinhole" or "fisheye"; empty without lens distortion
+    first, end, ended     first index of a launch; index after the last one; counter of finished threads (`end_thread`)
 
 Modules with kernels have no `from __future__ import annotations`, because Taichi reads the annotations.
 """
@@ -19,7 +35,7 @@ from typing import Any, NamedTuple
 from taichi_msm.render.labels import LABELS
 from taichi_msm.system.runtime import ti
 
-# Approximate number of rows of samples in a band on a CPU.
+# Approximate number of rows of samples in a band, on a CPU.
 BAND_ROWS = 16
 
 # Maximum number of samples in a row of a tile.
@@ -82,7 +98,7 @@ class DrawingConfig(NamedTuple):
 
     @property
     def unordered(self) -> bool:
-        """Whether the cells of a sample are processed in arbitrary order, as on a GPU, and not row by row."""
+        """Whether the cells at a sample are processed in arbitrary order, as on a GPU, instead of row by row."""
         return self.lanes == 1
 
     @property
@@ -104,7 +120,7 @@ class DrawingConfig(NamedTuple):
     def map_planes(self) -> int:
         """Vectors per tile of the undistortion map; 0 without lens distortion.
 
-        They are x and y, the steps to the next samples (`lens_table.undistortion_map`), and on a CPU a bounding box.
+        They are x and y, the steps to the next samples (`lens_table.undistortion_map`), and on a CPU the bounding box.
         """
         return (6 if self.map_has_steps else 2) + (not self.unordered) if self.lens else 0
 
@@ -115,7 +131,7 @@ class DrawingConfig(NamedTuple):
 
     @property
     def band_map_vectors(self) -> int:
-        """Vectors of the undistortion map per column of tiles in a band on a CPU, without the bounds."""
+        """Vectors of the undistortion map per column of tiles in a band on a CPU, without the band's bounding box."""
         return self.band_lines * self.map_planes
 
     @property
@@ -168,7 +184,7 @@ def _planes(config: DrawingConfig) -> Any:
 
 
 class Band(NamedTuple):
-    """A band of the picture, or a part of a band, with the view; all lengths in samples.
+    """Band of the picture, or a part of one, with the view; lengths are in samples.
 
     Attributes:
         config: compile-time configuration.
@@ -203,11 +219,8 @@ def clip(low_x, high_x, low_y, high_y, band: ti.template()):
     """Clip a rectangle to a band.
 
     Args:
-        low_x: least column of the rectangle [samples].
-        high_x: largest column of the rectangle [samples].
-        low_y: least row of the rectangle [samples].
-        high_y: largest row of the rectangle [samples].
-        band: the band.
+        low_x, high_x: edges of the rectangle, left and right [samples].
+        low_y, high_y: edges of the rectangle, upper and lower [samples].
 
     Returns:
         First and end column, first and end row of samples.
@@ -225,11 +238,8 @@ def tile_range(first_column, end_column, first_row, end_row, band: ti.template()
     """Return the tiles that a rectangle of samples overlaps.
 
     Args:
-        first_column: first column of the rectangle [samples].
-        end_column: column after the last one of the rectangle [samples].
-        first_row: first row of the rectangle [samples].
-        end_row: row after the last one of the rectangle [samples].
-        band: the band.
+        first_column, end_column: first column of the rectangle, and the column after the last one [samples].
+        first_row, end_row: first row, and the row after the last one [samples].
 
     Returns:
         First and end tile in a row of tiles, first and end row of tiles, both counted from the band's top.
@@ -245,13 +255,7 @@ def tile_range(first_column, end_column, first_row, end_row, band: ti.template()
 
 @ti.func
 def sample_centres(left, top, config: ti.template()):
-    """Return x and y of the sample centres of a tile [samples].
-
-    Args:
-        left: left edge of the tile [samples].
-        top: top edge of the tile [samples].
-        config: compile-time configuration.
-    """
+    """Return x and y of the sample centres of a tile [samples]."""
     tile_width = ti.static(config.tile_width)
     columns = config.float_vector([lane % tile_width + 0.5 for lane in ti.static(range(config.lanes))])
     lines = config.float_vector([lane // tile_width + 0.5 for lane in ti.static(range(config.lanes))])
@@ -263,11 +267,7 @@ def undistorted_centres(left, top, entry, samples: ti.template(), config: ti.tem
     """Return the undistorted x and y of the sample centres of a tile [samples].
 
     Args:
-        left: left edge of the tile [samples].
-        top: top edge of the tile [samples].
         entry: first entry of the tile in the undistortion map.
-        samples: G-buffer and undistortion map.
-        config: compile-time configuration.
     """
     x, y = sample_centres(left, top, config)
     if ti.static(config.has_distortion):
@@ -277,25 +277,13 @@ def undistorted_centres(left, top, entry, samples: ti.template(), config: ti.tem
 
 @ti.func
 def map_entry(entry, band: ti.template()):
-    """Return the first entry of a tile in the undistortion map.
-
-    Args:
-        entry: first entry of the tile in the G-buffer.
-        band: the band.
-    """
+    """Return the first entry of a tile in the undistortion map."""
     return band.map_start + (entry - band.first) // band.config.planes * band.config.map_planes
 
 
 @ti.func
 def tile_box(entry, left, top, band: ti.template()):
-    """Return the bounding box of the undistorted sample centres of a tile: left, right, top and bottom [samples].
-
-    Args:
-        entry: first entry of the tile in the G-buffer.
-        left: left edge of the tile [samples].
-        top: top edge of the tile [samples].
-        band: the band.
-    """
+    """Return the bounding box of the undistorted sample centres of a tile: left, right, top and bottom [samples]."""
     config = ti.static(band.config)
     x, y = left + 0.5, top + 0.5
     box = [x, x + (config.tile_width - 1.0), y, y + (config.tile_height - 1.0)]
@@ -311,11 +299,7 @@ def tile_box(entry, left, top, band: ti.template()):
 
 @ti.func
 def map_steps(entry, band: ti.template()):
-    """Return the undistorted steps from the samples of a tile to the next ones on the right and below [samples].
-
-    Args:
-        entry: first entry of the tile in the G-buffer.
-        band: the band.
+    """Return the steps from the samples of a tile to the next ones on the right and below, undistorted [samples].
 
     Returns:
         x and y of the step to the right, x and y of the step downward.
@@ -326,12 +310,7 @@ def map_steps(entry, band: ti.template()):
 
 @ti.func
 def clear_tile(entry, band: ti.template()):
-    """Mark the samples of a tile as empty.
-
-    Args:
-        entry: first entry of the tile in the G-buffer.
-        band: the band.
-    """
+    """Mark the samples of a tile as empty."""
     band.samples[entry + band.config.plane.depth] = band.config.float_vector(INFINITY)
     if ti.static(band.config.instruments):
         band.samples[entry + band.config.plane.instrument] = band.config.float_vector(0)
@@ -345,7 +324,6 @@ def store_visible(entry, visible, value, samples: ti.template()):
         entry: entry of the plane's vector in `samples`.
         visible: mask of the samples.
         value: values, one per lane.
-        samples: G-buffer.
     """
     samples[entry] = ti.select(visible, value, samples[entry])
 
@@ -358,7 +336,6 @@ def store_visible_unit(entry, visible, vector: ti.template(), samples: ti.templa
         entry: entry of the first plane's vector in `samples`.
         visible: mask of the samples.
         vector: list of three components, one number per lane.
-        samples: G-buffer.
     """
     length = ti.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
     for n in ti.static(range(3)):

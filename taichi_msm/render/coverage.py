@@ -1,13 +1,13 @@
 """Coverage: the nearest surface at every sample, of the sheet and of the instruments.
 
-Vertices are not stored. For a sample inside the outline of a cell, the two equations of geometry.py yield the sub-quad;
-the side of the sub-quad's diagonal yields the triangle; and the two linear equations of the triangle yield the point on
-it. A cell that is folded or extends behind the camera is drawn triangle by triangle instead.
+Vertices are not stored. For a sample inside the outline of a cell, the two equations of geometry.py yield the sub-quad,
+the side of the sub-quad's diagonal the triangle, and the two linear equations of the triangle the point on it. A cell
+that is folded or extends behind the camera is drawn triangle by triangle instead.
 
-An instrument is a capsule: all points within its radius of the line segment from the centre A of its tip to A + U
-length. The line of sight through a sample is P = O + D t, where t is the depth. On the cylinder the component of P - A
-perpendicular to U has the radius as its length, which is a quadratic equation for t. Where its solution lies beyond an
-end of the segment, the line of sight is intersected with the sphere around that end instead.
+An instrument is a capsule: all points within a radius of the line segment from the centre A of its tip to A + length U.
+The line of sight through a sample is P = O + D t, where t is the depth. On the cylinder the component of P - A
+perpendicular to U is as long as the radius, a quadratic equation for t. Where its solution is beyond an end of the
+segment, the line of sight is intersected with the sphere around that end.
 
 To add an output per pixel, add its planes in labels.py or config.py and its values in `store_surface`.
 """
@@ -33,23 +33,21 @@ from taichi_msm.render.lens_kernels import DISTORTED_STRIDE
 from taichi_msm.render.lens_table import INVALID_COORDINATE
 from taichi_msm.system.runtime import ti
 
-# Numbers per unit normal; the normals are stored after the other numbers of all mass points.
+# Numbers per unit normal; in `nodes` the normals follow the projected mass points.
 NORMAL_STRIDE = 3
 
-# Maximum footprint: covers any texture [texels squared].
+# Maximum footprint, above that of any texture.
 MAX_FOOTPRINT = 1e12
 
 
 class DrawnSheet(NamedTuple):
-    """The projected mass points and the size of the sheet.
+    """Projected mass points and texture size of the sheet.
 
     Attributes:
-        nodes: numbers of every mass point, `NODE_STRIDE` each, then the normals.
-        rows: number of rows of mass points.
-        cols: number of columns of mass points.
+        nodes: projected mass points, `NODE_STRIDE` numbers each; then the normals.
+        rows, cols: number of rows and columns of mass points.
         subdivisions: number of sub-quads along a side of a cell.
-        texture_width: width of the texture [texels].
-        texture_height: height of the texture [texels].
+        texture_width, texture_height: size of the texture [texels].
         distorted_start: entry of `nodes` at which the distorted mass points begin, with lens distortion.
     """
 
@@ -63,20 +61,15 @@ class DrawnSheet(NamedTuple):
 
 
 class Cell(NamedTuple):
-    """A cell and its position on the sheet and on the texture.
+    """Cell with its position on the sheet and on the texture.
 
     Attributes:
         patch: surface of the cell.
-        i: row of the cell.
-        j: column of the cell.
-        rows: number of rows of cells of the sheet.
-        cols: number of columns of cells of the sheet.
-        texel_x: integer part of the texture coordinate of the upper left mass point, horizontal [texels].
-        texel_y: integer part of that coordinate, vertical [texels].
-        fraction_x: fractional part of that coordinate, horizontal.
-        fraction_y: fractional part of that coordinate, vertical.
-        texels_across: width of the cell [texels].
-        texels_down: height of the cell [texels].
+        i, j: row and column of the cell.
+        rows, cols: number of rows and columns of cells of the sheet.
+        texel_x, texel_y: integer part of the texture coordinates of the upper left mass point [texels].
+        fraction_x, fraction_y: fractional part of these coordinates [texels].
+        texels_across, texels_down: width and height of the cell [texels].
         normal: entry of the normal at the upper left mass point.
     """
 
@@ -95,12 +88,11 @@ class Cell(NamedTuple):
 
 
 class Part(NamedTuple):
-    """The part of a cell that a thread of a GPU covers.
+    """Part of a cell that a thread of a GPU covers.
 
     Attributes:
-        invertible: whether the cell is drawn by inverting its bilinear map; the part is then the whole cell.
-        first: otherwise, the first triangle of the part.
-        end: otherwise, the triangle after the last one.
+        invertible: whether the cell is drawn by inverting its bilinear map; the part is then the entire cell.
+        first, end: otherwise, the first triangle of the part, and the triangle after the last one.
     """
 
     invertible: Any
@@ -115,12 +107,8 @@ def max_edge(p_x, p_y, q_x, q_y, box: ti.template(), facing):
     It is rounded as `geometry.edge` is, so that no tile with a sample inside is skipped.
 
     Args:
-        p_x: x of the edge's first end [samples].
-        p_y: y of the edge's first end [samples].
-        q_x: x of the edge's second end [samples].
-        q_y: y of the edge's second end [samples].
+        p_x, p_y, q_x, q_y: ends of the edge [samples].
         box: left, right, top and bottom [samples].
-        facing: 1 or -1, as for `geometry.edge`.
     """
     left, right, top, bottom = ti.static(box)
     x = ti.select((q_y - p_y) * facing > 0.0, left, right)
@@ -130,13 +118,7 @@ def max_edge(p_x, p_y, q_x, q_y, box: ti.template(), facing):
 
 @ti.func
 def may_cover(box: ti.template(), facing, outline: ti.template()):
-    """Return whether a cell may cover samples within a box.
-
-    Args:
-        box: left, right, top and bottom [samples].
-        facing: 1 if the front of the cell is visible, -1 for its back.
-        outline: outline of the cell.
-    """
+    """Return whether a cell may cover samples within a box: left, right, top and bottom [samples]."""
     p, q = ti.static((outline.x, outline.y))
     return (
         max_edge(p[0], q[0], p[2], q[2], box, -facing) >= 0.0
@@ -154,17 +136,9 @@ def cover_tile(
     """Cover a tile of samples with sub-quads of a cell, one per sample.
 
     Args:
-        entry: first entry of the tile in the G-buffer.
-        x: column of the undistorted samples.
-        y: row of the undistorted samples.
         inside: mask of the samples that the cell covers.
-        quad_column: column of the sub-quads in the cell.
-        quad_row: row of the sub-quads in the cell.
         lower: whether the triangle below the diagonal is drawn, if the cell is drawn triangle by triangle.
         enlargement: fraction of its side by which that triangle is enlarged.
-        cell: the cell.
-        sheet: the sheet.
-        band: the band.
     """
     config = ti.static(band.config)
     plane = ti.static(config.plane)
@@ -195,11 +169,8 @@ def cover_cell(i, j, part: ti.template(), sheet: ti.template(), band: ti.templat
     """Cover the samples of a band with a cell.
 
     Args:
-        i: row of the upper left mass point of the cell.
-        j: column of the upper left mass point of the cell.
+        i, j: row and column of the upper left mass point of the cell.
         part: part of the cell that is drawn, on a GPU; ignored on a CPU.
-        sheet: the sheet.
-        band: the band.
     """
     config, float_vector = ti.static((band.config, band.config.float_vector))
     corner = (i * sheet.cols + j) * geometry.NODE_STRIDE
@@ -249,7 +220,7 @@ def cover_cell(i, j, part: ti.template(), sheet: ti.template(), band: ti.templat
             x, y = sample_centres(tile_x, tile_y, config)
             inside = float_vector(1) > 0.0
             quad_column, quad_row = float_vector(quad_s), float_vector(quad_t)
-            # The last round only covers the pending tile.
+            # The last iteration only covers the pending tile.
             overlaps = True
             if n < tiles:
                 if ti.static(config.has_distortion):
@@ -297,12 +268,6 @@ def _dot(a_x, a_y, a_z, b_x, b_y, b_z):
 def intersect_capsule(x, y, index, uniforms: ti.template()):
     """Intersect lines of sight with an instrument.
 
-    Args:
-        x: column of the undistorted samples.
-        y: row of the undistorted samples.
-        index: index of the instrument.
-        uniforms: constants of the view.
-
     Returns:
         Depth of the first intersection [m], INFINITY without one; three components of the normal times the radius.
     """
@@ -348,15 +313,7 @@ def intersect_capsule(x, y, index, uniforms: ti.template()):
 
 @ti.func
 def cover_tile_with_capsule(entry, x, y, index, band: ti.template()):
-    """Cover a tile of samples with an instrument.
-
-    Args:
-        entry: first entry of the tile in the G-buffer.
-        x: column of the undistorted samples.
-        y: row of the undistorted samples.
-        index: index of the instrument.
-        band: the band.
-    """
+    """Cover a tile of samples with an instrument."""
     plane, samples = ti.static((band.config.plane, band.samples))
     depth, n_x, n_y, n_z = intersect_capsule(x, y, index, band.uniforms)
     visible = (w_at(depth, band.uniforms) > band.near) & (depth < samples[entry + plane.depth])
@@ -375,12 +332,7 @@ def cover_tile_with_capsule(entry, x, y, index, band: ti.template()):
 
 @ti.func
 def cover_capsules(count, band: ti.template()):
-    """Cover a band with the instruments.
-
-    Args:
-        count: number of instruments.
-        band: the band.
-    """
+    """Cover a band with the instruments."""
     config, uniforms = ti.static((band.config, band.uniforms))
     for index in range(count):
         capsule = uni.CAPSULES + index * uni.CAPSULE_STRIDE
@@ -410,14 +362,7 @@ def cover_capsules(count, band: ti.template()):
 
 @ti.func
 def cell_at(i, j, patch: ti.template(), sheet: ti.template()):
-    """Return the cell with a mass point as its upper left corner.
-
-    Args:
-        i: row of the mass point.
-        j: column of the mass point.
-        patch: surface of the cell.
-        sheet: the sheet.
-    """
+    """Return the cell with a mass point as its upper left corner."""
     # In f64, for the accuracy of a fraction of a texel on any sheet.
     texel_x = ti.cast(j, ti.f64) * sheet.texture_width / (sheet.cols - 1) - 0.5
     texel_y = ti.cast(i, ti.f64) * sheet.texture_height / (sheet.rows - 1) - 0.5
@@ -441,18 +386,7 @@ def cell_at(i, j, patch: ti.template(), sheet: ti.template()):
 def store_normal(
     position: ti.template(), i, j, rows, cols, config: ti.template(), uniforms: ti.template(), nodes: ti.template()
 ):
-    """Store the normal of the sheet at a mass point, if the shading uses it; for tissue in the camera's frame.
-
-    Args:
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        i: row of the mass point.
-        j: column of the mass point.
-        rows: number of rows of mass points.
-        cols: number of columns of mass points.
-        config: compile-time configuration.
-        uniforms: constants of the view.
-        nodes: destination, after the numbers of all mass points.
-    """
+    """Store the normal of the sheet at a mass point in `nodes`, if the shading uses it; for tissue in camera axes."""
     if ti.static(config.headlit or config.tissue):
         i0, i1 = ti.max(i - 1, 0), ti.min(i + 1, rows - 1)
         j0, j1 = ti.max(j - 1, 0), ti.min(j + 1, cols - 1)
@@ -480,10 +414,7 @@ def normal_at(across, along, cell: ti.template(), sheet: ti.template()):
     """Interpolate the normals of the mass points bilinearly.
 
     Args:
-        across: horizontal coordinate in the cell, from 0 to 1.
-        along: vertical coordinate in the cell, from 0 to 1.
-        cell: the cell.
-        sheet: the sheet.
+        across, along: coordinates in the cell, to the right and down, from 0 to 1.
 
     Returns:
         A list of three components; not normalised.
@@ -507,12 +438,7 @@ def absolute(values):
 
 @ti.func
 def headlight(normal: ti.template(), uniforms: ti.template()):
-    """Return the reflected share of the headlight: the absolute cosine between normal and direction to the light.
-
-    Args:
-        normal: list of three components, of any length.
-        uniforms: constants of the view.
-    """
+    """Return the reflected share of the headlight: the absolute cosine between normal and direction to the light."""
     length = ti.sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2])
     light = uni.HEADLIGHT
     cosine = absolute(normal[0] * uniforms[light] + normal[1] * uniforms[light + 1] + normal[2] * uniforms[light + 2])
@@ -525,22 +451,14 @@ def headlight(normal: ti.template(), uniforms: ti.template()):
 def footprint(entry, x, y, s, t, texels_x, texels_y, triangle: ti.template(), band: ti.template()):
     """Return the squared size of samples on the texture, for mipmapping.
 
-    With x = X / w the derivatives of (x, y) by (s, t) are (R_1, D_1; R_2, D_2) / w, where R_1 = R_x - x R_w and so on;
-    those of (s, t) by (x, y) are the inverse.
+    With x = X / w the Jacobian of (x, y) with respect to (s, t) is (R_1, D_1; R_2, D_2) / w, where R_1 = R_x - x R_w
+    and so on; that of (s, t) with respect to (x, y) is its inverse.
 
     Args:
-        entry: first entry of the tile in the G-buffer.
-        x: column of the undistorted samples.
-        y: row of the undistorted samples.
-        s: horizontal coordinate on the triangle.
-        t: vertical coordinate on the triangle.
-        texels_x: width of the sub-quad [texels].
-        texels_y: height of the sub-quad [texels].
-        triangle: the triangle.
-        band: the band.
+        texels_x, texels_y: width and height of the sub-quad [texels].
 
     Returns:
-        Square of the larger of width and height, in units of `uniforms.SHARP` texels; and 1 where the front of the
+        Squared size, in units of `uniforms.SHARP` texels: the larger of width and height; and 1 where the front of the
         triangle is visible, else -1.
     """
     p, r, d = ti.static((triangle.p, triangle.r, triangle.d))
@@ -567,8 +485,7 @@ def distance_to_line(coordinate, right_coordinate, lower_coordinate):
 
     Args:
         coordinate: coordinate across the lines [cells].
-        right_coordinate: the same of the next samples on the right, on the same triangle.
-        lower_coordinate: the same of the next samples below, on the same triangle.
+        right_coordinate, lower_coordinate: that of the next samples on the right and below, on the same triangle.
     """
     step_right, step_down = right_coordinate - coordinate, lower_coordinate - coordinate
     slope = ti.sqrt(step_right * step_right + step_down * step_down)
@@ -580,22 +497,7 @@ def store_surface(
     entry, visible, x, y, s, t, quad_column, quad_row,
     triangle: ti.template(), cell: ti.template(), sheet: ti.template(), band: ti.template(),
 ):  # fmt: skip
-    """Store the attributes of the visible samples of a tile.
-
-    Args:
-        entry: first entry of the tile in the G-buffer.
-        visible: mask of the samples.
-        x: column of the undistorted samples.
-        y: row of the undistorted samples.
-        s: horizontal coordinate on the triangle.
-        t: vertical coordinate on the triangle.
-        quad_column: column of the sub-quad in the cell.
-        quad_row: row of the sub-quad in the cell.
-        triangle: the triangle.
-        cell: the cell.
-        sheet: the sheet.
-        band: the band.
-    """
+    """Store the attributes of the visible samples of a tile, which `visible` masks."""
     config, samples = ti.static((band.config, band.samples))
     plane = ti.static(config.plane)
     quad_side = 1.0 / sheet.subdivisions
@@ -615,7 +517,7 @@ def store_surface(
         size, front = footprint(
             entry, x, y, s, t, cell.texels_across * quad_side, cell.texels_down * quad_side, triangle, band
         )
-        # On the visible side of the triangle: at a fold, the interpolated normal may point away from the camera.
+        # At a fold, the interpolated normal may point away from the camera; `front` moves it to the visible side.
         normal = normal_at(across, along, cell, sheet)
         store_visible(entry + plane.normal_x, visible, normal[0] * front, samples)
         store_visible(entry + plane.normal_y, visible, normal[1] * front, samples)

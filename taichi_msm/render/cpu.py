@@ -1,6 +1,6 @@
-"""Kernel 2 on a CPU: the picture is divided into bands of rows, which the workers process one after the other.
+"""Kernel 2 on a CPU: the picture is divided into bands of rows, which the workers process one by one.
 
-The G-buffer of a band fits into the cache, and no two workers write the same sample, so that no locks are needed.
+The G-buffer of a band fits into the cache. No two workers write the same sample, so no locks are needed.
 """
 
 from collections.abc import Callable
@@ -33,7 +33,7 @@ UNDISTORTED_STRIDE = NODE_STRIDE + NORMAL_STRIDE
 
 
 class Bands:
-    """The memory of one sheet's pictures on a CPU, and their kernel.
+    """Memory and kernel of one sheet's pictures on a CPU.
 
     Args:
         config: compile-time configuration.
@@ -78,14 +78,13 @@ class Bands:
             sizes: sizes and counters (uniforms.py).
 
         Returns:
-            Colours, shape (height, width, 3), and labels as expected by `labels_of`; each is undefined unless it is
-            drawn.
+            Colours, shape (height, width, 3), and labels for `labels_of`; undefined unless configured.
         """
         config, (width, height) = self._config, self._size
-        # Only complete tiles are written, and the last one of a row may extend beyond the picture.
+        # Tiles are written completely, and the last one of a row may extend beyond the picture.
         stride = config.tiles_across(width) * config.tile_width if config.writes_words else width
         picture = np.empty((height, stride, 3) if config.picture else (1, 4, 3), np.uint8)
-        # Without labels the argument is unused; passing an array of Taichi takes half the time of a NumPy array.
+        # Without labels the argument is unused; passing a Taichi array takes half the time of a NumPy array.
         labels: Any = self._nodes
         if config.labels:
             labels = np.zeros(label_width(normals=config.normals) * width * height, np.float32)
@@ -107,17 +106,7 @@ def _map_vectors(config: DrawingConfig, width: int) -> int:
 def project_row(
     position: ti.template(), i, rows, cols, config: ti.template(), uniforms: ti.template(), nodes: ti.template()
 ):
-    """Project a row of mass points, and store the first and last row of the picture that it reaches.
-
-    Args:
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        i: row of mass points.
-        rows: number of rows of mass points.
-        cols: number of columns of mass points.
-        config: compile-time configuration.
-        uniforms: constants of the view.
-        nodes: destination.
-    """
+    """Project a row of mass points, and store the first and last row of the picture that it overlaps."""
     first_row, last_row = INFINITY, -INFINITY
     for j in range(cols):
         project(position, i, j, cols, uniforms, nodes, False)
@@ -141,18 +130,9 @@ def project_all(
     position: ti.template(), rows, cols, config: ti.template(), uniforms: ti.template(), sizes: ti.template(),
     nodes: ti.template(),
 ):  # fmt: skip
-    """Project all mass points, row by row and shared among the workers; return when every row is finished.
+    """Project all mass points, row by row, shared among the workers; return when every row is finished.
 
-    A worker waits only for rows that a running worker has taken, so a worker that starts late delays nobody.
-
-    Args:
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        rows: number of rows of mass points.
-        cols: number of columns of mass points.
-        config: compile-time configuration.
-        uniforms: constants of the view.
-        sizes: sizes and counters.
-        nodes: destination.
+    A worker waits only for rows that a running worker has taken, so a worker that starts late does not delay others.
     """
     has_row = True
     while has_row:
@@ -168,12 +148,7 @@ def project_all(
 
 @ti.func
 def cover_band(sheet: ti.template(), band: ti.template()):
-    """Cover the samples of a band with the sheet.
-
-    Args:
-        sheet: the sheet.
-        band: the band.
-    """
+    """Cover the samples of a band with the sheet."""
     config, nodes = ti.static((band.config, sheet.nodes))
     lines = (band.bottom - band.top + config.tile_height - 1) // config.tile_height
     for tile in range(lines * band.tiles_across):
@@ -239,7 +214,7 @@ def _kernel(config: DrawingConfig) -> Callable[..., None]:
                 pixels = width * height
                 output = ti.static(PixelArrays(colours, labels, pixels))
                 samples_width, samples_height = width * factor, height * factor
-                # Bands are taken one by one: if a worker is delayed, the others take its bands.
+                # Bands are taken one by one, so that others take those of a delayed worker.
                 has_band = True
                 while has_band:
                     row = ti.atomic_add(sizes[uni.BANDS_TAKEN], 1) * config.band_rows

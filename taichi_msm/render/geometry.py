@@ -1,8 +1,8 @@
 """Projected mass points, cells and triangles, for one sample or a vector of samples, in f32 or f64.
 
 A point of the surface is represented by (X, Y, w, depth), the product of the camera's matrix and the point. This map is
-linear, so subdividing the projected cells is the same as subdividing the surface, also in perspective. With s to the
-right and t down, the surface between the four mass points of a cell is
+linear, so projected cells can be subdivided like the surface, also in perspective. With s to the right and t down, the
+surface between the four mass points of a cell is
 
     P(s, t) = A + B s + C t + D s t,    projected to sample (x, y) where    X - x w = 0,  Y - y w = 0.
 
@@ -20,28 +20,23 @@ from taichi_msm.system.runtime import ti
 # Numbers per mass point: X, Y, w, depth, and at SCREEN its x and y in the picture [samples].
 SCREEN, NODE_STRIDE = uni.SCREEN, 6
 
-# Triangles of cells that are not inverted are enlarged, to close the gaps between them: by this fraction of their side,
-# and by this fraction of the picture's side, the resolution of f32.
+# Triangles of cells that are not inverted are enlarged to close gaps between them: by this fraction of their side, and
+# by this fraction of the picture's side, the resolution of f32.
 ENLARGEMENT = 1e-5
 SCREEN_ENLARGEMENT = 2e-6
 
-# The bilinear map of a cell is inverted in f32 only if its outline is within this distance [samples].
+# Limit of the corners' coordinates up to which the bilinear map of a cell is inverted in f32 [samples].
 MAX_COORDINATE = float(1 << 16)
 
 
 class Outline(NamedTuple):
-    """The projected corners of a cell, and their bounding box [samples].
+    """Projected corners of a cell, and their bounding box [samples].
 
     Attributes:
-        x: x of the corners, a list.
-        y: y of the corners, a list.
-        left: left edge of the bounding box.
-        right: right edge of the bounding box.
-        top: top edge of the bounding box.
-        bottom: bottom edge of the bounding box.
+        x, y: lists of the corners' coordinates.
+        left, right, top, bottom: edges of the bounding box.
         facing: 1 if the front is visible, -1 for the back, 0 if the cell is folded.
-        in_front: whether all corners are in front of the near plane.
-        behind: whether all corners are behind it.
+        in_front, behind: whether all corners are in front of the near plane; whether all are behind it.
     """
 
     x: Any
@@ -56,15 +51,12 @@ class Outline(NamedTuple):
 
 
 class Patch(NamedTuple):
-    """The bilinear surface between four mass points.
+    """Bilinear surface between four mass points.
 
     Attributes:
-        a: coefficient A, a vector (X, Y, w, depth).
-        b: coefficient B.
-        c: coefficient C.
-        d: coefficient D.
+        a, b, c, d: coefficients A to D, vectors (X, Y, w, depth).
         facing: as in `Outline`.
-        invertible: whether the cell is drawn by inverting the bilinear map, and not triangle by triangle.
+        invertible: whether the cell is drawn by inverting the bilinear map, instead of triangle by triangle.
     """
 
     a: Any
@@ -76,12 +68,11 @@ class Patch(NamedTuple):
 
 
 class Triangle(NamedTuple):
-    """A triangle P + R s + D t of a sub-quad.
+    """Triangle P + R s + D t of a sub-quad.
 
     Attributes:
-        p: origin P, a list of X, Y, w and depth.
-        r: direction R, to the right.
-        d: direction D, down.
+        p: corner P, a list of X, Y, w and depth.
+        r, d: sides R to the right and D down.
         below: whether it is the triangle below the diagonal, where t > s.
     """
 
@@ -93,16 +84,10 @@ class Triangle(NamedTuple):
 
 @ti.func
 def project(position: ti.template(), i, j, cols, uniforms: ti.template(), nodes: ti.template(), double: ti.template()):
-    """Project a mass point, and store its numbers.
+    """Project a mass point, and store X, Y, w, depth, x and y in `nodes`.
 
     Args:
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        i: row of the mass point.
-        j: column of the mass point.
-        cols: number of columns.
-        uniforms: constants of the view.
-        nodes: destination, `NODE_STRIDE` numbers per mass point.
-        double: whether the numbers are f64, which are summed in a different order.
+        double: whether `nodes` is f64; the sums are in a different order then.
     """
     entry = (i * cols + j) * NODE_STRIDE
     x, y, z = position[i, j, 0], position[i, j, 1], position[i, j, 2]
@@ -118,48 +103,25 @@ def project(position: ti.template(), i, j, cols, uniforms: ti.template(), nodes:
 
 @ti.func
 def w_at(depth, uniforms: ti.template()):
-    """Return w at a depth.
-
-    Args:
-        depth: depth [m].
-        uniforms: constants of the view.
-    """
+    """Return w at a depth: for a pinhole camera the depth, otherwise 1."""
     return depth * uniforms[uni.PINHOLE] + (1.0 - uniforms[uni.PINHOLE])
 
 
 @ti.func
 def line_of_sight(x, y, uniforms: ti.template()):
-    """Return the offsets of lines of sight from the optical axis at w = 1, to the right and up [m].
-
-    Args:
-        x: column of the undistorted samples.
-        y: row of the undistorted samples.
-        uniforms: constants of the view.
-    """
+    """Return the offsets of lines of sight from the optical axis at w = 1, to the right and up [m]."""
     return (x - uniforms[uni.CENTRE_X]) * uniforms[uni.SPREAD_X], (uniforms[uni.CENTRE_Y] - y) * uniforms[uni.SPREAD_Y]
 
 
 @ti.func
 def corner_entry(cell, cols):
-    """Return the first entry of a cell's upper left mass point.
-
-    Args:
-        cell: index of the cell.
-        cols: number of columns of mass points.
-    """
+    """Return the first entry of a cell's upper left mass point."""
     return (cell // (cols - 1) * cols + cell % (cols - 1)) * NODE_STRIDE
 
 
 @ti.func
 def cell_outline(corner, cols, near, nodes: ti.template()):
-    """Return the `Outline` of a cell.
-
-    Args:
-        corner: first entry of the cell's upper left mass point.
-        cols: number of columns of mass points.
-        near: near plane [m].
-        nodes: projected mass points.
-    """
+    """Return the `Outline` of a cell."""
     below = corner + cols * NODE_STRIDE
     corners = ti.static((corner, corner + NODE_STRIDE, below, below + NODE_STRIDE))
     x = [nodes[entry + SCREEN] for entry in corners]
@@ -189,12 +151,7 @@ def cell_patch(corner, cols, facing, invertible, nodes: ti.template(), double: t
     """Return the `Patch` of a cell.
 
     Args:
-        corner: first entry of the cell's upper left mass point.
-        cols: number of columns of mass points.
-        facing: as in `Outline`.
-        invertible: whether the cell is drawn by inverting its bilinear map.
-        nodes: projected mass points.
-        double: whether the numbers are f64, for which D is summed in a different order.
+        double: whether `nodes` is f64; D is summed in a different order then.
     """
     below = corner + cols * NODE_STRIDE
     a = ti.Vector([nodes[corner + n] for n in ti.static(range(4))])
@@ -210,17 +167,11 @@ def cell_patch(corner, cols, facing, invertible, nodes: ti.template(), double: t
 def edge(p_x, p_y, q_x, q_y, x, y, facing):
     """Return twice the signed area of the triangle p, q, (x, y), times `facing`.
 
-    Its sign is the side of the line p q on which (x, y) lies. Both cells of an edge compute the same bits up to the
-    sign.
+    Its sign is the side of the line p q on which (x, y) lies. Both cells at an edge compute the same bits except for
+    the sign.
 
     Args:
-        p_x: x of the edge's first end [samples].
-        p_y: y of the edge's first end [samples].
-        q_x: x of the edge's second end [samples].
-        q_y: y of the edge's second end [samples].
-        x: column of the samples.
-        y: row of the samples.
-        facing: 1 or -1.
+        p_x, p_y, q_x, q_y: ends of the edge [samples].
     """
     step_x, step_y = (q_x - p_x) * facing, (q_y - p_y) * facing
     return step_x * (y - p_y) - step_y * (x - p_x)
@@ -228,14 +179,7 @@ def edge(p_x, p_y, q_x, q_y, x, y, facing):
 
 @ti.func
 def edges(x, y, facing, outline: ti.template()):
-    """Return `edge` for the left, right, upper and lower edge of a cell; all are non-negative inside the cell.
-
-    Args:
-        x: column of the samples.
-        y: row of the samples.
-        facing: 1 if the front of the cell is visible, -1 for its back.
-        outline: outline of the cell.
-    """
+    """Return `edge` for the left, right, upper and lower edge of a cell; none is negative inside the cell."""
     p, q = ti.static((outline.x, outline.y))
     return (
         edge(p[0], q[0], p[2], q[2], x, y, -facing),
@@ -247,27 +191,13 @@ def edges(x, y, facing, outline: ti.template()):
 
 @ti.func
 def turn(p_x, p_y, q_x, q_y, r_x, r_y):
-    """Return twice the signed area of a triangle: positive if the path from p over q to r turns right in the picture.
-
-    Args:
-        p_x: x of the first vertex.
-        p_y: y of the first vertex.
-        q_x: x of the second vertex.
-        q_y: y of the second vertex.
-        r_x: x of the third vertex.
-        r_y: y of the third vertex.
-    """
+    """Return twice the signed area of a triangle p, q, r; positive if its vertices are clockwise in the picture."""
     return (q_x - p_x) * (r_y - q_y) - (q_y - p_y) * (r_x - q_x)
 
 
 @ti.func
 def facing_of(x: ti.template(), y: ti.template()):
-    """Return 1 if the front of a cell is visible, -1 for its back, 0 if it is folded and both are visible.
-
-    Args:
-        x: x of the corners, a list.
-        y: y of the corners, a list.
-    """
+    """Return `facing` of a cell from lists of its corners' x and y; 0 if it is folded and both sides are visible."""
     turns = [
         turn(x[n], y[n], x[m], y[m], x[k], y[k]) for n, m, k in ti.static(((0, 1, 3), (1, 3, 2), (3, 2, 0), (2, 0, 1)))
     ]
@@ -277,15 +207,7 @@ def facing_of(x: ti.template(), y: ti.template()):
 
 @ti.func
 def find_quads(x, y, inside, subdivisions, patch: ti.template()):
-    """Return column and row of the sub-quads of a patch at samples.
-
-    Args:
-        x: column of the undistorted samples.
-        y: row of the undistorted samples.
-        inside: mask of the samples that the patch covers.
-        subdivisions: number of sub-quads along a side of the patch.
-        patch: the patch.
-    """
+    """Return column and row of the sub-quads of a patch at samples; 0 outside the mask `inside`."""
     coefficients = ti.static((patch.a, patch.b, patch.c, patch.d))
     a_1, b_1, c_1, d_1 = [k[0] - x * k[2] for k in coefficients]
     a_2, b_2, c_2, d_2 = [k[1] - y * k[2] for k in coefficients]
@@ -310,13 +232,8 @@ def triangle_at(x, y, quad_column, quad_row, quad_side, lower, patch: ti.templat
     """Return the `Triangle` of a sub-quad at samples.
 
     Args:
-        x: column of the undistorted samples.
-        y: row of the undistorted samples.
-        quad_column: column of the sub-quad in the cell.
-        quad_row: row of the sub-quad in the cell.
         quad_side: side of the sub-quad, as a fraction of the cell's.
         lower: whether the triangle below the diagonal is returned, if the patch is not invertible.
-        patch: the patch.
     """
     a, b, c, d = ti.static((patch.a, patch.b, patch.c, patch.d))
     s0 = quad_column * quad_side
@@ -341,13 +258,7 @@ def triangle_at(x, y, quad_column, quad_row, quad_side, lower, patch: ti.templat
 
 @ti.func
 def on_triangle(x, y, triangle: ti.template()):
-    """Return (s, t) of a triangle at samples.
-
-    Args:
-        x: column of the undistorted samples.
-        y: row of the undistorted samples.
-        triangle: the triangle.
-    """
+    """Return s and t on a triangle at samples."""
     coefficients = ti.static((triangle.p, triangle.r, triangle.d))
     p_1, r_1, d_1 = [k[0] - x * k[2] for k in coefficients]
     p_2, r_2, d_2 = [k[1] - y * k[2] for k in coefficients]
@@ -360,11 +271,7 @@ def is_within(s, t, enlargement, near, triangle: ti.template()):
     """Return whether (s, t) is in an enlarged triangle and in front of the near plane.
 
     Args:
-        s: horizontal coordinate in the triangle.
-        t: vertical coordinate in the triangle.
         enlargement: fraction of the side by which the triangle is enlarged.
-        near: near plane [m].
-        triangle: the triangle.
     """
     larger = ti.select(triangle.below, t, s)
     smaller = ti.select(triangle.below, s, t)
@@ -378,26 +285,13 @@ def is_within(s, t, enlargement, near, triangle: ti.template()):
 
 @ti.func
 def depth_at(s, t, triangle: ti.template()):
-    """Return the depth of a triangle's plane [m].
-
-    Args:
-        s: horizontal coordinate in the triangle.
-        t: vertical coordinate in the triangle.
-        triangle: the triangle.
-    """
+    """Return the depth of a triangle's plane [m]."""
     return triangle.p[3] + triangle.r[3] * s + triangle.d[3] * t
 
 
 @ti.func
 def facet(x, y, triangle: ti.template(), uniforms: ti.template()):
-    """Return the normal of a triangle on its visible side, a list of three components of any length, in OpenCV's axes.
-
-    Args:
-        x: column of the undistorted samples.
-        y: row of the undistorted samples.
-        triangle: the triangle.
-        uniforms: constants of the view.
-    """
+    """Return the normal of a triangle on its visible side, in OpenCV's axes."""
     sides = [
         [
             (k[0] - k[2] * uniforms[uni.CENTRE_X]) * uniforms[uni.SPREAD_X],
@@ -419,13 +313,8 @@ def may_cover_rows(corner, distorted_entry, cols, top, bottom, uniforms: ti.temp
     """Return whether a cell may overlap rows of a picture with lens distortion; cheaper than `distorted_cell_bounds`.
 
     Args:
-        corner: first entry of the cell's upper left mass point.
         distorted_entry: first entry of this mass point after distortion, as stored by `store_distorted`.
-        cols: number of columns of mass points.
-        top: top edge of the rows [samples].
-        bottom: bottom edge of the rows [samples].
-        uniforms: constants of the view.
-        nodes: projected mass points.
+        top, bottom: edges of the rows [samples].
     """
     below, distorted_below = corner + cols * NODE_STRIDE, distorted_entry + cols * lens_kernels.DISTORTED_STRIDE
     distorted_corners = ti.static(
@@ -459,10 +348,7 @@ def distorted_cell_bounds(distorted_entry, cols, outline: ti.template(), uniform
 
     Args:
         distorted_entry: first entry of the cell's upper left mass point, as stored by `store_distorted`.
-        cols: number of columns of mass points.
-        outline: outline of the cell without distortion.
-        uniforms: constants of the view.
-        nodes: projected mass points.
+        outline: `Outline` of the cell, without distortion.
     """
     below = distorted_entry + cols * lens_kernels.DISTORTED_STRIDE
     corners = ti.static(
@@ -485,14 +371,12 @@ def distorted_cell_bounds(distorted_entry, cols, outline: ti.template(), uniform
 def is_off_screen(corners: ti.template(), left, right, top, bottom):
     """Return whether a polygon, possibly partly behind the camera, is beyond an edge of the picture.
 
-    For each edge x of the picture, X = x w is a plane, also behind the camera; beyond it, X is larger or smaller.
+    For an edge x of the picture, X = x w is a plane that extends behind the camera; points beyond it have a larger X,
+    or a smaller one at the left edge.
 
     Args:
         corners: corners of the polygon, vectors (X, Y, w, ...).
-        left: left edge of the picture [samples].
-        right: right edge of the picture [samples].
-        top: top edge of the picture [samples].
-        bottom: bottom edge of the picture [samples].
+        left, right, top, bottom: edges of the picture [samples].
     """
     off_screen = False
     for axis, sign, edge in ti.static(((0, -1.0, left), (0, 1.0, right), (1, -1.0, top), (1, 1.0, bottom))):
@@ -511,16 +395,9 @@ def triangle_bounds(
     """Return the bounding box of a triangle of a sub-quad in the picture.
 
     Args:
-        quad_column: column of the sub-quad in the cell.
-        quad_row: row of the sub-quad in the cell.
         lower: whether it is the triangle below the diagonal.
         quad_side: side of the sub-quad, as a fraction of the cell's.
-        near: near plane [m].
-        width: width of the picture [samples].
-        height: height of the picture [samples].
-        patch: surface of the cell.
-        uniforms: constants of the view.
-        lens: lens model; empty without lens distortion.
+        width, height: size of the picture [samples].
 
     Returns:
         Least and largest x, least and largest y [samples]; and the fraction of its side by which the triangle is

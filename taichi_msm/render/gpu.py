@@ -1,9 +1,9 @@
 """Kernel 2 on a GPU: every mass point, cell, sample and pixel is a thread.
 
 A part is a cell, or some triangles of a cell that is drawn triangle by triangle. Parts are listed in bins (bins.py).
-Each sample processes the list of its bin, in as many launches as are needed to bound the time of a thread; the nearest
-surface is kept between launches. Then each pixel covers its samples with the instruments and shades them. A strip of
-rows is drawn at a time, with a thread per sample.
+Each sample processes the list of its bin, in several launches if necessary to bound the time of a thread; the nearest
+surface is kept between launches. Then each pixel covers its samples with the instruments and shades them. The picture
+is drawn in strips of rows, with a thread per sample.
 """
 
 from collections.abc import Callable
@@ -32,22 +32,18 @@ from taichi_msm.render.shading import Appearance, PixelArrays, resolve
 from taichi_msm.system.launches import VULKAN_THREADS, Launches, end_thread
 from taichi_msm.system.runtime import compilation_options, ti, write_vectors
 
-# Minimum width of a bin [samples].
-MIN_BIN_SIZE = 8
-
 # Margin of bounding boxes for rounding and for the centres of samples [samples].
 MARGIN = 1.5
 
-# Maximum number of parts; beyond it, a part consists of several triangles of a cell.
+# Maximum number of parts; if there are more triangles, a part has several of them.
 MAX_PARTS = 1 << 22
 
-# Numbers per mass point without the distorted ones, and in all.
+# Numbers per mass point, without the distorted ones.
 UNDISTORTED_STRIDE = NODE_STRIDE + NORMAL_STRIDE
-TOTAL_STRIDE = UNDISTORTED_STRIDE + DISTORTED_STRIDE
 
 
 class Threads:
-    """The memory of one sheet's pictures on a GPU, and their kernels; arguments as for `cpu.Bands`."""
+    """Memory and kernels of one sheet's pictures on a GPU; arguments as for `cpu.Bands`."""
 
     def __init__(
         self, config: DrawingConfig, shape: tuple[int, int], size: tuple[int, int], texels: NDArray[np.float32]
@@ -62,7 +58,7 @@ class Threads:
         # Rows of pixels in a strip.
         self._rows = min(max(1, VULKAN_THREADS // (samples_across * config.supersample)), height)
         self._texels = launches.upload(texels)
-        self._nodes = launches.array(np.float32, rows * cols * TOTAL_STRIDE)
+        self._nodes = launches.array(np.float32, rows * cols * (UNDISTORTED_STRIDE + DISTORTED_STRIDE))
         self._pieces = launches.array(np.int32, self._cells)
         strip = self._rows * config.supersample * samples_across * config.planes
         # With lens distortion the undistortion map comes before the strip.
@@ -80,7 +76,11 @@ class Threads:
     def draw(
         self, position: NDArray[np.float32], uniforms: NDArray[np.float32], sizes: NDArray[np.int32]
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Draw as the CPU backend (cpu.py) does; DeviceError: the device stopped threads early."""
+        """Draw the picture, the labels or both, like `cpu.Bands.draw`.
+
+        Raises:
+            DeviceError: when the device ended a thread early.
+        """
         launches, factor = Launches(bounded=True), self._config.supersample
         (width, height), capsules = self._size, int(sizes[uni.CAPSULE_COUNT])
         samples_across, samples_down = width * factor, height * factor
@@ -98,11 +98,11 @@ class Threads:
             owners, bounds,
             rounds=SEARCH_ROUNDS + pieces_per_part,
         )  # fmt: skip
-        bin_size = max(MIN_BIN_SIZE, round((samples_across * samples_down / self._cells) ** 0.5))
+        bin_size = max(8, round((samples_across * samples_down / self._cells) ** 0.5))
         bins = build_bins(launches, bounds, parts, (samples_across, samples_down), bin_size)
         sizes[[uni.BIN_SIZE, uni.BINS_ACROSS]] = bins.size, bins.columns
         view = view[0], launches.upload(sizes)
-        # Rounds per sample: one per part, and three per triangle, for the triangle and its tiles.
+        # Iterations per sample: one per part, and three per triangle, for the triangle and its tiles.
         rounds_of_part = 1 + 3 * pieces_per_part
         rounds_of_capsules = capsules * (1 + factor * (1 + factor))
         rounds_of_shading = factor * (1 + factor * (1 + int(sizes[uni.LEVEL_COUNT]) + capsules)) + 2
@@ -140,13 +140,6 @@ def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable
         """Project the mass points, and count the pieces of each cell.
 
         A cell has 1 piece if its bilinear map is inverted, otherwise one per triangle, and 0 behind the eye.
-
-        Args:
-            position: positions of the mass points [m], shape (rows, cols, 3).
-            uniforms: constants of the view.
-            sizes: sizes and counters.
-            nodes: projected mass points, written.
-            pieces: number of pieces of each cell, written.
         """
         for index in range(sizes[uni.ROWS] * sizes[uni.COLS]):
             rows, cols = sizes[uni.ROWS], sizes[uni.COLS]
@@ -171,14 +164,8 @@ def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable
         """Compute the cell, the first piece and the bounding box [samples] of parts.
 
         Args:
-            first: first part of the launch.
-            end: part after the last one.
-            ended: counter of finished threads.
             pieces_per_part: maximum number of pieces in a part.
-            uniforms: constants of the view.
-            sizes: sizes and counters.
             ends: cumulative number of parts up to and including each cell.
-            nodes: projected mass points.
             pieces: number of pieces of each cell.
             owners: cell and first piece of each part, written.
             bounds: bounding box of each part, written.
@@ -208,7 +195,7 @@ def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable
                         patch, uniforms, config.lens,
                     )  # fmt: skip
                     if not high_x < low_x:
-                        # NaN bounds: the triangle may be anywhere.
+                        # With NaN bounds the triangle may be anywhere.
                         if not (low_x <= high_x and low_y <= high_y):
                             low_x, high_x, low_y, high_y = -INFINITY, INFINITY, -INFINITY, INFINITY
                         left, right = ti.min(left, low_x), ti.max(right, high_x)
@@ -231,25 +218,18 @@ def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callab
         bounds: Integers, starts: Integers, entries: Integers,
         samples: ti.types.ndarray(dtype=config.float_vector, ndim=1),
     ):  # fmt: skip
-        """Cover the samples of a strip with some parts of their lists.
+        """Cover the samples of a strip with a chunk of the parts in their bins.
 
         Args:
-            first: first sample of the launch, counted in the strip.
-            end: sample after the last one.
-            ended: counter of finished threads.
             top: first row of samples of the strip.
-            listed: position in the lists of the first part.
+            listed: position of the first part in its list.
             count: number of parts.
             pieces_per_part: maximum number of pieces in a part.
-            uniforms: constants of the view.
-            sizes: sizes and counters.
-            nodes: projected mass points.
             pieces: number of pieces of each cell.
             owners: cell and first piece of each part.
             bounds: bounding box of each part.
             starts: start of the list of each bin.
             entries: parts of all lists.
-            samples: undistortion map and G-buffer, written.
         """
         for index in range(first, end):
             rows, cols, subdivisions = sizes[uni.ROWS], sizes[uni.COLS], uniforms[uni.SUBDIVISIONS]
@@ -282,20 +262,7 @@ def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callab
         first: ti.i32, end: ti.i32, ended: Integers, row: ti.i32, uniforms: Floats, sizes: Integers, texels: Floats,
         samples: ti.types.ndarray(dtype=config.float_vector, ndim=1), colours: Bytes, labels: Floats,
     ):  # fmt: skip
-        """Cover the pixels of a strip with the instruments, and write them.
-
-        Args:
-            first: first pixel of the launch, counted in the strip.
-            end: pixel after the last one.
-            ended: counter of finished threads.
-            row: first row of pixels of the strip.
-            uniforms: constants of the view.
-            sizes: sizes and counters.
-            texels: levels of the texture.
-            samples: undistortion map and G-buffer.
-            colours: colours of all pixels, written.
-            labels: labels of all pixels, written.
-        """
+        """Cover the pixels of a strip, which begins at `row`, with the instruments; write their colours and labels."""
         for index in range(first, end):
             width, height, capsule_count = sizes[uni.WIDTH], sizes[uni.HEIGHT], sizes[uni.CAPSULE_COUNT]
             x, y = index % width, row + index // width

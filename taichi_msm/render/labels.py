@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-# The value of unknown flow in the Middlebury format.
+# Unknown flow in the Middlebury format.
 NO_FLOW = 1e10
 
 
@@ -18,14 +18,14 @@ class Labels(NamedTuple):
 
     Attributes:
         coordinates: coordinates of the material point, as fractions of the sheet's width from its left and of its
-            height from its top, shape (height, width, 2); NaN where no sheet is visible.
+            height from its top, shape (height, width, 2); NaN where the sheet is not visible.
         depth: distance from the eye along the optical axis [m], shape (height, width); 0 where nothing is visible. The
             orthographic camera's eye is above the sheet at rest by the length of its larger side; surfaces above the
             eye have a negative depth.
         instrument: 255 where an instrument is visible, else 0, shape (height, width).
-        normals: unit normals of the drawn triangle or the instrument's surface, toward the camera, in OpenCV's axes of
-            the camera (x right, y down, z forward), shape (height, width, 3); NaN where nothing is visible. Shape (0,
-            0, 3) in the outputs of a scene that does not request normals.
+        normals: unit normals of the drawn triangle or the instrument's surface, toward the camera, in OpenCV's axes (x
+            right, y down, z forward), shape (height, width, 3); NaN where nothing is visible. Shape (0, 0, 3) in the
+            outputs of a scene that does not request normals.
     """
 
     coordinates: NDArray[np.float32]
@@ -35,10 +35,10 @@ class Labels(NamedTuple):
 
 
 class Label(NamedTuple):
-    """The layout of a label in the output of kernel 2: one or several values per pixel, row by row.
+    """Layout of a label in the output of kernel 2: one or several values per pixel, row by row.
 
     Attributes:
-        planes: names of the G-buffer's planes that hold the values (config.py).
+        planes: names of the G-buffer planes with the values (config.py).
         missing_value: value in pixels without a visible surface.
         sheet_only: whether pixels of instruments also have the missing value.
         dtype: type of the values.
@@ -73,7 +73,7 @@ def label_width(*, normals: bool) -> int:
 
 
 def label_channels(plane: Any) -> list[tuple[int, int, int, Label]]:
-    """List the planes from which labels are written; a label whose planes are missing stays 0.
+    """List the G-buffer planes that contain labels; a label without planes is 0.
 
     Args:
         plane: index of each plane of the G-buffer, by name.
@@ -90,15 +90,7 @@ def label_channels(plane: Any) -> list[tuple[int, int, int, Label]]:
 
 
 def labels_of(numbers: NDArray[np.float32], size: tuple[int, int]) -> Labels:
-    """Convert the output of the kernel to labels.
-
-    Args:
-        numbers: output of the kernel.
-        size: width and height of the picture [px].
-
-    Returns:
-        The labels.
-    """
+    """Convert the output of kernel 2 to labels, for a picture of a size (width, height) [px]."""
     (width, height), arrays = size, {}
     for name, label in LABELS.items():
         count = len(label.planes)
@@ -114,10 +106,10 @@ class Flow(NamedTuple):
     """Optical flow from one frame to another, in the pixels of the first one.
 
     Attributes:
-        flow: displacement of the material to the right and down [px], shape (height, width, 2); NO_FLOW where no sheet
-            is visible, and where the material moves behind the eye.
-        occlusion: 255 where the sheet is visible in the first frame, but hidden or outside the picture in the second
-            one; else 0; shape (height, width).
+        flow: displacement of the material to the right and down [px], shape (height, width, 2); NO_FLOW where the sheet
+            is not visible, and where the material moves behind the eye.
+        occlusion: 255 where the sheet is visible in the first frame, but occluded in the second one; else 0; shape
+            (height, width).
     """
 
     flow: NDArray[np.float32]

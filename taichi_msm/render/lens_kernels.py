@@ -8,12 +8,12 @@ from taichi_msm.render import uniforms as uni
 from taichi_msm.render.lens_table import INVALID_COORDINATE
 from taichi_msm.system.runtime import ti
 
-# Numbers per distorted mass point: x and y [samples], and 1 if it is in front of the camera and within the radius of
-# the lens.
+# Numbers per distorted mass point: x and y [samples]; 1 if it is in front of the camera and within the limit of the
+# lens, else 0.
 DISTORTED_STRIDE = 3
 
-# An angle is computed by a power series in the tangent of an eighth of it. The list has the divisors of the terms, the
-# smallest term first.
+# An angle is computed by a power series in the tangent of an eighth of it. The list contains the divisors of the terms,
+# the smallest term first.
 HALVINGS = 3
 SERIES = [(-1.0) ** n * (2 * n + 1) for n in reversed(range(12))]
 
@@ -37,15 +37,9 @@ def arctangent(tangent):
 def distorted_point(x, y, uniforms: ti.template(), lens: ti.template()):
     """Distort a point.
 
-    Args:
-        x: column of the undistorted point [samples].
-        y: row of the undistorted point [samples].
-        uniforms: constants of the view.
-        lens: lens model, "pinhole" or "fisheye".
-
     Returns:
-        x and y of the distorted point [samples], and whether the undistorted one is within the radius of the lens; if
-        it is not, the nearest point within it is distorted.
+        x and y of the distorted point [samples]; and whether the undistorted one is within the limit of the lens.
+        Otherwise, the nearest point within the limit is distorted.
     """
     a = (x - uniforms[uni.CENTRE_X]) * uniforms[uni.SPREAD_X]
     b = (y - uniforms[uni.CENTRE_Y]) * uniforms[uni.SPREAD_Y]
@@ -77,15 +71,7 @@ def distorted_point(x, y, uniforms: ti.template(), lens: ti.template()):
 
 @ti.func
 def store_distorted(distorted_entry, entry, uniforms: ti.template(), nodes: ti.template(), lens: ti.template()):
-    """Distort a projected mass point, and store it.
-
-    Args:
-        distorted_entry: destination in `nodes`, `DISTORTED_STRIDE` numbers.
-        entry: first entry of the projected mass point in `nodes`.
-        uniforms: constants of the view.
-        nodes: projected mass points.
-        lens: lens model, "pinhole" or "fisheye".
-    """
+    """Distort the projected mass point at `entry` of `nodes`, and store it at `distorted_entry`."""
     x, y, is_valid = distorted_point(nodes[entry + uni.SCREEN], nodes[entry + uni.SCREEN + 1], uniforms, lens)
     nodes[distorted_entry], nodes[distorted_entry + 1] = x, y
     nodes[distorted_entry + 2] = ti.cast(is_valid and nodes[entry + 2] > uniforms[uni.NEAR], ti.f32)
@@ -93,14 +79,7 @@ def store_distorted(distorted_entry, entry, uniforms: ti.template(), nodes: ti.t
 
 @ti.func
 def squared_side(x: ti.template(), y: ti.template(), n: ti.template(), m: ti.template()):
-    """Return the square of the distance between two vertices.
-
-    Args:
-        x: x of the vertices, a list.
-        y: y of the vertices, a list.
-        n: index of the first vertex.
-        m: index of the second vertex.
-    """
+    """Return the squared distance between vertices n and m of lists of x and y."""
     return (x[n] - x[m]) * (x[n] - x[m]) + (y[n] - y[m]) * (y[n] - y[m])
 
 
@@ -112,13 +91,10 @@ def distorted_bounds(
     """Return the bounding box of the samples that a convex polygon covers after distortion.
 
     Args:
-        x: x of the undistorted vertices, a list [samples].
-        y: y of the undistorted vertices, a list [samples].
-        distorted_x: x of the distorted vertices, a list [samples].
-        distorted_y: y of the distorted vertices, a list [samples].
-        is_valid: whether all vertices are within the radius of the lens.
+        x, y: lists of the coordinates of the undistorted vertices [samples].
+        distorted_x, distorted_y: lists of those of the distorted vertices [samples].
+        is_valid: whether all vertices are within the limit of the lens.
         squared_length: square of the longest side [samples^2].
-        uniforms: constants of the view.
 
     Returns:
         Least and largest x, least and largest y [samples]; an empty box, with the largest below the least, if the

@@ -22,24 +22,18 @@ Pair = tuple[float, float]
 # Undistorted coordinate of samples beyond the limit of the lens.
 INVALID_COORDINATE = 1e9
 
-# Maximum size of the undistorted picture, relative to the distorted one.
-MAX_VIEW_SCALE = 4
-
-# Derivatives of the lens are bounded by their maximum on a polar grid, with a safety factor for the points between.
-RADII, ANGLES, SAFETY_FACTOR = 256, 64, 1.25
-
 
 class VisibleRegion(NamedTuple):
-    """The region of the plane at depth 1 that is visible in a picture, with bounds of the lens distortion in it.
+    """Visible region of the plane at depth 1, with bounds of the lens distortion in it.
 
-    A line of length L is distorted into a curve whose distance from the chord is at most `sagitta_factor` L^2, because
-    its second derivatives are at most 8 `sagitta_factor`; and whose length is at most 2 `stretch_factor` L.
+    A line of length L is distorted into a curve whose distance from its chord is at most `sagitta_factor` L^2, because
+    its second derivatives are at most 8 `sagitta_factor`. The length of the curve is at most 2 `stretch_factor` L.
 
     Attributes:
         radius: largest distance from the optical axis.
         box: left, right, top and bottom without distortion [px].
-        sagitta_factor: bound of the sagitta over L^2 [1/px].
-        stretch_factor: half the bound of the length over L.
+        sagitta_factor: bound of the sagitta, divided by L^2 [1/px].
+        stretch_factor: half the bound of the length, divided by L.
     """
 
     radius: float
@@ -62,30 +56,29 @@ def _visible_region(lens: Lens, scale: Pair, centre: Pair, size: Pair) -> Visibl
     if np.isnan(radius):
         radius = lens.limit
         border = np.array([[-radius, -radius], [radius, radius]])
-    # One pixel of margin: the border is sampled at a distance of one pixel.
+    # With a margin of one pixel, the sampling distance of the border.
     (left, top), (right, bottom) = border.min(axis=0) * scale + centre - 1, border.max(axis=0) * scale + centre + 1
-    radii, angles = np.meshgrid(radius * np.linspace(0, 1, RADII), np.linspace(0, 2 * np.pi, ANGLES))
+    # The derivatives of the lens are bounded by their maximum on a polar grid, with a safety factor.
+    radii, angles = np.meshgrid(radius * np.linspace(0, 1, 256), np.linspace(0, 2 * np.pi, 64))
     points = np.stack([radii * np.cos(angles), radii * np.sin(angles)], axis=-1)
     step = 1e-5 * radius
     differences = [lens.jacobian(points + shift) - lens.jacobian(points - shift) for shift in np.eye(2) * step]
     second_derivative = np.sqrt((np.stack(differences) ** 2).sum(axis=(0, -1))).max() / (2 * step)
     derivative = np.sqrt((lens.jacobian(points) ** 2).sum(axis=-1)).max()
-    max_scale, min_scale = max(scale), min(scale)
+    max_scale, min_scale, safety_factor = max(scale), min(scale), 1.25
     return VisibleRegion(
         radius * (1 + 1e-5),
         (float(left), float(right), float(top), float(bottom)),
-        SAFETY_FACTOR * float(second_derivative) * max_scale / min_scale**2 / 8,
-        SAFETY_FACTOR * float(derivative) * max_scale / min_scale / 2,
+        safety_factor * float(second_derivative) * max_scale / min_scale**2 / 8,
+        safety_factor * float(derivative) * max_scale / min_scale / 2,
     )
 
 
 def undistorted_view(view: View) -> View:
-    """Return a camera without lens distortion that has the same visible region.
-
-    For wide lenses its resolution is lower.
-    """
+    """Return a camera with the same visible region without lens distortion; for wide lenses its resolution is lower."""
     left, right, top, bottom = visible_region(view).box
-    view_scale = min(1.0, MAX_VIEW_SCALE * float(view.size.max()) / max(right - left, bottom - top))
+    # The undistorted picture is at most four times as large as the distorted one.
+    view_scale = min(1.0, 4 * float(view.size.max()) / max(right - left, bottom - top))
     origin, matrix = np.array([left, top]), view.matrix.copy()
     for row in (0, 1):
         matrix[row] = (matrix[row] - origin[row] * matrix[2]) * view_scale
@@ -104,13 +97,13 @@ def undistortion_map(view: View, supersample: int, *, with_steps: bool) -> NDArr
         with_steps: whether the steps to the next samples are included.
 
     Returns:
-        x and y [samples], INVALID_COORDINATE outside the lens, shape (rows, columns, 2). With steps also x and y of the
-        step to the next sample on the right, and x and y of the step to the next one below; shape (rows, columns, 6).
+        x and y [samples], INVALID_COORDINATE beyond the limit of the lens, shape (rows, columns, 2). With steps also x
+        and y of the step to the next sample on the right and of that to the next one below, shape (rows, columns, 6).
     """
     assert view.lens is not None
     width, height = (int(side) * supersample for side in view.size)
     table = np.empty((height, width, 6 if with_steps else 2), np.float32)
-    # In blocks of rows, to limit the memory of the iterations.
+    # In blocks of rows, to bound the memory.
     for first_row in range(0, height, 64):
         end_row = min(first_row + 64, height)
         pixels = (np.stack(np.meshgrid(np.arange(width), np.arange(first_row, end_row)), axis=-1) + 0.5) / supersample
@@ -127,7 +120,7 @@ def undistortion_map(view: View, supersample: int, *, with_steps: bool) -> NDArr
 
 
 def bounds(coordinates: NDArray[np.float32]) -> Array:
-    """Return left, right, top and bottom of the valid coordinates, shape (..., 2); an empty box if none is valid."""
+    """Return left, right, top and bottom of the valid points, shape (..., 2); an empty box if none is valid."""
     valid = coordinates[coordinates[..., 0] < INVALID_COORDINATE]
     if not len(valid):
         return np.array([INVALID_COORDINATE, -INVALID_COORDINATE, INVALID_COORDINATE, -INVALID_COORDINATE])

@@ -1,4 +1,4 @@
-"""Warnings about scenes that will not look as intended."""
+"""Warnings about scenes whose pictures may not look as intended."""
 
 from __future__ import annotations
 
@@ -11,13 +11,6 @@ from taichi_msm.render import texture
 from taichi_msm.render.camera import View, is_moving, view_at
 from taichi_msm.scene.render import Light
 from taichi_msm.scene.scene import Scene
-
-# Maximum ratio of the picture's and the sheet's proportions without visible stretching.
-ASPECT_TOLERANCE = 1.02
-
-# The sheet is searched at this number of pixels per axis. A smaller sheet is a dot, as for a camera placed in
-# millimetres.
-SAMPLES_PER_SIDE = 100
 
 
 def drawing_warnings(scene: Scene) -> Iterator[str]:
@@ -59,7 +52,8 @@ def _invisible_sheet(scene: Scene) -> Iterator[str]:
     rate = scene.time.frames_per_second
     for name in scene.render.all_cameras:
         camera = view_at(scene, 0.0, name)
-        centres = (np.arange(SAMPLES_PER_SIDE) + 0.5) / SAMPLES_PER_SIDE
+        # At 100 x 100 pixels, all miss a sheet that is only a dot, as from a camera with lengths in millimetres.
+        centres = (np.arange(100) + 0.5) / 100
         pixels = camera.undistort(np.stack(np.meshgrid(*(centres * side for side in camera.size)), axis=-1))
         frames = range(scene.time.frames + 1 if is_moving(scene, name) else 1)
         if not any(_is_visible(view_at(scene, frame / rate, name), pixels, scene.sheet.size) for frame in frames):
@@ -68,7 +62,7 @@ def _invisible_sheet(scene: Scene) -> Iterator[str]:
 
 
 def _is_visible(camera: View, pixels: NDArray[np.float64], size: tuple[float, float]) -> bool:
-    """Return whether any of some pixels [px], shape (..., 2), shows a sheet of this height and width at rest."""
+    """Return whether any of the pixels [px], shape (..., 2), shows the sheet of a size (height, width) at rest."""
     try:
         # The homography from the plane of the sheet to the picture, inverted.
         inverse = np.linalg.inv(camera.matrix[:3][:, [0, 1, 3]])
@@ -88,7 +82,7 @@ def _stretched_picture(scene: Scene) -> Iterator[str]:
         return
     left, top, width, height = scene.region or (0, 0, *size)
     sheet_height, sheet_width = scene.sheet.size
-    if _fits(sheet_width * height, sheet_height * width):
+    if _nearly_equal(sheet_width * height, sheet_height * width):
         return
     side = max(sheet_height, sheet_width) / max(height, width)
     settings = f'--set "sheet.size=[{height * side:.4g},{width * side:.4g}]"'
@@ -107,11 +101,12 @@ def _stretched_picture(scene: Scene) -> Iterator[str]:
         min(height, round(width * sheet_height / sheet_width)),
     )
     # In a picture of few pixels even the best region may be stretched.
-    if cut_width and cut_height and _fits(sheet_width * cut_height, sheet_height * cut_width):
+    if cut_width and cut_height and _nearly_equal(sheet_width * cut_height, sheet_height * cut_width):
         region = left + (width - cut_width) // 2, top + (height - cut_height) // 2, cut_width, cut_height
         warning += f', --set "region=[{",".join(map(str, region))}]" cuts a part like the sheet'
     yield warning
 
 
-def _fits(area: float, expected: float) -> bool:
-    return expected / ASPECT_TOLERANCE < area < expected * ASPECT_TOLERANCE
+def _nearly_equal(value: float, expected: float) -> bool:
+    """Return whether two numbers differ by less than 2 %, as aspect ratios without visible stretching."""
+    return expected / 1.02 < value < expected * 1.02

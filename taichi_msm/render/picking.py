@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.render.camera import View
 
-# Number of cells that are processed at once, to bound the memory.
+# Number of cells that are processed at a time, to bound the memory.
 CELLS_PER_BATCH = 1024
 
 Array = NDArray[np.float64]
@@ -19,8 +19,8 @@ Hit = tuple[float, SheetCoordinates]
 def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pixel) -> SheetCoordinates | None:
     """Return the material point at the centre of a pixel, on the nearest triangle there.
 
-    The camera maps a point to (X, Y, w, depth). Then a = X - x w and b = Y - y w are linear in the point, and both are
-    0 if it projects to (x, y). This avoids a division by w, which is 0 or negative behind the camera.
+    The camera maps a point to (X, Y, w, depth). Then a = X - x w and b = Y - y w are linear in the point, and 0 if it
+    projects to (x, y). Thus there is no division by w, which is 0 or negative behind the camera.
 
     Args:
         position: positions of the mass points [m], shape (rows, cols, 3).
@@ -78,7 +78,7 @@ def _cells_on_ray(position: NDArray[np.floating], ray: View) -> NDArray[np.bool_
 
 
 def _hits_in_cells(corners: Array, i: NDArray[np.intp], j: NDArray[np.intp], refine: int, near: float) -> list[Hit]:
-    """List depth and position, in cells from the top left, of the hits in some cells."""
+    """List depth [m] and position (column, row) on the sheet [cells] of the hits in some cells."""
     subdivisions = refine + 1
     fractions = np.arange(subdivisions + 1) / subdivisions
     s, t = fractions[:, None], fractions[:, None, None]

@@ -35,7 +35,7 @@ def drawing_config(
     Args:
         scene: the scene.
         picture: whether colours are drawn.
-        labels: whether labels are written; together with the picture this requires one sample per pixel.
+        labels: whether labels are written; with a picture, this requires one sample per pixel.
         normals: whether the labels include normals.
         lens: lens model of the camera, as `View.lens_model`; by default that of the scene's main camera.
     """
@@ -60,7 +60,7 @@ def drawing_config(
 
 
 class Rasterizer:
-    """Draws pictures and labels of the sheet of one scene; call `runtime.start` first.
+    """Rasteriser of the pictures and labels of a scene; call `runtime.start` first.
 
     Args:
         scene: the scene.
@@ -83,7 +83,7 @@ class Rasterizer:
     def draw(
         self, position: NDArray[Any], camera: View | None = None, rods: Sequence[Capsule] = ()
     ) -> NDArray[np.uint8]:
-        """Draw the picture alone.
+        """Draw the picture.
 
         Args:
             position: positions of the mass points [m], shape (rows, cols, 3).
@@ -104,9 +104,6 @@ class Rasterizer:
             position: positions of the mass points [m], shape (rows, cols, 3).
             camera: the camera; by default the scene's main camera at the start.
             rods: the instruments.
-
-        Returns:
-            The picture and the labels.
         """
         self._sizes[uni.CAPSULE_COUNT] = len(rods)
         camera = camera or self._view
@@ -119,7 +116,7 @@ class Rasterizer:
         )
 
     def _update_undistortion_map(self, camera: View) -> None:
-        """Set the undistortion map again if the optics of the camera changed."""
+        """Replace the undistortion map if the optics of the camera have changed."""
         if not self.config.lens:
             return
         if camera.optics != self._optics:

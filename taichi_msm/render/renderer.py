@@ -1,4 +1,4 @@
-"""Pictures and labels of a scene's sheet from any camera, for simulations and live sessions."""
+"""Pictures and labels of a scene from any camera, for simulations and live sessions."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Array = NDArray[Any]
 
 
 class Shot(NamedTuple):
-    """The state of the sheet and the instruments at one time, and the camera that records it.
+    """State of the sheet and the instruments at a time, and the camera.
 
     Attributes:
         positions: positions of the mass points [m], shape (rows, cols, 3).
@@ -43,7 +43,7 @@ class Shot(NamedTuple):
 
 
 class Renderer:
-    """Draws and labels the sheet of a scene; call `runtime.start` first.
+    """Renderer of the pictures and labels of a scene; call `runtime.start` first.
 
     Args:
         scene: the scene.
@@ -69,18 +69,11 @@ class Renderer:
         self._views = {name: self.view if name == scene.render.main else view_at(scene, 0.0, name) for name in names}
 
     def resolve_camera(self, camera: CameraLike, time: float = 0.0) -> View:
-        """Resolve a camera.
-
-        Args:
-            camera: camera in any form; None for the scene's main camera.
-            time: time [s].
-
-        Returns:
-            The view.
+        """Resolve a camera at a time [s].
 
         Raises:
-            ArgumentError: if no camera has this name.
-            SceneError: if the camera is invalid.
+            ArgumentError: when no camera has this name.
+            SceneError: when the camera is invalid.
         """
         if isinstance(camera, View):
             return camera
@@ -110,12 +103,7 @@ class Renderer:
         return self._rasterizer(style, picture=True, labels=False, camera=shot.view).draw(*shot)
 
     def is_compiled(self, style: Render, camera: View) -> bool:
-        """Return whether the kernel of a picture is compiled already.
-
-        Args:
-            style: rendering settings, as for `draw`.
-            camera: the camera.
-        """
+        """Return whether the kernel of `draw` is compiled already, for a style and a camera."""
         return self._key(style, picture=True, labels=False, camera=camera) in self._rasterizers
 
     def kernels(self) -> tuple[object, ...]:
@@ -137,11 +125,8 @@ class Renderer:
             before: labels of the first shot.
             shot: the second shot.
 
-        Returns:
-            Optical flow and occlusion.
-
         Raises:
-            ArgumentError: if the labels do not fit the scene.
+            ArgumentError: when the labels do not fit the scene.
         """
         width, height = self.scene.render.size
         points = as_array(before.coordinates, "before") if isinstance(before, Labels) else np.empty(0)
@@ -153,17 +138,14 @@ class Renderer:
         return compute_flow(self.scene, points, *shot)
 
     def locate(self, coordinates: Array, shot: Shot) -> Sight:
-        """Locate material points in a shot.
+        """Project material points into a shot, and determine their occlusion.
 
         Args:
-            coordinates: coordinates on the sheet, 0 to 1, shape (n, 2).
+            coordinates: coordinates on the sheet, from 0 to 1, shape (n, 2).
             shot: sheet, camera and instruments.
 
-        Returns:
-            Pixels and occlusion.
-
         Raises:
-            ArgumentError: if the coordinates are invalid.
+            ArgumentError: when the coordinates are invalid.
         """
         points = as_array(coordinates, "coordinates")
         if not (is_real_array(points, (*points.shape[:1], 2)) and ((points >= 0) & (points <= 1)).all()):
@@ -178,11 +160,8 @@ class Renderer:
         """Render all outputs that the scene requests.
 
         Args:
-            before: labels of the previous frame; None without flow.
+            before: labels of the previous frame, for the optical flow; None for the first frame.
             shot: sheet, camera and instruments.
-
-        Returns:
-            The outputs.
         """
         scene = self.scene
         # Labels require a sample at the centre of each pixel, which supersampling does not have.

@@ -1,6 +1,6 @@
 """Shading: texture filtering and lighting of samples, then the colours and labels of pixels.
 
-Wet tissue and metal are lit by the light of an endoscope, which is next to the main camera and weakens with distance.
+Wet tissue and metal are lit by an endoscope: its light is next to the main camera, and weakens with distance.
 
 All vectors are in the camera's frame: the eye at 0, x right, y up, z toward the camera. P is the surface point of a
 sample, N its normal on the camera's side, L the unit vector from P to the light, V that from P to the eye, and
@@ -9,14 +9,12 @@ M = 2 (N L) N - L the direction of ideal reflection of the light:
     light    = ambient + (1 - ambient) (N L + wrap) / (1 + wrap) d0 / d / the same at the centre of the picture
     colour   = texture light + 255 gloss (M V)^shininess d0 / d
 
-d is the distance from P to the light, and d0 that from the centre of the picture; there, a flat sheet that faces the
-camera keeps its colours. Wrapped diffuse light approximates scattering in tissue, so no side of a dent is black. An
+d is the distance from P to the light, and d0 that from the centre of the picture, where a flat sheet that faces the
+camera keeps its colours. Wrapped diffuse light approximates scattering in tissue; no side of a dent is black. An
 instrument shades the tissue near it: at r times its radius from its axis it removes the share uniforms.SHADE / r^2 of
 the light.
 
-Normals are lists of three components, of any length.
-
-The texture is filtered with mipmaps, at 1, 1/2, 1/4, ... of its size, so that a sample of many texels has their mean.
+The texture is filtered with mipmaps, at 1, 1/2, 1/4, ... of its size, so that a sample of many texels is their mean.
 """
 
 from typing import Any, NamedTuple
@@ -32,14 +30,13 @@ from taichi_msm.system.runtime import ti
 
 
 class Appearance(NamedTuple):
-    """The texture of the sheet, and the light and the instruments.
+    """Texture, light and instruments.
 
     Attributes:
         config: compile-time configuration.
         texels: levels of the texture, as returned by `pyramid`.
         sizes: sizes and counters.
-        width: width of the first level [texels].
-        height: height of the first level [texels].
+        width, height: size of the first level [texels].
         uniforms: constants of the view.
         capsule_count: number of instruments.
     """
@@ -54,7 +51,7 @@ class Appearance(NamedTuple):
 
 
 class PixelArrays(NamedTuple):
-    """The output arrays of the kernel.
+    """Output arrays of kernel 2.
 
     Attributes:
         colours: colours of the pixels, as words or bytes.
@@ -72,15 +69,10 @@ def shade(entry, left, top, map_entry, samples: ti.template(), appearance: ti.te
     """Shade a tile: light the texture, then draw the mesh and the instruments.
 
     Args:
-        entry: first entry of the tile in the G-buffer.
-        left: left edge of the tile [samples].
-        top: top edge of the tile [samples].
         map_entry: first entry of the tile in the undistortion map, with lens distortion.
-        samples: G-buffer and undistortion map.
-        appearance: texture, light and instruments.
 
     Returns:
-        Red, green and blue.
+        Red, green and blue, 0 to 255.
     """
     config, uniforms = ti.static((appearance.config, appearance.uniforms))
     plane = ti.static(config.plane)
@@ -120,12 +112,9 @@ def write_colours(
 
     Args:
         colour: red, green and blue, 0 to 255.
-        row: first row of pixels of the tile.
-        end_row: end of the rows that are written.
+        row, end_row: first row of pixels of the tile; end of the rows that are written.
         tile: column of the tile.
-        tiles_across: number of tiles in a row.
-        colours: destination.
-        config: compile-time configuration.
+        colours: colours of the picture, written.
     """
     packed = ti.floor(colour[0] + 0.5) + ti.floor(colour[1] + 0.5) * 256.0 + ti.floor(colour[2] + 0.5) * 65536.0
     width = ti.static(config.tile_width)
@@ -154,15 +143,9 @@ def write_means(
 
     Args:
         first: first entry of the band in the G-buffer.
-        row: first row of pixels.
-        end_row: row after the last one.
-        left: first column of pixels.
-        right: column after the last one.
-        tiles_across: number of tiles in a row.
-        width: width of the picture [px].
-        samples: G-buffer.
-        colours: destination.
-        config: compile-time configuration.
+        row, end_row: first row of pixels, and the row after the last one.
+        left, right: first column of pixels, and the column after the last one.
+        colours: colours of the picture, written.
     """
     factor, tile_width, tile_height = ti.static((config.supersample, config.tile_width, config.tile_height))
     for y in range(row, end_row):
@@ -184,14 +167,9 @@ def write_labels(
     """Write the labels of the pixels of a tile.
 
     Args:
-        entry: first entry of the tile in the G-buffer.
         left: first column of pixels.
-        row: first row of pixels.
-        end_row: end of the rows that are written.
-        width: width of the picture [px].
-        samples: G-buffer.
-        output: destination.
-        config: compile-time configuration.
+        row, end_row: first row of pixels; end of the rows that are written.
+        output: arrays of the picture, written.
     """
     plane, channels = ti.static((config.plane, label_channels(config.plane)))
     is_covered = samples[entry + plane.depth] < INFINITY
@@ -221,16 +199,10 @@ def resolve(
 
     Args:
         first: first entry of the band in the G-buffer, at the left edge of the picture.
-        row: first row of pixels.
-        end_row: row after the last one.
-        left: first column of pixels.
-        right: column after the last one.
-        tiles_across: number of tiles in a row.
-        width: width of the picture [px].
+        row, end_row: first row of pixels, and the row after the last one.
+        left, right: first column of pixels, and the column after the last one.
         map_start: first entry of the band in the undistortion map, with lens distortion.
-        samples: G-buffer and undistortion map.
-        appearance: texture, light and instruments.
-        output: destination.
+        output: arrays of the picture, written.
     """
     config = ti.static(appearance.config)
     factor, tile_width, tile_height = ti.static((config.supersample, config.tile_width, config.tile_height))
@@ -256,13 +228,6 @@ def resolve(
 @ti.func
 def illuminate(x, y, depth, normal: ti.template(), uniforms: ti.template()):
     """Compute the illumination of samples.
-
-    Args:
-        x: column of the undistorted samples.
-        y: row of the undistorted samples.
-        depth: depth [m].
-        normal: list of three components.
-        uniforms: constants of the view.
 
     Returns:
         N L; M V; d0 / d; the upward component of the direction of ideal reflection of V.
@@ -305,16 +270,7 @@ def specular(mirror):
 
 @ti.func
 def light_transmission(x, y, depth, capsule_count, uniforms: ti.template(), config: ti.template()):
-    """Return the share of the light that is not shaded by the instruments.
-
-    Args:
-        x: column of the undistorted samples.
-        y: row of the undistorted samples.
-        depth: depth [m].
-        capsule_count: number of instruments.
-        uniforms: constants of the view.
-        config: compile-time configuration.
-    """
+    """Return the share of the light that is not shaded by the instruments."""
     offset_x, offset_y = line_of_sight(x, y, uniforms)
     w = w_at(depth, uniforms)
     right, up = offset_x * w, offset_y * w
@@ -333,13 +289,10 @@ def light_transmission(x, y, depth, capsule_count, uniforms: ti.template(), conf
 
 @ti.func
 def apply_relief(normal: ti.template(), slope_x, slope_y, uniforms: ti.template()):
-    """Tilt normals by the relief, in place: they lean away from rising grey levels.
+    """Tilt normals by the relief, in place, against the gradient of the grey level.
 
     Args:
-        normal: list of three components.
-        slope_x: rise of the grey level per texel, to the right.
-        slope_y: rise of the grey level per texel, downward.
-        uniforms: constants of the view.
+        slope_x, slope_y: gradient of the grey level, to the right and down [1/texel].
     """
     n_x, n_y, n_z = ti.static((normal[0], normal[1], normal[2]))
     length = 1.0 / ti.max(ti.sqrt(n_x * n_x + n_y * n_y + n_z * n_z), 1e-30)
@@ -356,21 +309,14 @@ def apply_relief(normal: ti.template(), slope_x, slope_y, uniforms: ti.template(
 
 @ti.func
 def light_tissue(x, y, depth, normal: ti.template(), slope_x, slope_y, column, row, appearance: ti.template()):
-    """Light wet tissue.
+    """Compute the lighting of wet tissue.
 
     Args:
-        x: column of the undistorted samples.
-        y: row of the undistorted samples.
-        depth: depth [m].
-        normal: list of three components.
-        slope_x: rise of the grey level per texel, to the right.
-        slope_y: rise of the grey level per texel, downward.
-        column: column of the samples in the picture.
-        row: row of the samples in the picture.
-        appearance: texture, light and instruments.
+        slope_x, slope_y: gradient of the grey level, to the right and down [1/texel].
+        column, row: column and row of the samples in the picture.
 
     Returns:
-        The factor of the colours, and the summand.
+        The factor of the colours, and the gloss that is added to them, 0 to 255.
     """
     config, uniforms = ti.static((appearance.config, appearance.uniforms))
     tilted = [normal[n] for n in ti.static(range(3))]
@@ -395,14 +341,7 @@ def light_tissue(x, y, depth, normal: ti.template(), slope_x, slope_y, column, r
 
 @ti.func
 def light_metal(x, y, depth, normal: ti.template(), uniforms: ti.template()):
-    """Light metal, which reflects a room that is bright above and dark below.
-
-    Args:
-        x: column of the undistorted samples.
-        y: row of the undistorted samples.
-        depth: depth [m].
-        normal: list of three components.
-        uniforms: constants of the view.
+    """Compute the colour of metal, which reflects a room with a bright ceiling and a dark floor.
 
     Returns:
         Red, green and blue.
@@ -452,26 +391,13 @@ def downsample(colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 @ti.func
 def to_integers(values, config: ti.template()):
-    """Convert to integers, lane by lane, because casting a vector crashes.
-
-    Args:
-        values: vector of floating-point numbers.
-        config: compile-time configuration.
-    """
+    """Convert to integers, lane by lane, because casting a vector crashes."""
     return config.integer_vector([ti.cast(values[lane], ti.i32) for lane in ti.static(range(config.lanes))])
 
 
 @ti.func
 def fetch_rgb(index, appearance: ti.template()):
-    """Gather texels and unpack them.
-
-    Args:
-        index: indices of the texels.
-        appearance: the texture.
-
-    Returns:
-        Red, green and blue.
-    """
+    """Gather the texels at some indices; return their red, green and blue."""
     config, texels = ti.static((appearance.config, appearance.texels))
     texel = config.float_vector([texels[index[lane]] for lane in ti.static(range(config.lanes))])
     blue = ti.floor(texel * (1.0 / 65536.0))
@@ -482,16 +408,7 @@ def fetch_rgb(index, appearance: ti.template()):
 
 @ti.func
 def bilinear(upper_left, upper_right, lower_left, lower_right, u, v):
-    """Interpolate bilinearly.
-
-    Args:
-        upper_left: value at u = v = 0.
-        upper_right: value at u = 1, v = 0.
-        lower_left: value at u = 0, v = 1.
-        lower_right: value at u = v = 1.
-        u: horizontal fraction between the values.
-        v: vertical fraction between the values.
-    """
+    """Interpolate bilinearly, at fractions u to the right and v down."""
     upper = upper_left + (upper_right - upper_left) * u
     lower = lower_left + (lower_right - lower_left) * u
     return upper + (lower - upper) * v
@@ -503,14 +420,11 @@ def fetch(first, width, height, x, y, appearance: ti.template()):
 
     Args:
         first: first texel of the level.
-        width: width of the level [texels].
-        height: height of the level [texels].
-        x: column, in the level [texels].
-        y: row, in the level [texels].
-        appearance: the texture.
+        width, height: size of the level [texels].
+        x, y: column and row in the level [texels].
 
     Returns:
-        The colour; and with a relief the rise of the grey level per texel, to the right and downward.
+        The colour; and with a relief the gradient of the grey level, to the right and down [1/texel].
     """
     config = ti.static(appearance.config)
     # Beyond the centres of its outermost texels the texture is constant.
@@ -535,16 +449,10 @@ def fetch(first, width, height, x, y, appearance: ti.template()):
 
 @ti.func
 def filter_texture(entry, is_covered, samples: ti.template(), appearance: ti.template()):
-    """Filter the texture for a tile.
-
-    Args:
-        entry: first entry of the tile in the G-buffer.
-        is_covered: mask of the samples with a visible surface.
-        samples: G-buffer.
-        appearance: the texture.
+    """Filter the texture for the samples of a tile that show a surface, the mask `is_covered`.
 
     Returns:
-        The colour; and with a relief the rise of the grey level per texel, to the right and downward.
+        As for `fetch`.
     """
     config, sizes = ti.static((appearance.config, appearance.sizes))
     float_vector, integer_vector, plane = ti.static((config.float_vector, config.integer_vector, config.plane))

@@ -17,17 +17,17 @@ if TYPE_CHECKING:
 def load_texture(scene: Scene, sha256: str | None = None) -> NDArray[np.uint8]:
     """Read the scene's picture: upright, in 8-bit RGB, cropped to the scene's region.
 
-    Only the first picture of a file is read; transparent ones are composited onto the scene's background.
+    Only the first picture of a file is read. Transparent pixels are composited onto the scene's background.
 
     Args:
         scene: the scene.
-        sha256: required SHA-256 of the file, if any.
+        sha256: required SHA-256 of the file; any if None.
 
     Returns:
         Colours, shape (height, width, 3).
 
     Raises:
-        SceneError: if there is no picture, or it is invalid.
+        SceneError: when there is no picture, or it is invalid.
     """
     import numpy as np
 
@@ -45,17 +45,7 @@ def load_texture(scene: Scene, sha256: str | None = None) -> NDArray[np.uint8]:
 
 
 def require_texture(texture: Any) -> NDArray[np.uint8]:
-    """Check that an array is a valid texture.
-
-    Args:
-        texture: any object.
-
-    Returns:
-        The texture, shape (height, width, 3).
-
-    Raises:
-        ArgumentError: if it is invalid.
-    """
+    """Return an argument as a texture, shape (height, width, 3); raise an ArgumentError if it is not one."""
     import numpy as np
 
     picture = as_array(texture, "texture")

@@ -1,7 +1,7 @@
 """Pixels and occlusion of material points, computed in f64 without a depth map.
 
-A material point is located on the drawn triangles, and projected. It is hidden if another part of the surface, or an
-instrument, is nearer on the same line of sight. Bins list the cells that may be there.
+A material point is located on the drawn triangles, and projected. It is occluded if another part of the surface or an
+instrument is nearer on the same line of sight. Bins list the cells that may be on it.
 """
 
 import math
@@ -27,11 +27,8 @@ from taichi_msm.system.runtime import compilation_options, lanes, ti
 
 Array = NDArray[np.floating]
 
-# Minimum width of a bin [px].
-MIN_BIN_SIZE = 4
-
-# Offsets in the numbers of a cell: its bounds in the picture [px]; its least depth [m]; and 1 if its front is visible,
-# -1 for its back, 0 if it is drawn triangle by triangle.
+# Offsets in the numbers of a cell: its bounds in the picture [px]; its least depth [m]; and `facing`, 0 if it is drawn
+# triangle by triangle.
 CELL_MIN_X, CELL_MAX_X, CELL_MIN_Y, CELL_MAX_Y, CELL_MIN_DEPTH, CELL_FACING, CELL_STRIDE = range(7)
 
 # Bounds of a cell that may be anywhere [px].
@@ -45,7 +42,7 @@ NOT_VISIBLE = math.nan
 
 
 def locate_points(scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Capsule] = ()) -> Sight:
-    """Locate material points in the picture.
+    """Project material points into the picture, and determine their occlusion.
 
     Args:
         scene: the scene.
@@ -54,31 +51,25 @@ def locate_points(scene: Scene, coordinates: Array, position: Array, view: View,
         view: the camera.
         rods: the instruments.
 
-    Returns:
-        Pixels and occlusion of the points.
-
     Raises:
-        DeviceError: if the device stopped threads early.
+        DeviceError: when the device ended a thread early.
     """
     pixels, hidden = _track(scene, coordinates, position, view, rods, as_flow=False)
     return Sight(pixels, hidden.view(np.bool_))
 
 
 def compute_flow(scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Capsule] = ()) -> Flow:
-    """Compute the optical flow from another frame.
+    """Compute the optical flow and the occlusion of another frame's pixels.
 
     Args:
         scene: the scene.
-        coordinates: coordinates in the labels of the other frame, shape (height, width, 2); NaN without a sheet.
+        coordinates: coordinates in the labels of the other frame, shape (height, width, 2).
         position: positions of the mass points in this frame [m], shape (rows, cols, 3).
         view: the camera of this frame.
         rods: the instruments of this frame.
 
-    Returns:
-        Optical flow and occlusion of the pixels of the other frame.
-
     Raises:
-        DeviceError: if the device stopped threads early.
+        DeviceError: when the device ended a thread early.
     """
     shape = coordinates.shape[:2]
     moved, hidden = _track(scene, coordinates.reshape(-1, 2), position, view, rods, as_flow=True)
@@ -88,7 +79,7 @@ def compute_flow(scene: Scene, coordinates: Array, position: Array, view: View, 
 def _track(
     scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Capsule], *, as_flow: bool
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Return pixels of material points, or as flow their offsets from another frame's pixels; and occlusion."""
+    """Return the pixels of material points, `as_flow` relative to another frame's pixels, and their occlusion."""
     total = len(coordinates)
     if total == 0:
         return np.empty((0, 2), np.float32), np.empty(0, np.uint8)
@@ -97,8 +88,8 @@ def _track(
     # Occlusion is computed without lens distortion.
     undistorted = view if view.lens is None else undistorted_view(view)
     width, height = (int(side) for side in undistorted.size)
-    # With bins half as wide as cells, most bins only overlap cells around one mass point.
-    bin_size = max(MIN_BIN_SIZE, round((width * height / cells) ** 0.5 / 2))
+    # With bins half as wide as cells, most bins only overlap the cells around one mass point.
+    bin_size = max(4, round((width * height / cells) ** 0.5 / 2))
     launches = Launches(bounded=lanes("f64") == 1)
     uniform_values = uni.view_uniforms(undistorted, scene.render, 1, scene.sheet.size, (1, 1), rods)
     if view.lens is not None:
@@ -125,7 +116,7 @@ def _track(
         int(as_flow), uniforms, launches.upload(sizes), nodes, cell, bins.starts, bins.entries, is_simple,
         pixels, hidden,
     )  # fmt: skip
-    # Rounds per point: one per cell, and one per triangle.
+    # Iterations per point: one per cell, and one per triangle.
     rounds = 1 + 2 * (scene.render.refine + 1) ** 2
     for listed, count in launches.chunks(int(bins.lengths.max()), rounds):
         launches.launch(_kernel(view.lens_model), total, listed, count, *arguments, rounds=count * rounds + len(rods))
@@ -176,9 +167,9 @@ def _mark_simple_bins(
 ):  # fmt: skip
     """Mark the bins in which no two cells overlap.
 
-    This holds if the cells of a bin are among the four around one mass point, and all of these four are invertible and
-    face the same way: each is convex, so it lies within the angle between its two edges at the mass point, and the four
-    angles add up to 360 degrees without overlapping.
+    This holds if the cells of a bin are among the four around one mass point, and these four are invertible and face
+    the same way: each is convex and therefore within the angle of its two edges at the mass point, and the four angles
+    add up to 360 degrees.
     """
     for bin_index in range(first, end):
         first_i, last_i, first_j, last_j = 1 << 30, -1, 1 << 30, -1
@@ -216,10 +207,7 @@ def _quad_depth(x, y, quad_column, quad_row, quad_side, lower, near, patch: ti.t
 def _cell_occludes(
     x, y, depth, index, own_cell, own_triangle, cols, subdivisions, near, nodes: ti.template(), cell: ti.template()
 ):
-    """Return whether a cell occludes a point at (x, y) and `depth`.
-
-    The point lies on the triangle `own_triangle` of the cell `own_cell`; this triangle does not occlude it.
-    """
+    """Return whether a cell occludes a point at (x, y) and `depth` on the triangle `own_triangle` of `own_cell`."""
     entry, quad_side = index * CELL_STRIDE, 1.0 / subdivisions
     facing = cell[entry + CELL_FACING]
     invertible = facing != 0.0
@@ -275,20 +263,13 @@ def _kernel(lens: str) -> Callable[..., None]:
         as_flow: ti.i32, uniforms: Doubles, sizes: Integers, nodes: Doubles, cell: Doubles,
         starts: Integers, entries: Integers, is_simple: Bytes, pixels: Floats, hidden: Bytes,
     ):  # fmt: skip
-        """Locate material points, and compare them with some cells of the lists of their bins.
+        """Project material points, and test their occlusion by a chunk of the cells in their bins.
 
         Args:
-            first: first point of the launch.
-            end: point after the last one.
-            ended: counter of finished threads.
-            listed: position in the lists of the first cell.
+            listed: position of the first cell in its list.
             count: number of cells.
             coordinates: coordinates of the points on the sheet.
-            as_flow: 0 to return pixels; otherwise the points are those of the pixels of another frame, and their
-                displacements from these pixels' centres are returned.
-            uniforms: constants of the view.
-            sizes: sizes and counters.
-            nodes: projected mass points.
+            as_flow: 0 for pixels; 1 for displacements from the pixel centres of another frame, whose points these are.
             cell: outlines of the cells.
             starts: start of the list of each bin.
             entries: cells of all lists.
@@ -315,7 +296,7 @@ def _kernel(lens: str) -> Callable[..., None]:
                 patch = ti.static(
                     geometry.cell_patch(geometry.corner_entry(own_cell, cols), cols, 0.0, True, nodes, True)
                 )
-                # In the sub-quad, D s t is replaced by a function that is linear on either side of the diagonal.
+                # In the sub-quad, D s t is replaced by a function that is linear on each side of the diagonal.
                 twist = s0 * t0 + s1 * t0 + s0 * t1 + ti.min(s1, t1) * quad_side
                 p = patch.a + patch.b * s + patch.c * t + patch.d * twist
                 is_hidden = True

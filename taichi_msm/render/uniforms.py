@@ -18,15 +18,15 @@ from taichi_msm.render.lens_table import visible_region
 from taichi_msm.scene.render import Render
 from taichi_msm.scene.scene import Scene
 
-# The mass-point mesh: colour, width [px] and opacity of its lines.
+# The wireframe: colour, width [px] and opacity of its lines.
 WIRE_COLOUR = (235, 245, 255)
 WIRE_WIDTH = 1.0
 WIRE_OPACITY = 0.75
 
-# Maximum width [texels] of a sample of tissue that is filtered at full size: the filter has two texels.
+# Maximum size of a tissue sample on the texture that is filtered at full resolution [texels]: the filter has two.
 SHARP = 2.0
 
-# Position of the light, to the right of and above the eye, as a fraction of the distance to the target.
+# Offset of the light from the eye, to the right and up, as a fraction of the distance to the target.
 LIGHT_RIGHT, LIGHT_UP = -0.3, 0.0
 
 # Wrap of diffuse light, and sharpness of highlights: (M V)^(2^SHARPNESS).
@@ -36,8 +36,7 @@ SHARPNESS = 3
 # Share of the light that an instrument removes from the tissue that it touches.
 SHADE = 0.7
 
-# Metal: colour; shares of ambient light, diffuse light and the reflected room; and brightness of the highlight, as a
-# fraction of white.
+# Metal: colour; shares of ambient light, diffuse light and the reflected room; brightness of the highlight, 1 is white.
 METAL = (176.0, 182.0, 190.0)
 METAL_AMBIENT, METAL_DIFFUSE, METAL_MIRROR, METAL_GLOSS = 0.2, 0.35, 0.6, 0.7
 
@@ -46,9 +45,9 @@ METAL_NEAREST = 0.2
 
 Array = NDArray[np.float64]
 
-# Indices into the array of sizes: of the sheet, the picture and its bins. Three are counters: rows of mass points that
-# workers have taken, rows that they have projected, and bands that they have taken. The levels of the texture come
-# last, each with its first texel, its width and its height.
+# Indices into the array of sizes: sizes of the sheet, the picture and its bins; three counters, of rows of mass points
+# that workers have taken, of rows that they have projected, and of bands that they have taken; and the levels of the
+# texture, each with its first texel, its width and its height.
 ROWS, COLS, WIDTH, HEIGHT, CAPSULE_COUNT, BIN_SIZE, BINS_ACROSS = range(7)
 ROWS_TAKEN, ROWS_PROJECTED, BANDS_TAKEN, LEVEL_COUNT, LEVELS = range(7, 12)
 LEVEL_STRIDE = 3
@@ -72,9 +71,8 @@ ACROSS, UP, SLOPE_X, SLOPE_Y = 44, 47, 50, 51
 # Offset of a mass point's x and y in the picture, after its X, Y, w and depth.
 SCREEN = 4
 
-# Surfaces closer to a point than this, along the line of sight, do not hide it [m].
+# The depth by which an occluding surface must be nearer than a point [m].
 DEPTH_TOLERANCE = 52
-RELATIVE_DEPTH_TOLERANCE = 1e-9  # as a fraction of the sheet's larger side
 
 # The lens: its coefficients; its radius at w = 1 [m]; the principal point [samples]; samples per metre at w = 1; the
 # numbers of `lens_table.VisibleRegion`, in samples.
@@ -91,14 +89,11 @@ TIP, AXIS, LENGTH, RADIUS, LEFT, TOP, RIGHT, BOTTOM = 0, 3, 6, 7, 8, 9, 10, 11
 
 
 def sizes_of(scene: Scene, levels: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Build the array of sizes, with zeros for those that change from frame to frame.
+    """Build the array of sizes; those that change from frame to frame are 0.
 
     Args:
         scene: the scene.
         levels: levels of the texture, as returned by `pyramid`.
-
-    Returns:
-        The sizes, at the indices above.
     """
     sizes = np.zeros(LEVELS + levels.size, np.int32)
     sizes[[ROWS, COLS, WIDTH, HEIGHT, LEVEL_COUNT]] = *scene.sheet.points, *scene.render.size, len(levels)
@@ -123,9 +118,6 @@ def view_uniforms(
         sheet: height and width of the sheet [m].
         texture: width and height of the texture [texels].
         rods: the instruments.
-
-    Returns:
-        The uniforms, at the indices above.
     """
     uniforms = np.zeros(CAPSULES + len(rods) * CAPSULE_STRIDE)
     uniforms[MATRIX:AXES] = (view.matrix * np.array([[factor], [factor], [1], [1]])).ravel()
@@ -145,7 +137,7 @@ def view_uniforms(
     uniforms[ACROSS:UP], uniforms[UP:SLOPE_X] = view.axes[:, 0], view.axes[:, 1]
     height = light.relief / 100 / 255 * max(sheet)
     uniforms[SLOPE_X:DEPTH_TOLERANCE] = height * texture[0] / sheet[1], -height * texture[1] / sheet[0]
-    uniforms[DEPTH_TOLERANCE] = RELATIVE_DEPTH_TOLERANCE * max(sheet)
+    uniforms[DEPTH_TOLERANCE] = 1e-9 * max(sheet)
     if view.lens is not None:
         region = visible_region(view)
         set_lens(uniforms, view, factor, region.radius)
@@ -165,7 +157,7 @@ def set_lens(uniforms: Array, view: View, factor: int, radius: float) -> None:
         uniforms: constants of the view, updated.
         view: camera with lens distortion.
         factor: samples per pixel along each axis.
-        radius: largest distance from the optical axis at which points are distorted [m], at w = 1.
+        radius: limit of the lens, or largest visible radius, at w = 1 [m].
     """
     assert view.lens is not None
     uniforms[LENS : LENS + len(view.lens.coefficients)] = view.lens.coefficients

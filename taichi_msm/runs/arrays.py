@@ -1,8 +1,8 @@
 """Array files: NumPy's .npz archives and Middlebury's .flo format.
 
-Archives are written in chunks, because a trajectory may exceed memory. Readers pass the expected dtype and shape, so
-that a forged header cannot make them allocate more. A .flo file holds a magic number, width, height and two float32
-per pixel, all little-endian.
+Archives are written in chunks, because a trajectory may exceed memory. Readers verify dtype and shape before they
+allocate, because a header may be forged. A .flo file contains a magic number, width, height and two float32 per pixel,
+all little-endian.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Shape = tuple[int, ...]
 
 
 class ChunkedArray(NamedTuple):
-    """An array that is written without being in memory at once."""
+    """Array that is written chunk by chunk, as it may exceed memory."""
 
     dtype: DTypeLike
     shape: Shape
@@ -32,16 +32,11 @@ class ChunkedArray(NamedTuple):
 
 
 def write_arrays(file: BinaryIO, arrays: Mapping[str, NDArray[Any] | ChunkedArray]) -> None:
-    """Write arrays to an uncompressed .npz archive. Equal arrays produce identical files.
-
-    Args:
-        file: binary file, open for writing.
-        arrays: the arrays by name.
-    """
+    """Write arrays, by name, to an uncompressed .npz archive. Equal arrays produce identical files."""
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         for name, array in arrays.items():
             chunked = array if isinstance(array, ChunkedArray) else ChunkedArray(array.dtype, array.shape, _rows(array))
-            # A fixed date, the earliest of the zip format, keeps files of equal arrays identical.
+            # The date is fixed, at the earliest of the zip format, so that equal arrays produce identical files.
             info = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
             with archive.open(info, "w", force_zip64=True) as entry:
                 entry.write(_header(chunked.dtype, chunked.shape))
@@ -50,24 +45,15 @@ def write_arrays(file: BinaryIO, arrays: Mapping[str, NDArray[Any] | ChunkedArra
 
 
 def _rows(array: NDArray[Any]) -> Iterable[NDArray[Any]]:
-    """Split an array into contiguous chunks, without copying it at once."""
+    """Split an array into contiguous chunks, without a copy of all of it."""
     return [array] if array.flags.c_contiguous else (np.ascontiguousarray(row) for row in array)
 
 
 def read_array(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, shape: Shape) -> NDArray[Any]:
-    """Read an array that `write_arrays` wrote, and verify its CRC-32.
-
-    Args:
-        archive: the archive, open for reading.
-        name: name of the array.
-        dtype: expected type.
-        shape: expected shape.
-
-    Returns:
-        The array, read-only.
+    """Read an array of the expected dtype and shape, read-only, and verify its CRC-32.
 
     Raises:
-        ValueError: when type or shape differ; raised before memory is allocated.
+        ValueError: when dtype or shape differ; raised before memory is allocated.
         Exception: when the archive is damaged; `zipfile` raises many types.
     """
     header, info = _header(dtype, shape), _entry(archive, name, dtype, shape)
@@ -78,46 +64,23 @@ def read_array(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, shape: Sha
 
 
 def read_rows(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, row_shape: Shape) -> NDArray[Any]:
-    """Read an array with an unknown number of rows; derive the number from the size of the entry.
-
-    Args:
-        archive: the archive, open for reading.
-        name: name of the array.
-        dtype: expected type.
-        row_shape: expected shape of a row.
-
-    Returns:
-        The array, shape (rows, *row_shape), read-only.
-
-    Raises:
-        ValueError: when type or shape differ.
-        Exception: as for `read_array`.
-    """
+    """Read an array of any number of rows, shape (rows, *row_shape); otherwise as `read_array`."""
     header_bytes, row_bytes = len(_header(dtype, (0, *row_shape))), math.prod(row_shape) * np.dtype(dtype).itemsize
     rows = (archive.getinfo(f"{name}.npy").file_size - header_bytes) // row_bytes
     return read_array(archive, name, dtype, (max(0, rows), *row_shape))
 
 
 def map_array(path: Path, name: str, dtype: DTypeLike, shape: Shape) -> NDArray[Any]:
-    """Map an array that `write_arrays` wrote into memory, and verify its CRC-32.
-
-    Args:
-        path: path of the archive.
-        name: name of the array.
-        dtype: expected type.
-        shape: expected shape, not empty; the array may exceed memory.
-
-    Returns:
-        The mapped array, read-only.
+    """Map an array of the expected dtype and shape, not empty, into memory, and verify its CRC-32.
 
     Raises:
-        ValueError: when type, shape or checksum differ.
+        ValueError: when dtype, shape or checksum differ.
         Exception: as for `read_array`.
     """
     header = _header(dtype, shape)
     with path.open("rb") as file, zipfile.ZipFile(file) as archive:
         info = _entry(archive, name, dtype, shape)
-        # The data follow the local header, the name and the extra field; bytes 26 to 29 hold the two lengths.
+        # The data follow the local header, the name and the extra field, whose lengths are bytes 26 to 29.
         file.seek(info.header_offset + 26)
         file.seek(sum(struct.unpack("<HH", file.read(4))), 1)
         if file.read(len(header)) != header:
@@ -146,12 +109,7 @@ def _header(dtype: DTypeLike, shape: Shape) -> bytes:
 
 
 def write_flo(file: BinaryIO, flow: NDArray[np.float32]) -> None:
-    """Write optical flow as .flo.
-
-    Args:
-        file: binary file, open for writing.
-        flow: flow to the right and down [px], shape (height, width, 2).
-    """
+    """Write optical flow to the right and down [px], shape (height, width, 2), as .flo."""
     height, width, _ = flow.shape
     file.write(_flo_header(width, height))
     file.write(np.ascontiguousarray(flow, "<f4").data)
@@ -168,7 +126,7 @@ def read_flo(path: Path, size: tuple[int, int]) -> NDArray[np.float32]:
         Flow to the right and down [px], shape (height, width, 2), read-only.
 
     Raises:
-        ValueError: when the file does not hold flow of this size.
+        ValueError: when the file does not contain flow of this size.
     """
     width, height = size
     header, length = _flo_header(width, height), 8 * width * height

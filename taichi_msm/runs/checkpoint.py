@@ -1,9 +1,8 @@
 """Checkpoint of an unfinished run, from which another process can continue it.
 
 A checkpoint is a folder with the manifest of the run, the positions and, if requested, the forces of every frame, and
-the state of the solver saved last. Each part has a checksum, which is verified before the part is used: the manifest
-and each frame have a SHA-256, the archive of the state has CRC-32. Contents are also checked for plausibility, because
-the folder may come from anybody.
+the last saved state of the solver. Each part has a checksum, which is verified before the part is used: SHA-256 for the
+manifest and for each frame, CRC-32 for the state. Contents are also validated, because the folder may be untrusted.
 """
 
 from __future__ import annotations
@@ -58,7 +57,7 @@ CHECKPOINT_PATTERNS = (
 # Upper bound of the time spent on saving states, as a fraction of the run's time.
 MAX_SAVE_TIME_FRACTION = 0.02
 
-# Columns of the arrays: tip and force of a `TipForce`; time and force of a `PeakForce`.
+# Numbers of a `TipForce`, tip and force, and of a `PeakForce`, time and force.
 FORCE_COLUMNS, PEAK_FORCE_COLUMNS = 6, 4
 
 
@@ -99,7 +98,7 @@ class Checkpoint:
         return time.perf_counter() >= self._next_save
 
     def begin(self, manifest: Mapping[str, Any]) -> None:
-        """Begin the checkpoint of a new run, and delete that of an earlier run."""
+        """Begin the checkpoint of a new run in place of an earlier one."""
         self.close()
         self._folder.mkdir(exist_ok=True)
         self.invalidate()
@@ -119,7 +118,7 @@ class Checkpoint:
         """Open the checkpoint of an earlier run to continue it.
 
         Returns:
-            The state saved last, or None when the run continues from its first frame.
+            The last saved state; None when the run continues from its first frame.
         """
         self.close()
         try:
@@ -156,10 +155,10 @@ class Checkpoint:
         return _tip_forces(self._forces.read(frame))
 
     def save(self, saved: Snapshot) -> str:
-        """Save a state of the run in place of the previous one. All frames up to it must have been stored.
+        """Save a state in place of the previous one; all frames up to it must be stored.
 
         Returns:
-            Path of the archive, with the fields of `State` and `RunProgress` by name.
+            Path of the archive, which contains the fields of `State` and `RunProgress` by name.
         """
         start = time.perf_counter()
         path = self._folder / STATE_FILE
@@ -170,7 +169,7 @@ class Checkpoint:
         return str(path)
 
     def load(self) -> Snapshot | None:
-        """Read the state saved last; return None when none was saved."""
+        """Read the last saved state; None if there is none."""
         empty = self._arrays(Snapshot(State(0, np.empty(0), np.empty(0)), RunProgress(), ProbeForces((), ())))
         types = {name: (array.dtype, array.shape) for name, array in empty.items()}
         types["forces"] = types["forces"][0], (self._probes, FORCE_COLUMNS)
@@ -214,7 +213,7 @@ class Checkpoint:
 
 
 def open_manifest(directory: Path) -> BinaryIO:
-    """Open the manifest of the unfinished run in a directory; raise OSError or ForeignError when there is none."""
+    """Open the manifest of the unfinished run in a directory; raise an OSError or a ForeignError without one."""
     checkpoint = require_kind(require_kind(directory / STAGING_FOLDER, FOLDER) / CHECKPOINT_FOLDER, FOLDER)
     return require_kind(checkpoint / MANIFEST_FILE, FILE).open("rb")
 
@@ -229,7 +228,7 @@ def is_unfinished(directory: Path) -> bool:
 
 
 def dump_with_checksum(content: Any) -> bytes:
-    """Serialise a value as JSON together with its SHA-256."""
+    """Serialise a value as JSON with its SHA-256."""
     return json.dumps({"sha256": sha256_digest(json.dumps(content).encode()).hex(), "content": content}).encode()
 
 
@@ -256,14 +255,9 @@ DIGEST_BYTES = 32
 
 
 class ArrayFile:
-    """File of arrays of equal shape, one per frame, that grows with the run.
+    """Growing file of arrays of equal shape and dtype, one per frame.
 
     Each array has a SHA-256 that also covers its index and the digest of the run's manifest.
-
-    Args:
-        path: path of the file.
-        shape: shape of an array.
-        dtype: type of its elements.
     """
 
     def __init__(self, path: Path, shape: tuple[int, ...], dtype: Any) -> None:
@@ -291,27 +285,22 @@ class ArrayFile:
             raise ForeignError.at(self._path, "a file that has other names")
 
     def require_length(self, count: int) -> None:
-        """Raise a DamagedError if the file has fewer arrays than `count`."""
+        """Raise a DamagedError if the file has fewer than `count` arrays."""
         if os.fstat(self._file.fileno()).st_size < count * self._size:
             raise damaged_checkpoint(self._path)
 
-    def write(self, number: int, values: NDArray[Any]) -> None:
-        """Write an array at an index, in place of an earlier one.
-
-        Args:
-            number: index of the array.
-            values: the array, of the file's shape.
-        """
+    def write(self, index: int, values: NDArray[Any]) -> None:
+        """Write an array at an index, in place of an earlier one."""
         data = np.ascontiguousarray(values, self._dtype).reshape(-1).view(np.uint8).data
-        self._file.seek(number * self._size)
-        for remaining in (memoryview(self._digest(number, data)), data):
+        self._file.seek(index * self._size)
+        for remaining in (memoryview(self._digest(index, data)), data):
             while remaining:  # A write to an unbuffered file may be partial.
                 remaining = remaining[self._file.write(remaining) :]
 
-    def read(self, number: int) -> NDArray[Any]:
+    def read(self, index: int) -> NDArray[Any]:
         """Read the array at an index; raise a DamagedError if its checksum differs or it is not finite."""
         record = np.empty(self._size, np.uint8)
-        self._file.seek(number * self._size)
+        self._file.seek(index * self._size)
         remaining = record.data
         while remaining and (count := self._file.readinto(remaining)):  # type: ignore[attr-defined]
             remaining = remaining[count:]
@@ -319,7 +308,7 @@ class ArrayFile:
         values = data.view(self._dtype).reshape(self._shape)
         if (
             remaining
-            or record[:DIGEST_BYTES].tobytes() != self._digest(number, data.data)
+            or record[:DIGEST_BYTES].tobytes() != self._digest(index, data.data)
             or not np.isfinite(values).all()
         ):
             raise damaged_checkpoint(self._path)
@@ -329,8 +318,8 @@ class ArrayFile:
         """Close the file."""
         self._open.close()
 
-    def _digest(self, number: int, data: memoryview) -> bytes:
-        return sha256_digest(self._manifest_digest, number.to_bytes(8, "little"), data)
+    def _digest(self, index: int, data: memoryview) -> bytes:
+        return sha256_digest(self._manifest_digest, index.to_bytes(8, "little"), data)
 
 
 def damaged_checkpoint(path: Path) -> DamagedError:

@@ -1,17 +1,16 @@
 """Atomic replacement of files and of all results in a directory.
 
-New results are written to `.partial/new` inside the directory. When they are complete, this folder is renamed to
-`.partial/whole`; this commits the publication. Then the record of the earlier results is moved aside, the new files are
-moved into place, leftover earlier files are deleted, and the new record is moved last. A directory with a record
-therefore always holds complete and consistent results. If the process is killed before the commit, the directory stays
-unchanged; if it is killed later, the next publication completes the moves.
+New results are written to `.partial/new` inside the directory. The publication is committed when this folder, complete,
+is renamed to `.partial/whole`. Then the record of the earlier results is moved aside, the new files are moved into
+place, obsolete files are deleted, and the new record is moved last. A directory with a record therefore always contains
+complete and consistent results. If the process is killed before the commit, the directory is unchanged; after it, the
+next publication completes the moves.
 
 The record lists the files of a publication, and only listed files are replaced or deleted. Any other entry in the way,
-such as a link or a device, is an error, raised before anything is changed. A folder is checked once, when work in it
-begins; files are created exclusively afterwards. Processes that can write to the directory during a run are trusted.
+such as a link or a device, is an error, raised before anything is changed. A folder is checked when work in it begins;
+later, files are created exclusively. Processes that can write to the directory during a run are trusted.
 
-Single files are replaced atomically, too: they are written in a hidden folder next to their destination and then
-renamed.
+Single files are replaced atomically, too: they are written to a hidden folder next to their destination and renamed.
 """
 
 from __future__ import annotations
@@ -33,13 +32,10 @@ from taichi_msm.errors import DamagedError, FilesError, ForeignError
 
 STAGING_FOLDER, NEW_FOLDER, READY_FOLDER, PREVIOUS_RECORD = ".partial", "new", "whole", "earlier.json"
 
-# Attempts to create and lock the staging folder while ending runs delete it.
-MAX_LOCK_ATTEMPTS = 100
-
-# Size limit of a record, larger than that of any run.
+# Size limit of a record, above the size of any run's.
 MAX_RECORD_BYTES = 1 << 28
 
-# Returns whether a record lists a file name.
+# Predicate of file names: whether a record lists them.
 IsListed = Callable[[str], bool]
 
 
@@ -49,7 +45,7 @@ class PublicationSpec(NamedTuple):
     name: str  # name of the publishing command, for messages
     record: str  # name of the file that lists the others
     patterns: Collection[str]  # of all files that may be published, including the record
-    read_record: Callable[[Mapping[str, Any]], IsListed]  # converts a record to a test of file names
+    read_record: Callable[[Mapping[str, Any]], IsListed]  # converts a record to a predicate of file names
     exclusive: bool = False  # whether the directory may not contain other files
     companion: tuple[str, Collection[str]] | None = None  # a folder that stays unpublished, and its patterns
 
@@ -58,13 +54,13 @@ class Publication:
     """Publication of new files in a directory, as a context manager. Without `publish`, they are discarded at exit.
 
     Args:
-        directory: the directory; created if missing.
-        spec: the kind of the publication.
+        directory: destination; created if missing.
+        spec: kind of the publication.
         names: names of all files that may be published; checked at entry for conflicts with foreign files.
 
     Raises:
-        FilesError: at entry and in `publish`, when another process publishes to the directory, or a foreign file is in
-            the way.
+        FilesError: at entry and in `publish`, when another process publishes to the directory, or a foreign file is at
+            the path of a result.
         OSError: when the directory cannot be written.
 
     Attributes:
@@ -96,7 +92,7 @@ class Publication:
         return (self._lock.fileno(),) if os.name == "posix" else ()
 
     def publish(self, names: Collection[str]) -> None:
-        """Replace earlier results by the new files of these names, which include the record."""
+        """Replace earlier results by the named new files, which include the record."""
         for name in names:
             if entry_kind(self.new_folder / name) != FILE:
                 raise FilesError(f"{self.new_folder / name} was removed during the {self._spec.name}; run it again")
@@ -150,9 +146,9 @@ class Publication:
             raise ValueError("no record") from error
 
     def _require_free(self, names: Collection[str], earlier: set[str]) -> None:
-        """Raise an error unless the folders are writable and the names are free or those of earlier results."""
+        """Raise an error unless all folders are writable, and all names are free or those of earlier results."""
         for folder in sorted(parent_folders(names)):
-            # Checked here to fail before the run rather than during the moves.
+            # Checked here, so that it fails before the run and not during the moves.
             path = require_kind(self._directory / folder, FOLDER)
             if entry_kind(path) is None:
                 continue
@@ -168,7 +164,7 @@ class Publication:
         ready, moved_record = self.staging_folder / READY_FOLDER, self.staging_folder / PREVIOUS_RECORD
         record = ready / self._spec.record
         if entry_kind(record) is None:
-            return  # The record is moved last: nothing is committed, or all moves are done.
+            return  # the record is moved last: nothing is committed, or all moves are done
         try:
             is_new = self._read_record(record)
             if not is_new(record.name):
@@ -199,13 +195,13 @@ class Publication:
         clear_folder(self.staging_folder, self._patterns, keep)
 
     def _acquire(self) -> ExitStack:
-        """Create the staging folder and lock it until all processes that hold the lock have ended."""
-        for _ in range(MAX_LOCK_ATTEMPTS):
-            # An ending run may delete the folder before the lock is opened or acquired.
+        """Create the staging folder, and lock it until all processes with the lock's descriptor have ended."""
+        # An ending run may delete the folder before the lock is opened or acquired.
+        for _ in range(100):
             with suppress(FileNotFoundError), ExitStack() as opened:
                 with suppress(FileExistsError):
                     self.staging_folder.mkdir()
-                # Raises an error before anything is written there.
+                # Raise an error for foreign files before anything is written.
                 list(list_files(require_kind(self.staging_folder, FOLDER), self._patterns, strict=True))
                 opened.callback(_try_to_remove, self.staging_folder.rmdir)
                 self._lock = opened.enter_context(lock_file(self.staging_folder / LOCK_FILE))
@@ -224,7 +220,7 @@ FILE, FOLDER = "a file", "a folder"
 
 
 def entry_kind(path: Path) -> str | None:
-    """Return the kind of a directory entry without following links: FILE, FOLDER or a description; None if missing."""
+    """Return the kind of a directory entry, which may be a link: FILE, FOLDER or a description; None if missing."""
     try:
         mode = path.lstat().st_mode
     except FileNotFoundError:
@@ -237,35 +233,18 @@ def entry_kind(path: Path) -> str | None:
 
 
 def require_kind(path: Path, wanted: str) -> Path:
-    """Check that a directory entry is missing or of a kind.
-
-    Args:
-        path: path of the entry.
-        wanted: FILE or FOLDER.
-
-    Returns:
-        The path.
-
-    Raises:
-        ForeignError: when the entry is of another kind.
-    """
+    """Return a path; raise a ForeignError if it exists and is not of the `wanted` kind, FILE or FOLDER."""
     if (actual := entry_kind(path)) not in (None, wanted):
         raise ForeignError.at(path, str(actual))
     return path
 
 
 def require_no_link(folder: Path, option: str) -> Path:
-    """Check that a default folder, which may have come with the scene, is not a symbolic link.
+    """Return a default folder, which may have come with the scene; raise a FilesError if it is a symbolic link.
 
     Args:
         folder: the folder.
-        option: the command-line option that names it, for messages.
-
-    Returns:
-        The folder.
-
-    Raises:
-        FilesError: when it is a symbolic link or cannot be accessed.
+        option: command-line option that selects it, for messages.
     """
     try:
         is_link = folder.is_symlink()
@@ -277,35 +256,32 @@ def require_no_link(folder: Path, option: str) -> Path:
 
 
 def list_files(top: Path, patterns: Collection[str], *, strict: bool, ignored: Collection[str] = ()) -> Iterator[str]:
-    """List the files below a folder whose relative paths match a pattern. Links are not followed.
+    """List the files below a folder whose relative paths, with slashes, match a pattern. Links are not followed.
 
     Args:
         top: the folder.
-        patterns: regular expressions for relative paths with slashes; the parts before slashes match subfolders.
+        patterns: regular expressions of relative paths; their parts before slashes match the subfolders.
         strict: whether other entries are errors.
         ignored: names of entries to ignore.
-
-    Returns:
-        Relative paths with slashes.
 
     Raises:
         ForeignError: with `strict`, at the first entry that matches no pattern.
     """
     allowed, folders = re.compile("|".join(patterns)), re.compile("|".join(parent_folders(patterns)))
 
-    def look(folder: Path, prefix: str) -> Iterator[str]:
+    def walk(folder: Path, prefix: str) -> Iterator[str]:
         for path in folder.iterdir():
             actual, name = entry_kind(path), prefix + path.name
             if actual is None or name in ignored:
                 continue
             if actual == FOLDER and folders.fullmatch(name):
-                yield from look(path, f"{name}/")
+                yield from walk(path, f"{name}/")
             elif actual == FILE and allowed.fullmatch(name):
                 yield name
             elif strict:
                 raise ForeignError.at(path, actual)
 
-    return look(top, "")
+    return walk(top, "")
 
 
 def clear_folder(top: Path, patterns: Collection[str], keep: Collection[str] = ()) -> None:
@@ -342,7 +318,7 @@ else:
 
 HIDDEN_FOLDER_PATTERN, LOCK_FILE, DRAFT_FILE = r"\.partial-[0-9a-f]{16}", "lock", "draft"
 
-# Files that may be in a hidden folder.
+# Files that a hidden folder may contain.
 STAGED_PATTERNS = (
     LOCK_FILE,
     DRAFT_FILE,
@@ -357,7 +333,7 @@ STAGED_PATTERNS = (
 
 @contextmanager
 def ensured_folder(folder: Path) -> Iterator[None]:
-    """Create a folder and its ancestors if missing; delete the new folder at exit if it is empty."""
+    """Create a folder and its ancestors if missing; at exit, delete the new folder if it is empty."""
     is_new = not folder.exists()
     if is_new:
         folder.mkdir(parents=True, exist_ok=True)
@@ -371,9 +347,9 @@ def ensured_folder(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def hidden_folder(folder: Path) -> Iterator[Path]:
-    """Create a hidden folder for unfinished files, and delete it at exit.
+    """Create a hidden folder for unfinished files in their destination `folder`, and delete it at exit.
 
-    Hidden folders of killed processes are deleted first. `folder`, the destination of the files, is created if missing.
+    The destination is created if missing. Hidden folders of killed processes are deleted.
     """
     with ensured_folder(folder):
         _clear_abandoned(folder)
@@ -389,7 +365,7 @@ def hidden_folder(folder: Path) -> Iterator[Path]:
 def _clear_abandoned(folder: Path) -> None:
     for hidden in list(folder.iterdir()):
         if re.fullmatch(HIDDEN_FOLDER_PATTERN, hidden.name) and entry_kind(hidden) == FOLDER:
-            # Folders that are locked, incomplete, of another user, or with foreign files are left alone.
+            # Folders that are locked, incomplete, of another user or with foreign files are kept.
             with suppress(OSError, FilesError):
                 list(list_files(hidden, STAGED_PATTERNS, strict=True))
                 if entry_kind(hidden / LOCK_FILE) == FILE:
@@ -401,7 +377,7 @@ def _clear_abandoned(folder: Path) -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """Open a hidden draft that replaces a file at exit; after an exception, the file stays unchanged."""
+    """Open a draft that replaces a file at exit; after an exception, the file is unchanged."""
     with hidden_folder(path.parent) as hidden:
         with create_file(hidden / DRAFT_FILE) as file:
             yield file
@@ -409,17 +385,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 
 
 def move_to_free_name(draft: Path, folder: Path, stem: str, suffix: str) -> Path:
-    """Move a file to the first free name of stem-1, stem-2 and so on, without replacing any file.
-
-    Args:
-        draft: the file.
-        folder: the destination.
-        stem: beginning of the name.
-        suffix: end of the name, such as ".png".
-
-    Returns:
-        The new path.
-    """
+    """Move a file to the first free name of stem-1, stem-2 and so on plus suffix; return the new path."""
     number = 1
     while os.path.lexists(path := folder / f"{stem}-{number}{suffix}") or not link_without_replacing(draft, path):
         number += 1
@@ -427,54 +393,30 @@ def move_to_free_name(draft: Path, folder: Path, stem: str, suffix: str) -> Path
 
 
 def link_without_replacing(draft: Path, path: Path) -> bool:
-    """Link a file to a new name without replacing another file.
-
-    Args:
-        draft: the file.
-        path: the new path.
-
-    Returns:
-        False when the new path exists already.
-    """
+    """Link a file to a new path; return False if the path exists already."""
     try:
         # A rename would replace an existing file.
         os.link(draft, path)
     except FileExistsError:
         return False
-    except OSError:  # The file system has no links.
+    except OSError:  # the file system has no links
         draft.replace(path)
     return True
 
 
 def create_file(path: Path, buffering: int = -1) -> BinaryIO:
-    """Create a file and open it for writing and reading.
-
-    Args:
-        path: path of the file.
-        buffering: as for `open`.
-
-    Raises:
-        FileExistsError: when the path exists.
-    """
+    """Create a file and open it for writing and reading; raise a FileExistsError if the path exists."""
     return path.open("x+b", buffering)
 
 
 def write_new_file(path: Path, data: bytes) -> None:
-    """Create a file.
-
-    Args:
-        path: path of the file.
-        data: its content.
-
-    Raises:
-        FileExistsError: when the path exists.
-    """
+    """Create a file with some content; raise a FileExistsError if the path exists."""
     with create_file(path) as file:
         file.write(data)
 
 
 def lock_file(path: Path) -> BinaryIO:
-    """Lock a file until it is closed here and in all processes that inherit it. The file is created if missing.
+    """Lock a file, created if missing, until it is closed here and in all processes that inherit it.
 
     Raises:
         BlockingIOError: when another process holds the lock.
@@ -489,7 +431,7 @@ def lock_file(path: Path) -> BinaryIO:
 
 
 def _try_lock(file: BinaryIO) -> bool:
-    """Lock an open file; return False when the file system has no locks."""
+    """Lock an open file; return False if the file system has no locks."""
     try:
         if sys.platform == "win32":
             msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)

@@ -1,7 +1,7 @@
 """Picture encoding in a separate process, in parallel with the simulation.
 
-Pillow releases the GIL while it encodes, but Taichi holds it while a kernel runs. Measured with kernel launches of
-25 ms and PNGs of 512 x 512 pixels, which take 18 ms to encode: threads lengthen a frame by 22 ms, a process by 1 ms.
+Pillow releases the GIL while it encodes, but Taichi holds it while a kernel runs. With kernel launches of 25 ms, and
+PNGs of 512 x 512 pixels that take 18 ms to encode, threads lengthen a frame by 22 ms, a process by 1 ms.
 """
 
 from __future__ import annotations
@@ -24,12 +24,8 @@ import numpy as np
 from taichi_msm.errors import FilesError, Pause
 from taichi_msm.runs.media import PAUSE_INTERVAL_S, EncodingJob, EncodingReport, Picture, PictureWriter
 
-# Limits of the queue in memory.
-MAX_QUEUED_FRAMES = 4
-MAX_QUEUED_BYTES = 256 << 20
-
-# With the parent's path, the child imports the same package. Unlike with multiprocessing, the child does not import the
-# caller's main module, so that scripts need no guard.
+# With the parent's sys.path, the child imports the same package. Unlike a child of multiprocessing, it does not import
+# the caller's main module, so that scripts need no guard.
 _CHILD_CODE = "import sys; sys.path[:] = {path!r}; from taichi_msm.runs.encoder import main; main()"
 
 
@@ -38,14 +34,14 @@ class Encoder:
 
     Args:
         job: formats, destinations and size of the pictures.
-        inherit: file descriptors that the child keeps open while it lives, such as locks.
+        inherit: file descriptors that the child inherits, such as locks.
 
     Raises:
         OSError: from any method, at the latest from `finish`, when a file cannot be written or the process has died.
     """
 
     def __init__(self, job: EncodingJob, inherit: tuple[int, ...] = ()) -> None:
-        with _sigint_blocked():  # the child unblocks it when it can handle it
+        with _sigint_blocked():  # the child unblocks it once its handler is set
             self._process = subprocess.Popen(
                 [sys.executable, "-c", _CHILD_CODE.format(path=sys.path)],
                 bufsize=0,
@@ -147,7 +143,7 @@ def main() -> None:
     """Run the child process: read a job and its pictures from stdin, write the report to stdout."""
     report: EncodingReport | Exception
     discard_queued = Event()
-    # A SIGTERM to a whole service also reaches this process. It is ignored: the parent closes the stream when it ends.
+    # A SIGTERM to all processes of a service is ignored here: the parent closes the stream when it ends.
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     signal.signal(signal.SIGINT, lambda number, frame: discard_queued.set())
     if hasattr(signal, "pthread_sigmask"):
@@ -169,8 +165,8 @@ def encode_stream(job: EncodingJob, source: BinaryIO, discard_queued: Event) -> 
 
     Args:
         job: formats, destinations and size of the pictures.
-        source: the frames one after another, each of shape (cameras, height, width, 3), uint8.
-        discard_queued: when set, pictures whose encoding has not begun are discarded, except for the first frame.
+        source: concatenated frames, each of shape (cameras, height, width, 3), uint8.
+        discard_queued: when set, frames whose encoding has not begun are discarded, except for the first one.
 
     Returns:
         The number of encoded frames and the processor time.
@@ -178,7 +174,8 @@ def encode_stream(job: EncodingJob, source: BinaryIO, discard_queued: Event) -> 
     width, height = job.size
     shape = len(job.folders), height, width, 3
     parent = os.getppid()
-    writer = PictureWriter(job, max(1, min(MAX_QUEUED_FRAMES, MAX_QUEUED_BYTES // math.prod(shape))), discard_queued)
+    # At most 4 frames and 256 MiB are queued.
+    writer = PictureWriter(job, max(1, min(4, (256 << 20) // math.prod(shape))), discard_queued)
     try:
         for pictures in _read_pictures(source, shape):
             writer.add(pictures)

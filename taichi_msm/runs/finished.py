@@ -1,4 +1,4 @@
-"""Reader of the results of a finished run. Files are validated, because they may come from anybody."""
+"""Reader of the results of a finished run. Files are validated, because they may be untrusted."""
 
 from __future__ import annotations
 
@@ -55,15 +55,15 @@ class FinishedRun:
             Positions of the mass points [m], shape (frames, rows, cols, 3), read-only.
 
         Raises:
-            FilesError: when there is no trajectory, or it is damaged or belongs to another run.
+            FilesError: when the trajectory is missing, damaged or of another run.
         """
         path = self.result_path("trajectory")
         dtype = np.dtype(np.float32 if self.scene.time.precision == "f32" else np.float64)
         rest = rest_positions(self.scene.sheet)
         with reading(path):
             positions = map_array(path, "position", dtype, (self.frames, *rest.shape))
-        # A dynamic run begins with the flat sheet. Kernels and export formats need values within f32. The comparison is
-        # written so that NaN fails it.
+        # A dynamic run begins with the flat sheet. Kernels and export formats need values within f32. NaN fails this
+        # comparison.
         largest = float(np.finfo(np.float32).max)
         starts_flat = self.scene.time.at_rest or np.array_equal(positions[0], rest.astype(dtype))
         if not starts_flat or not all(np.abs(position).max() <= largest for position in positions):
@@ -74,7 +74,7 @@ class FinishedRun:
         """Read a picture of a frame.
 
         Args:
-            key: the entry of `output` that wrote it, such as "png".
+            key: entry of `output` that wrote it, such as "png".
             frame: index of the frame.
 
         Returns:
@@ -94,7 +94,7 @@ class FinishedRun:
 
     @contextmanager
     def unchanged(self) -> Iterator[None]:
-        """Raise a FilesError, in place of other errors, if another run replaces the results within the block."""
+        """Raise a FilesError, instead of other errors, if another run replaces the results within the block."""
         try:
             yield
         except MsmError:
@@ -111,7 +111,7 @@ class FinishedRun:
             raise FilesError(f"{self.directory}: another run replaced these results while they were read; try again")
 
     def require_same_pictures(self, *, drawn: bool) -> None:
-        """Raise a FilesError if a map or, if it is `drawn`, the picture has changed since the run, by its SHA-256."""
+        """Raise a FilesError if the SHA-256 of a map has changed since the run, or with `drawn` that of the picture."""
         for key, path in self.scene.pictures.items():
             if key == "image" and not drawn:
                 continue
@@ -130,14 +130,14 @@ class FinishedRun:
             return path.exists()
 
     def camera_names(self) -> list[str]:
-        """Return the names of the cameras; empty if the scene has one unnamed camera."""
+        """Return the names of the cameras; empty for a single unnamed camera."""
         return list(self.scene.render.cameras or ())
 
     def _output_folder(self, key: str) -> Path:
         return self.directory / self.camera if OUTPUTS[key].is_camera_output else self.directory
 
     def remedy(self, *keys: str) -> str:
-        """Describe how to obtain the results of further entries of `output`, for messages."""
+        """Return the remedy for missing entries of `output`, for messages."""
         outputs = ",".join(dict.fromkeys([*self.scene.output, *keys]))
         if (self.directory / ".." / ".." / SWEEP_RECORD).is_file():
             return f"run the sweep into a new folder with `set: {{output: [{outputs}]}}` in its file"
@@ -147,7 +147,7 @@ class FinishedRun:
         """Return the verified path of an output file.
 
         Args:
-            key: the entry of `output` that wrote it.
+            key: entry of `output` that wrote it.
             frame: index of the frame, for outputs with a file per frame.
 
         Raises:
@@ -160,19 +160,16 @@ class FinishedRun:
         return self.require_own_file(path, key)
 
     def require_own_file(self, path: Path, key: str) -> Path:
-        """Check that a path below the run's folder is a regular file reached without links.
+        """Return a path below the run's folder after checking that it is a regular file, reached without links.
 
-        Results may come from anybody, and exports of them may be passed on. A link could expose other files.
+        In untrusted results, a link could make an export expose other files.
 
         Args:
             path: path of the file.
-            key: the entry of `output` that writes it, for messages.
-
-        Returns:
-            The path.
+            key: entry of `output` that writes it, for messages.
 
         Raises:
-            FilesError: when the file is missing or not regular, or when a folder on the way is a link.
+            FilesError: when the file is missing or not regular, or when one of its folders is a link.
         """
         below = path.relative_to(self.directory)
         for inner in [*list(below.parents)[-2::-1], below]:
@@ -187,7 +184,7 @@ class FinishedRun:
 
 
 def read_run(directory: str | Path) -> FinishedRun:
-    """Read the record of a finished run. Other results are read on demand.
+    """Read the record of a finished run; other results are read on demand.
 
     Raises:
         ArgumentError: when the directory is not a valid path.
@@ -230,12 +227,12 @@ def damaged_result(path: Path) -> FilesError:
 
 
 def _read_scene(record: Mapping[str, Any]) -> Scene:
-    """Build the scene of a record, with picture paths from the current directory."""
+    """Build the scene of a record, with picture paths relative to the current directory."""
     scene, folder = Scene(**record["scene"]), Path(record["working_directory"])
     if folder != Path.cwd():
         scene = scene.with_pictures(lambda path: str(folder / path))
     problems = [*try_plan(scene)[1], *camera_problems(scene)]
-    # Callers that need a picture report a missing or changed one; the step was valid for the original map.
+    # Missing or changed pictures are reported by the methods that need them; the step was valid for the original map.
     if any(problem.path[-1:] != ("image",) and problem.path[0] != "time" for problem in problems):
         raise SceneError([str(problem) for problem in problems])
     return scene

@@ -63,20 +63,20 @@ class Manifest:
                 raise FilesError(f"{path} has changed since the run began; put it back, or run the scene again")
         original, current = result_versions(self.versions, self.arch), result_versions(versions, self.arch)
         if original != current:
-            # For a run begun with a tested compiler, only the current compiler appears in the comparison.
+            # If the run began with a tested compiler, and the current one is untested, only the latter is compared.
             changed = any(version != current.get(name) for name, version in original.items())
             named = original if changed else self.versions
             others = [f"{name} {version}" for name, version in named.items() if version != versions.get(name)]
             raise FilesError(f"the run began with {', '.join(others)}; use these versions, or run the scene again")
 
     def has_same_bits_as(self, other: Manifest) -> bool:
-        """Return whether both runs produce the same bits, so that one can continue the other."""
-        return self._bit_deciding_values() == other._bit_deciding_values()
+        """Return whether both runs produce results with the same bits, so that one can continue the other."""
+        return self._result_inputs() == other._result_inputs()
 
-    def _bit_deciding_values(self) -> tuple[Any, ...]:
-        # Pictures are compared by their digests, not by their paths.
+    def _result_inputs(self) -> tuple[Any, ...]:
+        # Pictures are compared by digest, not by path.
         scene = self.scene.with_pictures(lambda path: "any")
-        # Dictionaries compare equal in any order, but the light is at the first camera.
+        # The order of the cameras matters, because the light is at the first one; dictionaries compare without order.
         return (
             scene,
             list(scene.render.all_cameras),
@@ -102,7 +102,7 @@ def read_manifest(directory: Path) -> tuple[Manifest, Plan]:
         with open_manifest(directory) as file:
             data = file.read(MAX_MANIFEST_BYTES + 1)
         manifest = _MANIFEST_ADAPTER.validate_python(load_with_checksum(data))
-        # The current directory may have changed since.
+        # The current directory may be another one.
         manifest = replace(manifest, scene=manifest.scene.with_pictures(partial(os.path.join, manifest.folder)))
     except (FileNotFoundError, NotADirectoryError):
         raise FilesError(f"{directory}: there is no unfinished run to resume") from None
@@ -113,7 +113,7 @@ def read_manifest(directory: Path) -> tuple[Manifest, Plan]:
     plan, problems = try_plan(manifest.scene)
     if unreadable := [str(problem) for problem in problems if problem.path[-1:] == ("image",)]:
         raise SceneError(unreadable)
-    # Validated, because the file may come from anybody.
+    # Validated, because the file may be untrusted.
     numbers = () if manifest.estimate is None else asdict(manifest.estimate).values()
     possible = manifest.arch in ARCHS and all(number >= 0 for number in numbers)
     if plan is None or problems or not possible or list(camera_problems(manifest.scene)):
@@ -124,7 +124,7 @@ def read_manifest(directory: Path) -> tuple[Manifest, Plan]:
 def input_digests(plan: Plan) -> dict[str, str]:
     """Compute the SHA-256 of the files of picture, maps and cameras, by their keys in the scene.
 
-    An unreadable picture is omitted. Digests of maps and cameras refer to the files as read for the plan.
+    An unreadable picture is omitted. Digests of maps and cameras are those of the files as read for the plan.
     """
     scene = plan.scene
     sha256 = {**plan.sha256} | {f"{scene.kind}.{name}.image": image.sha256 for name, image in plan.maps.items()}

@@ -1,9 +1,9 @@
 """Streaming writers of PNG, animated GIF and MP4.
 
 GIF: all frames share a palette, and their times are exact to 10 ms at any frame rate. At most two frames are queued,
-whereas Pillow's writer keeps all frames in memory; given RGB pictures, it also computes a palette per frame, which
-takes 24 times longer. Measured with 512 x 512 pixels of shaded tissue: 4 ms and 89 kB per frame. Floyd-Steinberg
-dithering would take 7 ms and 115 kB, and flicker.
+whereas Pillow's writer keeps all frames in memory; for RGB pictures, it also computes a palette per frame, which takes
+24 times longer. A frame of 512 x 512 pixels of shaded tissue takes 4 ms and 89 kB. Floyd-Steinberg dithering would take
+7 ms and 115 kB, and flicker.
 
 MP4: H.264, encoded by PyAV, whose wheels include the encoder (`docs/decisions/0029`).
 """
@@ -34,36 +34,30 @@ from taichi_msm.scene.outputs import OUTPUTS
 
 Picture = NDArray[np.uint8]  # colours, shape (height, width, 3), or palette indices, shape (height, width)
 
-# Limits of a frame's delay [1/100 s]: the field has 16 bits, and browsers replace 0 and 1 by 10.
+# Limits of a frame's delay [1/100 s]: browsers replace 0 and 1 by 10, and the field has 16 bits.
 MIN_GIF_DELAY = 2
 MAX_GIF_DELAY = 0xFFFF
 
-# Colours of a palette; the last of the 256 indices is transparent and keeps the pixel of the previous frame.
+# Number of colours of a palette; the last of the 256 indices is transparent, and keeps the pixel of the previous frame.
 PALETTE_SIZE = 255
 TRANSPARENT_INDEX = PALETTE_SIZE
 
-# The palette is fitted to a grid of PALETTE_SAMPLES pixels per axis of the first frame, at these relative brightnesses.
-# The first frame shows the sheet at rest; later, some of it turns toward the headlight or away from it.
-PALETTE_SAMPLES = 48
-PALETTE_LIGHT_LEVELS = (1.0, 1.0, 1.0, 1.0, 1.15, 1.3, 0.8, 0.6, 0.35, 0.15)
-
-# Pillow maps each cell of 4 x 4 x 4 colours to the palette entry nearest to the cell's darkest corner. A lookup palette
-# that is half a cell darker selects the entry nearest to the cell's centre instead, which reduces the error by 0.8 dB.
-HALF_CELL_LEVELS = 2
-
 
 def predict_colours(picture: Picture) -> Picture:
-    """Predict the colours of an animation from its first frame, shape (height, width, 3); return samples likewise."""
-    stride = -(-max(picture.shape) // PALETTE_SAMPLES)
+    """Predict typical colours of an animation, shape (n, m, 3), from its first frame, shape (height, width, 3)."""
+    # A grid of at most 48 pixels per axis, at several brightnesses: the first frame shows the sheet at rest; later,
+    # parts of it turn toward the headlight or away from it.
+    stride = -(-max(picture.shape) // 48)
     samples = picture[::stride, ::stride].astype(np.float32)
-    return np.concatenate([np.clip(samples * light, 0, 255) for light in PALETTE_LIGHT_LEVELS]).astype(np.uint8)
+    brightnesses = (1.0, 1.0, 1.0, 1.0, 1.15, 1.3, 0.8, 0.6, 0.35, 0.15)
+    return np.concatenate([np.clip(samples * factor, 0, 255) for factor in brightnesses]).astype(np.uint8)
 
 
 class Palette:
     """Colour palette of an animation.
 
     Args:
-        samples: typical colours, shape (height, width, 3).
+        samples: typical colours, shape (n, m, 3).
         background: a colour that the palette contains exactly.
 
     Attributes:
@@ -78,7 +72,9 @@ class Palette:
         self.table: Picture = np.concatenate([colours, np.zeros((PALETTE_SIZE + 1 - len(colours), 3), np.uint8)])
         self._background = background
         self._lookup = Image.new("P", (1, 1))
-        self._lookup.putpalette((np.maximum(colours, HALF_CELL_LEVELS) - HALF_CELL_LEVELS).tobytes())
+        # Pillow maps each cell of 4 x 4 x 4 colours to the palette entry nearest to the cell's darkest corner. With a
+        # palette that is half a cell darker it is the entry nearest to the cell's centre, which saves 0.8 dB of error.
+        self._lookup.putpalette((np.maximum(colours, 2) - 2).tobytes())
 
     def indices(self, picture: Picture) -> Picture:
         """Return the palette index of every pixel, shape (height, width), of a picture, shape (height, width, 3)."""
@@ -99,14 +95,14 @@ class _TimedFrame(NamedTuple):
 class GifWriter:
     """Writer of an endlessly looping GIF. Frame f lasts from f / rate to (f + 1) / rate, rounded to 1/100 s.
 
-    Frames shorter than 2/100 s are dropped, except for the last one, which shortens its predecessor. A frame that
-    equals its predecessor is merged with it.
+    Frames shorter than 2/100 s are dropped, except for the last one, which shortens its predecessor. Equal consecutive
+    frames are merged.
 
     Args:
         file: binary file, open for writing; `close` closes it.
         size: width and height [px].
         rate: frames per second.
-        palette: the palette of all frames.
+        palette: palette of all frames.
     """
 
     def __init__(self, file: BinaryIO, size: tuple[int, int], rate: float, palette: Palette) -> None:
@@ -185,14 +181,7 @@ class GifWriter:
         self._file.write(b"\x08" + Image.fromarray(patch).tobytes("gif", "L", 8, 0) + b"\x00")
 
 
-# This preset is twice as fast as the default at the same file size, and keeps 10 frames in memory instead of 40. With
-# one thread the file does not depend on the number of cores.
-H264_OPTIONS = {"preset": "veryfast", "threads": "1"}
-
-# Constant rate factor of H.264 at a quality of 0 %. At 100 % it is 1; 0 requires a profile that browsers do not play.
-MAX_RATE_FACTOR = 51
-
-# Colour space and range of HDTV, stated in the file: without them, players choose by the size of the picture.
+# Colour space and range of HDTV, stated in the file; otherwise players choose them by the size of the picture.
 BT709, LIMITED_RANGE = 1, 1
 
 # Largest denominator of a frame rate or of its inverse; the time base of MP4 has 32 bits.
@@ -216,13 +205,18 @@ class Mp4Writer:
 
         self._file, self._frame_class = file, av.VideoFrame
         self._padding = [(0, side % 2) for side in reversed(size)]
-        # With faststart, the index precedes the pictures, so that browsers play the video while it loads. To move the
-        # pictures behind it, PyAV opens the file a second time.
+        # With faststart, the index precedes the pictures, so that browsers play the video while it loads. PyAV opens
+        # the file a second time to move the pictures.
         options = {"movflags": "faststart"}
         self._container = av.open(file, "w", format="mp4", options=options, io_open=self._reopen)
-        factor = max(1, round(MAX_RATE_FACTOR * (1 - quality / 100)))
+        # The constant rate factor is 51 at 0 % and 1 at 100 %; 0 requires a profile that browsers do not play. This
+        # preset is twice as fast as the default at the same file size, and keeps 10 frames in memory instead of 40.
+        # With one thread the file does not depend on the number of cores.
+        factor = max(1, round(51 * (1 - quality / 100)))
         self._stream: Any = self._container.add_stream(
-            "libx264", _rate_fraction(rate), options={"crf": str(factor), **H264_OPTIONS}
+            "libx264",
+            _rate_fraction(rate),
+            options={"crf": str(factor), "preset": "veryfast", "threads": "1"},
         )
         self._stream.width, self._stream.height = (side + side % 2 for side in size)
         self._stream.pix_fmt = "yuv420p"
@@ -253,11 +247,7 @@ def _rate_fraction(rate: float) -> Fraction:
     return Fraction(rate).limit_denominator(MAX_RATE_DENOMINATOR)
 
 
-# For 512 x 512 pixels of shaded tissue, Pillow's default takes 93 ms, and level 1 takes 17 ms and 348 kB. Run-length
-# encoding takes 16 ms and 314 kB, because only the background repeats.
-PNG_OPTIONS = {"compress_level": 1, "compress_type": zlib.Z_RLE}
-
-# Interval between calls of `pause` while waiting for pictures to be encoded.
+# Time between calls of `pause` while waiting for the encoder.
 PAUSE_INTERVAL_S = 0.1
 
 
@@ -286,7 +276,7 @@ class EncodingReport(NamedTuple):
 
 
 class PictureWriter:
-    """Encoder of pictures in threads of this process, where no KeyboardInterrupt leaves incomplete files.
+    """Encoder of pictures in threads of this process, which a KeyboardInterrupt does not reach.
 
     Args:
         job: formats, destinations and size of the pictures.
@@ -364,7 +354,7 @@ class PictureWriter:
         return _measure_cpu_time(_write_png, picture, path)
 
     def _complete_frame(self, pictures: Picture, number: int, stills: Sequence[Future[float]]) -> None:
-        """Wait for the PNGs of a frame, then append it to the videos, which thus never have frames without a PNG."""
+        """Wait for the PNGs of a frame, then append it to the videos: they have no frames without a PNG."""
         self._cancel_if_discarding(number)
         self._seconds += sum(still.result() for still in stills)
         self._seconds += _measure_cpu_time(self._append_to_videos, pictures)
@@ -409,7 +399,9 @@ def _wait_for(task: Future[None], pause: Pause) -> None:
 
 def _write_png(picture: Picture, path: Path) -> None:
     with create_file(path) as file:
-        Image.fromarray(picture).save(file, "PNG", **PNG_OPTIONS)
+        # For 512 x 512 pixels of shaded tissue, Pillow's default takes 93 ms, and level 1 takes 17 ms and 348 kB.
+        # Run-length encoding takes 16 ms and 314 kB, because only the background repeats.
+        Image.fromarray(picture).save(file, "PNG", compress_level=1, compress_type=zlib.Z_RLE)
 
 
 def _measure_cpu_time(work: Callable[..., None], *args: object) -> float:

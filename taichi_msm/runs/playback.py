@@ -81,11 +81,11 @@ class Playback:
         return self._simulation.labels(camera, *self._frame_state(frame))
 
     def flow(self, first: int, second: int, camera: CameraLike = None, camera_then: CameraLike = None) -> Flow:
-        """Compute the optical flow from one frame to another, and which pixels of the first are occluded in the second.
+        """Compute the optical flow from a frame to another, and the occlusion of its pixels there.
 
         Args:
             first: index of the first frame.
-            second: index of the second frame, which may be the same or an earlier one.
+            second: index of the second frame; may be the first one or earlier.
             camera: camera of the first frame, as for `Simulation.draw`.
             camera_then: camera of the second frame; None for the same camera.
         """
@@ -93,7 +93,7 @@ class Playback:
         return self._simulation.flow(self.labels(first, camera), then, *self._frame_state(second))
 
     def locate(self, frame: int, coordinates: NDArray[np.floating], camera: CameraLike = None) -> Sight:
-        """Project material points into the picture of a frame, and determine whether they are hidden.
+        """Project material points into the picture of a frame, and determine their occlusion.
 
         Args:
             frame: index of the frame.

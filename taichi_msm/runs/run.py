@@ -48,15 +48,12 @@ from taichi_msm.system import process, runtime
 from taichi_msm.system.compiler import versions
 from taichi_msm.system.runtime import Device
 
-# Finer meshes are recommended only up to this estimated duration of the run.
-MAX_ADVISED_DURATION_S = 3600.0
-
 
 class Stopwatch:
     """Timer of the stages of a run. A nested stage pauses the outer one.
 
     Args:
-        started: `time.perf_counter()` at the beginning of the first stage, startup; None for now.
+        started: `time.perf_counter()` at the beginning of the stage startup; None for now.
 
     Attributes:
         seconds: time spent in each stage [s].
@@ -101,8 +98,8 @@ def run(
 ) -> RunRecord:
     """Simulate a scene and write its results atomically.
 
-    An unfinished run of the same scene in the same directory is continued, and the results have the same bits as those
-    of an uninterrupted run. It restarts if the error is estimated and the scene has no `output`, because the estimate
+    An unfinished run of the same scene in the same directory is continued; the results have the same bits as those of
+    an uninterrupted run. It is restarted if the error is estimated and the scene has no `output`, because the estimate
     needs all frames.
 
     Args:
@@ -111,7 +108,7 @@ def run(
             several cameras, pictures and labels go to a subfolder named after each camera.
         arch: cpu, cuda or vulkan.
         threads: number of CPU threads; None for all cores. With 1, pictures are encoded in this process, too.
-        overrides: the overrides that were applied to the scene file, for the record.
+        overrides: overrides that were applied to the scene file, for run.json.
         estimate_error: whether to estimate the error by companion runs; None if they take at most two fifths of the
             run's time. With a tolerance in the scene, the error is always estimated.
         started: `time.perf_counter()` at the start of the program; None for now.
@@ -124,8 +121,8 @@ def run(
 
     Raises:
         ArgumentError: when an argument is invalid.
-        SceneError: when the scene cannot be run, its picture cannot be decoded, no step meets its tolerance, or the
-            disk is too small for the results.
+        SceneError: when the scene cannot be run, its picture cannot be decoded, no step meets its tolerance, or there
+            is too little free disk space.
         DeviceError: when the arch is not available.
         FilesError: when the results cannot be written.
         KeyboardInterrupt: when interrupted before the first frame; nothing is written then.
@@ -137,7 +134,7 @@ def run(
         >>> record["status"], record["frames"], record["precision"]
         ('complete', 31, 'f64')
     """
-    watch = Stopwatch(started)
+    stopwatch = Stopwatch(started)
     plan = check_scene(scene)
     require_path(directory)
     folder = Path(directory)
@@ -147,7 +144,7 @@ def run(
     given = plan.scene
     texture = load_texture(given, sha256.get("image")) if given.draws else None
     has_tolerance = given.sheet.tolerance is not None or given.time.tolerance is not None
-    with watch.stage("pilot" if has_tolerance else "startup"):
+    with stopwatch.stage("pilot" if has_tolerance else "startup"):
         plan, estimate, mesh = resolve(plan, device, partial(progress, "pilot"))
     if mesh is not None:
         cost.require_disk(plan, folder)
@@ -159,8 +156,8 @@ def run(
     context = _RunContext(manifest, plan, texture, device, folder)
     if unfinished := _find_unfinished(context):
         with suppress(DamagedError):
-            return _execute(context._replace(manifest=_with_versions(unfinished)), watch, progress, resumes=True)
-    return _execute(context, watch, progress, resumes=False)
+            return _execute(context._replace(manifest=_with_versions(unfinished)), stopwatch, progress, resumes=True)
+    return _execute(context, stopwatch, progress, resumes=False)
 
 
 def resume(
@@ -189,7 +186,7 @@ def resume(
         FilesError: when there is no run to resume or it is damaged; and as for `run`.
         KeyboardInterrupt: when interrupted before another frame is finished; nothing has changed then.
     """
-    watch = Stopwatch(started)
+    stopwatch = Stopwatch(started)
     require_path(directory)
     manifest, plan = read_manifest(Path(directory))
     if too_large := [str(problem) for problem in cost.size_problems(plan)]:
@@ -198,7 +195,7 @@ def resume(
     texture = load_texture(plan.scene, manifest.sha256.get("image")) if plan.scene.draws else None
     device = runtime.start(manifest.arch, threads)
     context = _RunContext(_with_versions(manifest), plan, texture, device, Path(directory))
-    return _execute(context, watch, progress, resumes=True)
+    return _execute(context, stopwatch, progress, resumes=True)
 
 
 def _find_unfinished(context: _RunContext) -> Manifest | None:
@@ -210,7 +207,7 @@ def _find_unfinished(context: _RunContext) -> Manifest | None:
         return None
     if not manifest.has_same_bits_as(unfinished):
         return None
-    if _choose_pilots(context, resumed=True) != _choose_pilots(context, resumed=False):
+    if _choose_companions(context, resumed=True) != _choose_companions(context, resumed=False):
         return None
     return replace(manifest, versions=unfinished.versions)
 
@@ -230,12 +227,14 @@ class _RunContext(NamedTuple):
     directory: Path  # destination of the results
 
 
-def _execute(context: _RunContext, watch: Stopwatch, progress: StageProgressCallback, *, resumes: bool) -> RunRecord:
-    """Simulate and draw all frames, or the missing frames of the unfinished run in the directory."""
+def _execute(
+    context: _RunContext, stopwatch: Stopwatch, progress: StageProgressCallback, *, resumes: bool
+) -> RunRecord:
+    """Simulate and draw all frames, or with `resumes` those that the unfinished run in the directory lacks."""
     with ExitStack() as opened:
-        run = _Run(context, watch, progress, opened, resumes=resumes)
+        run = _Run(context, stopwatch, progress, opened, resumes=resumes)
         run.verify_stored_frames()
-        with watch.stage("hand over"):
+        with stopwatch.stage("write"):
             try:
                 run.prepare()
                 run.simulate_frames()
@@ -253,18 +252,18 @@ class _Run:
     def __init__(
         self,
         context: _RunContext,
-        watch: Stopwatch,
+        stopwatch: Stopwatch,
         progress: StageProgressCallback,
         opened: ExitStack,
         *,
         resumes: bool,
     ) -> None:
-        self._context, self._watch, self._progress = context, watch, progress
+        self._context, self._stopwatch, self._progress = context, stopwatch, progress
         plan, device, manifest = context.plan, context.device, context.manifest
         self._frames = plan.grid.frames + 1
         progress("compile", 0, self._frames)
         self._cores = cores = free_cores(plan)
-        # The writer comes first, so that its encoder starts while kernels are compiled.
+        # The writer is created first, so that its encoder starts while kernels are compiled.
         self._writer = opened.enter_context(
             ResultWriter(
                 context.directory,
@@ -276,20 +275,20 @@ class _Run:
         )
         self._simulation = opened.enter_context(Simulation(plan, device.arch, device.threads, context.texture, cores))
         self._resumed = self._writer.stored_frames
-        pilots = _choose_pilots(context, resumed=self._resumed > 0)
+        companions = _choose_companions(context, resumed=self._resumed > 0)
         self._error: RunErrorEstimator | None = None
         self._path_dependence = PathDependence(plan) if plan.scene.time.at_rest else None
         requested = manifest.asks_estimate
         self._repeats_solution = self._path_dependence is not None and (
             requested is True
-            or (requested is None and device.arch == "cpu" and self._path_dependence.affords(pilots.cost))
+            or (requested is None and device.arch == "cpu" and self._path_dependence.affords(companions.cost))
         )
-        self._known = RunErrorEstimates(manifest.estimate, pilots.reason, manifest.mesh)
-        if pilots.planned:
+        self._estimates = RunErrorEstimates(manifest.estimate, companions.reason, manifest.mesh)
+        if companions.planned:
             try:
-                self._error = RunErrorEstimator(plan, pilots, self._known, device, cores)
+                self._error = RunErrorEstimator(plan, companions, self._estimates, device, cores)
             except DeviceError:
-                self._known = self._known._replace(reason=f"{device.arch} cannot run this scene in f64")
+                self._estimates = self._estimates._replace(reason=f"{device.arch} cannot run this scene in f64")
 
     def verify_stored_frames(self) -> None:
         """Verify the checksums of stored positions before they are used."""
@@ -300,7 +299,7 @@ class _Run:
     def prepare(self) -> None:
         """Compile, and restore the simulation and its companion runs to the state of the unfinished run."""
         writer, rest = self._writer, rest_positions(self._context.plan.scene.sheet)
-        with self._watch.stage("compile"):
+        with self._stopwatch.stage("compile"):
             self._simulation.compile(partial(self._progress, "compile", 0, self._frames))
             if self._error:
                 self._error.compile()
@@ -310,7 +309,7 @@ class _Run:
             for frame in range(writer.frames):
                 self._path_dependence.check_frame(frame, writer.read_positions(frame) - rest)
         if self._error:
-            with self._watch.stage("pilot"):
+            with self._stopwatch.stage("pilot"):
                 for frame in range(1, writer.frames):
                     report = partial(self._progress, "pilot", frame, writer.frames)
                     self._error.compare_frame(writer.read_positions(frame) - rest, report)
@@ -318,9 +317,9 @@ class _Run:
     def simulate_frames(self) -> None:
         """Simulate, draw and write every missing frame, and complete the results."""
         writer, simulation, scene = self._writer, self._simulation, self._context.plan.scene
-        stage, rest = self._watch.stage, rest_positions(scene.sheet)
+        stage, rest = self._stopwatch.stage, rest_positions(scene.sheet)
         observed = dict.fromkeys(scene.render.all_cameras, FrameOutputs())
-        # Frames that need no steps are reported as a separate stage: they would distort the estimated remaining time.
+        # Frames without steps are reported as a separate stage, because they distort the estimated remaining time.
         redrawn_frames = max(self._resumed, 1)
         for frame in range(writer.frames, self._frames):
             kind, total = ("redraw", redrawn_frames) if frame < redrawn_frames else ("frames", self._frames)
@@ -343,18 +342,18 @@ class _Run:
                     self._error.compare_frame(position - rest, report, forces)
         try:
             if self._error:
-                kept = (
+                displacements = (
                     (writer.read_positions(frame) - rest for frame in range(1, self._frames)) if scene.output else None
                 )
                 with stage("pilot"):
-                    self._error.finish(kept, partial(self._progress, "pilot"))
+                    self._error.finish(displacements, partial(self._progress, "pilot"))
             if self._path_dependence and self._repeats_solution:
                 with stage("pilot"):
                     self._path_dependence.finish(
                         self._context.device, self._cores, partial(self._progress, "pilot", 0, 1)
                     )
         except KeyboardInterrupt:
-            # All frames are done; the estimate of the coarse companion run remains valid.
+            # All frames are finished; the estimate of the coarse companion run remains valid.
             writer.finish()
         else:
             writer.finish(partial(self._progress, "frames", self._frames, self._frames))
@@ -362,12 +361,12 @@ class _Run:
     def save_finished_frames(self) -> dict[str, Any]:
         """Save the state and the finished frames of an interrupted run; reraise if there is no new frame."""
         writer, simulation = self._writer, self._simulation
-        # The interruption may have come before the last simulated frame was stored.
+        # The last simulated frame may not have been stored.
         if simulation.steps > 0 and simulation.frame < writer.stored_frames and not simulation.inconsistent:
             # A divergence within this frame will recur in the resumed run.
             with suppress(DivergedError):
                 writer.save(simulation.save())
-        # To end soon, queued pictures are discarded, which may leave no new frame.
+        # Queued pictures are discarded, to end soon; there may be no new frame then.
         if writer.frames > self._resumed:
             writer.finish(discard_queued=True)
         if writer.frames <= self._resumed:
@@ -377,7 +376,7 @@ class _Run:
     def diagnose_divergence(self, error: DivergedError) -> dict[str, Any]:
         """Diagnose the divergence, and save the last valid state."""
         writer = self._writer
-        self._error, self._known = None, RunErrorEstimates(reason="the run diverged")
+        self._error, self._estimates = None, RunErrorEstimates(reason="the run diverged")
         ending: dict[str, Any] = {"status": "diverged", "error": str(error), "dump": None}
         with suppress(KeyboardInterrupt):
             diagnosis = self._simulation.diagnose(
@@ -390,23 +389,23 @@ class _Run:
 
     def publish_results(self, ending: dict[str, Any]) -> RunRecord:
         """Publish the results together with run.json."""
-        writer, simulation, device, watch = self._writer, self._simulation, self._context.device, self._watch
+        writer, simulation, device, stopwatch = self._writer, self._simulation, self._context.device, self._stopwatch
         self._progress("write", writer.frames, self._frames)
         writer.finish()
-        known = self._error.estimates if self._error else self._known
-        stages = ["startup", *(["pilot"] if "pilot" in watch.seconds else []), "compile", "simulate", "render"]
-        seconds = {stage: watch.seconds.get(stage, 0.0) for stage in stages}
+        estimates = self._error.estimates if self._error else self._estimates
+        stages = ["startup", *(["pilot"] if "pilot" in stopwatch.seconds else []), "compile", "simulate", "render"]
+        seconds = {stage: stopwatch.seconds.get(stage, 0.0) for stage in stages}
         record = {
             **ending,
-            **_record_facts(
+            **_run_entries(
                 self._context,
                 simulation.progress,
                 simulation.felt,
-                known,
+                estimates,
                 self._path_dependence.warnings() if self._path_dependence else (),
             ),
             "resumed": self._resumed,
-            "timings": {**seconds, "encode": writer.encode_seconds, "total": watch.total()},
+            "timings": {**seconds, "encode": writer.encode_seconds, "total": stopwatch.total()},
             "arch": device.arch,
             "device": device.name,
             "threads": device.threads,
@@ -418,33 +417,33 @@ class _Run:
 
     def _pause(self) -> None:
         """Report the progress within a frame, and save the state when due."""
-        with self._watch.stage("hand over"):
+        with self._stopwatch.stage("write"):
             self._progress("frames", self._writer.frames, self._frames)
             if self._writer.is_save_due:
                 self._writer.save(self._simulation.save())
 
 
-def _choose_pilots(context: _RunContext, *, resumed: bool) -> CompanionRuns:
+def _choose_companions(context: _RunContext, *, resumed: bool) -> CompanionRuns:
     """Choose the companion runs for the error estimate, or the reason for their absence."""
     requested = context.manifest.asks_estimate
     if requested is False:
         return CompanionRuns(reason="not asked for")
     if requested is None and context.device.arch != "cpu":
         return CompanionRuns(reason="on a GPU, this needs --estimate-error")
-    pilots = choose_companion_runs(context.plan, requested=requested is True)
-    if pilots.planned and resumed and not context.plan.scene.output:
+    companions = choose_companion_runs(context.plan, requested=requested is True)
+    if companions.planned and resumed and not context.plan.scene.output:
         return CompanionRuns(reason="the frames before the interruption were not kept")
-    return pilots
+    return companions
 
 
-def _record_facts(
+def _run_entries(
     context: _RunContext,
     progress: RunProgress,
     felt: ProbeForces,
-    known: RunErrorEstimates,
+    estimates: RunErrorEstimates,
     path_dependence: Iterable[str],
 ) -> dict[str, Any]:
-    """Build the entries of run.json that describe the scene, the last frame and the errors."""
+    """Build the entries of run.json about the scene, the last frame and the errors."""
     manifest, plan = context.manifest, context.plan
     scene = plan.scene
     probes = [
@@ -457,30 +456,30 @@ def _record_facts(
         for record, peak in zip(probe_records(scene), felt.greatest, strict=True)
     ]
     return {
-        # With picture paths as given; only the sections sheet and time contain resolved values.
+        # Picture paths are as given; only the sections sheet and time contain resolved values.
         "scene": manifest.given.model_copy(update={"sheet": scene.sheet, "time": scene.time}).model_dump(mode="json"),
         "asked": _chosen_keys(manifest.given, scene),
         "working_directory": manifest.folder,
         "sha256": dict(manifest.sha256),
         "overrides": list(manifest.overrides),
         "points": list(scene.sheet.points),
-        **_step_facts(plan, progress),
+        **_step_entries(plan, progress),
         "max_displacement": progress.max_displacement,
         "shortest_spring": progress.shortest_spring,
         "longest_spring": progress.longest_spring,
         "probes": probes,
         "notes": [
-            *run_warnings(plan, probes, progress, *known, _is_affordable, _pixels_per_metre(scene)),
+            *run_warnings(plan, probes, progress, *estimates, _is_affordable, _pixels_per_metre(scene)),
             *path_dependence,
             *drawing_warnings(scene),
         ],
-        "error_estimate": error_record(known),
-        **({"error_estimate_reason": known.reason} if known.estimate is None else {}),
+        "error_estimate": error_record(estimates),
+        **({"error_estimate_reason": estimates.reason} if estimates.estimate is None else {}),
     }
 
 
-def _step_facts(plan: Plan, progress: RunProgress) -> dict[str, Any]:
-    """Build the entries about the time steps, or at equilibrium those about the residual."""
+def _step_entries(plan: Plan, progress: RunProgress) -> dict[str, Any]:
+    """Build the entries about the time steps, or for a quasi-static scene about the residual."""
     grid, limit = plan.grid, plan.stable_step
     if plan.scene.time.at_rest:
         steps = dict.fromkeys(("step", "stable_step", "steps_per_frame", "steps"))
@@ -496,43 +495,43 @@ def _step_facts(plan: Plan, progress: RunProgress) -> dict[str, Any]:
 
 
 def free_cores(plan: Plan) -> int:
-    """Count the cores free for stepping: all, or all but one if the encoder is mostly busy."""
+    """Return the number of cores for stepping: all, or one less if encoding takes longer than stepping."""
     width, height = plan.scene.render.size
     rows, cols = plan.scene.sheet.points
     encoding = width * height * len(plan.scene.render.all_cameras) * ENCODING_WORK if plan.scene.draws else 0
-    busy = encoding > rows * cols * plan.grid.steps_per_frame
-    return max(1, process.available_threads() - busy)
+    is_encoder_busy = encoding > rows * cols * plan.grid.steps_per_frame
+    return max(1, process.available_threads() - is_encoder_busy)
 
 
 def _chosen_keys(given: Scene, scene: Scene) -> dict[str, Any]:
-    """Return the requested values of those keys that the run resolved to other values, by their paths."""
+    """Return the requested values of the keys that were resolved to others, by the paths of the keys."""
     keys = ("sheet.points", "sheet.tolerance", "time.step", "time.precision", "time.tolerance")
     pairs = [(key, attrgetter(key)(given), attrgetter(key)(scene)) for key in keys]
     return {key: requested for key, requested, resolved in pairs if requested != resolved}
 
 
 def _is_affordable(plan: Plan) -> bool:
-    """Return whether the estimated duration of a run permits recommending it."""
-    return cost.estimate_duration(plan).seconds <= MAX_ADVISED_DURATION_S
+    """Return whether a run takes an estimated hour at most, so that a warning may recommend it."""
+    return cost.estimate_duration(plan).seconds <= 3600
 
 
 def _pixels_per_metre(scene: Scene) -> float | None:
-    """Compute the image scale at the centre of the sheet [px/m]; None without pictures or outside the view."""
+    """Return the image scale at the centre of the sheet [px/m]; None without pictures or outside of them."""
     if not scene.renders:
         return None
-    middle, right, up = view_at(scene, 0.0, next(iter(scene.render.all_cameras))).pixels(
+    centre, right, up = view_at(scene, 0.0, next(iter(scene.render.all_cameras))).pixels(
         np.array([[0.0, 0, 0], [1e-4, 0, 0], [0, 1e-4, 0]])
     )
-    scale = float(max(np.linalg.norm(right - middle), np.linalg.norm(up - middle))) / 1e-4
+    scale = float(max(np.linalg.norm(right - centre), np.linalg.norm(up - centre))) / 1e-4
     return scale if math.isfinite(scale) else None
 
 
-def error_record(known: RunErrorEstimates) -> dict[str, Any] | None:
+def error_record(estimates: RunErrorEstimates) -> dict[str, Any] | None:
     """Build the error estimate for run.json; unknown values are null."""
-    estimate, mesh, keys = known.estimate, known.mesh, ("error", "rounding", "in_f64", "order", "at_least")
+    estimate, mesh, keys = estimates.estimate, estimates.mesh, ("error", "rounding", "in_f64", "order", "at_least")
     if estimate is not None:
         fields: dict[str, Any] = {key: getattr(estimate, key) for key in keys}
-    elif mesh is not None and known.reason == QUASISTATIC_REASON:
+    elif mesh is not None and estimates.reason == QUASISTATIC_REASON:
         fields = dict.fromkeys(keys) | {"at_least": False}
     else:
         return None
@@ -540,6 +539,6 @@ def error_record(known: RunErrorEstimates) -> dict[str, Any] | None:
         fields |= {"rounding": None, "in_f64": None}
     if mesh is not None:
         fields |= {"mesh_error": mesh.error, "mesh_doubt": mesh.doubt}
-    if known.force is not None:
-        fields |= {"force_error": known.force.error, "force_doubt": known.force.doubt}
+    if estimates.force is not None:
+        fields |= {"force_error": estimates.force.error, "force_doubt": estimates.force.doubt}
     return {key: None if value == math.inf else value for key, value in fields.items()}

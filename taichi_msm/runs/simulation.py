@@ -43,7 +43,7 @@ from taichi_msm.solver.rest import build_dynamics
 from taichi_msm.solver.state import ProbeForces, Reading, RunProgress, Snapshot, TipForce, largest_displacement
 from taichi_msm.system import runtime
 
-# Drawing kernels compiled in this process. Compiling them means drawing two frames, which is not repeated.
+# Drawing kernels that this process has compiled, by drawing two frames.
 _compiled_kernels: set[tuple[object, ...]] = set()
 
 
@@ -56,12 +56,12 @@ class Simulation:
         arch: cpu, cuda or vulkan.
         threads: number of CPU threads; None for all cores.
         texture: the picture on the sheet, shape (height, width, 3); None for the scene's, read at the first drawing.
-        cores: number of cores free for stepping; None for all. Threads spin while they wait for each other, so that a
-            thread without a core delays all others.
+        cores: number of cores for stepping; None for all. Threads spin while they wait for each other, so a thread
+            without a core delays all others.
 
     Raises:
-        MsmError: here and in all methods, in another thread than that of the first simulation, or in a process forked
-            after it; in most methods also after `close`.
+        MsmError: here and in all methods, outside the thread of the first simulation, or in a process forked after it;
+            in most methods also after `close`.
         ArgumentError: here and in all methods, when an argument is invalid.
         DeviceError: when the arch is not available, or the compiler already runs on another arch in this process.
         SceneError: when the scene cannot be run, or no step meets its tolerance.
@@ -92,9 +92,9 @@ class Simulation:
         self._plan = resolve(plan, self.device).plan
         # The original probes, before `steer`.
         self._probes = self.scene.probes
-        self._watch: DivergenceMonitor
-        self._gauge: ForceRecorder
-        self._felt: ProbeForces
+        self._monitor: DivergenceMonitor
+        self._force_recorder: ForceRecorder
+        self._probe_forces: ProbeForces
         self._frame_positions: Array | None
         self._divergence: DivergedError | None
         self._closed, self._cores = False, cores
@@ -140,14 +140,14 @@ class Simulation:
     @property
     def progress(self) -> RunProgress:
         """Progress and extrema of the run up to the last frame."""
-        return self._watch.progress
+        return self._monitor.progress
 
     def advance(self, frames: int = 1, pause: Pause = lambda: None) -> None:
         """Simulate a number of frames under the loads of the scene.
 
         Args:
             frames: number of frames, 0 or more; with 0, only the equilibrium of the first frame is solved, if the
-                scene is quasistatic.
+                scene is quasi-static.
             pause: called several times a second between steps; an exception from it stops the simulation, which the
                 next call continues.
 
@@ -182,12 +182,12 @@ class Simulation:
         self._solve_first_frame()
         plan = steer_plan(self._plan, probes, self._plan.grid.time(self.steps))
         self._dynamics.steer(plan)
-        self._watch.change_loads(plan)
-        self._gauge = ForceRecorder(plan)
+        self._monitor.change_loads(plan)
+        self._force_recorder = ForceRecorder(plan)
         self._plan, self.renderer.scene = plan, plan.scene
 
     def restart(self, scene: Plan | Scene | Mapping[str, Any] | None = None) -> None:
-        """Return to the initial state. Kernels are reused if the terms of the model and the precision are unchanged.
+        """Return to the initial state; kernels are reused if the terms of the model and the precision are unchanged.
 
         Args:
             scene: a new scene; None for the same.
@@ -219,11 +219,11 @@ class Simulation:
         self._require_open()
         self._solve_first_frame()
         reading = self._dynamics.read()
-        self._require_good(reading, self._watch.check(reading))
-        return Snapshot(self._dynamics.state(), self.progress, self._felt, self.scene.probes)
+        self._require_no_fault(reading, self._monitor.check(reading))
+        return Snapshot(self._dynamics.state(), self.progress, self._probe_forces, self.scene.probes)
 
     def restore(self, saved: Snapshot) -> None:
-        """Continue from a saved state of the same scene, to the same bits, also between two frames.
+        """Continue from a saved state of the same scene, to the same bits; it may be between two frames.
 
         Raises:
             ArgumentError: when the state has another mesh, precision, step or number of probes.
@@ -245,7 +245,7 @@ class Simulation:
         self._divergence = None
         self._dynamics.restart(self._plan, saved.state)
         self._frame_positions = to_positions(self._dynamics.displacement(), self.scene.sheet)
-        self._watch.progress, self._felt = saved.progress, saved.felt
+        self._monitor.progress, self._probe_forces = saved.progress, saved.felt
 
     def positions(self) -> Array:
         """Return the positions of the mass points [m], shape (rows, cols, 3), in the scene's precision; read-only."""
@@ -254,15 +254,15 @@ class Simulation:
     def forces(self) -> list[TipForce]:
         """Return the tip position and the force on the sheet of every probe at the last frame."""
         self._solve_first_frame()
-        return list(self._felt.forces)
+        return list(self._probe_forces.forces)
 
     @property
     def felt(self) -> ProbeForces:
-        """The forces of all probes at the last computed frame, and the greatest so far."""
-        return self._felt
+        """Forces of all probes at the last frame, and the greatest so far."""
+        return self._probe_forces
 
     def velocities(self) -> Array:
-        """Return the mean velocities of the mass points over the last step, which refer to half a step before `time`.
+        """Return the mean velocities of the mass points over the last step, those at half a step before `time`.
 
         Returns:
             Velocities [m/s], shape (rows, cols, 3), in the scene's precision; 0 at the start.
@@ -288,12 +288,12 @@ class Simulation:
         if self._divergence is None:
             raise MsmError("this simulation has not diverged; there is nothing to find out")
         if self.scene.time.at_rest:
-            good = (
+            last_state = (
                 None
                 if self._frame_positions is None
-                else Snapshot(self._dynamics.state(), self.progress, self._felt, self.scene.probes)
+                else Snapshot(self._dynamics.state(), self.progress, self._probe_forces, self.scene.probes)
             )
-            return Diagnosis(str(self._divergence), good)
+            return Diagnosis(str(self._divergence), last_state)
         return diagnose(self._dynamics, start, pause)
 
     def draw(
@@ -333,10 +333,10 @@ class Simulation:
     def flow(
         self, before: Labels, camera: CameraLike = None, positions: Array | None = None, time: float | None = None
     ) -> Flow:
-        """Compute the optical flow from another frame to this one, and which pixels of that frame are now occluded.
+        """Compute the optical flow from another frame to this one, and the occlusion of that frame's pixels.
 
         Args:
-            before: labels of the other frame, which may be earlier or later, with the same picture size. If they are of
+            before: labels of the other frame, which may be earlier or later, with the same picture size. With labels of
                 another camera, the flow leads from its picture to that of `camera`.
             camera: as for `draw`.
             positions: as for `draw`.
@@ -347,7 +347,7 @@ class Simulation:
     def locate(
         self, coordinates: Array, camera: CameraLike = None, positions: Array | None = None, time: float | None = None
     ) -> Sight:
-        """Project material points into the picture, and determine whether they are hidden; the inverse of `pick`.
+        """Project material points into the picture, and determine their occlusion; the inverse of `pick`.
 
         Args:
             coordinates: fractions of the sheet's width from its left and of its height from its top, shape (n, 2).
@@ -449,7 +449,7 @@ class Simulation:
 
     @property
     def _position(self) -> Array:
-        """Positions of the last frame [m]; a quasistatic first frame is solved if necessary."""
+        """Positions at the last frame [m]; a quasi-static first frame is solved if necessary."""
         self._solve_first_frame()
         assert self._frame_positions is not None
         return self._frame_positions
@@ -467,9 +467,11 @@ class Simulation:
             self._divergence = error
             raise
         reading = self._dynamics.read()
-        self._require_good(reading, self._watch.check_frame(reading))
+        self._require_no_fault(reading, self._monitor.check_frame(reading))
         position = to_positions(reading.displacement, self.scene.sheet)
-        self._felt = self._gauge.follow(self._felt, self.frame, position, self._dynamics.tool_forces())
+        self._probe_forces = self._force_recorder.follow(
+            self._probe_forces, self.frame, position, self._dynamics.tool_forces()
+        )
         self._frame_positions = position
 
     def _require_open(self) -> None:
@@ -495,7 +497,7 @@ class Simulation:
             raise ArgumentError(f"time: {time!r}; take a number, in seconds, or None for now")
         return Shot(positions, self.renderer.resolve_camera(camera, time), place_capsules(self.scene, positions, time))
 
-    def _require_good(self, reading: Reading, fault: str) -> None:
+    def _require_no_fault(self, reading: Reading, fault: str) -> None:
         """Raise a DivergedError if there is a fault."""
         if fault:
             steps, time = reading.steps, self._plan.grid.time(reading.steps)
@@ -506,21 +508,18 @@ class Simulation:
             raise self._divergence
 
     def _reset(self) -> None:
-        """Start from the flat sheet; a quasistatic first frame is solved later."""
+        """Start from the flat sheet; a quasi-static first frame is solved later."""
         self._divergence = None
-        self._watch, self._gauge = DivergenceMonitor(self._plan), ForceRecorder(self._plan)
-        self._felt = self._gauge.at_rest()
+        self._monitor, self._force_recorder = DivergenceMonitor(self._plan), ForceRecorder(self._plan)
+        self._probe_forces = self._force_recorder.at_rest()
         flat = to_positions(self._dynamics.displacement(), self.scene.sheet)
         self._frame_positions = None if self.scene.time.at_rest else flat
 
     def _restore_paths(self, probes: Sequence[Probe]) -> None:
         """Replace steered tool paths by those of the given probes."""
         self._plan = with_current_paths(self._plan, probes)
-        self._gauge, self.renderer.scene = ForceRecorder(self._plan), self.scene
+        self._force_recorder, self.renderer.scene = ForceRecorder(self._plan), self.scene
 
-
-# JPEG quality: differences are invisible, and hundreds of frames fit into a notebook.
-JPEG_QUALITY = 92
 
 _PLAYER_HTML = Template("""\
 <div id="$name">
@@ -558,7 +557,7 @@ class Player:
     """Playback of frames in a notebook, with a button and a slider.
 
     Args:
-        frames: pictures, at least one, each of shape (height, width, 3).
+        frames: pictures, each of shape (height, width, 3); at least one.
         rate: frames per second.
     """
 
@@ -582,15 +581,11 @@ class Player:
 def jpeg_data_url(picture: NDArray[np.uint8]) -> str:
     """Encode a picture, shape (height, width, 3), as a data URL with a JPEG."""
     file = io.BytesIO()
-    Image.fromarray(picture).save(file, "JPEG", quality=JPEG_QUALITY)
+    # Differences are invisible, and hundreds of frames fit into a notebook.
+    Image.fromarray(picture).save(file, "JPEG", quality=92)
     return f"data:image/jpeg;base64,{b64encode(file.getvalue()).decode()}"
 
 
 def captioned_figure(picture: NDArray[np.uint8], caption: str) -> str:
-    """Format a picture and a caption as HTML.
-
-    Args:
-        picture: colours, shape (height, width, 3).
-        caption: plain text.
-    """
+    """Format a picture, shape (height, width, 3), and a plain text as an HTML figure."""
     return f'<figure><img alt="" src="{jpeg_data_url(picture)}"><figcaption>{escape(caption)}</figcaption></figure>'

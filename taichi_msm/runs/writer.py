@@ -33,8 +33,8 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.state import Snapshot, TipForce
 
 
-def _run_file_test(record: Mapping[str, Any]) -> IsListed:
-    """Return a test of whether a file name is listed in a record."""
+def _is_listed_in(record: Mapping[str, Any]) -> IsListed:
+    """Return the predicate of the file names that a record lists."""
     return partial(outputs.is_result, set(record["outputs"]), int(record["frames"]))
 
 
@@ -42,7 +42,7 @@ RUN_PUBLICATION = PublicationSpec(
     "run",
     outputs.RUN_RECORD,
     outputs.RESULT_PATTERNS,
-    _run_file_test,
+    _is_listed_in,
     companion=(CHECKPOINT_FOLDER, CHECKPOINT_PATTERNS),
 )
 
@@ -50,9 +50,9 @@ RUN_PUBLICATION = PublicationSpec(
 class ResultWriter:
     """Streaming writer of the results of a run, as a context manager.
 
-    Files are written to a hidden folder, and `publish` moves them into place atomically. At exit without `publish`,
-    they are deleted, but the checkpoint of a run with a manifest is kept from the first frame until complete results
-    are published. Foreign files in the directory are never changed.
+    Files are written to a hidden folder, and `publish` moves them into place atomically. Without `publish`, they are
+    deleted at exit. The checkpoint of a run with a manifest is kept from the first frame until complete results are
+    published. Foreign files in the directory are never changed.
 
     Args:
         directory: destination of the results.
@@ -63,11 +63,11 @@ class ResultWriter:
 
     Raises:
         FilesError: at entry and in all methods, when the directory cannot be written, another run writes there, or a
-            foreign file is in the way.
+            foreign file is at the path of a result.
 
     Attributes:
-        saved: the state from which the run continues; None for the initial state.
-        frames: number of frames in the results; after an interruption, valid only after `finish`.
+        saved: state from which the run continues; None for the initial state.
+        frames: number of frames in the results; after an interruption, only valid once `finish` has returned.
         encode_seconds: processor time of encoding pictures [s]; valid after `finish`.
     """
 
@@ -100,7 +100,7 @@ class ResultWriter:
 
     @property
     def stored_frames(self) -> int:
-        """Number of frames in the checkpoint, including those from before the run was resumed."""
+        """Number of frames in the checkpoint, including those before the resumption."""
         return self._checkpoint.frames
 
     def read_positions(self, frame: int) -> NDArray[Any]:
@@ -120,7 +120,7 @@ class ResultWriter:
         Args:
             position: positions of the mass points [m], shape (rows, cols, 3).
             observed: pictures and labels, by the names of the cameras.
-            forces: the force of every probe; not needed for a frame that the checkpoint contains.
+            forces: force of every probe; unused for a frame that the checkpoint contains.
             pause: as for `Encoder.add`.
         """
         with writing(self._directory):
@@ -149,7 +149,7 @@ class ResultWriter:
             return self._checkpoint.save(saved)
 
     def load(self) -> Snapshot | None:
-        """Read the state saved last; return None when none was saved."""
+        """Read the last saved state; None if there is none."""
         with writing(self._directory):
             return self._checkpoint.load()
 
@@ -185,16 +185,16 @@ class ResultWriter:
         self.finish()
         with writing(self._directory):
             results = outputs.result_names(self._scene.folders if self.frames else {})
-            # By "outputs", the next run into the directory recognises these files.
-            facts = {**record, "frames": self.frames, "outputs": results}
-            text = json.dumps(facts, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-            # File names that are not UTF-8 contain surrogates; backslash escapes keep the JSON valid.
+            # The next run into the directory recognises these files by "outputs".
+            complete_record = {**record, "frames": self.frames, "outputs": results}
+            text = json.dumps(complete_record, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+            # File names that are not UTF-8 contain surrogates; with backslash escapes the JSON is valid.
             write_new_file(self._publication.new_folder / outputs.RUN_RECORD, text.encode("utf-8", "backslashreplace"))
             self._publication.publish(outputs.file_names(results, self.frames))
             if record.get("status") == "complete":
                 self._checkpoint.invalidate()
                 self._publication.keep_companion = False
-        return facts
+        return complete_record
 
     def _write_trajectory(self) -> None:
         """Write times [s] and positions [m] of all frames, which may exceed memory."""
@@ -208,7 +208,7 @@ class ResultWriter:
             write_arrays(file, arrays)
 
     def _write_forces(self) -> None:
-        """Write the forces of all frames with round-trip precision."""
+        """Write the forces of all frames, as decimals that round-trip to float64."""
         with (
             create_file(self._publication.new_folder / outputs.OUTPUTS["forces"].path()) as file,
             io.TextIOWrapper(file, encoding="ascii", newline="") as text,
@@ -265,7 +265,7 @@ class LabelWriter:
         selected = [output for name, output in OUTPUTS.items() if name in scene.folders[camera]]
         self._frame_outputs = [output for output in selected if output.source in ("labels", "flow", "stereo")]
         self._writes_camera = any(output.needs_camera for output in selected)
-        # Tracks stay in memory until the end, because their file is ordered by track.
+        # Tracks stay in memory until `finish`, because their file is ordered by track.
         shape = scene.render.tracks**2 if scene.asks_for("tracks") else 0, scene.time.frames + 1
         self._pixels, self._occluded = np.empty((*shape, 2), np.float32), np.empty(shape, np.bool_)
         self._position = np.empty((*shape, 3), np.float32)
@@ -293,7 +293,7 @@ class LabelWriter:
             self._position[:, frame] = surface_positions(position, self._scene.render.refine, self._grid)
 
     def finish(self, frames: int) -> None:
-        """Delete the files of later frames than the first `frames`, and write camera.json and the tracks."""
+        """Write camera.json and the tracks of the first `frames` frames, and delete the files of later ones."""
         if not frames:
             return
         for output in self._frame_outputs:
@@ -324,12 +324,12 @@ _LABEL_WRITERS: dict[str, Callable[[BinaryIO, Any], None]] = {
 
 
 class ErrorRecord(TypedDict):
-    """Error estimate of a run, relative to the largest displacement. None if unknown, for example after divergence."""
+    """Error estimate of a run, relative to the largest displacement; None if unknown, for example after divergence."""
 
-    error: float | None  # largest error of any mass point in any frame, due to step and rounding; None at equilibrium
-    rounding: float | None  # the part of `error` due to f32; None also if the companion run does not separate it
-    in_f64: float | None  # the error of the same step in f64; None likewise
-    order: int | None  # of the method; None at equilibrium
+    error: float | None  # largest error of any mass point in any frame, due to step and rounding; None if quasi-static
+    rounding: float | None  # share of `error` due to f32; None also if the companion runs do not separate it
+    in_f64: float | None  # error of the same step in f64; None likewise
+    order: int | None  # of the method; None if quasi-static
     at_least: bool  # whether `error` is a lower bound
     mesh_error: NotRequired[float | None]  # discretisation error; only with tissue
     mesh_doubt: NotRequired[str]  # why `mesh_error` may be larger or is unknown; empty if it is reliable
@@ -351,13 +351,13 @@ class RunRecord(TypedDict, total=False):
     sha256: dict[str, str]
     overrides: list[str]  # of the scene file
     points: list[int]  # rows and columns of mass points
-    step: float | None  # [s]; None if quasistatic
-    stable_step: float | None  # largest stable step [s]; None if quasistatic or if every step is stable
-    steps_per_frame: int | None  # None if quasistatic
+    step: float | None  # [s]; None if quasi-static
+    stable_step: float | None  # largest stable step [s]; None if quasi-static or if every step is stable
+    steps_per_frame: int | None  # None if quasi-static
     precision: str  # f32 or f64
-    steps: int | None  # number of steps so far; None if quasistatic
-    residual: float  # quasistatic: largest net force on a mass point in any frame, relative to the largest force
-    evaluations: int  # quasistatic: number of force evaluations so far
+    steps: int | None  # number of steps so far; None if quasi-static
+    residual: float  # quasi-static: largest net force on a mass point in any frame, relative to the largest force
+    evaluations: int  # quasi-static: number of force evaluations so far
     max_displacement: float  # [m]
     shortest_spring: float  # smallest ratio of a spring's length to its rest length
     longest_spring: float  # largest such ratio

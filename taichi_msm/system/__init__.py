@@ -1,1 +1,1 @@
-"""The machine: the compiler, cores and memory, signals, standard streams."""
+"""The machine: compiler, cores, memory, signals, standard streams."""

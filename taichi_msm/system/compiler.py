@@ -1,4 +1,4 @@
-"""The compiler of the kernels: Taichi, or Quadrants, its maintained fork. Only this module knows which one is used."""
+"""The compiler of the kernels: Taichi, or Quadrants, its maintained fork. Only this module distinguishes them."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ class Compiler:
         prefix: prefix of its environment variables.
         cache: directory of compiled kernels, relative to the home directory.
         lock: lock file of the cache, relative to that directory.
-        tested_version: version whose results on a CPU have the same bits as those of the other compiler's.
-        python_versions: Python versions for which it can be installed.
-        poll_s: time to poll a counter that another thread writes [s], measured on Zen 4. Taichi's LLVM fences the read
-            by `mfence`, that of Quadrants by a locked `or`.
+        tested_version: version whose results on a CPU have the same bits as those of the other compiler.
+        python_versions: python versions for which it can be installed.
+        poll_s: time to poll a counter that another thread writes [s], measured on Zen 4; Taichi fences the read by
+            `mfence`, Quadrants by a locked `or`.
     """
 
     name: str
@@ -106,10 +106,10 @@ class Compiler:
 
     @cached_property
     def patches(self) -> Patches:
-        """The patches that are applied while a kernel of this package is parsed; empty for an untested version.
+        """Patches that are applied while a kernel of this package is parsed; empty for an untested version.
 
-        A compiler parses every kernel in every process, as the key of its cache depends on the parsed kernel. For every
-        node it prepares the source lines for an error message, which only developers of kernels need.
+        They omit the source lines that a compiler prepares for error messages at every node. It parses all kernels in
+        every process, because the keys of its cache depend on the parsed kernels.
         """
         if "TAICHI_MSM_TRACEBACK" in os.environ or self.version != self.tested_version:
             return []
@@ -133,7 +133,7 @@ class Compiler:
 
         return [
             (nodes.ASTTransformerFuncContext, "memoized_get_pos_info", lambda context, node: ""),
-            # Quadrants parses every kernel twice, to find used fields of dataclasses; these kernels have none.
+            # Quadrants parses every kernel twice to find the fields of dataclasses in use; these kernels have none.
             (kernels.Kernel, "_try_load_fastcache", skip_dataclasses),
             (kernels._kernel_impl_dataclass, "unpack_ast_struct_expressions", lambda tree, struct_locals: tree),
         ]
@@ -195,10 +195,10 @@ def compiler_label(versions: Mapping[str, str]) -> str:
 
 
 def result_versions(versions: Mapping[str, str], arch: str) -> dict[str, str]:
-    """Return the versions that determine the bits of results: all except that of a tested compiler on a CPU.
+    """Return the versions that determine the bits of results: all of them, except that of a tested compiler on a CPU.
 
     Args:
-        versions: versions by name, as `versions` returns them.
+        versions: as returned by `versions`.
         arch: cpu, cuda or vulkan.
     """
     return {
@@ -209,7 +209,7 @@ def result_versions(versions: Mapping[str, str], arch: str) -> dict[str, str]:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions on which results depend, by name."""
+    """Return the versions of all software that affects the results, by name."""
     # These imports are slow, and most commands do not need them.
     import numpy as np
     import PIL

@@ -20,9 +20,6 @@ def read_regular(path: str | Path, limit: int) -> bytes:
         path: the file; symbolic links are followed.
         limit: largest size [bytes].
 
-    Returns:
-        The content.
-
     Raises:
         OSError: when the file cannot be read, is not a regular file or exceeds the limit; `strerror` has the reason.
         ValueError: when the path is invalid.
@@ -51,7 +48,7 @@ def private_folder() -> str:
         status = folder.lstat()
         if stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid() and not status.st_mode & 0o077:
             return str(folder)
-    # Another user has taken the name, so this process gets a directory of its own.
+    # The name is taken by another user, so this process gets its own directory.
     process_folder = tempfile.mkdtemp(prefix="taichi-msm-")
     atexit.register(shutil.rmtree, process_folder, ignore_errors=True)
     return process_folder

@@ -1,9 +1,9 @@
-"""Bounded launches of kernels with loops, so that no GPU ends a thread early, and a proof that none did.
+"""Kernel launches with bounded loops, so that no GPU ends a thread early, and a check that none did.
 
 llvmpipe ends all loops of a thread after 65,535 iterations in total, without an error; other drivers have other limits.
-So the number of iterations in a thread needs a bound that does not grow with the picture or the sheet, and every launch
-states that bound. An inner loop must not contain an atomic operation: in Mesa 22.3, llvmpipe leaves such a loop after
-two iterations if a group of threads is not full.
+So every launch states a bound of the iterations per thread, which must not grow with the picture or the sheet. An inner
+loop must not contain an atomic operation: in Mesa 22.3, llvmpipe leaves such a loop after two iterations if a group of
+threads is not full.
 """
 
 # No `from __future__ import annotations`: Taichi evaluates the annotations of kernels.
@@ -17,16 +17,16 @@ from numpy.typing import DTypeLike, NDArray
 from taichi_msm.errors import DeviceError
 from taichi_msm.system.runtime import compilation_options, current_device, ti
 
-# Largest number of threads that Taichi starts on Vulkan, which share the indices of a kernel's outermost loop.
+# Largest number of threads that Taichi starts on Vulkan; they share the indices of a kernel's outermost loop.
 VULKAN_THREADS = 1 << 17
 
 # Largest number of loop iterations in a thread, which also bounds the duration of a launch.
 MAX_ROUNDS = 1 << 15
 
-# Iterations of MAX_ROUNDS that are reserved for loops other than that over a list.
+# Iterations, out of MAX_ROUNDS, that are reserved for loops other than that over a list.
 RESERVED_ROUNDS = 1 << 8
 
-# Iterations of the loop that proves that a thread was not ended early.
+# Iterations of the loop in `end_thread`; a thread that was ended early does not complete them.
 PROOF_ROUNDS = 2
 
 
@@ -34,8 +34,8 @@ class Launches:
     """Launches of the kernels of one picture or of one tracking query, with their device arrays.
 
     Attributes:
-        bounded: whether loops are bounded and finished indices counted, as on a GPU. Otherwise every kernel is a single
-            launch, and arrays are NumPy's.
+        bounded: whether loops are bounded and finished indices are counted, as on a GPU. Otherwise every kernel is one
+            launch, and arrays are NumPy arrays.
     """
 
     def __init__(self, *, bounded: bool) -> None:
@@ -46,12 +46,7 @@ class Launches:
         self._ended = self.upload(np.array([0, PROOF_ROUNDS if bounded else 0], np.int32))
 
     def array(self, dtype: DTypeLike, length: int) -> Any:
-        """Allocate an uninitialised array on the device.
-
-        Args:
-            dtype: type of its entries.
-            length: number of entries.
-        """
+        """Allocate an uninitialised array on the device, shape (length,)."""
         if not self.bounded:
             return np.empty(length, dtype)
         kind = np.dtype(dtype)
@@ -67,11 +62,11 @@ class Launches:
         return array
 
     def download(self, array: Any) -> NDArray[Any]:
-        """Copy an array from the device; returns shape (length,)."""
+        """Copy an array, shape (length,), from the device."""
         return array.to_numpy() if self.bounded else array
 
     def chunks(self, length: int, rounds: int) -> Iterator[tuple[int, int]]:
-        """Split a list over which threads iterate into chunks, for a launch each.
+        """Split a list over which threads iterate into chunks of one launch each.
 
         Args:
             length: number of entries of the list.
@@ -91,10 +86,10 @@ class Launches:
         """Launch a kernel for all indices below `total`, split into several launches if necessary.
 
         Args:
-            kernel: takes the first index, the index after the last, the array for `end_thread`, and the arguments.
+            kernel: takes the first index, the index after the last one, the array for `end_thread`, and the arguments.
             total: number of indices.
             *arguments: further arguments of the kernel.
-            rounds: largest number of iterations of all loops together for an index.
+            rounds: largest number of iterations for an index, in all loops together.
         """
         batch = total
         if self.bounded:
@@ -107,7 +102,7 @@ class Launches:
                 kernel(first, min(first + batch, total), self._ended, *arguments)
 
     def require_completion(self) -> None:
-        """Check that every index of every launch was processed completely.
+        """Check that every index of every launch was completed.
 
         Raises:
             DeviceError: when the device ended a thread early.
@@ -125,9 +120,9 @@ class Launches:
 
 @ti.func
 def end_thread(ended: ti.template()):
-    """Count a finished index; a kernel calls this at the end of an index.
+    """Count a finished index; a kernel calls this at the end of every index.
 
-    If the device has ended all loops of the thread, it ends the loop here too, and the index is not counted.
+    If the device has ended the loops of the thread, it also ends the loop here, and the index is not counted.
     """
     if ended[1] > 0:
         proof = 0

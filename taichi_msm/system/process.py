@@ -1,8 +1,8 @@
 """Resources and signals of this process: cores, memory, interruption, standard streams.
 
 By default Python raises KeyboardInterrupt between any two bytecodes. Raised in an import, a destructor or a callback of
-a library, it is lost or turned into another error. So Ctrl-C and SIGTERM only request an interruption here, which
-happens where the program can stop.
+a library, it is lost or becomes another error. Therefore Ctrl-C and SIGTERM only request an interruption, and the
+program raises it where it can stop.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ CONTROL_GROUPS, MEMBERSHIP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 
 
 def available_threads() -> int:
-    """Return the number of cores that this process may use, by its affinity and the quotas of its control groups."""
+    """Return the number of cores that affinity and the quotas of control groups permit to this process."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     quotas = [quota for group in _control_groups("cpu") if (quota := _quota(group)) is not None]
     return max(1, min([cores, *map(math.floor, quotas)]))
 
 
 def _quota(group: Path) -> float | None:
-    """Read the number of cores that a control group of version 2 or 1 may use, or None without a limit."""
+    """Read the number of cores that a control group (version 2 or 1) may use; None without a limit."""
     with contextlib.suppress(OSError, ValueError):
         quota, period = map(int, (group / "cpu.max").read_text().split())
         return quota / period
@@ -45,7 +45,7 @@ def _quota(group: Path) -> float | None:
 
 
 def _control_groups(controller: str) -> Iterator[Path]:
-    """Yield the control groups of this process and their parents, of version 2 and of a controller of version 1."""
+    """List the control groups of this process and their ancestors, of version 2 and of a controller of version 1."""
     with contextlib.suppress(OSError):
         for line in MEMBERSHIP.read_text().splitlines():
             number, controllers, path = line.split(":", 2)
@@ -57,7 +57,7 @@ def _control_groups(controller: str) -> Iterator[Path]:
 
 
 def core_wait_s(tasks: Path = Path("/proc/self/task")) -> float | None:
-    """Return the total time that the threads of this process have waited for a core [s], or None if not known."""
+    """Return the total time that the threads of this process have waited for a core [s]; None if unknown."""
     try:
         waits = [int((task / "schedstat").read_text().split()[1]) for task in tasks.iterdir()]
     except (OSError, ValueError, IndexError):
@@ -95,7 +95,7 @@ def _free_memory(meminfo: Path) -> int:
 
 
 def _group_memory(group: Path) -> int:
-    """Read the memory left in a control group of version 2 or 1 [bytes], or sys.maxsize without a limit."""
+    """Read the free memory of a control group (version 2 or 1) [bytes]; sys.maxsize without a limit."""
     for limit, usage, cache in (
         ("memory.max", "memory.current", "inactive_file"),
         ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
@@ -103,7 +103,7 @@ def _group_memory(group: Path) -> int:
         with contextlib.suppress(OSError, ValueError):
             maximum, used = (int((group / name).read_text()) for name in (limit, usage))
             cached = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
-            # Cached files count as used, but the system drops them when memory is needed.
+            # Cached files count as used, but the kernel drops them on demand.
             return max(0, maximum - used + int(cached.get(cache, 0)))
     return sys.maxsize
 
@@ -189,7 +189,7 @@ def write_stderr(lines: Iterable[str]) -> None:
 
 
 def discard_buffer(stream: TextIO) -> None:
-    """Discard buffered text of a stream, which the interpreter would otherwise try to write at exit."""
+    """Discard the buffered text of a stream, which the interpreter would write at exit."""
     with suppress(OSError, ValueError):
         sink = os.open(os.devnull, os.O_WRONLY)
         os.dup2(sink, stream.fileno())
@@ -198,12 +198,7 @@ def discard_buffer(stream: TextIO) -> None:
 
 @contextmanager
 def discarded_output(*descriptors: int, into: str = os.devnull) -> Iterator[None]:
-    """Redirect the output of libraries; a closed descriptor stays closed.
-
-    Args:
-        *descriptors: file descriptors to redirect.
-        into: file that receives the output.
-    """
+    """Redirect file descriptors to a file, to capture or discard the output of libraries; closed ones stay closed."""
     with _redirecting, Path(into).open("wb") as sink:
         copies = {}
         for descriptor in descriptors:

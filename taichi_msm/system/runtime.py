@@ -1,7 +1,4 @@
-"""Start of Taichi, its device, arrays and compilation options. "Taichi" stands for Quadrants as well.
-
-No other module starts Taichi.
-"""
+"""Start of Taichi, or Quadrants; its device, arrays and compilation options. No other module starts it."""
 
 from __future__ import annotations
 
@@ -35,14 +32,14 @@ _features: dict[str, bool] = _core._multiarray_umath.__cpu_features__
 
 ARCHS = ("cpu", "cuda", "vulkan")
 
-# No machine has more cores; Taichi would start all of these threads.
+# Limit of CPU threads, above the cores of any machine; Taichi starts all of them.
 MAX_THREADS = 1024
 
-# Taichi reserves 1 GiB of address space, and its libraries need nearly the same amount [bytes].
-ADDRESS_SPACE_BYTES = 1900 << 20
+# Address space that Taichi needs: it reserves 1 GiB, and its libraries need nearly the same amount.
+MIN_ADDRESS_SPACE_BYTES = 1900 << 20
 
-# Lines of Taichi's log with the name of the GPU.
-GPU_NAME = re.compile(r'Vulkan Device "(.+)" supports|CUDA device \[id=\d+\]: (.+)')
+# The name of the GPU in Taichi's log.
+GPU_NAME_PATTERN = re.compile(r'Vulkan Device "(.+)" supports|CUDA device \[id=\d+\]: (.+)')
 
 # Smallest number of iterations of a parallel loop in a CPU thread, from make_cpu_multithreaded_range_for.cpp.
 ITERATIONS_PER_THREAD = 512
@@ -50,12 +47,12 @@ ITERATIONS_PER_THREAD = 512
 
 @dataclass(frozen=True)
 class Device:
-    """The device on which kernels run.
+    """Device on which kernels run.
 
     Attributes:
         arch: cpu, cuda or vulkan.
         threads: number of CPU threads.
-        name: name of the processor or the GPU; empty if it is not known.
+        name: name of the processor or the GPU; empty if unknown.
     """
 
     arch: str
@@ -64,18 +61,18 @@ class Device:
 
 
 class Memory:
-    """Taichi arrays, which later `Memory` objects reuse after this one was dropped: Taichi frees no array on a CPU."""
+    """Pool of Taichi arrays: they are reused once this object is dropped, because Taichi frees no arrays on a CPU."""
 
     def __init__(self) -> None:
         self._arrays: list[tuple[tuple[str, int], Any]] = []
         weakref.finalize(self, _recycle, self._arrays, _free)
 
     def array(self, precision: str, lanes: int, length: int) -> Any:
-        """Allocate a one-dimensional array, or reuse one that may be longer; its content is arbitrary.
+        """Allocate a one-dimensional array, or reuse a longer one; its content is arbitrary.
 
         Args:
             precision: f32 or f64.
-            lanes: number of components of an entry, which is a vector; 0 for scalar entries.
+            lanes: number of components of each entry, a vector; 0 for scalar entries.
             length: number of entries.
         """
         kind = precision, lanes
@@ -91,7 +88,7 @@ class Memory:
 
 
 def write_vectors(array: Any, values: NDArray[Any]) -> None:
-    """Set the first entries of an array of vectors, and the remaining entries to zero.
+    """Write the first entries of an array of vectors, and set the remaining entries to zero.
 
     Args:
         array: vectors with `lanes` components.
@@ -112,7 +109,7 @@ def _recycle(arrays: list[tuple[tuple[str, int], Any]], free: dict[tuple[str, in
 _device: Device | None = None
 # Ids of the process and the thread that started Taichi.
 _start_thread = (0, 0)
-# Held while Taichi starts, as two threads must not start it at once.
+# Held while Taichi starts; two threads must not start it at once.
 _starting = threading.Lock()
 
 
@@ -129,7 +126,7 @@ def vector_bits() -> int:
 
 
 def current_device() -> Device:
-    """Return the device that `start` has started."""
+    """Return the device of the last `start`."""
     assert _device is not None, "runtime.start comes first"
     return _device
 
@@ -140,9 +137,6 @@ def start(arch: str = "cpu", threads: int | None = None) -> Device:
     Args:
         arch: cpu, cuda or vulkan.
         threads: number of CPU threads, or None for one per available core.
-
-    Returns:
-        The device.
 
     Raises:
         ArgumentError: when the number of threads is invalid.
@@ -176,18 +170,14 @@ def _start(wanted: Device) -> Device:
 def stop() -> None:
     """Stop Taichi, which writes its cache of kernels; existing arrays and kernels become unusable."""
     global _device, _free
-    # The directory of the cache may have been removed; then the next process compiles again.
+    # The directory of the cache may have been removed; the next process then compiles again.
     with contextlib.suppress(RuntimeError):
         ti.reset()
     _device, _free = None, defaultdict(list)
 
 
 def require_start_thread() -> None:
-    """Check that this process and thread started Taichi, as no others can use it.
-
-    Raises:
-        MsmError: when another process or thread started it.
-    """
+    """Raise an MsmError unless this process and thread started Taichi; no others can use it."""
     process, thread = _start_thread
     if process != os.getpid():
         raise MsmError(
@@ -199,7 +189,7 @@ def require_start_thread() -> None:
 
 
 def compilation_options(*, optimised: bool = True) -> contextlib.AbstractContextManager[None]:
-    """Set the compiler's options for kernels of this package, but not for other kernels in the same process.
+    """Set the compiler's options for the kernels of this package, but not for others in the same process.
 
     Every operation is rounded by IEEE 754, so that the bits of a result do not depend on threads, lanes or compiler
     optimisation. On a CPU vectors are not split into scalars (docs/decisions/0010). Taichi's control-flow optimisation
@@ -244,16 +234,15 @@ def _cache() -> dict[str, Any]:
             pass
         if hasattr(os, "statvfs"):
             free = os.statvfs(folder)
-            # File systems without a limit on files may report 0 files.
-            # The kernels of a run need at most 64 files and 16 MiB.
+            # The kernels of a run need at most 64 files and 16 MiB. File systems without a limit on files report 0.
             if (free.f_files > 0 and free.f_favail < 64) or free.f_bavail * free.f_frsize < 1 << 24:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     except OSError:
         # Taichi crashes at exit if it cannot write to the directory, even if the cache is off.
         os.environ.pop(active_compiler().folder_variable, None)
         return {"offline_cache": False, "offline_cache_file_path": private_folder()}
-    # Taichi holds the lock for milliseconds. One that is older than 60 s was left by a killed process, and blocks the
-    # cache for all other processes.
+    # Taichi holds the lock for milliseconds. A lock older than 60 s was left by a killed process, and blocks the cache
+    # for all others.
     lock = folder / active_compiler().lock
     with contextlib.suppress(OSError):
         if time.time() - lock.stat().st_mtime > 60:
@@ -268,15 +257,15 @@ def _require_address_space() -> None:
     except ImportError:  # Windows
         return
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    if limit != resource.RLIM_INFINITY and limit < ADDRESS_SPACE_BYTES:
+    if limit != resource.RLIM_INFINITY and limit < MIN_ADDRESS_SPACE_BYTES:
         raise DeviceError(
-            f"{active_compiler().title} needs {ADDRESS_SPACE_BYTES >> 20} MiB of address space, and this process may "
-            f"have {limit >> 20} MiB; raise its limit (ulimit -v)"
+            f"{active_compiler().title} needs {MIN_ADDRESS_SPACE_BYTES >> 20} MiB of address space, and this process "
+            f"may have {limit >> 20} MiB; raise its limit (ulimit -v)"
         )
 
 
 def _threads() -> list[int]:
-    """Return the ids of the threads of this process, mostly in the order of their start; empty if not known."""
+    """Return the ids of the threads of this process, mostly in the order of their start; empty if unknown."""
     with contextlib.suppress(OSError):
         return sorted(int(task.name) for task in Path("/proc/self/task").iterdir())
     return []
@@ -285,7 +274,7 @@ def _threads() -> list[int]:
 def _pin(pool: list[int]) -> None:
     """Pin every thread of Taichi's pool to a core, if the pool has one thread per available core.
 
-    Otherwise two threads may share a core for about 10 ms, while one of them spins and waits for the other.
+    Without pinning, two threads may share a core for about 10 ms, while one of them spins and waits for the other.
     """
     if hasattr(os, "sched_setaffinity") and len(pool) == len(os.sched_getaffinity(0)):
         for thread, core in zip(pool, sorted(os.sched_getaffinity(0)), strict=True):
@@ -297,7 +286,7 @@ def _pin(pool: list[int]) -> None:
 def _isolated_environment() -> Iterator[None]:
     """Hide environment variables that override arguments of `ti.init`, and suppress its line on stdout.
 
-    Other threads may print meanwhile, so stdout itself is not redirected.
+    stdout itself is not redirected, because other threads may print meanwhile.
     """
     prefix, namespace = f"{active_compiler().prefix}_", vars(ti.lang.misc)
     hidden = {name: os.environ.pop(name) for name in list(os.environ) if _overrides(name.removeprefix(prefix), name)}
@@ -316,14 +305,13 @@ def _overrides(setting: str, name: str) -> bool:
 
 
 def _initialise(device: Device) -> str:
-    """Start Taichi; returns the name of the processor or the GPU."""
+    """Start Taichi; return the name of the processor or the GPU."""
     _require_address_space()
     cache = _cache()
     before = _threads()
     on_cpu = device.arch == "cpu"
     try:
-        # Only Taichi's log contains the name of the GPU. It also contains the search for a missing driver, which the
-        # error below replaces.
+        # Only Taichi's log contains the name of the GPU. The log of a failed start is replaced by the error below.
         with tempfile.NamedTemporaryFile("r", errors="replace") as log:
             with _isolated_environment(), discarded_output(*(() if on_cpu else (2,)), into=log.name):
                 ti.init(
@@ -336,7 +324,7 @@ def _initialise(device: Device) -> str:
                     log_level=ti.ERROR if on_cpu else ti.TRACE,
                 )
                 ti.set_logging_level(ti.ERROR)
-            gpu_name = GPU_NAME.search(log.read())
+            gpu_name = GPU_NAME_PATTERN.search(log.read())
     except Exception as error:
         remedy = f"{active_compiler().title} says: {' '.join(str(error).split())}" if on_cpu else "take --arch cpu"
         raise DeviceError(f"--arch {device.arch}: not available on this machine; {remedy}") from error
