@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from taichi_msm.solver.arrays import SheetArrays, SheetLayout
 from taichi_msm.system.runtime import compilation_options, ti
 from taichi_msm.terms.base import AREA_SHARE, KernelConfig
-from taichi_msm.terms.contact import CORRECTIONS, ContactTerm
+from taichi_msm.terms.contact import ContactTerm
+from taichi_msm.terms.contact_layout import CORRECTIONS
 
 
 def sum_corrections(layout: SheetLayout, arrays: SheetArrays, *, clear: bool) -> NDArray[np.float64]:

@@ -197,7 +197,7 @@ class Dynamics:
         """Read the state on which the next steps depend."""
         self._require_consistent()
         u, d = self._read_arrays(differences=False)[0], self._read_arrays(differences=True)[0]
-        return State(self.steps_done, u, d, self._memory())
+        return State(self.steps_done, u, d, self._read_memory())
 
     def read(self) -> Reading:
         """Read the displacements and measure the sheet, in the scene's precision."""
@@ -242,7 +242,7 @@ class Dynamics:
         sums = sum_corrections(self.layout, self._moving.arrays, clear=False)
         return sums / (gain * self.plan.grid.steps_per_frame)
 
-    def _memory(self) -> NDArray[Any]:
+    def _read_memory(self) -> NDArray[Any]:
         """Read the numbers that terms remember, shape (numbers, rows, cols)."""
         fields = [self._moving.arrays.get_fields(n, 1) for n in self.layout.config.memory_fields]
         return np.concatenate([np.empty((0, self.layout.rows, self.layout.cols), self._real), *fields])

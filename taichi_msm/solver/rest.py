@@ -91,7 +91,7 @@ class QuasiStatics(Dynamics):
             self._settle(frame, pause)
             self.steps_done = frame
             displacement = self._read_arrays(differences=False)[0]
-            self._last_frame = State(frame, displacement, np.zeros_like(displacement), self._memory())
+            self._last_frame = State(frame, displacement, np.zeros_like(displacement), self._read_memory())
 
     def compile(self) -> None:
         """Compile all kernels without moving a mass point."""
@@ -119,7 +119,7 @@ class QuasiStatics(Dynamics):
 
     def _touched(self) -> NDArray[np.bool_]:
         """Return whether each tool touches or holds each mass point, shape (tools, rows, cols)."""
-        return touched_points(len(self.plan.tools), self._memory()[self._contact])
+        return touched_points(len(self.plan.tools), self._read_memory()[self._contact])
 
     @property
     def _contact(self) -> slice:
