@@ -63,7 +63,8 @@ class DivergenceMonitor:
 
     Position-controlled tools add at most the energy E_T of displacing every mass point by the length of their path plus
     their radius, at their speed. In a deformed sheet this takes more energy, so E_T^(1/2) is added to the right-hand
-    side. The virtual springs store at most another K / 2 |u|^2, with the largest K; when they become active, this is
+    side. Stress relaxation returns at most 4 G of the largest elastic energy so far, with G, the sum of its shares, and
+    lets E exceed the energy of the sheet by 1 / (1 - G). The virtual springs store at most another K / 2 |u|^2, with the largest K; when they become active, this is
     added for the current displacements.
 
     Attributes:
@@ -78,6 +79,8 @@ class DivergenceMonitor:
         self._tool_energy = _tool_energy_bound(plan)
         self._load_norms = np.array([force_norm(slot, plan.scene) for slot in plan.slots])
         self._oscillation = ENERGY_OSCILLATION / max(1e-9, 1 - (plan.grid.step / plan.stable_step) ** 2)
+        self._relaxing = sum(share for share, _ in plan.material.relaxation)
+        self._oscillation /= 1 - self._relaxing
         self._underflow, self._growth = _underflow_energy(plan), EnergyGrowth(plan)
 
     def change_loads(self, plan: Plan) -> None:
@@ -143,7 +146,8 @@ class DivergenceMonitor:
         forces, active, activations = self._loads.between(begin, end)
         force = float((forces * self._load_norms).sum())
         # A power raises OverflowError where a product is infinite.
-        root = math.sqrt(progress.energy + active * virtual * progress.reach * progress.reach)
+        remembered = 4 * self._relaxing * progress.peak
+        root = math.sqrt(progress.energy + remembered + active * virtual * progress.reach * progress.reach)
         root += force * (end - begin) / math.sqrt(2 * mass) + math.sqrt(self._tool_energy)
         reach = progress.reach + (end - begin) * root * math.sqrt(2 / mass)
         for _ in range(activations):

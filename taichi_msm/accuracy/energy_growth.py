@@ -15,7 +15,7 @@ import numpy as np
 
 from taichi_msm.model.plan import Plan
 from taichi_msm.solver.state import Reading, RunProgress
-from taichi_msm.terms.foundation import point_shares
+from taichi_msm.terms.foundation import foundation_energy, point_shares
 
 
 class EnergyGrowth:
@@ -23,7 +23,9 @@ class EnergyGrowth:
 
     def __init__(self, plan: Plan) -> None:
         self._released = release_time(plan) + plan.grid.step
-        self._rate, self._stiffness = plan.grid.frames_per_second, np.zeros(())
+        if plan.material.relaxation:
+            self._released = math.inf  # what relaxed returns some of its energy
+        self._rate, self._material, self._stiffness = plan.grid.frames_per_second, plan.material, np.zeros((1, 1))
         if plan.material.always_active and plan.material.virtual > 0:
             self._stiffness = plan.material.virtual * point_shares(plan)
 
@@ -36,8 +38,8 @@ class EnergyGrowth:
         least, growth = before.least_energy, before.energy_growth
         if frame / self._rate < self._released:
             return least, growth
-        square = np.einsum("ijk,ijk->ij", reading.displacement, reading.displacement, dtype=np.float64)
-        energy = reading.energy + float((self._stiffness * square).sum()) / 2
+        foundation = foundation_energy(self._material, self._stiffness, reading.displacement.astype(np.float64))
+        energy = reading.energy + foundation
         # Rounding may add energy; below 1e-3 of the largest energy it does not affect the result.
         if least > 0 and energy > max(least, 1e-3 * before.peak):
             growth = max(growth, energy / least)

@@ -28,7 +28,9 @@ Array = NDArray[np.float64]
 
 
 def require_differentiable(plan: Plan) -> None:
-    """Raise a SceneError if a scene has position-controlled tools, and thus no gradient."""
+    """Raise a SceneError if a scene has position-controlled tools or stress relaxation, and thus no gradient."""
+    if plan.material.relaxation:
+        raise SceneError(["tissue.relaxation: has no gradient; remove it, or fit such scenes by differences"])
     for tool in plan.tools:
         reason = "a tool with a path has no gradient, as points meet and leave it; fit such scenes by differences"
         raise SceneError([f"probes.{tool.probe}.path: {reason}"])

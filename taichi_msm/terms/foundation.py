@@ -199,6 +199,15 @@ def foundation_force(material: Material, k: NDArray[Any] | float, displacement: 
     return force
 
 
+def foundation_energy(material: Material, k: NDArray[Any] | float, displacement: NDArray[Any]) -> float:
+    """Compute the energy of the foundation [J], with arguments as for `foundation_force`."""
+    square = displacement**2
+    if material.virtual_stiffening is not None:
+        scale, end, lock = law_numbers(material.virtual_stiffening, 1.0)
+        square[..., 2] = lock**2 * build_locking(NUMPY).energy(-displacement[..., 2] * scale, end)
+    return float((k * square.sum(axis=-1)).sum()) / 2
+
+
 def foundation_tangent(material: Material, k: NDArray[Any], displacement: NDArray[Any]) -> NDArray[Any]:
     """Compute the derivative of minus `foundation_force` along x, y and z [N/m], shape (rows, cols, 3)."""
     tangent = np.repeat(k[..., None], 3, axis=-1)
