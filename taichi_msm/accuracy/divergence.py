@@ -63,9 +63,9 @@ class DivergenceMonitor:
 
     Position-controlled tools add at most the energy E_T of displacing every mass point by the length of their path plus
     their radius, at their speed. In a deformed sheet this takes more energy, so E_T^(1/2) is added to the right-hand
-    side. Stress relaxation returns at most 4 G of the largest elastic energy so far, with G, the sum of its shares, and
-    lets E exceed the energy of the sheet by 1 / (1 - G). The virtual springs store at most another K / 2 |u|^2, with the largest K; when they become active, this is
-    added for the current displacements.
+    side. The virtual springs store at most another K / 2 |u|^2, with the largest K; when they become active, this is
+    added for the current displacements. With G, the sum of the shares, stress relaxation returns at most 4 G of the
+    largest E so far, and E exceeds the energy of the sheet by at most 1 / (1 - G).
 
     Attributes:
         progress: Progress at the last frame without a fault, initially at the first frame.

@@ -44,6 +44,8 @@ class SheetGradient:
         tensions: with respect to tau of each family at constant k - tau, shape (3,).
         foundation: with respect to log K, the foundation stiffness of every mass point, shape (rows, cols).
         bending: with respect to the logarithm of the bending stiffness.
+        stiffening: with respect to log(lock) and to the factor of the springs, shape (2,).
+        foundation_stiffening: with respect to log(lock) and to the factor of the foundation, shape (2,).
         keep: with respect to the factor `keep` of the steps.
         gain: with respect to the logarithm of the gain of all steps but step 0.
         first_gain: with respect to the logarithm of the gain of step 0.
@@ -53,6 +55,8 @@ class SheetGradient:
     tensions: Array
     foundation: Array
     bending: float
+    stiffening: Array
+    foundation_stiffening: Array
     keep: float = 0.0
     gain: float = 0.0
     first_gain: float = 0.0
@@ -117,11 +121,16 @@ def _sheet_coefficients(plan: Plan, scene: Scene) -> NDArray[Any]:
     material = derive_material(scene, {})
     springs = [material.across, material.down, material.shear, material.tension]
     steps = () if scene.time.at_rest else coefficients(replace(plan, scene=scene, material=material))
-    return np.array([*springs, material.virtual, material.bending, *steps])
+    laws = [each or (0.0, 0.0) for each in (material.stiffening, material.virtual_stiffening)]
+    return np.array([*springs, material.virtual, material.bending, *laws[0], *laws[1], *steps])
 
 
 def _coefficient_gradient(plan: Plan, gradient: SheetGradient) -> Array:
-    """Return the derivatives with respect to across, down, shear, tension, virtual, bending, keep and both gains."""
+    """Return the derivatives with respect to the coefficients of a sheet.
+
+    They are across, down, shear, tension, virtual, bending, lock and factor of the springs and of the foundation, keep
+    and both gains.
+    """
     material = plan.material
     assert material.factors is not None
     unit = spring_stiffness(replace(material, across=1.0, down=1.0, shear=1.0), material.factors)
@@ -136,6 +145,9 @@ def _coefficient_gradient(plan: Plan, gradient: SheetGradient) -> Array:
         _from_logarithm(float(gradient.foundation.sum()), material.virtual),
         _from_logarithm(gradient.bending, material.bending),
     ]
+    laws = (material.stiffening, gradient.stiffening), (material.virtual_stiffening, gradient.foundation_stiffening)
+    for law, (by_lock, by_factor) in laws:
+        derivatives += [_from_logarithm(by_lock, law.lock), by_factor] if law else [0.0, 0.0]
     if not plan.scene.time.at_rest:
         _, gain, first_gain = coefficients(plan)
         derivatives += [gradient.keep, gradient.gain / gain, gradient.first_gain / first_gain]
@@ -168,7 +180,10 @@ def _material_paths(scene: Scene) -> Iterator[tuple[str, ...]]:
         static = [("springs", name) for name in ("structural", "shear", "virtual")]
         dynamic = [("sheet", "mass"), ("damping",)]
     elif isinstance(scene.tissue.foundation, Foundation):
-        static[2:3] = [("tissue", "foundation", "young"), ("tissue", "foundation", "depth")]
+        foundation = ["young", "depth", *(("lock", "factor") if scene.tissue.foundation.lock else ())]
+        static[2:3] = [("tissue", "foundation", name) for name in foundation]
+    if scene.tissue is not None and scene.tissue.stiffening is not None:
+        static += [("tissue", "stiffening", name) for name in ("lock", "factor")]
     for path in static if scene.time.at_rest else static + dynamic:
         value = _value(scene, path)
         if value and not isinstance(value, str):

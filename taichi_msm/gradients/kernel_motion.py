@@ -51,8 +51,9 @@ BUFFERS, ADJOINT_CHANGE, LOSS, ADJOINT_PARTS = 0, 2, 3, 4
 SPRING_PARTS, FOUNDATION_PART, SUM_PARTS = 0, 3, 4
 
 # Indices of the sums of a row, which follow the parts: the sum of q u, for the derivative with respect to keep; the
-# derivatives with respect to tau of each family; that with respect to log D.
-KEEP_SUM, TENSION_SUMS, BENDING_SUM, ROW_SUMS = 0, 1, 4, 5
+# derivatives with respect to tau of each family; that with respect to log D; those with respect to log(lock) and the
+# factor of springs, and of the foundation.
+KEEP_SUM, TENSION_SUMS, BENDING_SUM, LOCK_SUMS, FOUNDATION_LOCK_SUMS, ROW_SUMS = 0, 1, 4, 5, 7, 9
 
 # Number of derivatives of a slot in every step and row: 3 with respect to its force, 2 to its control point.
 LOAD_DERIVATIVES = 5
@@ -276,7 +277,10 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
         probes.moves.count(False),
     )
     foundation = code.first_column(FoundationTerm) if foundation_term else 0
-    foundation_works = [foundation_term.build_work(code)] if foundation_term else []
+    foundation_derivatives = [foundation_term.build_derivatives(code)] if foundation_term else []
+    shares = [foundation_term.build_share(code)] if foundation_term and foundation_term.locks else []
+    locks = springs.law.number_count > 0
+    results = 7 if locks else 5
 
     @ti.func
     def spring_tangent(sheet: ti.template(), offset, p, q, x0, y0, length, k, family: ti.template()):
@@ -306,14 +310,17 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
         line = ti.static(KernelRow(i, kind, above, at, band.moments + (i + 1) % MOMENT_ROWS))
         for b in range(width - 1):
             # The cell to the right of the entry: the spring along its upper edge, and its diagonals.
-            right = [vector(0) for _ in ti.static(range(5))]
-            falling, rising = [vector(0) for _ in ti.static(range(5))], [vector(0) for _ in ti.static(range(5))]
+            right = [vector(0) for _ in ti.static(range(results))]
+            falling, rising = (
+                [vector(0) for _ in ti.static(range(results))],
+                [vector(0) for _ in ti.static(range(results))],
+            )
             if ti.static(structural):
                 k = row_stiffness(sheet, i, kind, b)
                 spring = spring_tangent(
                     sheet, offset, entry_row + b, entry_row + b + 1, 0 - dx, 0 * dy, dx, k, ALONG_ROW
                 )
-                for c in ti.static(range(5)):
+                for c in ti.static(range(results)):
                     right[c] = spring[c]
             if ti.static(shear):
                 k = diagonal_stiffness(sheet, i + 1, b)
@@ -321,14 +328,14 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
                     sheet, offset, entry_row + b, below + b + 1, 0 - dx, dy, diagonal, k, DIAGONAL
                 )
                 down_left = spring_tangent(sheet, offset, entry_row + b + 1, below + b, dx, dy, diagonal, k, DIAGONAL)
-                for c in ti.static(range(5)):
+                for c in ti.static(range(results)):
                     falling[c], rising[c] = down_right[c], down_left[c]
             if b > 0:
-                down = [vector(0) for _ in ti.static(range(5))]
+                down = [vector(0) for _ in ti.static(range(results))]
                 if ti.static(structural):
                     k = column_stiffness(sheet, i + 1, b)
                     spring = spring_tangent(sheet, offset, entry_row + b, below + b, 0 * dx, dy, dy, k, ALONG_COLUMN)
-                    for c in ti.static(range(5)):
+                    for c in ti.static(range(results)):
                         down[c] = spring[c]
                 force = [vector(0) for _ in ti.static(range(3))]
                 for c in ti.static(range(3)):
@@ -361,9 +368,18 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
                     if ti.static(shear):
                         diagonals = falling[3] + rising[3]
                         add(sheet.derivatives, (DIAGONAL * sheet.rows + i) * width + b, diagonals * (-1.0))
-                    for work in ti.static(foundation_works):
-                        index = (FOUNDATION_PART * sheet.rows + i) * width + b
-                        add(sheet.derivatives, index, work(sheet, p, u) * (0 - now[foundation]))
+                    for derive in ti.static(foundation_derivatives):
+                        index, by_foundation = (FOUNDATION_PART * sheet.rows + i) * width + b, derive(sheet, p, u)
+                        add(sheet.derivatives, index, by_foundation[0] * (0 - now[foundation]))
+                        for share in ti.static(shares):
+                            k = share(sheet, entry, now[foundation])
+                            for n in ti.static(range(2)):
+                                at_sum = ti.static(FOUNDATION_LOCK_SUMS + n)
+                                sums[at_sum] = sums[at_sum] - k * by_foundation[1 + n]
+                    if ti.static(locks):
+                        for n in ti.static(range(2)):
+                            springs_here = (right[5 + n] + down[5 + n]) + (falling[5 + n] + rising[5 + n])
+                            sums[LOCK_SUMS + n] = sums[LOCK_SUMS + n] - springs_here
                     if ti.static(tension):
                         sums[TENSION_SUMS + ALONG_ROW] = sums[TENSION_SUMS + ALONG_ROW] - right[4]
                         sums[TENSION_SUMS + ALONG_COLUMN] = sums[TENSION_SUMS + ALONG_COLUMN] - down[4]

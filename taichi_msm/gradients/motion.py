@@ -21,9 +21,11 @@ from taichi_msm.gradients.kernel_motion import (
     ADJOINT_PARTS,
     BENDING_SUM,
     BUFFERS,
+    FOUNDATION_LOCK_SUMS,
     FOUNDATION_PART,
     KEEP_SUM,
     LOAD_DERIVATIVES,
+    LOCK_SUMS,
     LOSS,
     ROW_SUMS,
     SPRING_PARTS,
@@ -284,7 +286,8 @@ class MotionAdjoint(Dynamics):
         springs = parts[SPRING_PARTS][:, :-1], parts[SPRING_PARTS + 1][:-1], parts[SPRING_PARTS + 2][:-1, :-1]
         foundation, keep = parts[FOUNDATION_PART] * point_shares(self.plan), float(sums[KEEP_SUM]) / gain
         tensions, bending = sums[TENSION_SUMS:BENDING_SUM], float(sums[BENDING_SUM])
-        gradient = SheetGradient(springs, tensions, foundation, bending, keep=keep)
+        stiffening, foundation_stiffening = sums[LOCK_SUMS:FOUNDATION_LOCK_SUMS], sums[FOUNDATION_LOCK_SUMS:]
+        gradient = SheetGradient(springs, tensions, foundation, bending, stiffening, foundation_stiffening, keep=keep)
         gradient.gain = gradient.work(self.plan) + float(work[0])
         gradient.first_gain = float(work[1])
         return gradient

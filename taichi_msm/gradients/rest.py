@@ -23,7 +23,7 @@ from taichi_msm.model.sheet import spacing
 from taichi_msm.solver.rest import QuasiStatics
 from taichi_msm.system.runtime import Device
 from taichi_msm.terms.elasticity import SpringFamily, spring_families
-from taichi_msm.terms.foundation import foundation_force, foundation_tangent, point_shares
+from taichi_msm.terms.foundation import foundation_derivatives, foundation_force, foundation_tangent, point_shares
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_matrix
@@ -85,7 +85,7 @@ class RestAdjoint:
         families, laplacian = list(spring_families(plan)), _laplacian(plan)
         gradient = SheetGradient(
             (np.zeros((rows, cols - 1)), np.zeros((rows - 1, cols)), np.zeros((rows - 1, cols - 1))),
-            np.zeros(3), np.zeros((rows, cols)), 0.0,
+            np.zeros(3), np.zeros((rows, cols)), 0.0, np.zeros(2), np.zeros(2),
         )  # fmt: skip
         loads = LoadGradient(plan)
         for n, by_displacement in enumerate(by_frame):
@@ -105,6 +105,10 @@ class RestAdjoint:
             if p is None:
                 continue  # a flat sheet remains flat with any material
             _add_springs(gradient, families, u, p)
+            gradient.foundation_stiffening += [
+                float((by_number * p[..., 2]).sum())
+                for by_number in foundation_derivatives(plan.material, foundation, u[..., 2])
+            ]
             gradient.foundation += (foundation_force(plan.material, foundation, u) * p).sum(axis=-1)
             curvatures = laplacian @ u.reshape(-1, 3), laplacian @ p.reshape(-1, 3)
             gradient.bending -= plan.material.bending * float((curvatures[0] * curvatures[1]).sum())
@@ -133,6 +137,7 @@ def _add_springs(gradient: SheetGradient, families: Sequence[SpringFamily], u: A
         _, _, by_stiffness, by_tension = family.slopes(square_difference, square, along)
         index = min(n, 2)  # both diagonals count as one family
         gradient.springs[index][...] += by_stiffness * along
+        gradient.stiffening += [float((by * along).sum()) for by in family.by_numbers(square_difference, square)]
         gradient.tensions[index] += (p_difference * q).sum() + (by_tension * along).sum()
 
 

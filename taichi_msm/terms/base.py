@@ -288,7 +288,7 @@ def build_max_lane(config: KernelConfig) -> Callable[..., Any]:
     halves = [lanes >> n for n in range(1, lanes.bit_length())]
 
     @ti.func
-    def max_lane(values):  # type: ignore[no-untyped-def]
+    def max_lane(values):
         most = values + vector(0)
         for half in ti.static(halves):
             most = ti.max(most, vector([most[(lane + half) % lanes] for lane in ti.static(range(lanes))]))

@@ -68,6 +68,12 @@ class SpringFamily(NamedTuple):
             self.stiffness, self.tension, square_difference, square, self.length, along, *self.numbers
         )
 
+    def by_numbers(self, square_difference: Array, square: Array) -> tuple[Array, Array]:
+        """Apply the derivatives of the law with respect to its numbers."""
+        arguments = self.stiffness, self.tension, square_difference, square, self.length
+        by_lock, by_factor = self.law.by_numbers(*arguments, *self.numbers)
+        return by_lock, by_factor
+
     def energy(self, displacement: Array) -> Array:
         """Compute the energy of each spring above that at rest [J].
 

@@ -100,7 +100,7 @@ class FoundationTerm(Term):
 
     def build_forces(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
         """Build the Taichi function that adds -K u, or with a law -K u_x, -K u_y and K f(-u_z)."""
-        ti, locks, column, share = config.ti, self.locks, config.first_column(FoundationTerm), self._build_share(config)
+        ti, locks, column, share = config.ti, self.locks, config.first_column(FoundationTerm), self.build_share(config)
         secant, _ = self._build_law(config)
 
         @ti.func
@@ -116,7 +116,7 @@ class FoundationTerm(Term):
 
     def build_tangents(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
         """Build the Taichi function that adds the linearised change of the force."""
-        ti, locks, column, share = config.ti, self.locks, config.first_column(FoundationTerm), self._build_share(config)
+        ti, locks, column, share = config.ti, self.locks, config.first_column(FoundationTerm), self.build_share(config)
         _, tangent = self._build_law(config)
 
         @ti.func
@@ -130,21 +130,29 @@ class FoundationTerm(Term):
 
         return (add,)
 
-    def build_work(self, config: KernelConfig) -> Callable[..., Any]:
-        """Build the Taichi function work(sheet, p, u), minus the product of p with the force for K = 1."""
-        ti, locks = config.ti, self.locks
-        secant, _ = self._build_law(config)
+    def build_derivatives(self, config: KernelConfig) -> Callable[..., Any]:
+        """Build the Taichi function derive(sheet, p, u), derivatives of minus the product of p with the force.
+
+        It returns those with respect to K, and for K = 1 with respect to log(lock) and the factor.
+        """
+        ti, locks, first, law = config.ti, self.locks, config.first_constant(FoundationTerm), self._build_law(config)
+        secant, tangent = law
 
         @ti.func
-        def work(sheet: ti.template(), p: ti.template(), u: ti.template()):
-            down = u[2]
+        def derive(sheet: ti.template(), p: ti.template(), u: ti.template()):
+            by_k = p[0] * u[0] + p[1] * u[1] + p[2] * u[2]
+            by_lock, by_factor = 0 * u[2], 0 * u[2]
             if ti.static(locks):
-                down = u[2] * secant(sheet, u[2])
-            return p[0] * u[0] + p[1] * u[1] + p[2] * down
+                ratio = secant(sheet, u[2])
+                by_k = p[0] * u[0] + p[1] * u[1] + p[2] * (u[2] * ratio)
+                by_lock = p[2] * u[2] * (ratio - tangent(sheet, u[2]))
+                end = sheet.constants[first + 1] / sheet.constants[first]
+                by_factor = p[2] * ti.min(u[2] + end, 0)
+            return [by_k, by_lock, by_factor]
 
-        return work
+        return derive
 
-    def _build_share(self, config: KernelConfig) -> Callable[..., Any]:
+    def build_share(self, config: KernelConfig) -> Callable[..., Any]:
         """Build the Taichi function share(sheet, entry, k), the stiffness at an entry."""
         ti, mapped, by_area, field = config.ti, self.mapped, self.by_area, config.first_field(FoundationTerm)
 
@@ -206,6 +214,15 @@ def foundation_energy(material: Material, k: NDArray[Any] | float, displacement:
         scale, end, lock = law_numbers(material.virtual_stiffening, 1.0)
         square[..., 2] = lock**2 * build_locking(NUMPY).energy(-displacement[..., 2] * scale, end)
     return float((k * square.sum(axis=-1)).sum()) / 2
+
+
+def foundation_derivatives(material: Material, k: NDArray[Any], u_z: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Differentiate the z component of `foundation_force` with respect to log(lock) and to the factor [N]."""
+    if material.virtual_stiffening is None:
+        return np.zeros_like(u_z), np.zeros_like(u_z)
+    (scale, end, lock), law = law_numbers(material.virtual_stiffening, 1.0), build_locking(NUMPY)
+    x = -u_z * scale
+    return -k * u_z * (law.secant(x, end) - law.tangent(x, end)), k * lock * np.maximum(x - end, 0)
 
 
 def foundation_tangent(material: Material, k: NDArray[Any], displacement: NDArray[Any]) -> NDArray[Any]:

@@ -53,12 +53,15 @@ class LawFunctions(NamedTuple):
         slopes: slopes(k, tau, square_difference, square, length, along, *numbers) for a displacement p of an end, with
             along = (o + q) . p. It returns s, w and the derivatives of `pull` by k and by tau. The force changes by
             s p + w (o + q), without tau p.
+        by_numbers: by_numbers(k, tau, square_difference, square, length, *numbers), the derivatives of `pull` with
+            respect to the logarithm of the lock and to the factor.
         energy: energy(k, tau, share, *numbers) for share = (L^2 - L0^2) / L0^2, twice the energy divided by
             L0^2, without tau q^2 [N/m].
     """
 
     pull: Callable[..., Any]
     slopes: Callable[..., Any]
+    by_numbers: Callable[..., Any]
     energy: Callable[..., Any]
 
 
@@ -90,9 +93,12 @@ class LinearLaw(Law):
             share = square_difference * square * inverse
             return k * share, k * ((1 - share) * both * inverse * along), share, 0 * share
 
+        def by_numbers(k, tau, square_difference, square, length):
+            return 0 * k, 0 * k
+
         def energy(k, tau, share):
             # L / L0 - 1; rounding can make `share` smaller than -1.
             stretch = share / (1 + sqrt(maximum(share + 1, 0)))
             return stretch * stretch * k
 
-        return LawFunctions(pull, slopes, energy)
+        return LawFunctions(pull, slopes, by_numbers, energy)

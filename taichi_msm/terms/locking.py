@@ -100,8 +100,15 @@ class LockingLaw(Law):
             axial = ((k + tau) * tangent(x, end) - tau - isotropic) / square * along
             return isotropic, axial, share * ratio, share * (ratio - 1)
 
+        def by_numbers(k, tau, square_difference, square, length, scale, end, lock):
+            root = sqrt(square)
+            share = square_difference / (square + length * root)
+            x = share * root * scale
+            by_lock = (k + tau) * share * (secant(x, end) - tangent(x, end))
+            return by_lock, (k + tau) * maximum(share - end / (scale * root), 0)
+
         def energy(k, tau, share, scale, end, lock):
             stretch = share / (1 + sqrt(maximum(share + 1, 0)))
             return (k + tau) * (lock * lock) * integral(stretch / lock, end) - tau * stretch * stretch
 
-        return LawFunctions(pull, slopes, energy)
+        return LawFunctions(pull, slopes, by_numbers, energy)

@@ -261,14 +261,18 @@ class SpringTerm(Term):
 
         with a linear law. The map from p to this change is symmetric.
         """
-        ti, tense, slopes = config.ti, self.tense, config.compile_law(self.law).slopes
+        ti, tense, count, law = config.ti, self.tense, self.law.number_count, config.compile_law(self.law)
+        slopes, by_numbers = law.slopes, law.by_numbers
         first_tension, numbers_of = config.first_constant(SpringTerm) + FIRST_TENSION, self.build_numbers(config)
 
         @ti.func
         def differentiate(
             sheet: ti.template(), family: ti.template(), q: ti.template(), p: ti.template(), x0, y0, length, k
         ):
-            """Return the change of the force (3), and the derivatives of its product with p by k - tau and by tau."""
+            """Return the change of the force (3), and derivatives of its product with p.
+
+            They are those with respect to k - tau and tau, and with a law that locks to log(lock) and the factor.
+            """
             to = [q[0] + x0, q[1] + y0, q[2]]
             square = to[0] * to[0] + to[1] * to[1] + (to[2] * to[2] + MIN_SQUARED_LENGTH)
             square_difference = q[0] * (to[0] + x0) + (q[1] * (to[1] + y0) + q[2] * q[2])
@@ -279,7 +283,11 @@ class SpringTerm(Term):
                 isotropic += tension
             change = [isotropic * p[c] + axial * to[c] for c in ti.static(range(3))]
             product = q[0] * p[0] + q[1] * p[1] + q[2] * p[2] + by_tau * along
-            return [change[0], change[1], change[2], by_k * along, product]
+            if ti.static(count > 0):
+                by_lock, by_factor = by_numbers(k, tension, square_difference, square, length, *numbers)
+                return [change[0], change[1], change[2], by_k * along, product, by_lock * along, by_factor * along]
+            else:  # noqa: RET505
+                return [change[0], change[1], change[2], by_k * along, product]
 
         return differentiate
 
