@@ -147,10 +147,10 @@ def _write_export(
     runs = [run for run, *_ in views]
     export_format, total, done = FORMATS[name], sum(run.frames for run in runs), 0
     write: FormatWriter = import_module(f"taichi_msm.exports.{export_format.module or name}").write
-    sources = []
+    sources, is_numbered = [], len(runs) > 1
     for number, run in enumerate(runs):
         run_progress = partial(_report_progress, progress, done, run.frames, total)
-        sources.append(ExportSource(run, zero_padded(number) if len(runs) > 1 else "", run_progress))
+        sources.append(ExportSource(run, zero_padded(number) if is_numbered else "", run_progress))
         done += run.frames
     progress(0, total)
     notes: dict[str, list[Path]] = {}
@@ -173,8 +173,11 @@ def _write_export(
             publication.new_folder / EXPORT_RECORD, (json.dumps({"files": written}, indent=1) + "\n").encode()
         )
         publication.publish([*written, EXPORT_RECORD])
-    several = len(runs) > 1
-    return Exported(directory, written, [_name_runs(note, of) if several else note for note, of in notes.items()])
+    return Exported(
+        directory,
+        written,
+        [_name_runs(note, directories) if is_numbered else note for note, directories in notes.items()],
+    )
 
 
 def _report_progress(progress: ProgressCallback, before: int, frames: int, total: int, done: int, parts: int) -> None:

@@ -9,8 +9,8 @@ Every run has a folder with
     left/seq00/0ms_icgstart.png, 1200ms_icgend.png  first and last frame
 
 Instead of infrared pictures, which show only the tattoos, the start and end pictures are visible frames: the loader
-needs their texture to match left and right tracks. Tracks that both cameras see in the first and last frame are marked,
-unless their discs would touch. The centre of a disc is the pixel that contains the track.
+needs their texture to match left and right tracks. Marked are the tracks that are visible to both cameras in the first
+and last frame, unless their discs would touch. The centre of a disc is the pixel that contains the track.
 
 A position X in the axes of the left camera (OpenCV's, [m]) is `rotation` X + `translation` in those of the right one,
 so that the first component of `translation` is the negative baseline. Camera matrices count from the centre of the
@@ -119,7 +119,7 @@ def _choose_tracks(runs: Sequence[FinishedRun], radius: int) -> tuple[Pixels, in
     """Choose the tracks to mark.
 
     Returns:
-        Pixels of n tracks for each camera in the first and last frame, shape (2, 2, n, 2); and the number of all tracks.
+        Pixels per camera in the first and last frame, shape (2, 2, tracks, 2); and the number of all tracks.
     """
     tracks, occluded = (np.stack(each)[:, :, [0, -1]] for each in zip(*map(read_tracks, runs), strict=True))
     pixels = np.floor(np.nan_to_num(tracks)).astype(np.int64).transpose(0, 2, 1, 3)

@@ -69,9 +69,9 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], left_colu
     """Format a Markdown table.
 
     Args:
-        head: Names of the columns.
-        rows: Cells of every row.
-        left_columns: Columns that are aligned left; all others are aligned right.
+        head: names of the columns.
+        rows: cells of every row.
+        left_columns: columns that are aligned left; all others are aligned right.
 
     Returns:
         The table, without a final line break.
@@ -93,9 +93,9 @@ def format_table(measurements: Sequence[Any], columns: Columns, remark: Callable
     """Format measurements as a Markdown table, one per row.
 
     Args:
-        measurements: Measurements of one kind.
-        columns: Functions that format the cells of a measurement, by the names of the columns.
-        remark: Function that formats the remark on a measurement in a last column without a name; empty for none.
+        measurements: measurements of one kind.
+        columns: functions that format the cells of a measurement, by the names of the columns.
+        remark: function that formats the remark on a measurement in a last column without a name; empty for none.
 
     Returns:
         The table.

@@ -74,15 +74,15 @@ class SteppingStudy:
     """Work-precision diagram of stepping.
 
     Args:
-        plan: Plan of the scene.
-        device: Device to run on.
-        longest_run: Approximate time limit of a run [s].
-        study: Receives the results.
-        progress: Called with the number of finished runs and their total. It may raise KeyboardInterrupt; the results
+        plan: plan of the scene.
+        device: device to run on.
+        longest_run: approximate time limit of a run [s].
+        study: receives the results.
+        progress: called with the number of finished runs and their total. It may raise KeyboardInterrupt; the results
             so far remain in `study`.
 
     Attributes:
-        frames: Displacements of the reference at every frame but the first [m], shape (F, rows, cols, 3).
+        frames: displacements of the reference at every frame but the first [m], shape (F, rows, cols, 3).
     """
 
     def __init__(
@@ -229,11 +229,11 @@ class MeshStudy:
     timed runs of another mesh together.
 
     Args:
-        plan: Plan of the scene.
-        device: Device to run on.
-        longest_run: Approximate time limit of a run [s].
-        study: Receives the results, the coarsest mesh first.
-        progress: Called with the number of finished runs and their total. It may raise KeyboardInterrupt; the results
+        plan: plan of the scene.
+        device: device to run on.
+        longest_run: approximate time limit of a run [s].
+        study: receives the results, the coarsest mesh first.
+        progress: called with the number of finished runs and their total. It may raise KeyboardInterrupt; the results
             so far remain in `study`.
     """
 
@@ -424,12 +424,12 @@ def measure_pictures(
     """Measure the error and the time of drawing with every setting.
 
     Args:
-        scene: Scene to draw.
-        position: Positions of the mass points [m], shape (rows, cols, 3).
-        texture: Picture on the sheet, 8-bit RGB, shape (height, width, 3).
-        quick: Whether to vary the settings one at a time.
-        study: Receives the results.
-        progress: Called with the number of finished pictures and their total.
+        scene: scene to draw.
+        position: positions of the mass points [m], shape (rows, cols, 3).
+        texture: picture on the sheet, 8-bit RGB, shape (height, width, 3).
+        quick: whether to vary the settings one at a time.
+        study: receives the results.
+        progress: called with the number of finished pictures and their total.
     """
     position = np.ascontiguousarray(position, np.float32)
     memory = process.available_memory() // 2
@@ -463,8 +463,8 @@ def render_settings(scene: Scene, quick: bool) -> Iterator[tuple[int, int]]:
     """List the refinements and supersamplings to compare.
 
     Args:
-        scene: Scene with its own settings.
-        quick: Whether one of both is always that of the scene.
+        scene: scene with its own settings.
+        quick: whether one of both is always that of the scene.
 
     Returns:
         Pairs of a refinement and a supersampling.
@@ -480,8 +480,8 @@ def psnr(picture: Picture, reference: Picture) -> float | None:
     """Compute the peak signal-to-noise ratio [dB], 10 log10(255^2 / mean square error).
 
     Args:
-        picture: Picture, 8-bit RGB, shape (height, width, 3).
-        reference: Reference of the same shape.
+        picture: picture, 8-bit RGB, shape (height, width, 3).
+        reference: reference of the same shape.
 
     Returns:
         The ratio [dB]; None if both pictures are equal.
@@ -509,11 +509,11 @@ def measure_terms(plan: Plan, device: Device, sample: float, study: Study, progr
     """Measure the time of a step with each term left out in turn.
 
     Args:
-        plan: Plan of the scene.
-        device: Device to run on.
-        sample: Approximate time of a measurement [s].
-        study: Receives the results.
-        progress: Called with the number of finished measurements and their total.
+        plan: plan of the scene.
+        device: device to run on.
+        sample: approximate time of a measurement [s].
+        study: receives the results.
+        progress: called with the number of finished measurements and their total.
     """
     # All variants have the step of the full scene, because the automatic step depends on the springs.
     grid = {"steps_per_frame": plan.grid.steps_per_frame, "precision": plan.grid.precision}
@@ -580,18 +580,18 @@ def solve_with_dop853(
     """Integrate the scene with SciPy's DOP853, between keyframes of the loads, where they are smooth.
 
     Args:
-        plan: Plan of the scene.
-        rtol: Relative tolerance.
-        atol: Absolute tolerance of displacements [m] and velocities [m/s].
-        deadline: Time limit, on the clock of `time.perf_counter` [s].
-        tick: Called several times a second.
+        plan: plan of the scene.
+        rtol: relative tolerance.
+        atol: absolute tolerance of displacements [m] and velocities [m/s].
+        deadline: time limit, on the clock of `time.perf_counter` [s].
+        tick: called several times a second.
 
     Returns:
         Displacements at every frame but the first [m], shape (F, rows, cols, 3), and the number of evaluations.
 
     Raises:
-        TimeLimitError: When the deadline has passed.
-        IntegrationError: When SciPy fails.
+        TimeLimitError: when the deadline has passed.
+        IntegrationError: when SciPy fails.
     """
     from scipy.integrate import solve_ivp
 
@@ -629,7 +629,7 @@ def acceleration_function(plan: Plan) -> Callable[[Array, Array, Schedule], Arra
     """Build the right-hand side of eq. 1, divided by the mass.
 
     Args:
-        plan: Plan of the scene.
+        plan: plan of the scene.
 
     Returns:
         Function of displacements [m] and velocities [m/s], shape (rows, cols, 3), and of a schedule of one step, that

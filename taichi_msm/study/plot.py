@@ -70,7 +70,7 @@ def plot(study: Study, path: Path) -> None:
     """Draw the measured parts of a study.
 
     Args:
-        study: Results with at least one of the `panels`.
+        study: results with at least one of the `panels`.
         path: PNG file to write.
     """
     with style.context(STYLE, after_reset=True), warnings.catch_warnings():

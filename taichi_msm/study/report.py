@@ -42,7 +42,7 @@ def require_writable(directory: Path) -> None:
     """Check before a long measurement that its report can be written.
 
     Raises:
-        FilesError: When the directory cannot be written.
+        FilesError: when the directory cannot be written.
     """
     with writing(directory), hidden_folder(directory):
         pass
@@ -54,14 +54,14 @@ def write_report(study: Study, directory: Path) -> list[str]:
     Every file is written atomically, study.json last.
 
     Args:
-        study: Results; a note is added to them if the picture cannot be drawn.
-        directory: Directory of the report.
+        study: results; a note is added to them if the picture cannot be drawn.
+        directory: directory of the report.
 
     Returns:
         Names of the files, study.json last.
 
     Raises:
-        FilesError: When the directory cannot be written.
+        FilesError: when the directory cannot be written.
     """
     with writing(directory), hidden_folder(directory) as hidden:
         outputs = [*([PICTURE_FILE] if _draw(study, hidden / PICTURE_FILE) else []), PAGE_FILE, RECORD_FILE]

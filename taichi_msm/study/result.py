@@ -39,9 +39,9 @@ class Reference:
     """Reference solution for the errors of stepping: central differences in f64, extrapolated.
 
     Attributes:
-        steps_per_frame: Steps per frame of its finest run.
-        error: Its own error, estimated by halving the step, as a fraction of the largest displacement.
-        largest: Largest displacement of any mass point at any frame [m].
+        steps_per_frame: steps per frame of its finest run.
+        error: its own error, estimated by halving the step, as a fraction of the largest displacement.
+        largest: largest displacement of any mass point at any frame [m].
     """
 
     steps_per_frame: int
@@ -54,7 +54,7 @@ class Measurement:
     """Measurement of one setting.
 
     Attributes:
-        samples: Times of repeated, equal work [s].
+        samples: times of repeated, equal work [s].
     """
 
     samples: list[float] = field(default_factory=list, kw_only=True)
@@ -70,14 +70,14 @@ class SteppingMeasurement(Measurement):
     """Measurement of stepping through the whole scene with one method and step, compiled and warm.
 
     Attributes:
-        precision: Precision, f32 or f64.
-        damping_difference: Difference of the damping, central or backward.
-        steps_per_frame: Steps per frame.
-        step: Time step h [s].
-        error: Largest error of any mass point at any frame, as a fraction of the largest displacement; None if the
+        precision: precision, f32 or f64.
+        damping_difference: difference of the damping, central or backward.
+        steps_per_frame: steps per frame.
+        step: time step h [s].
+        error: largest error of any mass point at any frame, as a fraction of the largest displacement; None if the
             simulation diverged.
-        rounding: Part of the error that comes from f32; None for f64.
-        known: Whether the reference is exact enough to determine this error; otherwise it is an approximate bound.
+        rounding: part of the error that comes from f32; None for f64.
+        known: whether the reference is exact enough to determine this error; otherwise it is an approximate bound.
     """
 
     precision: str
@@ -99,10 +99,10 @@ class PeerMeasurement(Measurement):
     """Measurement of SciPy's DOP853 on the same equations, for the whole scene.
 
     Attributes:
-        rtol: Relative tolerance; the absolute one is rtol x the largest displacement / 10.
-        error: Error, as in `SteppingMeasurement`.
-        known: Whether the error is exact, as in `SteppingMeasurement`.
-        evaluations: Number of evaluations of the forces.
+        rtol: relative tolerance; the absolute one is rtol x the largest displacement / 10.
+        error: error, as in `SteppingMeasurement`.
+        known: whether the error is exact, as in `SteppingMeasurement`.
+        evaluations: number of evaluations of the forces.
     """
 
     rtol: float
@@ -116,10 +116,10 @@ class DrawingMeasurement(Measurement):
     """Measurement of drawing the most deformed frame.
 
     Attributes:
-        refine: Refinement.
-        supersample: Supersampling.
+        refine: refinement.
+        supersample: supersampling.
         psnr: PSNR against a picture of high refinement and supersampling [dB]; None if both are equal.
-        largest_error: Largest error of any colour of any pixel, 0 to 255.
+        largest_error: largest error of any colour of any pixel, 0 to 255.
     """
 
     refine: int
@@ -133,12 +133,12 @@ class MeshMeasurement(Measurement):
     """Measurement of stepping tissue with another mesh through the whole scene, in f64.
 
     Attributes:
-        rows: Rows of mass points.
-        cols: Columns of mass points.
-        steps_per_frame: Steps per frame of the automatic step on this mesh.
-        error: Discretisation error of the mesh, at the mass points and between them, as in `SteppingMeasurement`.
-        known: Whether the error is exact, as in `SteppingMeasurement`.
-        estimate: Estimate of this error by the companion runs of `run`; None if unknown.
+        rows: rows of mass points.
+        cols: columns of mass points.
+        steps_per_frame: steps per frame of the automatic step on this mesh.
+        error: discretisation error of the mesh, at the mass points and between them, as in `SteppingMeasurement`.
+        known: whether the error is exact, as in `SteppingMeasurement`.
+        estimate: estimate of this error by the companion runs of `run`; None if unknown.
     """
 
     rows: int
@@ -159,7 +159,7 @@ class TermMeasurement(Measurement):
     """Measurement of a step without one term of the model.
 
     Attributes:
-        without: Key of the term that is left out; empty for the full model.
+        without: key of the term that is left out; empty for the full model.
     """
 
     without: str
@@ -170,19 +170,19 @@ class Study:
     """Speed against error of a scene on a machine.
 
     Attributes:
-        scene: Name of the scene.
-        settings: The scene with its defaults filled in.
+        scene: name of the scene.
+        settings: the scene with its defaults filled in.
         status: complete or interrupted.
-        tolerance: Largest allowed error, as a fraction of the largest displacement.
+        tolerance: largest allowed error, as a fraction of the largest displacement.
         machine: CPU, cores, arch, threads, bits of a vector, and versions.
-        reference: Reference solution; None if the study was interrupted before it was computed.
-        stepping: Measurements of stepping, by method and then by decreasing step.
-        orders: Result of `observed_orders`.
-        peers: Measurements of DOP853.
-        drawing: Measurements of drawing, by supersampling and refinement; empty without a picture.
-        points: Measurements of meshes, from coarse to fine; empty for springs.
-        terms: Measurements without single terms; the first is of the full model.
-        notes: Remarks for the reader, such as omitted parts and the reason.
+        reference: reference solution; None if the study was interrupted before it was computed.
+        stepping: measurements of stepping, by method and then by decreasing step.
+        orders: result of `observed_orders`.
+        peers: measurements of DOP853.
+        drawing: measurements of drawing, by supersampling and refinement; empty without a picture.
+        points: measurements of meshes, from coarse to fine; empty for springs.
+        terms: measurements without single terms; the first is of the full model.
+        notes: remarks for the reader, such as omitted parts and the reason.
     """
 
     scene: str
@@ -308,7 +308,7 @@ def observed_orders(points: list[SteppingMeasurement]) -> dict[str, float | None
     """Fit the order of every method to the measurements whose error comes from the step.
 
     Args:
-        points: Measurements of stepping.
+        points: measurements of stepping.
 
     Returns:
         The order by the name of the method; None for fewer than three such measurements.

@@ -38,10 +38,10 @@ class TimeBudget(NamedTuple):
     """Time budget of the parts of a study.
 
     Attributes:
-        longest_run: Time to step through the whole scene once [s].
-        peer: Time of SciPy for each of its tolerances [s].
-        peer_rtols: Relative tolerances of SciPy.
-        sample: Time of one measurement of a step [s].
+        longest_run: time to step through the whole scene once [s].
+        peer: time of SciPy for each of its tolerances [s].
+        peer_rtols: relative tolerances of SciPy.
+        sample: time of one measurement of a step [s].
     """
 
     longest_run: float
@@ -67,22 +67,22 @@ def run_study(
     """Measure the cost and the error of the settings of a scene on this machine.
 
     Args:
-        scene: Scene or its plan.
-        name: Name of the scene for the report.
-        tolerance: Largest allowed error, as a fraction of the largest displacement; None for the scene's, or else 1e-3.
-        quick: Whether to measure fewer settings, in about a minute for a small sheet.
-        arch: Architecture to run on.
-        threads: Number of CPU threads; None for every core.
-        progress: Called with the stage, the finished part and the total; after a KeyboardInterrupt from it the study
+        scene: scene or its plan.
+        name: name of the scene for the report.
+        tolerance: largest allowed error, as a fraction of the largest displacement; None for the scene's, or else 1e-3.
+        quick: whether to measure fewer settings, in about a minute for a small sheet.
+        arch: architecture to run on.
+        threads: number of CPU threads; None for every core.
+        progress: called with the stage, the finished part and the total; after a KeyboardInterrupt from it the study
             returns the results so far.
 
     Returns:
         The results.
 
     Raises:
-        SceneError: When the scene is quasi-static, the picture cannot be decoded, or the trajectories do not fit in
+        SceneError: when the scene is quasi-static, the picture cannot be decoded, or the trajectories do not fit in
             memory.
-        DeviceError: When the arch is not available.
+        DeviceError: when the arch is not available.
     """
     plan, device = check_scene(scene), runtime.start(arch, threads)
     scene = plan.scene
