@@ -121,8 +121,8 @@ def largest_motion(observations: Observations, scene: Scene) -> float:
 
 def _motion(observations: Observations, scene: Scene) -> Array:
     """Return observed minus mean positions, or minus rest positions if every point was observed once."""
-    known = observations.there.any(axis=1)
-    values, is_repeated = observations.values[known], observations.there.sum(axis=1).max() > 1
+    known = observations.is_observed.any(axis=1)
+    values, is_repeated = observations.values[known], observations.is_observed.sum(axis=1).max() > 1
     motion = values - (
         np.nanmean(values, axis=1, keepdims=True) if is_repeated else observe_at_rest(scene, observations)[known]
     )
@@ -161,7 +161,7 @@ def _times(time: Array, name: str, scene: Scene) -> Iterator[str]:
 
 def _units(observations: Observations, scene: Scene) -> Iterator[str]:
     """Compare the extent of the observed points with that at rest."""
-    is_observed = observations.there
+    is_observed = observations.is_observed
     rest = positions_at_rest(scene, observations)[is_observed.any(axis=1)]
     if observations.kind != "position" or len(rest) < 2:
         return
@@ -199,7 +199,7 @@ def _lost_markers(observations: Observations, scene: Scene) -> Iterator[str]:
 
 def _misplaced(observations: Observations, scene: Scene, first: Prediction) -> Iterator[str]:
     """Compare the first observed points with their rest positions: the camera or origin may differ."""
-    is_observed = observations.there
+    is_observed = observations.is_observed
     start = int(np.argmax(is_observed.any(axis=0)))
     rest = observe_at_rest(scene, observations)
     offsets = np.linalg.norm((observations.values - rest)[:, start], axis=1)[is_observed[:, start]]

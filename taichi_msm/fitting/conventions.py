@@ -29,7 +29,7 @@ UNITS_PER_NEWTON, MAX_UNIT_FACTOR = {"mN": 1000.0, "gf": 101.97, "kN": 0.001}, 3
 def half_pixel(observations: Observations, scene: Scene, first: Prediction) -> Iterator[str]:
     """Yield a common half-pixel offset of all points at rest, whose predicted motion is below 0.02 px."""
     rest = observe_at_rest(scene, observations)
-    is_at_rest = observations.there & (np.linalg.norm(first.values - rest, axis=2) < 0.02)
+    is_at_rest = observations.is_observed & (np.linalg.norm(first.values - rest, axis=2) < 0.02)
     count = is_at_rest.sum(axis=1)
     offsets = (
         np.where(is_at_rest[..., None], observations.values - rest, 0.0).sum(axis=1)[count > 0] / count[count > 0, None]
@@ -51,7 +51,7 @@ def half_pixel(observations: Observations, scene: Scene, first: Prediction) -> I
 
 def mirrored(observations: Observations, scene: Scene) -> Iterator[str]:
     """Yield mirrored axes, from the points at rest."""
-    count = observations.there.sum(axis=1, keepdims=True)
+    count = observations.is_observed.sum(axis=1, keepdims=True)
     rest, observed = (
         np.where(observations.known, values, 0.0).sum(axis=1)[count[:, 0] > 0, :2] / count[count > 0, None]
         for values in (observe_at_rest(scene, observations), observations.values)

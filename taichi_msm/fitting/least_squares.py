@@ -409,14 +409,14 @@ def _correlated(misfit: Misfit, rows: Array, error_correlation: ErrorCorrelation
     """Compute U^T K U, and the effective number of observations tr(K)^2 / tr(K^2); errors of forces are independent."""
     values, observations = misfit.count[0], misfit.observations
     # Distances are those of mean observed positions; tracks without observations are left out.
-    is_tracked: NDArray[np.bool_] = np.any(observations.there, axis=1)
+    is_tracked: NDArray[np.bool_] = np.any(observations.is_observed, axis=1)
     space, time = _correlations(observations, is_tracked, error_correlation)
     by_track = np.zeros((*observations.values.shape, rows.shape[1]))
     by_track[observations.known] = rows[:values]
     by_track = by_track[is_tracked]
     correlated = np.einsum("st,ntcp->nscp", time, np.tensordot(space, by_track, 1))
     forces = len(rows) - values
-    is_observed = observations.there[is_tracked].astype(float)
+    is_observed = observations.is_observed[is_tracked].astype(float)
     square = forces + observations.values.shape[2] * float(np.sum(space**2 * (is_observed @ time**2 @ is_observed.T)))
     matrix = np.tensordot(by_track, correlated, ((0, 1, 2), (0, 1, 2))) + rows[values:].T @ rows[values:]
     return matrix, len(rows) ** 2 / square

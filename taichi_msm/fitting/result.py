@@ -180,7 +180,7 @@ class FitResult:
         lines += [f"{key}: {_in_words(one)}" for key, one in self.parameters.items()]
         lines += [one.text for one in self.unseen]
         lines += [] if self.map is None else [self.map.summary()]
-        points, times = observations.there.shape
+        points, times = observations.is_observed.shape
         chi = ""
         if self.chi_square is not None:
             chi = f", chi-square {self.chi_square:.3g} for {self.degrees_of_freedom} degrees of freedom"

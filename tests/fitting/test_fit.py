@@ -289,7 +289,7 @@ def test_what_a_mask_hides_is_not_seen(tracks: dict[str, Array]) -> None:
     pixel[3] = 5000
     pixel[3] = np.ma.masked
     seen = read_observations({**tracks, "pixel": pixel}, 25)
-    np.testing.assert_array_equal(np.flatnonzero(~seen.there.any(axis=1)), [3])
+    np.testing.assert_array_equal(np.flatnonzero(~seen.is_observed.any(axis=1)), [3])
 
 
 def test_an_occluded_track_is_not_used() -> None:
