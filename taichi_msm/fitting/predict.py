@@ -245,13 +245,13 @@ class Runs:
         self.count += 1
         return predicted
 
-    def predict_many(self, places: Sequence[Array], steps: int | None = None) -> list[Prediction | None]:
-        """Predict at several x, in parallel if there is a pool."""
+    def predict_many(self, coordinates: Sequence[Array], steps: int | None = None) -> list[Prediction | None]:
+        """Predict at several x, in parallel if that pays off."""
         if self._pool is None and (workers := self._choose_workers()) > 1:
             self._pool = Pool(workers)
-        if self._pool is None or len(places) < 2:
-            return [self.one(x, steps) for x in places]
-        return self._predict_in_pool(self._pool, places, steps)
+        if self._pool is None or len(coordinates) < 2:
+            return [self.one(x, steps) for x in coordinates]
+        return self._predict_in_pool(self._pool, coordinates, steps)
 
     def _choose_workers(self) -> int:
         if self._workers is not None:
@@ -263,8 +263,8 @@ class Runs:
         process_bytes = PROCESS_BYTES + cost.estimate_budget(check_scene(self.job.scene)).memory_bytes
         return max(1, min(available_threads(), available_memory() // process_bytes, 2 * parameters))
 
-    def _predict_in_pool(self, pool: Pool, places: Sequence[Array], steps: int | None) -> list[Prediction | None]:
-        futures: list[Future[Any]] = [pool.submit(predict, self.job, x, steps) for x in places]
+    def _predict_in_pool(self, pool: Pool, coordinates: Sequence[Array], steps: int | None) -> list[Prediction | None]:
+        futures: list[Future[Any]] = [pool.submit(predict, self.job, x, steps) for x in coordinates]
         waiting = set(futures)
         while waiting:
             self._report_progress()

@@ -219,7 +219,8 @@ def _faults(observations: Observations, scene: Scene, settings: MapSettings) -> 
     # Two copies of the Jacobian, in f64.
     if (needed := 16 * count * cell_count) > (free := available_memory()):
         fault = f"{cell_count} fields by {count} observed numbers take {needed / 2**30:.3g} GiB of memory"
-        yield f"--resolution {settings.resolution}: {fault}, and {free / 2**30:.3g} GiB is free; take fewer fields or points"
+        remedy = "take fewer fields or points"
+        yield f"--resolution {settings.resolution}: {fault}, and {free / 2**30:.3g} GiB is free; {remedy}"
         return
     yield from faults(observations, scene, settings.resolution**2)
 

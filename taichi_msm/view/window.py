@@ -251,16 +251,16 @@ class Pacing:
 
     def due_frames(self) -> Iterator[int]:
         """Yield the number of each due frame, until none is due or the delay of the picture exceeds `MAX_DELAY_S`."""
-        begun = self._clock()
-        self._next = max(self._next, begun - MAX_DELAY_S)
+        start = self._clock()
+        self._next = max(self._next, start - MAX_DELAY_S)
         count = 0
-        while self._next <= self._clock() and (count == 0 or self._clock() < begun + MAX_DELAY_S):
+        while self._next <= self._clock() and (count == 0 or self._clock() < start + MAX_DELAY_S):
             self._next += 1 / self._rate
             yield count
             count += 1
-        self._pictures.append((begun, count))
+        self._pictures.append((start, count))
         # The speed is averaged over 1 s.
-        while begun - self._pictures[0][0] > 1.0:
+        while start - self._pictures[0][0] > 1.0:
             self._pictures.popleft()
 
     def status(self) -> str:
