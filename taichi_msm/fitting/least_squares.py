@@ -190,7 +190,7 @@ class Search:
         """Predict at x, with a cache."""
         key = x.tobytes()
         if key not in self._known:
-            self._known[key] = self._runs.one(x)
+            self._known[key] = self._runs.predict_one(x)
         return self._known[key]
 
     def _solve(self, start: Array) -> Solution:

@@ -79,7 +79,7 @@ class ForwardModel:
         steps: int | None = None,
         *,
         coarse: int = 0,
-        whole: bool = False,
+        to_end: bool = False,
         pause: Pause = lambda: None,
     ) -> Prediction:
         """Simulate the scene with the parameters at x.
@@ -88,7 +88,7 @@ class ForwardModel:
             x: coordinates of the parameters, shape (n,).
             steps: smallest number of steps per frame; None: enough for finite differences around x.
             coarse: number of halvings of the cells per side.
-            whole: whether to simulate to the last frame, beyond the last observation.
+            to_end: whether to simulate to the last frame, beyond the last observation.
             pause: called several times a second; an exception from it ends the run.
 
         Raises:
@@ -106,7 +106,7 @@ class ForwardModel:
             self._simulation = Simulation(plan, threads=self._threads)
         else:
             self._simulation.restart(plan)
-        return self._run(self._simulation, plan, whole, pause)
+        return self._run(self._simulation, plan, to_end, pause)
 
     def compile(self, x: Array, pause: Pause = lambda: None) -> None:
         """Compile the kernels for the parameters at x; raises a SceneError as `predict` does."""
@@ -131,11 +131,11 @@ class ForwardModel:
         data = with_values(self._data, self.job.parameters, values)
         return check_scene(Scene(**data), self._maps)
 
-    def _run(self, simulation: Simulation, plan: Plan, whole: bool, pause: Pause) -> Prediction:
+    def _run(self, simulation: Simulation, plan: Plan, to_end: bool, pause: Pause) -> Prediction:
         observations, scene = self.job.observations, plan.scene
         # The mesh of a coarse run differs.
         model, points, forces = ObservationModel(scene, observations, self._frames), [], []
-        for frame in range(max(self._frames, plan.grid.frames + 1) if whole else self._frames):
+        for frame in range(max(self._frames, plan.grid.frames + 1) if to_end else self._frames):
             simulation.advance(min(frame, 1), pause)
             points.append(model.points_on_sheet(simulation.positions()))
             if observations.forces is not None:
@@ -225,7 +225,7 @@ class Runs:
         """Predict to the last frame; raises as `ForwardModel.predict` does."""
         self._predictor.compile(x, self._report_progress)
         start = time.perf_counter()
-        predicted = self._predictor.predict(x, whole=True, pause=self._report_progress)
+        predicted = self._predictor.predict(x, to_end=True, pause=self._report_progress)
         self._seconds, self.count = time.perf_counter() - start, self.count + 1
         return predicted
 
@@ -238,7 +238,7 @@ class Runs:
         """Estimate the mesh error at x, as the function `mesh_error` does."""
         return mesh_error(self._predictor.plan(x), self._report_progress)
 
-    def one(self, x: Array, steps: int | None = None) -> Prediction | None:
+    def predict_one(self, x: Array, steps: int | None = None) -> Prediction | None:
         """Predict at x; None if that fails."""
         self._report_progress()
         predicted = self._predictor.try_predict(x, steps, pause=self._report_progress)
@@ -250,7 +250,7 @@ class Runs:
         if self._pool is None and (workers := self._choose_workers()) > 1:
             self._pool = Pool(workers)
         if self._pool is None or len(coordinates) < 2:
-            return [self.one(x, steps) for x in coordinates]
+            return [self.predict_one(x, steps) for x in coordinates]
         return self._predict_in_pool(self._pool, coordinates, steps)
 
     def _choose_workers(self) -> int:

@@ -211,7 +211,7 @@ class Session:
         self.frame_time_s += weight * (duration - self.frame_time_s)
 
     def picture(self, pacing: str = "") -> Picture:
-        """Draw the tissue and the overlay; append the picture without figures to a running film.
+        """Draw the tissue and the overlay; append the picture without text to a running film.
 
         Args:
             pacing: text about the speed of the session.

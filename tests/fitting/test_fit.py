@@ -404,7 +404,7 @@ def test_a_third_mesh_tells_the_order_of_the_mesh_error(
 ) -> None:
     def told(order: int) -> float:
         def coarse(runs: Runs, x: Array, halvings: int) -> Prediction:
-            fine = runs.one(x)
+            fine = runs.predict_one(x)
             assert fine is not None
             off = 1e-3 * (2 ** (order * halvings) - 1)
             return fine._replace(values=fine.values + off * (fine.values - tracks["pixel"][:, :1]))
@@ -806,7 +806,7 @@ def test_an_exact_fit_has_errors_next_to_0(device: Device, robust: bool) -> None
     empty = read_observations({"time": np.arange(11) / 25, "coordinates": PLACES, "position": np.ones((36, 11, 3))}, 25)
     job = FitProblem("token", without_outputs(changed()), make_parameters(changed(), free, {}), empty)
     predictor = ForwardModel(job, device.threads)
-    seen = {"time": empty.time, "coordinates": PLACES, "position": predictor.predict(np.zeros(2), whole=True).values}
+    seen = {"time": empty.time, "coordinates": PLACES, "position": predictor.predict(np.zeros(2), to_end=True).values}
     predictor.close()
     found = fit(changed(), seen, free, robust=robust, profile=True, workers=1)
     assert found.residual == 0
