@@ -297,7 +297,7 @@ def test_an_occluded_track_is_not_used() -> None:
     occluded[1, 2] = True
     seen = read_observations({"coordinates": [[0.5, 0.5], [0.2, 0.7]], "points": points, "occluded": occluded}, 25)
     assert seen.time.tolist() == [0, 0.04, 0.08]
-    assert (seen.there != occluded).all()
+    assert (seen.is_observed != occluded).all()
 
 
 def test_a_number_that_nothing_shows_is_not_identifiable(motion: Array) -> None:
@@ -732,7 +732,7 @@ def test_an_array_that_cannot_be_read_is_named(
 
 def test_what_is_visible_is_seen(tracks: dict[str, Array]) -> None:
     visible = np.random.default_rng(0).random(tracks["pixel"].shape[:2]) < 0.5
-    np.testing.assert_array_equal(read_observations({**tracks, "visible": visible}, 25).there, visible)
+    np.testing.assert_array_equal(read_observations({**tracks, "visible": visible}, 25).is_observed, visible)
     with pytest.raises(SceneError, match="observed: visible: float64 of shape"):
         read_observations({**tracks, "visible": 0.9 * visible}, 25)
     for name in ("validity", "status"):
