@@ -289,7 +289,7 @@ def test_what_a_mask_hides_is_not_seen(tracks: dict[str, Array]) -> None:
     pixel[3] = 5000
     pixel[3] = np.ma.masked
     seen = read_observations({**tracks, "pixel": pixel}, 25)
-    np.testing.assert_array_equal(np.flatnonzero(~seen.there.any(axis=1)), [3])
+    np.testing.assert_array_equal(np.flatnonzero(~seen.is_observed.any(axis=1)), [3])
 
 
 def test_an_occluded_track_is_not_used() -> None:
@@ -297,7 +297,7 @@ def test_an_occluded_track_is_not_used() -> None:
     occluded[1, 2] = True
     seen = read_observations({"coordinates": [[0.5, 0.5], [0.2, 0.7]], "points": points, "occluded": occluded}, 25)
     assert seen.time.tolist() == [0, 0.04, 0.08]
-    assert (seen.there != occluded).all()
+    assert (seen.is_observed != occluded).all()
 
 
 def test_a_number_that_nothing_shows_is_not_identifiable(motion: Array) -> None:
@@ -404,7 +404,7 @@ def test_a_third_mesh_tells_the_order_of_the_mesh_error(
 ) -> None:
     def told(order: int) -> float:
         def coarse(runs: Runs, x: Array, halvings: int) -> Prediction:
-            fine = runs.one(x)
+            fine = runs.predict_one(x)
             assert fine is not None
             off = 1e-3 * (2 ** (order * halvings) - 1)
             return fine._replace(values=fine.values + off * (fine.values - tracks["pixel"][:, :1]))
@@ -732,7 +732,7 @@ def test_an_array_that_cannot_be_read_is_named(
 
 def test_what_is_visible_is_seen(tracks: dict[str, Array]) -> None:
     visible = np.random.default_rng(0).random(tracks["pixel"].shape[:2]) < 0.5
-    np.testing.assert_array_equal(read_observations({**tracks, "visible": visible}, 25).there, visible)
+    np.testing.assert_array_equal(read_observations({**tracks, "visible": visible}, 25).is_observed, visible)
     with pytest.raises(SceneError, match="observed: visible: float64 of shape"):
         read_observations({**tracks, "visible": 0.9 * visible}, 25)
     for name in ("validity", "status"):
@@ -806,7 +806,7 @@ def test_an_exact_fit_has_errors_next_to_0(device: Device, robust: bool) -> None
     empty = read_observations({"time": np.arange(11) / 25, "coordinates": PLACES, "position": np.ones((36, 11, 3))}, 25)
     job = FitProblem("token", without_outputs(changed()), make_parameters(changed(), free, {}), empty)
     predictor = ForwardModel(job, device.threads)
-    seen = {"time": empty.time, "coordinates": PLACES, "position": predictor.predict(np.zeros(2), whole=True).values}
+    seen = {"time": empty.time, "coordinates": PLACES, "position": predictor.predict(np.zeros(2), to_end=True).values}
     predictor.close()
     found = fit(changed(), seen, free, robust=robust, profile=True, workers=1)
     assert found.residual == 0
