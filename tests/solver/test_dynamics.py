@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import itertools
 import math
 import time
 from collections.abc import Iterator
@@ -43,7 +44,6 @@ def simulate(made: Scene, device: Device, layout: SheetLayout | None = None) -> 
     for _ in range(grid.frames):
         dynamics.advance(grid.steps_per_frame)
         frames.append(dynamics.displacement())
-    dynamics.close()
     return np.array(frames)
 
 
@@ -130,7 +130,6 @@ def test_more_bands_than_threads_give_the_same_bits(workers: int, device: Device
     for _ in range(plan_of(made).grid.steps):
         dynamics.advance(1)
     assert dynamics.displacement().tobytes() == simulate(made, device)[-1].tobytes()
-    dynamics.close()
 
 
 def test_the_depth_of_a_pass_is_chosen_from_the_size(device: Device) -> None:
@@ -180,7 +179,6 @@ def test_a_launch_ends_soon(device: Device, monkeypatch: pytest.MonkeyPatch) -> 
     assert dynamics.steps_done == 36
     dynamics.advance(64)
     assert dynamics.displacement().tobytes() == whole.tobytes()
-    dynamics.close()
 
 
 def test_a_frame_of_a_small_sheet_is_one_launch(device: Device) -> None:
@@ -188,7 +186,6 @@ def test_a_frame_of_a_small_sheet_is_one_launch(device: Device) -> None:
     dynamics.advance(plan_of(scene()).grid.steps_per_frame)
     assert plan_of(scene()).grid.steps_per_frame > 1
     assert dynamics.launches == 1
-    dynamics.close()
 
 
 def test_absent_terms_are_left_out(device: Device) -> None:
@@ -217,7 +214,6 @@ def test_a_spring_that_is_pressed_to_a_point(ratio: float, precision: str, devic
     dynamics.advance(2)
     twin = reference.simulate(made)[2] - rest_positions(made.sheet)
     np.testing.assert_allclose(dynamics.displacement(), twin, rtol=0, atol=8 * ROUNDING[precision])
-    dynamics.close()
 
 
 def test_nothing_moves_without_a_load_and_fixed_points_never(device: Device) -> None:
@@ -253,7 +249,6 @@ def test_energy_does_not_drift(device: Device) -> None:
         after = dynamics.displacement()
         middle = (before + after) / 2
         energies.append(motion_energy(made, middle, after - before) + virtual / 2 * (middle**2).sum())
-    dynamics.close()
     late = np.array(energies[10:])
     trend = np.polyfit(np.linspace(-0.5, 0.5, len(late)), late, 1)[0]
     # (w h)^2 / 8 = 1/8 of the energy of the highest mode is in the oscillation; the press excites low modes.
@@ -293,7 +288,6 @@ def test_a_state_is_gone_on_from_with_the_same_bits(change: dict[str, Any] | Non
         assert there.displacement.tobytes() == here.displacement.tobytes()
         assert there.difference.tobytes() == here.difference.tobytes()
     assert end.difference.any()
-    dynamics.close()
 
 
 @pytest.mark.usefixtures("short_launches")
@@ -306,7 +300,6 @@ def test_the_energy_is_that_of_motion_and_springs(seed: int, width: int, device:
     (_, u, difference, *_), reading = dynamics.state(), dynamics.read()
     assert reading.energy == pytest.approx(motion_energy(made, u, difference), rel=1e-12)
     assert reading.shortest_spring == pytest.approx(reference.shortest_spring(made, u), rel=1e-12)
-    dynamics.close()
 
 
 @pytest.mark.parametrize("difference", ["central", "backward"])
@@ -321,7 +314,6 @@ def test_just_under_the_limit_stays_bounded(difference: str, device: Device) -> 
         dynamics.advance(1000)
         largest = np.abs(dynamics.displacement()).max()
         assert largest < max(made.sheet.size), "bounded by the sheet, over 10^5 steps"
-    dynamics.close()
 
 
 def test_a_restart_is_a_new_start(device: Device) -> None:
@@ -337,7 +329,6 @@ def test_a_restart_is_a_new_start(device: Device) -> None:
             dynamics.advance(plan_of(made).grid.steps_per_frame)
             frames.append(dynamics.displacement())
         np.testing.assert_array_equal(frames, simulate(made, device))
-    dynamics.close()
 
 
 @pytest.mark.parametrize("patience", [0, 30])
@@ -366,8 +357,7 @@ def test_rests_grow_while_workers_give_up_and_are_forgotten_when_they_do_not(
     device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = scene(sheet={**SHEET, "points": [21, 19]}, time={"precision": "f32"})
-    scatter = dynamics_of(made, device, replace(structure_of(made, device), workers=2))._moving
-    assert isinstance(scatter, kernel_cpu.ScatterKernel)
+    scatter: Any = dynamics_of(made, device, replace(structure_of(made, device), workers=2))._moving
     now, taken, patient = 0.0, [0, 0], False
 
     def alone(done: int, end: int, *_: object) -> None:
@@ -380,40 +370,34 @@ def test_rests_grow_while_workers_give_up_and_are_forgotten_when_they_do_not(
         now, taken[1] = now + 0.001 * steps, taken[1] + steps
         return steps, not patient
 
-    had, waited = iter(range(100_000)), 0.0
+    def steps_together(count: int) -> int:
+        taken[:] = [0, 0]
+        scatter.advance(count, np.empty(0))
+        assert sum(taken) == count
+        return taken[1]
 
-    def wait_as_long_as_we_run() -> float:
-        nonlocal waited
-        waited += 1
-        return waited
-
+    had, waited = itertools.count(), itertools.count()
     monkeypatch.setattr(scatter, "_advance_alone", alone)
     monkeypatch.setattr(scatter, "_launch_together", together)
     monkeypatch.setattr("time.perf_counter", lambda: now)
     monkeypatch.setattr("time.process_time", lambda: next(had))
     # As long as nobody wants our cores, a worker that gives up is an accident, and rests stay the shortest.
     monkeypatch.setattr(process, "core_wait_s", lambda: 0.0)
-    scatter.advance(10_000, np.empty(0))
-    assert taken[1] > 1000
-    taken = [0, 0]
-    monkeypatch.setattr(process, "core_wait_s", wait_as_long_as_we_run)
-    scatter.advance(10_000, np.empty(0))
-    assert sum(taken) == 10_000
-    assert taken[1] < 100
+    assert steps_together(10_000) > 1000
+    # We wait as long as we run.
+    monkeypatch.setattr(process, "core_wait_s", lambda: float(next(waited)))
+    assert steps_together(10_000) < 100
     # During a rest nobody waits, which makes the next one no shorter.
-    taken = [0, 0]
     with monkeypatch.context() as patch:
         patch.setattr("time.process_time", lambda: now)
         patch.setattr(process, "core_wait_s", lambda: 0.001 * taken[1])
-        scatter.advance(10_000, np.empty(0))
-    assert taken[1] < 200
+        assert steps_together(10_000) < 200
     # Undisturbed for minutes, and then disturbed once: the rest is the shortest again.
     patient = True
-    scatter.advance(1_000_000, np.empty(0))
-    patient, taken = False, [0, 0]
-    scatter.advance(5, np.empty(0))
+    steps_together(1_000_000)
+    patient = False
     # One step in each launch of all; the rest of 2 ms takes pieces of one and two steps.
-    assert taken == [3, 2]
+    assert steps_together(5) == 2
 
 
 def test_giving_up_in_the_last_pass_of_a_launch_counts(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:

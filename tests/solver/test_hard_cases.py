@@ -179,7 +179,6 @@ def test_a_million_steps_keep_the_energy(name: str, device: Device) -> None:
         after = dynamics.displacement().astype(float)
         energy.append(shadow_energy(scene, before, after))
         reach.append(longest(after))
-    dynamics.close()
     # The shadow energy of a mode of frequency w swings by theta^4 / 24 / (1 - theta^2 / 4) with theta = w h: 5 %, far
     # below the limit, if all of the energy were in the highest mode.
     if name == "undamped":
