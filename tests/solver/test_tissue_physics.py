@@ -237,20 +237,21 @@ def series(made: Scene) -> Array:
     return at_points @ amplitude @ at_points.T
 
 
-@pytest.mark.parametrize("tool", [pytest.param(EVERYWHERE, id="everywhere"), pytest.param(WIDE, id="tool")])
+BENT: dict[str, dict[str, Any]] = {
+    "plate": {"bending": "plate"},
+    "plate on a foundation": {"bending": 2e-4, "foundation": 1e4},
+    "membrane": {"pretension": 5},
+    "membrane on a foundation": {"pretension": 5, "foundation": 1e4},
+    "plate under tension": {"pretension": 0.5, "bending": "plate"},
+}
+
+
 @pytest.mark.parametrize(
-    "terms",
-    [
-        pytest.param({"bending": "plate"}, id="plate"),
-        pytest.param({"bending": 2e-4, "foundation": 1e4}, id="plate on a foundation"),
-        pytest.param({"pretension": 5}, id="membrane"),
-        pytest.param({"pretension": 5, "foundation": 1e4}, id="membrane on a foundation"),
-        pytest.param({"pretension": 0.5, "bending": "plate"}, id="plate under tension"),
-    ],
+    ("name", "everywhere"), [*((name, False) for name in BENT), ("plate", True), ("membrane on a foundation", True)]
 )
-def test_a_load_from_above_bends_it_like_the_double_series(
-    terms: dict[str, Any], tool: dict[str, Any], device: Device
-) -> None:
+def test_a_load_from_above_bends_it_like_the_double_series(name: str, everywhere: bool, device: Device) -> None:
+    tool, terms = EVERYWHERE if everywhere else WIDE, BENT[name]
+
     def made(points: int) -> Scene:
         return tissue((points, points), size=(0.08, 0.1), probes=[{**tool, "total": [0, 0, -1e-7]}], **terms)
 
