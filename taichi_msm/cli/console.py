@@ -38,16 +38,11 @@ STAGES = {
     "contact": "drawing the last frames",
 }
 
-# Interval between lines of progress when stderr is not a terminal [s].
 LINE_INTERVAL_S = 10.0
 
 
 class ProgressDisplay:
-    """Progress on stderr: a bar on a terminal, otherwise a line every ten seconds.
-
-    Args:
-        quiet: whether to print nothing.
-    """
+    """Progress on stderr: a bar on a terminal, otherwise a line every `LINE_INTERVAL_S`."""
 
     def __init__(self, quiet: bool) -> None:
         self._quiet = quiet
@@ -63,7 +58,7 @@ class ProgressDisplay:
         Args:
             stage: a key of `STAGES`.
             done: number of finished items.
-            total: number of items; 0 if it is not known.
+            total: number of items; 0: unknown.
         """
         if self._quiet:
             return
@@ -90,7 +85,7 @@ class ProgressDisplay:
 
 
 class _Pace:
-    """Rate of progress in a stage, from the time when it began."""
+    """Rate of progress since the beginning of a stage."""
 
     def __init__(self, stage: str, done: int, now: float) -> None:
         self.stage, self.done = stage, done
@@ -98,16 +93,7 @@ class _Pace:
         self._last = now
 
     def remaining_s(self, done: int, total: int, now: float) -> float | None:
-        """Estimate the remaining time of the stage.
-
-        Args:
-            done: number of finished items.
-            total: number of items.
-            now: current time [s].
-
-        Returns:
-            The time [s], or None if it is not known or the stage is finished.
-        """
+        """Estimate the remaining time of the stage; None: unknown, or finished."""
         if done > self.done:
             self._last, self.done = now, done
         if done == self._initially_done or done >= total:
@@ -128,8 +114,8 @@ def run_summary(record: Mapping[str, Any], directory: Path) -> str:
     """Summarise a run in a few lines: frames, steps, forces, warnings and timings.
 
     Args:
-        record: content of its run.json.
-        directory: of its results.
+        record: content of run.json.
+        directory: of the results.
     """
     times, (rows, cols) = record["timings"], record["points"]
     stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in times.items() if stage != "total")

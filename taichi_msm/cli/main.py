@@ -27,11 +27,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line.
 
     Args:
-        arguments: words of the command line, or None for those of the process.
+        arguments: words of the command line; None: sys.argv.
 
     Returns:
-        The exit code: 0 done, 1 a bug, 2 invalid scene or arguments, 3 diverged, 4 files cannot be read or written,
-        130 Ctrl-C, 143 SIGTERM.
+        Exit code: 0 done, 1 bug, 2 invalid scene or arguments, 3 diverged, 4 files cannot be read or written, 130
+        Ctrl-C, 143 SIGTERM.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
@@ -49,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(words: list[str]) -> tuple[int, Sequence[str]]:
-    """Run a command; returns the exit code, and the message of a failure."""
+    """Run a command; return the exit code, and the lines of an error."""
     try:
         Path.cwd()
     except OSError:

@@ -14,18 +14,13 @@ from taichi_msm.version import __version__
 
 
 class SuggestingChoice(click.Choice):  # type: ignore[type-arg]  # not generic before click 8.2
-    """Type of an option with a fixed set of words; errors suggest the nearest word."""
+    """Option type with a fixed set of words; errors suggest the nearest one."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """Return the word.
-
-        Args:
-            value: the word on the command line.
-            param: the option.
-            ctx: of the command.
+        """Validate a word; arguments as for `click.ParamType.convert`.
 
         Raises:
-            click.BadParameter: when the word is not allowed; suggests the nearest word.
+            click.BadParameter: when the word is not allowed.
         """
         try:
             return str(super().convert(value, param, ctx))
@@ -35,17 +30,12 @@ class SuggestingChoice(click.Choice):  # type: ignore[type-arg]  # not generic b
 
 
 class ShardType(click.ParamType):  # type: ignore[type-arg]  # as above
-    """Type of an option I/N: part I of N, from 1."""
+    """Option type I/N: part I of N, counted from 1."""
 
     name = "I/N"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
-        """Return I and N.
-
-        Args:
-            value: the word on the command line.
-            param: the option.
-            ctx: of the command.
+        """Parse I/N; arguments as for `click.ParamType.convert`.
 
         Raises:
             click.BadParameter: when the word is not I/N with 1 <= I <= N.
@@ -82,12 +72,7 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print one JS
 
 
 def print_version(context: click.Context, _option: click.Parameter, requested: bool) -> None:
-    """Print the versions of the program and of its compiler, and exit; a callback of click.
-
-    Args:
-        context: of the program.
-        requested: whether the option was given.
-    """
+    """Print the versions of the program and of its compiler, and exit; a callback of click."""
     if requested:
         from taichi_msm.system.compiler import active_compiler
 
@@ -105,18 +90,18 @@ def program() -> None:
 
 
 def require_no_settings(context: click.Context, action: str, allowed: Sequence[str]) -> None:
-    """Check that an option that reuses the settings of an earlier run was given without other settings.
+    """Reject settings next to an option that reuses those of an earlier run.
 
     Args:
         context: of the command.
         action: the option and its verb, for the message.
-        allowed: names of the parameters that may be given.
+        allowed: names of the allowed parameters.
 
     Raises:
         click.UsageError: when another parameter was given.
     """
     for option in context.command.params:
-        typed = context.get_parameter_source(str(option.name)) is click.core.ParameterSource.COMMANDLINE
-        if typed and option.name not in allowed:
+        is_given = context.get_parameter_source(str(option.name)) is click.core.ParameterSource.COMMANDLINE
+        if is_given and option.name not in allowed:
             name = option.opts[0] if isinstance(option, click.Option) else "SCENE"
             raise click.UsageError(f"{action} a run with its own settings; leave out {name}")

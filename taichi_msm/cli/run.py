@@ -33,7 +33,7 @@ from taichi_msm.cli.session import (
 )
 from taichi_msm.system.process import Interruption, write_stderr
 
-# Parameters that may be given together with --resume and --again.
+# Parameters that are allowed with --resume and --again.
 RESUME_OPTIONS = ("resume", "threads", "quiet", "as_json")
 REPEAT_OPTIONS = ("again", "out", "arch", "threads", "estimate_error", "quiet", "as_json")
 
@@ -148,25 +148,25 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         cost_module.require_disk(plan, Path("output"))
         if plan.scene.draws:
             load_texture(plan.scene)
-    loaded, grid, limit = plan.scene, plan.grid, plan.stable_step
+    loaded, grid, stable_step = plan.scene, plan.grid, plan.stable_step
     steps = {
         "step": grid.step,
-        "stable_step": limit if limit < float("inf") else None,
+        "stable_step": stable_step if stable_step < float("inf") else None,
         "steps_per_frame": grid.steps_per_frame,
         "precision": grid.precision,
-        "steps": plan.grid.steps,
+        "steps": grid.steps,
     }
     if loaded.time.at_rest:
         steps |= dict.fromkeys(("step", "stable_step", "steps_per_frame", "steps"))
-    need, duration = cost_module.estimate_budget(plan), cost_module.estimate_duration(plan)
-    facts: dict[str, Any] = {
+    budget, duration = cost_module.estimate_budget(plan), cost_module.estimate_duration(plan)
+    report: dict[str, Any] = {
         "scene": loaded.model_dump(mode="json"),
         **steps,
-        "frames": need.frames,
+        "frames": budget.frames,
         "estimated_seconds": duration.seconds,
-        "memory": need.memory_bytes,
-        "disk": need.disk_bytes,
-        "disk_while_running": need.disk_bytes + need.working_bytes,
+        "memory": budget.memory_bytes,
+        "disk": budget.disk_bytes,
+        "disk_while_running": budget.disk_bytes + budget.working_bytes,
         "probes": (records := probe_records(loaded)),
         "notes": [
             *tool_force.force_warnings(loaded, records),
@@ -175,33 +175,33 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         ],
     }
     if as_json:
-        print_json(facts)
+        print_json(report)
         return DONE
     import yaml
 
     from taichi_msm.load.cost import format_rough_time
 
     tolerances = [f"{name}.tolerance" for name in ("sheet", "time") if getattr(loaded, name).tolerance is not None]
-    # Pilot runs may refine a scene with a tolerance.
+    # Companion runs may refine a scene with a tolerance.
     more = ", or more" if tolerances else ""
     longer = f", or longer, as {' and '.join(tolerances)} may ask for more" if tolerances else ""
-    click.echo(yaml.safe_dump(facts["scene"], sort_keys=False, default_flow_style=None), nl=False)
+    click.echo(yaml.safe_dump(report["scene"], sort_keys=False, default_flow_style=None), nl=False)
     stepping = (
         f"each at rest{more}, in {grid.precision}"
         if loaded.time.at_rest
-        else f"{need.steps} steps of {grid.step:.6g} s (limit {limit:.6g} s), {grid.steps_per_frame} a frame{more}, in "
-        f"{grid.precision}"
+        else f"{budget.steps} steps of {grid.step:.6g} s (limit {stable_step:.6g} s), "
+        f"{grid.steps_per_frame} a frame{more}, in {grid.precision}"
     )
     click.echo(
-        f"\n{need.points} points, {need.frames} frames, {stepping}\n"
+        f"\n{budget.points} points, {budget.frames} frames, {stepping}\n"
         f"about {format_rough_time(duration.seconds)} to run{longer} (estimated from its work)\n"
-        f"about {need.memory_bytes / 2**20:.0f} MiB of memory, at most {need.disk_bytes / 2**20:.1f} MiB on disk, "
-        f"{need.working_bytes / 2**20:.1f} MiB more while it runs"
+        f"about {budget.memory_bytes / 2**20:.0f} MiB of memory, at most {budget.disk_bytes / 2**20:.1f} MiB on disk, "
+        f"{budget.working_bytes / 2**20:.1f} MiB more while it runs"
     )
-    for index, probe in enumerate(facts["probes"]):
+    for index, probe in enumerate(report["probes"]):
         if description := describe_forces(probe):
             click.echo(f"probes.{index}: {description}")
-    for note in facts["notes"]:
+    for note in report["notes"]:
         click.echo(note)
     return DONE
 

@@ -1,4 +1,4 @@
-"""Exit codes, directories, interruption and error messages that the commands share."""
+"""Exit codes, directories, interruption and error messages shared by the commands."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ EXIT_CODES = {"complete": DONE, "diverged": DIVERGED}
 
 
 def plan_repetition(directory: str) -> tuple[Plan, list[str]]:
-    """Return the plan of an earlier run, whose pictures are read again, and the overrides of that run."""
+    """Return the plan and overrides of an earlier run, after checking that its pictures are unchanged."""
     from taichi_msm.load.check import check_scene
     from taichi_msm.runs.finished import read_run
 
@@ -39,8 +39,8 @@ def result_directory(out: str | None, default: str = "", option: str = "--out") 
     """Return the directory of results.
 
     Args:
-        out: the directory that the user has named, or None.
-        default: name of the default directory within output/.
+        out: the directory given by the user; None: the default.
+        default: name of the default directory in output/.
         option: name of the option in messages.
 
     Raises:
@@ -66,17 +66,17 @@ def resume_hint(directory: Path) -> str:
 
 @contextmanager
 def add_resume_hint(directory: Path) -> Iterator[None]:
-    """Append the command that continues an unfinished run to errors about its files."""
+    """Append the command that continues an unfinished run to file errors."""
     try:
         yield
     except FilesError as error:
-        # Continuing may help if a file cannot be written now, but not if it is damaged or locked.
+        # Resuming helps if a file could not be written, but not if it is damaged or locked.
         raise FilesError(f"{error}{resume_hint(directory) if isinstance(error.__cause__, OSError) else ''}") from None
 
 
 @contextmanager
 def prefix_errors(scene: str) -> Iterator[None]:
-    """Prefix errors that are raised after a scene was loaded with the name of the scene."""
+    """Prefix scene errors with the name of the scene, as loading it does."""
     try:
         yield
     except SceneError as error:
@@ -87,13 +87,13 @@ def interruptible_progress(bar: ProgressDisplay, interruption: Interruption) -> 
     """Return a progress callback that updates a display and raises KeyboardInterrupt after an interruption.
 
     Args:
-        bar: shows the progress.
-        interruption: receives the signals from the first call on.
+        bar: the display.
+        interruption: listens to signals from the first call on.
     """
 
     def progress(stage: str, done: int, total: int) -> None:
         bar.update(stage, done, total)
-        # Before the first stage, a signal may end the process at once. Moving results into place is not interrupted.
+        # Before the first stage, a signal may end the process at once. The publication of results is not interrupted.
         interruption.listen()
         if stage != "write":
             interruption.raise_if_requested()
@@ -109,26 +109,17 @@ def print_json(value: Any) -> None:
 def report_interruption(
     interruption: Interruption, as_json: bool, message: str = "interrupted; nothing was written"
 ) -> int:
-    """Report that a command was interrupted.
-
-    Args:
-        interruption: the signal.
-        as_json: whether to print a JSON object on stdout too.
-        message: printed to stderr.
-
-    Returns:
-        The exit code.
-    """
+    """Report an interruption as `report_failure` does; return the exit code."""
     report_failure("interrupted", [message], as_json)
     return interruption.code
 
 
 def report_failure(status: str, lines: Sequence[str], as_json: bool) -> None:
-    """Report that a command has no results.
+    """Report the failure of a command.
 
     Args:
-        status: of the JSON object.
-        lines: messages, which are printed to stderr.
+        status: status in the JSON object.
+        lines: messages, printed to stderr.
         as_json: whether to print a JSON object on stdout too.
     """
     write_stderr(lines)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from taichi_msm.sweeps.spec import Sweep
     from taichi_msm.sweeps.tables import SweepCost
 
-# A sweep with more runs needs the option --yes.
+# More runs need the option --yes.
 MAX_UNCONFIRMED_RUNS = 10_000
 
 
@@ -97,17 +97,14 @@ def sweep(
 
 
 def print_dry_run(loaded: Sweep, cost: SweepCost, shard: tuple[int, int], workers: int | None, as_json: bool) -> int:
-    """Print the values of the runs of a shard, and their cost.
+    """Print the values of the runs of a shard, and their cost; return the exit code.
 
     Args:
         loaded: the sweep.
         cost: of the whole sweep.
-        shard: part I of N, as (I, N).
-        workers: number of processes that the user has chosen, or None.
+        shard: part I of N as (I, N).
+        workers: number of processes chosen by the user, or None.
         as_json: whether to print a JSON object instead of a table.
-
-    Returns:
-        The exit code.
     """
     from taichi_msm.sweeps.spec import format_override
     from taichi_msm.sweeps.tables import choose_worker_count, cost_line, csv_line
@@ -128,10 +125,5 @@ def print_dry_run(loaded: Sweep, cost: SweepCost, shard: tuple[int, int], worker
 
 
 def progress_message(done: int, total: int) -> str:
-    """Format the progress of an unfinished sweep.
-
-    Args:
-        done: number of finished runs.
-        total: number of runs.
-    """
+    """Format the progress of an unfinished sweep."""
     return f"{done} of {total} runs have ended; the same command goes on"

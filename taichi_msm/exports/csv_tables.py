@@ -26,9 +26,6 @@ from taichi_msm.scene.outputs import FORCES_HEADER, zero_padded
 
 TRACKS_HEADER = ("time", "point", "across", "down", "x", "y", "occluded", "position_x", "position_y", "position_z")
 
-# Limit for the lines of forces.csv, which are shorter in the results of any run.
-MAX_LINE_CHARACTERS = 4096
-
 
 def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
     """Write the forces and tracks of runs; arguments as for `FormatWriter`.
@@ -55,10 +52,11 @@ def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
 
 
 def _write_forces(run: FinishedRun, number: str, file: TextIO) -> None:
-    """Copy the rows of a run after checking that all values are numbers."""
+    """Validate and copy the rows of a run."""
     path = run.result_path("forces")
     with reading(path), path.open(encoding="ascii", newline="") as source:
-        rows = csv.reader(iter(partial(source.readline, MAX_LINE_CHARACTERS), ""))
+        # The limit bounds the memory for a foreign file; lines of a run are shorter.
+        rows = csv.reader(iter(partial(source.readline, 4096), ""))
         if tuple(next(rows)) != FORCES_HEADER:
             raise damaged_result(path)
         for row in rows:
@@ -68,7 +66,6 @@ def _write_forces(run: FinishedRun, number: str, file: TextIO) -> None:
 
 
 def _write_tracks(run: FinishedRun, number: str, file: TextIO) -> None:
-    """Write a row per frame and track of a run."""
     (pixels, occluded), (coordinates, position) = read_tracks(run), read_track_positions(run)
     count = len(pixels)
     for frame, time in enumerate(run.time.tolist()):

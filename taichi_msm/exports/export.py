@@ -38,22 +38,19 @@ from taichi_msm.runs.directory import (
 from taichi_msm.runs.finished import RESTORE_PICTURE, FinishedRun
 from taichi_msm.scene.outputs import OUTPUTS, zero_padded
 
-# The list of exported files, and the table of runs by number.
-EXPORT_RECORD, INDEX_FILE = "export.json", "index.csv"
+EXPORT_RECORD = "export.json"
 
 
-def _export_file_test(record: Mapping[str, Any]) -> IsListed:
+def _is_exported_file(record: Mapping[str, Any]) -> IsListed:
     return {EXPORT_RECORD, *record["files"]}.__contains__
 
 
-# Files of all formats, because the folder may contain an earlier export of another format. Other files are errors: the
-# user would not find them among the exported ones.
+# Files of all formats, as the folder may contain an earlier export of another format; any other file is an error.
 EXPORT_PATTERNS = (
     r"export\.json",
     r"index\.csv",
     *dict.fromkeys(pattern for export_format in FORMATS.values() for pattern in export_format.file_patterns),
 )
-EXPORT_PUBLICATION = PublicationSpec("export", EXPORT_RECORD, EXPORT_PATTERNS, _export_file_test, exclusive=True)
 
 
 class Exported(NamedTuple):
@@ -146,18 +143,19 @@ def _camera_views(run: FinishedRun, name: str, camera: str | None) -> list[Finis
 def _write_export(
     views: Sequence[Sequence[FinishedRun]], name: str, directory: Path, progress: ProgressCallback
 ) -> Exported:
-    """Write an export atomically; `views` has a list of copies of each run, one per exported camera."""
+    """Write an export atomically; `views` has the copies of each run by `_camera_views`."""
     runs = [run for run, *_ in views]
     export_format, total, done = FORMATS[name], sum(run.frames for run in runs), 0
     write: FormatWriter = import_module(f"taichi_msm.exports.{export_format.module or name}").write
-    sources = []
+    sources, is_numbered = [], len(runs) > 1
     for number, run in enumerate(runs):
         run_progress = partial(_report_progress, progress, done, run.frames, total)
-        sources.append(ExportSource(run, zero_padded(number) if len(runs) > 1 else "", run_progress))
+        sources.append(ExportSource(run, zero_padded(number) if is_numbered else "", run_progress))
         done += run.frames
     progress(0, total)
     notes: dict[str, list[Path]] = {}
-    with writing(directory), Publication(directory, EXPORT_PUBLICATION) as publication:
+    spec = PublicationSpec("export", EXPORT_RECORD, EXPORT_PATTERNS, _is_exported_file, exclusive=True)
+    with writing(directory), Publication(directory, spec) as publication:
         for run in chain.from_iterable(views):
             with run.unchanged():
                 if missing := [key for key in export_format.required_outputs if not run.has_output(key)]:
@@ -169,14 +167,17 @@ def _write_export(
                 for note in next(writer):
                     notes.setdefault(note, []).append(run.directory)
         next(writer, None)
-        _write_index(runs, export_format.numbers_pairs, publication.new_folder / INDEX_FILE)
+        _write_index(runs, export_format.numbers_pairs, publication.new_folder / "index.csv")
         written = sorted(list_files(publication.new_folder, EXPORT_PATTERNS, strict=True))
         write_new_file(
             publication.new_folder / EXPORT_RECORD, (json.dumps({"files": written}, indent=1) + "\n").encode()
         )
         publication.publish([*written, EXPORT_RECORD])
-    several = len(runs) > 1
-    return Exported(directory, written, [_name_runs(note, of) if several else note for note, of in notes.items()])
+    return Exported(
+        directory,
+        written,
+        [_name_runs(note, directories) if is_numbered else note for note, directories in notes.items()],
+    )
 
 
 def _report_progress(progress: ProgressCallback, before: int, frames: int, total: int, done: int, parts: int) -> None:
@@ -186,12 +187,12 @@ def _report_progress(progress: ProgressCallback, before: int, frames: int, total
 
 @contextmanager
 def _name_run_in_errors(run: FinishedRun, name: str) -> Iterator[None]:
-    """Convert errors of a run's scene or numbers to a FilesError that names the run."""
+    """Convert scene and floating-point errors of a run to a FilesError that names the run."""
     try:
         with np.errstate(over="raise", divide="raise", invalid="raise"):
             yield
     except SceneError as error:
-        # The remedy in the SceneError is to change the scene; here the picture must be restored.
+        # The SceneError suggests to change the scene; here the picture must be restored.
         fault = error.lines[0].partition(";")[0]
         raise FilesError(f"{run.directory}: {fault}; {RESTORE_PICTURE}") from None
     except FloatingPointError:

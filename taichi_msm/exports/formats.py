@@ -1,7 +1,4 @@
-"""Table of the export formats, and the runs as their input.
-
-A format is a row of `FORMATS` and a module of its name with a function `write`.
-"""
+"""Registry of the export formats: each is a row of `FORMATS`, and a module of its name with a function `write`."""
 
 from __future__ import annotations
 
@@ -21,13 +18,13 @@ from taichi_msm.system.files import read_regular
 class Format(NamedTuple):
     """Export format."""
 
-    description: str  # purpose, in few words
-    required_outputs: tuple[str, ...]  # entries of a scene's `output` that it needs
-    file_patterns: tuple[str, ...]  # regular expressions of its file names, for `list_files`
-    optional_outputs: tuple[str, ...] = ()  # further entries of `output` that it exports
-    numbers_pairs: bool = False  # whether numbers refer to pairs of frames instead of runs
-    cameras: tuple[str, ...] = ()  # cameras whose results it exports: none, ANY_CAMERA or these names
-    module: str = ""  # name of its module, if different from the format's
+    description: str  # for the help text
+    required_outputs: tuple[str, ...]  # entries of a scene's `output`
+    file_patterns: tuple[str, ...]  # regular expressions, for `list_files`
+    optional_outputs: tuple[str, ...] = ()  # further exported entries of `output`
+    numbers_pairs: bool = False  # whether files are numbered by pairs of frames instead of runs
+    cameras: tuple[str, ...] = ()  # exported cameras by name, or ANY_CAMERA; empty: independent of the camera
+    module: str = ""  # if its name differs from the format's
 
 
 def _patterns_per_run(*patterns: str) -> tuple[str, ...]:
@@ -103,17 +100,13 @@ class ExportSource(NamedTuple):
     progress: ProgressCallback  # called with the finished and total frames of this run
 
 
-# Writes the files of all runs to an empty folder: a generator that yields the warnings about each run in turn, and then
-# writes the files that combine runs.
+# Generator that writes all runs to an empty folder: yields the warnings about each run in turn, and finally writes the
+# files that combine runs.
 FormatWriter = Callable[[Sequence[ExportSource], Path], Iterator[list[str]]]
 
 
 def one_folder_per_run(write: Callable[[FinishedRun, Path, ProgressCallback], list[str]]) -> FormatWriter:
-    """Build a format's `write` from a function that writes one run.
-
-    Args:
-        write: takes the run, its empty folder, and a callback for the finished and total frames; returns warnings.
-    """
+    """Decorate a function that writes a run (run, empty folder, progress) and returns warnings, as a `FormatWriter`."""
 
     @wraps(write)
     def write_all(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
@@ -129,7 +122,7 @@ def read_runs(directories: Sequence[str | Path]) -> tuple[list[FinishedRun], int
     """Read the records of runs, given as folders of runs or of sweeps.
 
     Returns:
-        The runs, of sweeps only the complete ones; and the number of incomplete runs of the sweeps.
+        The runs, only complete ones of sweeps; and the number of incomplete runs.
 
     Raises:
         FilesError: as for `read_run`, and when there is no run.

@@ -1,12 +1,11 @@
 """glTF 2.0 export: the animated surface and its picture in a single file.
 
-The mesh is the surface in the first frame. Every other frame is a morph target, which contains the differences of
-vertices and normals from the mesh. In the animation, the weight of a frame's target is 1 at its time and 0 at the times
-of the adjacent frames, with linear interpolation. Like this package, glTF uses metres, y up, and texture coordinates
-from the upper left corner.
+The mesh is the surface in the first frame. Every other frame is a morph target: the differences of vertices and normals
+from the mesh. In the animation, the weight of a target is 1 at its frame and 0 at the adjacent ones, with linear
+interpolation. Like this package, glTF uses metres, y up, and texture coordinates from the upper left corner.
 
-Browsers store each target in a layer of a texture, and WebGL 2 guarantees 256 layers. Runs with more frames, or with
-meshes that would make the file too large, are reduced to keyframes, and the largest interpolation error is reported.
+Browsers store each target in a layer of a texture, and WebGL 2 guarantees 256 layers. Runs that exceed this, or the
+size limit, are reduced to keyframes, and the largest interpolation error is reported.
 
 Source: the glTF 2.0 specification of Khronos, sections 3.6 (accessors), 3.7.2.2 (morph targets), 3.11 (animations) and
 4.4 (GLB).
@@ -40,14 +39,13 @@ TARGET_VERTEX_BYTES = 2 * 3 * 4  # differences of position and normal, float32
 # Constants of OpenGL for texture filtering and wrapping.
 GL_LINEAR, GL_LINEAR_MIPMAP_LINEAR, GL_CLAMP_TO_EDGE = 9729, 9987, 33071
 
-JSON_CHUNK, BINARY_CHUNK = b"JSON", b"BIN\0"
-
 COMPONENT_TYPES = {"f": 5126, "u": 5125}  # float32, uint32
 ACCESSOR_TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3"}
+
 # Constants of OpenGL for buffers of vertices and of vertex indices.
 GL_ARRAY_BUFFER, GL_ELEMENT_ARRAY_BUFFER = 34962, 34963
 
-# Alignment of the chunks and of the views in them.
+# Alignment of chunks and buffer views.
 ALIGNMENT_BYTES = 4
 
 
@@ -106,7 +104,6 @@ def _surface(position: NDArray[np.floating], has_picture: bool, binary: BinaryCh
 
 
 def _target(first: NDArray[np.floating], position: NDArray[np.floating], binary: BinaryChunk) -> dict[str, int]:
-    """Build the morph target of a frame."""
     displacement = (position.astype(np.float64) - first).reshape(-1, 3).astype(np.float32)
     normal_change = (unit_normals(position) - unit_normals(first)).astype(np.float32)
     return {
@@ -116,7 +113,7 @@ def _target(first: NDArray[np.floating], position: NDArray[np.floating], binary:
 
 
 def _animation(times: NDArray[np.float32], binary: BinaryChunk) -> dict[str, Any]:
-    """Build the animation: the weight of each target is 1 at its keyframe; the first frame has no target."""
+    # The first frame has no target.
     weights = np.eye(len(times), dtype=np.float32)[:, 1:].reshape(-1)
     sampler = {
         "input": binary.accessor(times, bounds=True),
@@ -131,14 +128,13 @@ def _animation(times: NDArray[np.float32], binary: BinaryChunk) -> dict[str, Any
 
 
 def _material(has_picture: bool) -> dict[str, Any]:
-    """Build a rough material, whose shading shows the shape of the surface."""
+    """Build a matte material."""
     colour = {"baseColorTexture": {"index": 0}} if has_picture else {}
     rough = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
     return {"name": "sheet", "doubleSided": True, "pbrMetallicRoughness": {**colour, **rough}}
 
 
 def _texture(picture: bytes, binary: BinaryChunk) -> dict[str, Any]:
-    """Build the texture of the picture."""
     return {
         "textures": [{"source": 0, "sampler": 0}],
         "images": [{"name": "picture", "mimeType": "image/png", "bufferView": binary.view(picture)}],
@@ -163,10 +159,10 @@ class KeyFrames(NamedTuple):
 def key_frames(
     position: NDArray[np.floating], limit: int, progress: ProgressCallback = lambda done, total: None
 ) -> KeyFrames:
-    """Choose the keyframes of a motion: all frames if possible, otherwise a greedy selection.
+    """Choose the keyframes of a motion: all frames if possible, otherwise by a greedy selection.
 
-    The selection starts with the first and the last frame, and repeatedly adds the frame with the largest interpolation
-    error. Keyframes are therefore dense where the motion is sudden.
+    The selection starts with the first and last frame, and repeatedly adds the frame with the largest interpolation
+    error.
 
     Args:
         position: positions at equidistant times [m], shape (frames, rows, cols, 3).
@@ -210,7 +206,7 @@ def _worst_frame(position: NDArray[np.floating], first: int, last: int) -> _Span
 
 
 class BinaryChunk:
-    """Binary chunk of a .glb file, to which the JSON chunk refers.
+    """Binary chunk of a .glb file.
 
     The container, a header of 12 bytes and two chunks, is too simple to justify a dependency on pygltflib.
     """
@@ -225,11 +221,11 @@ class BinaryChunk:
         """Append bytes.
 
         Args:
-            data: the bytes.
-            target: their purpose, GL_ARRAY_BUFFER or GL_ELEMENT_ARRAY_BUFFER; None for other data.
+            data: content of the view.
+            target: GL_ARRAY_BUFFER or GL_ELEMENT_ARRAY_BUFFER; None for other data.
 
         Returns:
-            Index of their buffer view.
+            Index of the buffer view.
         """
         view = {"buffer": 0, "byteOffset": self._length, "byteLength": len(data)}
         self._views.append(view if target is None else {**view, "target": target})
@@ -243,10 +239,10 @@ class BinaryChunk:
         Args:
             values: float32 or uint32, shape (n,) or (n, k), k = 1 to 3.
             target: as for `view`.
-            bounds: whether the accessor contains the minimum and maximum.
+            bounds: whether to store the minimum and maximum.
 
         Returns:
-            Index of their accessor.
+            Index of the accessor.
         """
         rows = np.ascontiguousarray(values).reshape(len(values), -1)
         accessor = {
@@ -261,14 +257,14 @@ class BinaryChunk:
         return len(self._accessors) - 1
 
     def container(self, document: dict[str, Any]) -> Iterator[bytes | memoryview]:
-        """Yield the content of a .glb file with this chunk and the JSON document that refers to it."""
+        """Yield the content of a .glb file with this chunk and a JSON document that refers to it."""
         buffers = {"accessors": self._accessors, "bufferViews": self._views, "buffers": [{"byteLength": self._length}]}
         text = json.dumps({**document, **buffers}, separators=(",", ":"), allow_nan=False).encode()
         text += _padding(len(text), b" ")
         yield struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + self._length)
-        yield struct.pack("<I4s", len(text), JSON_CHUNK)
+        yield struct.pack("<I4s", len(text), b"JSON")
         yield text
-        yield struct.pack("<I4s", self._length, BINARY_CHUNK)
+        yield struct.pack("<I4s", self._length, b"BIN\0")
         yield from self._parts
 
 

@@ -1,6 +1,6 @@
 """Inputs shared by the export formats: picture, surface normals, tracks and camera of a run.
 
-Files are validated, because they may come from anybody.
+Files are validated, as they may come from an untrusted source.
 """
 
 from __future__ import annotations
@@ -22,11 +22,10 @@ from taichi_msm.runs.finished import FinishedRun, damaged_result, reading
 from taichi_msm.scene.outputs import CAMERA_FILE
 from taichi_msm.system.files import read_regular
 
-# Exported vertices are the mass points. The surface between them is bilinear, so that more vertices would not add
-# information about the motion.
+# Exported vertices are the mass points: the surface between them is bilinear, so a refinement adds no information.
 EXPORT_REFINE = 0
 
-# Distinguishes any two float32 values.
+# Enough digits for any float32.
 FLOAT32_FORMAT = "%.9g"
 
 PICTURE_FILE = "picture.png"
@@ -48,8 +47,8 @@ def picture_png(run: FinishedRun) -> bytes | None:
 def unit_normals(position: NDArray[np.floating]) -> NDArray[np.float64]:
     """Compute the unit normals of the sheet, as used for shading.
 
-    The tangents are central differences, one-sided at edges. The normals of the flat sheet point toward the viewer;
-    where a fold makes the normal vanish, it is set to z.
+    Tangents are central differences, one-sided at edges. The normals of the flat sheet point toward the viewer; where a
+    fold makes the normal vanish, it is set to z.
 
     Args:
         position: positions of the mass points [m], shape (rows, cols, 3).
@@ -105,11 +104,8 @@ def read_track_positions(run: FinishedRun) -> tuple[NDArray[np.float32], NDArray
 
 Array = NDArray[np.float64]
 
-# Offset between pixel coordinates of this package, counted from the picture's corner, and those of OpenCV [px].
+# Pixel coordinates count from the picture's corner here, and from the centre of the first pixel in OpenCV [px].
 FIRST_PIXEL_CENTRE = 0.5
-
-# Limit for camera.json, sufficient for 100,000 poses.
-MAX_CAMERA_BYTES = 1 << 25
 
 
 class Pinhole(NamedTuple):
@@ -134,7 +130,8 @@ def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
     path = run.directory / run.camera / CAMERA_FILE
     another = "choose another camera by --camera, or " if FORMATS[name].cameras == ANY_CAMERA else ""
     with reading(path):
-        camera = json.loads(read_regular(run.require_own_file(path, "tracks"), MAX_CAMERA_BYTES))
+        # The limit is sufficient for 100,000 poses.
+        camera = json.loads(read_regular(run.require_own_file(path, "tracks"), 1 << 25))
         # A fisheye lens distorts even without coefficients.
         is_distorted = camera.get("model") == "fisheye" or bool(np.any(camera.get("distortion", ())))
         is_pinhole = "intrinsics" in camera

@@ -1,14 +1,13 @@
 """KITTI 2015 export: optical flow.
 
-Every pair of frames f and f + 1 is a scene of KITTI with the pictures `image_2/NNNNNN_10.png` and `_11.png`. The flow
-in `flow_occ/NNNNNN_10.png` is valid on the whole sheet, that in `flow_noc/NNNNNN_10.png` only where the material point
-is visible in both frames. Pairs are numbered consecutively over all runs. The folders are in a folder `training`, as
-KITTI loaders expect. A flow (u, v) [px] is stored in a PNG with 16 bits per channel as
+Every pair of adjacent frames is a scene of KITTI with the pictures `image_2/NNNNNN_10.png` and `_11.png`. The flow in
+`flow_occ/NNNNNN_10.png` is valid on the whole sheet, that in `flow_noc/NNNNNN_10.png` only where the material point is
+visible in both frames. Pairs are numbered consecutively over all runs. The folders are in a folder `training`, as KITTI
+loaders expect. A flow (u, v) [px] is stored in a PNG with 16 bits per channel as
 
     red = 64 u + 2^15,   green = 64 v + 2^15,   blue = 1,
 
-and invalid pixels are 0: the background, and values outside -512 to +511.98 px. Rounding makes the flow exact to
-1/128 px.
+and 0 where it is invalid: on the background, and outside -512 to +511.98 px. The rounding error is at most 1/128 px.
 
 Source: the development kit of KITTI's scene flow benchmark 2015, readme.txt and cpp/io_flow.h.
 """
@@ -31,15 +30,12 @@ from taichi_msm.runs.finished import FinishedRun, reading
 from taichi_msm.scene.outputs import OUTPUTS, zero_padded
 from taichi_msm.system.files import read_regular
 
-FLOW_SCALE, FLOW_OFFSET, MAX_VALUE = 64.0, 32768.0, 65535.0
-
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_BIT_DEPTH, PNG_RGB = 16, 2
-# Stores the byte-wise difference from the row above.
+# Filter that stores the byte-wise difference from the row above.
 PNG_UP_FILTER = 2
 
-
-# The folders and the entries of `output` from which they are made.
+# Source of each folder, an entry of `output`.
 SOURCE_OUTPUTS = {"flow_occ": "flow", "flow_noc": "occlusion", "image_2": "png"}
 
 
@@ -88,15 +84,15 @@ def encode_flow(flow: NDArray[np.float32], visible: NDArray[np.bool_] | None = N
     """Encode flow as the colours of KITTI.
 
     Args:
-        flow: flow to the right and down [px], shape (height, width, 2).
+        flow: to the right and down [px], shape (height, width, 2).
         visible: mask of valid pixels, shape (height, width); None for all.
 
     Returns:
         Colours, shape (height, width, 3); 0 where the flow is invalid or out of range.
     """
-    # In double precision, so that only the final rounding changes the value.
-    scaled = np.rint(flow.astype(np.float64) * FLOW_SCALE + FLOW_OFFSET)
-    valid = ((scaled >= 0) & (scaled <= MAX_VALUE)).all(axis=-1)
+    # In double precision, only the final rounding changes the value.
+    scaled = np.rint(flow.astype(np.float64) * 64.0 + 32768.0)
+    valid = ((scaled >= 0) & (scaled <= 65535.0)).all(axis=-1)
     if visible is not None:
         valid &= visible
     colours = np.zeros((*valid.shape, 3), np.uint16)
@@ -133,7 +129,7 @@ def _chunk(kind: bytes, data: bytes) -> Iterator[bytes]:
 
 
 def _copy_frame(run: FinishedRun, number: int, path: Path) -> None:
-    """Copy a frame after decoding it to verify its content and size."""
+    """Validate a frame by decoding it, and copy its file."""
     run.read_picture("png", number)
     source = run.result_path("png", number)
     with reading(source):

@@ -59,7 +59,7 @@ def _lines(key: str, rows: NDArray[np.floating]) -> str:
 
 
 def _material(has_picture: bool) -> Iterable[str]:
-    """Return the lines of a material without highlights."""
+    """Yield the lines of a matte material."""
     yield from ("newmtl sheet", "Kd 1 1 1", "Ks 0 0 0", "illum 1")
     if has_picture:
         yield f"map_Kd {PICTURE_FILE}"

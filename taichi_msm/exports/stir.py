@@ -8,9 +8,9 @@ Every run has a folder with
     left/seq00/segmentation/icgendseg.png           the same for the last frame
     left/seq00/0ms_icgstart.png, 1200ms_icgend.png  first and last frame
 
-STIR's infrared pictures show only the tattoos. Here, they are the visible frames, whose texture the loader needs to
-match left and right tracks. Marked are the tracks that are visible to both cameras in the first and the last frame,
-unless their discs would touch. The centre of a disc is the pixel that contains the track.
+Instead of infrared pictures, which show only the tattoos, the start and end pictures are visible frames: the loader
+needs their texture to match left and right tracks. Marked are the tracks that are visible to both cameras in the first
+and last frame, unless their discs would touch. The centre of a disc is the pixel that contains the track.
 
 A position X in the axes of the left camera (OpenCV's, [m]) is `rotation` X + `translation` in those of the right one,
 so that the first component of `translation` is the negative baseline. Camera matrices count from the centre of the
@@ -45,11 +45,8 @@ from taichi_msm.scene.outputs import zero_padded
 
 FORMAT_NAME, CAMERAS = "stir", ("left", "right")
 
-# Limits of STIR's loader: size of the pictures [px], and disparities for stereo triangulation.
+# Limits of STIR's loader: size of the pictures [px], and disparities that it triangulates.
 LOADER_SIZE, MIN_DISPARITY_PX, MAX_DISPARITY_PX = (1280, 1024), 8, 105
-
-# Ratio of the width of the picture to the radius of a disc.
-WIDTH_PER_DISC_RADIUS = 160
 
 # Tolerance of a rectified stereo pair: deviation of the rotation matrix, and offsets relative to the baseline.
 ALIGNMENT_TOLERANCE = 1e-6
@@ -77,7 +74,7 @@ def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> li
     left, right = (read_pinhole(each, FORMAT_NAME) for each in runs)
     baseline = _baseline(run, left, right)
     write_new_file(folder / "calib.json", (json.dumps(_calibration(left, right, baseline), indent=2) + "\n").encode())
-    radius = max(1, round(run.scene.render.size[0] / WIDTH_PER_DISC_RADIUS))
+    radius = max(1, round(run.scene.render.size[0] / 160))
     pixels, tracks = _choose_tracks(runs, radius)
     for number, each in enumerate(runs):
         sequence = folder / each.camera / "seq00"
@@ -114,7 +111,7 @@ def _calibration(left: Pinhole, right: Pinhole, baseline: float) -> dict[str, An
 
 
 def _report_progress(progress: ProgressCallback, before: int, done: int, total: int) -> None:
-    """Report the progress of a camera as that of both; `before` is the number of finished cameras."""
+    """Convert the progress of a camera, after `before` finished ones, to that of both."""
     progress(before * total + done, len(CAMERAS) * total)
 
 
@@ -122,7 +119,7 @@ def _choose_tracks(runs: Sequence[FinishedRun], radius: int) -> tuple[Pixels, in
     """Choose the tracks to mark.
 
     Returns:
-        Their pixels for each camera in the first and the last frame, shape (2, 2, n, 2); and the number of all tracks.
+        Pixels per camera in the first and last frame, shape (2, 2, tracks, 2); and the number of all tracks.
     """
     tracks, occluded = (np.stack(each)[:, :, [0, -1]] for each in zip(*map(read_tracks, runs), strict=True))
     pixels = np.floor(np.nan_to_num(tracks)).astype(np.int64).transpose(0, 2, 1, 3)
@@ -136,7 +133,7 @@ def _choose_tracks(runs: Sequence[FinishedRun], radius: int) -> tuple[Pixels, in
 
 
 def _discs(pixels: Pixels, size: tuple[int, int], radius: int) -> NDArray[np.uint8]:
-    """Draw discs around pixels, shape (n, 2), in a mask of a width and height."""
+    """Draw discs around pixels, shape (n, 2), in a mask of `size` (width, height)."""
     mask = np.zeros(size[::-1], np.uint8)
     offset = np.arange(-radius, radius + 1)
     disc = (offset[:, None] ** 2 + offset**2 <= radius**2) * np.uint8(255)
@@ -167,7 +164,7 @@ def _png(picture: NDArray[np.uint8]) -> bytes:
 
 
 def _notes(size: tuple[int, int], pixels: Pixels, tracks: int, baseline: float) -> list[str]:
-    """Build warnings about omitted tracks and limits of STIR's loader."""
+    """Return warnings about omitted tracks and limits of STIR's loader."""
     notes, marked = [], pixels.shape[2]
     if marked < tracks:
         notes.append(

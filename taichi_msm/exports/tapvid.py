@@ -1,6 +1,6 @@
 """TAP-Vid export: 2D tracks.
 
-A single pickle like that of TAP-Vid-DAVIS: a dictionary from the name of each video, one per run, to a dictionary of
+A single pickle like that of TAP-Vid-DAVIS: a dictionary of videos by name, one per run, each a dictionary of
 
     video      frames, uint8, shape (frames, height, width, 3)
     points     positions, float32, shape (tracks, frames, 2): x / width and y / height, 0 at the left and the upper
@@ -33,7 +33,7 @@ from taichi_msm.system.process import available_memory
 
 
 class _Pickler(pickle.Pickler):
-    """Pickler whose arrays all versions of NumPy can read; NumPy 2 would refer to a module that 1.26.0 lacks."""
+    """Pickler for arrays that NumPy 1 can read; NumPy 2 would refer to a module that 1.26.0 lacks."""
 
     def reducer_override(self, value: Any) -> Any:
         if isinstance(value, np.ndarray):
@@ -68,7 +68,6 @@ def _require_memory(runs: Sequence[FinishedRun]) -> None:
 
 
 def _video(run: FinishedRun, progress: ProgressCallback) -> dict[str, NDArray[Any]]:
-    """Read the frames and tracks of a run."""
     width, height = run.scene.render.size
     points, occluded = read_tracks(run)
     points = np.nan_to_num(points)

@@ -1,7 +1,7 @@
 """TAPVid-3D export: 3D tracks, an .npz per run.
 
     images_jpeg_bytes   frames as JPEG bytes, shape (frames,)
-    queries_xyt         start of each track: x and y [px] in frame t, the first in which it is visible,
+    queries_xyt         start of each track: x and y [px] in the first frame t in which it is visible,
                         shape (tracks, 3)
     tracks_XYZ          positions in the axes of the camera in each frame, OpenCV's: x right, y down, z forward [m],
                         shape (frames, tracks, 3)

@@ -31,8 +31,6 @@ from taichi_msm.runs.finished import FinishedRun
 from taichi_msm.solver.planning import make_plan
 from taichi_msm.terms.elasticity import energy_density
 
-COLLECTION_FILE = "surface.pvd"
-
 DISPLACEMENT, SPEED, ENERGY = "displacement", "speed", "energy_density"
 UNITS = {DISPLACEMENT: "m", SPEED: "m/s", ENERGY: "J/m2"}
 
@@ -66,7 +64,7 @@ def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[st
         write_new_file(folder / _name(frame), _grid(positions[frame], values))
     if picture is not None:
         write_new_file(folder / PICTURE_FILE, picture)
-    write_new_file(folder / COLLECTION_FILE, _collection(run.time))
+    write_new_file(folder / "surface.pvd", _collection(run.time))
     return []
 
 
@@ -95,7 +93,7 @@ def _name(frame: int) -> str:
 
 
 def _grid(position: Array, values: dict[str, Array]) -> bytes:
-    """Build the content of a .vtu file from positions [m] and point data."""
+    """Build the content of a .vtu file with point data."""
     from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
     from vtkmodules.vtkCommonCore import vtkDataArray, vtkPoints
     from vtkmodules.vtkCommonDataModel import VTK_TRIANGLE, vtkCellArray, vtkUnstructuredGrid
@@ -123,7 +121,7 @@ def _grid(position: Array, values: dict[str, Array]) -> bytes:
         grid.GetPointData().AddArray(named(name, data))
     grid.GetPointData().SetActiveVectors(DISPLACEMENT)
     grid.GetPointData().SetTCoords(named("texture", mesh.texture_coordinates * (1, -1) + (0, 1)))
-    # VTK writes to a string, because it only prints an error when the disk is full.
+    # VTK writes to a string: to a file, it would only print an error when the disk is full.
     writer = vtkXMLUnstructuredGridWriter()
     writer.WriteToOutputStringOn()
     writer.SetInputData(grid)
@@ -132,7 +130,7 @@ def _grid(position: Array, values: dict[str, Array]) -> bytes:
 
 
 def _collection(time: Array) -> bytes:
-    """Build the content of the .pvd file, which lists the frames with their times."""
+    """Build the content of the .pvd file."""
     root = ElementTree.Element("VTKFile", type="Collection", version="0.1")
     collection = ElementTree.SubElement(root, "Collection")
     for frame, seconds in enumerate(time.tolist()):

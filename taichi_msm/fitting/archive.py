@@ -1,4 +1,4 @@
-"""Read the arrays of observations from an .npz; other arrays stay unread."""
+"""Read the arrays of observations from an .npz."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from taichi_msm.system.process import available_memory
 NEEDS = "time (T,), coordinates (N, 2) and position (N, T, 3) or pixel (N, T, 2)"
 MEMBERS = ("time", "coordinates", "position", "pixel", "sigma", "points", "occluded", "visible")
 
-# Words in the names of arrays with a meaning for observations.
-MEANINGFUL_WORDS = (
+# Parts of array names that suggest data of observations.
+SUGGESTIVE_NAME_PARTS = (
     "visib",
     "occlu",
     "mask",
@@ -36,7 +36,7 @@ MEANINGFUL_WORDS = (
 
 
 def read_archive(name: str) -> tuple[dict[str, NDArray[Any]], list[str]]:
-    """Return the arrays of an .npz that observations may have, and the names of all its arrays.
+    """Read the arrays of observations from an .npz, and the names of all its arrays.
 
     Raises:
         SceneError: when the file is not an .npz, or an array cannot be used.
@@ -46,11 +46,11 @@ def read_archive(name: str) -> tuple[dict[str, NDArray[Any]], list[str]]:
         if kind := irregular_kind(path):
             raise SceneError([f"{name}: {'a folder' if path.is_dir() else kind}; {remedy}"])
         with path.open("rb") as file:
-            begin = file.read(6)
-        if begin.startswith(b"PK"):
+            signature = file.read(6)
+        if signature.startswith(b"PK"):
             with zipfile.ZipFile(path) as archive:
                 return _members(name, archive)
-        reason = "a single array, as np.save writes" if begin == b"\x93NUMPY" else "not an .npz"
+        reason = "a single array, as np.save writes" if signature == b"\x93NUMPY" else "not an .npz"
     except FileNotFoundError:
         reason = "no such file"
     except OSError as error:
@@ -61,28 +61,30 @@ def read_archive(name: str) -> tuple[dict[str, NDArray[Any]], list[str]]:
 
 
 def require_understood(name: str, keys: list[str]) -> None:
-    """Check that no array with a meaning for observations stays unread; SceneError: lists such arrays."""
-    unknown = [key for key in keys if key not in MEMBERS and any(word in key.lower() for word in MEANINGFUL_WORDS)]
-    if unknown:
-        said = "not understood; take NaN where not observed, or visible or occluded (N, T), and sigma for errors"
-        raise SceneError([f"{name}: {', '.join(map(ascii, unknown))}: {said}"])
+    """Check that no array is ignored whose name suggests data of observations; SceneError: lists such arrays."""
+    ignored = [key for key in keys if key not in MEMBERS and any(word in key.lower() for word in SUGGESTIVE_NAME_PARTS)]
+    if ignored:
+        fault = "not understood; take NaN where not observed, or visible or occluded (N, T), and sigma for errors"
+        raise SceneError([f"{name}: {', '.join(map(ascii, ignored))}: {fault}"])
 
 
 def _members(name: str, archive: zipfile.ZipFile) -> tuple[dict[str, NDArray[Any]], list[str]]:
     infos = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
     require_understood(name, list(infos))
-    wanted = {key: info for key, info in infos.items() if key in MEMBERS}
-    if (size := sum(info.file_size for info in wanted.values())) > (most := available_memory() // 4):
-        said = f"{size / 1e9:.1f} GB of arrays, and there is memory for {most / 1e9:.1f} GB; leave points or times out"
-        raise SceneError([f"{name}: {said}"])
+    members = {key: info for key, info in infos.items() if key in MEMBERS}
+    if (size := sum(info.file_size for info in members.values())) > (limit := available_memory() // 4):
+        fault = (
+            f"{size / 1e9:.1f} GB of arrays, and there is memory for {limit / 1e9:.1f} GB; leave points or times out"
+        )
+        raise SceneError([f"{name}: {fault}"])
     arrays = {}
-    for key, info in wanted.items():
+    for key, info in members.items():
         try:
             with archive.open(info) as member:
                 arrays[key] = np.lib.format.read_array(member, allow_pickle=False)
         except Exception as error:  # zipfile, its decompressors and NumPy raise any kind
-            why = str(error).partition("\n")[0] or type(error).__name__
-            why = "encrypted" if info.flag_bits & 1 else why
-            why = "an array of Python objects" if why.startswith("Object arrays") else f"cannot be read: {why}"
-            raise SceneError([f"{name}: {key}: {why}; write it again by np.savez, as numbers"]) from None
+            reason = str(error).partition("\n")[0] or type(error).__name__
+            reason = "encrypted" if info.flag_bits & 1 else reason
+            reason = "an array of Python objects" if reason.startswith("Object arrays") else f"cannot be read: {reason}"
+            raise SceneError([f"{name}: {key}: {reason}; write it again by np.savez, as numbers"]) from None
     return arrays, list(infos)

@@ -1,6 +1,6 @@
-"""Read a forces.csv of measured tool forces.
+"""Reader of measured tool forces, a forces.csv with any separator and decimal mark.
 
-Only an empty cell and NaN mean "not measured"; every other cell that is not a number is an error.
+Empty cells and NaN mean "not measured"; any other cell must be a number.
 """
 
 from __future__ import annotations
@@ -25,22 +25,19 @@ MAX_BYTES = 2**26
 # Encodings by byte order mark.
 BYTE_ORDER_MARKS = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
 
-NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+NUMBER_PATTERN = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 
 def read_forces(path: str | Path, sigma: float, probes: int) -> Forces:
     """Read a forces.csv.
 
     Args:
-        path: of the file.
+        path: the file.
         sigma: standard deviation of the error of each component [N].
-        probes: number of the scene's tools.
-
-    Returns:
-        The forces of every row [N], NaN where not measured.
+        probes: number of tools of the scene.
 
     Raises:
-        SceneError: when it is not such a table, or names a tool that the scene does not have.
+        SceneError: when the file is not such a table, or refers to a missing tool.
     """
     name = str(path)
     if not 0 < sigma < math.inf:
@@ -50,15 +47,15 @@ def read_forces(path: str | Path, sigma: float, probes: int) -> Forces:
     table = np.array(_Reader(name, text).rows(), np.float64).reshape(-1, len(COLUMNS))
     time, probe, force = table[:, 0], table[:, 1], table[:, 2:]
     if not (np.isfinite(force).any() and np.isfinite(time).all()):
-        what = "no row" if not len(time) else "no force" if np.isfinite(time).all() else "a row without a time"
-        raise SceneError([f"{name}: {what}; {EXPECTED}, and numbers in them"])
-    if wrong := [one for one in probe.tolist() if one not in range(probes)]:
-        raise SceneError([f"{name}: probe: {wrong[0]:g}; the scene has {probes}, numbered from 0"])
+        fault = "no row" if not len(time) else "no force" if np.isfinite(time).all() else "a row without a time"
+        raise SceneError([f"{name}: {fault}; {EXPECTED}, and numbers in them"])
+    if unknown := [index for index in probe.tolist() if index not in range(probes)]:
+        raise SceneError([f"{name}: probe: {unknown[0]:g}; the scene has {probes}, numbered from 0"])
     return Forces(name, time, probe.astype(np.intp), force, sigma)
 
 
 def _text(name: str) -> str:
-    """Return the text of a regular file of bounded size."""
+    """Read a text file of at most `MAX_BYTES`."""
     try:
         if not (reason := irregular_kind(Path(name))):
             if (size := Path(name).stat().st_size) <= MAX_BYTES:
@@ -79,81 +76,85 @@ def _text(name: str) -> str:
 
 
 class _Reader:
-    """Reader of a table with any separator and decimal mark."""
+    """Reader of a table; detects its header, separator and decimal mark."""
 
     def __init__(self, name: str, text: str) -> None:
         self._name, lines = name, text.splitlines()
-        # Other lines may stand before the header.
-        known = (n for n, line in enumerate(lines) if set(COLUMNS) <= set(re.findall(r"\w+", line.lower())))
-        self._first = next(known, 0)
-        self._lines = lines[self._first :]
+        # Other lines may precede the header.
+        headers = (n for n, line in enumerate(lines) if set(COLUMNS) <= set(re.findall(r"\w+", line.lower())))
+        self._header_index = next(headers, 0)
+        self._lines = lines[self._header_index :]
         self._delimiter = next((mark for mark in ";\t" if mark in self._lines[0]), ",")
-        self._decimal = ""  # the mark that was found
-        self._seen: set[tuple[str, str]] = set()
+        self._decimal = ""  # once detected
+        self._row_keys: set[tuple[str, str]] = set()
 
     def rows(self) -> list[list[float]]:
-        """Return the numbers of each row in the order of the columns."""
+        """Return the numbers of all rows in the order of `COLUMNS`."""
         reader = csv.reader(self._lines, delimiter=self._delimiter, skipinitialspace=True)
         rows: list[list[float]] = []
         try:
-            header = _header(f"{self._name}:{self._first + 1}", [cell.lstrip("#% ").strip() for cell in next(reader)])
+            header = _header(
+                f"{self._name}:{self._header_index + 1}", [cell.lstrip("#% ").strip() for cell in next(reader)]
+            )
             for cells in reader:
                 if any(map(str.strip, cells)) and not cells[0].startswith(("#", "%")):
-                    rows += self._row(f"{self._name}:{self._first + reader.line_num}", header, cells, first=not rows)
+                    rows += self._row(
+                        f"{self._name}:{self._header_index + reader.line_num}", header, cells, first=not rows
+                    )
         except csv.Error as error:
-            raise SceneError([f"{self._name}:{self._first + reader.line_num}: {error}; {EXPECTED}"]) from None
+            raise SceneError([f"{self._name}:{self._header_index + reader.line_num}: {error}; {EXPECTED}"]) from None
         return rows
 
     def _row(self, where: str, header: list[str], cells: list[str], *, first: bool) -> list[list[float]]:
-        """Return the numbers of a row, in a list; it is empty for a row of units."""
+        """Parse a row; return a list of its numbers, or an empty list for a row of units."""
         if len(cells) < len(header) or any(cells[len(header) :]):
             remedy = "with decimal commas, separate cells by ;" if self._delimiter == "," else "give a cell a column"
             raise SceneError([f"{where}: {len(cells)} cells, and {len(header)} columns; {remedy}"])
         named = {key: cells[header.index(key)].strip() for key in COLUMNS}
         if first and _is_units(where, named):
             return []
-        if (moment := (named["time"], named["probe"])) in self._seen:
-            raise SceneError([f"{where}: a second row of {moment[0]} s and probe {moment[1]}; leave one"])
-        self._seen.add(moment)
+        if (row_key := (named["time"], named["probe"])) in self._row_keys:
+            raise SceneError([f"{where}: a second row of {row_key[0]} s and probe {row_key[1]}; leave one"])
+        self._row_keys.add(row_key)
         return [[self._number(where, key, cell) for key, cell in named.items()]]
 
     def _number(self, where: str, key: str, cell: str) -> float:
-        """Return the number of a cell, NaN of an empty one."""
+        """Parse a cell; NaN if it is empty."""
         if cell.lower() in ("", "nan"):
             return math.nan
-        plain, said = cell.replace("\N{MINUS SIGN}", "-"), "leave the cell empty where nothing was measured"
-        for mark in {*plain} & {*",."} if self._delimiter != "," else ():
+        normalised, remedy = cell.replace("\N{MINUS SIGN}", "-"), "leave the cell empty where nothing was measured"
+        for mark in {*normalised} & {*",."} if self._delimiter != "," else ():
             if self._decimal not in ("", mark):
                 raise SceneError(
                     [f"{where}: {key}: {cell[:40]!r}; both . and , are decimal marks in this file; take one"]
                 )
             self._decimal = mark
-            plain = plain.replace(",", ".", 1)
-        if "," in plain:
-            said = "with decimal commas, separate cells by ;"
-        if not (NUMBER.fullmatch(plain) and abs(value := float(plain)) <= MAX_MAGNITUDE):
-            raise SceneError([f"{where}: {key}: {cell[:40]!r}; take a number, or {said}"])
+            normalised = normalised.replace(",", ".", 1)
+        if "," in normalised:
+            remedy = "with decimal commas, separate cells by ;"
+        if not (NUMBER_PATTERN.fullmatch(normalised) and abs(value := float(normalised)) <= MAX_MAGNITUDE):
+            raise SceneError([f"{where}: {key}: {cell[:40]!r}; take a number, or {remedy}"])
         return value
 
 
 def _header(where: str, cells: list[str]) -> list[str]:
-    """Return the column names without units; SceneError: a column is missing, repeated or in another unit."""
-    split = [re.fullmatch(r"(.*?)\s*[\[(](.*)[\])]", cell) for cell in cells]
-    names = [cell if found is None else found[1] for cell, found in zip(cells, split, strict=True)]
+    """Return the column names without units; SceneError: missing or repeated columns, or other units."""
+    matches = [re.fullmatch(r"(.*?)\s*[\[(](.*)[\])]", cell) for cell in cells]
+    names = [cell if match_ is None else match_[1] for cell, match_ in zip(cells, matches, strict=True)]
     names = [name.lower() for name in names]
     if missing := [key for key in COLUMNS if key not in names]:
         listed = ", ".join(name[:20] for name in names[:12])
         raise SceneError([f"{where.rpartition(':')[0]}: {missing[0]}: missing; found {listed}; {EXPECTED}"])
-    if twice := [key for key in COLUMNS if names.count(key) > 1]:
-        raise SceneError([f"{where}: {twice[0]}: {names.count(twice[0])} columns of this name; leave one"])
-    for key, found in zip(names, split, strict=True):
-        if found is not None:
-            _check_unit(where, key, found[2].strip())
+    if repeated := [key for key in COLUMNS if names.count(key) > 1]:
+        raise SceneError([f"{where}: {repeated[0]}: {names.count(repeated[0])} columns of this name; leave one"])
+    for key, match_ in zip(names, matches, strict=True):
+        if match_ is not None:
+            _check_unit(where, key, match_[2].strip())
     return names
 
 
 def _is_units(where: str, named: dict[str, str]) -> bool:
-    """Return whether a row has units instead of numbers; SceneError: other units."""
+    """Return whether a row contains units instead of numbers; SceneError: other units."""
     units = {key: cell.strip("[]() ") for key, cell in named.items()}
     if not (units["time"].isalpha() and units["time"].lower() != "nan"):
         return False

@@ -1,12 +1,12 @@
-"""Observations of a tissue: positions or pixels of points in time, and tool forces.
+"""Observations of a tissue: positions or pixels of points over time, and tool forces.
 
 An .npz file has `time` (T,) [s], `coordinates` (N, 2), across and down, and `position` (N, T, 3) [m] or `pixel`
-(N, T, 2) [px], NaN where not observed, and may have `sigma`, the standard deviation of each number's error.
-trajectory.npz and tracks.npz of a run are accepted.
+(N, T, 2) [px], NaN where not observed; optionally `sigma`, the standard deviation of their errors. A run's
+trajectory.npz and tracks.npz are accepted too.
 
-`ObservationModel` maps the mass points of a scene to such observations. An observed point lies on the drawn surface and
-is a weighted mean of four mass points; between two frames it moves in a straight line; the camera projects it. The
-first two maps are linear, with their transposes as adjoints; the derivative of the projection is a central difference.
+`ObservationModel` maps the mass points of a scene to observations: a point on the drawn surface is a weighted mean of
+four mass points, moves in a straight line between frames, and is projected by the camera. The first two maps are
+linear, with their transposes as adjoints; the derivative of the projection is a central difference.
 """
 
 from __future__ import annotations
@@ -28,12 +28,9 @@ from taichi_msm.scene.section import MAX_MAGNITUDE, MIN_MAGNITUDE
 
 Array = NDArray[np.float64]
 
-# Step of finite differences of the projection, as a share of the larger side of the sheet.
-DIFFERENCE_SHARE = 1e-6
-
 
 class ObservationModel:
-    """Observation model of a scene: from mass points to observations, and the adjoint.
+    """Map from the mass points of a scene to observations, and its adjoint.
 
     Args:
         scene: the scene, with its camera.
@@ -51,61 +48,61 @@ class ObservationModel:
         self._time_weights = time_weights(scene, observations.time, frames)
 
     def points_on_sheet(self, position: Array) -> Array:
-        """Interpolate positions of one frame, shape (rows, cols, 3), at the observed points [m], shape (N, 3)."""
+        """Interpolate the positions of a frame, shape (rows, cols, 3), at the observed points [m], shape (N, 3)."""
         return np.asarray(self._surface @ position.reshape(-1, 3))
 
     def interpolate(self, at_frames: Array) -> Array:
-        """Interpolate points at frames, shape (frames, N, 3), at the observed times, shape (N, T, 3)."""
+        """Interpolate points, shape (frames, N, 3), at the observed times, shape (N, T, 3)."""
         at_times = self._time_weights @ at_frames.reshape(len(at_frames), -1)
         return np.asarray(at_times.reshape(-1, *at_frames.shape[1:]).swapaxes(0, 1))
 
     def motion(self, at_frames: Array) -> Array:
-        """Return the largest displacement of the points at each frame [m], shape (frames,)."""
+        """Return the largest displacement of points, shape (frames, N, 3), at each frame [m], shape (frames,)."""
         return np.asarray(
             np.linalg.norm(at_frames - positions_at_rest(self.scene, self._observations), axis=2).max(axis=1)
         )
 
     def points(self, position: Array) -> Array:
-        """Interpolate positions [m], shape (frames, rows, cols, 3), in space and time, shape (N, T, 3)."""
+        """Interpolate positions [m], shape (frames, rows, cols, 3), in space and time; returns shape (N, T, 3)."""
         return self.interpolate(np.array([self.points_on_sheet(frame) for frame in position]))
 
     def observe(self, points: Array) -> Array:
-        """Return points [m], shape (N, T, 3), as observations, shape (N, T, 3 or 2); NaN behind the camera."""
+        """Convert points [m], shape (N, T, 3), to observations, shape (N, T, 3 or 2); NaN behind the camera."""
         if self._observations.kind == "position":
             return points
         return project_points(self.scene, points, self._observations.time)
 
-    def backward(self, points: Array, slope: Array) -> Array:
-        """Return the derivative of a loss by the positions of every frame.
+    def backward(self, points: Array, gradient: Array) -> Array:
+        """Return the gradient of a loss by the positions of every frame.
 
         Args:
             points: observed points [m], shape (N, T, 3).
-            slope: derivative of the loss by the observations, shape (N, T, 3 or 2).
+            gradient: by the observations, shape (N, T, 3 or 2).
 
         Returns:
-            The derivative by the positions, shape (frames, rows, cols, 3).
+            Gradient by the positions, shape (frames, rows, cols, 3).
         """
         if self._observations.kind == "pixel":
-            by = DIFFERENCE_SHARE * max(self.scene.sheet.size) * np.eye(3)
-            changes = ((self.observe(points + one) - self.observe(points - one)) / (2 * one.sum()) for one in by)
-            slope = np.stack([(slope * change).sum(axis=-1) for change in changes], axis=-1)
-        at_frames = self._time_weights.T @ slope.swapaxes(0, 1).reshape(slope.shape[1], -1)
+            steps = 1e-6 * max(self.scene.sheet.size) * np.eye(3)
+            changes = ((self.observe(points + step) - self.observe(points - step)) / (2 * step.sum()) for step in steps)
+            gradient = np.stack([(gradient * change).sum(axis=-1) for change in changes], axis=-1)
+        at_frames = self._time_weights.T @ gradient.swapaxes(0, 1).reshape(gradient.shape[1], -1)
         shape = *self.scene.sheet.points, 3
         return np.array([(self._surface.T @ frame.reshape(-1, 3)).reshape(shape) for frame in at_frames])
 
 
 def time_in_frames(scene: Scene, time: Array) -> Array:
-    """Return times as frame numbers, whole where they are within rounding of a frame."""
+    """Convert times [s] to frame numbers, rounded to six decimals, so that frames are integers."""
     return np.round(time * scene.time.frames_per_second, 6)
 
 
 def time_weights(scene: Scene, time: Array, frames: int) -> Any:
-    """Return the weights of linear interpolation between frames, a sparse matrix of shape (T, frames)."""
+    """Return the weights of linear interpolation at times [s] between frames, sparse, shape (T, frames)."""
     from scipy.sparse import csr_matrix
 
-    place, row = time_in_frames(scene, time), np.arange(len(time))
-    before = np.clip(np.floor(place), 0, frames - 2).astype(int)
-    shares, frame = np.stack([1 - place + before, place - before]), np.stack([before, before + 1])
+    position, row = time_in_frames(scene, time), np.arange(len(time))
+    before = np.clip(np.floor(position), 0, frames - 2).astype(int)
+    shares, frame = np.stack([1 - position + before, position - before]), np.stack([before, before + 1])
     return csr_matrix((shares.ravel(), (np.tile(row, 2), frame.ravel())), (len(time), frames))
 
 
@@ -117,20 +114,23 @@ def positions_at_rest(scene: Scene, observations: Observations) -> Array:
 
 
 def project_points(scene: Scene, points: Array, time: Array) -> Array:
-    """Find where the scene's main camera sees points [m], shape (N, T, 3), at T times [s].
+    """Project points by the scene's main camera.
 
-    Returns pixels from the picture's upper left corner, shape (N, T, 2); NaN: behind the eye, or beyond the lens.
+    Args:
+        scene: has the camera.
+        points: positions [m], shape (N, T, 3).
+        time: times of the points [s], shape (T,).
+
+    Returns:
+        Pixels from the picture's upper left corner, shape (N, T, 2); NaN behind the eye, or beyond the lens.
     """
     return np.stack([view(scene, each).pixels(points[:, n]) for n, each in enumerate(time.tolist())], axis=1)
 
 
 def observe_at_rest(scene: Scene, observations: Observations) -> Array:
-    """Return the observations of the sheet at rest, shape (N, T, 3 or 2)."""
+    """Return the observations of a sheet at rest, shape (N, T, 3 or 2)."""
     rest = np.repeat(positions_at_rest(scene, observations)[:, None], len(observations.time), axis=1)
     return rest if observations.kind == "position" else project_points(scene, rest, observations.time)
-
-
-MAX_POINTS_PER_SIDE = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,14 +139,14 @@ class Forces:
 
     name: str  # of the file, in messages
     time: Array  # of every row [s], shape (rows,)
-    probe: NDArray[np.intp]  # whose it is, shape (rows,)
+    probe: NDArray[np.intp]  # index of the tool, shape (rows,)
     force: Array  # [N], shape (rows, 3); NaN: not measured
     sigma: float  # standard deviation of each component's error [N]
 
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Positions or pixels of points in time, NaN where not observed."""
+    """Positions or pixels of points over time, NaN where not observed."""
 
     name: str  # of the file, in messages
     kind: Literal["position", "pixel"]
@@ -163,12 +163,12 @@ class Observations:
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """Mask of the observed values, of their shape."""
+        """Mask of the observed values, with their shape."""
         return np.isfinite(self.values)
 
     @property
-    def there(self) -> NDArray[np.bool_]:
-        """Mask of the observed points in time, shape (N, T)."""
+    def is_observed(self) -> NDArray[np.bool_]:
+        """Mask of the observed points over time, shape (N, T)."""
         return self.known[..., 0]
 
 
@@ -176,11 +176,11 @@ def read_observations(observed: str | Path | Mapping[str, Any], rate: float) -> 
     """Read observations from a file, or from a mapping of the same arrays.
 
     Args:
-        observed: the path of an .npz, or a mapping.
-        rate: the scene's frames per second, for the times of a tracks.npz.
+        observed: path of an .npz, or a mapping.
+        rate: frames per second of the scene, for a tracks.npz.
 
     Raises:
-        SceneError: when the arrays are missing, of other shapes, or not understood.
+        SceneError: when arrays are missing, unknown, or have other shapes.
     """
     if isinstance(observed, Mapping):
         filled = {
@@ -193,27 +193,27 @@ def read_observations(observed: str | Path | Mapping[str, Any], rate: float) -> 
 
 
 def with_sigma(observations: Observations, sigma: Any) -> Observations:
-    """Return the observations with another sigma [m] or [px], unless it is None; SceneError: not a positive number."""
+    """Replace sigma [m] or [px] unless it is None; SceneError: not a positive number."""
     if sigma is None:
         return observations
     array = np.asarray(sigma)
     is_number = array.dtype.kind in "fiu" and array.size == 1
     if not (is_number and MIN_MAGNITUDE <= (value := float(array.ravel()[0])) <= MAX_MAGNITUDE):
         shown = f"{value:g}" if is_number else f"{array.dtype} of shape {array.shape}"
-        said = f"take one number above 0, the standard deviation of the errors [{observations.unit}], or leave it out"
-        raise SceneError([f"{observations.name}: sigma: {shown}; {said}"])
+        remedy = f"take one number above 0, the standard deviation of the errors [{observations.unit}], or leave it out"
+        raise SceneError([f"{observations.name}: sigma: {shown}; {remedy}"])
     return replace(observations, sigma=value)
 
 
 def _checked(name: str, arrays: dict[str, NDArray[Any]], names: list[str], rate: float) -> Observations:
-    """Build observations from arrays, of a file or mapping with these names; SceneError: they are not valid."""
-    arrays = _thinned(_hidden(name, arrays, rate))
+    """Validate arrays, and build observations; `names`: of all arrays in the source."""
+    arrays = _thinned(_masked(name, arrays, rate))
     kinds = [kind for kind in ("position", "pixel") if kind in arrays]
     missing = [key for key in ("time", "coordinates") if key not in arrays]
     if missing := missing + ([] if kinds else ["position or pixel"]):
         found = ", ".join(map(ascii, names[:20])) or "nothing"
-        near = did_you_mean(missing[0].partition(" ")[0], names).replace("; did you mean", "; is it")
-        raise SceneError([f"{name}: {missing[0]}: missing; expected {NEEDS}, and it has {found}{near}"])
+        suggestion = did_you_mean(missing[0].partition(" ")[0], names).replace("; did you mean", "; is it")
+        raise SceneError([f"{name}: {missing[0]}: missing; expected {NEEDS}, and it has {found}{suggestion}"])
     if len(kinds) == 2:
         raise SceneError([f"{name}: has both position and pixel; leave one of them out"])
     kind: Literal["position", "pixel"] = "position" if kinds[0] == "position" else "pixel"
@@ -226,27 +226,26 @@ def _checked(name: str, arrays: dict[str, NDArray[Any]], names: list[str], rate:
     expected = {"time": (times,), "coordinates": (points, 2), kind: (points, times, size)}
     for key, array in (("time", time), ("coordinates", coordinates), (kind, values)):
         if array.shape != expected[key] or array.size == 0:
-            said = f"{name}: {key}: shape {array.shape}; expected {NEEDS}"
+            message = f"{name}: {key}: shape {array.shape}; expected {NEEDS}"
             if key == kind and array.shape == (times, points, size):
-                said = f"{name}: {key}: shape {array.shape}; the points come first: take {key}.swapaxes(0, 1)"
-            raise SceneError([said])
+                message = f"{name}: {key}: shape {array.shape}; the points come first: take {key}.swapaxes(0, 1)"
+            raise SceneError([message])
     if not np.isfinite(time).all():
         raise SceneError([f"{name}: time: holds NaN or infinity; give the time of every column in seconds"])
     if not ((coordinates >= 0) & (coordinates <= 1)).all():
-        said = "give across and down as fractions of the sheet, 0 to 1, from its upper left corner"
-        raise SceneError([f"{name}: coordinates: {coordinates.flat[np.abs(coordinates - 0.5).argmax()]:g}; {said}"])
-    # A point with a missing coordinate is not observed.
+        message = "give across and down as fractions of the sheet, 0 to 1, from its upper left corner"
+        raise SceneError([f"{name}: coordinates: {coordinates.flat[np.abs(coordinates - 0.5).argmax()]:g}; {message}"])
+    # Points with a missing coordinate are not observed.
     values = np.where(np.isfinite(values).all(axis=2, keepdims=True), values, np.nan)
     if not np.isfinite(values).any():
-        why = "is NaN or occluded"
-        fault = f"every one of the {points} points {why} at all {times} times; there are no observations"
+        fault = f"every one of the {points} points is NaN or occluded at all {times} times; there are no observations"
         raise SceneError([f"{name}: {fault}"])
-    if (most := np.nanmax(np.abs(values))) > MAX_MAGNITUDE:
-        raise SceneError([f"{name}: {kind}: {most:g}; take NaN where not observed"])
+    if (largest := np.nanmax(np.abs(values))) > MAX_MAGNITUDE:
+        raise SceneError([f"{name}: {kind}: {largest:g}; take NaN where not observed"])
     return with_sigma(Observations(name, kind, time, coordinates, values, None), arrays.get("sigma"))
 
 
-def _hidden(name: str, arrays: dict[str, NDArray[Any]], rate: float) -> dict[str, NDArray[Any]]:
+def _masked(name: str, arrays: dict[str, NDArray[Any]], rate: float) -> dict[str, NDArray[Any]]:
     """Apply the masks `visible` and `occluded`, and rename the `points` of a tracks.npz to `pixel`."""
     arrays = dict(arrays)
     flags = {key: arrays.pop(key) for key in ("visible", "occluded") if key in arrays}
@@ -254,25 +253,24 @@ def _hidden(name: str, arrays: dict[str, NDArray[Any]], rate: float) -> dict[str
     for flag, array in flags.items():
         shape = arrays[key].shape[:2] if key in arrays else ()
         if array.shape != shape or array.dtype.kind not in "biu" or not np.isin(array, (0, 1)).all():
-            said = f"{array.dtype} of shape {array.shape}; take true or false for every point and time (N, T)"
-            raise SceneError([f"{name}: {flag}: {said}, as {key} has them"])
+            fault = f"{array.dtype} of shape {array.shape}; take true or false for every point and time (N, T)"
+            raise SceneError([f"{name}: {flag}: {fault}, as {key} has them"])
         if arrays[key].dtype.kind in "fiu" and arrays[key].ndim == 3:
             arrays[key] = np.where((array != (flag == "visible"))[..., None], np.nan, arrays[key])
     if flags and key == "points":
-        arrays = {one: array for one, array in arrays.items() if one in ("time", "coordinates", "points")}
+        arrays = {
+            array_name: array for array_name, array in arrays.items() if array_name in ("time", "coordinates", "points")
+        }
         arrays["pixel"] = arrays.pop("points")
         arrays.setdefault("time", np.arange(arrays["pixel"].shape[1]) / rate)
     return arrays
 
 
 def _thinned(arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Convert the arrays of a trajectory.npz, thinned to at most MAX_POINTS_PER_SIDE points a side."""
+    """Convert the arrays of a trajectory.npz, thinned to at most 64 points per side."""
     position = arrays.get("position")
     if position is not None and position.ndim == 4 and min(position.shape[:3]) > 0 and "coordinates" not in arrays:
-        rows, cols = (
-            np.unique(np.linspace(0, n - 1, min(n, MAX_POINTS_PER_SIDE)).round().astype(int))
-            for n in position.shape[1:3]
-        )
+        rows, cols = (np.unique(np.linspace(0, n - 1, min(n, 64)).round().astype(int)) for n in position.shape[1:3])
         down, across = np.meshgrid(
             rows / max(position.shape[1] - 1, 1), cols / max(position.shape[2] - 1, 1), indexing="ij"
         )

@@ -1,8 +1,7 @@
-"""Parameters of a fit: their keys, scales and bounds, and the types of the arguments of `fit`.
+"""Parameters of a fit: keys, scales and bounds; and the types of the arguments of `fit`.
 
-A number of unknown magnitude, such as a stiffness or a force, is fitted as the logarithm of its magnitude: its sign is
-fixed, and all such parameters change by the same share. Other numbers, and those that start at 0, are fitted linearly,
-in units of their range.
+Numbers of unknown magnitude, such as a stiffness or a force, are fitted as the logarithm of their magnitude, with a
+fixed sign. Other numbers, and those with an initial value of 0, are fitted linearly, in units of their range.
 """
 
 from __future__ import annotations
@@ -25,21 +24,15 @@ from taichi_msm.scene.scene import Scene
 
 Array = NDArray[np.float64]
 
-# Sections with fittable numbers, and keys in them that are choices, array sizes or without effect on the tissue.
+# Sections with fittable numbers, and keys in them that are not: options, array sizes, and keys without effect.
 SECTIONS = ("tissue", "springs", "damping", "sheet", "probes", "render.camera", "render.cameras")
 FIXED_KEYS = ("tolerance", "grip", "shaft", "points")
 
-# Keys of coordinates and times, which are fitted linearly, as are all numbers of a camera except focal lengths.
+# Keys of coordinates and times, which are fitted linearly.
 COORDINATE_KEYS = ("at", "path", "offset", "load")
-FOCAL_LENGTH_KEYS = ("fx", "fy")
 
-# Camera keys with a range of 1: degrees, coefficients and directions.
-UNIT_RANGE_KEYS = ("fov", "distortion", "rotation", "up")
-
-# Bound of the log of a parameter without bounds: a factor of 1000 from the start.
+# Default bound of a logarithmic parameter: a factor of 1000 from the initial value.
 MAX_LOG = math.log(1000)
-
-MAPS = ("map", "foundation_map")
 
 Bounds = tuple[float, float]
 
@@ -51,11 +44,11 @@ def rounded(number: float) -> str:
 
 @dataclass(frozen=True)
 class Parameter:
-    """Fitted number of the scene, with the coordinate x, 0 at the start."""
+    """Fitted number of a scene, as a function of a coordinate x, which is initially 0."""
 
-    key: str  # its dotted path
-    start: float
-    low: float  # the smallest value allowed; -inf: any
+    key: str  # dotted path
+    start: float  # initial value
+    low: float  # bounds of the value, may be infinite
     high: float
     scale: float  # x = (value - start) / scale; 0: x = log(value / start)
 
@@ -87,19 +80,19 @@ class Parameter:
         )
 
     def error(self, x: float, deviation: float) -> float:
-        """Return the standard deviation of the value for that of x."""
+        """Convert a standard deviation of x to that of the value."""
         return deviation * (abs(self.value(x)) if self.is_log else self.scale)
 
     def share(self, x: float, deviation: float) -> float:
-        """Return a standard deviation of x as a share of the value, or of a coordinate's range."""
+        """Convert a standard deviation of x to a share of the value, or of a coordinate's range."""
         if self.is_log:
             return deviation
-        natural = self.scale if _is_place(self.path) else abs(self.value(x))
-        return deviation * self.scale / natural if natural else math.inf
+        unit = self.scale if _is_coordinate(self.path) else abs(self.value(x))
+        return deviation * self.scale / unit if unit else math.inf
 
 
 def make_parameters(scene: Scene, free: Sequence[str], bounds: Mapping[str, Bounds]) -> tuple[Parameter, ...]:
-    """Build the parameters of the keys in `free`, with their bounds; SceneError: lists all faults."""
+    """Build the parameters of the keys `free`, with bounds by key; SceneError: lists all faults."""
     data, faults, parameters = as_data(scene), [], []
     if not free:
         faults.append("--free: names no key; take one or more, such as --free tissue.young")
@@ -118,85 +111,87 @@ def make_parameters(scene: Scene, free: Sequence[str], bounds: Mapping[str, Boun
 
 def _parameter(scene: Scene, data: dict[str, Any], key: str, bounds: Bounds | None) -> Parameter:
     path = parse_key(key)
-    named = f"--free {key}"
-    if path and path[-1] in MAPS:
+    option = f"--free {key}"
+    if path and path[-1] in ("map", "foundation_map"):
         raise SceneError(
-            [f"{named}: of maps only tissue.map is fitted; name numbers, such as {scene.kind}.{path[-1]}.range.1"]
+            [f"{option}: of maps only tissue.map is fitted; name numbers, such as {scene.kind}.{path[-1]}.range.1"]
         )
-    value = _look_up(named, data, path)
-    inside = any(key == section or key.startswith(f"{section}.") for section in SECTIONS)
-    if not inside or not isinstance(value, float) or any(part in FIXED_KEYS for part in path):
+    value = _look_up(option, data, path)
+    is_fittable = any(key == section or key.startswith(f"{section}.") for section in SECTIONS)
+    if not is_fittable or not isinstance(value, float) or any(part in FIXED_KEYS for part in path):
         if isinstance(value, list):
-            raise SceneError([f"{named}: a list; name one of its numbers by its index, such as {key}.0"])
-        what = "a section" if isinstance(value, dict) else f"{value!r}"
-        raise SceneError([f"{named}: {what}, which cannot be free; take a number of {', '.join(SECTIONS)}"])
+            raise SceneError([f"{option}: a list; name one of its numbers by its index, such as {key}.0"])
+        description = "a section" if isinstance(value, dict) else f"{value!r}"
+        raise SceneError([f"{option}: {description}, which cannot be free; take a number of {', '.join(SECTIONS)}"])
     low, high = bounds or (-math.inf, math.inf)
     if not low < high:
         raise SceneError([f"--bounds {key}={low:g},{high:g}: give the smaller one first, then a larger one"])
     if not low <= value <= high:
         raise SceneError([f"--bounds {key}={low:g},{high:g}: {value:g}, where it starts, is outside; --set {key}=..."])
     scale = 0.0
-    if value == 0 or _is_place(path):
+    if value == 0 or _is_coordinate(path):
         if math.isfinite(high - low):
             scale = high - low
-        elif _is_place(path):
-            scale = _natural(scene, path)
+        elif _is_coordinate(path):
+            scale = _default_range(scene, path)
         else:
             raise SceneError(
-                [f"{named}: starts at 0, so its size is open; add --bounds {key}=LOW,HIGH, or --set {key}=..."]
+                [f"{option}: starts at 0, so its size is open; add --bounds {key}=LOW,HIGH, or --set {key}=..."]
             )
     return Parameter(key, value, low, high, scale)
 
 
-def _look_up(named: str, data: Any, path: Key) -> Any:
+def _look_up(option: str, data: Any, path: Key) -> Any:
     """Return the value of a key; SceneError: it does not exist."""
     for part in path or ("",):
         known = (
             list(data) if isinstance(data, dict) else [str(n) for n in range(len(data))] if type(data) is list else []
         )
         if str(part) not in known:
-            near = did_you_mean(str(part), known) or (f"; take one of {', '.join(known)}" if known else "")
-            raise SceneError([f"{named}: the scene has no {str(part) or 'such key'} there{near}"])
+            suggestion = did_you_mean(str(part), known) or (f"; take one of {', '.join(known)}" if known else "")
+            raise SceneError([f"{option}: the scene has no {str(part) or 'such key'} there{suggestion}"])
         data = data[part if isinstance(data, list) else str(part)]
     return data
 
 
-def _is_place(path: Key) -> bool:
-    """Return whether a number is a coordinate, a time or a percentage, which may change sign."""
-    return path[-1] not in FOCAL_LENGTH_KEYS if path[0] == "render" else any(part in COORDINATE_KEYS for part in path)
+def _is_coordinate(path: Key) -> bool:
+    """Return whether a number is a coordinate, a time or a percentage, which is fitted linearly."""
+    return path[-1] not in ("fx", "fy") if path[0] == "render" else any(part in COORDINATE_KEYS for part in path)
 
 
-def _natural(scene: Scene, path: Key) -> float:
-    """Return the range of a coordinate without bounds."""
+def _default_range(scene: Scene, path: Key) -> float:
+    """Return the default range of a coordinate."""
     time, last = scene.time.duration, path[-1]
     if path[0] == "render":
         if last in ("cx", "cy"):
             return float(scene.render.size[last == "cy"])
-        return 1.0 if any(part in UNIT_RANGE_KEYS for part in path[2:]) else max(scene.sheet.size)
+        # Degrees, coefficients and directions have a range of 1.
+        has_unit_range = any(part in ("fov", "distortion", "rotation", "up") for part in path[2:])
+        return 1.0 if has_unit_range else max(scene.sheet.size)
     if "offset" in path:
         return 1.0
     if "load" in path:
         return 100.0 if last == 1 else time
     if "path" in path:
         return (time, 1.0, 1.0, 0.1 * max(scene.sheet.size))[int(last)]
-    # Of `at`, which may have a time before the place.
+    # `at` may contain keyframes, with a time before the position.
     return time if len(path) == 5 and last == 0 else 1.0
 
 
 def as_data(scene: Scene) -> dict[str, Any]:
-    """Return a scene as plain data, with defaults."""
+    """Convert a scene to data, with defaults."""
     return scene.model_dump(mode="json", exclude_none=True)
 
 
 def with_values(data: dict[str, Any], parameters: Sequence[Parameter], values: Sequence[float]) -> dict[str, Any]:
-    """Return the data of a scene with the values of parameters."""
+    """Return a copy of a scene's data with the values of parameters."""
     changed = deepcopy(data)
     for parameter, value in zip(parameters, values, strict=True):
-        holder: Any = changed
+        container: Any = changed
         for part in parameter.path[:-1]:
-            holder = holder[part if isinstance(holder, list) else str(part)]
+            container = container[part if isinstance(container, list) else str(part)]
         last = parameter.path[-1]
-        holder[last if isinstance(holder, list) else str(last)] = value
+        container[last if isinstance(container, list) else str(last)] = value
     return changed
 
 
@@ -212,7 +207,7 @@ class Method(TypedDict, total=False):
 
 
 def require_types(observed: Any, free: Any, method: Mapping[str, Any], **others: Any) -> None:
-    """Check the types of the arguments of `fit`; ArgumentError: names the first fault."""
+    """Check the types of the arguments of `fit`; ArgumentError: the first fault."""
     known = Method.__annotations__
     if unknown := sorted(set(method) - set(known)):
         raise ArgumentError(f"{unknown[0]}: unknown; take {', '.join(known)}{did_you_mean(unknown[0], known)}")

@@ -1,6 +1,6 @@
-"""Forward model of a fit: predicted observations and forces, in this process or in a pool of processes.
+"""Forward model of a fit: predicted observations and forces, in this process or in a pool.
 
-All runs are in f64 with one compiled kernel.
+All runs are in f64, with one compiled kernel per process.
 """
 
 from __future__ import annotations
@@ -31,41 +31,34 @@ from taichi_msm.system.process import available_memory, available_threads
 
 Array = NDArray[np.float64]
 
-# Steps of finite differences, in units of x.
-SMALL_STEP, LARGE_STEP = 1e-5, 1e-2
-
 
 class Prediction(NamedTuple):
     """Predicted observations and forces."""
 
     values: Array  # as in the observations, shape (N, T, 3 or 2); NaN behind the camera
-    forces: Array  # shape (rows, 3)
-    steps: int  # of a frame
-    motion: Array  # the farthest that any of the points is from rest, at every frame that was simulated [m]
+    forces: Array  # [N], shape (rows, 3)
+    steps: int  # per frame
+    motion: Array  # largest displacement of the observed points at every simulated frame [m]
 
 
 @dataclass(frozen=True, eq=False)
 class FitProblem:
-    """Scene, parameters and observations of a fit; each worker process keeps a kernel for it."""
+    """Scene, parameters and observations of a fit."""
 
-    token: str  # identifies the fit
-    scene: Scene  # of which only the parameters change
+    token: str  # identifies the fit in worker processes
+    scene: Scene  # with initial values
     parameters: tuple[Parameter, ...]
     observations: Observations
 
 
 def without_outputs(scene: Scene) -> Scene:
-    """Return the scene in f64, without image and outputs."""
+    """Return a scene in f64, without image and outputs."""
     time = scene.time.model_copy(update={"precision": "f64"})
     return scene.model_copy(update={"image": None, "region": None, "output": (), "time": time})
 
 
 class ForwardModel:
-    """Simulation that is restarted for every prediction.
-
-    Attributes:
-        job: what it predicts.
-    """
+    """Forward model of a fit: a simulation that is restarted for every prediction."""
 
     def __init__(self, job: FitProblem, threads: int | None) -> None:
         self.job, self._data = job, as_data(job.scene)
@@ -86,71 +79,73 @@ class ForwardModel:
         steps: int | None = None,
         *,
         coarse: int = 0,
-        whole: bool = False,
+        to_end: bool = False,
         pause: Pause = lambda: None,
     ) -> Prediction:
-        """Run the scene with the parameters at x.
+        """Simulate the scene with the parameters at x.
 
         Args:
-            x: of every parameter.
-            steps: steps per frame, at least; None: enough for runs with neighbouring values.
+            x: coordinates of the parameters, shape (n,).
+            steps: smallest number of steps per frame; None: enough for finite differences around x.
             coarse: number of halvings of the cells per side.
-            whole: whether to run to the last frame, also beyond the last observation.
-            pause: called several times a second; its exceptions end the run.
+            to_end: whether to simulate to the last frame, beyond the last observation.
+            pause: called several times a second; an exception from it ends the run.
 
         Raises:
-            SceneError: when the scene with these values is not valid, or too coarse.
+            SceneError: when the scene with these values is not valid, or has too few mass points to be coarsened.
             DivergedError: when the run diverges.
         """
         plan = self.plan(x)
         for _ in range(coarse):
-            if (half := coarser_plan(plan)) is None:
+            if (coarser := coarser_plan(plan)) is None:
                 raise SceneError(["sheet.points: too few to take half of them"])
-            plan = half
+            plan = coarser
         if plan.scene.time.step == "auto" and not plan.scene.time.at_rest:
             plan = plan.with_grid(steps_per_frame=max(steps or _steps_with_margin(plan), plan.grid.steps_per_frame))
         if self._simulation is None:
             self._simulation = Simulation(plan, threads=self._threads)
         else:
             self._simulation.restart(plan)
-        return self._run(self._simulation, plan, whole, pause)
+        return self._run(self._simulation, plan, to_end, pause)
 
     def compile(self, x: Array, pause: Pause = lambda: None) -> None:
-        """Compile the kernels for a run with the parameters at x; raises a SceneError as `predict` does."""
+        """Compile the kernels for the parameters at x; raises a SceneError as `predict` does."""
         self._simulation = Simulation(self.plan(x), threads=self._threads)
         self._simulation.compile(pause)
 
-    def try_predict(self, x: Array, steps: int | None = None, **how: Any) -> Prediction | None:
-        """Predict; None if the scene is not valid, diverges, or has an observed point behind the camera."""
+    def try_predict(self, x: Array, steps: int | None = None, **options: Any) -> Prediction | None:
+        """Predict as `predict` does; None if the run fails, or an observed point is behind the camera."""
         try:
-            predicted = self.predict(x, steps, **how)
+            predicted = self.predict(x, steps, **options)
         except (SceneError, DivergedError):
             return None
         return predicted if np.isfinite(predicted.values[self.job.observations.known]).all() else None
 
     def plan(self, x: Array) -> Plan:
-        """Return the plan of the scene with the parameters at x; SceneError: it is not valid."""
-        values = [one.value(each) for one, each in zip(self.job.parameters, x.tolist(), strict=True)]
+        """Plan the scene with the parameters at x; SceneError: it is not valid."""
+        values = [
+            parameter.value(coordinate) for parameter, coordinate in zip(self.job.parameters, x.tolist(), strict=True)
+        ]
         if not np.isfinite(values).all():
             raise SceneError(["the values are out of range"])
         data = with_values(self._data, self.job.parameters, values)
         return check_scene(Scene(**data), self._maps)
 
-    def _run(self, simulation: Simulation, plan: Plan, whole: bool, pause: Pause) -> Prediction:
+    def _run(self, simulation: Simulation, plan: Plan, to_end: bool, pause: Pause) -> Prediction:
         observations, scene = self.job.observations, plan.scene
-        # A coarse run has another mesh.
-        sight, points, forces = ObservationModel(scene, observations, self._frames), [], []
-        for frame in range(max(self._frames, plan.grid.frames + 1) if whole else self._frames):
+        # The mesh of a coarse run differs.
+        model, points, forces = ObservationModel(scene, observations, self._frames), [], []
+        for frame in range(max(self._frames, plan.grid.frames + 1) if to_end else self._frames):
             simulation.advance(min(frame, 1), pause)
-            points.append(sight.points_on_sheet(simulation.positions()))
+            points.append(model.points_on_sheet(simulation.positions()))
             if observations.forces is not None:
-                forces.append([one.force for one in simulation.forces()])
-        values, felt = sight.observe(sight.interpolate(np.array(points[: self._frames]))), np.empty((0, 3))
+                forces.append([tool.force for tool in simulation.forces()])
+        values, tool_forces = model.observe(model.interpolate(np.array(points[: self._frames]))), np.empty((0, 3))
         if observations.forces is not None:
             rows, shares = len(observations.forces.time), time_weights(scene, observations.forces.time, self._frames)
-            every = shares @ np.array(forces[: self._frames]).reshape(self._frames, -1)
-            felt = every.reshape(rows, -1, 3)[np.arange(rows), observations.forces.probe]
-        return Prediction(values, felt, plan.grid.steps_per_frame, sight.motion(np.array(points)))
+            at_times = shares @ np.array(forces[: self._frames]).reshape(self._frames, -1)
+            tool_forces = at_times.reshape(rows, -1, 3)[np.arange(rows), observations.forces.probe]
+        return Prediction(values, tool_forces, plan.grid.steps_per_frame, model.motion(np.array(points)))
 
     def close(self) -> None:
         """Release the simulation."""
@@ -161,34 +156,29 @@ class ForwardModel:
 def difference_step(scene: Scene) -> float:
     """Return the step of finite differences, in units of x.
 
-    Equilibria are solved to about 1e-6, and contact changes in small jumps: both need the larger step.
+    It is larger for equilibria, which are solved to about 1e-6, and for contact, which changes in small jumps.
     """
-    return LARGE_STEP if scene.time.at_rest or any(probe.moved for probe in scene.probes) else SMALL_STEP
+    return 1e-2 if scene.time.at_rest or any(probe.moved for probe in scene.probes) else 1e-5
 
 
 def _steps_with_margin(plan: Plan) -> int:
-    """Return the steps per frame for a plan and its neighbours in parameter space."""
+    """Return a number of steps per frame that is stable for finite differences around the parameters of a plan."""
     frame = 1 / plan.grid.frames_per_second
     return math.ceil(2 * frame / plan.stable_step * (1 + difference_step(plan.scene)))
 
 
-# The forward model of the last fit in this process.
-_kept: dict[str, ForwardModel] = {}
+# Forward model of the last fit in this process, by its token.
+_cached_models: dict[str, ForwardModel] = {}
 
 
 def predict(job: FitProblem, x: Array, steps: int | None) -> Prediction | None:
-    """Predict in a worker process, on one thread; None as `ForwardModel.try_predict`."""
-    if job.token not in _kept:
-        for other in _kept.values():
-            other.close()
-        _kept.clear()
-        _kept[job.token] = ForwardModel(job, threads=1)
-    return _kept[job.token].try_predict(x, steps)
-
-
-# A pool is started if this number of runs for each parameter takes longer than MIN_PARALLEL_S; its start takes seconds.
-RUNS_PER_PARAMETER, MIN_PARALLEL_S = 8, 8.0
-PROGRESS_INTERVAL_S = 0.1
+    """Predict in a worker process on one thread, as `ForwardModel.try_predict` does."""
+    if job.token not in _cached_models:
+        for model in _cached_models.values():
+            model.close()
+        _cached_models.clear()
+        _cached_models[job.token] = ForwardModel(job, threads=1)
+    return _cached_models[job.token].try_predict(x, steps)
 
 
 def mesh_error(plan: Plan, pause: Pause) -> float | None:
@@ -196,10 +186,10 @@ def mesh_error(plan: Plan, pause: Pause) -> float | None:
 
     Args:
         plan: of the scene.
-        pause: called several times a second; its exceptions end the runs.
+        pause: called several times a second; an exception from it ends the runs.
 
     Returns:
-        The error; None without tissue, with too few mass points, or if a coarser run fails.
+        The error; None for springs, with too few mass points, or if a coarser run fails.
     """
     if coarser_plan(plan) is None:
         return None
@@ -211,12 +201,17 @@ def mesh_error(plan: Plan, pause: Pause) -> float | None:
 
 
 class Runs:
-    """Predictions of a fit, counted, in this process or in a pool. A context manager, which ends the pool.
+    """Execution of the runs of a fit, in this process or in a pool; a context manager, which ends the pool.
 
     Args:
         job: the fit.
-        workers: number of worker processes; 1: none; None: by the duration of the first run.
-        progress: called often, with the stage, the runs done and expected; its exceptions end the fit.
+        workers: number of worker processes; 1: no pool; None: by the duration of the first run.
+        progress: called often with the stage, the finished and the expected number of runs; an exception from it ends
+            the fit.
+
+    Attributes:
+        count: number of finished runs.
+        expected: expected number of runs.
     """
 
     def __init__(self, job: FitProblem, workers: int | None, progress: StageProgressCallback) -> None:
@@ -228,58 +223,59 @@ class Runs:
 
     def first(self, x: Array) -> Prediction:
         """Predict to the last frame; raises as `ForwardModel.predict` does."""
-        self._predictor.compile(x, self._tell)
-        begun = time.perf_counter()
-        predicted = self._predictor.predict(x, whole=True, pause=self._tell)
-        self._seconds, self.count = time.perf_counter() - begun, self.count + 1
+        self._predictor.compile(x, self._report_progress)
+        start = time.perf_counter()
+        predicted = self._predictor.predict(x, to_end=True, pause=self._report_progress)
+        self._seconds, self.count = time.perf_counter() - start, self.count + 1
         return predicted
 
     def predict_coarse(self, x: Array, halvings: int) -> Prediction | None:
         """Predict with the cells per side halved `halvings` times; None if that fails."""
         self.count += 1
-        return self._predictor.try_predict(x, coarse=halvings, pause=self._tell)
+        return self._predictor.try_predict(x, coarse=halvings, pause=self._report_progress)
 
     def mesh_error(self, x: Array) -> float | None:
-        """Estimate the mesh error at x, as the function of this name."""
-        return mesh_error(self._predictor.plan(x), self._tell)
+        """Estimate the mesh error at x, as the function `mesh_error` does."""
+        return mesh_error(self._predictor.plan(x), self._report_progress)
 
-    def one(self, x: Array, steps: int | None = None) -> Prediction | None:
+    def predict_one(self, x: Array, steps: int | None = None) -> Prediction | None:
         """Predict at x; None if that fails."""
-        self._tell()
-        predicted = self._predictor.try_predict(x, steps, pause=self._tell)
+        self._report_progress()
+        predicted = self._predictor.try_predict(x, steps, pause=self._report_progress)
         self.count += 1
         return predicted
 
-    def predict_many(self, places: Sequence[Array], steps: int | None = None) -> list[Prediction | None]:
-        """Predict at several x, in parallel if that is faster."""
-        if self._pool is None and (workers := self._choose()) > 1:
+    def predict_many(self, coordinates: Sequence[Array], steps: int | None = None) -> list[Prediction | None]:
+        """Predict at several x, in parallel if that pays off."""
+        if self._pool is None and (workers := self._choose_workers()) > 1:
             self._pool = Pool(workers)
-        if self._pool is None or len(places) < 2:
-            return [self.one(x, steps) for x in places]
-        return self._side_by_side(self._pool, places, steps)
+        if self._pool is None or len(coordinates) < 2:
+            return [self.predict_one(x, steps) for x in coordinates]
+        return self._predict_in_pool(self._pool, coordinates, steps)
 
-    def _choose(self) -> int:
+    def _choose_workers(self) -> int:
         if self._workers is not None:
             return self._workers
         parameters = len(self.job.parameters)
-        if RUNS_PER_PARAMETER * parameters * self._seconds < MIN_PARALLEL_S:
+        # A pool, whose start takes seconds, pays off if eight runs per parameter take longer than eight seconds.
+        if 8 * parameters * self._seconds < 8.0:
             return 1
-        needed = PROCESS_BYTES + cost.estimate_budget(check_scene(self.job.scene)).memory_bytes
-        return max(1, min(available_threads(), available_memory() // needed, 2 * parameters))
+        process_bytes = PROCESS_BYTES + cost.estimate_budget(check_scene(self.job.scene)).memory_bytes
+        return max(1, min(available_threads(), available_memory() // process_bytes, 2 * parameters))
 
-    def _side_by_side(self, pool: Pool, places: Sequence[Array], steps: int | None) -> list[Prediction | None]:
-        futures: list[Future[Any]] = [pool.submit(predict, self.job, x, steps) for x in places]
+    def _predict_in_pool(self, pool: Pool, coordinates: Sequence[Array], steps: int | None) -> list[Prediction | None]:
+        futures: list[Future[Any]] = [pool.submit(predict, self.job, x, steps) for x in coordinates]
         waiting = set(futures)
         while waiting:
-            self._tell()
-            done, waiting = wait(waiting, PROGRESS_INTERVAL_S)
+            self._report_progress()
+            done, waiting = wait(waiting, 0.1)
             self.count += len(done)
         try:
             return [future.result() for future in futures]
         except DiedError as error:
             raise ExecutorError(f"a run of the fit ended early: {error}; take fewer --workers") from None
 
-    def _tell(self) -> None:
+    def _report_progress(self) -> None:
         self._progress("fit", self.count, max(self.expected, self.count + 1))
 
     def __enter__(self) -> Runs:

@@ -1,9 +1,9 @@
-"""Rejection of a model: improbable chi-square, and residuals with structure.
+"""Rejection of a model by an improbable chi-square, or by correlated residuals.
 
-Independent errors have products of mean 0, from one time to the next and from a point to its neighbours, and these
-products are uncorrelated, also those that share a point; Student's t tests their mean. Large residuals are clipped, so
-that tracks with jumps count as much as others. As tracks may drift, products of neighbours are summed over time; with a
-given correlation of neighbours, products of successive times are summed over the points.
+Products of independent errors, of successive times or of neighbouring points, have a mean of 0 and are uncorrelated,
+even if they share a point; Student's t tests their mean. Residuals are clipped, to limit the weight of tracks with
+jumps. As tracks may drift, products of neighbours are summed over time; if a correlation of neighbours is given,
+products of successive times are summed over the points.
 """
 
 from __future__ import annotations
@@ -18,19 +18,8 @@ from taichi_msm.fitting.observations import Observations
 
 Array = NDArray[np.float64]
 
-# A model with a smaller probability is rejected.
+# Smallest probability of a model that is not rejected.
 MIN_PROBABILITY = 1e-3
-
-# Residuals below this share of the motion are rounding and the tolerance of the search.
-ROUNDING_SHARE = 1e-4
-
-# Smallest numbers of products for a test; those of neighbours share points.
-MIN_TIME_PRODUCTS, MIN_NEIGHBOUR_PRODUCTS = 4, 24
-
-NEIGHBOUR_COUNT = 4
-
-# Residuals are clipped at this many medians.
-CLIP_MEDIANS = 4.0
 
 
 def by_chi_square(chi_square: float, freedom: int, independent: float, what: str = "chi-square") -> str | None:
@@ -40,7 +29,7 @@ def by_chi_square(chi_square: float, freedom: int, independent: float, what: str
         chi_square: sum of squared residuals.
         freedom: degrees of freedom.
         independent: effective number of independent residuals, at most `freedom`.
-        what: name of the sum in the text.
+        what: name of the sum in the reason.
     """
     from scipy.stats import chi2
 
@@ -50,60 +39,55 @@ def by_chi_square(chi_square: float, freedom: int, independent: float, what: str
 
 
 def by_pattern(
-    observations: Observations, left: Array, motion: float, error_correlation: ErrorCorrelation
+    observations: Observations, residuals: Array, motion: float, error_correlation: ErrorCorrelation
 ) -> str | None:
     """Return the reason for rejection by correlated residuals, or None.
 
     Args:
         observations: the observations.
-        left: residuals, shape (N, T, numbers) [m] or [px].
-        motion: root mean square of the motion, in the same unit.
+        residuals: shape (N, T, numbers) [m] or [px].
+        motion: root mean square of the motion [m] or [px].
         error_correlation: given correlation lengths of the errors.
     """
-    if np.sqrt(np.nanmean(left**2)) < ROUNDING_SHARE * motion:
+    # Smaller residuals are due to rounding and the tolerance of the search.
+    if np.sqrt(np.nanmean(residuals**2)) < 1e-4 * motion:
         return None
-    most = CLIP_MEDIANS * np.nanmedian(np.abs(left))
-    cut = np.nan_to_num(np.clip(left, -most, most))[:, np.argsort(observations.time)]
+    limit = 4.0 * np.nanmedian(np.abs(residuals))
+    clipped = np.nan_to_num(np.clip(residuals, -limit, limit))[:, np.argsort(observations.time)]
     if error_correlation.correlation is None:
-        one, other = _neighbours(observations)
-        if _has_mean((cut[one] * cut[other]).sum(axis=(1, 2)), MIN_NEIGHBOUR_PRODUCTS):
+        first, second = _neighbours(observations)
+        if _has_mean((clipped[first] * clipped[second]).sum(axis=(1, 2)), 24):
             remedy = "give --correlation PX" if observations.kind == "pixel" else "give --sigma"
             fault = "the residuals of neighbouring points are correlated, unlike independent errors"
             return f"{fault}; if the errors are, {remedy}"
     if error_correlation.drift is None:
-        products = (cut[:, 1:] * cut[:, :-1]).sum(axis=2)
-        if _has_mean(
-            products.ravel() if error_correlation.correlation is None else products.sum(axis=0), MIN_TIME_PRODUCTS
-        ):
-            said = "the residuals of a point are correlated in time, unlike independent errors"
-            return f"{said}; if the tracks drift, give --drift SECONDS"
+        products = (clipped[:, 1:] * clipped[:, :-1]).sum(axis=2)
+        if _has_mean(products.ravel() if error_correlation.correlation is None else products.sum(axis=0), 4):
+            reason = "the residuals of a point are correlated in time, unlike independent errors"
+            return f"{reason}; if the tracks drift, give --drift SECONDS"
     return None
 
 
 def _neighbours(observations: Observations) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the pairs of neighbouring points, each once."""
+    """Return the pairs of points and their four nearest neighbours, each once."""
     from scipy.spatial import KDTree
 
     count = len(observations.coordinates)
-    near = (
-        KDTree(observations.coordinates)
-        .query(observations.coordinates, min(count, NEIGHBOUR_COUNT + 1))[1]
-        .reshape(count, -1)
-    )
-    pairs = np.stack([np.repeat(np.arange(count), near.shape[1]), near.ravel()], axis=1)
+    nearest = KDTree(observations.coordinates).query(observations.coordinates, min(count, 4 + 1))[1].reshape(count, -1)
+    pairs = np.stack([np.repeat(np.arange(count), nearest.shape[1]), nearest.ravel()], axis=1)
     pairs = np.unique(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1), axis=0)
     return pairs[:, 0], pairs[:, 1]
 
 
-def _has_mean(products: Array, fewest: int) -> bool:
+def _has_mean(products: Array, min_count: int) -> bool:
     """Return whether the products have a significantly positive mean."""
     from scipy.stats import t
 
     products = products[products != 0]
-    if (count := len(products)) < fewest:
+    if (count := len(products)) < min_count:
         return False
-    # With the variance around 0, the mean cannot be small by chance where all products are alike.
-    share = float(products.sum()) / math.sqrt(count * float(products @ products))
-    statistic = share * math.sqrt(count - 1) / math.sqrt(max(1 - share**2, 1e-12))
-    # There are two such tests, and products of neighbours, which share points, are not quite normal.
+    # The variance is taken around 0: around the mean it vanishes for equal products.
+    normalised_mean = float(products.sum()) / math.sqrt(count * float(products @ products))
+    statistic = normalised_mean * math.sqrt(count - 1) / math.sqrt(max(1 - normalised_mean**2, 1e-12))
+    # The margin is for two tests, and for products of neighbours, which share points and are not quite normal.
     return bool(t.sf(statistic, count - 1) < MIN_PROBABILITY / 4)

@@ -1,4 +1,4 @@
-"""Files of a fit: fit.json, scene.yaml, copies of its pictures, fit.png, and the pictures of a map."""
+"""Files of a fit: fit.json, scene.yaml, copies of the scene's pictures, fit.png, and the pictures of a map."""
 
 from __future__ import annotations
 
@@ -24,30 +24,31 @@ MAP, ERRORS = FittedMap.FILE, "map-error.png"
 
 PATTERNS = (r"fit\.json", r"scene\.yaml", r"fit\.png", r"map\.png", r"map-error\.png", rf"{PICTURES}/.+")
 
-NO_PLOT = 'fit.png is left out, as matplotlib is not installed; pip install "taichi-msm[report]"'
 
-
-def _listed(record: Mapping[str, Any]) -> IsListed:
+def _is_fit_file(record: Mapping[str, Any]) -> IsListed:
     return {RECORD, *record["files"]}.__contains__
 
 
 def publication(directory: Path) -> Publication:
-    """Begin to replace the fit in a directory."""
-    return Publication(directory, PublicationSpec("fit", RECORD, PATTERNS, _listed), [RECORD, SCENE, PLOT, MAP, ERRORS])
+    """Begin the atomic replacement of a fit in a directory."""
+    return Publication(
+        directory, PublicationSpec("fit", RECORD, PATTERNS, _is_fit_file), [RECORD, SCENE, PLOT, MAP, ERRORS]
+    )
 
 
 def write_report(result: FitResult, published: Publication) -> None:
-    """Write the files of a fit, and put them in place."""
+    """Write and publish the files of a fit."""
     folder = published.new_folder
     write_new_file(folder / SCENE, _scene_text(result, folder).encode())
     if result.map is not None:
-        _write(result.map.grey, folder / MAP)
-        # White: unknown, or not even known to 100 %.
-        _write(sixteen_bits(np.nan_to_num(result.map.errors, nan=1.0).clip(0, 1)), folder / ERRORS)
+        _write_png(result.map.grey, folder / MAP)
+        # White: unknown, or with an error above 100 %.
+        _write_png(sixteen_bits(np.nan_to_num(result.map.errors, nan=1.0).clip(0, 1)), folder / ERRORS)
     try:
         from taichi_msm.fitting.plots import plot
     except ImportError:
-        result.notes.append(NO_PLOT)
+        message = 'fit.png is left out, as matplotlib is not installed; pip install "taichi-msm[report]"'
+        result.notes.append(message)
     else:
         with create_file(folder / PLOT) as file:
             plot(result, file)
@@ -57,13 +58,13 @@ def write_report(result: FitResult, published: Publication) -> None:
     published.publish([*written, RECORD])
 
 
-def _write(grey: NDArray[np.uint16], path: Path) -> None:
+def _write_png(grey: NDArray[np.uint16], path: Path) -> None:
     with create_file(path) as file:
         Image.fromarray(grey).save(file, "PNG")
 
 
 def _scene_text(result: FitResult, folder: Path) -> str:
-    """Write the fitted scene, and copy its pictures to its folder."""
+    """Format the fitted scene, and copy its pictures to the folder."""
     names: dict[str, str] = {}
 
     def copied(path: str) -> str:
@@ -79,11 +80,13 @@ def _scene_text(result: FitResult, folder: Path) -> str:
 
     scene = result.scene
     if result.map is not None and scene.tissue is not None:
-        # The map that was found is no copy; another picture may have its name.
+        # The fitted map is written elsewhere; another picture may have its name.
         scene = scene.model_copy(update={"tissue": scene.tissue.model_copy(update={"map": None})})
     data = scene.with_pictures(copied).model_dump(mode="json", exclude_none=True)
     if result.map is not None:
         data["tissue"]["map"] = {"image": MAP, "range": list(result.map.range)}
     text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)
-    found = ", ".join(f"{key} {one.value:.6g}" for key, one in result.parameters.items()) or f"tissue.map, {MAP}"
-    return f"# Fitted to {printable(result.observations.name)}: {printable(found)}; more in {RECORD}.\n{text}"
+    summary = (
+        ", ".join(f"{key} {estimate.value:.6g}" for key, estimate in result.parameters.items()) or f"tissue.map, {MAP}"
+    )
+    return f"# Fitted to {printable(result.observations.name)}: {printable(summary)}; more in {RECORD}.\n{text}"

@@ -1,4 +1,4 @@
-"""Result of a fit, and its notes for the user."""
+"""Result of a fit, and its warnings."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Estimate(NamedTuple):
         interval: ends of the 95 % confidence interval; None: beyond the bounds.
         start: initial value.
         identifiable: whether the standard error is at most the value, or the range of a coordinate or time.
-        mesh_error: error of the value by the mesh, estimated to be rather too large; None: not known.
+        mesh_error: conservative estimate of the discretisation error (mesh) of the value; None: not known.
     """
 
     value: float
@@ -40,19 +40,19 @@ class Estimate(NamedTuple):
 
 
 def sixteen_bits(shares: Array) -> NDArray[np.uint16]:
-    """Convert shares, 0 to 1, to 16-bit greys."""
+    """Convert shares, 0 to 1, to 16-bit grey."""
     return np.asarray((65535 * shares).round(), np.uint16)
 
 
 @dataclass(frozen=True, eq=False)
 class FittedMap:
-    """Estimated map of the stiffness.
+    """Estimated stiffness map.
 
     Attributes:
-        factors: factors of young, from the upper left corner of the sheet, shape (R, R).
+        factors: factors of young, shape (R, R), from the upper left corner of the sheet.
         errors: relative standard errors, shape (R, R); NaN: not identifiable.
         choice: weight of the smoothness.
-        sigma: standard deviation of the observations and the mesh error together [m] or [px].
+        sigma: combined standard deviation of the observations and the mesh error [m] or [px].
     """
 
     FILE: ClassVar = "map.png"
@@ -69,18 +69,18 @@ class FittedMap:
 
     @property
     def range(self) -> tuple[float, float]:
-        """Smallest and largest factor, black and white in map.png."""
+        """Smallest and largest factor: black and white in map.png."""
         return float(self.factors.min()), float(self.factors.max())
 
     @property
     def grey(self) -> NDArray[np.uint16]:
-        """Picture of map.png, 16 bits, shape (R, R)."""
+        """Content of map.png, 16 bits, shape (R, R)."""
         low, high = self.range
         return sixteen_bits((self.factors - low) / ((high - low) or 1.0))
 
     def as_json(self) -> dict[str, Any]:
         """Return JSON data, as in fit.json."""
-        errors = [[None if math.isnan(one) else one for one in row] for row in self.errors.tolist()]
+        errors = [[None if math.isnan(error) else error for error in row] for row in self.errors.tolist()]
         return {
             **{"resolution": len(self.factors), "range": self.range, "factors": self.factors.tolist()},
             **{"standard_error": errors, "unknown": int(self.unknown.sum())},
@@ -88,7 +88,7 @@ class FittedMap:
         }
 
     def summary(self) -> str:
-        """Format the map in one line."""
+        """Format the map in a line."""
         low, high = self.range
         size, known = len(self.factors), self.errors[~self.unknown]
         errors = "all unknown"
@@ -105,26 +105,25 @@ class FitResult:
     Attributes:
         parameters: estimates, by key.
         correlation: correlation matrix of the parameters, in their order.
-        residual: root mean square of predicted minus observed coordinates [m] or [px].
-        residual_force: the same of the forces [N]; None without forces.
+        residual: root mean square of predicted minus observed values [m] or [px].
+        residual_force: root mean square of predicted minus observed forces [N]; None without forces.
         sigma_force: given standard deviation of the forces [N]; None without forces.
-        sigma: standard deviation of the coordinates, given or estimated.
+        sigma: standard deviation of the values [m] or [px], given or estimated.
         unit: unit of residual and sigma, m or px.
         chi_square: sum of (predicted - observed)^2 / sigma^2; None without a given sigma.
         rejection: reason for rejecting the model; None: not rejected.
-        degrees_of_freedom: number of observations less the number of parameters; of a map, the number of observations.
+        degrees_of_freedom: number of observations minus that of parameters; for a map, the number of observations.
         identifiable: whether all parameters are identifiable.
         unseen: groups of parameters that are identifiable in combinations only.
         mesh_error: mesh error of the fitted scene, as a fraction of its largest displacement; None: not known.
         runs: number of runs.
         seconds: duration [s].
-        notes: notes for the user, a line each.
-        scene: fitted scene; the picture of a map is map.png in the given directory.
+        notes: warnings, a line each.
+        scene: fitted scene; a map refers to map.png in the given directory.
         observations: the observations.
         fitted: predicted observations of the fitted scene.
         fitted_forces: predicted forces of the fitted scene [N], shape (rows, 3).
-        curves: by key, the profile of a parameter: the signed root of twice the rise of the cost, or its quadratic
-            approximation.
+        curves: profiles of the parameters by key, or their quadratic approximations.
         map: estimated map; None for a fit of numbers.
     """
 
@@ -158,105 +157,100 @@ class FitResult:
 
     def as_json(self) -> dict[str, Any]:
         """Return JSON data, as in fit.json."""
-        plain = "model_rejected correlation residual residual_force sigma sigma_force unit chi_square "
-        plain += "degrees_of_freedom identifiable mesh_error"
+        names = "model_rejected correlation residual residual_force sigma sigma_force unit chi_square "
+        names += "degrees_of_freedom identifiable mesh_error"
         return {
             "observed": self.observations.name,
-            "parameters": {key: one._asdict() for key, one in self.parameters.items()},
-            **{name: getattr(self, name) for name in (*plain.split(), "runs", "seconds", "notes")},
-            "unseen": [one.as_json() for one in self.unseen],
+            "parameters": {key: item._asdict() for key, item in self.parameters.items()},
+            **{name: getattr(self, name) for name in (*names.split(), "runs", "seconds", "notes")},
+            "unseen": [item.as_json() for item in self.unseen],
             **({} if self.map is None else {"map": self.map.as_json()}),
         }
 
     def summary(self) -> list[str]:
-        """Format the result, a line each."""
+        """Format the result in lines."""
         observations = self.observations
-        known = "intervals" if self.map is None else "errors of the fields"
+        intervals = "intervals" if self.map is None else "errors of the fields"
         lines = (
             []
             if self.rejection is None
-            else [f"the model is rejected: {self.rejection}; the {known} do not cover this"]
+            else [f"the model is rejected: {self.rejection}; the {intervals} do not cover this"]
         )
-        lines += [f"{key}: {_in_words(one)}" for key, one in self.parameters.items()]
-        lines += [one.text for one in self.unseen]
+        lines += [f"{key}: {_format_estimate(item)}" for key, item in self.parameters.items()]
+        lines += [item.text for item in self.unseen]
         lines += [] if self.map is None else [self.map.summary()]
-        points, times = observations.there.shape
-        chi = ""
+        points, times = observations.is_observed.shape
+        chi_text = ""
         if self.chi_square is not None:
-            chi = f", chi-square {self.chi_square:.3g} for {self.degrees_of_freedom} degrees of freedom"
-        force = "" if self.residual_force is None else f", {self.residual_force:.3g} N"
-        lines.append(f"residual {self.residual:.3g} {self.unit} of {points} points at {times} times{force}{chi}")
+            chi_text = f", chi-square {self.chi_square:.3g} for {self.degrees_of_freedom} degrees of freedom"
+        force_text = "" if self.residual_force is None else f", {self.residual_force:.3g} N"
+        lines.append(
+            f"residual {self.residual:.3g} {self.unit} of {points} points at {times} times{force_text}{chi_text}"
+        )
         if self.mesh_error is not None:
-            most = "at most about " if any(probe.moved for probe in self.scene.probes) else ""
-            error = f"{most}{rounded(100 * self.mesh_error)} % of the largest displacement"
+            qualifier = "at most about " if any(probe.moved for probe in self.scene.probes) else ""
+            error = f"{qualifier}{rounded(100 * self.mesh_error)} % of the largest displacement"
             lines.append(f"mesh error of the fitted scene: {error}")
         return [*lines, *self.notes, f"{self.runs} runs, {self.seconds:.1f} s"]
 
 
-def _in_words(one: Estimate) -> str:
+def _format_estimate(estimate: Estimate) -> str:
     """Format an estimate with its significant digits."""
-    error = one.standard_error
-    digits = 3 if not one.value else math.floor(math.log10(abs(one.value) / max(error, 1e-300))) + 3
+    error = estimate.standard_error
+    digits = 3 if not estimate.value else math.floor(math.log10(abs(estimate.value) / max(error, 1e-300))) + 3
 
     def written(number: float | None) -> str:
         return "?" if number is None else f"{float(f'{number:.{min(max(digits, 2), 9)}g}'):.10g}"
 
-    low, high = map(written, one.interval)
-    known = "?" if error > 1000 * max(abs(one.value), abs(one.start)) else rounded(error)
-    doubt = "" if one.identifiable else ": not identifiable"
-    return f"{written(one.value)} +- {known}, 95 % {low} to {high}, from {one.start:.6g}{doubt}"
+    low, high = map(written, estimate.interval)
+    error_text = "?" if error > 1000 * max(abs(estimate.value), abs(estimate.start)) else rounded(error)
+    suffix = "" if estimate.identifiable else ": not identifiable"
+    return f"{written(estimate.value)} +- {error_text}, 95 % {low} to {high}, from {estimate.start:.6g}{suffix}"
 
 
-# Distance from a bound, in units of x, at which a parameter has ended there.
-BOUND_TOLERANCE = 1e-3
-
-# Smallest correlations of parameters and of residuals for a note.
-MIN_CORRELATION, MIN_ERROR_CORRELATION = 0.95, 0.3
-
-# Smallest residuals for a note: as a share of the motion, and of a given sigma.
-MIN_RESIDUAL_SHARE = 1e-6
-MIN_RESIDUAL_SIGMAS = 0.1
+# Smallest correlation of residuals for a warning.
+MIN_ERROR_CORRELATION = 0.3
 
 
 def search_notes(solution: Solution, parameters: Sequence[Parameter], *, fits_well: bool) -> Iterator[str]:
-    """Yield notes on the end of the search; `fits`: whether the residual is small."""
+    """Yield warnings about the search; `fits_well`: whether the residual is small."""
     if not solution.converged:
         yield "the search ended before it came to rest; start nearer by --set, or give --bounds"
     if not fits_well:
         yield "the residual is large: no values of these parameters reproduce the observations"
-    for one, x in zip(parameters, solution.x.tolist(), strict=True):
-        low, high = one.limits
-        if min(x - low, high - x) < BOUND_TOLERANCE:
-            bounded = math.isfinite(one.low) or math.isfinite(one.high)
+    for parameter, x in zip(parameters, solution.x.tolist(), strict=True):
+        low, high = parameter.limits
+        if min(x - low, high - x) < 1e-3:
+            bounded = math.isfinite(parameter.low) or math.isfinite(parameter.high)
             end = "a bound" if bounded else "1000 times from where it starts"
-            yield f"{one.key}: ended at {one.value(x):.4g}, {end}: its interval says little"
+            yield f"{parameter.key}: ended at {parameter.value(x):.4g}, {end}: its interval says little"
 
 
 def mesh_notes(
     parameters: Sequence[Parameter], x: Array, uncertainties: Uncertainty, shifts: Array | None
 ) -> Iterator[str]:
-    """Yield a note on parameters with a mesh error above their interval."""
-    wide = uncertainties.quantile * uncertainties.deviations
+    """Yield a warning about parameters whose mesh error exceeds their interval."""
+    half_widths = uncertainties.quantile * uncertainties.deviations
     if shifts is not None and (
-        moved := [
-            f"{one.key} by about {rounded(100 * one.share(x[n], float(shifts[n])))} %"
-            for n, one in enumerate(parameters)
-            if shifts[n] > wide[n]
+        shifted := [
+            f"{parameter.key} by about {rounded(100 * parameter.share(x[n], float(shifts[n])))} %"
+            for n, parameter in enumerate(parameters)
+            if shifts[n] > half_widths[n]
         ]
     ):
-        said = "farther than the interval; take more sheet.points"
-        yield f"the number of points moves {', '.join(moved)}: {said}"
+        remedy = "farther than the interval; take more sheet.points"
+        yield f"the number of points moves {', '.join(shifted)}: {remedy}"
 
 
 def correlation_notes(
-    parameters: Sequence[Parameter], uncertainties: Uncertainty, blind: Sequence[UnidentifiedGroup]
+    parameters: Sequence[Parameter], uncertainties: Uncertainty, unidentified: Sequence[UnidentifiedGroup]
 ) -> Iterator[str]:
-    """Yield notes on correlated parameters, without unidentified ones."""
-    for n, m in zip(*np.nonzero(np.triu(np.abs(uncertainties.correlation) > MIN_CORRELATION, 1)), strict=True):
+    """Yield warnings about correlated parameters, except unidentified ones."""
+    for n, m in zip(*np.nonzero(np.triu(np.abs(uncertainties.correlation) > 0.95, 1)), strict=True):
         keys = parameters[n].key, parameters[m].key
-        if not any(set(keys) <= set(one.parameters) for one in blind):
-            tied = f"{keys[0]} and {keys[1]} correlate by {uncertainties.correlation[n, m]:.3f}"
-            yield f"{tied}: they are known best together"
+        if not any(set(keys) <= set(group.parameters) for group in unidentified):
+            fault = f"{keys[0]} and {keys[1]} correlate by {uncertainties.correlation[n, m]:.3f}"
+            yield f"{fault}: they are known best together"
 
 
 def residual_notes(
@@ -266,36 +260,38 @@ def residual_notes(
     motion: float,
     error_correlation: ErrorCorrelation,
 ) -> Iterator[str]:
-    """Yield notes on residuals above sigma, and on correlated ones."""
+    """Yield warnings about residuals above sigma, and correlated residuals."""
     if uncertainties.factor > 1.5:
-        times = rounded(math.sqrt(uncertainties.factor))
-        yield f"the residual is {times} times sigma, and the intervals are widened by this factor"
-    left = solution.predicted.values - observations.values
-    if np.sqrt(np.nanmean(left**2)) < max(
-        MIN_RESIDUAL_SHARE * motion, MIN_RESIDUAL_SIGMAS * (observations.sigma or 0.0)
-    ):
+        factor = rounded(math.sqrt(uncertainties.factor))
+        yield f"the residual is {factor} times sigma, and the intervals are widened by this factor"
+    residuals = solution.predicted.values - observations.values
+    if np.sqrt(np.nanmean(residuals**2)) < max(1e-6 * motion, 0.1 * (observations.sigma or 0.0)):
         if observations.sigma is None:
             yield "the residual is next to 0, and so are the intervals; give the standard deviation by --sigma"
         return
-    in_space, in_time = _residual_correlations(left, observations.coordinates)
+    in_space, in_time = _residual_correlations(residuals, observations.coordinates)
     if in_space > MIN_ERROR_CORRELATION and error_correlation.correlation is None:
         remedy = "; give --correlation PX" if observations.kind == "pixel" else ""
-        said = f"the residuals of neighbouring points are correlated (by {in_space:.2f})"
-        yield f"{said}, so that the intervals are too narrow{remedy}"
+        fault = f"the residuals of neighbouring points are correlated (by {in_space:.2f})"
+        yield f"{fault}, so that the intervals are too narrow{remedy}"
     elif in_time > MIN_ERROR_CORRELATION and error_correlation.drift is None:
-        said = f"the residuals of a point are correlated in time (by {in_time:.2f})"
-        yield f"{said}, so that the intervals are too narrow; give --drift SECONDS"
+        fault = f"the residuals of a point are correlated in time (by {in_time:.2f})"
+        yield f"{fault}, so that the intervals are too narrow; give --drift SECONDS"
 
 
-def _residual_correlations(left: Array, coordinates: Array) -> tuple[float, float]:
-    """Return the correlations of residuals, shape (N, T, numbers), with the nearest neighbour, and in time."""
+def _residual_correlations(residuals: Array, coordinates: Array) -> tuple[float, float]:
+    """Return the correlations of residuals, shape (N, T, numbers), of nearest neighbours and of successive times."""
     from scipy.spatial import KDTree
 
-    def correlation(one: Array, other: Array) -> float:
-        product, square = one * other, one**2 + other**2
-        there = np.isfinite(product)
-        return 2 * float(product[there].sum()) / max(float(square[there].sum()), 1e-300)
+    def correlation(first: Array, second: Array) -> float:
+        product, square = first * second, first**2 + second**2
+        is_known = np.isfinite(product)
+        return 2 * float(product[is_known].sum()) / max(float(square[is_known].sum()), 1e-300)
 
-    # The nearest to a point but for itself.
-    in_space = correlation(left, left[KDTree(coordinates).query(coordinates, 2)[1][:, 1]]) if len(left) > 1 else 0.0
-    return in_space, correlation(left[:, 1:], left[:, :-1])
+    # The nearest point is the point itself, the second its neighbour.
+    in_space = (
+        correlation(residuals, residuals[KDTree(coordinates).query(coordinates, 2)[1][:, 1]])
+        if len(residuals) > 1
+        else 0.0
+    )
+    return in_space, correlation(residuals[:, 1:], residuals[:, :-1])

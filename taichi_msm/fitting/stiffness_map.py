@@ -1,4 +1,4 @@
-"""Estimate the stiffness map of a tissue: an image of factors, and one of their standard errors."""
+"""Fit of a stiffness map: factors of Young's modulus, and their standard errors."""
 
 from __future__ import annotations
 
@@ -34,229 +34,224 @@ Array = NDArray[np.float64]
 
 KEY = "tissue.map"
 
-# A component of a force.
+# Key of a component of a force.
 FORCE_KEY = re.compile(r"probes\.\d+\.total\.[012]")
 
-# Standard deviations of the ends of a 95 % interval, and the standard deviation of an unknown log.
-NORMAL_QUANTILE, UNKNOWN_DEVIATION = 1.96, 3.0
+# Standard deviation of an unknown log of a force.
+UNKNOWN_DEVIATION = 3.0
 
 # Default bounds of the factors.
 DEFAULT_LOW, DEFAULT_HIGH = 0.1, 10.0
 
-# Widest bounds, up or down.
+# Largest bound of the factors, and the inverse of the smallest.
 MAX_FACTOR = 1e6
-
-# Margin of the smallest factor above that of a spring with a rest length of 0.
-SLACK_MARGIN = 1.05
-
-# Difference between meshes of half the cells per side over the error: 2^2 - 1.
-RICHARDSON_DIVISOR = 3.0
-
-# Typical number of runs of a search, for the progress.
-TYPICAL_RUNS = 150
-
-# Residuals below this share of sigma are noted.
-MIN_RESIDUAL_SIGMAS = 0.5
-
-# Distance of the log of a factor from a bound at which it has ended there.
-BOUND_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
 class MapSettings:
-    """Requested map."""
+    """Settings of a fitted map."""
 
     resolution: int
     limits: Bounds  # of the factors
-    force: Parameter | None  # component of a force whose factor all forces share; None: all forces are known
+    force: Parameter | None  # component of a force, whose factor all forces share; None: forces are known
 
 
 def map_settings(
     scene: Scene, free: Sequence[str], bounds: Mapping[str, Bounds], resolution: int | None
 ) -> MapSettings | None:
-    """Return the requested map; None for a fit of numbers; SceneError: arguments that exclude each other."""
+    """Return the settings of a map, None for a fit of numbers; SceneError: invalid or conflicting arguments."""
     if KEY not in free:
         if resolution is not None:
             raise SceneError([f"--resolution {resolution}: is that of a map; add --free {KEY}"])
         return None
-    named = f"--free {KEY}"
-    others = [key for key in free if key != KEY]
-    if fixed := [key for key in others if not FORCE_KEY.fullmatch(key)] + others[1:]:
-        why = f"a map is found alone, as its level and {fixed[0]} can look alike; leave that out"
-        raise SceneError([f"{named}: {why}, or free one component of a force, whose factor all forces share"])
+    option = f"--free {KEY}"
+    force_keys = [key for key in free if key != KEY]
+    if conflicting := [key for key in force_keys if not FORCE_KEY.fullmatch(key)] + force_keys[1:]:
+        reason = f"a map is found alone, as its level and {conflicting[0]} can look alike; leave that out"
+        raise SceneError([f"{option}: {reason}, or free one component of a force, whose factor all forces share"])
     if scene.tissue is None:
-        raise SceneError([f"{named}: the scene has springs; describe them as tissue"])
+        raise SceneError([f"{option}: the scene has springs; describe them as tissue"])
     cells = min(scene.sheet.points) - 1
     if resolution is None:
-        raise SceneError([f"{named}: add --resolution R, the fields along a side, such as {min(16, cells)}"])
+        raise SceneError([f"{option}: add --resolution R, the fields along a side, such as {min(16, cells)}"])
     if not 2 <= resolution <= cells:
-        said = f"take 2 to {cells}, as the sheet has {cells} cells along a side, or more sheet.points"
-        raise SceneError([f"--resolution {resolution}: {said}"])
-    if wrong := [key for key in bounds if key not in free]:
-        raise SceneError([f"--bounds {wrong[0]}: not among --free; take {KEY}=LOW,HIGH, factors of young"])
+        remedy = f"take 2 to {cells}, as the sheet has {cells} cells along a side, or more sheet.points"
+        raise SceneError([f"--resolution {resolution}: {remedy}"])
+    if unknown := [key for key in bounds if key not in free]:
+        raise SceneError([f"--bounds {unknown[0]}: not among --free; take {KEY}=LOW,HIGH, factors of young"])
     low, high = bounds.get(KEY, (DEFAULT_LOW, DEFAULT_HIGH))
     low, high = (DEFAULT_LOW if low == -math.inf else low), (DEFAULT_HIGH if high == math.inf else high)
     if not 0 < low < high:
         raise SceneError([f"--bounds {KEY}={low:g},{high:g}: take factors of young above 0, the smaller one first"])
     if low < 1 / MAX_FACTOR or high > MAX_FACTOR:
-        said = f"take factors of young from {1 / MAX_FACTOR:g} to {MAX_FACTOR:g}"
-        raise SceneError([f"--bounds {KEY}={low:g},{high:g}: {said}"])
-    force = make_parameters(scene, others, {key: bounds[key] for key in others if key in bounds})[0] if others else None
+        remedy = f"take factors of young from {1 / MAX_FACTOR:g} to {MAX_FACTOR:g}"
+        raise SceneError([f"--bounds {KEY}={low:g},{high:g}: {remedy}"])
+    force = (
+        make_parameters(scene, force_keys, {key: bounds[key] for key in force_keys if key in bounds})[0]
+        if force_keys
+        else None
+    )
     return MapSettings(resolution, (low, high), force)
 
 
 def fit_map(
-    given: Scene, observations: Observations, task: MapSettings, image: str, progress: StageProgressCallback
+    scene: Scene, observations: Observations, settings: MapSettings, image: str, progress: StageProgressCallback
 ) -> FitResult:
     """Estimate a map.
 
     Args:
-        given: the scene.
+        scene: the scene.
         observations: with sigma.
-        task: resolution and limits.
+        settings: of the map.
         image: path of the map's picture in the fitted scene.
-        progress: called often; its exceptions end the fit.
+        progress: called often; an exception from it ends the fit.
 
     Raises:
-        SceneError: when the scene or the observations cannot be used.
+        SceneError: when the scene or the observations are invalid.
         DivergedError: when a run diverges.
     """
-    plan = _with_steps_for(check_scene(without_outputs(given)), task.limits[1])
+    plan = _with_stable_steps(check_scene(without_outputs(scene)), settings.limits[1])
     require_differentiable(plan)
-    if wrong := list(_unusable(observations, given, task)):
-        raise SceneError(wrong)
+    if invalid := list(_faults(observations, scene, settings)):
+        raise SceneError(invalid)
     assert observations.sigma is not None
-    low = max(task.limits[0], SLACK_MARGIN * plan.material.tension)
-    if low >= task.limits[1]:
-        said = f"{given.kind}.pretension leaves springs no length below {plan.material.tension:.3g}"
+    # Below this factor, with a margin of 5 %, springs have no positive rest length.
+    low = max(settings.limits[0], 1.05 * plan.material.tension)
+    if low >= settings.limits[1]:
+        fault = f"{scene.kind}.pretension leaves springs no length below {plan.material.tension:.3g}"
         remedy = f"take a HIGH well above {low:.3g}, or less pretension"
-        raise SceneError([f"--bounds {KEY}={task.limits[0]:g},{task.limits[1]:g}: {said}; {remedy}"])
-    limits = math.log(low), math.log(task.limits[1])
-    fields, cells = MapGrid(task.resolution, _cells(plan)), task.resolution**2
-    start = np.clip(np.log(_start(plan, task.resolution)), *limits).ravel()
-    start = np.append(start, [0.0] * (task.force is not None))
+        raise SceneError([f"--bounds {KEY}={settings.limits[0]:g},{settings.limits[1]:g}: {fault}; {remedy}"])
+    limits = math.log(low), math.log(settings.limits[1])
+    grid, cell_count = MapGrid(settings.resolution, _cells(plan)), settings.resolution**2
+    start = np.clip(np.log(_initial_factors(plan, settings.resolution)), *limits).ravel()
+    start = np.append(start, [0.0] * (settings.force is not None))
     device = runtime.start("cpu")
-    adjoint, sight = Adjoint(plan, device), ObservationModel(plan.scene, observations, plan.grid.frames + 1)
+    adjoint, model = Adjoint(plan, device), ObservationModel(plan.scene, observations, plan.grid.frames + 1)
 
-    def tell() -> None:
+    def report_progress() -> None:
         done = search.runs if search is not None else 0
-        progress("fit", done, max(TYPICAL_RUNS + 2 * len(start), done + 1))
+        progress("fit", done, max(150 + 2 * len(start), done + 1))
 
     search: MapSearch | None = None
-    tell()
-    position = adjoint.run(fields.factors(start[:cells]), tell)
-    points = _first(position, sight, observations, given)
-    by_points = 0.0
-    if (half := coarser_plan(plan)) is not None:
-        few = MapGrid(task.resolution, _cells(half)).factors(start[:cells])
-        other = ObservationModel(half.scene, observations, half.grid.frames + 1)
-        moved = other.points(Adjoint(half, device).run(few, tell))
-        apart = (other.observe(moved) - sight.observe(points))[observations.known] / RICHARDSON_DIVISOR
-        by_points = float(np.sqrt(np.nanmean(apart**2)))
-    sigma = math.hypot(observations.sigma, by_points)
+    report_progress()
+    position = adjoint.run(grid.factors(start[:cell_count]), report_progress)
+    points = _initial_points(position, model, observations, scene)
+    mesh_shift = 0.0
+    if (coarse_plan := coarser_plan(plan)) is not None:
+        coarse_factors = MapGrid(settings.resolution, _cells(coarse_plan)).factors(start[:cell_count])
+        coarse_model = ObservationModel(coarse_plan.scene, observations, coarse_plan.grid.frames + 1)
+        coarse_points = coarse_model.points(Adjoint(coarse_plan, device).run(coarse_factors, report_progress))
+        # Richardson's estimate of order 2 for half the cells per side.
+        differences = (coarse_model.observe(coarse_points) - model.observe(points))[observations.known] / 3.0
+        mesh_shift = float(np.sqrt(np.nanmean(differences**2)))
+    sigma = math.hypot(observations.sigma, mesh_shift)
     search = MapSearch(
         adjoint,
-        sight,
+        model,
         observations,
         sigma,
-        fields,
+        grid,
         limits,
-        tell,
-        force_limits=task.force.limits if task.force else None,
+        report_progress,
+        force_limits=settings.force.limits if settings.force else None,
     )
     solution = search.best(start)
-    factors, errors = (each[:cells].reshape(task.resolution, -1) for each in (np.exp(solution.x), solution.errors))
-    found = FittedMap(factors, errors, solution.choice, sigma)
+    factors, errors = (
+        values[:cell_count].reshape(settings.resolution, -1) for values in (np.exp(solution.x), solution.errors)
+    )
+    fitted_map = FittedMap(factors, errors, solution.choice, sigma)
     fitted = search.predict(solution.x)[1]
-    left = (fitted - observations.values)[observations.known]
-    assert given.tissue is not None
-    drawn = {"map": StiffnessMap(image=image, range=found.range)}
-    scene = given.model_copy(update={"tissue": given.tissue.model_copy(update=drawn)})
-    scene = with_scaled_forces(scene, *np.exp(solution.x[cells:]).tolist())
-    parameters = {} if task.force is None else {task.force.key: _force(task.force, solution)}
-    mapped = check_scene(without_outputs(scene), {**plan.maps, "map": MapImage(found.grey, "")})
-    chi_square = float(np.sum((left / observations.sigma) ** 2))
+    residuals = (fitted - observations.values)[observations.known]
+    assert scene.tissue is not None
+    update = {"map": StiffnessMap(image=image, range=fitted_map.range)}
+    fitted_scene = scene.model_copy(update={"tissue": scene.tissue.model_copy(update=update)})
+    fitted_scene = with_scaled_forces(fitted_scene, *np.exp(solution.x[cell_count:]).tolist())
+    parameters = {} if settings.force is None else {settings.force.key: _force_estimate(settings.force, solution)}
+    mapped_plan = check_scene(without_outputs(fitted_scene), {**plan.maps, "map": MapImage(fitted_map.grey, "")})
+    chi_square = float(np.sum((residuals / observations.sigma) ** 2))
     return FitResult(
         parameters=parameters,
         correlation=[[1.0]] * len(parameters),
-        curves={key: _curve(one, solution) for key, one in parameters.items()},
-        residual=float(np.sqrt(np.mean(left**2))),
+        curves={key: _curve(estimate, solution) for key, estimate in parameters.items()},
+        residual=float(np.sqrt(np.mean(residuals**2))),
         sigma=observations.sigma,
         unit=observations.unit,
         chi_square=chi_square,
-        rejection=by_chi_square(chi_square, left.size, left.size),
-        degrees_of_freedom=left.size,
-        identifiable=not found.unknown.any() and all(one.identifiable for one in parameters.values()),
-        mesh_error=mesh_error(mapped, tell),
+        rejection=by_chi_square(chi_square, residuals.size, residuals.size),
+        degrees_of_freedom=residuals.size,
+        identifiable=not fitted_map.unknown.any() and all(estimate.identifiable for estimate in parameters.values()),
+        mesh_error=mesh_error(mapped_plan, report_progress),
         runs=search.runs + 1,
-        notes=list(_notes(observations, solution, found, by_points, limits, left)),
-        scene=scene,
+        notes=list(_notes(observations, solution, fitted_map, mesh_shift, limits, residuals)),
+        scene=fitted_scene,
         observations=observations,
         fitted=fitted,
-        map=found,
+        map=fitted_map,
     )
 
 
-def _force(parameter: Parameter, solution: MapSolution) -> Estimate:
-    """Return the estimate of a component of a force."""
+def _force_estimate(parameter: Parameter, solution: MapSolution) -> Estimate:
     x, deviation = float(solution.x[-1]), float(np.nan_to_num(solution.errors[-1], nan=UNKNOWN_DEVIATION))
-    ends = sorted(parameter.value(x + side * NORMAL_QUANTILE * deviation) for side in (-1, 1))
+    ends = sorted(parameter.value(x + side * 1.96 * deviation) for side in (-1, 1))
     is_identifiable = deviation <= MAX_RELATIVE_ERROR
     error = parameter.error(x, deviation)
     return Estimate(parameter.value(x), error, (ends[0], ends[1]), parameter.start, is_identifiable, None)
 
 
 def _curve(estimate: Estimate, solution: MapSolution) -> list[ProfilePoint]:
-    """Return the quadratic approximation of the profile of a force."""
+    """Return the quadratic approximation of a force's profile."""
     deviation = float(np.nan_to_num(solution.errors[-1], nan=UNKNOWN_DEVIATION))
     return [ProfilePoint(estimate.value * math.exp(n * deviation), float(n)) for n in np.linspace(-3, 3, 25)]
 
 
-def _unusable(observations: Observations, scene: Scene, task: MapSettings) -> Iterator[str]:
-    """Yield the faults that are known before any run."""
+def _faults(observations: Observations, scene: Scene, settings: MapSettings) -> Iterator[str]:
+    """Yield the faults that need no run."""
     if observations.sigma is None:
-        said = "the errors of the observations decide how smooth a map is; give their standard deviation by --sigma"
-        yield f"{observations.name}: sigma: missing: {said}"
+        fault = "the errors of the observations decide how smooth a map is; give their standard deviation by --sigma"
+        yield f"{observations.name}: sigma: missing: {fault}"
         return
-    if (known := int(observations.known.sum())) <= (needed := task.resolution**2):
-        said = f"{known} numbers were observed, too few for {needed} fields; observe more points, or take fewer fields"
-        yield f"{observations.name}: {said}: --resolution {max(2, math.isqrt(max(known - 1, 0)))}"
+    if (count := int(observations.known.sum())) <= (cell_count := settings.resolution**2):
+        fault = (
+            f"{count} numbers were observed, too few for {cell_count} fields; observe more points, or take fewer fields"
+        )
+        yield f"{observations.name}: {fault}: --resolution {max(2, math.isqrt(max(count - 1, 0)))}"
         return
-    # The Jacobian, twice while it is multiplied.
-    if (size := 16 * known * needed) > (free := available_memory()):
-        said = f"{needed} fields by {known} observed numbers take {size / 2**30:.3g} GiB of memory"
-        yield f"--resolution {task.resolution}: {said}, and {free / 2**30:.3g} GiB is free; take fewer fields or points"
+    # Two copies of the Jacobian, in f64.
+    if (needed := 16 * count * cell_count) > (free := available_memory()):
+        fault = f"{cell_count} fields by {count} observed numbers take {needed / 2**30:.3g} GiB of memory"
+        remedy = "take fewer fields or points"
+        yield f"--resolution {settings.resolution}: {fault}, and {free / 2**30:.3g} GiB is free; {remedy}"
         return
-    yield from faults(observations, scene, task.resolution**2)
+    yield from faults(observations, scene, settings.resolution**2)
 
 
-def _first(position: Array, sight: ObservationModel, observations: Observations, given: Scene) -> Array:
-    """Return the points at the start [m], shape (N, T, 3); SceneError: implausible observations."""
-    at_frames = np.array([sight.points_on_sheet(frame) for frame in position])
-    points = sight.interpolate(at_frames)
-    first = Prediction(sight.observe(points), np.empty((0, 3)), 0, sight.motion(at_frames))
-    if wrong := list(faults_at_start(observations, given, first)):
-        raise SceneError(wrong)
+def _initial_points(position: Array, model: ObservationModel, observations: Observations, scene: Scene) -> Array:
+    """Return the observed points in the initial run [m], shape (N, T, 3); SceneError: implausible observations."""
+    at_frames = np.array([model.points_on_sheet(frame) for frame in position])
+    points = model.interpolate(at_frames)
+    prediction = Prediction(model.observe(points), np.empty((0, 3)), 0, model.motion(at_frames))
+    if invalid := list(faults_at_start(observations, scene, prediction)):
+        raise SceneError(invalid)
     return points
 
 
-def _with_steps_for(plan: Plan, high: float) -> Plan:
-    """Return the plan with steps that are stable for the largest factor; SceneError: the scene's step is not."""
+def _with_stable_steps(plan: Plan, high: float) -> Plan:
+    """Return the plan with steps that are stable for factors up to `high`; SceneError: the scene's own step is not."""
     if plan.scene.time.at_rest:
         return plan
-    stiff = replace(plan.material, factors=np.full(_cells(plan), high))
-    limit = stable_step(stiff, plan.scene.sheet, plan.scene.time.damping_difference)
+    stiffest = replace(plan.material, factors=np.full(_cells(plan), high))
+    limit = stable_step(stiffest, plan.scene.sheet, plan.scene.time.damping_difference)
     if plan.scene.time.step == "auto":
-        least = math.ceil(2 / (plan.grid.frames_per_second * limit))
-        return plan.with_grid(steps_per_frame=max(plan.grid.steps_per_frame, least))
+        min_steps = math.ceil(2 / (plan.grid.frames_per_second * limit))
+        return plan.with_grid(steps_per_frame=max(plan.grid.steps_per_frame, min_steps))
     if plan.grid.step > limit:
-        said = f"{plan.grid.step:g} s is too long for a factor of {high:g}; take {limit:.3g} s or less, or auto"
-        raise SceneError([f"time.step: {said}, or smaller --bounds {KEY}=LOW,HIGH"])
+        remedy = f"{plan.grid.step:g} s is too long for a factor of {high:g}; take {limit:.3g} s or less, or auto"
+        raise SceneError([f"time.step: {remedy}, or smaller --bounds {KEY}=LOW,HIGH"])
     return plan
 
 
-def _start(plan: Plan, resolution: int) -> Array:
-    """Return the initial factors: those of the scene's map, else 1."""
+def _initial_factors(plan: Plan, resolution: int) -> Array:
+    """Return the initial factors, shape (R, R): those of the scene's map, otherwise 1."""
     tissue, image = plan.scene.tissue, plan.maps.get("map")
     if tissue is None or tissue.map is None or image is None:
         return np.ones((resolution, resolution))
@@ -271,24 +266,24 @@ def _cells(plan: Plan) -> tuple[int, int]:
 def _notes(
     observations: Observations,
     solution: MapSolution,
-    found: FittedMap,
-    by_points: float,
+    fitted_map: FittedMap,
+    mesh_shift: float,
     limits: tuple[float, float],
-    left: Array,
+    residuals: Array,
 ) -> Iterator[str]:
-    """Yield notes for the user; `left`: the residuals [m] or [px]."""
+    """Yield warnings; `residuals` are in [m] or [px]."""
     assert observations.sigma is not None
-    if (unknown := int(found.unknown.sum())) > 0:
-        yield f"{unknown} of {found.factors.size} fields are unknown: nothing moves there; press there"
-    if by_points > observations.sigma / 2:
-        said = f"about {rounded(by_points)} {observations.unit}, and sigma is {rounded(observations.sigma)}"
+    if (unknown_count := int(fitted_map.unknown.sum())) > 0:
+        yield f"{unknown_count} of {fitted_map.factors.size} fields are unknown: nothing moves there; press there"
+    if mesh_shift > observations.sigma / 2:
+        size = f"about {rounded(mesh_shift)} {observations.unit}, and sigma is {rounded(observations.sigma)}"
         remedy = "the map is as smooth as both require; take more sheet.points"
-        yield f"the mesh changes the observations by {said}: {remedy}"
-    if (share := float(np.sqrt(np.mean(left**2))) / observations.sigma) < MIN_RESIDUAL_SIGMAS:
+        yield f"the mesh changes the observations by {size}: {remedy}"
+    if (share := float(np.sqrt(np.mean(residuals**2))) / observations.sigma) < 0.5:
         yield f"the residual is only {rounded(share)} times sigma: with a smaller sigma the map shows more"
     if solution.excess > 1.5:
-        times = rounded(math.sqrt(solution.excess))
-        yield f"the residual is {times} times the expected one with any map, and the errors are widened by this factor"
-    x = solution.x[: found.factors.size]
-    if bound := int((np.minimum(x - limits[0], limits[1] - x) < BOUND_TOLERANCE).sum()):
-        yield f"{bound} fields ended at a bound, {math.exp(limits[0]):.3g} or {math.exp(limits[1]):.3g}; see --bounds"
+        factor = rounded(math.sqrt(solution.excess))
+        yield f"the residual is {factor} times the expected one with any map, and the errors are widened by this factor"
+    logs = solution.x[: fitted_map.factors.size]
+    if bounded := int((np.minimum(logs - limits[0], limits[1] - logs) < 1e-3).sum()):
+        yield f"{bounded} fields ended at a bound, {math.exp(limits[0]):.3g} or {math.exp(limits[1]):.3g}; see --bounds"

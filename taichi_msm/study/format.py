@@ -8,7 +8,7 @@ from typing import Any
 
 from taichi_msm.study.result import MeshMeasurement, PeerMeasurement, SteppingMeasurement, Study, Timing
 
-# Units of time, with their number in a second.
+# Units of time: number in a second, and name.
 TIME_UNITS = ((1, "s"), (1e3, "ms"), (1e6, "us"))
 
 Columns = Mapping[str, Callable[[Any], str]]
@@ -23,7 +23,7 @@ def format_number(value: float) -> str:
 
 
 def time_unit(seconds: float) -> tuple[float, str]:
-    """Choose a readable unit for a time; return the number of units in a second, and its name."""
+    """Choose a readable unit of time; return its number in a second, and its name."""
     return next(((scale, name) for scale, name in TIME_UNITS if seconds * scale >= 0.9995), TIME_UNITS[-1])
 
 
@@ -33,29 +33,29 @@ def format_duration(seconds: float) -> str:
     return f"{format_number(seconds * scale)} {name}"
 
 
-def format_timing(seconds: Timing) -> str:
+def format_timing(timing: Timing) -> str:
     """Format a median and, in the same unit, the range."""
-    scale, _ = time_unit(seconds.median)
-    spread = "once"
-    if seconds.runs > 1:
-        spread = f"{format_number(seconds.fastest * scale)} to {format_number(seconds.slowest * scale)}"
-    return f"{format_duration(seconds.median)} ({spread})"
+    scale, _ = time_unit(timing.median)
+    range_text = "once"
+    if timing.runs > 1:
+        range_text = f"{format_number(timing.fastest * scale)} to {format_number(timing.slowest * scale)}"
+    return f"{format_duration(timing.median)} ({range_text})"
 
 
-def comparable_error(point: ErrorMeasurement) -> float:
-    """Return an error, infinite where the simulation diverged."""
-    return math.inf if point.error is None or math.isnan(point.error) else point.error
+def comparable_error(measurement: ErrorMeasurement) -> float:
+    """Return the error; infinite if the simulation diverged."""
+    return math.inf if measurement.error is None or math.isnan(measurement.error) else measurement.error
 
 
-def format_error(point: ErrorMeasurement) -> str:
-    """Format an error, or its bound if it is not known exactly."""
-    error = comparable_error(point)
-    return f"{'' if point.known else '< '}{format_number(error)}" if error < math.inf else "diverged"
+def format_error(measurement: ErrorMeasurement) -> str:
+    """Format the error, or its bound."""
+    error = comparable_error(measurement)
+    return f"{'' if measurement.known else '< '}{format_number(error)}" if error < math.inf else "diverged"
 
 
-def is_mostly_rounding(point: ErrorMeasurement) -> bool:
-    """Return whether most of an error comes from f32."""
-    return isinstance(point, SteppingMeasurement) and (point.rounding or 0) > (point.error or 0) / 2
+def is_mostly_rounding(measurement: ErrorMeasurement) -> bool:
+    """Return whether rounding in f32 dominates the error."""
+    return isinstance(measurement, SteppingMeasurement) and (measurement.rounding or 0) > (measurement.error or 0) / 2
 
 
 def machine_summary(study: Study) -> str:
@@ -69,15 +69,17 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], left_colu
     """Format a Markdown table.
 
     Args:
-        head: Names of the columns.
-        rows: Cells of every row.
-        left_columns: Columns that are aligned left; all others are aligned right.
+        head: names of the columns.
+        rows: cells of every row.
+        left_columns: indices of left-aligned columns; all others are right-aligned.
 
     Returns:
         The table, without a final line break.
     """
     widths = [max(len(row[column]) for row in [head, *rows]) for column in range(len(head))]
-    rule = ["-" * width if column in left_columns else "-" * (width - 1) + ":" for column, width in enumerate(widths)]
+    separator = [
+        "-" * width if column in left_columns else "-" * (width - 1) + ":" for column, width in enumerate(widths)
+    ]
 
     def line(cells: Sequence[str]) -> str:
         padded = [
@@ -86,19 +88,16 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], left_colu
         ]
         return f"| {' | '.join(padded)} |"
 
-    return "\n".join([line(head), line(rule), *map(line, rows)])
+    return "\n".join([line(head), line(separator), *map(line, rows)])
 
 
 def format_table(measurements: Sequence[Any], columns: Columns, remark: Callable[[Any], str] | None = None) -> str:
     """Format measurements as a Markdown table, one per row.
 
     Args:
-        measurements: Measurements of one kind.
-        columns: Functions that format the cells of a measurement, by the names of the columns.
-        remark: Function that formats the remark on a measurement in a last column without a name; empty for none.
-
-    Returns:
-        The table.
+        measurements: measurements of one kind.
+        columns: format functions of the cells, by the name of the column.
+        remark: format function of a last column without a name, which is omitted if all its cells are empty.
     """
     if remark and any(map(remark, measurements)):
         columns = {**columns, "": remark}

@@ -3,7 +3,7 @@
 - Work-precision diagram of stepping: every precision and damping difference, from the largest stable step downwards.
 - Work-precision diagram of the mesh: tissue with a quarter, half and twice the cells per side.
 - Work-precision diagram of drawing: every refinement and supersampling, for the most deformed frame.
-- Cost of each term of the model: the time of a step without it.
+- Ablation of the terms of the model: the time of a step without each of them.
 - Solution of the same equations by SciPy's DOP853, for comparison.
 """
 
@@ -59,14 +59,11 @@ from taichi_msm.terms.foundation import foundation_force
 PRECISIONS: tuple[Precision, ...] = ("f64", "f32")
 DIFFERENCES = ("central", "backward")
 
-# Number of times that every setting is timed, in turns.
+# Number of timings of every setting; all settings are timed in turns.
 STEPPING_ROUNDS = 5
 
-# An error is known if it is at least this multiple of that of the reference.
+# Smallest ratio of a known error to the error of the reference.
 REFERENCE_MARGIN = 20
-
-# The largest stable step is halved at least this number of times, whatever it costs.
-MIN_HALVINGS = 2
 
 Frames = NDArray[Any]
 
@@ -75,15 +72,14 @@ class SteppingStudy:
     """Work-precision diagram of stepping.
 
     Args:
-        plan: Plan of the scene.
-        device: Device to run on.
-        longest_run: Approximate time limit of a run [s].
-        study: Receives the results.
-        progress: Called with the number of finished runs and their total. It may raise KeyboardInterrupt; the results
-            so far remain in `study`.
+        plan: of the scene.
+        device: runs the simulations.
+        longest_run: approximate time limit of a run [s].
+        study: receives the results, also those before a KeyboardInterrupt from `progress`.
+        progress: called with the number of finished runs and their total.
 
     Attributes:
-        frames: Displacements of the reference at every frame but the first [m], shape (F, rows, cols, 3).
+        frames: reference displacements at every frame but the first [m], shape (F, rows, cols, 3).
     """
 
     def __init__(
@@ -102,7 +98,7 @@ class SteppingStudy:
         }
 
     def run(self) -> None:
-        """Compute the reference and the errors, and then measure the times."""
+        """Compute the reference and the errors, then repeat all runs for their times."""
         for dynamics in self._dynamics.values():
             self._progress(0, self._total)
             dynamics.compile()
@@ -118,13 +114,13 @@ class SteppingStudy:
                 self._run(point.precision, point.damping_difference, point.steps_per_frame, point.samples)
 
     def relative_error(self, frames: Frames) -> float:
-        """Return the largest error of frames against the reference, as a fraction of the largest displacement."""
+        """Return the largest error against the reference, as a fraction of the largest displacement."""
         assert self.frames is not None
         largest = self._reference.largest
         return max_norm(frames - self.frames) / largest if largest > 0 else 0.0
 
     def determines(self, error: float) -> bool:
-        """Return whether the reference is exact enough to determine an error."""
+        """Return whether the reference is accurate enough to determine an error."""
         return error >= REFERENCE_MARGIN * self._reference.error
 
     def close(self) -> None:
@@ -138,20 +134,21 @@ class SteppingStudy:
         return self.study.reference
 
     def _series(self, difference: str) -> Iterator[int]:
-        """List steps per frame, beginning with the largest valid step, doubled until a run would take too long."""
+        """Yield the steps per frame, from that of the largest valid step, doubled until a run would take too long."""
         steps = min_steps_per_frame(self.plan.tools, self.plan.grid, stable_steps(self._plans[difference]))
         samples: list[float] = []
         self._run("f64", difference, steps, samples)
         yield steps
         for halving in range(1, 64):
-            if halving > MIN_HALVINGS and samples[0] * 2**halving > self._longest_run:
+            # Two halvings are measured regardless of the time limit.
+            if halving > 2 and samples[0] * 2**halving > self._longest_run:
                 return
             yield steps * 2**halving
 
     def _compute_reference(self, finest: int) -> None:
-        """Extrapolate central differences with steps well below the finest measured one."""
+        """Extrapolate central differences with one half and one quarter of the finest measured step."""
         # u* = u_{h/2} + (u_{h/2} - u_h) / 3. Its error is at most about its distance from the same formula with 2 h for
-        # h. With contact, where the order is about 1, nothing is extrapolated.
+        # h. With contact, of order 1, the finest run is the reference.
         coarse, middle, fine = (self._run("f64", "central", finest * 2**halving, []) for halving in range(3))
         before, self.frames = middle + (middle - coarse) / 3, fine + (fine - middle) / 3
         if self.plan.tools:
@@ -161,7 +158,7 @@ class SteppingStudy:
         self.study.reference = Reference(4 * finest, error, largest)
 
     def _measure_errors(self, difference: str, counts: list[int]) -> None:
-        """Run every step once, in f32 until rounding dominates, in f64 until the reference is not exact enough."""
+        """Run every step once: in f32 until rounding dominates, in f64 until the reference is too inaccurate."""
         remaining, bound = set(PRECISIONS), displacement_bound(self.plan, self.plan.scene.time.duration)
         for steps in counts:
             exact: Frames | None = None
@@ -181,7 +178,7 @@ class SteppingStudy:
                         remaining.discard(precision)
 
     def _run(self, precision: str, difference: str, steps: int, samples: list[float]) -> Frames:
-        """Step through the scene, append the time of stepping alone [s] to the samples, and return the frames."""
+        """Simulate the scene, append the time without that of the copies [s] to the samples, and return the frames."""
         dynamics = self._dynamics[precision]
         plan = self._plans[difference].with_grid(precision=precision, steps_per_frame=steps)
         dynamics.restart(plan)
@@ -198,22 +195,16 @@ class SteppingStudy:
         return frames
 
 
-# Cells per side of the other meshes, relative to those of the scene.
-COARSE_CELL_RATIOS = (1 / 4, 1 / 2)
+# Cells per side of the finer mesh, relative to those of the scene.
 FINE_CELL_RATIO = 2
 
-# Number of times that every mesh is timed, in turns.
+# Number of timings of every mesh; all meshes are timed in turns.
 MESH_ROUNDS = 5
-
-# An error is known if it is at least this multiple of the bound of the reference's own error.
-MESH_REFERENCE_MARGIN = 5
 
 Field = NDArray[Any]
 
 
 class _MeshRun(NamedTuple):
-    """A sheet with some mesh, and its measurement."""
-
     plan: Plan
     dynamics: Dynamics
     measurement: MeshMeasurement
@@ -222,20 +213,19 @@ class _MeshRun(NamedTuple):
 class MeshStudy:
     """Work-precision diagram of the mesh of a sheet of tissue, in f64.
 
-    Errors are measured with the same steps for all meshes, so that the time-step errors cancel. Times are measured with
+    Errors are measured with the same step for all meshes, so that the time-step errors cancel. Times are measured with
     the automatic step of each mesh, which is longer for coarser ones.
 
-    The reference is a mesh finer than all measured ones, if there is time for it. Otherwise it is the finest measured
-    one, whose own error is then known only as a bound. The reference is run only once, and may take as long as all the
-    timed runs of another mesh together.
+    The reference is a mesh finer than all measured ones if there is time for it: a single run, which may take as long
+    as all timed runs of another mesh. Otherwise it is the finest measured mesh, for whose own error only a bound is
+    known.
 
     Args:
-        plan: Plan of the scene.
-        device: Device to run on.
-        longest_run: Approximate time limit of a run [s].
-        study: Receives the results, the coarsest mesh first.
-        progress: Called with the number of finished runs and their total. It may raise KeyboardInterrupt; the results
-            so far remain in `study`.
+        plan: of the scene.
+        device: runs the simulations.
+        longest_run: approximate time limit of a run [s].
+        study: receives the results, from coarse to fine, also those before a KeyboardInterrupt from `progress`.
+        progress: called with the number of finished runs and their total.
     """
 
     def __init__(
@@ -248,9 +238,9 @@ class MeshStudy:
         self._done = 0
 
     def run(self) -> None:
-        """Compute the estimates and the errors, and then measure the times.
+        """Compute the estimates and the errors, then measure the times.
 
-        A sheet of springs is not measured, because it is a different sheet with another mesh.
+        Sheets of springs are skipped, as their stiffness depends on the mesh.
         """
         if self._plan.scene.tissue is None:
             return
@@ -277,7 +267,7 @@ class MeshStudy:
                     sheet.measurement.samples.append(self._step_through(sheet))
 
     def _measure_mesh(self, plan: Plan, opened: ExitStack) -> float:
-        """Run a mesh with its automatic step and the companion runs of `run`; return the time of stepping [s]."""
+        """Simulate a mesh with its automatic step and companion runs; return the time of its steps [s]."""
         dynamics = opened.enter_context(closing(Dynamics(plan, self._device)))
         sheet = _MeshRun(plan, dynamics, MeshMeasurement(*plan.scene.sheet.points, plan.grid.steps_per_frame))
         coarse = mesh_companion_plan(plan)
@@ -296,7 +286,7 @@ class MeshStudy:
         return seconds
 
     def _finer_plan(self, plan: Plan, seconds: float, longest_run: float) -> Plan | None:
-        """Plan a finer mesh than that of a run of `seconds`; return None if it takes too much time or memory."""
+        """Plan the next finer mesh than one that took `seconds`; return None beyond the limits of time or memory."""
         points = _scaled(plan, FINE_CELL_RATIO)
         if max(points) > MAX_POINTS:
             return None
@@ -305,7 +295,7 @@ class MeshStudy:
         return None if seconds * work[1] / work[0] > longest_run or any(cost.size_problems(finer)) else finer
 
     def _measure_errors(self, finer: Plan | None) -> None:
-        """Step all meshes through the scene in parallel, and a finer one if given; compare every frame."""
+        """Step all meshes, and the finer one if given, in lockstep, and compare every frame."""
         finest = self._sheets[-1].plan if finer is None else finer
         grid = finest.grid
         with ExitStack() as opened:
@@ -324,8 +314,8 @@ class MeshStudy:
                 with np.errstate(all="ignore"):
                     exact, bound = _reference(fields, extrapolate=not finest.tools)
                     frame_errors = [max_norm(_sampled(field, exact) - exact) for field in fields[:-1]]
-                    # The error of the finest mesh is unknown between its mass points. But at an order of 1 or more, it
-                    # is at most its distance from a mesh that is twice as coarse.
+                    # The error of the finest mesh is unknown between its mass points. But at an order of at least 1,
+                    # it is at most the distance from a mesh with half the cells per side.
                     frame_errors.append(max_norm(_sampled(fields[-2], fields[-1]) - fields[-1]))
                 errors = [max(pair) for pair in zip(errors, frame_errors, strict=True)]
                 reference_error, largest = max(reference_error, bound), max(largest, max_norm(exact))
@@ -335,13 +325,13 @@ class MeshStudy:
             return
         for (plan, _, measurement), error in zip(self._sheets, errors, strict=False):
             if plan is not finest:
-                measurement.known = error >= MESH_REFERENCE_MARGIN * reference_error
+                measurement.known = error >= 5 * reference_error
                 error += 0.0 if measurement.known else reference_error
             share = error / largest if largest > 0 else 0.0
             measurement.error = share if share < math.inf else None
 
     def _step_through(self, sheet: _MeshRun, companion: MeshCompanion | None = None) -> float:
-        """Step through the scene with the automatic step; return the time of stepping alone [s]."""
+        """Simulate the scene with the automatic step; return the time of the steps alone [s]."""
         plan, dynamics, _ = sheet
         dynamics.restart(plan)
         seconds = 0.0
@@ -357,13 +347,13 @@ class MeshStudy:
         return seconds
 
     def _tick(self) -> None:
-        # Every mesh has a run with its companions, a second run and the rounds; the errors are one run of all.
+        # Two runs of every mesh with its companions and the timed runs; the comparison of all meshes counts as one.
         self._progress(self._done, 1 + (2 + MESH_ROUNDS) * len(self._sheets))
 
 
 def mesh_plans(plan: Plan) -> Iterator[Plan]:
-    """Plan the meshes to compare, as far as the scene allows them; its own is the last."""
-    for ratio in COARSE_CELL_RATIOS:
+    """Yield the plans of the meshes that the scene allows, from coarse to its own."""
+    for ratio in (1 / 4, 1 / 2):
         points = _scaled(plan, ratio)
         coarse, _ = (
             try_plan(with_points(plan.scene, points), plan.maps) if min(points) >= MIN_POINTS_PER_SIDE else (None, [])
@@ -381,10 +371,11 @@ def _scaled(plan: Plan, ratio: float) -> tuple[int, int]:
 
 
 def _reference(fields: list[Field], *, extrapolate: bool) -> tuple[Field, float]:
-    """Extrapolate the two finest displacement fields to order 2; return the result and a bound of its error [m]."""
+    """Apply Richardson's extrapolation of order 2 to the two finest fields; return it and a bound of its error [m]."""
     # u* = u + (u - u_r) / (r^2 - 1), where u_r has cells r times as long. The correction is computed at the mass points
     # of u_r and interpolated at those of u. The error of u* is at most about its distance from the extrapolation of the
-    # next two fields, or that of u from u_r if there are only two. With contact the order is lower.
+    # next coarser pair, or from u if there are only two fields. With contact, of order 1, u is not extrapolated; its
+    # error is at most about its distance from u_r.
     if not extrapolate:
         return fields[-1], max_norm(_sampled(fields[-1], fields[-2]) - fields[-2])
     exact = fields[-1] + _sampled(_correction(fields[-1], fields[-2]), fields[-1])
@@ -396,22 +387,25 @@ def _reference(fields: list[Field], *, extrapolate: bool) -> tuple[Field, float]
 
 
 def _correction(fine: Field, coarse: Field) -> Field:
-    """Return the correction of Richardson's extrapolation at the mass points of the coarse field."""
-    ratio = min((many - 1) / (few - 1) for many, few in zip(fine.shape[:2], coarse.shape[:2], strict=True))
+    """Return Richardson's correction at the mass points of the coarse field."""
+    ratio = min(
+        (fine_count - 1) / (coarse_count - 1)
+        for fine_count, coarse_count in zip(fine.shape[:2], coarse.shape[:2], strict=True)
+    )
     correction: Field = (_sampled(fine, coarse) - coarse) / (ratio**2 - 1)
     return correction
 
 
-def _sampled(values: Field, like: Field) -> Field:
+def _sampled(values: Field, target: Field) -> Field:
     """Interpolate a field at the mass points of another one."""
-    (rows, cols), (target_rows, target_cols) = values.shape[:2], like.shape[:2]
+    (rows, cols), (target_rows, target_cols) = values.shape[:2], target.shape[:2]
     return CubicInterpolation((rows, cols), (target_rows, target_cols)).evaluate(values)
 
 
 REFINES = (0, 1, 2, 5, 10, 20)
 SUPERSAMPLES = (1, 2, 3, 4)
 
-# Settings of the reference picture, if there is memory for it. They must be finer than all settings compared with it.
+# Settings of the reference picture, finer than all others.
 REFERENCE_RENDER = {"refine": 40, "supersample": 8}
 
 PICTURE_ROUNDS = 5
@@ -425,12 +419,12 @@ def measure_pictures(
     """Measure the error and the time of drawing with every setting.
 
     Args:
-        scene: Scene to draw.
-        position: Positions of the mass points [m], shape (rows, cols, 3).
-        texture: Picture on the sheet, 8-bit RGB, shape (height, width, 3).
-        quick: Whether to vary the settings one at a time.
-        study: Receives the results.
-        progress: Called with the number of finished pictures and their total.
+        scene: the scene.
+        position: of the mass points [m], shape (rows, cols, 3).
+        texture: picture on the sheet, 8-bit RGB, shape (height, width, 3).
+        quick: as for `render_settings`.
+        study: receives the results.
+        progress: called with the number of finished pictures and their total.
     """
     position = np.ascontiguousarray(position, np.float32)
     memory = process.available_memory() // 2
@@ -461,14 +455,11 @@ def measure_pictures(
 
 
 def render_settings(scene: Scene, quick: bool) -> Iterator[tuple[int, int]]:
-    """List the refinements and supersamplings to compare.
+    """Yield the pairs of refinement and supersampling to compare.
 
     Args:
-        scene: Scene with its own settings.
-        quick: Whether one of both is always that of the scene.
-
-    Returns:
-        Pairs of a refinement and a supersampling.
+        scene: has its own settings.
+        quick: whether to vary one of both at a time.
     """
     render = scene.render
     for supersample in sorted({*SUPERSAMPLES, render.supersample}):
@@ -481,8 +472,8 @@ def psnr(picture: Picture, reference: Picture) -> float | None:
     """Compute the peak signal-to-noise ratio [dB], 10 log10(255^2 / mean square error).
 
     Args:
-        picture: Picture, 8-bit RGB, shape (height, width, 3).
-        reference: Reference of the same shape.
+        picture: 8-bit RGB, shape (height, width, 3).
+        reference: of the same shape.
 
     Returns:
         The ratio [dB]; None if both pictures are equal.
@@ -492,13 +483,13 @@ def psnr(picture: Picture, reference: Picture) -> float | None:
 
 
 def _with_render(scene: Scene, **changes: int) -> Scene:
-    # There is no validation, because the settings of the reference picture exceed the limits of a scene.
+    # Not validated, as the settings of the reference picture exceed the limits of a scene.
     return scene.model_copy(update={"render": BaseModel.model_copy(scene.render, update=changes)})
 
 
 TERM_ROUNDS = 9
 
-# Keys of the terms of a sheet that can be left out, and the values that leave them out.
+# Keys of the terms that can be disabled, with the values that do so.
 SPRING_TERMS: dict[str, float | None] = {"structural": 0.0, "shear": 0.0, "virtual": 0.0, "map": None}
 TISSUE_TERMS: dict[str, float | None] = {
     **dict.fromkeys(("foundation", "damping", "pretension", "bending"), 0.0),
@@ -507,14 +498,14 @@ TISSUE_TERMS: dict[str, float | None] = {
 
 
 def measure_terms(plan: Plan, device: Device, sample: float, study: Study, progress: ProgressCallback) -> None:
-    """Measure the time of a step with each term left out in turn.
+    """Measure the time of a step without each term in turn.
 
     Args:
-        plan: Plan of the scene.
-        device: Device to run on.
-        sample: Approximate time of a measurement [s].
-        study: Receives the results.
-        progress: Called with the number of finished measurements and their total.
+        plan: of the scene.
+        device: runs the simulations.
+        sample: approximate time of a measurement [s].
+        study: receives the results.
+        progress: called with the number of finished measurements and their total.
     """
     # All variants have the step of the full scene, because the automatic step depends on the springs.
     grid = {"steps_per_frame": plan.grid.steps_per_frame, "precision": plan.grid.precision}
@@ -531,13 +522,13 @@ def measure_terms(plan: Plan, device: Device, sample: float, study: Study, progr
         for round_ in range(TERM_ROUNDS):
             for number, (term, sheet) in enumerate(zip(study.terms, sheets, strict=True)):
                 progress(round_ * len(sheets) + number, TERM_ROUNDS * len(sheets))
-                # All variants start from rest, and so step through the same part of the scene.
+                # All variants step through the same part of the scene.
                 sheet.restart(sheet.plan)
                 term.samples.append(_step_seconds(sheet, frames))
 
 
 def scene_variants(scene: Scene) -> Iterator[tuple[str, Scene]]:
-    """List the scene without each of its terms in turn, with the term's key; the first variant is the full scene."""
+    """Yield the full scene with an empty key, then the scene without each of its terms, with the key of the term."""
     yield "", scene
     terms, sheet = (SPRING_TERMS, scene.springs) if scene.tissue is None else (TISSUE_TERMS, scene.tissue)
     assert sheet is not None
@@ -560,8 +551,7 @@ def _step_seconds(dynamics: Dynamics, frames: int) -> float:
     return (time.perf_counter() - start) / steps
 
 
-# Distance from the ends of an interval between keyframes, where loads may jump, at which they are evaluated, as a
-# fraction of the interval.
+# Loads may jump at keyframes: they are evaluated at this distance from them, as a fraction of the interval.
 KEY_MARGIN = 1e-9
 
 Array = NDArray[np.float64]
@@ -572,27 +562,27 @@ class TimeLimitError(Exception):
 
 
 class IntegrationError(Exception):
-    """The solver has no step that is small enough; the message contains the time."""
+    """The step size of the solver has underflowed; the message contains the time."""
 
 
 def solve_with_dop853(
     plan: Plan, rtol: float, atol: float, deadline: float, tick: Callable[[], None]
 ) -> tuple[Array, int]:
-    """Integrate the scene with SciPy's DOP853, between keyframes of the loads, where they are smooth.
+    """Integrate the scene with SciPy's DOP853, in intervals between keyframes, where loads are smooth.
 
     Args:
-        plan: Plan of the scene.
-        rtol: Relative tolerance.
-        atol: Absolute tolerance of displacements [m] and velocities [m/s].
-        deadline: Time limit, on the clock of `time.perf_counter` [s].
-        tick: Called several times a second.
+        plan: of the scene.
+        rtol: relative tolerance.
+        atol: absolute tolerance of displacements [m] and velocities [m/s].
+        deadline: time limit, on the clock of `time.perf_counter` [s].
+        tick: called several times a second.
 
     Returns:
         Displacements at every frame but the first [m], shape (F, rows, cols, 3), and the number of evaluations.
 
     Raises:
-        TimeLimitError: When the deadline has passed.
-        IntegrationError: When SciPy fails.
+        TimeLimitError: when the deadline has passed.
+        IntegrationError: when SciPy fails.
     """
     from scipy.integrate import solve_ivp
 
@@ -629,9 +619,6 @@ def solve_with_dop853(
 def acceleration_function(plan: Plan) -> Callable[[Array, Array, Schedule], Array]:
     """Build the right-hand side of eq. 1, divided by the mass.
 
-    Args:
-        plan: Plan of the scene.
-
     Returns:
         Function of displacements [m] and velocities [m/s], shape (rows, cols, 3), and of a schedule of one step, that
         returns accelerations [m/s2].
@@ -655,7 +642,7 @@ def acceleration_function(plan: Plan) -> Callable[[Array, Array, Schedule], Arra
             decay = probe.decay(np.hypot(x - at_x, y - at_y)) * (shares if probe.by_area else 1)
             force += decay[..., None] * strength
         if material.bending:
-            # Mass points with four neighbours have a moment; those at the border are fixed and need no force.
+            # The bending moment needs four neighbours; the border is fixed.
             moment = np.zeros_like(u)
             moment[1:-1, 1:-1] = material.bending * laplacian(u)
             force[1:-1, 1:-1] -= laplacian(moment)
@@ -665,10 +652,10 @@ def acceleration_function(plan: Plan) -> Callable[[Array, Array, Schedule], Arra
 
 
 def _smooth_intervals(scene: Scene) -> Iterator[tuple[float, float, Array]]:
-    """Split the time at the keyframes into start, end, and the times t of frames with start < t <= end."""
+    """Split the time at the keyframes; yield start, end, and the times t of frames with start < t <= end."""
     frames = np.arange(1, scene.time.frames + 1) / scene.time.frames_per_second
     bounds = [0.0, *keyframe_times(scene), float(frames[-1])]
     for start, end in pairwise(bounds):
-        # A keyframe that differs from the time of a frame only by rounding is at that frame.
+        # The margin absorbs rounding where a keyframe is at a frame.
         inside = frames[(frames > start * (1 + KEY_MARGIN)) & (frames <= end * (1 + KEY_MARGIN))]
         yield start, end, np.minimum(inside, end)

@@ -1,4 +1,4 @@
-"""Picture of a study: work-precision diagrams of stepping, drawing and meshes, and the cost of every term."""
+"""Figure of a study: work-precision diagrams of stepping, drawing and meshes, and the cost of every term."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from taichi_msm.study.format import (
 from taichi_msm.study.result import DrawingMeasurement, Study
 from taichi_msm.system.compiler import compiler_label
 
-# Colour shows the damping difference, dashes and markers the precision.
+# Colours encode the damping difference, dashes and markers the precision.
 DIFFERENCE_COLOURS = {"central": BLUE, "backward": VERMILION}
 PRECISION_LINES: dict[str, dict[str, Any]] = {
     "f32": {"linestyle": "-", "marker": "o"},
@@ -60,18 +60,18 @@ LEGEND_MARKER: dict[str, Any] = {"linestyle": "none", "marker": "o", "color": GR
 SUPERSAMPLE_COLOURS = (SKY, BLUE, GREEN, ORANGE, PURPLE, VERMILION)
 MARKERS = "osD^vPX"
 
-# Mosaic of the panels by their number; the first of three is as high as the others together.
+# Mosaic by the number of panels.
 PANEL_MOSAICS = {1: "A", 2: "AB", 3: "AB;AC", 4: "AB;CD"}
 
 Panel = Callable[[Axes, Study], None]
 
 
 def plot(study: Study, path: Path) -> None:
-    """Draw the measured parts of a study.
+    """Plot the measured parts of a study.
 
     Args:
-        study: Results with at least one of the `panels`.
-        path: PNG file to write.
+        study: results with at least one of the `panels`.
+        path: the PNG file.
     """
     with style.context(STYLE, after_reset=True), warnings.catch_warnings():
         # The name of a scene may contain characters that the font lacks.
@@ -80,7 +80,7 @@ def plot(study: Study, path: Path) -> None:
 
 
 def panels(study: Study) -> Iterator[Panel]:
-    """List the panels that have something to draw."""
+    """Yield the plot functions of the panels with drawable data."""
     if any(_drawable(point.error) for point in study.stepping):
         yield _plot_stepping
     if any(_drawable(drawing.psnr) for drawing in study.drawing):
@@ -92,7 +92,7 @@ def panels(study: Study) -> Iterator[Panel]:
 
 
 def _drawable(value: float | None) -> bool:
-    """Return whether a logarithmic axis can show a value."""
+    """Return whether a logarithmic axis can represent a value."""
     return value is not None and 0 < value < math.inf
 
 
@@ -116,7 +116,6 @@ def _figure(study: Study) -> Figure:
 
 
 def _recommendation_line(study: Study) -> str:
-    """Format the recommendation in a line."""
     settings = [line.strip() for line in study.recommendation() if not line.endswith(":")]
     if study.recommended_points is None and study.best_stepping is None:
         settings.append(f"no step measured is within the tolerance of {study.tolerance:g}")
@@ -146,7 +145,7 @@ def _plot_stepping(axes: Axes, study: Study) -> None:
 
 
 def _plot_line(axes: Axes, points: Sequence[ErrorMeasurement], line: dict[str, Any], label: str) -> Line2D:
-    """Draw a line through measurements, and return its entry in the legend."""
+    """Plot a line through measurements; return its legend handle."""
     points = [point for point in points if _drawable(point.error)]
     errors = [point.error or 0.0 for point in points]
     axes.plot(errors, [point.seconds.median for point in points], **line, zorder=3)
@@ -161,7 +160,7 @@ def _plot_line(axes: Axes, points: Sequence[ErrorMeasurement], line: dict[str, A
 
 
 def _marker_legend(study: Study) -> Iterator[Line2D]:
-    """List the legend entries for the kinds of markers in the picture."""
+    """Yield the legend handles of the plotted kinds of markers."""
     points: list[ErrorMeasurement] = [*study.stepping, *study.peers]
     yield Line2D([], [], **TOLERANCE_LINE, label="tolerance")
     if study.best_stepping is not None:
@@ -249,20 +248,19 @@ def _plot_spread(
     colour: str,
     scale: float = 1,
 ) -> None:
-    """Draw a thin line from the fastest to the slowest run of every measurement."""
+    """Plot the range of the times of every measurement as a thin line."""
     fastest = [scale * point.seconds.fastest for point in points]
     slowest = [scale * point.seconds.slowest for point in points]
     axes.vlines(x, fastest, slowest, color=colour, linewidth=0.7, alpha=0.6)
 
 
 def _extremes(points: Iterable[ErrorMeasurement | DrawingMeasurement]) -> Iterator[float]:
-    """List the fastest and slowest times [s]."""
     for point in points:
         yield from (point.seconds.fastest, point.seconds.slowest)
 
 
 def _scale_errors(axes: Axes, points: Sequence[ErrorMeasurement], tolerance: float, more: Iterable[float] = ()) -> None:
-    """Fit logarithmic axes to times and errors, and mark the tolerance."""
+    """Scale the axes to times and errors, and mark the tolerance."""
     axes.axvline(tolerance, **TOLERANCE_LINE)
     _scale(axes, "x", [*(point.error or 0.0 for point in points), *more, tolerance], 2)
     _scale(axes, "y", _extremes(points), 1)
@@ -276,7 +274,7 @@ def _scale(axes: Axes, axis: str, values: Iterable[float], min_decades: float) -
     axes.set(**{f"{axis}scale": "log", f"{axis}lim": (10 ** (low - margin), 10 ** (high + margin))})
     ticks: Axis = getattr(axes, f"{axis}axis")
     if axis == "y":
-        # Times are written like 0.05 rather than 5 x 10^-2.
+        # 0.05 rather than 5 x 10^-2.
         ticks.set_major_locator(LogLocator(subs=(1, 2, 5) if high - low + 2 * margin < 2.5 else (1,)))
         ticks.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     ticks.set_minor_formatter(NullFormatter())

@@ -1,4 +1,4 @@
-"""Report of a study: the results as JSON, a page in Markdown, a picture, and a summary for the terminal."""
+"""Report of a study: JSON, a page in Markdown, a figure, and a summary for the terminal."""
 
 from __future__ import annotations
 
@@ -39,11 +39,7 @@ WITHOUT_MATPLOTLIB = "study.png needs matplotlib: pip install matplotlib"
 
 
 def require_writable(directory: Path) -> None:
-    """Check before a long measurement that its report can be written.
-
-    Raises:
-        FilesError: When the directory cannot be written.
-    """
+    """Check that a directory can be written; FilesError otherwise."""
     with writing(directory), hidden_folder(directory):
         pass
 
@@ -54,20 +50,20 @@ def write_report(study: Study, directory: Path) -> list[str]:
     Every file is written atomically, study.json last.
 
     Args:
-        study: Results; a note is added to them if the picture cannot be drawn.
-        directory: Directory of the report.
+        study: the results; gets a note if the figure cannot be plotted.
+        directory: of the report.
 
     Returns:
         Names of the files, study.json last.
 
     Raises:
-        FilesError: When the directory cannot be written.
+        FilesError: when the directory cannot be written.
     """
     with writing(directory), hidden_folder(directory) as hidden:
         outputs = [*([PICTURE_FILE] if _draw(study, hidden / PICTURE_FILE) else []), PAGE_FILE, RECORD_FILE]
         record = json.dumps({**study_record(study), "outputs": outputs}, indent=2, ensure_ascii=False, allow_nan=False)
         for file, text in ((PAGE_FILE, format_page(study)), (RECORD_FILE, record + "\n")):
-            # The surrogates of a file name that is not UTF-8 become backslashes, which are valid in JSON too.
+            # Surrogates, of a file name that is not UTF-8, become backslash escapes, which are valid in JSON too.
             (hidden / file).write_text(text, encoding="utf-8", errors="backslashreplace", newline="")
         if PICTURE_FILE not in outputs:
             (directory / PICTURE_FILE).unlink(missing_ok=True)
@@ -77,7 +73,7 @@ def write_report(study: Study, directory: Path) -> list[str]:
 
 
 def study_record(study: Study) -> dict[str, Any]:
-    """Convert a study to data for JSON; non-finite numbers become null."""
+    """Convert a study to JSON data; non-finite numbers become null."""
     return {**_as_data(vars(study)), "recommendation": study.recommendation()}
 
 
@@ -97,7 +93,7 @@ def _as_data(value: Any) -> Any:
 
 
 def _draw(study: Study, path: Path) -> bool:
-    """Draw the picture if Matplotlib is installed and there is something to draw; return whether it was drawn."""
+    """Plot the figure if Matplotlib is installed and a panel has data; return whether it was plotted."""
     try:
         from taichi_msm.study.plot import panels, plot
     except ImportError:
@@ -109,7 +105,7 @@ def _draw(study: Study, path: Path) -> bool:
     try:
         plot(study, path)
     except Exception as error:
-        # Minutes of measurement must not be lost because their picture fails.
+        # A failing plot must not discard minutes of measurements.
         study.notes.append(f"study.png could not be drawn: {type(error).__name__}: {error}")
         return False
     return True
@@ -147,8 +143,6 @@ TERM_COLUMNS: Columns = {
     "without": lambda term: term.without or "nothing",
     "time of a step": lambda term: format_timing(term.seconds),
 }
-# Columns of stepping in the summary.
-SUMMARY_COLUMNS = ("method", "step", "error", "time of the scene")
 
 M = TypeVar("M", SteppingMeasurement, PeerMeasurement)
 
@@ -186,7 +180,7 @@ def format_page(study: Study) -> str:
 
 
 def format_summary(study: Study) -> str:
-    """Format the most important results for the terminal, followed by the recommended lines of a scene."""
+    """Format the main results for the terminal, followed by the recommended lines of a scene file."""
     lines = [f"{printable(study.scene)} on {machine_summary(study)}"]
     if study.reference is not None:
         lines.append(
@@ -198,7 +192,8 @@ def format_summary(study: Study) -> str:
     fastest = [point for point in best if point]
     blocks = ["\n".join(lines)]
     if fastest:
-        blocks.append(_methods_table(study, fastest, {name: STEPPING_COLUMNS[name] for name in SUMMARY_COLUMNS}))
+        names = "method", "step", "error", "time of the scene"
+        blocks.append(_methods_table(study, fastest, {name: STEPPING_COLUMNS[name] for name in names}))
     if peer := _best(study.peers, study.tolerance):
         blocks.append(
             f"SciPy's DOP853 at rtol {peer.rtol:g}: error {format_error(peer)}, {format_timing(peer.seconds)}"
@@ -216,7 +211,7 @@ def format_summary(study: Study) -> str:
 
 
 def remarks(study: Study) -> Iterator[str]:
-    """List remarks on the recommendation, and on the share of the mesh in the error."""
+    """Yield remarks on the recommendation and on the discretisation error (mesh)."""
     mesh, recommended = study.scene_mesh, study.recommended_points
     if recommended is None and study.best_stepping is None:
         yield _shortfall(study)
@@ -246,7 +241,7 @@ def remarks(study: Study) -> Iterator[str]:
 
 
 def _shortfall(study: Study) -> str:
-    """Explain why no step is recommended, and suggest a remedy."""
+    """Return the reason why no step is recommended, and a remedy."""
     closest = _best(study.stepping, study.tolerance)
     if closest is None:
         return "No step is recommended: none was measured."
@@ -297,7 +292,7 @@ def _meshes(study: Study) -> Iterator[str]:
 
 
 def _bounds(points: Sequence[ErrorMeasurement]) -> Iterator[str]:
-    """Explain errors that are upper bounds, if there are any."""
+    """Yield an explanation of errors that are upper bounds, if there are any."""
     if any(format_error(point).startswith("<") for point in points):
         yield "An error with < is an approximate upper bound; the reference is not exact enough to know the error."
 
@@ -318,7 +313,7 @@ def _meshes_table(study: Study) -> str:
 
 
 def _drawings(study: Study) -> Iterator[DrawingMeasurement]:
-    """List, for every supersampling, the refinement that would be recommended with it."""
+    """Yield the best refinement for every supersampling."""
     for supersample in sorted({drawing.supersample for drawing in study.drawing}):
         render = {**study.settings["render"], "supersample": supersample}
         best = replace(study, settings={**study.settings, "render": render}).best_drawing
@@ -327,7 +322,7 @@ def _drawings(study: Study) -> Iterator[DrawingMeasurement]:
 
 
 def _best(points: Sequence[M], tolerance: float) -> M | None:
-    """Return the fastest measurement within the tolerance, or else the most accurate one."""
+    """Return the fastest measurement within the tolerance, otherwise the most accurate one."""
     sufficient = [point for point in points if comparable_error(point) <= tolerance]
     if sufficient:
         return min(sufficient, key=lambda point: point.seconds.median)

@@ -12,16 +12,13 @@ import numpy as np
 
 from taichi_msm.scene.section import MAX_POINTS
 
-# A refinement suffices if no other one with the same supersampling has a PSNR higher by more than this [dB].
+# A refinement suffices within this distance from the best PSNR with the same supersampling [dB].
 PSNR_TOLERANCE_DB = 0.1
-
-# Timings count as equal within this factor.
-TIMING_TOLERANCE = 1.1
 
 
 @dataclass(frozen=True)
 class Timing:
-    """Times of repeated, equal work [s], and the number of repetitions."""
+    """Statistics of the times of repeated runs [s], and their number."""
 
     median: float
     fastest: float
@@ -30,7 +27,7 @@ class Timing:
 
     @classmethod
     def of(cls, samples: Sequence[float]) -> Timing:
-        """Summarise one or more samples [s]."""
+        """Compute the statistics of one or more samples [s]."""
         return cls(statistics.median(samples), min(samples), max(samples), len(samples))
 
 
@@ -39,9 +36,9 @@ class Reference:
     """Reference solution for the errors of stepping: central differences in f64, extrapolated.
 
     Attributes:
-        steps_per_frame: Steps per frame of its finest run.
-        error: Its own error, estimated by halving the step, as a fraction of the largest displacement.
-        largest: Largest displacement of any mass point at any frame [m].
+        steps_per_frame: of its finest run.
+        error: of the reference itself, estimated by halving the step, as a fraction of the largest displacement.
+        largest: largest displacement of any mass point at any frame [m].
     """
 
     steps_per_frame: int
@@ -54,30 +51,30 @@ class Measurement:
     """Measurement of one setting.
 
     Attributes:
-        samples: Times of repeated, equal work [s].
+        samples: times of repeated runs [s].
     """
 
     samples: list[float] = field(default_factory=list, kw_only=True)
 
     @property
     def seconds(self) -> Timing:
-        """Summary of the samples, of which there must be at least one."""
+        """Statistics of the samples, at least one."""
         return Timing.of(self.samples)
 
 
 @dataclass
 class SteppingMeasurement(Measurement):
-    """Measurement of stepping through the whole scene with one method and step, compiled and warm.
+    """Measurement of stepping through the whole scene with one method and step, without compilation.
 
     Attributes:
-        precision: Precision, f32 or f64.
-        damping_difference: Difference of the damping, central or backward.
-        steps_per_frame: Steps per frame.
-        step: Time step h [s].
-        error: Largest error of any mass point at any frame, as a fraction of the largest displacement; None if the
+        precision: f32 or f64.
+        damping_difference: central or backward.
+        steps_per_frame: number of steps per frame.
+        step: time step h [s].
+        error: largest error of any mass point at any frame, as a fraction of the largest displacement; None if the
             simulation diverged.
-        rounding: Part of the error that comes from f32; None for f64.
-        known: Whether the reference is exact enough to determine this error; otherwise it is an approximate bound.
+        rounding: difference from f64 with the same step, as a fraction of the largest displacement; None if not known.
+        known: whether the reference is accurate enough for this error; otherwise `error` is an approximate bound.
     """
 
     precision: str
@@ -99,10 +96,10 @@ class PeerMeasurement(Measurement):
     """Measurement of SciPy's DOP853 on the same equations, for the whole scene.
 
     Attributes:
-        rtol: Relative tolerance; the absolute one is rtol x the largest displacement / 10.
-        error: Error, as in `SteppingMeasurement`.
-        known: Whether the error is exact, as in `SteppingMeasurement`.
-        evaluations: Number of evaluations of the forces.
+        rtol: relative tolerance; the absolute one is rtol x the largest displacement / 10.
+        error: as in `SteppingMeasurement`.
+        known: as in `SteppingMeasurement`.
+        evaluations: number of evaluations of the forces.
     """
 
     rtol: float
@@ -116,10 +113,10 @@ class DrawingMeasurement(Measurement):
     """Measurement of drawing the most deformed frame.
 
     Attributes:
-        refine: Refinement.
-        supersample: Supersampling.
-        psnr: PSNR against a picture of high refinement and supersampling [dB]; None if both are equal.
-        largest_error: Largest error of any colour of any pixel, 0 to 255.
+        refine: refinement of the surface.
+        supersample: samples per pixel along each axis.
+        psnr: against a picture of high refinement and supersampling [dB]; None if both are equal.
+        largest_error: largest error of any colour channel of any pixel, 0 to 255.
     """
 
     refine: int
@@ -133,12 +130,12 @@ class MeshMeasurement(Measurement):
     """Measurement of stepping tissue with another mesh through the whole scene, in f64.
 
     Attributes:
-        rows: Rows of mass points.
-        cols: Columns of mass points.
-        steps_per_frame: Steps per frame of the automatic step on this mesh.
-        error: Discretisation error of the mesh, at the mass points and between them, as in `SteppingMeasurement`.
-        known: Whether the error is exact, as in `SteppingMeasurement`.
-        estimate: Estimate of this error by the companion runs of `run`; None if unknown.
+        rows: rows of mass points.
+        cols: columns of mass points.
+        steps_per_frame: of the automatic step on this mesh.
+        error: discretisation error of the mesh, at the mass points and between them, as in `SteppingMeasurement`.
+        known: as in `SteppingMeasurement`.
+        estimate: of this error by the companion run of `run`; None if unknown.
     """
 
     rows: int
@@ -159,7 +156,7 @@ class TermMeasurement(Measurement):
     """Measurement of a step without one term of the model.
 
     Attributes:
-        without: Key of the term that is left out; empty for the full model.
+        without: key of the term; empty for the full model.
     """
 
     without: str
@@ -167,22 +164,22 @@ class TermMeasurement(Measurement):
 
 @dataclass
 class Study:
-    """Speed against error of a scene on a machine.
+    """Results of a study: speed against error of a scene on a machine.
 
     Attributes:
-        scene: Name of the scene.
-        settings: The scene with its defaults filled in.
+        scene: name of the scene.
+        settings: the scene with its defaults filled in.
         status: complete or interrupted.
-        tolerance: Largest allowed error, as a fraction of the largest displacement.
+        tolerance: largest allowed error, as a fraction of the largest displacement.
         machine: CPU, cores, arch, threads, bits of a vector, and versions.
-        reference: Reference solution; None if the study was interrupted before it was computed.
-        stepping: Measurements of stepping, by method and then by decreasing step.
-        orders: Result of `observed_orders`.
-        peers: Measurements of DOP853.
-        drawing: Measurements of drawing, by supersampling and refinement; empty without a picture.
-        points: Measurements of meshes, from coarse to fine; empty for springs.
-        terms: Measurements without single terms; the first is of the full model.
-        notes: Remarks for the reader, such as omitted parts and the reason.
+        reference: reference solution; None if the study was interrupted before it was computed.
+        stepping: measurements of stepping, by method and then by decreasing step.
+        orders: of convergence, as returned by `observed_orders`.
+        peers: measurements of DOP853.
+        drawing: measurements of drawing, by supersampling and refinement; empty without a picture.
+        points: measurements of meshes, from coarse to fine; empty for springs.
+        terms: measurements without single terms; the first is of the full model.
+        notes: remarks for the reader, such as omitted parts and the reason.
     """
 
     scene: str
@@ -200,7 +197,7 @@ class Study:
     notes: list[str] = field(default_factory=list)
 
     def finish(self) -> None:
-        """Remove settings that were not timed, sort the measurements of stepping, and fit their orders."""
+        """Remove measurements without timings, sort those of stepping, and fit the orders of convergence."""
         self.stepping = sorted(
             (point for point in self.stepping if point.samples),
             key=lambda point: (point.precision, point.damping_difference != "central", point.steps_per_frame),
@@ -230,8 +227,8 @@ class Study:
     def recommended_points(self) -> tuple[int, int] | None:
         """Rows and columns of mass points with an error within the tolerance; None if the scene's own mesh suffices.
 
-        This is the coarsest sufficient mesh that was measured, or else an extrapolation: the error decreases with the
-        power of the cell size that the two finest meshes show, limited to 1 to 2. It may be finer than a scene allows.
+        This is the coarsest sufficient mesh that was measured, otherwise an extrapolation with the order of convergence
+        of the two finest meshes, limited to 1 to 2. It may be finer than a scene allows.
         """
         scene_mesh, allowed = self.scene_mesh, self.mesh_tolerance
         if scene_mesh is None or scene_mesh.error is None or scene_mesh.error <= allowed:
@@ -251,22 +248,22 @@ class Study:
 
     @property
     def best_stepping(self) -> SteppingMeasurement | None:
-        """Fastest stepping within the tolerance, or the most accurate of those that are equally fast.
+        """Fastest stepping within the tolerance, or the most accurate of those within 10 % of its time.
 
         None if there is none, or if the scene needs another mesh, for which no step was measured. Only the largest step
-        of every method counts, so that the noise of the clock cannot prefer a smaller one.
+        of every method is considered, as timing noise could favour a smaller one.
         """
         if self.recommended_points is not None:
             return None
         sufficient = [point for point in self.stepping if point.error is not None and point.error <= self.tolerance]
         largest = {point.method: point for point in sorted(sufficient, key=lambda point: point.step)}
         fastest = min((point.seconds.median for point in largest.values()), default=0.0)
-        equal = [point for point in largest.values() if point.seconds.median <= TIMING_TOLERANCE * fastest]
+        equal = [point for point in largest.values() if point.seconds.median <= 1.1 * fastest]
         return min(equal, key=lambda point: point.error or 0.0, default=None)
 
     @property
     def best_drawing(self) -> DrawingMeasurement | None:
-        """Fastest sufficient refinement at the scene's own supersampling; None without one."""
+        """Fastest sufficient refinement at the scene's own supersampling; None if not measured."""
         supersample = self.settings["render"]["supersample"]
         decibels = [
             (math.inf if drawing.psnr is None else drawing.psnr, drawing)
@@ -294,7 +291,7 @@ class Study:
             if self.settings["time"]["tolerance"] is not None:
                 lines.append("  tolerance: null")
             lines += [
-                # All digits are written, as the largest stable step exceeds the limit if it is rounded up.
+                # With all digits: rounded up, the largest stable step would exceed the limit.
                 f"  step: {step.step!r}",
                 f"  damping_difference: {step.damping_difference}",
                 f"  precision: {step.precision}",
@@ -305,13 +302,10 @@ class Study:
 
 
 def observed_orders(points: list[SteppingMeasurement]) -> dict[str, float | None]:
-    """Fit the order of every method to the measurements whose error comes from the step.
-
-    Args:
-        points: Measurements of stepping.
+    """Fit the order of convergence of every method to the measurements whose error is due to the step.
 
     Returns:
-        The order by the name of the method; None for fewer than three such measurements.
+        Order by the name of the method; None for fewer than three such measurements.
     """
     orders: dict[str, float | None] = {}
     for method in dict.fromkeys(point.method for point in points):

@@ -29,7 +29,7 @@ from taichi_msm.system import process, runtime
 from taichi_msm.system.compiler import versions
 from taichi_msm.system.runtime import Device
 
-# Subject of the notes about the integrator that the study compares with, and their end.
+# Beginning and end of the notes about DOP853.
 DOP853_SUBJECT = "DOP853, SciPy's general integrator, which the study compares its own steps with,"
 DOP853_INDEPENDENCE = "no other figure depends on it"
 
@@ -38,10 +38,10 @@ class TimeBudget(NamedTuple):
     """Time budget of the parts of a study.
 
     Attributes:
-        longest_run: Time to step through the whole scene once [s].
-        peer: Time of SciPy for each of its tolerances [s].
-        peer_rtols: Relative tolerances of SciPy.
-        sample: Time of one measurement of a step [s].
+        longest_run: limit of a run of the whole scene [s].
+        peer: limit of DOP853 for each of its tolerances [s].
+        peer_rtols: relative tolerances of DOP853.
+        sample: time of one measurement of a step [s].
     """
 
     longest_run: float
@@ -67,22 +67,19 @@ def run_study(
     """Measure the cost and the error of the settings of a scene on this machine.
 
     Args:
-        scene: Scene or its plan.
-        name: Name of the scene for the report.
-        tolerance: Largest allowed error, as a fraction of the largest displacement; None for the scene's, or else 1e-3.
-        quick: Whether to measure fewer settings, in about a minute for a small sheet.
-        arch: Architecture to run on.
-        threads: Number of CPU threads; None for every core.
-        progress: Called with the stage, the finished part and the total; after a KeyboardInterrupt from it the study
+        scene: the scene or its plan.
+        name: of the scene, in the report.
+        tolerance: largest allowed error, as a fraction of the largest displacement; None: the scene's, otherwise 1e-3.
+        quick: whether to measure fewer settings, in about a minute for a small sheet.
+        arch: cpu, cuda or vulkan.
+        threads: number of CPU threads; None: one per core.
+        progress: called with the stage, the finished part and the total; after a KeyboardInterrupt from it the study
             returns the results so far.
 
-    Returns:
-        The results.
-
     Raises:
-        SceneError: When the scene is quasi-static, the picture cannot be decoded, or the trajectories do not fit in
+        SceneError: when the scene is quasi-static, the picture cannot be decoded, or the trajectories do not fit in
             memory.
-        DeviceError: When the arch is not available.
+        DeviceError: when the arch is not available.
     """
     plan, device = check_scene(scene), runtime.start(arch, threads)
     scene = plan.scene
@@ -123,7 +120,7 @@ def run_study(
 
 
 def machine_record(device: Device) -> dict[str, Any]:
-    """Describe the machine of the study for its record."""
+    """Return the machine of a study as JSON data."""
     return {
         "cpu": process.processor_name(),
         "cores": os.cpu_count(),
@@ -136,7 +133,7 @@ def machine_record(device: Device) -> dict[str, Any]:
 
 def _require_memory(scene: Scene) -> None:
     rows, cols = scene.sheet.points
-    # Six trajectories are in memory at a time: the reference, and those that it is made of or compared with.
+    # At most six trajectories are in memory: the reference, and those of its extrapolation and comparison.
     needed = 6 * scene.time.frames * rows * cols * 3 * 8
     available = process.available_memory()
     if needed > available:
@@ -150,7 +147,7 @@ def _require_memory(scene: Scene) -> None:
 def _measure_peer(
     plan: Plan, stepping: SteppingStudy, budget: TimeBudget, results: Study, progress: StageProgressCallback
 ) -> None:
-    """Measure DOP853 at several tolerances, up to five times each within the time budget."""
+    """Measure DOP853 at several tolerances, at most five times each, within the time budget."""
     assert results.reference is not None
     if plan.tools:
         results.notes.append(f"{DOP853_SUBJECT} is left out, as it knows no contact; {DOP853_INDEPENDENCE}")

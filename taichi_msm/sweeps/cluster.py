@@ -1,7 +1,7 @@
 """A dask.distributed cluster as a `concurrent.futures` executor.
 
-A worker plugin sends the scene and its files to every worker once, also to workers that join later. Apart from that, a
-worker needs this package and access to the directory of the sweep.
+A worker plugin sends the scene and its files to every worker once, including workers that join later. A worker needs
+this package and access to the directory of the sweep.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from taichi_msm.system.compiler import result_versions, versions
 # Time limit for the answer of a scheduler [s].
 MAX_WAIT_S = 10
 
-# Requirements of transports in addition to dask.
+# Further requirements of transports.
 _CERTIFICATES = "certificates; name them in dask's configuration, under distributed.comm.tls"
 TRANSPORT_REQUIREMENTS = {
     "tls": _CERTIFICATES,
@@ -44,10 +44,10 @@ TRANSPORT_REQUIREMENTS = {
 
 
 class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
-    """Worker plugin with the inputs that all runs of a sweep share.
+    """Worker plugin with the common inputs of all runs of a sweep.
 
     Args:
-        sweep: the sweep.
+        sweep: has the scene and the files.
         directory: of the sweep.
 
     Attributes:
@@ -57,7 +57,7 @@ class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
 
     def __init__(self, sweep: Sweep, directory: Path) -> None:
         scene = sweep.scene
-        # The current directory may not exist on the machine of a worker, so paths must be absolute.
+        # Paths are absolute, as the current directory may not exist on a worker's machine.
         self.scene, self.directory = scene._replace(folder=scene.folder.absolute()), directory.absolute()
         self.home = Path.cwd()
         self.versions = result_versions(versions(), "cpu")
@@ -69,7 +69,7 @@ class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
         self._ended = False
 
     def setup(self, worker: Any) -> None:
-        """Write the files into a temporary folder of the worker.
+        """Write the files to a temporary folder of the worker.
 
         Raises:
             ExecutorError: when the worker cannot execute runs.
@@ -86,13 +86,13 @@ class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
         self.copies = {path: self._folder / digest for path, digest in self._digests.items()}
 
     def teardown(self, worker: Any) -> None:  # noqa: ARG002
-        """Stop the run of the worker, as the worker or the sweep ends."""
+        """Stop the worker's run, at the end of the worker or the sweep."""
         self._ended = True
         if self.copies:
             shutil.rmtree(self._folder, ignore_errors=True)
 
     def pause(self, _stage: str, _done: int, _total: int) -> None:
-        """Interrupt a run after `teardown`; a `Progress` callback."""
+        """Interrupt a run after `teardown`; a progress callback."""
         if self._ended:
             raise KeyboardInterrupt
 
@@ -100,7 +100,7 @@ class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
         """Return the reason why a worker cannot execute runs, or an empty string."""
         if (threads := worker.state.nthreads) != 1:
             return f"worker {worker.address} has {threads} threads; start it with one: dask worker --nthreads 1"
-        # Results that a worker writes into a local directory would be lost.
+        # Results in a directory of the worker itself would be lost.
         if not (self.directory / SWEEP_RECORD).is_file():
             return f"worker {worker.address} does not see {self.directory}; choose an --out that all machines share"
         installed = versions()
@@ -112,7 +112,7 @@ class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
 
 
 class Cluster(Executor):
-    """Executor of the workers of a scheduler; of each run it sends only the number and the overrides."""
+    """Executor for the workers of a scheduler, which sends only the number and the overrides of each run."""
 
     def __init__(self, client: Any, name: str) -> None:
         self._executor, self._name = client.get_executor(pure=False), name
@@ -121,7 +121,7 @@ class Cluster(Executor):
         """Schedule a call in an idle worker.
 
         Args:
-            function: the function, which must be importable.
+            function: an importable function.
             *arguments: its positional arguments; named ones are not supported.
         """
         result: Future[Any] = Future()
@@ -138,17 +138,17 @@ class Cluster(Executor):
         return result
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Wait for all calls, or cancel calls that have not begun.
+        """Shut down the executor.
 
         Args:
             wait: whether to wait for all calls.
-            cancel_futures: whether to cancel calls that have not begun, without waiting for the others.
+            cancel_futures: whether to cancel pending calls, without waiting for running ones.
         """
         self._executor.shutdown(wait and not cancel_futures)
 
 
 def _forward_result(result: Future[Any], dask_future: Future[Any]) -> None:
-    """Copy the result of a call, with a reproducible message for workers that died."""
+    """Forward the result of a call, with a reproducible message for dead workers."""
     if dask_future.cancelled():
         _cancel(result)
     elif isinstance(error := dask_future.exception(), KilledWorker):
@@ -165,7 +165,7 @@ def _cancel(result: Future[Any]) -> None:
 
 
 def _call(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a function in a worker, which reads its local copies of the files."""
+    """Call a function in a worker, with its local copies of the files."""
     with use_copies(_inputs(name).copies):
         return function(*arguments)
 
@@ -177,12 +177,12 @@ def _execute_run(name: str, run: int, overrides: tuple[str, ...]) -> Outcome:
         outcome: Outcome = _call(name, execute_run, task, inputs.pause)
         inputs.pause("", 0, 0)
         return outcome
-    # The run was interrupted as its worker ends, so another worker must execute it.
+    # The worker ends; another one must execute the run.
     raise Reschedule
 
 
 def _inputs(name: str) -> Inputs:
-    """Return the inputs that this worker was sent."""
+    """Return the inputs of this worker."""
     inputs: Inputs | None = get_worker().plugins.get(name)
     if inputs is None:
         raise ExecutorError("another command for the same folder has ended meanwhile")
@@ -195,21 +195,21 @@ def _inputs(name: str) -> Inputs:
 def cluster_connection(
     address: str, sweep: Sweep, directory: Path, progress: StageProgressCallback
 ) -> Iterator[Cluster]:
-    """Connect to a scheduler, and provide its workers with the inputs of a sweep until the block ends.
+    """Connect to a scheduler, and provide its workers with the inputs of a sweep within the block.
 
     Args:
         address: of the scheduler, such as tcp://10.0.0.1:8786.
         sweep: the sweep.
         directory: of the sweep.
-        progress: called while the first worker is awaited.
+        progress: called while waiting for the first worker.
 
     Raises:
         ExecutorError: when no scheduler answers, or a worker cannot execute runs.
-        LostExecutorError: when the connection is lost within the block; replaces the error of the block.
+        LostExecutorError: when the connection is lost within the block, in place of the error of the block.
     """
     with silence_logging_cmgr(logging.CRITICAL):
         client = _client(address)
-        # The name is unique per directory, so a new command replaces the plugin of a killed one.
+        # With a name per directory, a new command replaces the plugin of a killed one.
         name = f"taichi-msm {directory.absolute()}"
         cluster, lost = Cluster(client, name), False
         try:
@@ -217,13 +217,13 @@ def cluster_connection(
             _wait_for_worker(client, progress)
             yield cluster
         except ExecutorError as error:
-            # Within the block, runs are cancelled only when the connection is lost.
+            # Within the block, runs are cancelled only by a lost connection.
             if lost := isinstance(error.__cause__, (CancelledError, OSError)):
                 raise LostExecutorError(f"lost the scheduler at {address}") from error
             raise
         finally:
             if not lost:
-                # The connection may be lost now, or another command for this directory may have removed the plugin.
+                # The connection may be lost, or another command for this directory may have removed the plugin.
                 with suppress(OSError, ValueError):
                     cluster.shutdown(cancel_futures=True)
                     client.unregister_worker_plugin(name)
@@ -233,7 +233,7 @@ def cluster_connection(
 def _client(address: str) -> Any:
     remedy = "give the address that `dask scheduler` prints, such as tcp://10.0.0.1:8786"
     try:
-        # A client would wait forever for the handshake of another program, such as the scheduler's web page.
+        # A client would wait forever for the handshake of another service, such as the scheduler's web page.
         LoopRunner(asynchronous=False).run_sync(_check_scheduler, address)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # `Inputs` compares versions.
@@ -254,13 +254,13 @@ async def _check_scheduler(address: str) -> None:
 
 
 def _register_inputs(inputs: Inputs, name: str, client: Any) -> None:
-    """Send the inputs to all workers, also to workers that join later."""
+    """Send the inputs to all workers, including later ones."""
     try:
         client.register_plugin(inputs, name=name)
     except ExecutorError:
         raise
     except Exception as error:
-        # Unpickling the inputs raises an arbitrary error if a worker lacks a package.
+        # Unpickling raises an arbitrary error if a worker lacks a package.
         raise ExecutorError(f"a worker cannot take runs: {error}; install there what is here") from None
 
 

@@ -1,15 +1,15 @@
 """Plots of a sweep: results against parameters, a contact sheet of last frames, and first-order sensitivities.
 
-The first-order sensitivity index is the share of a result's variance that one parameter explains alone.
+The first-order sensitivity index is the share of a result's variance explained by one parameter alone.
 
 Source: Plischke, "An effective algorithm for computing global sensitivity indices (EASI)", 2010, and Tissot and Prieur,
 "Bias correction for the estimation of sensitivity indices based on random balance designs", 2012; both as RBD-FAST of
-SALib. The method takes the results in the order of one parameter and assumes that the other parameters then come at
-random. In Sobol points and grids they do not: of two neighbours in one coordinate, one is low and the other high in
-another coordinate. So neighbours are shuffled, and the index is the mean over several shuffles. (Without shuffling, the
-index for y of 3 x + y from 64 Sobol points has a root-mean-square error of 0.3; with it, of 0.07.)
+SALib. The method sorts the results by one parameter, and assumes that the others are then in random order. In Sobol
+points and grids they are not: neighbours in one coordinate alternate between low and high values of another. Therefore
+neighbours are shuffled, and the index is the mean over several shuffles. (From 64 Sobol points, the index for y of
+3 x + y has a root-mean-square error of 0.3 without shuffling, and of 0.07 with it.)
 
-Matplotlib and SALib are optional, so they are imported in the functions that need them.
+Matplotlib and SALib are optional, and imported where they are needed.
 """
 
 from __future__ import annotations
@@ -39,21 +39,18 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MAX_PANEL_COLUMNS = 8
-
-# Width and height of a panel, and the margins left of and above all panels [in].
-PANEL_WIDTH_IN, PANEL_HEIGHT_IN, LEFT_MARGIN_IN, TOP_MARGIN_IN = 1.75, 1.55, 0.9, 1.3
+PANEL_WIDTH_IN = 1.75
 
 CHARACTERS_PER_INCH = 17
 
-# Margin between the dots and the ends of an axis, as a fraction of the axis.
+# Margin at the ends of an axis, as a fraction of its length.
 AXIS_MARGIN = 0.05
 
 UNITS = {"max_displacement": " [m]", "force": " [N]", "greatest": " [N]"}
 
 
 class PlotData(NamedTuple):
-    """Data of sweep.png. Every array has shape (runs,)."""
+    """Data of sweep.png; arrays have shape (runs,)."""
 
     title: str
     parameters: Sequence[VariedParameter]
@@ -63,9 +60,7 @@ class PlotData(NamedTuple):
 
 
 def plot(data: PlotData, file: BinaryIO) -> None:
-    """Draw a PNG with a panel for each pair of a result and a parameter.
-
-    If there are too many parameters, only those with the largest sensitivity are drawn.
+    """Plot sweep.png, with a panel for each result and each of the most sensitive parameters.
 
     Args:
         data: results and parameters of the runs.
@@ -79,7 +74,7 @@ def plot(data: PlotData, file: BinaryIO) -> None:
     with style.context(STYLE, after_reset=True), warnings.catch_warnings():
         # A name may contain characters that the font lacks.
         warnings.filterwarnings("ignore", "Glyph .* missing")
-        # The default metadata contains the version of Matplotlib, which would change the file.
+        # The default metadata contains the version of Matplotlib.
         _figure(data).savefig(file, format="png", metadata={"Software": None})
 
 
@@ -91,8 +86,8 @@ def _figure(data: PlotData) -> Figure:
 
     indices = {(index.result, index.parameter): index for index in data.indices}
     parameters = _most_sensitive(data)
-    width = max(LEFT_MARGIN_IN + PANEL_WIDTH_IN * len(parameters), ONE_COLUMN_WIDTH)
-    height = TOP_MARGIN_IN + PANEL_HEIGHT_IN * len(data.results)
+    width = max(0.9 + PANEL_WIDTH_IN * len(parameters), ONE_COLUMN_WIDTH)
+    height = 1.3 + 1.55 * len(data.results)
     figure = Figure(figsize=(width, height), dpi=DPI, layout=ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.06))
     FigureCanvasAgg(figure)
     figure.suptitle(printable(data.title), x=0.01, ha="left", parse_math=False)
@@ -115,12 +110,12 @@ def _figure(data: PlotData) -> Figure:
 
 
 def _most_sensitive(data: PlotData) -> list[VariedParameter]:
-    """Choose the parameters that are drawn, in their original order."""
+    """Return the eight most sensitive parameters, in their original order."""
     largest = dict.fromkeys((parameter.name for parameter in data.parameters), -math.inf)
     for index in data.indices:
         largest[index.parameter] = max(index.first_order, largest[index.parameter])
     ranked = sorted(data.parameters, key=lambda parameter: -largest[parameter.name])
-    chosen = {parameter.name for parameter in ranked[:MAX_PANEL_COLUMNS]}
+    chosen = {parameter.name for parameter in ranked[:8]}
     return [parameter for parameter in data.parameters if parameter.name in chosen]
 
 
@@ -136,10 +131,10 @@ def _legend(data: PlotData, drawn: Sequence[VariedParameter]) -> Iterator[str]:
 
 
 def _plot_runs(axes: Axes, parameter: VariedParameter, numbers: NDArray[np.float64], failed: NDArray[np.bool_]) -> None:
-    """Draw a dot for each run, and a cross at the bottom edge for each failed run."""
+    """Plot a dot for each run, and a cross at the bottom edge for each failed run."""
     x = parameter.numbers
     if parameter.labels:
-        # Random offsets keep the dots of one label apart.
+        # Random offsets separate the dots of a label.
         x = x + 0.3 * (np.random.default_rng(0).random(len(x)) - 0.5)
     area_pt2 = float(np.clip(900 / len(x), 1.5, 12))
     axes.scatter(x, numbers, area_pt2, color=BLUE, alpha=0.6, linewidths=0)
@@ -148,7 +143,7 @@ def _plot_runs(axes: Axes, parameter: VariedParameter, numbers: NDArray[np.float
 
 
 def _plot_index(axes: Axes, index: SensitivityIndex) -> None:
-    """Draw the index as a bar over a panel; the panel's width is 1."""
+    """Plot the index as a bar above a panel, whose width is 1."""
     low, middle, high = (
         min(max(value, 0.0), 1.0)
         for value in (index.first_order - index.confidence, index.first_order, index.first_order + index.confidence)
@@ -167,7 +162,7 @@ def _format_axis(axes: Axes, parameter: VariedParameter) -> None:
     axes.set_xlabel(name, parse_math=False)
     if parameter.labels:
         labels = [textwrap.shorten(printable(label), 12, placeholder="…") for label in parameter.labels]
-        # More than 20 characters do not fit next to each other under a panel.
+        # A panel has space for 20 characters.
         rotated: dict[str, Any] = (
             {"rotation": 30, "ha": "right", "rotation_mode": "anchor"} if sum(map(len, labels)) > 20 else {}
         )
@@ -180,7 +175,7 @@ def _format_axis(axes: Axes, parameter: VariedParameter) -> None:
     else:
         axes.xaxis.set_major_locator(MaxNLocator(3))
     axes.xaxis.set_major_formatter(FuncFormatter(_tick_label))
-    # The limits cover all runs, as failed runs may lie outside the range of the others.
+    # The limits include failed runs.
     axes.set_xlim(*_axis_limits(parameter))
 
 
@@ -193,7 +188,7 @@ def _axis_limits(parameter: VariedParameter) -> tuple[float, float]:
 
 
 def _tick_label(number: float, _: int) -> str:
-    """Format a number in full, as a common exponent above the axis would overlap the sensitivity bar."""
+    """Format a number with its exponent, as a common one above the axis would overlap the sensitivity bar."""
     if number == 0 or 1e-3 <= abs(number) < 1e5:
         return f"{number:.10g}"
     digits, exponent = f"{number:.10e}".split("e")
@@ -202,21 +197,17 @@ def _tick_label(number: float, _: int) -> str:
 
 WITHOUT_PICTURES = f"{CONTACT} needs pictures of the runs; take set: {{output: [png]}}, or trajectory, and an image"
 
-MAX_TILES, MAX_TILE_COLUMNS = 36, 8
-
-# Smallest width of a tile, and largest width of the contact sheet [px].
-MIN_TILE_WIDTH_PX, MAX_SHEET_WIDTH_PX = 330, 2200
-GAP_PX, FONT_SIZE_PX, LINE_HEIGHT_PX = 20, 17, 23
+GAP_PX, LINE_HEIGHT_PX = 20, 23
 
 MAX_CAPTION_LINES = 8
 
 
 class Tile(NamedTuple):
-    """A run in the contact sheet."""
+    """Run in the contact sheet."""
 
-    frame: Image.Image | None  # the last frame of the run
-    status: str  # written in place of a missing frame
-    caption: list[str]  # parts between which lines may break
+    frame: Image.Image | None  # last frame of the run
+    status: str  # in place of a missing frame
+    caption: list[str]  # unbreakable parts
 
 
 def write_contact_sheet(
@@ -227,12 +218,12 @@ def write_contact_sheet(
     Args:
         result: the finished sweep.
         executor: draws the runs that have a trajectory but no pictures.
-        progress: called with the stage, the frames drawn and the frames to draw.
+        progress: called with the stage, the drawn and the total number of frames.
 
     Returns:
-        The names of the files written, and warnings for the user.
+        Names of the written files, and warnings.
     """
-    runs = result.sample_runs(MAX_TILES)
+    runs = result.sample_runs(36)
     complete = [run for run in runs if result.outcomes[run].status == "complete"]
     frames, errors = _last_frames({run: result.run_directory(run) for run in complete}, executor, progress)
     if not frames:
@@ -257,7 +248,7 @@ def write_contact_sheet(
 
 
 def draw_last_frame(directory: Path) -> NDArray[np.uint8]:
-    """Draw the last frame of the run in a directory, on one thread; returns shape (height, width, 3)."""
+    """Draw the last frame of the run in a directory on one thread, shape (height, width, 3)."""
     from taichi_msm.runs.playback import Playback
 
     with Playback(directory, threads=1) as run:
@@ -267,7 +258,7 @@ def draw_last_frame(directory: Path) -> NDArray[np.uint8]:
 def _last_frames(
     directories: dict[int, Path], executor: Executor, progress: StageProgressCallback
 ) -> tuple[dict[int, Image.Image], list[str]]:
-    """Read or draw the last frames of complete runs; returns them by run, and the errors."""
+    """Read or draw the last frames of complete runs; return them by run, and the errors."""
     frames: dict[int, Image.Image] = {}
     futures: dict[int, Future[NDArray[np.uint8]]] = {}
     errors = []
@@ -302,9 +293,9 @@ def read_last_frame(path: Path) -> Image.Image:
 
 
 def _column_count(result: SweepResult, tiles: int) -> int:
-    """Choose the number of columns: the values of a grid's last key, otherwise about the number of rows."""
+    """Choose the number of columns: that of the values of a grid's last key, otherwise about that of the rows."""
     last = list(result.sweep.settings.vary.values())[-1]
-    if tiles == len(result.outcomes) and last.kind == "grid" and 1 < len(last.values) <= MAX_TILE_COLUMNS:
+    if tiles == len(result.outcomes) and last.kind == "grid" and 1 < len(last.values) <= 8:
         return len(last.values)
     square = math.ceil(math.sqrt(tiles))
     return min(square, square + 1, key=lambda columns: -tiles % columns)
@@ -312,10 +303,11 @@ def _column_count(result: SweepResult, tiles: int) -> int:
 
 def _draw_tiles(tiles: Sequence[Tile], columns: int, heading: str) -> Image.Image:
     frames = [tile.frame for tile in tiles if tile.frame]
-    max_width = (MAX_SHEET_WIDTH_PX - GAP_PX) // columns - GAP_PX
-    width = min(max(MIN_TILE_WIDTH_PX, *(frame.width for frame in frames)), max_width)
+    # The contact sheet is at most 2200 px wide, and a tile at least 330 px.
+    max_width = (2200 - GAP_PX) // columns - GAP_PX
+    width = min(max(330, *(frame.width for frame in frames)), max_width)
     height = round(width * min(2, median(frame.height / frame.width for frame in frames)))
-    font = ImageFont.load_default(FONT_SIZE_PX)
+    font = ImageFont.load_default(17)
     captions = [_wrap(tile.caption, lambda text: font.getlength(text) <= width) for tile in tiles]
     caption_height = LINE_HEIGHT_PX * max(map(len, captions)) + GAP_PX
     rows = math.ceil(len(tiles) / columns)
@@ -338,14 +330,14 @@ def _draw_tiles(tiles: Sequence[Tile], columns: int, heading: str) -> Image.Imag
 
 
 def _wrap(parts: Iterable[str], fits: Callable[[str], bool]) -> list[str]:
-    """Wrap parts into lines; a part that is longer than a line and excess lines are cut off."""
+    """Wrap parts into lines; long parts and excess lines are truncated."""
     lines = [""]
     for part in parts:
         longer = f"{lines[-1]}   {part}".lstrip()
         if fits(longer):
             lines[-1] = longer
             continue
-        # No line is longer than 300 characters, so a long value is not measured character by character.
+        # A limit above the length of any line bounds the number of iterations.
         cut = part[:300]
         while not fits(cut):
             cut = f"{cut[:-2]}…"
@@ -354,7 +346,7 @@ def _wrap(parts: Iterable[str], fits: Callable[[str], bool]) -> list[str]:
 
 
 def abbreviate_keys(keys: Sequence[str]) -> list[str]:
-    """Shorten each dotted key to its shortest suffix that starts with a word and ends no other key."""
+    """Abbreviate dotted keys to their shortest unambiguous suffix that starts with a word."""
     return [next(name for name in _suffixes(key) if _is_unambiguous(name, key, keys)) for key in keys]
 
 
@@ -372,7 +364,7 @@ def format_short(value: Any) -> str:
 
 
 def _suffixes(key: str) -> Iterable[str]:
-    """Return the suffixes of a dotted key, the shortest first."""
+    """Return the suffixes of a dotted key, from short to long."""
     parts = key.split(".")
     return (".".join(parts[start:]) for start in reversed(range(len(parts))))
 
@@ -383,26 +375,21 @@ def _is_unambiguous(name: str, key: str, keys: Sequence[str]) -> bool:
     )
 
 
-# A parameter with at most this many non-numeric values has a label for each.
+# Largest number of labels of a parameter; with more values, it has none.
 MAX_LABELS = 8
 
 
 class VariedParameter(NamedTuple):
-    """A parameter that differs between runs: a number, or the index of a value in a list."""
+    """Parameter that differs between runs."""
 
-    name: str  # the abbreviated key, with the index of a list's component
-    numbers: NDArray[np.float64]  # shape (runs,)
+    name: str  # abbreviated key, with the index of a list's component
+    numbers: NDArray[np.float64]  # values, or indices of non-numeric values; shape (runs,)
     is_logarithmic: bool = False
-    labels: Sequence[str] = ()  # of the values, if they are at most MAX_LABELS
+    labels: Sequence[str] = ()  # of at most MAX_LABELS non-numeric values
 
 
 def varied_parameters(result: SweepResult, runs: Sequence[int]) -> list[VariedParameter]:
-    """Return the parameters that differ between runs, in the order of the keys.
-
-    Args:
-        result: the finished sweep.
-        runs: numbers of the runs.
-    """
+    """Return the parameters that differ between the numbered runs, in the order of the keys."""
     names = abbreviate_keys(result.sweep.keys)
     candidates = [
         parameter
@@ -413,14 +400,10 @@ def varied_parameters(result: SweepResult, runs: Sequence[int]) -> list[VariedPa
 
 
 def varied_results(result: SweepResult, runs: Sequence[int]) -> dict[str, NDArray[np.float64]]:
-    """Return the results that differ between complete runs.
-
-    Args:
-        result: the finished sweep.
-        runs: numbers of the runs.
+    """Return the results that differ between the numbered runs.
 
     Returns:
-        Columns of the table by name, shape (runs,); NaN where a run is not complete or lacks the result.
+        Columns of the table by name, shape (runs,); NaN where a run is incomplete or lacks the result.
     """
     outcomes = [result.outcomes[run] for run in runs]
     columns = {}
@@ -437,12 +420,12 @@ def varied_results(result: SweepResult, runs: Sequence[int]) -> dict[str, NDArra
 
 
 def is_wide_range(numbers: NDArray[np.float64]) -> bool:
-    """Return whether positive numbers span a ratio above 50, so that a logarithmic axis shows them; NaN is ignored."""
+    """Return whether numbers, apart from NaN, are positive and span a ratio above 50, for a logarithmic axis."""
     return bool(np.nanmin(numbers) > 0 and np.nanmax(numbers) > 50 * np.nanmin(numbers))
 
 
 def _parameters(name: str, distribution: Distribution, values: list[Any]) -> Iterator[VariedParameter]:
-    """Convert the values of a key into parameters: one for each component of a list of numbers."""
+    """Yield the parameters of a key, one for each component of a list of numbers."""
     if distribution.kind not in ("choice", "grid"):
         is_logarithmic = distribution.kind == "log_uniform"
         for suffix, *components in zip(_component_indices(values[0]), *map(_flatten, values), strict=True):
@@ -477,15 +460,12 @@ def _component_indices(value: Any) -> Iterator[str]:
         yield ""
 
 
-# With fewer runs the indices are too inaccurate to rank parameters.
+# With fewer runs, indices are too inaccurate to rank parameters.
 MIN_RUNS = 64
-
-# Runs that are shuffled with each other, number of shuffles, and harmonics of RBD-FAST.
-NEIGHBOURS, SHUFFLES, HARMONICS = 4, 8, 4
 
 
 class SensitivityIndex(NamedTuple):
-    """The first-order sensitivity of a result to a parameter."""
+    """First-order sensitivity of a result to a parameter."""
 
     result: str
     parameter: str
@@ -496,10 +476,10 @@ class SensitivityIndex(NamedTuple):
 def estimate_sensitivity(
     parameters: Sequence[VariedParameter], results: Mapping[str, NDArray[np.float64]]
 ) -> list[SensitivityIndex]:
-    """Estimate the first-order sensitivity of every result that at least `MIN_RUNS` runs have.
+    """Estimate the first-order sensitivities of results in at least `MIN_RUNS` runs.
 
     Args:
-        parameters: with numbers of shape (runs,).
+        parameters: the parameters, with numbers of shape (runs,).
         results: by name, shape (runs,); NaN where a run lacks the result.
 
     Raises:
@@ -520,8 +500,8 @@ def first_order_index(parameter: NDArray[np.float64], result: NDArray[np.float64
     """Estimate the first-order index of a parameter by RBD-FAST, as the mean over shuffles.
 
     Args:
-        parameter: shape (runs,).
-        result: shape (runs,).
+        parameter: values of the parameter, shape (runs,).
+        result: values of the result, shape (runs,).
 
     Returns:
         The index, and the half-width of its 95 % interval.
@@ -531,12 +511,13 @@ def first_order_index(parameter: NDArray[np.float64], result: NDArray[np.float64
     random = np.random.default_rng(0)
     problem = {"num_vars": 1, "names": [""]}
     estimates = []
-    for shuffle in range(SHUFFLES):
+    for shuffle in range(8):
         shuffled = random.permutation(len(result))
         ranks = np.argsort(np.argsort(parameter[shuffled], kind="stable"), kind="stable")
-        ordered = result[shuffled][np.argsort(ranks // NEIGHBOURS, kind="stable")]
+        # Four neighbours are in random order.
+        ordered = result[shuffled][np.argsort(ranks // 4, kind="stable")]
         positions = np.arange(len(result), dtype=np.float64)[:, np.newaxis]
-        analysis = rbd_fast.analyze(problem, positions, ordered, M=HARMONICS, num_resamples=25, seed=1 + shuffle)
+        analysis = rbd_fast.analyze(problem, positions, ordered, M=4, num_resamples=25, seed=1 + shuffle)
         estimates.append((analysis["S1"][0], analysis["S1_conf"][0]))
     estimate, confidence = np.mean(estimates, axis=0)
     return float(estimate), float(confidence)

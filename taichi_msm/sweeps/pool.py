@@ -1,7 +1,7 @@
 """A process pool as a `concurrent.futures` executor, whose processes may be killed one by one.
 
-Processes of the standard library's pool import the caller's main module again, and all calls fail when one process is
-killed. In this pool only the call of the killed process raises `DiedError`, and the next call starts a new process.
+Unlike in the standard library's pool, processes do not import the caller's main module, and if one is killed, only its
+call fails with a `DiedError`; the next call starts a new process.
 """
 
 from __future__ import annotations
@@ -25,15 +25,13 @@ from taichi_msm.errors import MsmError
 # Interval at which a process checks that its parent is alive [s].
 PARENT_POLL_S = 0.2
 
-_CHILD = "import sys; sys.path[:] = {path!r}; from taichi_msm.sweeps.pool import serve; serve()"
-
 
 class DiedError(MsmError):
     """Raised when the process of a call ended before the call returned."""
 
 
 class Pool(Executor):
-    """Executor whose processes are started on demand; functions, arguments and results must be picklable."""
+    """Executor that starts processes on demand; functions, arguments and results must be picklable."""
 
     def __init__(self, workers: int) -> None:
         self._threads = ThreadPoolExecutor(workers)
@@ -47,7 +45,7 @@ class Pool(Executor):
         """Schedule a call in an idle process.
 
         Args:
-            function: the function, which must be importable.
+            function: an importable function.
             *arguments: its positional arguments.
             **named: its named arguments.
         """
@@ -57,9 +55,8 @@ class Pool(Executor):
         """End the processes.
 
         Args:
-            wait: whether to wait until all threads of the pool have ended.
-            cancel_futures: whether to cancel waiting calls and kill the processes at once, instead of ending them after
-                all calls.
+            wait: whether to wait for the end of all calls.
+            cancel_futures: whether to cancel pending calls and kill the processes at once.
         """
         self._threads.shutdown(wait=False, cancel_futures=cancel_futures)
         if cancel_futures:
@@ -95,17 +92,18 @@ class _Process:
     """A process that executes calls, one at a time."""
 
     def __init__(self) -> None:
+        code = f"import sys; sys.path[:] = {sys.path!r}; from taichi_msm.sweeps.pool import serve; serve()"
         self._process = subprocess.Popen(
-            [sys.executable, "-c", _CHILD.format(path=sys.path)],
+            [sys.executable, "-c", code],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            # Ctrl-C must reach only the parent process.
+            # Ctrl-C must reach the parent process only.
             start_new_session=True,
             creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
         )
 
     def call(self, call: tuple[Any, ...]) -> Any:
-        """Execute a call; returns whether it succeeded, and its value or exception."""
+        """Execute a call; return whether it succeeded, and its value or exception."""
         assert self._process.stdin
         assert self._process.stdout
         pickle.dump(call, self._process.stdin)
@@ -117,7 +115,7 @@ class _Process:
         self._process.kill()
 
     def close(self) -> int:
-        """End the process after its call; returns its exit code."""
+        """End the process after its call; return its exit code."""
         assert self._process.stdin
         assert self._process.stdout
         with suppress(BrokenPipeError):
@@ -136,7 +134,7 @@ def _exit_reason(code: int | None) -> str:
 
 
 def serve() -> None:
-    """Execute calls from stdin as a process of the pool, until the parent closes the pipe or dies."""
+    """Execute calls from stdin in a process of the pool, until the parent closes the pipe or dies."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     Thread(target=_exit_with_parent, args=[os.getppid()], daemon=True).start()
     answers = os.fdopen(os.dup(1), "wb")
@@ -154,12 +152,12 @@ def serve() -> None:
         answers.write(pickle.dumps(answer))
         answers.flush()
     if runtime := sys.modules.get("taichi_msm.system.runtime"):
-        runtime.stop()  # This writes the cache of kernels.
-    gc.freeze()  # This avoids a slow garbage collection at exit.
+        runtime.stop()  # writes the cache of kernels
+    gc.freeze()  # avoids a slow garbage collection at exit
 
 
 def _exit_with_parent(parent: int) -> None:
-    """End this process after its parent was killed, which unlocks the directory of its run."""
+    """End this process after the death of its parent, which unlocks the directory of its run."""
     while os.getppid() == parent:
         time.sleep(PARENT_POLL_S)
     os._exit(1)

@@ -1,4 +1,4 @@
-"""Runs of a sweep: the sweep's directory, execution of the missing runs, and their outcomes."""
+"""Runs of a sweep: the sweep's directory, execution of missing runs, and outcomes."""
 
 from __future__ import annotations
 
@@ -43,23 +43,23 @@ from taichi_msm.sweeps.pool import DiedError
 from taichi_msm.sweeps.spec import Sweep
 from taichi_msm.system.compiler import result_versions, versions
 
-# A run with one of these statuses is not run again.
+# Statuses of runs that are not repeated.
 FINAL_STATUSES = ("complete", "diverged")
 
 
 def register_sweep(directory: Path, sweep: Sweep) -> list[list[Any]]:
-    """Write the description of a sweep into its directory, or check that the directory holds the same sweep.
+    """Write the description of a sweep to its directory, or check that the directory contains the same sweep.
 
     Args:
         directory: of the sweep.
-        sweep: the sweep to register.
+        sweep: the sweep.
 
     Returns:
-        The values of the varied keys for each run.
+        Values of the varied keys for each run.
 
     Raises:
-        SceneError: when the directory holds another sweep, or the same sweep of versions with other results.
-        FilesError: when the directory cannot be read or written, contains other files, or is damaged.
+        SceneError: when the directory contains another sweep, or versions with other results.
+        FilesError: when the directory cannot be read or written, contains foreign files, or is damaged.
     """
     record = require_kind(directory / SWEEP_RECORD, FILE)
     require_kind(directory / RUNS_FOLDER, FOLDER)
@@ -77,12 +77,12 @@ def register_sweep(directory: Path, sweep: Sweep) -> list[list[Any]]:
         }
         with writing(directory), hidden_folder(directory) as hidden:
             (hidden / SWEEP_RECORD).write_text(json.dumps(content) + "\n", encoding="utf-8", errors="backslashreplace")
-            link_without_replacing(hidden / SWEEP_RECORD, record)  # unless another shard has just done so
+            link_without_replacing(hidden / SWEEP_RECORD, record)  # unless another shard was faster
     # Values are compared as text: 1 differs from 1.0, and NaN equals itself.
     expected_values = json.dumps(values)
     try:
         with record.open("rb") as file:
-            # The limit bounds the memory for a foreign file.
+            # Bounds the memory for a foreign file.
             stored = json.loads(file.read(max(1 << 28, 2 * len(expected_values))))
         earlier = {name: stored.get(name) for name in description}
         stored_values, stored_versions = json.dumps(stored["values"]), result_versions(stored["versions"], "cpu")
@@ -106,7 +106,7 @@ def register_sweep(directory: Path, sweep: Sweep) -> list[list[Any]]:
 
 
 def _changed_file(files: dict[str, str], earlier: Any) -> str:
-    """Return the path of a file whose digest has changed."""
+    """Return the path of a changed file."""
     known = earlier if isinstance(earlier, dict) else files
     return next((path for path, digest in files.items() if known.get(path) != digest), "a file")
 
@@ -117,11 +117,11 @@ class SweepState:
 
     Attributes:
         directory: of the sweep.
-        sweep: the scene and its variation.
+        sweep: scene and variation.
         values: of the varied keys, for each run of the sweep.
         done: outcomes of the finished runs; grows while the sweep runs.
-        missing: runs that were not finished at the beginning.
-        total: number of runs, of the sweep or the shard.
+        missing: unfinished runs at the beginning.
+        total: number of runs of the sweep or shard.
     """
 
     directory: Path
@@ -138,7 +138,7 @@ def begin_sweep(sweep: Sweep, directory: Path, shard: tuple[int, int] = (1, 1)) 
     Args:
         sweep: the sweep.
         directory: of the sweep; created if it does not exist.
-        shard: part I of N of the runs, (I, N) with 1 <= I <= N.
+        shard: part I of N as (I, N), 1 <= I <= N.
 
     Raises:
         SceneError, FilesError: as `register_sweep`.
@@ -162,12 +162,12 @@ def read_outcome(task: RunTask, sweep: Sweep) -> Outcome | None:
 
     Args:
         task: the run.
-        sweep: the sweep it belongs to.
+        sweep: its sweep.
 
     Returns:
-        The outcome, or None if the run is missing, was interrupted, or belongs to another task.
+        The outcome; None if the run is missing, was interrupted, or belongs to another task.
     """
-    # A damaged record counts as missing, so the run is repeated.
+    # A run with a damaged record is repeated.
     with suppress(OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         if entry_kind(task.directory / RUN_RECORD) == FILE:
             with (task.directory / RUN_RECORD).open("rb") as file:
@@ -181,12 +181,7 @@ def read_outcome(task: RunTask, sweep: Sweep) -> Outcome | None:
 
 @contextmanager
 def report_lock(directory: Path, pause: Pause) -> Iterator[None]:
-    """Hold the lock under which the reports of a sweep are written.
-
-    Args:
-        directory: of the sweep.
-        pause: called while another command holds the lock.
-    """
+    """Hold the lock of a sweep's reports; `pause` is called while another command holds it."""
     with ExitStack() as stack:
         while True:
             try:
@@ -203,13 +198,13 @@ POLL_INTERVAL_S = 0.1
 
 
 def execute_tasks(tasks: Iterable[RunTask], executor: Executor, pause: Pause) -> Iterator[Outcome]:
-    """Execute runs, and yield their outcomes in the order in which they end.
+    """Execute runs, and yield their outcomes in order of completion.
 
     A run whose process in `Pool` ended early is executed once more.
 
     Args:
         tasks: the runs.
-        executor: executes them.
+        executor: executes the runs.
         pause: called several times a second; an exception from it ends the sweep.
 
     Raises:
@@ -222,13 +217,13 @@ def execute_tasks(tasks: Iterable[RunTask], executor: Executor, pause: Pause) ->
     def submit(task: RunTask) -> None:
         try:
             future = executor.submit(execute_run, task)
-        except RuntimeError as error:  # such as that of a broken executor
+        except RuntimeError as error:  # such as BrokenExecutor
             raise _executor_error(executor, error) from error
         pending[future] = task
         future.add_done_callback(done.put)
 
     remaining = iter(tasks)
-    # A limit on submitted runs bounds the memory of the executor.
+    # The number of submitted runs is limited, to bound the memory of the executor.
     for task in islice(remaining, 4096):
         submit(task)
     while pending:
@@ -251,7 +246,7 @@ def execute_tasks(tasks: Iterable[RunTask], executor: Executor, pause: Pause) ->
                 continue
             outcome = Outcome(task.run, "died", f"{error}, twice")
         except Exception as error:
-            # `execute_run` raises nothing, so the worker has died; other executors have their own setting for retries.
+            # `execute_run` raises nothing: the worker has died. Other executors have their own retries.
             outcome = Outcome(task.run, "died", " ".join(str(error).split()))
         yield outcome
         for task in islice(remaining, 1):
@@ -263,17 +258,17 @@ def _executor_error(executor: Executor, error: Exception) -> LostExecutorError:
 
 
 class RunTask(NamedTuple):
-    """A run of a sweep that is to be executed."""
+    """Run of a sweep to execute."""
 
     run: int  # number of the run, from 0
     scene: ParsedFile
     overrides: tuple[str, ...]
     folder: Path  # directory of the sweep
-    home: Path  # current directory for relative paths
+    home: Path  # base of relative paths
 
     @property
     def directory(self) -> Path:
-        """The directory of the run's results."""
+        """Directory of the run's results."""
         return self.folder / RUNS_FOLDER / zero_padded(self.run)
 
 
@@ -304,7 +299,7 @@ def execute_run(task: RunTask, progress: StageProgressCallback = lambda stage, d
         record = run_module.run(
             plan, task.directory, threads=1, overrides=task.overrides, started=time.perf_counter(), progress=progress
         )
-    except SceneError as error:  # raised only by the run, such as for a picture that cannot be decoded
+    except SceneError as error:  # such as for a picture that cannot be decoded
         return _without_results(task, "refused", "; ".join(error.lines))
     except MsmError as error:
         return _without_results(task, "failed", str(error))
@@ -314,47 +309,47 @@ def execute_run(task: RunTask, progress: StageProgressCallback = lambda stage, d
 
 
 def _without_results(task: RunTask, status: Status, reason: str) -> Outcome:
-    """Build the outcome of a run without results; its reason must not depend on the location of the directories."""
+    """Build the outcome of a run without results, with a reason that is independent of absolute paths."""
     reason = " ".join(reason.split()).replace(str(task.directory), task.directory.name)
-    # The path of a picture follows a blank.
+    # The path of a picture follows a space.
     return Outcome(task.run, status, reason.replace(f" {task.scene.folder / '_'}"[:-1], " "))
 
 
-# "refused": its values are not valid; "failed": by an error; "died": its process ended early twice.
+# "refused": invalid values; "failed": an error; "died": the process ended early twice.
 Status = Literal["complete", "diverged", "refused", "failed", "died"]
 STATUSES: tuple[Status, ...] = get_args(Status)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Status and results of a run of a sweep; results are None if the run has none."""
+    """Status and results of a run of a sweep; results are None where missing."""
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(allow_inf_nan=False)
 
     run: int  # number of the run, from 0
     status: Status
-    error: str = ""  # the reason, if the run is not complete
+    error: str = ""  # reason, if not complete
     max_displacement: float | None = None  # [m]
     shortest_spring: float | None = None  # smallest ratio of a spring's length to its rest length
     error_estimate: float | None = None  # discretisation error (time step), as a fraction of the largest displacement
     mesh_error: float | None = None  # discretisation error (mesh), as a fraction of the largest displacement
     forces: tuple[float | None, ...] = ()  # largest force of each probe over all frames [N]
-    notes: tuple[str, ...] = ()  # warnings of the run, without that about the errors
+    notes: tuple[str, ...] = ()  # warnings of the run, except the first, about its errors
     seconds: float | None = field(default=None, compare=False)  # wall-clock time of the run [s]
 
 
 _OUTCOME = TypeAdapter(Outcome)
 
-# Columns of the table after those of the keys; the forces of the probes and `seconds` follow.
+# Columns of the table between the varied keys and the forces of the probes.
 RESULT_COLUMNS = ("status", "error", "max_displacement", "shortest_spring", "error_estimate", "mesh_error")
 
 
 def outcome_from_record(run: int, record: Mapping[str, Any]) -> Outcome:
-    """Extract the outcome of a finished run from its record.
+    """Extract the outcome of a run from its record.
 
     Args:
         run: number of the run.
-        record: content of its run.json.
+        record: content of run.json.
 
     Raises:
         ValueError: when the record was not written by a run.
@@ -370,7 +365,7 @@ def outcome_from_record(run: int, record: Mapping[str, Any]) -> Outcome:
             "error_estimate": estimate.get("error"),
             "mesh_error": estimate.get("mesh_error"),
             "forces": tuple(probe.get("greatest_force") for probe in record["probes"]),
-            "notes": tuple(record["notes"][1:]),  # The first one is about the errors.
+            "notes": tuple(record["notes"][1:]),  # The first is about the errors.
             "seconds": record["timings"]["total"],
         }
     )
@@ -397,12 +392,12 @@ class SweepResult:
     outcomes: list[Outcome]  # for each run, in the order of their numbers
 
     def columns(self) -> dict[str, list[Any]]:
-        """Return the result columns of the table by name, with a value for each run."""
+        """Return the result columns of the table by name."""
         outcomes = self.outcomes
         columns = {name: [getattr(outcome, name) for outcome in outcomes] for name in RESULT_COLUMNS}
         for n in range(max((len(outcome.forces) for outcome in outcomes), default=0)):
             name = f"probes.{n}.force"
-            # A scene has a key of this name, which the sweep may vary.
+            # The sweep may vary a key of this name.
             name += ".greatest" if name in self.sweep.keys else ""
             columns[name] = [outcome.forces[n] if n < len(outcome.forces) else None for outcome in outcomes]
         return columns | {"seconds": [outcome.seconds for outcome in outcomes]}
@@ -412,6 +407,6 @@ class SweepResult:
         return self.directory / RUNS_FOLDER / zero_padded(run)
 
     def sample_runs(self, limit: int) -> list[int]:
-        """Return the numbers of at most `limit` runs, evenly spread over all runs."""
+        """Return the numbers of at most `limit` runs, evenly spaced."""
         total, count = len(self.outcomes), min(len(self.outcomes), limit)
         return [(2 * n + 1) * total // (2 * count) for n in range(count)]

@@ -1,7 +1,4 @@
-"""Sweep files: parsing, distributions of the varied keys, and the values of every run.
-
-Errors contain the file, line and column.
-"""
+"""Sweep files: parsing, distributions of the varied keys, and values of the runs."""
 
 from __future__ import annotations
 
@@ -51,7 +48,7 @@ from taichi_msm.scene.section import (
 
 MAX_RUNS = 10**7
 
-# SciPy's Sobol sequences have no more dimensions.
+# Limit of SciPy's Sobol sequences.
 MAX_DIMENSIONS = 21201
 
 
@@ -108,7 +105,7 @@ class SweepSettings(Section):
 
 @dataclass(frozen=True)
 class Sweep:
-    """A scene file and the variation of its keys. Paths of pictures in the values are relative to the scene file."""
+    """Scene file and the variation of its keys; paths in the values are relative to the scene file."""
 
     scene: ParsedFile
     settings: SweepSettings
@@ -128,17 +125,17 @@ class Sweep:
         return run_values(self.settings.vary, self.settings.samples, self.settings.seed)
 
     def sample_values(self, limit: int) -> list[list[Any]]:
-        """Return the values of the varied keys for at most `limit` runs, spread over all runs."""
+        """Return the values of the varied keys for at most `limit` runs, evenly spaced."""
         return sample_run_values(self.settings.vary, self.settings.samples, self.settings.seed, limit)
 
     def overrides(self, values: list[Any]) -> tuple[str, ...]:
-        """Return the arguments of `run --set` for the run with these values."""
+        """Return the arguments of `run --set` for a run."""
         pairs = [*self.settings.set.items(), *zip(self.keys, values, strict=True)]
         return tuple(f"{name}={format_override(value)}" for name, value in pairs)
 
     @cached_property
     def files(self) -> dict[str, str]:
-        """The SHA-256 of every readable file that the runs may need, by path."""
+        """SHA-256 by path of every readable file that a run may use."""
         names: list[str] = []
 
         def collect(_: Key, text: str) -> str:
@@ -166,7 +163,7 @@ class Sweep:
         return frozenset(self.files.values())
 
     def description(self) -> dict[str, Any]:
-        """Return everything that determines the results, for JSON; sweeps with equal descriptions are the same."""
+        """Return all settings that determine the results as JSON data; equal sweeps have equal descriptions."""
         settings = self.settings.model_dump(mode="json", exclude={"scene", "vary"})
         vary = {name: {distribution.kind: distribution.values} for name, distribution in self.settings.vary.items()}
         scene = json.dumps(self.scene.document.data).encode()
@@ -194,7 +191,7 @@ def make_sweep(scene: str | Path, settings: Mapping[str, Any]) -> Sweep:
     """Build a sweep without a sweep file.
 
     Args:
-        scene: path of the scene file; paths in `settings` are relative to it.
+        scene: path of the scene file, the base of relative paths in `settings`.
         settings: content of a sweep file, without `scene`.
 
     Raises:
@@ -212,14 +209,14 @@ def make_sweep(scene: str | Path, settings: Mapping[str, Any]) -> Sweep:
 
 
 def _checked(data: dict[str, Any], folder: Path) -> tuple[Sweep | None, list[Problem]]:
-    """Check the content of a sweep file in a folder, and read its scene; returns the sweep and all errors."""
+    """Check the content of a sweep file in a folder, and read its scene; return the sweep and all errors."""
     problems: list[Problem] = []
     file, name = None, data.get("scene")
     if isinstance(name, str) and name:
         path = folder / name
         problems += _relocate(data, folder, path.parent)
         try:
-            # Errors of runs must not depend on the current directory, so the name of the scene has no folder.
+            # Without its folder, as errors of runs must not depend on the current directory.
             file = read_file(_normalised(path), SCENE_KIND)._replace(name=path.name)
             problems += _unknown_keys(file, data)
         except SceneError as error:
@@ -229,7 +226,7 @@ def _checked(data: dict[str, Any], folder: Path) -> tuple[Sweep | None, list[Pro
 
 
 def _normalised(path: Path) -> str:
-    """Remove .. from a path if the result is the same file; through symbolic links it may not be."""
+    """Remove .. from a path, unless symbolic links make the result another file."""
     short = Path(os.path.normpath(path))
     try:
         return str(short if short.samefile(path) else path)
@@ -248,7 +245,7 @@ def format_override(value: Any) -> str:
 
 
 def _relocate(data: dict[str, Any], folder: Path, home: Path) -> Iterator[Problem]:
-    """Rewrite paths relative to `folder` as paths relative to `home`, the scene's folder, and expand file patterns."""
+    """Expand file patterns, and convert paths from the base `folder` to the base `home`, the scene's folder."""
     vary, fixed = _mappings(data)
     for name, distribution in vary.items():
         for kind in {"choice", "grid"} & set(distribution if isinstance(distribution, dict) else ()):
@@ -272,7 +269,7 @@ def _relocate(data: dict[str, Any], folder: Path, home: Path) -> Iterator[Proble
 
 
 def _relocated(name: str, value: Any, folder: Path, home: Path) -> tuple[Any, list[str]]:
-    """Relocate the files in the value of a key; returns the value and the errors."""
+    """Relocate the files in the value of a key; return the value and the errors."""
     errors = []
 
     def relocated(key: Key, text: str) -> str:
@@ -288,19 +285,19 @@ def _relocated(name: str, value: Any, folder: Path, home: Path) -> tuple[Any, li
             )
         elif not is_file:
             errors.append(f"{truncate(text)}: no such file; name a {noun} relative to the sweep file")
-        # The folder is resolved first, as .. after a symbolic link leads to the parent of its target.
+        # Resolved first, as .. after a symbolic link is the parent of its target.
         return Path(os.path.relpath(path.parent.resolve() / path.name, home.resolve())).as_posix()
 
     return _map_files(_split_key(name), value, relocated), errors
 
 
 def _kind_of_file(key: Key) -> tuple[str, tuple[str, ...]]:
-    """Return the noun for the file of a key in messages, and the allowed suffixes."""
+    """Return the noun for the file of a key, and its allowed suffixes."""
     return ("picture", PICTURE_SUFFIXES) if key in PICTURE_KEYS else ("file", ("",))
 
 
 def _map_files(path: Key, value: Any, change: Callable[[Key, str], str]) -> Any:
-    """Apply a function to the paths of files in the value of a key."""
+    """Apply a function to the file paths in the value of a key."""
     if names_file(path):
         return change(path, value) if isinstance(value, str) and 0 < len(value) <= MAX_PATH else value
     if isinstance(value, dict):
@@ -309,12 +306,12 @@ def _map_files(path: Key, value: Any, change: Callable[[Key, str], str]) -> Any:
 
 
 def _split_key(name: str) -> Key:
-    """Split a dotted key; the result is empty if `--set` does not accept the key."""
+    """Split a dotted key; empty if `--set` does not accept it."""
     return parse_key(name.strip()) if "=" not in name else ()
 
 
 def _unknown_keys(scene: ParsedFile, data: dict[str, Any]) -> Iterator[Problem]:
-    """Check that a scene has the keys, by setting each to one of its values."""
+    """Check that a scene has the keys, by trying one value of each."""
     vary, fixed = _mappings(data)
     trials: dict[Key, Any] = {("set", name): value for name, value in fixed.items()}
     for name, distribution in vary.items():
@@ -331,7 +328,7 @@ def _unknown_keys(scene: ParsedFile, data: dict[str, Any]) -> Iterator[Problem]:
     for problem in parse_model(Scene, draft.data)[1]:
         if not problem.message.startswith("unknown key"):
             continue
-        # The unknown key may be above a tried key, below one whose value is a whole section, or in the scene file.
+        # The unknown key may be above a tried key, in the section that is its value, or in the scene file.
         related = [path for path in trials if _is_prefix(_split_key(str(path[1])), problem.path)]
         for path in related or [("scene",)]:
             prefix = f"{problem.key}: " if problem.path != _split_key(str(path[-1])) else ""
@@ -344,7 +341,7 @@ def _is_prefix(first: Key, second: Key) -> bool:
 
 
 def _mappings(data: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the sections `vary` and `set`, each empty if it is not a mapping."""
+    """Return the sections `vary` and `set`; empty where not a mapping."""
     vary, fixed = (data.get(name) for name in ("vary", "set"))
     return vary if isinstance(vary, dict) else {}, fixed if isinstance(fixed, dict) else {}
 
@@ -353,8 +350,7 @@ def run_values(vary: Mapping[str, Distribution], samples: int | None, seed: int)
     """Compute the values of the varied keys, in their order, for every run.
 
     Without `samples` the runs are all combinations of the grids, the last key varying fastest. Otherwise they are the
-    first points of a scrambled Sobol sequence, with a dimension for every number and every choice, in the order of the
-    keys.
+    first points of a scrambled Sobol sequence, with a dimension for every number and choice, in the order of the keys.
 
     Args:
         vary: distributions by key.
@@ -369,8 +365,8 @@ def run_values(vary: Mapping[str, Distribution], samples: int | None, seed: int)
     from scipy.stats import qmc
 
     counts = [distribution.dimensions for distribution in vary.values()]
-    # A generator is passed, as SciPy's versions derive different ones from the same integer. A power of two is drawn,
-    # as SciPy warns about other numbers of points; the first points are the same.
+    # A generator is passed, as versions of SciPy derive different ones from an integer. Other numbers of points than
+    # powers of two would cause a warning of SciPy.
     sequence = qmc.Sobol(sum(counts), scramble=True, seed=np.random.default_rng(seed))
     points = sequence.random_base2(math.ceil(math.log2(samples)))[:samples]
     columns = [
@@ -381,33 +377,21 @@ def run_values(vary: Mapping[str, Distribution], samples: int | None, seed: int)
 
 
 def sample_run_values(vary: Mapping[str, Distribution], samples: int | None, seed: int, limit: int) -> list[list[Any]]:
-    """Compute the values of at most `limit` runs, spread over all runs, without those of the other runs.
-
-    Args:
-        vary: distributions by key.
-        samples: number of runs, or None for grids.
-        seed: of the scrambling.
-        limit: largest number of runs that are returned.
-    """
+    """Compute the values of at most `limit` runs, spread over all runs; other arguments as for `run_values`."""
     if samples is not None:
-        # The first points of a Sobol sequence cover the whole range.
+        # The first points of a Sobol sequence cover the range.
         return run_values(vary, min(samples, limit), seed)
     total = count_runs(vary, None)
     return [_combination(vary, run) for run in sorted({(2 * n + 1) * total // (2 * limit) for n in range(limit)})]
 
 
 def count_runs(vary: Mapping[str, Distribution], samples: int | None) -> int:
-    """Count the runs, without computing their values.
-
-    Args:
-        vary: distributions by key.
-        samples: number of runs, or None for grids.
-    """
+    """Count the runs; arguments as for `run_values`."""
     return math.prod(len(distribution.values) for distribution in vary.values()) if samples is None else samples
 
 
 def _combination(vary: Mapping[str, Distribution], run: int) -> list[Any]:
-    """Return the combination of grid values with this number."""
+    """Return the combination of grid values of a run."""
     values = []
     for distribution in reversed(list(vary.values())):
         run, index = divmod(run, len(distribution.values))
@@ -493,23 +477,23 @@ class Distribution(Section):
 
     @property
     def kind(self) -> str:
-        """The name of the field that is set."""
+        """Name of the field that is set."""
         return next(iter(self.model_fields_set))
 
     @property
     def values(self) -> Any:
-        """The parameters of the distribution, or the values of a choice or grid."""
+        """Parameters of the distribution, or values of a choice or grid."""
         return getattr(self, self.kind)
 
     @property
     def dimensions(self) -> int:
-        """The number of fractions that `value` takes: one for each number, one for a choice, none for a grid."""
+        """Number of fractions for `value`: one per number, 1 for a choice, 0 for a grid."""
         if self.kind in ("choice", "grid"):
             return int(self.kind == "choice")
         return len(_numbers(self.values[0]))
 
     def value(self, fractions: Sequence[float]) -> Any:
-        """Map fractions from [0, 1), shape (dimensions,), to a value by the inverse distribution function."""
+        """Apply the quantile function to fractions in [0, 1), shape (dimensions,)."""
         if self.kind == "choice":
             return self.values[int(fractions[0] * len(self.values))]
         remaining = iter(fractions)
@@ -521,7 +505,7 @@ def _uniform(low: float, high: float, fraction: float) -> float:
 
 
 def _log_uniform(low: float, high: float, fraction: float) -> float:
-    # Rounding must not lead outside the interval.
+    # Rounding could leave the interval.
     return min(max(math.exp(_uniform(math.log(low), math.log(high), fraction)), low), high)
 
 
@@ -540,14 +524,14 @@ _QUANTILES: dict[str, Callable[[float, float, float], float]] = {
 
 
 def _map_pairs(function: Callable[[float, float], float], first: Any, second: Any) -> Any:
-    """Apply a function to pairs of numbers in two values of the same shape."""
+    """Apply a function to the pairs of numbers in two values of one shape."""
     if isinstance(first, list):
         return list(map(partial(_map_pairs, function), first, second))
     return float(function(first, second))
 
 
 def _numbers(value: Any) -> list[float]:
-    """Return the numbers in a value; empty if it contains anything else."""
+    """Return the flattened numbers of a value; empty if it contains anything else."""
     if isinstance(value, list):
         parts = [_numbers(item) for item in value]
         return [number for part in parts for number in part] if all(parts) else []
@@ -562,7 +546,7 @@ def _is_finite(value: Any) -> bool:
 
 
 def _shape(value: Any) -> Any:
-    """Return the nesting of a value: its numbers are replaced by None."""
+    """Return a value with its numbers replaced by None."""
     if isinstance(value, list):
         return [_shape(item) for item in value]
     return None if _numbers(value) else value

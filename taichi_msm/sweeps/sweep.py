@@ -1,4 +1,4 @@
-"""The Python API of sweeps, and the steps that it shares with the command line."""
+"""Python interface of sweeps, and the steps that it shares with the command line."""
 
 from __future__ import annotations
 
@@ -45,21 +45,20 @@ def sweep(
 ) -> Iterator[Outcome]:
     """Run a scene many times with varied values.
 
-    Runs are executed while the iterator is consumed, which yields outcomes in the order in which runs end. After the
-    last run the table and the other reports are written. Repeating the same call executes only the missing runs.
+    Runs are executed while the iterator is consumed, which yields outcomes in order of completion. After the last run
+    the table and the other reports are written. The same call again executes only the missing runs.
 
     Args:
         scene: path of the scene file.
         vary: distributions by dotted key, as in a sweep file. Paths of files are relative to the scene file, and below
             its folder.
-        directory: directory for runs/, table.csv and the other reports.
-        samples: number of runs, or None for every combination of the keys' grids.
+        directory: receives runs/, table.csv and the other reports.
+        samples: number of runs; None: every combination of the keys' grids.
         seed: seed of the samples.
         overrides: values of keys in all runs, by dotted key.
-        executor: executes the runs. Each of its workers must be a process with one thread, and must find scene and
-            directory at the same paths. A string is the address of a dask.distributed scheduler, whose workers execute
-            the runs. None starts processes on this machine.
-        workers: number of processes on this machine, or None for one per core, limited by the free memory.
+        executor: executes the runs; None: processes on this machine. Its workers must be processes with one thread,
+            with scene and directory at the same paths. A string is the address of a dask.distributed scheduler.
+        workers: number of processes on this machine; None: one per core, limited by the free memory.
         progress: called often with the stage, the number of finished runs and the number of runs; an exception from it
             stops the sweep.
 
@@ -104,13 +103,13 @@ def sweep(
 def open_executor(
     executor: Executor | str | None, workers: int, state: SweepState, progress: StageProgressCallback
 ) -> Iterator[Executor]:
-    """Open the executor of a sweep; processes that it starts end with the block.
+    """Open the executor of a sweep; its own processes end with the block.
 
     Args:
-        executor: an executor, which is used as it is; the address of a dask scheduler; or None for a new `Pool`.
+        executor: an executor; the address of a dask scheduler; or None for a new `Pool`.
         workers: number of processes of the pool.
         state: the sweep.
-        progress: called while the first worker of a cluster is awaited.
+        progress: called while waiting for the first worker of a cluster.
 
     Raises:
         NotInstalledError: when dask.distributed is needed and not installed.
@@ -138,7 +137,7 @@ def open_executor(
 
 
 def run_missing(state: SweepState, executor: Executor, progress: StageProgressCallback) -> Iterator[Outcome]:
-    """Execute the missing runs of a sweep, and yield their outcomes in the order in which they end.
+    """Execute the missing runs of a sweep, and yield their outcomes in order of completion.
 
     Args:
         state: the sweep; outcomes are appended to `state.done`.
@@ -158,19 +157,19 @@ def finish_sweep(state: SweepState, executor: Executor, progress: StageProgressC
     """Write the table and the other reports of a sweep.
 
     Args:
-        state: the sweep, all of whose runs have ended.
+        state: the sweep, after all its runs have ended.
         executor: draws frames for the contact sheet.
         progress: called several times a second.
 
     Returns:
-        The names of the files written, and warnings for the user.
+        Names of the written files, and warnings.
 
     Raises:
         FilesError: when the table cannot be written.
     """
     directory, total, sweep = state.directory, state.total, state.sweep
     with writing(directory), report_lock(directory, lambda: progress("runs", total, total)):
-        # A run that failed here, as another command held its lock, may have been finished by that command.
+        # A run that was locked by another command may be finished now.
         tasks = {task.run: task for task in state.missing}
         rows = [
             (None if row.status in FINAL_STATUSES else read_outcome(tasks[row.run], sweep)) or row

@@ -1,8 +1,8 @@
-"""Reports of a sweep: its table, the data set description, plots, a summary, and an estimate of its cost.
+"""Reports of a sweep: table, description of the data set, plots, summary, and cost estimate.
 
-A tenth of all runs is for testing and a tenth for validation, rounded to the nearest run: the first runs and the next
-ones in the order of the SHA-256 of "SEED RUN". So the split of a run depends only on the seed, the number of the run
-and the number of runs: neither on which runs failed, nor on the version of a library.
+In the order of the SHA-256 of "SEED RUN", the first tenth of the runs is the test split and the second tenth the
+validation split. The split of a run depends only on the seed, the number of the run and the number of runs: not on
+failures or versions of libraries.
 """
 
 from __future__ import annotations
@@ -57,20 +57,20 @@ from taichi_msm.system.process import available_memory, available_threads
 WITHOUT_MATPLOTLIB = f"{PLOT} needs matplotlib: pip install matplotlib"
 WITHOUT_SALIB = f"{SENSITIVITY} needs SALib: pip install SALib"
 
-# Names of the files written, and warnings for the user.
+# Names of the written files, and warnings.
 WrittenFiles = tuple[list[str], list[str]]
 
 
 def write_reports(result: SweepResult, executor: Executor, progress: StageProgressCallback) -> WrittenFiles:
-    """Write the reports of a sweep, each atomically, and remove outdated ones of an earlier call.
+    """Write the reports of a sweep, each atomically, and remove outdated ones.
 
     Args:
         result: the finished sweep.
         executor: draws the last frames of runs without pictures.
-        progress: called with the stage, the frames drawn and the frames to draw.
+        progress: called with the stage, the drawn and the total number of frames.
 
     Returns:
-        The names of the files written, and warnings for the user, also about reports that could not be written.
+        Names of the written files, and warnings, including failures of reports other than the table.
 
     Raises:
         FilesError: when the table cannot be written.
@@ -88,7 +88,7 @@ def write_reports(result: SweepResult, executor: Executor, progress: StageProgre
             try:
                 new_names, new_notes = write(result)
             except Exception as error:
-                # An error in a plot must not discard the table of hours of runs.
+                # A failing report must not discard hours of runs.
                 new_names, new_notes = [], [f"{name} could not be made: {type(error).__name__}: {error}"]
             names += new_names
             notes += new_notes
@@ -99,7 +99,7 @@ def write_reports(result: SweepResult, executor: Executor, progress: StageProgre
 
 def _write_plots(result: SweepResult) -> WrittenFiles:
     """Write sensitivity.csv if there are enough runs, and sweep.png if complete runs differ."""
-    # More runs would slow down the plot and hardly change it.
+    # More runs would slow down the plots without changing them visibly.
     runs = result.sample_runs(4096)
     varied, columns = varied_parameters(result, runs), varied_results(result, runs)
     names: list[str] = []
@@ -146,12 +146,12 @@ def write_parquet(result: SweepResult) -> WrittenFiles:
     rows = zip(*_rows(result, lambda value: value), strict=True)
     columns: dict[str, Any] = dict(zip(_names(result), map(list, rows), strict=True))
     for name in result.sweep.keys:
-        # A column of values with different types, such as numbers and null, is written as text.
+        # Columns of mixed types, such as numbers and lists, become text.
         try:
             pyarrow.array(columns[name])
         except pyarrow.ArrowException:
             columns[name] = list(map(format_override, columns[name]))
-    for name in result.columns():  # An explicit type is needed for columns without a value.
+    for name in result.columns():  # explicit types, for columns without values
         kind = pyarrow.string() if name in ("status", "error") else pyarrow.float64()
         columns[name] = pyarrow.array(columns[name], kind)
     with replacing(result.directory / PARQUET) as file:
@@ -160,7 +160,7 @@ def write_parquet(result: SweepResult) -> WrittenFiles:
 
 
 def csv_line(row: Iterable[Any]) -> str:
-    """Format a row as a line of a CSV file, without the line end."""
+    """Format a row of a CSV file, without the line break."""
     text = io.StringIO()
     csv.writer(text, lineterminator="").writerow(row)
     return text.getvalue()
@@ -171,7 +171,7 @@ def _names(result: SweepResult) -> list[str]:
 
 
 def _rows(result: SweepResult, write: Callable[[Any], Any]) -> Iterator[list[Any]]:
-    """Yield the rows of the table, with `write` applied to the values of the keys."""
+    """Yield the rows of the table, with the values of the keys converted by `write`."""
     columns = zip(*result.columns().values(), strict=True)
     for values, outcome, results in zip(result.values, result.outcomes, columns, strict=True):
         yield [outcome.run, *map(write, values), *results]
@@ -181,7 +181,7 @@ def write_dataset(result: SweepResult) -> WrittenFiles:
     """Write dataset.json, with a line for every complete run."""
     sweep, complete = result.sweep, [outcome.run for outcome in result.outcomes if outcome.status == "complete"]
     common = _output_format(result.run_directory(complete[0])) if complete else {}
-    # These sections of a scene determine the outputs of a run.
+    # The sections of a scene that determine the output format.
     differ = any(key.split(".")[0] in ("output", "render", "time") for key in sweep.keys)
     splits = assign_splits(len(result.outcomes), sweep.settings.seed)
     head = {"scene": sweep.settings.scene, **sweep.description(), "versions": versions(), **common}
@@ -206,7 +206,7 @@ def assign_splits(runs: int, seed: int) -> list[str]:
 
     Args:
         runs: number of runs.
-        seed: seed of the assignment.
+        seed: of the assignment.
 
     Returns:
         "train", "val" or "test" for each run.
@@ -221,7 +221,7 @@ def assign_splits(runs: int, seed: int) -> list[str]:
 
 
 def _output_format(directory: Path) -> dict[str, Any]:
-    """Read the outputs, number of frames, frame size [px] and frame rate of a run, which a data loader needs."""
+    """Read the outputs, number of frames, frame size [px] and frame rate of a run, for data loaders."""
     record = json.loads(read_regular(directory / RUN_RECORD, MAX_RECORD_BYTES))
     scene = record["scene"]
     return {
@@ -237,12 +237,12 @@ def _json(value: Any) -> bytes:
 
 
 def cost_line(runs: int, cost: SweepCost, workers: WorkerCount | None) -> str:
-    """Format the cost of a sweep as a line.
+    """Format the cost of runs as a line.
 
     Args:
         runs: number of runs.
-        cost: of these runs.
-        workers: processes on this machine, or None if the runs are executed elsewhere.
+        cost: of the runs.
+        workers: processes on this machine; None if the runs are executed elsewhere.
     """
     if workers is None:
         location = "if they were run here"
@@ -261,8 +261,8 @@ def summary_lines(
 
     Args:
         directory: of the sweep.
-        outcomes: of the runs of the sweep or the shard.
-        shard: part I of N as (I, N), or None for the whole sweep.
+        outcomes: of the sweep or shard.
+        shard: part I of N as (I, N); None: the whole sweep.
         files: names of the reports.
         notes: warnings about the reports.
     """
@@ -284,7 +284,7 @@ def summary_lines(
 
 
 def _note_examples(outcomes: Sequence[Outcome]) -> Iterator[str]:
-    """Yield an example of each of the five most frequent notes; notes that differ only in numbers count as the same."""
+    """Yield an example of the five most frequent warnings, where numbers are ignored."""
     groups: dict[str, list[str]] = {}
     for outcome in outcomes:
         for note in outcome.notes:
@@ -303,22 +303,22 @@ def count_statuses(outcomes: Sequence[Outcome]) -> dict[str, int]:
     return {status: counts[status] for status in STATUSES}
 
 
-# Memory of a process without that of its run: Python, the compiler, kernels [bytes].
+# Memory of a process without its run: Python, compiler, kernels [bytes].
 PROCESS_BYTES = 400 << 20
 
-# Overhead of a run and of each of its frames [s]: directories, files, calls; measured on Zen 4.
+# Overhead per run and per frame [s]: directories, files, calls; measured on Zen 4.
 RUN_OVERHEAD_S, FRAME_OVERHEAD_S = 0.04, 0.003
 
 
 class SweepCost(NamedTuple):
-    """Estimated cost of the runs of a sweep. The command line prints these fields as JSON."""
+    """Estimated cost of the runs of a sweep; its fields are keys of the JSON of --dry-run."""
 
     seconds: float  # on all cores of this machine
     disk_bytes: int  # upper bound
     memory_bytes: int  # of one process
-    looked_at: int  # number of runs on which the estimate is based
+    looked_at: int  # number of runs in the estimate
     refused: int  # number of these runs with invalid values
-    example: str  # the error of a refused run
+    example: str  # error of a refused run
 
     def scaled(self, fraction: float) -> SweepCost:
         """Return the cost of a fraction of the runs."""
@@ -330,7 +330,7 @@ class WorkerCount(NamedTuple):
 
     number: int
     cores: int  # available to this program
-    memory_limit: int  # number of processes that fit into the free memory
+    memory_limit: int  # number of processes that the free memory allows
 
 
 def estimate_cost(sweep: Sweep) -> SweepCost:
@@ -343,16 +343,16 @@ def estimate_cost(sweep: Sweep) -> SweepCost:
         except SceneError as error:
             errors.append(error.lines[0])
     durations = list(map(cost_module.estimate_duration, plans))
-    needs = list(map(cost_module.estimate_budget, plans))
+    budgets = list(map(cost_module.estimate_budget, plans))
     looked_at = len(plans) + len(errors)
     scale, cores = sweep.runs / looked_at, available_threads()
     seconds = sum(duration.seconds - duration.start for duration in durations)
-    seconds += sum(RUN_OVERHEAD_S + FRAME_OVERHEAD_S * need.frames for need in needs) / cores
+    seconds += sum(RUN_OVERHEAD_S + FRAME_OVERHEAD_S * budget.frames for budget in budgets) / cores
     return SweepCost(
-        # A process starts once, for many runs.
+        # A process starts once for many runs.
         seconds=max((duration.start for duration in durations), default=0.0) + scale * seconds,
-        disk_bytes=round(scale * sum(need.disk_bytes for need in needs)),
-        memory_bytes=PROCESS_BYTES + max((need.memory_bytes for need in needs), default=0),
+        disk_bytes=round(scale * sum(budget.disk_bytes for budget in budgets)),
+        memory_bytes=PROCESS_BYTES + max((budget.memory_bytes for budget in budgets), default=0),
         looked_at=looked_at,
         refused=len(errors),
         example=next(iter(errors), ""),
@@ -365,7 +365,7 @@ def choose_worker_count(cost: SweepCost, runs: int, requested: int | None = None
     Args:
         cost: of the sweep.
         runs: number of runs.
-        requested: number that the user has chosen, which is used without limits.
+        requested: number chosen by the user, which is not limited.
     """
     cores, memory_limit = available_threads(), available_memory() // cost.memory_bytes
     return WorkerCount(requested or max(1, min(cores, memory_limit, runs)), cores, memory_limit)

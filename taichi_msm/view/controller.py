@@ -1,4 +1,4 @@
-"""The pointer and the camera of a session: the controller of the tool, and the viewport."""
+"""Controller of the tool by the pointer, and viewport of a session."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from taichi_msm.view.tools import ForceControlledTool, PositionControlledTool, S
 
 
 class Controller:
-    """Controller of a tool with a pointer over the picture of a simulation.
+    """Controller of a tool by a pointer over the picture of a simulation.
 
-    A force-controlled tool acts on the material that is visible under the pointer. A position-controlled tool acts in
-    space: its tip is above or below the position of the sheet at rest that is under the pointer.
+    A force-controlled tool acts on the material that is visible under the pointer. The tip of a position-controlled
+    tool is above or below the point of the rest plane under the pointer.
 
     Args:
         tool: the initial tool.
-        viewport: has the camera of the picture.
+        viewport: has the camera.
         simulation: has the sheet.
 
     Attributes:
-        tool: the tool; may be replaced while it does not press.
+        tool: the current tool; may be replaced while it does not press.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class Controller:
         self.tool = tool
         self._viewport = viewport
         self._simulation = simulation
-        # Start of a drag: position of the tool, and the point of the rest plane under the pointer [m].
+        # Start of a drag: position of the tool, and point of the rest plane under the pointer [m].
         self._drag_start: tuple[SheetPosition, NDArray[np.floating] | None] | None = None
         self._pointer = (0.0, 0.0)
         self._hover_pixel: tuple[float, float] | None = None
@@ -50,12 +50,12 @@ class Controller:
         """Press the tissue that is visible at a pixel.
 
         Args:
-            x: column of the pixel.
-            y: row of the pixel.
+            x: column [px].
+            y: row [px].
             direction: 1 to press, -1 to pull or grip.
 
         Returns:
-            Whether tissue is visible there.
+            Whether tissue is visible at the pixel.
         """
         position = self._simulation.pick((x, y), self._viewport.view)
         if position is None:
@@ -68,30 +68,21 @@ class Controller:
         return True
 
     def hover_position(self) -> SheetPosition | None:
-        """Return the position at which a force-controlled tool would press, or None if there is none or it presses."""
+        """Return the position at which a force-controlled tool would press; None if it presses, or for other tools."""
         if isinstance(self.tool, PositionControlledTool) or self.tool.engaged or self.tool.percent != 0:
             return None
         return None if self._hover_pixel is None else self._simulation.pick(self._hover_pixel, self._viewport.view)
 
     def hover(self, x: float, y: float) -> None:
-        """Move the pointer without pressing; the tip of a position-controlled tool follows.
-
-        Args:
-            x: column of the pixel.
-            y: row of the pixel.
-        """
+        """Move the pointer to column x and row y [px] without pressing; a position-controlled tool follows."""
         self._hover_pixel = x, y
         if isinstance(self.tool, PositionControlledTool) and (position := self._rest_position(x, y)):
             self.tool.move(position)
 
     def drag(self, x: float, y: float) -> None:
-        """Move the pressing tool over the sheet at rest by the movement of the pointer.
+        """Move the pressing tool by the displacement of the pointer to column x and row y [px], on the rest plane.
 
-        The deformed sheet cannot be used: it moves with the tool, so each movement would cause another one.
-
-        Args:
-            x: column of the pixel under the pointer.
-            y: row of that pixel.
+        Picking the deformed sheet would feed back, as it moves with the tool.
         """
         if self._drag_start is None:
             return
@@ -109,7 +100,7 @@ class Controller:
             self.tool.release()
 
     def rebase_drag(self) -> None:
-        """Keep the position of the tool after the camera has moved; a drag continues from there."""
+        """Restart a drag at the current position of the tool, after the camera has moved."""
         if self._drag_start is not None:
             self._drag_start = self.tool.target, intersect_rest_plane(self._viewport.view, self._pointer)
 
@@ -119,7 +110,7 @@ class Controller:
         self._drag_start = self._hover_pixel = None
 
     def _rest_position(self, x: float, y: float) -> SheetPosition | None:
-        """Return the position of the sheet at rest at a pixel, or None if the pixel does not show its plane."""
+        """Return the position on the rest plane at a pixel; None if the plane is not visible there."""
         if (point := intersect_rest_plane(self._viewport.view, (x, y))) is None:
             return None
         height, width = self._simulation.scene.sheet.size
@@ -127,11 +118,11 @@ class Controller:
 
 
 class Viewport:
-    """Camera, light and mesh display of a session, which the user can change.
+    """Interactive camera, light and mesh display of a session.
 
     Args:
-        renderer: draws the sheet; its scene has the initial settings.
-        play: whether to follow a moving camera of the scene, which otherwise stays at its initial pose.
+        renderer: has the initial settings in its scene.
+        play: whether to follow a moving camera of the scene; otherwise it stays at its initial pose.
 
     Attributes:
         render: current drawing settings.
@@ -157,7 +148,7 @@ class Viewport:
         self.view = view(self._renderer.scene.model_copy(update={"render": self.render, "output": ()}), self._time)
 
     def set_time(self, time: float) -> bool:
-        """Move a moving camera to its pose at a time [s]; returns whether the camera moves."""
+        """Move the camera to its pose at a time [s]; return whether it moves."""
         self._time = time
         camera = self.render.main_camera
         moving = isinstance(camera, Camera) and camera.moves
@@ -166,7 +157,7 @@ class Viewport:
         return moving
 
     def recorded_render(self, duration: float) -> Render:
-        """Return the drawing settings for a scene of a duration [s]; the camera's last pose is held until its end."""
+        """Return the drawing settings for a scene of a duration [s], with the last camera pose held until its end."""
         camera = self.render.main_camera
         if isinstance(camera, Camera) and isinstance(camera.poses, tuple) and camera.poses[-1][0] < duration:
             last = (duration, *camera.poses[-1][1:])
@@ -174,40 +165,40 @@ class Viewport:
         return self.render
 
     def turn(self, right: float, down: float) -> None:
-        """Orbit the camera as if the nearest side of the tissue were dragged.
+        """Orbit the camera as if the near side of the tissue were dragged.
 
         Args:
-            right: horizontal distance of the drag [px]; the height of the picture is half a turn.
-            down: vertical distance of the drag [px].
+            right: horizontal drag [px]; the height of the picture is half a turn.
+            down: vertical drag [px].
         """
         angle = math.pi / self.render.size[1]
         scene = self._renderer.scene.model_copy(update={"render": self.render})
         self.set_camera(orbit_camera(pinhole(scene, self._time), -right * angle, down * angle))
 
     def toggle_light(self) -> None:
-        """Switch between no shading and that of the scene, or the headlight if the scene has none."""
+        """Toggle the shading of the scene, or a headlight if the scene has none."""
         scene_shading = self._renderer.scene.render.shading
-        lit = scene_shading if scene_shading != "none" else "headlight"
-        self._change(shading="none" if self.render.shading != "none" else lit)
+        shading = scene_shading if scene_shading != "none" else "headlight"
+        self._change(shading="none" if self.render.shading != "none" else shading)
 
     def toggle_mesh(self) -> None:
         """Show or hide the mesh."""
         self._change(wireframe=not self.render.wireframe)
 
-    def draw(self, positions: NDArray[Any], rods: Sequence[Capsule] = ()) -> Picture:
+    def draw(self, positions: NDArray[Any], capsules: Sequence[Capsule] = ()) -> Picture:
         """Draw the sheet and instruments.
 
         Args:
             positions: of the mass points [m], shape (rows, cols, 3).
-            rods: capsules of the instruments.
+            capsules: the instruments.
 
         Returns:
             The picture, shape (height, width, 3).
         """
-        return self._renderer.draw(Shot(positions, self.view, rods), self.render)
+        return self._renderer.draw(Shot(positions, self.view, capsules), self.render)
 
     def project(self, point: NDArray[np.floating]) -> tuple[float, float] | None:
-        """Project a point [m], shape (3,), to a pixel (x, y), or to None if it is behind the camera."""
+        """Project a point [m], shape (3,), to a pixel (x, y); None behind the camera."""
         x, y = self.view.pixels(point.astype(float)).tolist()
         return (x, y) if math.isfinite(x) else None
 

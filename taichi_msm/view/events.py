@@ -1,4 +1,4 @@
-"""Input events of a session. Pixels count from the top left of the picture, x to the right and y down."""
+"""Input events of a session, in pixels from the upper left corner of the picture, x to the right and y down."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class Hover(NamedTuple):
-    """The pointer moves to a pixel without a pressed button."""
+    """The pointer moves to a pixel, without a pressed button."""
 
     x: float
     y: float
@@ -32,7 +32,7 @@ class Release(NamedTuple):
 
 
 class Turn(NamedTuple):
-    """The camera orbits the tissue, as if its nearest side were dragged by this distance [px]."""
+    """The camera orbits, as if the near side of the tissue were dragged by this distance [px]."""
 
     right: float
     down: float
@@ -45,7 +45,7 @@ class Strength(NamedTuple):
 
 
 class StrengthChange(NamedTuple):
-    """The strength is increased [% of the full force or depth]; negative values decrease it."""
+    """The strength changes by an increment [% of the full force or depth]."""
 
     percent: float
 
@@ -58,7 +58,7 @@ class Key(NamedTuple):
 
 Event = Hover | Press | Drag | Release | Turn | Strength | StrengthChange | Key
 
-# Change of the strength by a notch of the wheel, or by the up or down key [% of the full force or depth].
+# Increment of the strength per notch of the wheel or press of a key [% of the full force or depth].
 STRENGTH_STEP = 5.0
 
 # Pointer actions and their help texts.

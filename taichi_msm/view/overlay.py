@@ -1,4 +1,4 @@
-"""Overlay of a session's picture: figures, help texts, and the position of the tool."""
+"""Overlay of a session's picture: figures, help texts, and a mark at the tool."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from PIL import Image, ImageDraw, ImageFont
 
 from taichi_msm.runs.media import Picture
 
-# Width of a bar [letter heights].
-BAR_LETTERS = 10
+# Length of a bar [letter heights].
+BAR_LENGTH_LETTERS = 10
 
 OUTLINE_GREY = 140
 
 
 class ValueBar(NamedTuple):
-    """A value as a bar, whose end is the smallest round number that is not below the largest value so far."""
+    """A value as a bar, scaled to the largest value so far, rounded up."""
 
     value: float
     largest: float  # positive
@@ -41,19 +41,21 @@ def write_text(
     table: Mapping[str, str] | None = None,
     bar: ValueBar | None = None,
 ) -> None:
-    """Write text on dark panels over a picture.
+    """Write text on dark panels over a picture, in place.
 
     Args:
-        picture: shape (height, width, 3); changed in place.
-        above: lines in the top left corner.
-        below: wrapped text at the bottom.
-        table: two columns below the lines and the bar.
-        bar: drawn below the lines.
+        picture: shape (height, width, 3).
+        above: lines in the upper left corner.
+        below: text at the bottom, which is wrapped.
+        table: two columns, below the lines and the bar.
+        bar: below the lines.
     """
     height, width = picture.shape[:2]
     size = _letter_size(picture)
     top = edge = size // 2
-    bar_panel = _bar(size, round(BAR_LETTERS * size * bar.value / bar.end), f"{bar.end:g} {bar.unit}") if bar else None
+    bar_panel = (
+        _bar(size, round(BAR_LENGTH_LETTERS * size * bar.value / bar.end), f"{bar.end:g} {bar.unit}") if bar else None
+    )
     for panel in (_panel(size, *above), bar_panel, _columns(tuple((table or {}).items()), size)):
         if panel is not None and len(panel):
             _blend(picture, panel, edge, top)
@@ -64,41 +66,38 @@ def write_text(
 
 
 def announce(picture: Picture, text: str) -> None:
-    """Write text over the middle of a picture.
-
-    Args:
-        picture: shape (height, width, 3); changed in place.
-        text: the text.
-    """
+    """Write text over the middle of a picture, shape (height, width, 3), in place."""
     panel = _panel(_letter_size(picture), text)
     _blend(picture, panel, (picture.shape[1] - panel.shape[1]) // 2, (len(picture) - len(panel)) // 2)
 
 
-def mark_tool(picture: Picture, tool: tuple[float, float], *, pulls: bool) -> None:
-    """Draw a ring around the tool.
+def mark_tool(picture: Picture, pixel: tuple[float, float], *, pulls: bool) -> None:
+    """Draw a ring around the tool, in place.
 
     Args:
-        picture: shape (height, width, 3); changed in place.
-        tool: pixel at which the tool is visible.
-        pulls: whether the tool pulls, which changes the colour.
+        picture: shape (height, width, 3).
+        pixel: position of the tool (x, y).
+        pulls: whether to use the colour of a pulling tool.
     """
     radius = picture.shape[0] * (1 / 50)
     reach = int(radius) + 4
-    left, top = max(0, int(tool[0]) - reach), max(0, int(tool[1]) - reach)
-    # Only this region is copied, as a copy of the whole picture would dominate the time.
-    region = picture[top : max(0, int(tool[1]) + reach), left : max(0, int(tool[0]) + reach)]
+    left, top = max(0, int(pixel[0]) - reach), max(0, int(pixel[1]) - reach)
+    # Copying only this region is much faster than the whole picture.
+    region = picture[top : max(0, int(pixel[1]) + reach), left : max(0, int(pixel[0]) + reach)]
     if region.size == 0:
         return
     image = Image.fromarray(region)
-    x, y = tool[0] - left, tool[1] - top
+    x, y = pixel[0] - left, pixel[1] - top
     colour = (255, 214, 90) if pulls else (255, 255, 255)
-    for r, outline, line in ((radius + 1, (0, 0, 0), 3), (radius, colour, 1)):
-        ImageDraw.Draw(image).ellipse((x - r, y - r, x + r, y + r), outline=outline, width=line)
+    for ring_radius, outline, line_width in ((radius + 1, (0, 0, 0), 3), (radius, colour, 1)):
+        ImageDraw.Draw(image).ellipse(
+            (x - ring_radius, y - ring_radius, x + ring_radius, y + ring_radius), outline=outline, width=line_width
+        )
     region[:] = np.asarray(image)
 
 
 def _blend(picture: Picture, panel: NDArray[np.uint8], left: int, top: int) -> None:
-    """Blend a panel with white letters over a darkened picture, clipped to the picture."""
+    """Blend a panel over a darkened region of the picture, clipped to the picture."""
     left, top = max(0, left), max(0, top)
     region = picture[top : top + panel.shape[0], left : left + panel.shape[1]]
     region[:] = np.maximum(region // 3, panel[: region.shape[0], : region.shape[1], None])
@@ -110,7 +109,7 @@ def _panel(size: int, *lines: str) -> NDArray[np.uint8]:
 
 @lru_cache(maxsize=64)
 def _columns(rows: tuple[tuple[str, str], ...], size: int) -> NDArray[np.uint8]:
-    """Draw a panel of two columns, shape (height, width); empty without rows."""
+    """Draw two columns of text, shape (height, width); empty without rows."""
     if not rows:
         return np.zeros((0, 0), np.uint8)
     font, line, edge = ImageFont.load_default(size), round(1.4 * size), size // 2
@@ -126,8 +125,8 @@ def _columns(rows: tuple[tuple[str, str], ...], size: int) -> NDArray[np.uint8]:
 
 @lru_cache(maxsize=64)
 def _bar(size: int, filled: int, end: str) -> NDArray[np.uint8]:
-    """Draw a panel of a bar that is filled by a length [px], with the value at its end; shape (height, width)."""
-    edge, height, width = size // 2, round(0.6 * size), BAR_LETTERS * size
+    """Draw a bar that is filled to a length [px], with the label of its end; shape (height, width)."""
+    edge, height, width = size // 2, round(0.6 * size), BAR_LENGTH_LETTERS * size
     label = _panel(size, end)
     panel = np.zeros((len(label), edge + width + label.shape[1]), np.uint8)
     panel[:, edge + width :] = label
@@ -139,5 +138,5 @@ def _bar(size: int, filled: int, end: str) -> NDArray[np.uint8]:
 
 
 def _letter_size(picture: Picture) -> int:
-    """Return the height of letters [px], which depends on the height of the picture."""
+    """Return the height of letters [px] for the size of the picture."""
     return int(min(22, max(11, picture.shape[0] * (1 / 36))))

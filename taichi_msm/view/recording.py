@@ -1,4 +1,4 @@
-"""Files that a session saves: pictures, films and scenes. Each is written atomically under a new name."""
+"""Files saved by a session: pictures, films and scenes, each written atomically under a free name."""
 
 from __future__ import annotations
 
@@ -22,26 +22,25 @@ from taichi_msm.scene.outputs import OUTPUTS
 from taichi_msm.scene.render import Render
 from taichi_msm.scene.scene import Scene
 
-# The C emitter is ten times faster; it writes the same text as the other one.
+# The C emitter is ten times faster, with the same output.
 _DUMPER: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 
 class Film:
-    """A GIF of a session, encoded in a hidden folder while the session runs.
+    """A GIF of a session, encoded in a hidden folder while the session runs; `close` removes it unless it was moved.
 
-    Closing removes the file unless it was moved. The constructor and the methods raise a FilesError when the GIF cannot
-    be written.
+    The constructor and the methods raise a FilesError when the GIF cannot be written.
 
     Args:
-        folder: directory of the hidden folder.
-        render: has the size and the background of the pictures.
+        folder: parent of the hidden folder.
+        render: has the size and background of the pictures.
         rate: pictures per second.
-        subframes: frames of the session for each picture.
+        subframes: frames of the session per picture.
         begin: first frame of the session.
-        option: name of the option in the message of an error.
+        option: name of the option in messages.
 
     Attributes:
-        pictures: number of pictures.
+        pictures: number of pictures so far.
     """
 
     def __init__(
@@ -57,11 +56,11 @@ class Film:
             self._opened = opened.pop_all()
 
     def add_frame(self, picture: Picture, frame: int, pause: Pause = lambda: None) -> None:
-        """Append a picture, repeated if earlier pictures are missing.
+        """Append a picture, repeated in place of missing earlier ones.
 
         Args:
             picture: shape (height, width, 3).
-            frame: frame of the session.
+            frame: number of the session's frame.
             pause: called while the encoder is busy.
         """
         with writing(*self._location):
@@ -70,7 +69,7 @@ class Film:
                 self.pictures += 1
 
     def finish(self, pause: Pause = lambda: None) -> Path:
-        """Finish the film, which must have a picture; returns the file, which the caller must move."""
+        """Finish a film with at least one picture; return its file, which the caller must move."""
         with writing(*self._location):
             self._encoder.finish(pause)
         return self._hidden / OUTPUTS["gif"].path()
@@ -81,16 +80,16 @@ class Film:
 
 
 class Captures:
-    """The directory of the files that a session saves, which is created with the first file.
+    """Directory of the files saved by a session, created with the first file.
 
     The methods raise a FilesError when the directory cannot be written.
 
     Args:
-        folder: the directory.
+        folder: path of the directory.
         name: name of the scene, for comments.
 
     Attributes:
-        saved: the saved files, in order.
+        saved: paths of the saved files, in order.
     """
 
     def __init__(self, folder: Path, name: str) -> None:
@@ -99,13 +98,13 @@ class Captures:
         self._name = name
 
     def save_picture(self, picture: Picture) -> Path:
-        """Save a picture, shape (height, width, 3), as PNG; returns its file."""
+        """Save a picture, shape (height, width, 3), as PNG; return its path."""
         with writing(self.folder), hidden_folder(self.folder) as hidden:
             Image.fromarray(picture).save(hidden / "picture", "PNG")
             return self._move_to_free_name(hidden / "picture", "picture", ".png")
 
     def save_scene(self, scene: Scene) -> Path:
-        """Save a scene and copies of its pictures in the same directory; returns the scene file."""
+        """Save a scene and copies of its pictures; return the path of the scene file."""
         with writing(self.folder), hidden_folder(self.folder) as hidden:
             scene = scene.with_pictures(lambda path: self._copy_picture(Path(path)).name)
             data = scene.model_dump(mode="json", exclude_none=True)
@@ -113,24 +112,23 @@ class Captures:
                 data, Dumper=_DUMPER, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True
             )
             text = f"# What was done in a live session of {printable(self._name)}; `run` repeats it.\n{text}"
-            # A scene has at most 1000 values in addition to the keyframes of its probes.
+            # Without the keyframes of its probes, a scene has at most 1000 values.
             if len(text.encode()) > MAX_BYTES or count_probe_values(scene) + 1000 > MAX_NODES:
                 raise FilesError("this session is too long for a scene file; reset it, and do less")
             (hidden / "session").write_text(text, "utf-8")
             return self._move_to_free_name(hidden / "session", "session", ".yaml")
 
     def save_film(self, film: Film) -> Path:
-        """Finish and save a film that has a picture; returns its file."""
+        """Finish and save a film with at least one picture; return its path."""
         with closing(film), writing(self.folder):
             return self._move_to_free_name(film.finish(), "film", ".gif")
 
     def _move_to_free_name(self, draft: Path, stem: str, suffix: str) -> Path:
-        """Move a file to the next free name."""
         self.saved.append(move_to_free_name(draft, self.folder, stem, suffix))
         return self.saved[-1]
 
     def _copy_picture(self, image: Path) -> Path:
-        """Copy a picture into the directory, under its name or a numbered one, unless an equal copy exists."""
+        """Copy a picture under its name, or a numbered one, unless an equal copy exists."""
         copy, number = self.folder / image.name, 1
         if not image.is_file():
             raise FilesError(f"{image}: missing; put the picture back, the scene needs a copy of it")
@@ -144,7 +142,7 @@ class Captures:
 
 
 def count_probe_values(scene: Scene) -> int:
-    """Return the number of values in the keyframes of a scene's probes, for the limit `MAX_NODES` of scene files."""
+    """Count the values in the keyframes of a scene's probes."""
     return sum(
         4 * len(probe.at) + 3 * len(probe.load) + 5 * len(probe.path or ()) + 3 * len(probe.grip)
         for probe in scene.probes

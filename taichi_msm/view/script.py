@@ -29,14 +29,11 @@ Pair = tuple[Number, Number]
 Seconds = Annotated[NotNegative, Field(le=MAX_SCRIPT_S)]
 SECONDS = f"a number from 0 to {MAX_SCRIPT_S:g}, in seconds"
 
-# The key that each kind of event requires in addition to its time.
+# Required key of each kind of event, in addition to its time.
 REQUIRED_KEYS = {"press": "at", "pull": "at", "drag": "at", "release": "", "turn": "by", "percent": "to", "key": "name"}
-*KINDS, LAST_KIND = REQUIRED_KEYS
 
-# A script cannot quit, as the duration of a film is given.
+# A script cannot quit: the duration of the film is an option.
 SCRIPT_KEYS = tuple(name for name in KEYS if name != "q")
-
-_SCRIPT = FileKind("script", "events")
 
 
 class ScriptEvent(Section):
@@ -44,7 +41,7 @@ class ScriptEvent(Section):
 
     t: Seconds = key(..., description="when, or when it begins [s]", expects=SECONDS)
     do: Literal["press", "pull", "drag", "release", "turn", "percent", "key"] = key(
-        ..., description="action", expects=f"{', '.join(KINDS)} or {LAST_KIND}"
+        ..., description="action", expects="press, pull, drag, release, turn, percent or key"
     )
     at: Pair | None = key(
         None, description="the pixel", expects="for press, pull and drag [x, y] in pixels from the top left"
@@ -115,7 +112,7 @@ def load_script(path: str | Path, size: tuple[int, int]) -> Script:
     Raises:
         SceneError: with a line for each error of the file, in the order of the file.
     """
-    draft = Draft(read_file(str(path), _SCRIPT))
+    draft = Draft(read_file(str(path), FileKind("script", "events")))
     script, problems = parse_model(Script, draft.data)
     draft.report(problems)
     draft.report(_outside(script, script.size or size) if script is not None else ())
@@ -125,7 +122,7 @@ def load_script(path: str | Path, size: tuple[int, int]) -> Script:
 
 
 def _outside(script: Script, size: tuple[int, int]) -> Iterator[Problem]:
-    """Check that presses are inside the picture."""
+    """Yield the presses outside the picture."""
     width, height = size
     for n, entry in enumerate(script.events):
         if entry.do in ("press", "pull") and entry.at is not None:
@@ -144,7 +141,7 @@ def schedule_events(script: Script, rate: float, size: tuple[int, int]) -> Itera
         size: width and height of the session's picture [px].
 
     Returns:
-        The events in order, each with the frame before which it happens.
+        Pairs of a frame and the event before it, in order.
     """
     scale = [actual / assumed for actual, assumed in zip(size, script.size or size, strict=True)]
     x = y = 0.0
@@ -180,19 +177,18 @@ def record_film(
     progress: Callable[[int, int], None] = lambda done, total: None,
     notify: Callable[[str], None] = lambda notice: None,
 ) -> None:
-    """Run a session without a window and record it as a GIF, which replaces an earlier file at the end.
+    """Run a session without a window, and record a GIF, which replaces an earlier file at the end.
 
     Args:
-        session: the session.
+        session: a new session.
         path: the GIF.
         seconds: duration of the film [s].
-        events: from `schedule_events`; read one at a time.
-        progress: called often with the number of finished frames and the number of frames; an exception from it stops
-            the session.
+        events: as returned by `schedule_events`; consumed lazily.
+        progress: called often with the finished and total frames; an exception from it stops the session.
         notify: called with notices for the user.
 
     Raises:
-        FilesError: when the film cannot be written; after it was written, when an event could not save its file.
+        FilesError: when the film cannot be written; or, after it was written, when an event could not save its file.
     """
     if path.is_dir():
         raise FilesError(f"{path}: a directory; choose another {OPTION}")

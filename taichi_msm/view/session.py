@@ -1,7 +1,4 @@
-"""An interactive session: it processes events, and provides the state of the tissue and its picture.
-
-It has no window and no clock.
-"""
+"""Interactive session: event handling, simulation and picture, independent of a window and a clock."""
 
 from __future__ import annotations
 
@@ -32,7 +29,7 @@ from taichi_msm.view.controller import Controller, Viewport
 from taichi_msm.view.recording import Captures, Film, count_probe_values
 from taichi_msm.view.tools import ForceControlledTool, PositionControlledTool, SheetPosition
 
-# Largest number of frames per second of a session, which a screen can show.
+# Largest frame rate of a session, that of common screens [1/s].
 MAX_FRAME_RATE = 60.0
 
 NOTICE_DURATION_S = 3.0
@@ -42,7 +39,7 @@ def divide_frames(plan: Plan) -> tuple[Plan, int]:
     """Divide the frames of a scene into equal subframes, at most `MAX_FRAME_RATE` per second.
 
     Returns:
-        The plan with the subframes as frames, and the number of subframes per frame.
+        The plan with subframes as frames, and the number of subframes per frame of the scene.
     """
     scene = plan.scene
     subframes = max(1, int(MAX_FRAME_RATE / scene.time.frames_per_second * (1 + 1e-9)))
@@ -54,19 +51,19 @@ def divide_frames(plan: Plan) -> tuple[Plan, int]:
 
 
 class Session:
-    """An interactive simulation of a scene with a tool; a context manager, which saves a running film.
+    """Interactive simulation of a scene with a tool; a context manager, which saves a running film at its end.
 
-    A force-controlled tool has the force, the falloff and the offset of the scene's first probe with a force. A
-    position-controlled tool has the instrument and the friction of the first probe with a path, or otherwise the first
-    instrument. The initial tool corresponds to the scene's first probe.
+    A force-controlled tool has the force, falloff and offset of the scene's first probe with a force. A
+    position-controlled tool has the instrument and friction of the first probe with a path, otherwise the first
+    instrument. The first probe determines which one is the initial tool.
 
     Args:
         scene: the scene.
         captures: receives saved files.
         arch: cpu, cuda or vulkan.
-        threads: number of CPU threads, or None for one per core.
+        threads: number of CPU threads; None: one per core.
         play: whether the scene's own probes act too.
-        progress: called often with the name of the stage; an exception from it stops the session.
+        progress: called often with the stage; an exception from it stops the session.
 
     Raises:
         SceneError: when the scene has no picture, no probe, or too many probes.
@@ -76,10 +73,10 @@ class Session:
         scene: the scene, with the frames and the time step of the session.
         tool: the current tool.
         viewport: camera, light and mesh display.
-        subframes: number of frames of the session per frame of the given scene.
+        subframes: frames of the session per frame of the given scene.
         paused: whether the simulation is paused.
-        divergence_error: message of a divergence, which stops the simulation; empty otherwise.
-        frame_time_s: average time of the steps of a frame [s].
+        divergence_error: message of a divergence, which stops the simulation; otherwise empty.
+        frame_time_s: moving average of the time to simulate a frame [s].
     """
 
     def __init__(
@@ -102,7 +99,7 @@ class Session:
         self._captures = captures
         self._film: Film | None = None
         self._scene_probes = scene.probes if play else ()
-        # Without outputs their kernels are not compiled.
+        # Without outputs, their kernels are not compiled.
         self._plan = replace(plan, scene=scene.model_copy(update={"output": ()}))
         self._force_tool, self._position_tool = _force_tool(plan), _position_tool(plan)
         tool = self._position_tool if scene.probes[0].moved else self._force_tool
@@ -110,14 +107,14 @@ class Session:
         self.tool = tool
         plan = self._with_tool(tool)
         self.scene = scene.model_copy(update={"probes": plan.scene.probes})
-        self._shows_figures, self._shows_keys = True, False
-        self._single_step = self._length_warned = self.paused = False
+        self._show_figures, self._show_keys = True, False
+        self._single_step = self._has_warned_of_length = self.paused = False
         # Elapsed frames, including those of pauses.
         self._elapsed = 0
         self._notice, self._notice_until = "", 0
         self.divergence_error = ""
         self.frame_time_s = 0.0
-        # Largest felt force since the last reset [N].
+        # Since the last reset [N].
         self._max_felt_force = 0.0
         progress("compile")
         self._simulation = Simulation(plan, arch, threads, texture)
@@ -146,14 +143,14 @@ class Session:
         return float(np.linalg.norm(self._touched_point() - [*self._rest_point(self.tool.position), 0.0]))
 
     def felt_force(self) -> float:
-        """Return the force on a position-controlled tool, averaged over the last frame [N]; 0 for other tools."""
+        """Return the mean force on a position-controlled tool in the last frame [N]; 0 for other tools."""
         if isinstance(self.tool, ForceControlledTool):
             return 0.0
         return float(np.linalg.norm(self._simulation.forces()[-1].force))
 
     def recorded_scene(self) -> Scene:
-        """Return the recorded session as a scene, whose run has the same bits."""
-        # After a divergence, the frame in which it happened is part of the scene, whose run diverges as well.
+        """Return the session as a scene, whose run is bit-identical."""
+        # The frame of a divergence is included, so that the run diverges too.
         frames = max(1, self.frame + bool(self.divergence_error))
         time = self.scene.time.model_copy(update={"duration": frames / self.frame_rate, "tolerance": None})
         probes = (*self._scene_probes, self.tool.recorded_probe(frames))
@@ -162,7 +159,7 @@ class Session:
         )
 
     def handle(self, event: events.Event) -> None:
-        """Process an event, which takes effect from the next frame on.
+        """Process an event, with effect from the next frame on.
 
         Raises:
             FilesError: when a file cannot be saved.
@@ -190,13 +187,13 @@ class Session:
                 self._handle_key(name)
 
     def advance(self) -> None:
-        """Advance by a frame; the tissue moves unless the session is paused."""
+        """Advance by a frame, without motion while paused."""
         self._elapsed += 1
         if (self.paused and not self._single_step) or self.divergence_error:
             return
         self._single_step = False
-        if self.frame % 200 == 0 and not self._length_warned and self._is_nearly_too_long():
-            self._length_warned = True
+        if self.frame % 200 == 0 and not self._has_warned_of_length and self._is_nearly_too_long():
+            self._has_warned_of_length = True
             self.show_notice("this session will soon be too long for a scene: save it now (w), then reset it (r)")
         start = time.perf_counter()
         try:
@@ -214,7 +211,7 @@ class Session:
         self.frame_time_s += weight * (duration - self.frame_time_s)
 
     def picture(self, pacing: str = "") -> Picture:
-        """Draw the tissue and the overlay; a running film gets the picture without the overlay.
+        """Draw the tissue and the overlay; append the picture without text to a running film.
 
         Args:
             pacing: text about the speed of the session.
@@ -234,10 +231,10 @@ class Session:
                 self._film.close()
                 self._film = None
                 self.show_notice(str(error))
-        above = self._figure_lines(pacing) if self._shows_figures else ["paused"] if self.paused else []
-        keys, bar = (events.POINTER | events.KEYS if self._shows_keys else None), None
-        # A small picture has no space for both the keys and the bar.
-        if self._shows_figures and self._max_felt_force > 0 and keys is None:
+        above = self._figure_lines(pacing) if self._show_figures else ["paused"] if self.paused else []
+        keys, bar = (events.POINTER | events.KEYS if self._show_keys else None), None
+        # A small picture has no space for both.
+        if self._show_figures and self._max_felt_force > 0 and keys is None:
             bar = overlay.ValueBar(self.felt_force(), self._max_felt_force, "N")
         overlay.write_text(picture, above, self.notice, keys, bar)
         return picture
@@ -263,7 +260,7 @@ class Session:
         self.close()
 
     def _draw(self) -> Picture:
-        """Draw the tissue and the instruments; that of the tool is where the tool acts, or would act."""
+        """Draw the tissue and the instruments, with that of the tool where it acts or would act."""
         positions, scene = self.positions(), self._simulation.scene
         instruments = place_capsules(scene, positions, self._simulation.time)
         instrument = scene.probes[-1].instrument
@@ -317,12 +314,12 @@ class Session:
             case "w":
                 self.show_notice(f"saved {self._captures.save_scene(self.recorded_scene())}")
             case "i":
-                self._shows_figures = not self._shows_figures
+                self._show_figures = not self._show_figures
             case "h":
-                self._shows_keys = not self._shows_keys
+                self._show_keys = not self._show_keys
 
     def _with_tool(self, tool: ForceControlledTool | PositionControlledTool) -> Plan:
-        """Plan the scene with a tool at rest; raises a SceneError if its instrument cannot be position-controlled."""
+        """Plan the scene with a tool at rest; SceneError: its instrument cannot be position-controlled."""
         plan = self._plan.with_probes((*self._scene_probes, tool.recorded_probe(0)))
         session_tools = [tool for tool in plan.tools if tool.probe == len(self._scene_probes)]
         if any(path_problems(plan.scene, session_tools, plan.grid)):
@@ -354,8 +351,7 @@ class Session:
         self.show_notice("; ".join(path_warnings(plan.scene, session_tools)))
 
     def _reset_figures(self) -> None:
-        """Reset warnings and figures of the session."""
-        self._single_step = self._length_warned = False
+        self._single_step = self._has_warned_of_length = False
         self._max_felt_force, self.divergence_error = 0.0, ""
 
     def _end_film(self) -> None:
@@ -370,12 +366,12 @@ class Session:
             self.show_notice("no film was saved: it had no picture yet")
 
     def _is_nearly_too_long(self) -> bool:
-        """Return whether the recorded scene has reached three quarters of the limit of scene files."""
+        """Return whether the recorded scene has reached three quarters of the size limit."""
         return count_probe_values(self.recorded_scene()) > 0.75 * MAX_NODES
 
     @property
     def _pulls(self) -> bool:
-        """Whether the force of the tool points away from the sheet, as that of a scene may."""
+        """Whether the tool pulls; the force of a scene's probe may do so too."""
         tool = self.tool
         return (
             isinstance(tool, ForceControlledTool)
@@ -399,7 +395,7 @@ class Session:
         action = "pull" if self._pulls else "push"
         percent = f"{action} {abs(tool.percent):.0f} %" if tool.percent else f"tool {tool.strength:.0f} %"
         displacement = self.displacement()
-        # Smaller displacements are rounding errors of positions in f32.
+        # Smaller displacements are rounding errors of f32.
         return [percent, length(displacement if displacement > 1e-6 * max(self.scene.sheet.size) else 0.0)]
 
 
@@ -415,20 +411,20 @@ def _require_usable(scene: Scene, *, play: bool) -> None:
 
 
 def _force_tool(plan: Plan) -> ForceControlledTool | None:
-    """Build the force-controlled tool, if a probe has a force."""
+    """Build the force-controlled tool; None if no probe has a force."""
     probe = next((probe for probe in plan.scene.probes if not probe.moved), None)
     return ForceControlledTool(probe, plan.grid.frames_per_second) if probe else None
 
 
 def _position_tool(plan: Plan) -> PositionControlledTool | None:
-    """Build the position-controlled tool, if a probe has an instrument; a probe with a path takes precedence."""
+    """Build the position-controlled tool; None if no probe has an instrument."""
     probes = sorted(plan.scene.probes, key=lambda probe: not probe.moved)
     probe = next((probe for probe in probes if probe.instrument is not None), None)
     return PositionControlledTool(probe, plan) if probe else None
 
 
 def newtons(force: float) -> str:
-    """Format a force [N] with two significant digits, or as an integer."""
+    """Format a force [N] with at least two digits."""
     return f"{force:.2g} N" if force < 10 else f"{force:.0f} N"
 
 

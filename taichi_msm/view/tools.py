@@ -1,7 +1,4 @@
-"""The tool of a live session, as a probe of a scene: force-controlled, or position-controlled.
-
-Every frame adds the keyframes that a run needs to repeat the session.
-"""
+"""Tools of a live session, force-controlled or position-controlled, which record keyframes to repeat the session."""
 
 from __future__ import annotations
 
@@ -14,32 +11,32 @@ from taichi_msm.model.plan import Plan
 from taichi_msm.model.tools import MAX_STRIDE_RADII
 from taichi_msm.scene.tools import Probe
 
-# Time in which the tool goes from no force to the full force, or from the highest to the deepest position [s].
+# Rise time from no force to the full force, and travel time from the highest to the deepest position [s].
 RISE_TIME_S = 0.2
 
-# Number of last keyframes that determine the next frame, with the jump at its beginning.
-LATEST = 4
+# Number of latest keyframes that determine the next frame; there may be a jump at its beginning.
+ACTIVE_KEYFRAMES = 4
 
-# A position on the sheet, as fractions (across, down) of its size.
+# Position on the sheet, fractions (across, down) of its size.
 SheetPosition = tuple[float, float]
 
 
 class ForceControlledTool:
-    """A tool that presses at one position at a time, with the force, the falloff and the offset of a probe.
+    """A tool that presses at one control point at a time, with the force, falloff and offset of a probe.
 
-    Presses, moves and releases take effect at the next frame, at most one press or release per frame. So the force
-    jumps only between frames, and it is 0 for at least one frame before the tool acts at another position. The force
-    rises within `RISE_TIME_S` and falls to 0 at once.
+    Actions take effect at the next frame, at most one press or release per frame: the force jumps only between frames,
+    and is 0 for at least one frame before the tool acts at another position. It rises within `RISE_TIME_S`, and falls
+    to 0 at once.
 
     Args:
-        probe: has the force, the falloff and the offset of the tool.
+        probe: has the force, falloff and offset.
         frame_rate: frames per second of the session.
 
     Attributes:
         strength: force of a press [% of the full force].
         percent: current force [% of the full force]; negative when pulling.
         position: current control point.
-        probe: as given.
+        probe: the given probe.
     """
 
     def __init__(self, probe: Probe, frame_rate: float) -> None:
@@ -54,16 +51,16 @@ class ForceControlledTool:
         self.position: SheetPosition = (0.5, 0.5)
         self._target = self.position
         self._direction = 0
-        # Pending actions: presses, with position and direction (1 to push, -1 to pull), and releases (None).
+        # Presses, with position and direction (1 to push, -1 to pull), and releases (None).
         self._pending: deque[tuple[SheetPosition, int] | None] = deque()
-        # Percentage and position of the last returned probe.
+        # Percentage and position of the last probe.
         self._last_returned: tuple[float, SheetPosition] | None = None
         self._load: list[tuple[float, float]] = [(0.0, 0.0)]
         self._at: list[tuple[float, float, float]] = [(0.0, *self.position)]
 
     @property
     def target(self) -> SheetPosition:
-        """The position of the tool after all pending actions."""
+        """Position after all pending actions."""
         return next((press[0] for press in reversed(self._pending) if press is not None), self._target)
 
     @property
@@ -72,18 +69,18 @@ class ForceControlledTool:
         return self._pending[-1] is not None if self._pending else self._direction != 0
 
     def set_strength(self, strength: float) -> None:
-        """Set the force of a press [% of the full force], limited to 0 to 100."""
+        """Set the force of a press [% of the full force], clamped to 0 to 100."""
         self.strength = min(100.0, max(0.0, strength))
 
     def press(self, position: SheetPosition, direction: int) -> None:
-        """Press or pull, after a release at another position.
+        """Press or pull; an engaged tool is released first.
 
         Args:
             position: where to press.
             direction: 1 to press, -1 to pull.
         """
         if len(self._pending) > 1 and self._pending[-1] is None:
-            # A click that has not taken effect yet, such as in a paused session, is discarded.
+            # Discard an earlier click without effect yet, such as in a paused session.
             self._pending.pop()
             self._pending.pop()
         if self.engaged:
@@ -103,13 +100,10 @@ class ForceControlledTool:
         self._pending.append(None)
 
     def advance(self, frame: int) -> Probe | None:
-        """Apply the pending action for a frame.
-
-        Args:
-            frame: number of the frame at which the step begins.
+        """Apply the pending action in the frame interval that begins at `frame`.
 
         Returns:
-            The probe with the keyframes that affect this frame, or None if the probe has not changed.
+            The probe with the keyframes of this interval; None if it has not changed.
         """
         begin, end = frame / self._frame_rate, (frame + 1) / self._frame_rate
         if self._pending:
@@ -128,14 +122,14 @@ class ForceControlledTool:
         if self._last_returned == (self.percent, self.position):
             return None
         self._last_returned = self.percent, self.position
-        return self._as_probe(self._load[-LATEST:], self._at[-LATEST:], end)
+        return self._as_probe(self._load[-ACTIVE_KEYFRAMES:], self._at[-ACTIVE_KEYFRAMES:], end)
 
     def recorded_probe(self, frame: int) -> Probe:
         """Return the probe with all keyframes up to a frame."""
         return self._as_probe(self._load, self._at, frame / self._frame_rate)
 
     def _approach(self, target: float) -> float:
-        """Return the percentage after a frame in which the force rises towards a target."""
+        """Return the percentage after a frame of rising towards a target."""
         limit = 100 / (RISE_TIME_S * self._frame_rate)
         change = target - self.percent
         return target if abs(change) <= limit else self.percent + math.copysign(limit, change)
@@ -150,54 +144,48 @@ class ForceControlledTool:
     def _as_probe(
         self, load: Sequence[tuple[float, float]], at: Sequence[tuple[float, float, float]], end: float
     ) -> Probe:
-        """Build a probe whose control point has at least two keyframes, as the kernel is compiled for a moving one."""
+        """Build a probe with at least two control points, as the kernel is compiled for moving ones."""
         if len(at) == 1:
             at = [*at, (max(end, 1 / self._frame_rate), *at[0][1:])]
         return self.probe.model_copy(update={"load": tuple(load), "at": tuple(at)})
 
 
 def extend(keys: list[Any], key: tuple[float, ...]) -> None:
-    """Append a keyframe; of three keyframes with equal values the middle one is removed, which changes no result.
-
-    Args:
-        keys: keyframes, each a time [s] followed by values.
-        key: the new keyframe.
-    """
+    """Append a keyframe, a time [s] followed by values, and remove the middle one of three with equal values."""
     if len(keys) > 1 and keys[-1][1:] == keys[-2][1:] == key[1:]:
         keys.pop()
     keys.append(key)
 
 
 def on_sheet(position: SheetPosition) -> SheetPosition:
-    """Limit a position to the sheet, and round it to the six decimal places of a scene file."""
+    """Clamp a position to the sheet, and round it to the six decimals of a scene file."""
     across, down = (round(min(1.0, max(0.0, fraction)), 6) for fraction in position)
     return across, down
 
 
-# Height of the tip above the sheet at rest while it does not press [tip radii].
-HOVER_RADII = 1.0
+# Height of the tip above the sheet at rest when it does not press [tip radii].
+HOVER_HEIGHT_RADII = 1.0
 
-# Largest depth of the tip, and largest height of a grip [tip radii]. Both are also limited to a quarter of the sheet's
-# shorter side.
+# Largest depth of the tip and height of a grip [tip radii]; also limited to a quarter of the sheet's shorter side.
 MAX_DEPTH_RADII = 5.0
 
-# Coefficient of Coulomb friction, if the scene has none.
+# Coefficient of Coulomb friction of probes without one.
 DEFAULT_FRICTION = 0.5
 
-# A grip interval before the start, which has no effect; with it the kernel is compiled for grips.
+# Interval before the start, without effect, for which the kernel is compiled with grips.
 NO_GRIP = (-2.0, -1.0)
 
 PathKey = tuple[float, float, float, float]
 
 
 class PositionControlledTool:
-    """A tool whose tip follows the pointer: above the sheet, or at a chosen depth while it presses.
+    """A tool whose tip follows the pointer, above the sheet or at a given depth while it presses.
 
-    Between frames the tip moves in straight lines, down and up within `RISE_TIME_S`, and in a step never farther than a
-    run allows. A grip begins when the tip has reached its depth, and ends with the release.
+    Between frames the tip moves in straight lines, up and down within `RISE_TIME_S`, and per step at most by the stride
+    that a run allows. A grip begins when the tip has reached its depth, and ends with the release.
 
     Args:
-        probe: has the instrument, and may have a path; its friction is used if it is set, except in equilibrium.
+        probe: has the instrument, and the friction if it is set; quasi-static sessions have no friction.
         plan: of the session.
 
     Attributes:
@@ -212,12 +200,12 @@ class PositionControlledTool:
         assert probe.instrument is not None
         self._grid, self._sheet, self._radius = plan.grid, plan.scene.sheet, probe.instrument.radius
         self._max_depth = min(MAX_DEPTH_RADII * self._radius, 0.25 * min(self._sheet.size))
-        self._hover_height = _rounded(HOVER_RADII * self._radius)
+        self._hover_height = _rounded(HOVER_HEIGHT_RADII * self._radius)
         friction = probe.friction if "friction" in probe.model_fields_set else DEFAULT_FRICTION
         if plan.scene.time.at_rest:
             friction = 0.0
         self._probe = Probe(path=((0.0, 0.5, 0.5, self._hover_height),), friction=friction, instrument=probe.instrument)
-        # The default depth of a press is the radius of the tip.
+        # The default depth is the radius of the tip.
         self.strength = min(100.0, 100 * self._radius / self._max_depth)
         self._press_strength = self.strength
         self.reset()
@@ -235,12 +223,12 @@ class PositionControlledTool:
 
     @property
     def depth(self) -> float:
-        """The depth of a press [m]; negative to lift a grip."""
+        """Depth of a press [m]; negative to lift a grip."""
         return self._max_depth * self.strength / 100
 
     @property
     def percent(self) -> float:
-        """The current depth of the tip [% of the largest depth]; negative above the sheet."""
+        """Current depth of the tip [% of the largest depth]; negative above the sheet."""
         return -100 * self.height / self._max_depth
 
     @property
@@ -249,7 +237,7 @@ class PositionControlledTool:
         return self._grip_start is not None
 
     def set_strength(self, strength: float) -> None:
-        """Set the depth of a press [% of the largest depth], limited to 0 to 100, or to -100 to 100 during a grip."""
+        """Set the depth of a press [% of the largest depth], clamped to 0 to 100, or -100 to 100 during a grip."""
         self.strength = min(100.0, max(-100.0 if self._grip_requested else 0.0, strength))
 
     def press(self, position: SheetPosition, direction: int) -> None:
@@ -275,14 +263,7 @@ class PositionControlledTool:
         self.engaged = self._grip_requested = False
 
     def advance(self, frame: int) -> Probe:
-        """Move the tip for a frame.
-
-        Args:
-            frame: number of the frame at which the step begins.
-
-        Returns:
-            The probe for `Simulation.steer`.
-        """
+        """Move the tip in the frame interval that begins at `frame`; return the probe for `Simulation.steer`."""
         begin, end = self._time(frame), self._time(frame + 1)
         if self._grip_start is not None and not self._grip_requested:
             self._grips.append((self._grip_start, begin))
@@ -292,7 +273,7 @@ class PositionControlledTool:
         self._move_tip()
         key = end, *self.position, self.height
         extend(self._path, key)
-        # The end of an active grip is not known yet, so it is later than the end of any session.
+        # The end of an active grip is unknown, and set beyond the end of any session.
         grip = NO_GRIP if self._grip_start is None else (self._grip_start, self._grip_start + 1e9)
         return self._probe.model_copy(update={"path": (key,), "grip": (grip,)})
 
@@ -306,13 +287,13 @@ class PositionControlledTool:
         return _rounded(0.0 - self.depth) if self.engaged else self._hover_height
 
     def _move_tip(self) -> None:
-        """Move the tip towards its target, within the limits of a frame."""
-        max_rise = (HOVER_RADII * self._radius + self._max_depth) / (RISE_TIME_S * self._grid.frames_per_second)
+        """Move the tip towards its target, by at most the distance that a frame allows."""
+        max_rise = (HOVER_HEIGHT_RADII * self._radius + self._max_depth) / (RISE_TIME_S * self._grid.frames_per_second)
         rise = self._target_height - self.height
         goal = self._target_height if abs(rise) <= max_rise else self.height + math.copysign(max_rise, rise)
         (across, down), (to_across, to_down), (height, width) = self.position, self.target, self._sheet.size
         distance = math.hypot((to_across - across) * width, (to_down - down) * height, goal - self.height)
-        # A margin of 2 % allows for the rounding of positions.
+        # The margin of 2 % allows for rounded positions.
         max_distance = 0.98 * MAX_STRIDE_RADII * self._radius * self._grid.steps_per_frame
         fraction = min(1.0, max_distance / distance) if distance > 0 else 1.0
         if fraction < 1:
@@ -322,7 +303,7 @@ class PositionControlledTool:
             self.position, self.height = self.target, _rounded(goal)
 
     def _time(self, frame: int) -> float:
-        """Return the time of a frame [s], with the bits of the time of its step, so the tip is exactly at its key."""
+        """Return the time of a frame [s], bit-identical to that of its step, so that the tip is exactly at its key."""
         return self._grid.time(frame * self._grid.steps_per_frame)
 
 

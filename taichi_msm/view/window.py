@@ -1,4 +1,4 @@
-"""The window of a session: conversion of pointer and keyboard input to events, and display in real time."""
+"""Window of a session: conversion of pointer and keyboard input to events, and display in real time."""
 
 from __future__ import annotations
 
@@ -17,40 +17,38 @@ from taichi_msm.view import overlay
 from taichi_msm.view.events import KEYS, STRENGTH_STEP, Drag, Event, Hover, Key, Press, Release, StrengthChange, Turn
 from taichi_msm.view.session import Session
 
-# pygame must print no greeting on stdout, and the desktop's effects stay on.
+# Without a greeting on stdout, and without disabling the effects of the desktop.
 ENVIRONMENT = {"PYGAME_HIDE_SUPPORT_PROMPT": "1", "SDL_VIDEO_X11_NET_WM_BYPASS_COMPOSITOR": "0"}
 if sys.platform not in ("win32", "darwin"):
-    # Without this SDL draws into invisible memory if there is no display.
+    # Otherwise SDL falls back to its invisible dummy driver if there is no display.
     ENVIRONMENT["SDL_VIDEODRIVER"] = "x11,wayland"
 for _name, _value in ENVIRONMENT.items():
     os.environ.setdefault(_name, _value)
 
 import pygame  # noqa: E402
 
-# Names of keys by their text, and by their codes in pygame.
+# Names of keys by text, and by key code.
 TEXT_KEYS = {" ": "space", "=": "up", "+": "up", "-": "down", "\x1b": "q"}
 ARROW_KEYS = {pygame.K_UP: "up", pygame.K_DOWN: "down"}
 SHIFT_KEYS = {pygame.K_LSHIFT, pygame.K_RSHIFT}
 
-LEFT_BUTTON, RIGHT_BUTTON = 1, 3
-
 QUIT = Key("q")
 
-# The other tool may need another kernel, which is compiled first.
+# Switching the tool may compile another kernel.
 SWITCH_TOOL = Key("f")
 COMPILING = "one moment: compiling"
 
-# Delays beyond this are not made up for, and no picture waits longer for its frames [s].
+# Longer delays are not caught up, and no picture waits longer for its frames [s].
 MAX_DELAY_S = 0.1
 
 
 class Window:
     """A window that shows pictures, scaled to its size; a context manager.
 
-    A process may have only one window at a time, as it receives all events of the process.
+    A process may have only one at a time, as it receives all events of the process.
 
     Args:
-        title: of the window.
+        title: in the title bar.
         size: width and height of the pictures [px].
 
     Raises:
@@ -65,7 +63,7 @@ class Window:
             with discarded_output(2):
                 pygame.display.init()
                 if pygame.display.get_driver() == "x11":
-                    # OpenGL is slower, without a GPU several times.
+                    # OpenGL is slower, several times without a GPU.
                     os.environ.setdefault("SDL_FRAMEBUFFER_ACCELERATION", "0")
                 screen = pygame.display.get_desktop_sizes()[0]
                 self._window = pygame.Window(title, initial_window_size(size, screen), resizable=True)
@@ -94,7 +92,7 @@ class Window:
 
     def announce(self, text: str) -> None:
         """Write text over the current picture."""
-        # Some systems show a new window only when it asks for its events.
+        # Some systems show a new window only after its events were queried.
         pygame.event.pump()
         picture = self._picture.copy()
         overlay.announce(picture, text)
@@ -116,8 +114,8 @@ class Window:
 def initial_window_size(picture: tuple[int, int], screen: tuple[int, int]) -> tuple[int, int]:
     """Choose the size of a new window.
 
-    It is the largest integer multiple of the picture's size that fits into half of the screen in both directions. If
-    there is none, it is the picture's size, reduced to fit the screen.
+    It is the largest integer multiple of the picture's size that fits into half of the screen in both directions,
+    otherwise the picture's size, reduced to fit the screen.
 
     Args:
         picture: width and height of the pictures [px].
@@ -146,7 +144,7 @@ def fit_picture(picture: tuple[int, int], window: tuple[int, int]) -> pygame.Rec
 
 
 class InputReader:
-    """Converter from input of pygame to events of a session.
+    """Converter of pygame events to events of a session.
 
     Args:
         size: width and height of the pictures [px].
@@ -159,17 +157,17 @@ class InputReader:
         self._down: set[int] = set()
 
     def events(self, inputs: Iterable[pygame.Event], area: pygame.Rect) -> Iterator[Event]:
-        """Convert events of pygame to events of the session.
+        """Convert events.
 
         Args:
-            inputs: events of pygame, in order.
+            inputs: pygame events, in order.
             area: rectangle of the picture in the window [px].
         """
         for event in inputs:
             if event.type == pygame.QUIT:
                 yield QUIT
             elif event.type == pygame.KEYDOWN:
-                # pygame repeats the event of a key that is held down, which only the strength uses.
+                # Only keys of the strength repeat while they are held down.
                 if (name := key_name(event)) and (event.key not in self._down or name in ("up", "down")):
                     yield Key(name)
                 self._down.add(event.key)
@@ -188,7 +186,7 @@ class InputReader:
                 self._turning = None
 
     def _pixel(self, position: tuple[int, int], area: pygame.Rect) -> tuple[float, float]:
-        """Convert a position in the window to a pixel of the picture; integers are the centres of pixels."""
+        """Convert a position in the window to one in the picture [px]; integers are pixel centres."""
         x, y = (
             (at + 0.5 - begin) * pixels / extent - 0.5
             for at, begin, pixels, extent in zip(position, area.topleft, self._size, area.size, strict=True)
@@ -197,12 +195,12 @@ class InputReader:
 
     def _button(self, event: pygame.Event, x: float, y: float) -> Iterator[Event]:
         pressed = event.type == pygame.MOUSEBUTTONDOWN
-        if event.button == LEFT_BUTTON and pressed:
+        if event.button == pygame.BUTTON_LEFT and pressed:
             self._pressing = True
             yield Press(x, y, not SHIFT_KEYS.isdisjoint(self._down))
-        elif event.button == LEFT_BUTTON:
+        elif event.button == pygame.BUTTON_LEFT:
             yield from self._release()
-        elif event.button == RIGHT_BUTTON:
+        elif event.button == pygame.BUTTON_RIGHT:
             self._turning = (x, y) if pressed else None
 
     def _motion(self, x: float, y: float) -> Iterator[Event]:
@@ -223,7 +221,7 @@ class InputReader:
 def key_name(event: pygame.Event) -> str | None:
     """Return the name of the pressed key in `KEYS`, or None.
 
-    A key is identified by its text on any keyboard layout, or by its position if the text is not a Latin letter.
+    A key is identified by its text, or by its position on layouts without Latin letters.
     """
     typed = event.unicode.lower()
     if not typed.isascii():
@@ -233,11 +231,11 @@ def key_name(event: pygame.Event) -> str | None:
 
 
 class Pacing:
-    """Scheduler of frames, which keeps simulated time in step with real time.
+    """Scheduler that synchronises simulated with real time.
 
     Args:
         rate: frames per second of the session.
-        clock: current time [s].
+        clock: returns the current time [s].
     """
 
     def __init__(self, rate: float, clock: Callable[[], float]) -> None:
@@ -252,21 +250,21 @@ class Pacing:
         return max(0.0, self._next - self._clock())
 
     def due_frames(self) -> Iterator[int]:
-        """Yield a number for each due frame, until no frame is due or the picture cannot wait any longer."""
-        begun = self._clock()
-        self._next = max(self._next, begun - MAX_DELAY_S)
+        """Yield the number of each due frame, until none is due or the delay of the picture exceeds `MAX_DELAY_S`."""
+        start = self._clock()
+        self._next = max(self._next, start - MAX_DELAY_S)
         count = 0
-        while self._next <= self._clock() and (count == 0 or self._clock() < begun + MAX_DELAY_S):
+        while self._next <= self._clock() and (count == 0 or self._clock() < start + MAX_DELAY_S):
             self._next += 1 / self._rate
             yield count
             count += 1
-        self._pictures.append((begun, count))
+        self._pictures.append((start, count))
         # The speed is averaged over 1 s.
-        while begun - self._pictures[0][0] > 1.0:
+        while start - self._pictures[0][0] > 1.0:
             self._pictures.popleft()
 
     def status(self) -> str:
-        """Return the pictures per second as text, and the speed of simulated time if it is below 95 % of real time."""
+        """Format the pictures per second, and the speed relative to real time if it is below 95 %."""
         if len(self._pictures) < 2:
             return ""
         seconds = self._pictures[-1][0] - self._pictures[0][0]
@@ -280,9 +278,9 @@ def run_session(session: Session, window: Window, pause: Pause) -> None:
     """Run a session in a window until the user quits.
 
     Args:
-        session: the session.
-        window: shows the pictures, and has the input.
-        pause: called before every picture.
+        session: a new session.
+        window: the window.
+        pause: called before every picture; an exception from it ends the session.
     """
     pacing = Pacing(session.frame_rate, time.perf_counter)
     session.show_notice("h: the keys")
@@ -297,7 +295,7 @@ def run_session(session: Session, window: Window, pause: Pause) -> None:
             try:
                 session.handle(event)
             except FilesError as error:
-                # The session continues, so that a full disk does not discard it.
+                # A full disk must not end the session.
                 session.show_notice(str(error))
         for _ in pacing.due_frames():
             session.advance()

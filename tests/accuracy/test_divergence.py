@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +16,7 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.dynamics import ForceRecorder
 from taichi_msm.solver.state import RunProgress, Snapshot, State
 from taichi_msm.system.runtime import Device
+from tests.golden import Messages
 from tests.motion import notes_of
 from tests.scenes import SHEET, plan_of, scene, with_steps
 from tests.terms.test_contact import moved
@@ -56,7 +56,7 @@ def with_fault(saved: Snapshot, part: str, change: float, random: np.random.Gene
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_faults_are_found_within_a_frame(name: str, device: Device) -> None:
+def test_faults_are_found_within_a_frame(name: str, device: Device, message: Messages) -> None:
     """Put in at 40 places, found at 40."""
     made = pressed()
     part, change, frames = FAULTS[name]
@@ -66,7 +66,7 @@ def test_faults_are_found_within_a_frame(name: str, device: Device) -> None:
             simulation.advance(frame)
             good = simulation.positions()
             simulation.restore(with_fault(simulation.save(), part, change, np.random.default_rng(frame)))
-            with pytest.raises(DivergedError, match=r"diverged before [.\d]+ s, step \d+: .*point \(\d+, \d+\) is"):
+            with message.raises(DivergedError, "diverged before ", hide=r"\d[\d.e+]*"):
                 simulation.advance()
             assert simulation.frame == frame, "the frame that went wrong does not count"
             assert np.isfinite(good).all()
@@ -164,9 +164,7 @@ def test_what_is_sound_is_let_pass(name: str, device: Device) -> None:
         assert simulation.progress.peak > 0
 
 
-@pytest.mark.parametrize(
-    "fault", ["displacement is no number", "difference is infinite", "thrown far away", "thrown fast"]
-)
+@pytest.mark.parametrize("fault", ["displacement is no number", "thrown fast"])
 def test_faults_are_found_beside_a_tool(fault: str, device: Device) -> None:
     part, change, _ = FAULTS[fault]
     with Simulation(
@@ -208,56 +206,48 @@ def diagnosed(made: Scene, device: Device, fault: Callable[[Simulation], None] =
         return simulation.diagnose(start)
 
 
-def test_a_force_that_is_too_strong_is_named(device: Device) -> None:
-    weak = {"force": [0, 0, 1], "at": [0.2, 0.2]}
-    inconsistent = {"force": [0, 0, -1], "load": [[0, 0], [0.1, 100], [0.1, 1e9]], "falloff": 20}
-    made = pressed(probes=[weak, inconsistent])
-    found = diagnosed(made, device)
-    assert re.fullmatch(
-        r"diverged at 0\.1\d* s, step \d+: point \(4, 5\) is [.\d]+ m from its rest position, and the sheet is 0\.4 m "
-        r"long; likely cause: probes\.1\.force, which reaches 454 N at this point; take less, as it diverges with "
-        r"every time\.step that was tried, down to [-.\de]+ s",
-        found.message,
-    )
+INCONSISTENT = {"force": [0, 0, -1], "load": [[0, 0], [0.1, 100], [0.1, 1e9]], "falloff": 20}
+
+
+def test_a_force_that_is_too_strong_is_named(device: Device, message: Messages) -> None:
+    """And not a tool that does no harm."""
+    weak, made = {"force": [0, 0, 1], "at": [0.2, 0.2]}, []
+    for other in (weak, moved([0, 0.2, 0.2, 0.0], [0.2, 0.2, 0.2, -0.02])):
+        made.append(pressed(probes=[other, INCONSISTENT]))
+        found = diagnosed(made[-1], device)
+        message(found.message, "probes.1.force, which reaches 454 N", hide=r"0\.1\d+|(?<=step )\d+|[-.\de]+(?= [ms]\b)")
     # The step named is the first: one less is fine, and it is not.
     bad = int(re.findall(r"step (\d+)", found.message)[0])
     assert found.last_sound_state
     assert found.last_sound_state.state.steps == bad - 1
     assert np.isfinite(found.last_sound_state.state.displacement).all()
-    with Simulation(made, threads=device.threads) as simulation:
+    with Simulation(made[-1], threads=device.threads) as simulation:
         simulation.restore(found.last_sound_state)
         with pytest.raises(DivergedError):
             simulation.advance()
 
 
-def test_a_tool_that_does_no_harm_is_not_named(device: Device) -> None:
-    inconsistent = {"force": [0, 0, -1], "load": [[0, 0], [0.1, 100], [0.1, 1e9]], "falloff": 20}
-    made = pressed(probes=[moved([0, 0.2, 0.2, 0.0], [0.2, 0.2, 0.2, -0.02]), inconsistent])
-    assert "likely cause: probes.1.force, which reaches 454 N" in diagnosed(made, device).message
-
-
-def test_a_step_that_is_too_long_is_named(device: Device) -> None:
+def test_a_step_that_is_too_long_is_named(device: Device, message: Messages) -> None:
     """Near the limit of stability, an undamped sheet that is hit hard flies apart."""
     blow = {"force": [0, 0, -4e6], "load": [[0.1, 0], [0.1, 100]], "falloff": 60}
-    made = pressed("f64", probes=[blow], damping=0)
-    made = with_steps(made, 9)
+    made = with_steps(pressed("f64", probes=[blow], damping=0), 9)
     found = diagnosed(made, device).message
-    assert "; likely cause: time.step, 0.00444444 s; with 0.00" in found
+    message(
+        found, "time.step, 0.00444444 s", hide=r"(?<=step )\d+|(?<=with )[.\d]+|(?<= at )[.\d]+|(?<= is )[.\d]+|\(.*?\)"
+    )
     finer = float(re.findall(r"with ([.\d]+) s it does not diverge here", found)[0])
     with Simulation(with_steps(made, round(1 / 25 / finer)), threads=device.threads) as simulation:
         simulation.advance(3)
 
 
-def test_a_machine_that_makes_errors_is_told_of(device: Device) -> None:
+def test_a_machine_that_makes_errors_is_told_of(device: Device, message: Messages) -> None:
     def flip(simulation: Simulation) -> None:
         simulation.advance(3)
         simulation.restore(with_fault(simulation.save(), "displacement", np.nan, np.random.default_rng(1)))
 
     made = pressed()
     found = diagnosed(made, device, flip)
-    assert found.message.endswith(
-        "but not when it was repeated, so the machine has made an error; continue with --resume"
-    )
+    message(found.message, "machine", "--resume", hide=r"(?<=step )\d+|(?<=point )\(.*?\)")
     assert found.last_sound_state
     assert found.last_sound_state.progress.frame == 1, "where it was saved"
     with Simulation(made, threads=device.threads) as simulation:
@@ -283,18 +273,16 @@ def test_how_far_a_point_may_be() -> None:
 def released(across: float, down: float, active: str) -> Scene:
     """A rod that crushes tissue without damping at this place, and is away from 0.3 s on."""
     way = [[0, 0, 0, 0.0005], [0.12, 0, 0, -0.0053], [0.2, 0.04, 0.1, -0.0053], [0.3, 0, 0, 0.05]]
-    rod = moved(
-        *([t, across + x, down + y, height] for t, x, y, height in way),
-        instrument={"radius": 0.006, "shaft": [0, 0, 1], "length": 0.15},
-    )
-    tissue: dict[str, Any] = {"young": 3e5, "thickness": 3.2e-3, "density": 1050, "foundation": 1e6, "pretension": 200}
-    sheet = {"points": [15, 9], "size": [0.045, 0.026]}
-    tissue["foundation_active"] = active
-    return scene(sheet=sheet, springs=None, damping=0, tissue=tissue, probes=[rod], time={"duration": 0.8})
+    path = [[t, across + x, down + y, height] for t, x, y, height in way]
+    rod = moved(*path, instrument={"radius": 0.006, "shaft": [0, 0, 1], "length": 0.15})
+    tissue = {"young": 3e5, "thickness": 3.2e-3, "density": 1050, "foundation": 1e6, "pretension": 200}
+    sheet, time = {"points": [15, 9], "size": [0.045, 0.026]}, {"duration": 0.8}
+    tissue |= {"foundation_active": active}  # type: ignore[dict-item]
+    return scene(sheet=sheet, springs=None, damping=0, tissue=tissue, probes=[rod], time=time)
 
 
 @pytest.mark.parametrize("active", ["always", "loaded"])
-def test_energy_that_grows_without_a_load_is_noted(active: str, device: Device) -> None:
+def test_energy_that_grows_without_a_load_is_noted(active: str, device: Device, message: Messages) -> None:
     # Near the border, springs that are pressed together are stiffer than the step limit assumes.
     for across, down, grows in ((0.76, 0.78, True), (0.5, 0.45, False)):
         made = released(across, down, active)
@@ -302,6 +290,5 @@ def test_energy_that_grows_without_a_load_is_noted(active: str, device: Device) 
             simulation.advance(20)
             progress = simulation.progress
         assert progress.energy_growth > (3 if grows else 0)
-        noted = [note for note in notes_of(made, progress, None) if note.startswith("the energy grew")]
-        assert len(noted) == grows
-        assert all(re.match(r"the energy grew \d+\.?\d* times after 0\.3 s", note) for note in noted)
+        notes = [note for note in notes_of(made, progress, None) if note.startswith("the energy grew")]
+        message(notes, *(["after 0.3 s"] if grows else []), hide=r"[\d.]+(?= times)")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import zipfile
-from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +23,11 @@ from taichi_msm.fitting.parameters import Method, make_parameters
 from taichi_msm.fitting.predict import FitProblem, ForwardModel, Prediction, Runs, without_outputs
 from taichi_msm.fitting.rejection import by_pattern
 from taichi_msm.fitting.result import FitResult
-from taichi_msm.model.surface import surface_point, surface_positions, surface_weights
+from taichi_msm.model.surface import surface_positions
 from taichi_msm.scene.scene import Scene
-from taichi_msm.system import process
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
+from tests.golden import Messages
 
 Array = NDArray[np.float64]
 
@@ -57,15 +56,6 @@ GRID = (np.arange(6) + 0.5) / 6
 PLACES = np.stack([axis.ravel() for axis in np.meshgrid(GRID, GRID)], axis=1)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_device(device: Device) -> Iterator[None]:
-    """A fit takes every core, and a process has one device."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(process, "available_threads", lambda: device.threads)
-        patch.setattr("taichi_msm.system.runtime.process_module.available_threads", lambda: device.threads)
-        yield
-
-
 def changed(**keys: Any) -> Scene:
     """The truth with other values, by their dotted paths with __ for the dots."""
     data = json.loads(json.dumps(TRUTH))
@@ -78,10 +68,9 @@ def changed(**keys: Any) -> Scene:
     return Scene.model_validate(data)
 
 
-@pytest.fixture(scope="module")
-def motion(device: Device) -> Array:
-    """Positions of the mass points in every frame of the truth [m], shape (frames, rows, cols, 3)."""
-    with Simulation(changed(), threads=device.threads) as simulation:
+def positions_in(made: Scene, device: Device) -> Array:
+    """Positions of the mass points in every frame [m], shape (frames, rows, cols, 3)."""
+    with Simulation(made, threads=device.threads) as simulation:
         frames = [simulation.positions()]
         for _ in range(10):
             simulation.advance()
@@ -89,12 +78,23 @@ def motion(device: Device) -> Array:
     return np.array(frames)
 
 
+def pixels_in(made: Scene, motion: Array, device: Device) -> Array:
+    """What a scene's camera sees of the places in every frame, without errors, shape (places, frames, 2)."""
+    with Simulation(made, threads=device.threads) as simulation:
+        frames = enumerate(motion)
+        pixels = [simulation.locate(PLACES, positions=each, time=n / 25).pixels for n, each in frames]
+    return np.stack(pixels, axis=1).astype(np.float64)
+
+
+@pytest.fixture(scope="module")
+def motion(device: Device) -> Array:
+    """That of the truth."""
+    return positions_in(changed(), device)
+
+
 @pytest.fixture(scope="module")
 def tracks(device: Device, motion: Array) -> dict[str, Array]:
-    """What the truth's camera sees of the places, without errors."""
-    with Simulation(changed(), threads=device.threads) as simulation:
-        pixels = [simulation.locate(PLACES, positions=positions).pixels for positions in motion]
-    return {"time": np.arange(11) / 25, "coordinates": PLACES, "pixel": np.stack(pixels, axis=1).astype(np.float64)}
+    return {"time": np.arange(11) / 25, "coordinates": PLACES, "pixel": pixels_in(changed(), motion, device)}
 
 
 def noisy(tracks: dict[str, Array], error: float, seed: int = 0, **more: Any) -> dict[str, Any]:
@@ -102,7 +102,7 @@ def noisy(tracks: dict[str, Array], error: float, seed: int = 0, **more: Any) ->
     return {**tracks, "pixel": pixel, **more}
 
 
-def save(path: Path, arrays: Mapping[str, Any]) -> None:
+def save(path: Path, arrays: Any) -> None:
     np.savez(path, **arrays)
 
 
@@ -110,24 +110,12 @@ def values(result: FitResult) -> list[float]:
     return [one.value for one in result.parameters.values()]
 
 
-def test_points_are_on_the_surface_that_is_drawn(motion: Array) -> None:
-    sheet, position = changed().sheet, motion[5]
-    for refine in (0, 3):
-        corners, weights = surface_weights(PLACES, sheet, refine)
-        points = np.einsum("nk,nkc->nc", weights, position.reshape(-1, 3)[corners])
-        for place, point in zip(PLACES, points, strict=True):
-            rest = np.array([(place[0] - 0.5) * 0.1, (0.5 - place[1]) * 0.1])
-            np.testing.assert_allclose(point, surface_point(position, refine, sheet, rest)[0], atol=1e-15)
-
-
 def test_a_camera_that_moves_and_bends_lines_sees_what_is_predicted(motion: Array, device: Device) -> None:
     eye = [[0, 0, -0.06, 0.09], [0.4, 0.02, -0.05, 0.1]]
     made = changed(render__camera={"eye": eye, "fov": 40, "distortion": {"k1": -0.3, "k2": 0.1}})
-    with Simulation(made, threads=device.threads) as simulation:
-        pixels = [simulation.locate(PLACES, positions=motion[n], time=n / 25).pixels for n in range(11)]
     points = np.stack([surface_positions(each, made.render.refine, PLACES) for each in motion], axis=1)
     seen = project_points(made, points, np.arange(11) / 25)
-    np.testing.assert_allclose(seen, np.stack(pixels, axis=1), atol=1e-4)
+    np.testing.assert_allclose(seen, pixels_in(made, motion, device), atol=1e-4)
 
 
 def test_the_truth_comes_back_from_a_start_that_is_far_off(motion: Array) -> None:
@@ -154,7 +142,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(tracks: dict[str, Array])
     # Errors so small that the motion is linear in the parameters within their intervals.
     start = changed(tissue__damping=300, tissue__foundation=2e5)
     held, ratios = [], []
-    for seed in range(8):
+    for seed in range(6):
         more = {"sigma": 0.05} if seed % 2 else {}
         found = fit(start, noisy(tracks, 0.05, seed, **more), ["tissue.damping", "tissue.foundation"], workers=1)
         assert found.sigma == pytest.approx(0.05, rel=0.12)  # of 792 numbers, 4.8 / sqrt(2 * 790)
@@ -164,51 +152,55 @@ def test_intervals_hold_the_truth_as_often_as_they_say(tracks: dict[str, Array])
             assert high is not None
             held.append(low < truth < high)
             ratios.append((one.value - truth) / one.standard_error)
-    # Of 16 at 95 % each: 13 or fewer with a probability of 4 %; the seeds are fixed.
-    assert sum(held) >= 14
-    # The standard deviation of 16 standard normal numbers is 1 +- 0.18.
+    # Of 12 at 95 % each: 9 or fewer with a probability of 2 %; the seeds are fixed.
+    assert sum(held) >= 10
+    # The standard deviation of 12 standard normal numbers is 1 +- 0.2.
     assert 0.5 < float(np.std(ratios)) < 1.5
 
 
-def test_a_profile_ends_where_the_others_can_no_longer_make_up_for_it(tracks: dict[str, Array]) -> None:
-    # Errors so large that the motion is not linear in the damping.
-    seen = noisy(tracks, 0.5, sigma=0.5)
-    best = fit(changed(), seen, ["tissue.damping", "tissue.foundation"], profile=True)
-    assert best.chi_square is not None
+@pytest.mark.parametrize("bounded", [False, True])
+def test_a_profile_ends_where_the_others_can_no_longer_make_up_for_it(tracks: dict[str, Array], bounded: bool) -> None:
+    # Errors so large that the motion is not linear in the damping; or a foundation that bounds keep from the truth.
+    key, other, error = ("young", 2.95e5, 0.1) if bounded else ("damping", 3e5, 0.5)
+    bounds = {"tissue.foundation": (2.9e5, 2.99e5)} if bounded else {}
+    given: dict[str, Any] = {"bounds": bounds, "workers": 1}
+    free, seen = [f"tissue.{key}", "tissue.foundation"], noisy(tracks, error, sigma=error)
+    best: Any = fit(changed(tissue__foundation=other), seen, free, profile=True, **given)
     quantile = student.ppf(0.975, best.degrees_of_freedom)
-    for end in best.parameters["tissue.damping"].interval:
+    for end in best.parameters[free[0]].interval:
         assert end is not None
-        held = fit(changed(tissue__damping=end), seen, ["tissue.foundation"])
-        assert held.chi_square is not None
+        held: Any = fit(changed(**{f"tissue__{key}": end, "tissue__foundation": other}), seen, free[1:], **given)
         # An end is found to 1 % of its distance.
-        assert held.chi_square - best.chi_square == pytest.approx(quantile**2, rel=0.03)
-    curve = np.array([place.deviations for place in best.curves["tissue.damping"]])
+        assert held.chi_square - best.chi_square == pytest.approx(quantile**2, rel=0.04 if bounded else 0.03)
+    curve = np.array([place.deviations for place in best.curves[free[0]]])
     assert curve.min() < -1.9
     assert curve.max() > 1.9
 
 
-def test_what_pictures_cannot_tell_is_named_and_a_force_tells_it(tracks: dict[str, Array], tmp_path: Path) -> None:
+def test_what_pictures_cannot_tell_is_named_and_a_force_tells_it(
+    tracks: dict[str, Array], tmp_path: Path, message: Messages
+) -> None:
     # Without inertia only ratios of forces are seen.
-    at_rest = {**TRUTH, "time": {**TRUTH["time"], "motion": "quasistatic"}, "output": ["tracks", "forces"]}
+    time = {"duration": 0.2, "frames_per_second": 20, "motion": "quasistatic"}
+    at_rest = {**TRUTH, "time": {**TRUTH["time"], **time}, "output": ["tracks", "forces"]}
     run(at_rest, tmp_path / "truth", threads=2, estimate_error=False)
     start = Scene.model_validate(at_rest).model_copy(update={"output": ()})
     free = ["tissue.young", "tissue.foundation", "tissue.pretension", "probes.0.total.2"]
-    found = fit(start, tmp_path / "truth" / "tracks.npz", free, sigma=0.1, workers=1)
+    given = start, tmp_path / "truth" / "tracks.npz", free
+    found = fit(*given, sigma=0.1, workers=1)
     assert not found.identifiable
-    assert not any(one.identifiable for one in found.parameters.values())
-    assert all(one.mesh_error is None for one in found.parameters.values())
+    for one in found.parameters.values():
+        assert (one.identifiable, one.interval, one.mesh_error) == (False, (None, None), None)
     (unseen,) = found.unseen
     assert unseen.parameters == free
     assert len(unseen.known) == 3
     assert all(sorted(map(abs, one.exponents.values())) == [1, 1] for one in unseen.known)
-    assert "each alone is not: fix one, or give a force (--forces)" in unseen.text
-    forces = tmp_path / "truth" / "forces.csv", 0.01
-    told = fit(start, tmp_path / "truth" / "tracks.npz", free, sigma=0.1, forces=forces, workers=1)
+    message(unseen.text, "--forces", hide=r"^.*(?=each alone)")
+    told: Any = fit(*given, sigma=0.1, forces=(tmp_path / "truth" / "forces.csv", 0.01), workers=1)
     assert told.identifiable
     assert told.unseen == []
-    assert told.residual_force is not None
     assert told.residual_force < 1e-4
-    assert told.fitted_forces.shape == (11, 3)
+    assert told.fitted_forces.shape == (5, 3)
     np.testing.assert_allclose(values(told), [2e4, 3e5, 10, -2], rtol=1e-4)
 
 
@@ -224,57 +216,19 @@ def test_a_product_is_known_where_its_factors_are_not(motion: Array) -> None:
     assert not found.identifiable
 
 
-def test_a_pair_that_is_not_seen_leaves_the_others_as_they_are(tracks: dict[str, Array]) -> None:
+@pytest.mark.parametrize("sigma", [0.02, *(pytest.param(one, marks=pytest.mark.fuzz) for one in (0.2, 0.002))])
+def test_a_pair_that_is_not_seen_leaves_the_others_as_they_are(tracks: dict[str, Array], sigma: float) -> None:
     """Young and depth of the foundation act only as their quotient, at any size of the errors."""
-    layer = {"young": 1.5e4, "depth": 0.05}
-    for sigma in (0.2, 0.02, 0.002):
-        seen = noisy(tracks, sigma, sigma=sigma)
-        start = changed(tissue__foundation=layer)
-        alone = fit(start, seen, ["tissue.young", "tissue.foundation.young"], workers=1)
-        found = fit(start, seen, ["tissue.young", "tissue.foundation.young", "tissue.foundation.depth"], workers=1)
-        error = alone.parameters["tissue.young"].standard_error
-        assert found.parameters["tissue.young"].standard_error == pytest.approx(error, rel=0.05)
-        assert [one.identifiable for one in found.parameters.values()] == [True, False, False]
-        (unseen,) = found.unseen
-        (known,) = unseen.known
-        assert sorted(known.exponents.values()) == [-1, 1]
-        known_alone = alone.parameters["tissue.foundation.young"].standard_error / 1.5e4
-        assert known.standard_error == pytest.approx(known_alone, rel=0.05)
-
-
-def test_forces_and_stiffnesses_together_are_not_seen_from_anywhere(tracks: dict[str, Array]) -> None:
-    start = changed(
-        tissue__young=1.5e4,
-        tissue__foundation=2.5e5,
-        tissue__density=900,
-        tissue__pretension=8,
-        probes__0__total=[0, 0, -1.6],
-    )
-    names = ("young", "foundation", "density", "pretension")
-    found = fit(
-        start, noisy(tracks, 0.02, sigma=0.02), [*(f"tissue.{n}" for n in names), "probes.0.total.2"], workers=1
-    )
-    assert not any(one.identifiable for one in found.parameters.values())
-    assert {one.interval for one in found.parameters.values()} == {(None, None)}
-
-
-def test_a_profile_stays_within_the_bounds_of_the_others(tracks: dict[str, Array]) -> None:
-    # The truth of the other, 3e5, is beyond them.
-    seen, free = noisy(tracks, 0.1, sigma=0.1), ["tissue.young", "tissue.foundation"]
-    start, bounds = changed(tissue__foundation=2.95e5), {"tissue.foundation": (2.9e5, 2.99e5)}
-    best = fit(start, seen, free, bounds=bounds, profile=True, workers=1)
-    assert best.chi_square is not None
-    quantile = student.ppf(0.975, best.degrees_of_freedom)
-    for end in best.parameters["tissue.young"].interval:
-        assert end is not None
-        held = fit(changed(tissue__young=end, tissue__foundation=2.95e5), seen, free[1:], bounds=bounds, workers=1)
-        assert held.chi_square is not None
-        assert held.chi_square - best.chi_square == pytest.approx(quantile**2, rel=0.04)
-
-
-def test_a_camera_is_found_from_a_start_that_is_far_off(tracks: dict[str, Array]) -> None:
-    found = fit(changed(render__camera={"eye": [0, -0.06, 0.09], "fov": 33}), tracks, ["render.camera.fov"], workers=1)
-    assert values(found) == pytest.approx([40], rel=1e-6)
+    start, seen = changed(tissue__foundation={"young": 1.5e4, "depth": 0.05}), noisy(tracks, sigma, sigma=sigma)
+    free = ["tissue.young", "tissue.foundation.young", "tissue.foundation.depth"]
+    alone, found = fit(start, seen, free[:2], workers=1), fit(start, seen, free, workers=1)
+    error = alone.parameters[free[0]].standard_error
+    assert found.parameters[free[0]].standard_error == pytest.approx(error, rel=0.05)
+    assert [one.identifiable for one in found.parameters.values()] == [True, False, False]
+    (unseen,) = found.unseen
+    (known,) = unseen.known
+    assert sorted(known.exponents.values()) == [-1, 1]
+    assert known.standard_error == pytest.approx(alone.parameters[free[1]].standard_error / 1.5e4, rel=0.05)
 
 
 def test_a_number_that_can_change_to_one_side_only_is_found(tracks: dict[str, Array]) -> None:
@@ -285,11 +239,10 @@ def test_a_number_that_can_change_to_one_side_only_is_found(tracks: dict[str, Ar
 
 
 def test_what_a_mask_hides_is_not_seen(tracks: dict[str, Array]) -> None:
-    pixel = np.ma.array(tracks["pixel"].copy(), mask=np.zeros(tracks["pixel"].shape, bool))
-    pixel[3] = 5000
+    pixel = np.ma.masked_equal(tracks["pixel"].copy(), 5000)
     pixel[3] = np.ma.masked
     seen = read_observations({**tracks, "pixel": pixel}, 25)
-    np.testing.assert_array_equal(np.flatnonzero(~seen.there.any(axis=1)), [3])
+    np.testing.assert_array_equal(np.flatnonzero(~seen.is_observed.any(axis=1)), [3])
 
 
 def test_an_occluded_track_is_not_used() -> None:
@@ -297,7 +250,7 @@ def test_an_occluded_track_is_not_used() -> None:
     occluded[1, 2] = True
     seen = read_observations({"coordinates": [[0.5, 0.5], [0.2, 0.7]], "points": points, "occluded": occluded}, 25)
     assert seen.time.tolist() == [0, 0.04, 0.08]
-    assert (seen.there != occluded).all()
+    assert (seen.is_observed != occluded).all()
 
 
 def test_a_number_that_nothing_shows_is_not_identifiable(motion: Array) -> None:
@@ -352,20 +305,11 @@ def test_a_robust_fit_of_good_tracks_is_nearly_the_same(tracks: dict[str, Array]
 
 @pytest.mark.parametrize("robust", [False, True])
 def test_tracks_that_are_far_apart_for_their_errors_are_independent(tracks: dict[str, Array], robust: bool) -> None:
-    errors = [
-        [one.standard_error for one in found.parameters.values()]
-        for correlation in (None, 1e-6)
-        for found in [
-            fit(
-                changed(),
-                noisy(tracks, 0.1, sigma=0.1),
-                ["tissue.young", "tissue.foundation"],
-                robust=robust,
-                correlation=correlation,
-                workers=1,
-            )
-        ]
-    ]
+    errors = []
+    for correlation in (None, 1e-6):
+        given, free = noisy(tracks, 0.1, sigma=0.1), ["tissue.young", "tissue.foundation"]
+        found = fit(changed(), given, free, robust=robust, correlation=correlation, workers=1)
+        errors.append([one.standard_error for one in found.parameters.values()])
     np.testing.assert_allclose(errors[0], errors[1], rtol=1e-9)
 
 
@@ -373,27 +317,21 @@ def test_errors_that_are_alike_widen_the_intervals_and_are_told(tracks: dict[str
     # Each frame's tracks are off by one number, as when a camera shakes.
     rng, seen = np.random.default_rng(2), noisy(tracks, 0.02)
     seen["pixel"] += rng.normal(0, 0.5, (1, 11, 2))
-    free = ["tissue.young", "tissue.foundation"]
+    free = ["tissue.foundation"]
     plain = fit(changed(), seen, free, workers=1)
     assert any("neighbouring points are correlated" in note and "--correlation PX" in note for note in plain.notes)
     alike = fit(changed(), seen, free, correlation=1000, workers=1, profile=True)
-    assert alike.parameters[free[1]].standard_error > 2 * plain.parameters[free[1]].standard_error
+    assert alike.parameters[free[0]].standard_error > 2 * plain.parameters[free[0]].standard_error
     assert not any("--correlation" in note for note in alike.notes)
-    low, high = np.array(alike.parameters[free[1]].interval, float)
-    assert (high - low) / (2 * 1.96) == pytest.approx(alike.parameters[free[1]].standard_error, rel=0.1)
+    low, high = np.array(alike.parameters[free[0]].interval, float)
+    assert (high - low) / (2 * 1.96) == pytest.approx(alike.parameters[free[0]].standard_error, rel=0.1)
 
 
 def test_the_points_move_what_is_found_about_as_far_as_is_said(device: Device) -> None:
-    finer = changed(sheet__points=[33, 33])
-    with Simulation(finer, threads=device.threads) as simulation:
-        frames = [simulation.positions()[::4, ::4]]
-        for _ in range(10):
-            simulation.advance()
-            frames.append(simulation.positions()[::4, ::4])
-    found = fit(changed(), {"time": np.arange(11) / 25, "position": np.array(frames)}, ["tissue.foundation"])
-    one = found.parameters["tissue.foundation"]
-    assert one.mesh_error is not None
-    assert found.mesh_error is not None
+    position = positions_in(changed(sheet__points=[33, 33]), device)[:, ::4, ::4]
+    found = fit(changed(), {"time": np.arange(11) / 25, "position": position}, ["tissue.foundation"])
+    one: Any = found.parameters["tissue.foundation"]
+    assert found.mesh_error
     # The finer scene has a sixteenth of the error left; half of so few points are too few to tell it closely.
     assert abs(one.value - 3e5) / 4 < one.mesh_error < 4 * abs(one.value - 3e5)
     assert any("the number of points moves tissue.foundation" in note for note in found.notes)
@@ -404,14 +342,12 @@ def test_a_third_mesh_tells_the_order_of_the_mesh_error(
 ) -> None:
     def told(order: int) -> float:
         def coarse(runs: Runs, x: Array, halvings: int) -> Prediction:
-            fine = runs.one(x)
-            assert fine is not None
+            fine: Any = runs.predict_one(x)
             off = 1e-3 * (2 ** (order * halvings) - 1)
             return fine._replace(values=fine.values + off * (fine.values - tracks["pixel"][:, :1]))
 
         monkeypatch.setattr(Runs, "predict_coarse", coarse)
-        error = fit(changed(), tracks, ["tissue.foundation"], workers=1).parameters["tissue.foundation"].mesh_error
-        assert error is not None
+        error: Any = fit(changed(), tracks, ["tissue.foundation"], workers=1).parameters["tissue.foundation"].mesh_error
         return error
 
     # From half the cells to so many the change is 1 or 3 errors.
@@ -424,17 +360,15 @@ def test_side_by_side_and_one_after_another_give_the_same_bits(tracks: dict[str,
     assert found[0].runs == found[1].runs
 
 
-def test_a_number_below_0_stays_there_and_one_that_starts_at_0_needs_bounds(tracks: dict[str, Array]) -> None:
-    found = fit(
-        changed(probes__0__total=[0, 0, -1]), tracks, ["probes.0.total.2"], bounds={"probes.0.total.2": (-5, 5)}
-    )
-    one = found.parameters["probes.0.total.2"]
+def test_a_number_below_0_stays_there_and_one_that_starts_at_0_needs_bounds(
+    tracks: dict[str, Array], message: Messages
+) -> None:
+    start, key = changed(probes__0__total=[0, 0, -1]), "probes.0.total.2"
+    one: Any = fit(start, tracks, [key], bounds={key: (-5, 5)}).parameters[key]
     assert one.value == pytest.approx(-2, rel=1e-4)
-    assert one.interval[0] is not None
-    assert one.interval[1] is not None
     assert one.interval[0] <= one.value <= one.interval[1]
     start = changed(tissue__damping=0)
-    with pytest.raises(SceneError, match=r"tissue\.damping: starts at 0, so its size is open; add --bounds"):
+    with message.raises(SceneError, "tissue.damping", "--bounds"):
         fit(start, tracks, ["tissue.damping"])
     found = fit(start, tracks, ["tissue.damping"], bounds={"tissue.damping": (0, 1000)})
     assert values(found) == pytest.approx([200], rel=1e-4)
@@ -462,8 +396,7 @@ def test_the_command_writes_what_it_found(tracks: dict[str, Array], small: Path,
     assert said["parameters"] == record["parameters"]
     assert sorted(record["files"]) == ["fit.png", "pictures/speckle.png", "scene.yaml"]
     assert (folder / "pictures" / "speckle.png").read_bytes() == (small / "speckle.png").read_bytes()
-    fitted = load_scene(folder / "scene.yaml")
-    assert fitted.tissue is not None
+    fitted: Any = load_scene(folder / "scene.yaml")
     assert fitted.tissue.young == record["parameters"]["tissue.young"]["value"]
     assert fitted.output == ("png",)
     young = record["parameters"]["tissue.young"]
@@ -479,57 +412,41 @@ def test_the_command_writes_what_it_found(tracks: dict[str, Array], small: Path,
     assert "tissue.young: 2" in done.stdout
 
 
-def bad(tracks: dict[str, Array], motion: Array) -> Iterator[tuple[str, dict[str, Any], str]]:
-    """What cannot be used, and what is said of it."""
-    position = {"time": np.arange(11) / 25, "coordinates": PLACES, "position": np.zeros((36, 11, 3))}
-    mass = {"time": np.arange(11) / 25, "position": motion}
-    hidden = np.full_like(tracks["pixel"], np.nan)
+def bad(tracks: dict[str, Array], motion: Array) -> dict[str, dict[str, Any]]:
+    """What cannot be used."""
+    pixel, time, still = tracks["pixel"], tracks["time"], np.repeat(tracks["pixel"][:, :1], 11, axis=1)
+    hidden, mass = np.full_like(pixel, np.nan), {"time": time, "position": motion}
     lone = hidden.copy()
-    lone[0, 3] = tracks["pixel"][0, 3]
-    yield "few", {**tracks, "pixel": lone}, "2 numbers were observed, too few for 3 parameters"
-    yield "hidden", {**tracks, "pixel": hidden}, "every one of the 36 points is NaN or occluded at all 11 times"
-    still = np.repeat(tracks["pixel"][:, :1], 11, axis=1)
-    yield "still", {**tracks, "pixel": still}, "no point moves at all; observe while a tool acts"
-    rounded = still * (1 + 1e-13 * np.random.default_rng(1).normal(size=still.shape))
-    yield "rounded", {**tracks, "pixel": rounded}, "no point moves at all; observe while a tool acts"
-    yield "huge", {**tracks, "pixel": 1e40 * tracks["pixel"]}, "e\\+42; take NaN where not observed"
-    yield "tiny", {**tracks, "sigma": 1e-300}, "sigma: 1e-300; take one number above 0"
-    yield "noise", {**tracks, "sigma": 50.0}, "no point moves by more than its error, sigma 50 px"
-    late = {**tracks, "time": np.linspace(0, 0.004, 11)}
-    yield "missed", late, "its 11 times miss the motion: .*; observe between 0.08 and 0.2 s too"
-    yield "mm", {**mass, "position": 1000 * motion}, "; give metres: are they in mm\\? divide them by 1000"
-    yield "ms", {**tracks, "time": 1000 * tracks["time"]}, "scene ends at 0.4 s; are they in ms\\? divide time by 1000"
-    yield "late", {**tracks, "time": tracks["time"] + 0.1}, "up to 0.5 s, and the scene ends at 0.4 s; cut them off"
-    yield "early", {**tracks, "time": tracks["time"] - 0.1}, "from -0.1 s, and the scene begins at 0 s"
-    yield (
-        "camera",
-        {**tracks, "pixel": 2 * tracks["pixel"]},
-        "from where the scene's camera sees them at rest in its 512",
-    )
-    yield (
-        "origin",
-        {**mass, "position": motion + 0.05},
-        "from where they are at rest in the scene; count from the sheet's",
-    )
-    yield "sigma", {**tracks, "sigma": 0.0}, "sigma: 0; take one number above 0"
-    yield "pixels", {**tracks, "coordinates": 512 * PLACES}, "coordinates: 469.333; give across and down as fractions"
-    yield "turned", {**tracks, "pixel": tracks["pixel"].swapaxes(0, 1)}, "the points come first: take pixel.swapaxes"
-    yield "lacks", {"time": tracks["time"], "pixel": tracks["pixel"]}, "coordinates: missing; expected time"
-    yield "both", {**tracks, **position}, "has both position and pixel; leave one of them out"
+    lone[0, 3] = pixel[0, 3]
+    return {
+        "few": {**tracks, "pixel": lone},
+        "hidden": {**tracks, "pixel": hidden},
+        "still": {**tracks, "pixel": still},
+        "rounded": {**tracks, "pixel": still * (1 + 1e-13 * np.random.default_rng(1).normal(size=still.shape))},
+        "huge": {**tracks, "pixel": 1e40 * pixel},
+        "tiny": {**tracks, "sigma": 1e-300},
+        "noise": {**tracks, "sigma": 50.0},
+        "missed": {**tracks, "time": np.linspace(0, 0.004, 11)},
+        "mm": {**mass, "position": 1000 * motion},
+        "ms": {**tracks, "time": 1000 * time},
+        "late": {**tracks, "time": time + 0.1},
+        "early": {**tracks, "time": time - 0.1},
+        "camera": {**tracks, "pixel": 2 * pixel},
+        "origin": {**mass, "position": motion + 0.05},
+        "pixels": {**tracks, "coordinates": 512 * PLACES},
+        "turned": {**tracks, "pixel": pixel.swapaxes(0, 1)},
+        "lacks": {"time": time, "pixel": pixel},
+        "both": {**tracks, "position": np.zeros((36, 11, 3))},
+    }
 
 
 def test_what_cannot_be_used_is_answered_by_one_sentence(
-    tracks: dict[str, Array], motion: Array, tmp_path: Path
+    tracks: dict[str, Array], motion: Array, tmp_path: Path, message: Messages
 ) -> None:
-    free = ["tissue.young", "tissue.foundation", "tissue.damping"]
-    for name, arrays, message in bad(tracks, motion):
-        path = tmp_path / f"{name}.npz"
-        save(path, arrays)
-        with pytest.raises(SceneError, match=message) as caught:
-            fit(changed(), path, free, workers=1)
-        assert len(caught.value.lines) == 1, name
-        assert caught.value.lines[0].startswith(f"{path}: "), name
-        assert ";" in caught.value.lines[0], name
+    for name, arrays in bad(tracks, motion).items():
+        save(tmp_path / f"{name}.npz", arrays)
+        with message.raises(SceneError, f"{name}.npz: ", "; "):
+            fit(changed(), tmp_path / f"{name}.npz", ["tissue.young", "tissue.foundation", "tissue.damping"], workers=1)
 
 
 def test_motion_of_many_tracks_is_seen_though_it_is_smaller_than_their_errors(tracks: dict[str, Array]) -> None:
@@ -557,62 +474,72 @@ def test_values_that_make_no_scene_give_no_run(device: Device, tracks: dict[str,
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    "arguments",
     [
-        (["--free", "tissue.yuong"], "--free tissue.yuong: the scene has no yuong there; did you mean 'young'?"),
-        (["--free", "sheet.points.0"], "--free sheet.points.0: 9, which cannot be free"),
-        (["--free", "time.duration"], "--free time.duration: 0.4, which cannot be free"),
-        ([], "--free: names no key"),
-        (["--free", "tissue.young", "--bounds", "tissue.young=9"], "expected KEY=LOW,HIGH"),
-        (["--free", "tissue.young", "--bounds", "tissue.young=3e4,9e4"], "20000, where it starts, is outside"),
-        (["--free", "tissue.young", "--bounds", "tissue.damping=1,2"], "--bounds tissue.damping: not among --free"),
-        (["--free", "tissue.young", "--forces", "none.csv,0.1"], "none.csv: no such file; name a forces.csv"),
-        (["--free", "tissue.young", "--forces", "none.csv"], "expected FILE,SIGMA"),
-        (["--free", "tissue.young", "--free", "tissue.young"], "--free tissue.young: given twice; leave one of them"),
-        (["--free", "tissue.young", "--bounds", "tissue.young=1,1e5", "tissue.young=2,1e5"], "--bounds: tissue.young"),
-        (["--free", "tissue.young", "--set", "sheet.tolerance=0.1"], "sheet.tolerance: 0.1 is for one run"),
-        (["--free", "tissue.young", "--sigma", "0"], "seen.npz: sigma: 0; take one number above 0"),
-        (["--free", "tissue.young", "--correlation", "0"], "--correlation 0: take a number of pixels above 0"),
+        "--free tissue.yuong",
+        "--free time.duration",
+        "",
+        "--free tissue.young --bounds tissue.young=9",
+        "--free tissue.young --bounds tissue.young=3e4,9e4",
+        "--free tissue.young --bounds tissue.damping=1,2",
+        "--free tissue.young --forces none.csv,0.1",
+        "--free tissue.young --forces none.csv",
+        "--free tissue.young --free tissue.young",
+        "--free tissue.young --bounds tissue.young=1,1e5 tissue.young=2,1e5",
+        "--free tissue.young --set sheet.tolerance=0.1",
+        "--free tissue.young --sigma 0",
+        "--free tissue.young --correlation 0",
     ],
 )
 def test_wrong_arguments_are_answered_in_a_line(
-    tracks: dict[str, Array], small: Path, program: Program, arguments: list[str], message: str
+    tracks: dict[str, Array], small: Path, program: Program, arguments: str, message: Messages
 ) -> None:
     (small / "press.yaml").write_text(yaml.safe_dump(TRUTH))
     save(small / "seen.npz", tracks)
-    done = program("fit", "press.yaml", "seen.npz", *arguments)
+    done = program("fit", "press.yaml", "seen.npz", *arguments.split())
     assert done.returncode == 2
-    assert message in done.stderr
+    message(done.stderr)
     assert len(done.stderr.splitlines()) == 1
     assert not (small / "output").exists()
 
 
 @pytest.mark.parametrize("text", [b"", b"nothing", b"PK\x05\x06" + bytes(18)], ids=["empty", "text", "no arrays"])
-def test_a_file_that_is_none_is_refused(small: Path, program: Program, text: bytes) -> None:
-    (small / "press.yaml").write_text(yaml.safe_dump(TRUTH))
-    (small / "seen.npz").write_bytes(text)
-    done = program("fit", "press.yaml", "seen.npz", "--free", "tissue.young")
-    assert done.returncode == 2
-    assert done.stderr.startswith("seen.npz: ")
-    assert len(done.stderr.splitlines()) == 1
+def test_a_file_that_is_none_is_refused(tmp_path: Path, text: bytes, message: Messages) -> None:
+    (tmp_path / "seen.npz").write_bytes(text)
+    with message.raises(SceneError, "seen.npz: "):
+        fit(changed(), tmp_path / "seen.npz", ["tissue.young"])
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "is empty; name a forces.csv"),
-        (FORCES, "no row; name a forces.csv"),
-        (FORCES + "0.1,0,,,\n", "no force; name a forces.csv"),
-        (FORCES + ",,,,\n", "no row; name a forces.csv"),
-        (FORCES + ",0,0,0,1\n", "a row without a time; name a forces.csv"),
-        (FORCES.replace(",", " "), "time: missing; found time probe force_x f; name a forces.csv"),
-    ],
-)
-def test_a_table_without_forces_is_refused(tracks: dict[str, Array], tmp_path: Path, text: str, message: str) -> None:
-    (tmp_path / "forces.csv").write_text(text)
-    with pytest.raises(SceneError, match=f"forces.csv: {message}") as caught:
-        fit(changed(), tracks, ["tissue.young"], forces=(tmp_path / "forces.csv", 0.1))
-    assert len(caught.value.lines) == 1
+ZEROS = f"{FORCES}0,0,0,0,0\n"
+UNREADABLE: dict[str, str | bytes] = {
+    "empty": "",
+    "no row": FORCES,
+    "no force": f"{FORCES}0.1,0,,,\n",
+    "only empty cells": f"{FORCES},,,,\n",
+    "no time": f"{FORCES},0,0,0,1\n",
+    "one column": FORCES.replace(",", " "),
+    "unit in a cell": f"{ZEROS}0.1,0,0,0,-0.5 N\n",
+    "word": f"{ZEROS}0.1,0,n/a,0,0\n",
+    "infinite": f"{ZEROS}0.1,0,0,inf,0\n",
+    "huge": f"{ZEROS}0.1,0,0,1e308,0\n",
+    "decimal comma": f'{ZEROS}"0,1",0,0,0,0\n',
+    "twice": f"{ZEROS}0,0,0,0,1\n",
+    "decimal commas": f"{ZEROS}0,1,0,0,0,0,0,-0,5\n",
+    # A German -1.234 is a thousand times as much.
+    "both decimal marks": FORCES.replace(",", ";") + "0,2;0;0;0;-1.234\n",
+    "workbook": b"PK\x03\x04",
+    "utf-16 without a mark": FORCES.encode("utf-16-le"),
+    "millinewtons": f"{FORCES}s,-,mN,mN,mN\n0,0,0,0,1\n",
+    "column twice": f"{FORCES.strip()},force_z [N]\n0,0,0,0,1,2\n",
+}
+
+
+@pytest.mark.parametrize("case", UNREADABLE)
+def test_a_table_of_forces_that_cannot_be_read_is_refused(tmp_path: Path, case: str, message: Messages) -> None:
+    table = UNREADABLE[case]
+    (tmp_path / "forces.csv").write_bytes(table.encode() if isinstance(table, str) else table)
+    with message.raises(SceneError, "forces.csv"):
+        read_forces(tmp_path / "forces.csv", 0.1, 1)
 
 
 @pytest.mark.parametrize(
@@ -635,71 +562,23 @@ def test_tables_of_other_programs_are_understood(tmp_path: Path, data: bytes) ->
     np.testing.assert_array_equal(read.force, [[np.nan, np.nan, -0.5]])
 
 
-@pytest.mark.parametrize(
-    ("row", "message"),
-    [
-        ("0.1,0,0,0,-0.5 N", r":3: force_z: '-0.5 N'; take a number, or leave the cell empty"),
-        ("0.1,0,n/a,0,0", ":3: force_x: 'n/a'; take"),
-        ("0.1,0,0,inf,0", ":3: force_y: 'inf'; take"),
-        ("0.1,0,0,1e308,0", ":3: force_y: '1e308'; take"),
-        ('"0,1",0,0,0,0', ":3: time: '0,1'; take a number, or with decimal commas, separate cells by ;"),
-        ("0,0,0,0,1", ":3: a second row of 0 s and probe 0; leave one"),
-        ("0,1,0,0,0,0,0,-0,5", ":3: 9 cells, and 5 columns; with decimal commas, separate cells by ;"),
-    ],
-)
-def test_a_cell_that_is_no_number_is_refused(tmp_path: Path, row: str, message: str) -> None:
-    (tmp_path / "forces.csv").write_text(f"{FORCES}0,0,0,0,0\n{row}\n")
-    with pytest.raises(SceneError, match=message):
-        read_forces(tmp_path / "forces.csv", 0.1, 1)
-
-
-def test_one_file_has_one_decimal_mark(tmp_path: Path) -> None:
-    """A German -1.234 is a thousand times as much."""
-    (tmp_path / "forces.csv").write_text(FORCES.replace(",", ";") + "0,2;0;0;0;-1.234\n")
-    with pytest.raises(SceneError, match=r":2: force_z: '-1\.234'; both \. and , are decimal marks"):
-        read_forces(tmp_path / "forces.csv", 0.1, 1)
-
-
-@pytest.mark.parametrize("data", [b"PK\x03\x04", FORCES.encode("utf-16-le")], ids=["workbook", "no mark"])
-def test_a_file_that_is_no_text_is_named(tmp_path: Path, data: bytes) -> None:
-    (tmp_path / "forces.csv").write_bytes(data)
-    with pytest.raises(SceneError, match="a workbook, or UTF-16 without a byte order mark; save it as CSV in UTF-8"):
-        read_forces(tmp_path / "forces.csv", 0.1, 1)
-
-
-def test_a_unit_of_forces_other_than_newtons_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "forces.csv").write_text(f"{FORCES}s,-,mN,mN,mN\n0,0,0,0,1\n")
-    with pytest.raises(SceneError, match=":2: force_x: unit 'mN'; give seconds and newtons"):
-        read_forces(tmp_path / "forces.csv", 0.1, 1)
-
-
-def test_a_column_given_twice_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "forces.csv").write_text(f"{FORCES.strip()},force_z [N]\n0,0,0,0,1,2\n")
-    with pytest.raises(SceneError, match=":1: force_z: 2 columns of this name; leave one"):
-        read_forces(tmp_path / "forces.csv", 0.1, 1)
-
-
-def test_forces_of_a_pipe_or_a_huge_file_are_refused(tmp_path: Path) -> None:
+def test_forces_of_a_pipe_or_a_huge_file_are_refused(tmp_path: Path, message: Messages) -> None:
     os.mkfifo(tmp_path / "pipe")
     with (tmp_path / "huge").open("wb") as file:
         file.truncate(20 * 10**9)
-    for name, message in (("pipe", "not a regular file"), ("huge", "20000 MB, more than")):
-        with pytest.raises(SceneError, match=f"{name}: {message}"):
+    for name in ("pipe", "huge"):
+        with message.raises(SceneError, name):
             read_forces(tmp_path / name, 0.1, 1)
 
 
-def test_arrays_that_are_not_needed_are_left_unread(tracks: dict[str, Array], tmp_path: Path) -> None:
+def test_arrays_that_are_not_needed_are_left_unread(
+    tracks: dict[str, Array], tmp_path: Path, message: Messages
+) -> None:
     save(tmp_path / "seen.npz", {**tracks, "meta": np.array({"rig": 1}, object)})
     assert read_observations(tmp_path / "seen.npz", 25).values.shape == tracks["pixel"].shape
     save(tmp_path / "seen.npz", {**tracks, "time": np.array([{}], object)})
-    with pytest.raises(SceneError, match=r"seen\.npz: time: an array of Python objects; write it again"):
+    with message.raises(SceneError, "seen.npz: time: ", "objects"):
         read_observations(tmp_path / "seen.npz", 25)
-
-
-def _member(tmp_path: Path, data: bytes, method: int) -> bytearray:
-    with zipfile.ZipFile(tmp_path / "seen.npz", "w", method) as archive:
-        archive.writestr("time.npy", data)
-    return bytearray((tmp_path / "seen.npz").read_bytes())
 
 
 HEADER = b"\x93NUMPY\x01\x00"
@@ -718,49 +597,44 @@ HEADER = b"\x93NUMPY\x01\x00"
     ids=["deflate", "lzma", "encrypted", "tokens", "raw", "deep"],
 )
 def test_an_array_that_cannot_be_read_is_named(
-    tmp_path: Path, data: bytes, method: int, changes: dict[int, int]
+    tmp_path: Path, data: bytes, method: int, changes: dict[int, int], message: Messages
 ) -> None:
-    damaged = _member(tmp_path, data, method)
+    with zipfile.ZipFile(tmp_path / "seen.npz", "w", method) as archive:
+        archive.writestr("time.npy", data)
+    damaged = bytearray((tmp_path / "seen.npz").read_bytes())
     for at, byte in changes.items():
         damaged[at] = byte
     (tmp_path / "seen.npz").write_bytes(damaged)
-    with pytest.raises(SceneError, match=r"seen\.npz: time: cannot be read: ") as caught:
+    with message.raises(SceneError, "seen.npz: time: ", hide=r"(?<=cannot be read: )[^;]*") as caught:
         read_observations(tmp_path / "seen.npz", 25)
     assert "\n" not in str(caught.value)
     assert "ZipInfo" not in str(caught.value)
 
 
-def test_what_is_visible_is_seen(tracks: dict[str, Array]) -> None:
+def test_what_is_visible_is_seen(tracks: dict[str, Array], message: Messages) -> None:
     visible = np.random.default_rng(0).random(tracks["pixel"].shape[:2]) < 0.5
-    np.testing.assert_array_equal(read_observations({**tracks, "visible": visible}, 25).there, visible)
-    with pytest.raises(SceneError, match="observed: visible: float64 of shape"):
-        read_observations({**tracks, "visible": 0.9 * visible}, 25)
-    for name in ("validity", "status"):
-        with pytest.raises(SceneError, match=f"observed: '{name}': not understood; take NaN"):
-            read_observations({**tracks, name: visible}, 25)
+    np.testing.assert_array_equal(read_observations({**tracks, "visible": visible}, 25).is_observed, visible)
+    for name, array in (("visible", 0.9 * visible), ("validity", visible)):
+        with message.raises(SceneError, name):
+            read_observations({**tracks, name: array}, 25)
 
 
-def test_conventions_of_other_programs_are_asked_about(tracks: dict[str, Array]) -> None:
-    def answer(**more: Any) -> str:
-        return "\n".join(faults(read_observations({**tracks, **more}, 25), changed(), 2))
+def test_conventions_of_other_programs_are_asked_about(tracks: dict[str, Array], message: Messages) -> None:
+    def answer(**more: Any) -> list[str]:
+        return list(faults(read_observations({**tracks, **more}, 25), changed(), 2))
 
-    assert answer() == ""
-    for mark in (0, -1, -9999):
+    assert answer() == []
+    for mark in (0, -9999):
         pixel = tracks["pixel"].copy()
         pixel[3, 4:] = mark
-        assert f"pixel: {mark} in all numbers of 7 points and times; are they lost points? take NaN" in answer(
-            pixel=pixel
-        )
-    fractions = tracks["pixel"] / changed().render.size
-    assert "are they fractions of the frame? multiply them by its width and height" in answer(pixel=fractions)
-    assert "are they frame numbers? divide time by the frames per second, 25" in answer(time=np.arange(11))
+        message(answer(pixel=pixel), f"{mark} in all numbers of 7 points")
+    message(answer(pixel=tracks["pixel"] / changed().render.size), "fractions")
+    message(answer(time=np.arange(11)), "frame numbers")
 
 
-@pytest.mark.parametrize(
-    ("factor", "unit"), [(1, None), (1.1, None), (-1, None), (1000, "mN"), (101.97, "gf"), (0.001, "kN")]
-)
+@pytest.mark.parametrize("factor", [1, 1.1, -1, 1000, 101.97, 0.001])
 def test_units_and_signs_of_forces_are_asked_about(
-    tracks: dict[str, Array], device: Device, tmp_path: Path, factor: float, unit: str | None
+    tracks: dict[str, Array], device: Device, tmp_path: Path, factor: float, message: Messages
 ) -> None:
     rows = [FORCES.strip()]
     with Simulation(changed(), threads=device.threads) as simulation:
@@ -771,32 +645,25 @@ def test_units_and_signs_of_forces_are_asked_about(
     # The force of the tool is given, so that no parameter scales it.
     given = changed(tissue__young=2e5), noisy(tracks, 0.1, sigma=0.1), ["tissue.young"]
     forces = tmp_path / "forces.csv", 0.01 * abs(factor)
-    if factor == 1.1:
-        first = fit(*given, forces=(forces[0], 0.01), workers=1).summary()[0]
-        assert ", mostly of the forces, which are 1.1 times the predicted ones; the intervals" in first
-    if abs(factor) < 1.2 and factor > 0.5:
-        assert not any("times those of the scene" in note for note in fit(*given, forces=forces, workers=1).notes)
+    if factor not in (1, 1.1):
+        with message.raises(SceneError, "forces.csv"):
+            fit(*given, forces=forces, workers=1)
         return
-    said = "is it the force on the tool" if factor < 0 else f"are they in {unit}\\? divide them by {factor:g}"
-    if unit == "kN":
-        said = "are they in kN\\? multiply them by 1000"
-    with pytest.raises(SceneError, match=said):
-        fit(*given, forces=forces, workers=1)
+    found = fit(*given, forces=(forces[0], 0.01), workers=1)
+    assert not any("times those of the scene" in note for note in found.notes)
+    assert (", mostly of the forces, which are 1.1 times the predicted ones" in found.summary()[0]) == (factor == 1.1)
 
 
-def test_offsets_of_half_a_pixel_and_turned_axes_are_asked_about(tracks: dict[str, Array], motion: Array) -> None:
-    def answer(**arrays: Any) -> str:
-        with pytest.raises(SceneError) as caught:
-            fit(changed(), arrays, ["tissue.young"], workers=1)
-        return str(caught.value)
-
+def test_offsets_of_half_a_pixel_and_turned_axes_are_asked_about(
+    tracks: dict[str, Array], motion: Array, message: Messages
+) -> None:
     seen = noisy(tracks, 0.1)
-    for offset, said in ((-0.5, "at 0? add 0.5"), (0.5, "at 1? subtract 0.5"), (np.array([0.5, 0]), "at 1?")):
-        assert f"is the centre of their first pixel {said}" in answer(**{**seen, "pixel": seen["pixel"] + offset})
-    assert "take 512 - y, counted from above" in answer(**{**seen, "pixel": [0, 512] + seen["pixel"] * [1, -1]})
-    turned = {"time": seen["time"], "position": motion * [1, -1, 1]}
-    assert "position: y of the points at rest has the other sign in the scene; take -y" in answer(**turned)
-    assert "position: z changes against the scene's" in answer(**{**turned, "position": motion * [1, 1, -1]})
+    pixel, turned = seen["pixel"], motion * [1, -1, 1]
+    changes = [{"pixel": pixel + offset} for offset in (-0.5, 0.5, np.array([0.5, 0]))]
+    arrays = [{**seen, **change} for change in (*changes, {"pixel": [0, 512] + pixel * [1, -1]})]
+    for one in (*arrays, *({"time": seen["time"], "position": each} for each in (turned, motion * [1, 1, -1]))):
+        with message.raises(SceneError, "pixel" if "pixel" in one else "position"):
+            fit(changed(), one, ["tissue.young"], workers=1)
 
 
 @pytest.mark.parametrize("robust", [False, True])
@@ -806,7 +673,7 @@ def test_an_exact_fit_has_errors_next_to_0(device: Device, robust: bool) -> None
     empty = read_observations({"time": np.arange(11) / 25, "coordinates": PLACES, "position": np.ones((36, 11, 3))}, 25)
     job = FitProblem("token", without_outputs(changed()), make_parameters(changed(), free, {}), empty)
     predictor = ForwardModel(job, device.threads)
-    seen = {"time": empty.time, "coordinates": PLACES, "position": predictor.predict(np.zeros(2), whole=True).values}
+    seen = {"time": empty.time, "coordinates": PLACES, "position": predictor.predict(np.zeros(2), to_end=True).values}
     predictor.close()
     found = fit(changed(), seen, free, robust=robust, profile=True, workers=1)
     assert found.residual == 0
@@ -823,9 +690,7 @@ def test_an_exact_fit_has_errors_next_to_0(device: Device, robust: bool) -> None
 def near_the_sheet(motion: Array, device: Device) -> tuple[Scene, dict[str, Array]]:
     """A camera that a third of the places are behind, and what it sees."""
     scene = changed(render__camera={"eye": [0, -0.02, 0.01], "target": [0, 0.05, 0]})
-    with Simulation(scene, threads=device.threads) as simulation:
-        pixels = [simulation.locate(PLACES, positions=positions).pixels for positions in motion]
-    pixel = np.stack(pixels, axis=1).astype(np.float64)
+    pixel = pixels_in(scene, motion, device)
     assert np.isnan(pixel).any(axis=(1, 2)).sum() == 12
     return scene, {"time": np.arange(11) / 25, "coordinates": PLACES, "pixel": pixel}
 
@@ -844,27 +709,25 @@ def test_points_that_the_camera_does_not_see_have_no_part_in_a_correlation(motio
     assert whole.standard_error == pytest.approx(part.standard_error, rel=1e-9)
 
 
-def test_points_behind_the_eye_are_refused_where_they_were_seen(motion: Array, device: Device) -> None:
+def test_points_behind_the_eye_are_refused_where_they_were_seen(
+    motion: Array, device: Device, message: Messages
+) -> None:
     scene, seen = near_the_sheet(motion, device)
     unseen = np.isnan(seen["pixel"])
     seen["pixel"][unseen] = np.arange(unseen.sum())
-    with pytest.raises(SceneError, match="pixel: 12 of the observed points are behind the eye") as caught:
+    with message.raises(SceneError, "pixel: 12 "):
         fit(scene, seen, ["tissue.young"], workers=1)
-    assert len(caught.value.lines) == 1
 
 
-def test_a_calibrated_camera_comes_back(motion: Array, device: Device) -> None:
-    camera = {"eye": [0, -0.06, 0.09], "intrinsics": {"fx": 700, "fy": 710, "cx": 255.5, "cy": 250.5}}
-    with Simulation(changed(render__camera=camera), threads=device.threads) as simulation:
-        pixels = [simulation.locate(PLACES, positions=positions).pixels for positions in motion]
-    seen = {"time": np.arange(11) / 25, "coordinates": PLACES, "pixel": np.stack(pixels, axis=1), "sigma": 1.0}
+def test_a_calibrated_camera_comes_back(tracks: dict[str, Array], motion: Array, device: Device) -> None:
+    camera, truth = {"eye": [0, -0.06, 0.09]}, {"fx": 700, "fy": 710, "cx": 255.5, "cy": 250.5}
+    pixel = pixels_in(changed(render__camera={**camera, "intrinsics": truth}), motion, device)
     start = changed(render__camera={**camera, "intrinsics": {"fx": 702, "fy": 708, "cx": 254.5, "cy": 251.5}})
-    keys = [f"render.camera.intrinsics.{name}" for name in ("fx", "fy", "cx", "cy")]
-    parameters = make_parameters(start, keys, {})
+    keys = [f"render.camera.intrinsics.{name}" for name in truth]
     # Focal lengths by their logs, the principal point in widths and heights of the picture.
-    assert [one.scale for one in parameters] == [0, 0, 512, 512]
-    found = fit(start, seen, keys, workers=1)
-    np.testing.assert_allclose(values(found), [700, 710, 255.5, 250.5], atol=1e-3)
+    assert [one.scale for one in make_parameters(start, keys, {})] == [0, 0, 512, 512]
+    found = fit(start, {**tracks, "pixel": pixel, "sigma": 1.0}, keys, workers=1)
+    np.testing.assert_allclose(values(found), list(truth.values()), atol=1e-3)
     assert found.identifiable
 
 
@@ -877,38 +740,36 @@ def test_a_number_of_a_named_camera_is_found(tracks: dict[str, Array]) -> None:
 
 
 @pytest.mark.parametrize("name", ["seen.npy", "seen.npz"])
-def test_a_single_array_is_refused(tracks: dict[str, Array], tmp_path: Path, name: str) -> None:
+def test_a_single_array_is_refused(tracks: dict[str, Array], tmp_path: Path, name: str, message: Messages) -> None:
     np.save(tmp_path / "seen.npy", tracks["pixel"])
     (tmp_path / "seen.npy").rename(tmp_path / name)
-    with pytest.raises(SceneError, match=f"{name}: a single array, as np.save writes; name an .npz with time"):
+    with message.raises(SceneError, name):
         fit(changed(), tmp_path / name, ["tissue.young"])
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"free": "tissue.young"}, r"free: 'tissue.young'; take a list of keys"),
-        ({"free": [0]}, r"free: \[0\]; take a list of keys"),
-        ({"observed": 5}, "observed: 5; take the path of an .npz"),
-        ({"scene": 5}, "int is no scene"),
-        ({"bounds": [("tissue.young", 1, 2)]}, "bounds: .*; take a mapping"),
-        ({"bounds": {"tissue.young": 5}}, "bounds: .*; take a mapping"),
-        ({"bounds": {"tissue.young": ("1", 2)}}, "bounds: .*; take a mapping"),
-        ({"forces": "forces.csv"}, "forces: 'forces.csv'; take a forces.csv and the standard deviation"),
-        ({"directory": 5}, "directory: 5; take a path"),
-        ({"workers": 0}, "workers: 0; take a whole number, 1 to 1024"),
-        ({"sigma": "0.5"}, "sigma: '0.5'; take a number"),
-        ({"correlation": "5"}, "correlation: '5'; take a number"),
-        ({"resolution": 4.0}, "resolution: 4.0; take a whole number"),
-        ({"robust": "yes"}, "robust: 'yes'; take True or False"),
-        ({"profiles": True}, "profiles: unknown; take .*; did you mean 'profile'"),
-    ],
-)
+WRONG_TYPES: dict[str, dict[str, Any]] = {
+    "free, text": {"free": "tissue.young"},
+    "free, numbers": {"free": [0]},
+    "observed": {"observed": 5},
+    "scene": {"scene": 5},
+    "bounds, list": {"bounds": [("tissue.young", 1, 2)]},
+    "bounds, text": {"bounds": {"tissue.young": ("1", 2)}},
+    "forces": {"forces": "forces.csv"},
+    "directory": {"directory": 5},
+    "workers": {"workers": 0},
+    "sigma": {"sigma": "0.5"},
+    "resolution": {"resolution": 4.0},
+    "robust": {"robust": "yes"},
+    "unknown": {"profiles": True},
+}
+
+
+@pytest.mark.parametrize("case", WRONG_TYPES)
 def test_arguments_of_a_wrong_type_are_answered_in_a_line(
-    tracks: dict[str, Array], arguments: dict[str, Any], message: str
+    tracks: dict[str, Array], case: str, message: Messages
 ) -> None:
-    given: dict[str, Any] = {"scene": changed(), "observed": tracks, "free": ["tissue.young"], **arguments}
-    with pytest.raises(ArgumentError, match=message):
+    given: dict[str, Any] = {"scene": changed(), "observed": tracks, "free": ["tissue.young"], **WRONG_TYPES[case]}
+    with message.raises(ArgumentError):
         fit(given.pop("scene"), given.pop("observed"), given.pop("free"), **given)
 
 
@@ -931,36 +792,38 @@ def test_tracks_that_drift_widen_the_intervals(tracks: dict[str, Array]) -> None
     assert 1.2 < widening < 11**0.5
 
 
-def test_a_scene_that_cannot_move_as_was_seen_is_rejected_first_of_all(tracks: dict[str, Array]) -> None:
+def test_a_scene_that_cannot_move_as_was_seen_is_rejected_first_of_all(
+    tracks: dict[str, Array], message: Messages
+) -> None:
     """With another damping, and none that is free."""
     seen = noisy(tracks, 0.05, sigma=0.05)
-    wrong = fit(changed(tissue__damping=600), seen, ["tissue.foundation"], workers=1)
-    assert wrong.as_json()["model_rejected"] is True
-    first = wrong.summary()[0]
-    assert first.startswith("the model is rejected: ")
-    assert first.endswith("; the intervals do not cover this")
-    right = fit(changed(), seen, ["tissue.foundation"], workers=1)
-    assert right.as_json()["model_rejected"] is False
+    wrong, right = (fit(changed(tissue__damping=g), seen, ["tissue.foundation"], workers=1) for g in (600, 200))
+    assert (wrong.as_json()["model_rejected"], right.as_json()["model_rejected"]) == (True, False)
+    message(wrong.summary()[0], "the model is rejected: ", hide=r"\d[\d.]*")
     assert "rejected" not in right.summary()[0]
 
 
 @pytest.mark.parametrize("few", [False, True])
-def test_a_wrong_scene_is_rejected_by_what_is_left_alone(tracks: dict[str, Array], few: bool) -> None:
+def test_a_wrong_scene_is_rejected_by_what_is_left_alone(
+    tracks: dict[str, Array], few: bool, message: Messages
+) -> None:
     """By a wrong damping, also where two times tell nothing of time."""
     seen = noisy(tracks, 0.02)
     if few:
         seen |= {"time": seen["time"][5:7], "pixel": seen["pixel"][:, 5:7]}
     wrong = fit(changed(tissue__damping=600), seen, ["tissue.foundation"], workers=1)
-    assert wrong.summary()[0].startswith("the model is rejected: the residuals of neighbouring points are correlated")
+    message(wrong.summary()[0], "the model is rejected: ", hide=r"\d[\d.]*")
     assert not fit(changed(), seen, ["tissue.foundation"], workers=1).model_rejected
 
 
-def test_what_is_far_off_counts_in_full_for_the_rejection_of_a_robust_fit(tracks: dict[str, Array]) -> None:
+def test_what_is_far_off_counts_in_full_for_the_rejection_of_a_robust_fit(
+    tracks: dict[str, Array], message: Messages
+) -> None:
     seen = noisy(tracks, 0.1, sigma=0.1)
     assert not fit(changed(), seen, ["tissue.foundation"], robust=True, workers=1).model_rejected
     seen["pixel"][[7, 20]] += np.linspace(0, 40, 11)[:, None]
     found = fit(changed(), seen, ["tissue.foundation"], robust=True, workers=1)
-    assert found.summary()[0].startswith("the model is rejected: chi-square of the plain residuals ")
+    message(found.summary()[0], "the model is rejected: ", hide=r"\d[\d.]*")
 
 
 NOISE = [ErrorCorrelation(None, None), ErrorCorrelation(5.0, None), ErrorCorrelation(None, 1.0)]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 from time import sleep
 from typing import Any
@@ -15,18 +14,18 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from taichi_msm import FitResult, SceneError, fit, load_scene
+from taichi_msm import SceneError, fit, load_scene
 from taichi_msm.accuracy.mesh import estimate_mesh_error
 from taichi_msm.fitting.observations import ObservationModel, Observations, read_observations
 from taichi_msm.fitting.predict import without_outputs
 from taichi_msm.fitting.tikhonov import MapGrid, MapSearch
 from taichi_msm.gradients.gradient import Adjoint
 from taichi_msm.load.check import check_scene
-from taichi_msm.model.sheet import read_map, rest_positions
+from taichi_msm.model.sheet import read_map
 from taichi_msm.scene.scene import Scene
-from taichi_msm.system import process as process_module
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
+from tests.golden import Messages
 from tests.telling import Telling
 
 Array = NDArray[np.float64]
@@ -75,22 +74,13 @@ def seen_in(truth: Scene, device: Device, factors: Array, times: Array, error: f
     return {"time": times, "coordinates": PLACES, "position": points + noise, "sigma": error}
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_device(device: Device) -> Iterator[None]:
-    """A fit takes every core, and a process has one device."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("taichi_msm.system.runtime.process_module.available_threads", lambda: device.threads)
-        patch.setattr(process_module, "available_threads", lambda: device.threads)
-        yield
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("fit")
 
 
 @pytest.fixture(scope="module")
-def result(device: Device, folder: Path) -> FitResult:
+def result(device: Device, folder: Path) -> Any:
     """The map that is found from errors of 10 um, with its files."""
     observed = seen_in(scene(), device, TRUTH, np.array([1.0, 2.0]), 1e-5)
     # Half the cells a side would say little of these.
@@ -99,8 +89,7 @@ def result(device: Device, folder: Path) -> FitResult:
         return fit(scene(), observed, ["tissue.map"], resolution=4, directory=folder)
 
 
-def test_the_map_comes_back_as_well_known_as_is_said(result: FitResult) -> None:
-    assert result.map is not None
+def test_the_map_comes_back_as_well_known_as_is_said(result: Any) -> None:
     assert result.identifiable
     off = np.log(result.map.factors / TRUTH) / result.map.errors
     # Chi-square of 16 numbers is below 3.9, or above 39, once in a thousand times each.
@@ -112,56 +101,29 @@ def test_the_map_comes_back_as_well_known_as_is_said(result: FitResult) -> None:
     assert not result.model_rejected
 
 
-def test_a_map_in_a_wrong_scene_is_rejected(device: Device) -> None:
-    """With forces 10 % too large, which no stiffness of the springs explains where the tissue rests on a foundation."""
-    observed = seen_in(scene(), device, np.ones((4, 4)), np.array([1.0, 2.0]), 3e-6)
-    louder = [one | {"total": [1.1 * each for each in one["total"]]} for one in scene().model_dump()["probes"]]
-    found = fit(scene(probes=louder), observed, ["tissue.map"], resolution=4)
-    assert found.model_rejected
-    assert found.summary()[0].startswith("the model is rejected: chi-square ")
-    assert found.summary()[0].endswith("; the errors of the fields do not cover this")
-    assert not fit(scene(), observed, ["tissue.map"], resolution=4).model_rejected
-
-
-def test_a_common_factor_of_the_forces_comes_back_with_the_map(device: Device) -> None:
+def test_a_common_factor_of_the_forces_comes_back_with_the_map(device: Device, message: Messages) -> None:
     """From forces that are 30 % too small, which would make the tissue too soft on its foundation."""
     observed = seen_in(scene(), device, TRUTH, np.array([1.0, 2.0]), 3e-6)
     quieter = [one | {"total": [0.7 * each for each in one["total"]]} for one in scene().model_dump()["probes"]]
     key = "probes.0.total.0"
-    found = fit(scene(probes=quieter), observed, ["tissue.map", key], resolution=4)
+    found: Any = fit(scene(probes=quieter), observed, ["tissue.map", key], resolution=4)
     force = found.parameters[key]
     assert abs(force.value - 0.5) < 4 * force.standard_error < 0.1
-    assert force.interval[0] < force.value < force.interval[1]  # type: ignore[operator]
+    assert force.interval[0] < force.value < force.interval[1]
     assert [max(probe.total) for probe in found.scene.probes if probe.total] == pytest.approx([force.value] * 4)
-    assert found.map is not None
     assert np.abs(np.log(found.map.factors / TRUTH) / found.map.errors).max() < 4
     assert not found.model_rejected
     assert found.summary()[0].startswith(f"{key}: ")
-    assert fit(scene(probes=quieter), observed, ["tissue.map"], resolution=4).model_rejected
+    wrong = fit(scene(probes=quieter), observed, ["tissue.map"], resolution=4)
+    assert wrong.model_rejected
+    message(wrong.summary()[0], "the model is rejected: chi-square ", hide=r"\d[\d.]*")
 
 
-@pytest.mark.parametrize("motion", [False, True])
-def test_the_gradient_by_the_factor_of_the_forces(device: Device, motion: bool) -> None:
-    made = swinging() if motion else scene()
-    times = np.array([0.08, 0.16] if motion else [1.0, 2.0])
-    seen = read_observations(seen_in(made, device, TRUTH, times, 1e-4), 1)
-    plan, fields, limits = check_scene(made), MapGrid(4, (8, 8)), (-2.0, 2.0)
-    model = ObservationModel(plan.scene, seen, plan.grid.frames + 1)
-    search = MapSearch(Adjoint(plan, device), model, seen, 1e-4, fields, limits, lambda: None, force_limits=limits)
-    x, step = np.append(np.zeros(16), 0.2), np.append(np.zeros(16), 1e-3)
-    (_, slope), (high, _), (low, _) = (search.misfit(x + each) for each in (0 * step, step, -step))
-    assert slope[-1] == pytest.approx((high - low) / 2e-3, rel=1e-3)
-
-
-def test_the_files_give_what_was_fitted(result: FitResult, folder: Path) -> None:
-    assert result.map is not None
-    written = load_scene(folder / "scene.yaml")
-    assert written.tissue is not None
-    assert written.tissue.map is not None
+def test_the_files_give_what_was_fitted(result: Any, folder: Path) -> None:
+    written: Any = load_scene(folder / "scene.yaml")
     low, high = result.map.range
     assert written.tissue.map.range == pytest.approx((low, high), rel=1e-12)
-    found = check_scene(written).material.factors
-    assert found is not None
+    found: Any = check_scene(written).material.factors
     fields = MapGrid(4, (8, 8)).factors(np.log(result.map.factors).ravel())
     np.testing.assert_allclose(found, fields, atol=(high - low) / 65535)
     assert read_map(written.tissue.map).grey.dtype == np.uint16
@@ -177,8 +139,7 @@ def test_a_map_is_as_smooth_as_the_errors_allow(device: Device) -> None:
     spreads = []
     for factors in (TRUTH, np.ones((4, 4))):
         observed = seen_in(scene(), device, factors, np.array([1.0, 2.0]), 1e-4)
-        found = fit(scene(), observed, ["tissue.map"], resolution=4).map
-        assert found is not None
+        found: Any = fit(scene(), observed, ["tissue.map"], resolution=4).map
         off = np.log(found.factors / factors)[~found.unknown] / found.errors[~found.unknown]
         assert np.sqrt((off**2).mean()) < 1.6
         spreads.append(np.log(found.factors).std())
@@ -195,8 +156,7 @@ def test_fields_that_do_not_move_are_unknown(device: Device, tmp_path: Path) -> 
     tissue, probes = data["tissue"] | {"foundation": 2.4e6}, [one | {"at": [0.2, 0.5]} for one in data["probes"][:2]]
     local = scene(tissue=tissue, probes=probes)
     observed = seen_in(local, device, np.ones((4, 4)), np.array([1.0, 2.0]), 1e-6)
-    found = fit(local, observed, ["tissue.map"], resolution=4, directory=tmp_path).map
-    assert found is not None
+    found: Any = fit(local, observed, ["tissue.map"], resolution=4, directory=tmp_path).map
     assert found.unknown[:, 3].all()
     assert not found.unknown[1:3, 0].any()
     assert (np.asarray(Image.open(tmp_path / "map-error.png"))[:, 3] == 65535).all()
@@ -214,31 +174,29 @@ def test_pictures_that_have_the_name_of_the_map_are_kept(
     observed = seen_in(scene(tissue=ground), device, np.ones((2, 2)), np.array([1.0, 2.0]), 1e-5)
     begin = ground | {"map": {"image": "other/map.png", "range": [1, 2]}}
     found = fit(scene(tissue=begin, image="map.png"), observed, ["tissue.map"], resolution=2, directory="found")
-    for fitted in (load_scene("found/scene.yaml"), found.scene):
-        assert fitted.tissue is not None
-        assert fitted.tissue.map is not None
-        assert fitted.tissue.foundation_map is not None
+    written: Any = load_scene("found/scene.yaml")
+    fitted: Any
+    for fitted in (written, found.scene):
+        assert fitted.tissue.foundation_map
         assert fitted.tissue.map.image == str(Path("found/map.png"))
-    fitted = load_scene("found/scene.yaml")
-    assert fitted.image == str(Path("found/pictures/map.png"))
+    assert written.image == str(Path("found/pictures/map.png"))
     assert Path("found/pictures/map.png").read_bytes() == Path("map.png").read_bytes()
     assert np.asarray(Image.open("found/map.png")).shape == (2, 2)
 
 
-def test_bounds_must_leave_springs_a_length(device: Device) -> None:
+def test_bounds_must_leave_springs_a_length(device: Device, message: Messages) -> None:
     # Pretension shortens springs by 0.3 at a factor of 1.
     tissue = scene().model_dump(mode="json", exclude_none=True)["tissue"] | {"pretension": 0.3 * 1.5 * 2e4 * 3e-3}
     taut = scene(tissue=tissue)
     observed = seen_in(taut, device, np.ones((2, 2)), np.array([1.0, 2.0]), 1e-5)
-    message = r"--bounds tissue.map=0.05,0.2: tissue.pretension leaves springs no length below 0.3; take a HIGH"
-    with pytest.raises(SceneError, match=message):
-        fit(taut, observed, ["tissue.map"], resolution=2, bounds={"tissue.map": (0.05, 0.2)})
-    found = fit(taut, observed, ["tissue.map"], resolution=2, bounds={"tissue.map": (0.05, 2)}).map
-    assert found is not None
+    for bounds in ((0.05, 0.2), (0.1, 1e300)):
+        with message.raises(SceneError, "--bounds tissue.map="):
+            fit(taut, observed, ["tissue.map"], resolution=2, bounds={"tissue.map": bounds})
+    found: Any = fit(taut, observed, ["tissue.map"], resolution=2, bounds={"tissue.map": (0.05, 2)}).map
     assert np.abs(np.log(found.factors)).max() < 4 * found.errors.max()
 
 
-def test_the_mesh_error_is_that_of_the_map_that_was_found(result: FitResult, folder: Path, device: Device) -> None:
+def test_the_mesh_error_is_that_of_the_map_that_was_found(result: Any, folder: Path, device: Device) -> None:
     # The lump of the truth, where the search begins with none, changes it by more than the last digit.
     found, even = (
         estimate_mesh_error(check_scene(without_outputs(each)), device, lambda done, total: None).error
@@ -248,111 +206,85 @@ def test_the_mesh_error_is_that_of_the_map_that_was_found(result: FitResult, fol
     assert result.mesh_error != pytest.approx(even, rel=1e-2)
 
 
-def test_points_behind_the_eye_are_refused(device: Device) -> None:
+def test_points_behind_the_eye_are_refused(device: Device, message: Messages) -> None:
     low = scene(render={"camera": {"eye": [0, -0.02, 0.01], "target": [0, 0.05, 0]}})
     pixel = np.arange(2.0 * len(PLACES)).reshape(-1, 1, 2)
     seen = {"time": [1.0], "coordinates": PLACES, "pixel": pixel, "sigma": 1.0}
-    with pytest.raises(SceneError, match="of the observed points are behind the eye of the scene's camera"):
+    with message.raises(SceneError, "behind the eye"):
         fit(low, seen, ["tissue.map"], resolution=2)
     # As where they get there while the map changes.
-    there = read_observations(seen, 1)
-    plan, fields = check_scene(low), MapGrid(2, (8, 8))
-    search = MapSearch(
-        Adjoint(plan, device), ObservationModel(plan.scene, there, 3), there, 1.0, fields, (-2, 2), lambda: None
-    )
-    with pytest.raises(SceneError, match="pixel: an observed point gets behind the eye of the camera"):
+    there, fields, adjoint = read_observations(seen, 1), MapGrid(2, (8, 8)), Adjoint(check_scene(low), device)
+    search = MapSearch(adjoint, ObservationModel(low, there, 3), there, 1.0, fields, (-2, 2), lambda: None)
+    with message.raises(SceneError, "behind the eye"):
         search.predict(np.zeros(4))
 
 
-@pytest.mark.parametrize("kind", ["position", "pixel"])
-def test_the_slope_of_the_misfit_is_that_of_differences(device: Device, kind: str) -> None:
-    seen = read_observations(seen_in(scene(), device, TRUTH, np.array([0.7, 2.0]), 1e-4), 1)
-    seen = Observations("", kind, seen.time, PLACES, seen.values[..., : 3 if kind == "position" else 2], 1e-4)  # type: ignore[arg-type]
-    plan, fields = check_scene(scene()), MapGrid(4, (8, 8))
-    search = MapSearch(
-        Adjoint(plan, device), ObservationModel(plan.scene, seen, 3), seen, 1.0, fields, (-2, 2), lambda: None
-    )
-    rng = np.random.default_rng(0)
-    x, change = rng.normal(0, 0.2, (2, 16))
-    after, before = (search.misfit(x + sign * 1e-3 * change)[0] for sign in (1, -1))
-    # The shapes at rest are known to 1e-6, and the second difference is 1e-6 of the first.
-    assert (after - before) / 2e-3 == pytest.approx(search.misfit(x)[1] @ change, rel=1e-3)
-
-
-def test_going_back_is_the_transpose_of_seeing(device: Device) -> None:
-    seen = Observations("", "pixel", np.array([0.3, 1.0]), PLACES, np.zeros((len(PLACES), 2, 2)), None)
-    rng = np.random.default_rng(0)
-    flat = rest_positions(scene().sheet)
-    position, change = flat + rng.normal(0, 2e-3, (3, *flat.shape)), rng.normal(0, 1, (3, *flat.shape))
-    slope, sight = rng.normal(0, 1, (len(PLACES), 2, 2)), ObservationModel(scene(), seen, 3)
-    back = sight.backward(sight.points(position), slope)
-    after, before = (sight.observe(sight.points(position + sign * 1e-7 * change)) for sign in (1, -1))
-    assert (back * change).sum() == pytest.approx((slope * (after - before)).sum() / 2e-7, rel=1e-7)
+@pytest.mark.parametrize(("kind", "made"), [("pixel", scene()), ("position", swinging())], ids=["rest", "motion"])
+def test_the_slope_of_the_misfit_is_that_of_differences(device: Device, kind: Any, made: Scene) -> None:
+    """By the fields, and by the factor of the forces."""
+    times = np.array([0.7, 2.0] if kind == "pixel" else [0.08, 0.16])
+    seen = read_observations(seen_in(made, device, TRUTH, times, 1e-4), 1)
+    seen = Observations("", kind, seen.time, PLACES, seen.values[..., : 3 if kind == "position" else 2], 1e-4)
+    plan, fields, limits = check_scene(made), MapGrid(4, (8, 8)), (-2.0, 2.0)
+    model = ObservationModel(plan.scene, seen, plan.grid.frames + 1)
+    search = MapSearch(Adjoint(plan, device), model, seen, 1.0, fields, limits, lambda: None, force_limits=limits)
+    x, change = np.random.default_rng(0).normal(0, 0.2, (2, 17))
+    for way in (change, 0.2 * np.eye(17)[16]):
+        after, before = (search.misfit(x + sign * 1e-3 * way)[0] for sign in (1, -1))
+        # The shapes at rest are known to 1e-6, and the second difference is 1e-6 of the first.
+        assert (after - before) / 2e-3 == pytest.approx(search.misfit(x)[1] @ way, rel=1e-3)
 
 
 def test_a_map_is_found_in_motion(device: Device) -> None:
     factors = np.array([[1.0, 1.5], [0.7, 1.0]])
     observed = seen_in(swinging(), device, factors, np.arange(1, 6) / 25, 1e-6)
-    found = fit(swinging(), observed, ["tissue.map"], resolution=2, bounds={"tissue.map": (0.3, 3)}).map
-    assert found is not None
+    found: Any = fit(swinging(), observed, ["tissue.map"], resolution=2, bounds={"tissue.map": (0.3, 3)}).map
     np.testing.assert_allclose(found.factors, factors, rtol=0.02)
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    "options",
     [
-        (["--free", "tissue.young", "--resolution", "4"], "--resolution 4: is that of a map; add --free tissue.map"),
-        (["--free", "tissue.map"], "--free tissue.map: add --resolution R"),
-        (["--free", "tissue.map", "--free", "tissue.young", "--resolution", "4"], "a map is found alone"),
-        (["--free", "tissue.map", "--resolution", "9"], "--resolution 9: take 2 to 8, as the sheet has 8 cells"),
-        (["--free", "tissue.map", "--resolution", "4"], "sigma: missing"),
-        (
-            ["--free", "tissue.map", "--resolution", "8", "--sigma", "1e-5"],
-            "6 numbers were observed, too few for 64 fields",
-        ),
-        (["--free", "tissue.map", "--resolution", "4", "--profile"], "--profile is of fits of numbers; leave it out"),
-        (["--free", "tissue.map", "--resolution", "4", "--bounds", "tissue.map=2,1"], "the smaller one first"),
-        (["--free", "tissue.foundation_map"], "of maps only tissue.map is fitted"),
+        "tissue.young --resolution 4",
+        "tissue.map",
+        "tissue.map tissue.young --resolution 4",
+        "tissue.map --resolution 9",
+        "tissue.map --resolution 4",
+        "tissue.map --resolution 8 --sigma 1e-5",
+        "tissue.map --resolution 4 --profile",
+        "tissue.map --resolution 4 --bounds tissue.map=2,1",
+        "tissue.foundation_map",
     ],
 )
 def test_what_cannot_be_is_said_in_a_sentence(
-    options: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: Program
+    options: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: Program, message: Messages
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    text = json.dumps(scene().model_dump(mode="json", exclude_none=True))
-    (tmp_path / "scene.yaml").write_text(text, encoding="utf-8")
-    rest = [[-0.02, 0, 0], [0.02, 0, 0]]
-    np.savez(tmp_path / "seen.npz", time=[1.0], coordinates=[[0.3, 0.5], [0.7, 0.5]], position=np.array(rest)[:, None])
-    done = program("fit", "scene.yaml", "seen.npz", *options)
+    Path("scene.yaml").write_text(json.dumps(scene().model_dump(mode="json", exclude_none=True)))
+    rest = np.array([[[-0.02, 0, 0]], [[0.02, 0, 0]]])
+    np.savez("seen.npz", time=[1.0], coordinates=[[0.3, 0.5], [0.7, 0.5]], position=rest)
+    done = program("fit", "scene.yaml", "seen.npz", "--free", *options.split())
     assert done.returncode == 2
-    assert said in done.stderr
+    message(done.stderr)
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_springs_and_contact_are_refused(device: Device) -> None:
+def test_springs_and_contact_are_refused(device: Device, message: Messages) -> None:
     observed = seen_in(scene(), device, TRUTH, np.array([1.0]), 1e-5)
-    springs = {**scene().model_dump(mode="json", exclude_none=True), "springs": {"structural": 20}}
+    springs = {**scene().model_dump(mode="json", exclude_none=True), "springs": {"structural": 20}, "probes": []}
     del springs["tissue"]
-    springs["probes"] = []
-    with pytest.raises(SceneError, match="the scene has springs"):
-        fit(springs, observed, ["tissue.map"], resolution=4)
     rod = {"radius": 0.006, "shaft": [0, 0, 1], "length": 0.1}
     path = [[0, 0.5, 0.5, 0.001], [2, 0.5, 0.5, -0.003]]
-    with pytest.raises(SceneError, match="a tool with a path has no gradient"):
-        fit(scene(probes=[{"path": path, "instrument": rod}]), observed, ["tissue.map"], resolution=4)
+    for made in (springs, scene(probes=[{"path": path, "instrument": rod}])):
+        with message.raises(SceneError):
+            fit(made, observed, ["tissue.map"], resolution=4)
 
 
-def test_a_map_that_takes_too_much_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_map_that_takes_too_much_memory_is_refused(monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
     monkeypatch.setattr("taichi_msm.fitting.stiffness_map.available_memory", lambda: 1000)
     seen = {"time": [1.0], "coordinates": PLACES, "position": np.zeros((len(PLACES), 1, 3)), "sigma": 1e-5}
-    with pytest.raises(SceneError, match="--resolution 4: 16 fields by 432 observed numbers take"):
+    with message.raises(SceneError, "--resolution 4: "):
         fit(scene(), seen, ["tissue.map"], resolution=4)
-
-
-def test_bounds_that_no_tissue_reaches_are_refused() -> None:
-    seen = {"time": [1.0], "coordinates": PLACES, "position": np.zeros((len(PLACES), 1, 3)), "sigma": 1e-5}
-    with pytest.raises(SceneError, match=r"--bounds tissue.map=0.1,1e\+300: take factors of young from 1e-06"):
-        fit(scene(), seen, ["tissue.map"], resolution=4, bounds={"tissue.map": (0.1, 1e300)})
 
 
 def test_ctrl_c_stops_a_map_in_the_middle_of_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

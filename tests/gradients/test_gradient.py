@@ -26,11 +26,13 @@ from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.solver.dynamics import choose_layout
 from taichi_msm.system.runtime import Device
-from tests.reference import adjoint as twin
-from tests.reference.sheet import sheet
+from tests import reference
+from tests.golden import Messages
+from tests.reference.sheet import Sheet, sheet
 from tests.scenes import plan_of, speckle
 
 Array = NDArray[np.float64]
+
 
 # A complex step; its square vanishes.
 STEP = 1e-60
@@ -101,10 +103,9 @@ def differentiated(made: Mapping[str, Any], device: Device) -> Derivatives:
     return adjoint.backward(loss(adjoint.run())[1])
 
 
-def twin_value(plan: Plan, put: Any = None, loads: Any = None) -> Any:
-    """The loss by the twin, of another sheet or other loads, which may be complex."""
-    loads = average_loads(plan, 0, plan.grid.steps) if loads is None else loads
-    every = twin.displacements(plan, sheet(plan.scene) if put is None else put, loads)
+def twin_value(plan: Plan, put: Sheet) -> Any:
+    """The loss by the twin, of another sheet, which may be complex."""
+    every = [u for u, _ in reference.steps(plan, put)]
     return value(rest_positions(plan.scene.sheet) + np.array(every[:: plan.grid.steps_per_frame]))
 
 
@@ -121,44 +122,13 @@ def material_numbers(found: Derivatives) -> list[str]:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_adjoint_of_the_twin_is_its_complex_step(kind: str, image: str) -> None:
-    plan = plan_of(Scene.model_validate(described(kind, image)))
-    put, loads, rng = sheet(plan.scene), average_loads(plan, 0, plan.grid.steps), np.random.default_rng(0)
-    every = twin.displacements(plan, put, loads)
-    frames = range(0, plan.grid.steps + 1, plan.grid.steps_per_frame)
-    slope = loss(rest_positions(plan.scene.sheet) + np.array(every)[frames])[1]
-    bars = twin.backward(plan, put, loads, every, dict(zip(frames, slope, strict=True)))
-
-    def check(found: Any, **changed: Any) -> None:
-        assert found == pytest.approx(twin_value(plan, **changed).imag / STEP, rel=1e-11, abs=1e-15)
-
-    for n, springs in enumerate(put.springs):
-        some = rng.standard_normal(springs.stiffness.shape) * (springs.stiffness > 0)
-        for name, bar in (("stiffness", bars.stiffness[n]), ("unstretched", bars.unstretched[n])):
-            others = list(put.springs)
-            others[n] = springs._replace(**{name: getattr(springs, name) + 1j * STEP * some})
-            check((bar * some).sum(), put=put._replace(springs=tuple(others)))
-    some = rng.standard_normal(put.virtual.shape)
-    check((bars.virtual * some).sum(), put=put._replace(virtual=put.virtual + 1j * STEP * some))
-    check(bars.bending, put=put._replace(bending=put.bending + 1j * STEP))
-    for name in ("mass", "drag"):
-        changed = put._replace(**{name: getattr(put, name) + 1j * STEP * some})
-        keep, gain, first = (of.imag[..., 0] / STEP for of in twin.coefficients(plan, changed))
-        check((bars.keep * keep + bars.gain * gain + bars.first_gain * first).sum(), put=changed)
-    for name in ("strength", "point"):
-        some = rng.standard_normal(getattr(loads, name).shape)
-        pushed = loads._replace(**{name: getattr(loads, name) + 1j * STEP * some})
-        check((getattr(bars, name) * some).sum(), loads=pushed)
-
-
-@pytest.mark.parametrize("kind", KINDS)
 def test_the_tangent_is_symmetric_and_that_of_the_force(kind: str, image: str) -> None:
     plan = plan_of(Scene.model_validate(described(kind, image)))
-    put, loads = sheet(plan.scene), average_loads(plan, 0, 1)
+    loads = average_loads(plan, 0, 1)
     u, v, w = 0.004 * np.random.default_rng(1).standard_normal((3, *plan.scene.sheet.points, 3))
-    changed = [twin.tangent(plan.scene, put, loads.active[0], u, of) for of in (v, w)]
+    changed = [reference.tangent(plan.scene, u, of, loads.active[0]) for of in (v, w)]
     assert (w * changed[0]).sum() == pytest.approx((v * changed[1]).sum(), rel=1e-13)
-    exact = twin.force(plan.scene, put, loads, 0, u + 1j * STEP * v).imag / STEP
+    exact = reference.force(plan.scene, u + 1j * STEP * v, loads, 0).imag / STEP
     np.testing.assert_allclose(changed[0], exact, rtol=0, atol=1e-13 * np.abs(exact).max())
 
 
@@ -180,8 +150,7 @@ def test_the_map_of_the_foundation_is_that_of_the_twin(image: str, device: Devic
     made = described("tissue", image)
     plan, found = plan_of(Scene.model_validate(made)), differentiated(made, device)
     some, put = np.random.default_rng(2).standard_normal(plan.fixed.shape), sheet(plan.scene)
-    factors = plan.material.virtual_factors
-    assert factors is not None
+    factors: Any = plan.material.virtual_factors
     changed = put._replace(virtual=put.virtual * (1 + 1j * STEP * some / factors))
     slope = float((found.maps["tissue.foundation_map"] * some).sum())
     assert slope == pytest.approx(twin_value(plan, changed).imag / STEP, rel=1e-11)
@@ -197,10 +166,6 @@ def require_second_order(known: float, missed: tuple[float, float], name: str) -
     whole, half = missed
     assert whole > 1e-12 * abs(known), f"{name}: {whole}"
     assert 3.8 < whole / half < 4.2, f"{name}: {whole / half}"
-
-
-def entries(slope: float | Array) -> list[tuple[int, ...]]:
-    return list(np.ndindex(np.shape(slope)))
 
 
 def put_in(made: dict[str, Any], path: list[str], index: tuple[int, ...], change: float) -> dict[str, Any]:
@@ -223,16 +188,15 @@ def put_in(made: dict[str, Any], path: list[str], index: tuple[int, ...], change
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_is_missed_by_every_number_is_of_second_order(kind: str, image: str, device: Device) -> None:
+    """By every number of a tool; complex steps do the others."""
     made = described(kind, image)
     adjoint = Adjoint(plan_of(Scene.model_validate(made)), device)
     known, slope = loss(adjoint.run())
-    found = adjoint.backward(slope)
+    numbers = {name: by for name, by in adjoint.backward(slope).numbers.items() if name.startswith("probes")}
     count = 0
-    for name, by in found.numbers.items():
-        for index in entries(by):
+    for name, by in numbers.items():
+        for index in np.ndindex(np.shape(by)):
             path, step = name.split("."), {"load": 5.0, "at": 1e-4}.get(name.split(".")[-1], 0.05)
-            if path[0] != "probes":
-                step *= float(attrgetter(name)(Scene.model_validate(made)))
 
             def changed(by: float, path: list[str] = path, index: tuple[int, ...] = index) -> float:
                 return loss(Adjoint(plan_of(Scene.model_validate(put_in(made, path, index, by))), device).run())[0]
@@ -240,8 +204,8 @@ def test_what_is_missed_by_every_number_is_of_second_order(kind: str, image: str
             missed = remainders(known, float(np.asarray(by)[index]), step, changed)
             require_second_order(known, missed, f"{name} {index}")
             count += 1
-    # Of the probes: 6 components, 5 percents, and 4 places of two numbers.
-    assert count == len(material_numbers(found)) + 6 + 5 + 8
+    # 6 components, 5 percents, and 4 places of two numbers.
+    assert count == 6 + 5 + 8
 
 
 @pytest.mark.parametrize("kind", ["tissue, free edges", "springs"])
@@ -370,7 +334,7 @@ def test_a_sheet_at_rest_has_the_slopes_of_its_shapes(device: Device) -> None:
         return float(((moved(1) - moved(-1)) * slope).sum() / 2)
 
     for name, by in found.numbers.items():
-        for index in entries(by):
+        for index in np.ndindex(np.shape(by)):
             step = {"load": 1.0, "at": 1e-3, "total": 0.02}.get(name.split(".")[-1], 0.02)
             if not name.startswith("probes"):
                 step *= float(attrgetter(name)(Scene.model_validate(REST)))
@@ -392,51 +356,46 @@ def test_a_flat_sheet_that_nothing_holds_stays_flat(device: Device) -> None:
     assert not any(np.any(by) for by in adjoint.backward(slope).numbers.values())
 
 
-def test_a_shape_without_stiffness_is_named(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_shape_without_stiffness_is_named(device: Device, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
     adjoint = Adjoint(plan_of(Scene.model_validate(REST)), device)
     slope = 1 + 0 * adjoint.run()
     # As if no solution were one.
     monkeypatch.setattr(rest, "RESIDUAL_TOLERANCE", -1)
-    with pytest.raises(MsmError, match=r"frame 1 has no gradient: .*give it a foundation, pretension or bending"):
+    with message.raises(MsmError, "frame 1 "):
         adjoint.backward(slope)
 
 
-def test_contact_is_refused(device: Device) -> None:
+def test_contact_is_refused(device: Device, message: Messages) -> None:
     rod = {"radius": 0.005, "shaft": [0, 0, 1], "length": 0.1}
-    made = {**REST, "probes": [REST["probes"][0], {"path": [[0, 0.5, 0.5, 0.01]], "instrument": rod}]}  # type: ignore[index]
-    with pytest.raises(SceneError, match=r"^probes\.1\.path: a tool with a path has no gradient, .* by differences$"):
+    made = {**REST, "probes": [{"path": [[0, 0.5, 0.5, 0.01]], "instrument": rod}]}
+    with message.raises(SceneError, "probes.0.path: "):
         gradient(made, loss, threads=device.threads)
 
 
-@pytest.mark.parametrize(
-    ("returned", "message"),
-    [
-        (3, r"loss: 3; take a function of the positions of every frame"),
-        (lambda position: 1.0, r"loss: returned float; return a pair, its value and its derivative by the positions"),
-        (lambda position: (np.nan, position), r"loss: its value is nan; return a finite number"),
-        (lambda position: (position, position), r"loss: its value is an array of shape \(3, 6, 11, 3\); return a"),
-        (
-            lambda position: (1.0, position[0]),
-            r"derivative: float64 of shape \(6, 11, 3\); take finite numbers of shape",
-        ),
-        (lambda position: (1.0, position + np.inf), r"take finite numbers of shape \(3, 6, 11, 3\), that of the"),
-        (lambda position: (1.0, position > 0), r"derivative: bool of shape"),
-    ],
-)
-def test_a_loss_that_returns_something_else(
-    returned: Callable[[Array], Any], message: str, image: str, device: Device
-) -> None:
-    with pytest.raises(ArgumentError, match=message):
-        gradient(described("tissue", image), returned, threads=device.threads)
+LOSSES: dict[str, Any] = {
+    "number": 3,
+    "no pair": lambda position: 1.0,
+    "no number": lambda position: (np.nan, position),
+    "array": lambda position: (position, position),
+    "another shape": lambda position: (1.0, position[0]),
+    "infinite": lambda position: (1.0, position + np.inf),
+    "bool": lambda position: (1.0, position > 0),
+}
+
+
+@pytest.mark.parametrize("case", LOSSES)
+def test_a_loss_that_returns_something_else(case: str, image: str, device: Device, message: Messages) -> None:
+    with message.raises(ArgumentError, "loss"):
+        gradient(described("tissue", image), LOSSES[case], threads=device.threads)
 
 
 @pytest.mark.parametrize("kind", ["motion", "rest"])
 def test_a_gradient_for_which_there_is_no_memory(
-    kind: str, image: str, device: Device, monkeypatch: pytest.MonkeyPatch
+    kind: str, image: str, device: Device, monkeypatch: pytest.MonkeyPatch, message: Messages
 ) -> None:
     scene = Scene.model_validate(REST if kind == "rest" else described("tissue", image))
     monkeypatch.setattr("taichi_msm.gradients.gradient.available_memory", lambda: 1000)
-    with pytest.raises(SceneError, match=r"GiB of memory, and .* is free; take fewer points"):
+    with message.raises(SceneError, "memory"):
         Adjoint(plan_of(scene), device)
 
 
@@ -475,7 +434,7 @@ def test_a_pause_follows_every_launch(image: str, device: Device, monkeypatch: p
 def test_a_solution_that_takes_long_is_left_behind(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     adjoint, pauses = Adjoint(plan_of(Scene.model_validate(REST)), device), []
     slope = loss(adjoint.run())[1]
-    monkeypatch.setattr(rest, "_solve", lambda *_: time.sleep(20))
+    monkeypatch.setattr(rest, "_solve", lambda *_: time.sleep(2))
 
     def stop() -> None:
         pauses.append(1)
@@ -486,12 +445,10 @@ def test_a_solution_that_takes_long_is_left_behind(device: Device, monkeypatch: 
         adjoint.backward(slope, stop)
 
 
-def test_factors_that_cannot_be(image: str, device: Device) -> None:
+def test_factors_that_cannot_be(image: str, device: Device, message: Messages) -> None:
     adjoint = Adjoint(plan_of(Scene.model_validate(described("tissue", image))), device)
-    with pytest.raises(MsmError, match="nothing has run yet that could be differentiated; call run first"):
+    with message.raises(MsmError, "run"):
         adjoint.backward(np.zeros((3, 6, 11, 3)))
-    for factors in (np.ones((6, 11)), np.zeros((5, 10))):
-        with pytest.raises(ArgumentError, match=r"factors: take numbers above 0\.\d+, of shape \(5, 10\)"):
+    for factors in (np.ones((6, 11)), np.zeros((5, 10)), np.full((5, 10), 1000.0)):
+        with message.raises(ArgumentError, "factors: "):
             adjoint.run(factors)
-    with pytest.raises(ArgumentError, match=r"factors: up to 1000 need a step of .* set a smaller time\.step"):
-        adjoint.run(np.full((5, 10), 1000.0))

@@ -15,6 +15,7 @@ from tests.reference.dynamics import (
     simulate,
     steps,
     surgical_force,
+    tangent,
 )
 from tests.reference.rest import clearance, equilibrium, equilibrium_outside_tool, place, potential, stiffness
 from tests.reference.sheet import sheet
@@ -39,4 +40,5 @@ __all__ = [
     "steps",
     "stiffness",
     "surgical_force",
+    "tangent",
 ]

@@ -21,15 +21,7 @@ Sampled = Callable[[float, float], tuple[Array, Array]]
 
 
 def refine(values: Array, n: int) -> Array:
-    """Insert n values between neighbours by bilinear interpolation.
-
-    Args:
-        values: values at the mass points, shape (rows, cols, k).
-        n: number of values inserted between two.
-
-    Returns:
-        Values at the vertices, shape ((rows - 1)(n + 1) + 1, (cols - 1)(n + 1) + 1, k).
-    """
+    """Insert n values between neighbours by bilinear interpolation; the last axis of the array is of one place."""
     for axis in (0, 1):
         count = values.shape[axis]
         place = np.arange((count - 1) * (n + 1) + 1) / (n + 1)
@@ -42,16 +34,9 @@ def refine(values: Array, n: int) -> Array:
 def weights(triangle: Array, x: Array, y: Array) -> Array:
     """Give the barycentric weights of the point of a triangle that is seen at a pixel, corrected for perspective.
 
-    With p the pixel and (X, Y, w) the corners, the point sum b_i (X, Y, w)_i is seen at p if
-    sum b_i ((X, Y)_i - p w_i) = 0, so b_i is the cross product of the other two such differences.
-
-    Args:
-        triangle: corners (X, Y, w, ...), shape (3, k).
-        x: pixel, right [px], any shape.
-        y: pixel, down [px], the same shape.
-
-    Returns:
-        Weights with sum 1, shape (3, *x.shape); inside all are 0 or more; NaN where the triangle is seen edge-on.
+    With p the pixel and (X, Y, w, ...) the corners, shape (3, k), the point sum b_i (X, Y, w)_i is seen at p if
+    sum b_i ((X, Y)_i - p w_i) = 0, so b_i is the cross product of the other two such differences. Inside, all are 0 or
+    more; where the triangle is seen edge-on, they are NaN. Shape (3, *x.shape).
     """
     dx = [corner[0] - x * corner[2] for corner in triangle]
     dy = [corner[1] - y * corner[2] for corner in triangle]
@@ -61,16 +46,7 @@ def weights(triangle: Array, x: Array, y: Array) -> Array:
 
 
 def wire_share(scene: Scene, triangle: Array, at: Sampled) -> Array:
-    """Give the share of the mesh lines in the colour of the pixels of a triangle.
-
-    Args:
-        scene: the scene.
-        triangle: corners (X, Y, w, depth, u, v, ...), shape (3, k).
-        at: gives the places of the pixels, shifted by so many pixels.
-
-    Returns:
-        Share 0 to 1, of the pixels' shape.
-    """
+    """Give the share of the mesh lines in the colour of a triangle's pixels; corners (X, Y, w, depth, u, v, ...)."""
     rows, cols = scene.sheet.points
 
     def mesh(x: Array, y: Array) -> Array:
@@ -113,15 +89,7 @@ class Seen(NamedTuple):
 def look(
     scene: Scene, position: Array, factor: int = 1, texels: tuple[int, int] = (1, 1), camera: View | None = None
 ) -> Seen:
-    """Find what every sample shows: refine, project, and keep the nearest triangle at every sample.
-
-    Args:
-        scene: the scene.
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        factor: samples per pixel along each axis.
-        texels: width and height of the texture.
-        camera: another camera than the scene's.
-    """
+    """Find what every sample shows, `factor` a pixel and axis: refine, project, and keep the nearest triangle."""
     rows, cols = scene.sheet.points
     width, height = (size * factor for size in scene.render.size)
     camera = camera or view(scene)
@@ -179,12 +147,7 @@ def triangles(surface: Array) -> Iterator[Array]:
 def footprint(triangle: Array, at: Sampled, texels: tuple[int, int]) -> Array:
     """Give the larger of a sample's width and height on the texture, in units of uniforms.SHARP texels.
 
-    It is found by finite differences over a thousandth of a sample.
-
-    Args:
-        triangle: corners (X, Y, w, depth, u, v), shape (3, 6).
-        at: gives the places of the samples, shifted by so many samples.
-        texels: width and height of the texture.
+    It is found by finite differences over a thousandth of a sample; corners as for `wire_share`.
     """
     step = 1e-3
 
@@ -200,18 +163,7 @@ def footprint(triangle: Array, at: Sampled, texels: tuple[int, int]) -> Array:
 def draw(
     scene: Scene, position: Array, texture: NDArray[np.uint8], rods: Sequence[Capsule] = (), camera: View | None = None
 ) -> NDArray[np.uint8]:
-    """Draw one frame.
-
-    Args:
-        scene: the scene.
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        texture: the picture on the sheet, shape (height, width, 3).
-        rods: the instruments.
-        camera: another camera than the scene's.
-
-    Returns:
-        Colours, shape (height, width, 3).
-    """
+    """Draw one frame of positions, shape (rows, cols, 3), a picture, shape (height, width, 3), and instruments."""
     factor, camera = scene.render.supersample, camera or view(scene)
     seen = look(scene, position, factor, (texture.shape[1], texture.shape[0]), camera)
     sheet = np.isfinite(seen.depth)

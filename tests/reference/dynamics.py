@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,25 +15,21 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Foundation
 from taichi_msm.solver.planning import make_plan
 from tests.reference.contact import Contact
-from tests.reference.sheet import Springs, sheet
+from tests.reference.sheet import Sheet, Springs, sheet
 
 Array = NDArray[np.float64]
 
 
-def elastic_force(scene: Scene, displacement: Array) -> Array:
+def elastic_force(scene: Scene, displacement: Array, made: Sheet | None = None) -> Array:
     """Sum k (L - L0) (Q - P) / L over the neighbours Q of every point P (eq. 2), without the part that cancels at rest.
 
-    Args:
-        scene: the scene.
-        displacement: x - X [m], shape (rows, cols, 3).
-
-    Returns:
-        Force [N], shape (rows, cols, 3).
+    Of displacements x - X [m], shape (rows, cols, 3), and of another sheet than the scene's, numbers may be complex.
     """
-    force = np.zeros_like(displacement)
-    for springs in sheet(scene).springs:
+    every = (made or sheet(scene)).springs
+    force = np.zeros(displacement.shape, np.result_type(displacement, *(springs.unstretched for springs in every)))
+    for springs in every:
         between, length = _ends_apart(springs, displacement)
-        pull = np.divide(length - springs.unstretched, length, out=np.zeros_like(length), where=length > 0)
+        pull = (length - springs.unstretched) / np.where(length == 0, 1, length)
         found = (springs.stiffness * pull)[..., None] * between
         at_rest = springs.stiffness * (springs.length - springs.unstretched) / springs.length
         found -= at_rest[..., None] * springs.offset
@@ -52,9 +49,10 @@ def lock(e: Array, m: float, factor: float) -> Array:
     return np.where(e > c, c / (1 - c / m) + (e - c) * factor, curved)
 
 
-def foundation_force(scene: Scene, displacement: Array) -> Array:
+def foundation_force(scene: Scene, displacement: Array, made: Sheet | None = None) -> Array:
     """Return the force of the virtual springs while they are active [N], shape (rows, cols, 3)."""
-    k, force = sheet(scene).virtual, -sheet(scene).virtual[..., None] * displacement
+    k = (made or sheet(scene)).virtual
+    force = -k[..., None] * displacement
     foundation = None if scene.tissue is None else scene.tissue.foundation
     if isinstance(foundation, Foundation) and foundation.lock is not None:
         depth = -displacement[..., 2]
@@ -65,7 +63,7 @@ def foundation_force(scene: Scene, displacement: Array) -> Array:
 def _ends_apart(springs: Springs, displacement: Array) -> tuple[Array, Array]:
     """Give the vectors from one end of each spring to the other, and their lengths [m]."""
     between = displacement[springs.there] - displacement[springs.here] + springs.offset
-    return between, np.linalg.norm(between, axis=-1)
+    return between, np.sqrt((between**2).sum(axis=-1))
 
 
 def _laplacian(scene: Scene, u: Array) -> Array:
@@ -74,18 +72,10 @@ def _laplacian(scene: Scene, u: Array) -> Array:
     return (u[1:-1, 2:] - 2 * inner + u[1:-1, :-2]) / dx**2 + (u[2:, 1:-1] - 2 * inner + u[:-2, 1:-1]) / dy**2
 
 
-def bending_force(scene: Scene, displacement: Array) -> Array:
-    """Differentiate D / 2 sum of dx dy |Laplacian of u|^2 over the points with four neighbours.
-
-    Args:
-        scene: the scene.
-        displacement: x - X [m], shape (rows, cols, 3).
-
-    Returns:
-        Force [N], shape (rows, cols, 3).
-    """
-    (dx, dy), force = spacing(scene.sheet), np.zeros_like(displacement)
-    moment = sheet(scene).bending * _laplacian(scene, displacement)
+def bending_force(scene: Scene, displacement: Array, made: Sheet | None = None) -> Array:
+    """Differentiate D / 2 sum of dx dy |Laplacian of u|^2 over the points with four neighbours; as `elastic_force`."""
+    (dx, dy), moment = spacing(scene.sheet), (made or sheet(scene)).bending * _laplacian(scene, displacement)
+    force = np.zeros(displacement.shape, moment.dtype)
     force[1:-1, 1:-1] += (2 / dx**2 + 2 / dy**2) * moment
     force[1:-1, 2:] -= moment / dx**2
     force[1:-1, :-2] -= moment / dx**2
@@ -95,15 +85,7 @@ def bending_force(scene: Scene, displacement: Array) -> Array:
 
 
 def shortest_spring(scene: Scene, displacement: Array) -> float:
-    """Find how far the springs are compressed.
-
-    Args:
-        scene: the scene.
-        displacement: x - X [m], shape (rows, cols, 3).
-
-    Returns:
-        The smallest ratio of a spring's length to that at rest; 1 if there are no springs.
-    """
+    """Find the smallest ratio of a spring's length to that at rest; 1 if there are no springs."""
     return min(1.0, *(float(strain.min(initial=1.0)) for strain in _strains(scene, displacement)))
 
 
@@ -119,38 +101,29 @@ def _strains(scene: Scene, displacement: Array) -> Iterator[Array]:
 
 def energy(scene: Scene, displacement: Array) -> float:
     """Give the elastic energy of springs and bending above that at rest [J], without the virtual springs."""
-    held = sum(float(held.sum()) for _, held in _held(scene, displacement))
-    return held + sheet(scene).bending / 2 * float((_laplacian(scene, displacement) ** 2).sum())
-
-
-def _held(scene: Scene, displacement: Array) -> Iterator[tuple[Springs, Array]]:
-    """Give the energy of every spring above that at rest [J], with the springs."""
-    for springs in sheet(scene).springs:
+    made = sheet(scene)
+    held = made.bending / 2 * float((_laplacian(scene, displacement) ** 2).sum())
+    for springs in made.springs:
         between, length = _ends_apart(springs, displacement)
         rest = springs.length - springs.unstretched
         # The part that is linear in the displacements cancels in the sum, as the sheet is in equilibrium at rest.
         linear = (between - springs.offset) @ springs.offset * rest / springs.length
-        held = springs.stiffness * ((length - springs.unstretched) ** 2 / 2 - rest**2 / 2 - linear)
+        strained = (length - springs.unstretched) ** 2 / 2 - rest**2 / 2 - linear
+        held += float((springs.stiffness * strained).sum())
         if scene.tissue is not None and scene.tissue.stiffening is not None:
             keys, strain = scene.tissue.stiffening, length / springs.length - 1
             # The integral of lock(e) - e from 0 to the strain, by Gauss and Legendre.
             nodes, weights = np.polynomial.legendre.leggauss(60)
             at = strain[..., None] * (nodes + 1) / 2
             more = ((lock(at, keys.lock, keys.factor) - at) * weights).sum(axis=-1) * strain / 2
-            held = held + springs.stiffness * springs.length**2 * more
-        yield springs, held
+            held += float((springs.stiffness * springs.length**2 * more).sum())
+    return held
 
 
 def surgical_force(scene: Scene, loads: Schedule, n: int) -> Array:
-    """Sum the forces of the probes: (percent / 100) force exp(-falloff d - offset) (eq. 5), or shares of their totals.
+    """Sum the forces of probes in row n of a schedule [N], shape (rows, cols, 3).
 
-    Args:
-        scene: the scene.
-        loads: its schedule.
-        n: row of the schedule.
-
-    Returns:
-        Force [N], shape (rows, cols, 3).
+    They are (percent / 100) force exp(-falloff d - offset) (eq. 5), or shares of their totals.
     """
     rest = rest_positions(scene.sheet)
     force = np.zeros_like(rest)
@@ -167,24 +140,56 @@ def surgical_force(scene: Scene, loads: Schedule, n: int) -> Array:
     return force
 
 
-def force(scene: Scene, displacement: Array, loads: Schedule, n: int) -> Array:
-    """Add up all forces except the damping at one step (eq. 1).
+def force(scene: Scene, displacement: Array, loads: Schedule, n: int, made: Sheet | None = None) -> Array:
+    """Add up all forces except the damping at one step (eq. 1), row n of the schedule; as `elastic_force`."""
+    made = made or sheet(scene)
+    return internal_force(scene, displacement, loads, n, made) + surgical_force(scene, loads, n)
 
-    Args:
-        scene: the scene.
-        displacement: x - X [m], shape (rows, cols, 3).
-        loads: its schedule.
-        n: row of the schedule.
 
-    Returns:
-        Force [N], shape (rows, cols, 3).
+def internal_force(scene: Scene, displacement: Array, loads: Schedule, n: int, made: Sheet) -> Array:
+    """Add up the forces of springs, bending and foundation [N], shape (rows, cols, 3)."""
+    springs = elastic_force(scene, displacement, made) + bending_force(scene, displacement, made)
+    return springs + loads.active[n] * foundation_force(scene, displacement, made)
+
+
+class Relaxation:
+    """The memory of tissue that relaxes, h [s] apart."""
+
+    def __init__(self, scene: Scene, h: float) -> None:
+        branches = () if scene.tissue is None else scene.tissue.relaxation
+        self._branches = [(branch.share, h / branch.time) for branch in branches]
+        self._memory: list[Any] = [0.0 for _ in branches]
+
+    def step(self, elastic: Array) -> Array:
+        """Return the force that acts in place of the elastic force, which becomes part of the memory."""
+        total = (1 - sum(share for share, _ in self._branches)) * elastic
+        for n, (share, x) in enumerate(self._branches):
+            phi = (1 - np.exp(-x)) / x
+            total = total + self._memory[n] + share * phi * elastic
+            self._memory[n] = np.exp(-x) * self._memory[n] - share * phi * (1 - np.exp(-x)) * elastic
+        return total
+
+    def begin(self, elastic: Array) -> None:
+        """Remember a load that was put on at frame 0 of a scene at rest."""
+        for n, (share, x) in enumerate(self._branches):
+            self._memory[n] = share * (np.exp(-x) - (1 - np.exp(-x)) / x) * elastic
+
+
+def tangent(scene: Scene, displacement: Array, change: Array, active: float = 1.0, made: Sheet | None = None) -> Array:
+    """Give the change of all forces but those of the probes with a small change of the displacements [N].
+
+    Of the virtual springs a share is active; `made` is the scene's sheet, where it is known.
     """
-    return (
-        elastic_force(scene, displacement)
-        + bending_force(scene, displacement)
-        + surgical_force(scene, loads, n)
-        + loads.active[n] * foundation_force(scene, displacement)
-    )
+    made = made or sheet(scene)
+    total = bending_force(scene, change, made) - active * made.virtual[..., None] * change
+    for springs in made.springs:
+        between, length = _ends_apart(springs, displacement)
+        apart, slack = change[springs.there] - change[springs.here], (springs.unstretched / length)[..., None]
+        turned = ((between * apart).sum(axis=-1) / length**2)[..., None] * between
+        pull = springs.stiffness[..., None] * ((1 - slack) * apart + slack * turned)
+        total[springs.here] += pull
+        total[springs.there] -= pull
+    return total
 
 
 def displacements(plan: Plan) -> Iterator[Array]:
@@ -192,20 +197,29 @@ def displacements(plan: Plan) -> Iterator[Array]:
     return (u for u, _ in steps(plan))
 
 
-def steps(plan: Plan) -> Iterator[tuple[Array, Contact]]:
-    """Yield u_0, u_1, ... [m], shape (rows, cols, 3), each with the contact in the step before it."""
+def steps(plan: Plan, made: Sheet | None = None) -> Iterator[tuple[Array, Contact]]:
+    """Yield u_0, u_1, ... [m], shape (rows, cols, 3), each with the contact in the step before it.
+
+    made: another sheet than the scene's, as for `elastic_force`.
+    """
     scene = plan.scene
-    h, made = plan.grid.step, sheet(scene)
+    h, made = plan.grid.step, made or sheet(scene)
     m, g = made.mass[..., None], (made.drag / made.mass)[..., None]
     moves, contact = ~plan.fixed[..., None], Contact(plan)
     loads = average_loads(plan, 0, plan.grid.steps)
 
+    relaxation = Relaxation(scene, h)
+
+    def acceleration(u: Array, n: int) -> Array:
+        elastic = internal_force(scene, u, loads, n, made)
+        return np.asarray((relaxation.step(elastic) + surgical_force(scene, loads, n)) / m)
+
     previous = np.zeros((*scene.sheet.points, 3))
     yield previous, contact
-    current = contact.after(0, previous, h**2 / 2 * force(scene, previous, loads, 0) / m * moves)
+    current = contact.after(0, previous, h**2 / 2 * acceleration(previous, 0) * moves)
     yield current, contact
     for n in range(1, len(loads.active)):
-        a = force(scene, current, loads, n) / m
+        a = acceleration(current, n)
         if scene.time.damping_difference == "central":
             following = (2 * current - (1 - g * h / 2) * previous + h**2 * a) / (1 + g * h / 2)
         else:
@@ -215,11 +229,7 @@ def steps(plan: Plan) -> Iterator[tuple[Array, Contact]]:
 
 
 def simulate(scene: Scene) -> Array:
-    """Run the whole scene.
-
-    Returns:
-        Positions of every frame [m], shape (F + 1, rows, cols, 3).
-    """
+    """Run the whole scene and give the positions of every frame [m], shape (F + 1, rows, cols, 3)."""
     plan = make_plan(scene)
     frames = [u for n, u in enumerate(displacements(plan)) if n % plan.grid.steps_per_frame == 0]
     return rest_positions(scene.sheet) + np.array(frames)

@@ -23,11 +23,6 @@ TOUCHING = 1e-9
 def labels(scene: Scene, position: Array, rods: Sequence[Capsule] = ()) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Find what each pixel shows at its centre.
 
-    Args:
-        scene: the scene.
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        rods: the instruments.
-
     Returns:
         Coordinates of the material points, shape (height, width, 2), NaN where there is none; depth [m], 0 where there
         is nothing; whether an instrument is seen.
@@ -54,13 +49,8 @@ def normals(scene: Scene, position: Array, rods: Sequence[Capsule] = ()) -> Arra
 def find(scene: Scene, coordinates: Array, position: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Find where material points are seen, and whether the sheet hides them or they are outside the picture.
 
-    Args:
-        scene: the scene.
-        coordinates: fractions of the sheet's width from its left and of its height from its top, shape (n, 2).
-        position: positions of the mass points [m], shape (rows, cols, 3).
-
-    Returns:
-        Pixels, shape (n, 2), NaN behind the eye; and whether each point is hidden, shape (n,).
+    Coordinates are fractions of the sheet's width from its left and of its height from its top, shape (n, 2); pixels,
+    shape (n, 2), are NaN behind the eye.
     """
     camera, (width, height) = view(scene), scene.render.size
     points = np.concatenate([position, np.ones((*position.shape[:2], 1))], axis=-1) @ camera.matrix.T

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 from scipy.optimize import minimize
+from scipy.sparse.linalg import spsolve
 
 from taichi_msm.model.loads import Schedule
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.scene.scene import Scene
-from tests.reference.dynamics import energy, force, surgical_force
+from tests.reference.dynamics import energy, force, surgical_force, tangent
 from tests.reference.sheet import sheet
 
 Array = NDArray[np.float64]
@@ -50,7 +55,7 @@ def _from_axes(plan: Plan, displacement: Array, time: float) -> Array:
 def equilibrium(plan: Plan, loads: Schedule, start: Array, held: NDArray[np.bool_] | None = None) -> Array:
     """Minimise the potential from a start, whose fixed and held points stay, without tools [m], shape (rows, cols, 3).
 
-    Near the minimum the energy is all rounding, and Newton's steps with a matrix of differences go on.
+    Near the minimum the energy is all rounding, and Newton's steps go on.
     """
     free = ~plan.fixed if held is None else ~(plan.fixed | held)
 
@@ -69,9 +74,9 @@ def equilibrium(plan: Plan, loads: Schedule, start: Array, held: NDArray[np.bool
         method="L-BFGS-B",
         options={"maxiter": 20000, "maxfun": 40000, "ftol": 1e-13, "gtol": 0, "maxcor": 30},
     )
-    x = found.x
+    x, moving = found.x, np.flatnonzero(np.repeat(free, 3))
     for _ in range(5):
-        x = x - np.linalg.solve(stiffness(slope, x), slope(x))
+        x = x - spsolve(stiffness(plan.scene, spread(x), loads.active[0])[moving][:, moving], slope(x))
     return spread(x)
 
 
@@ -106,9 +111,22 @@ def equilibrium_outside_tool(plan: Plan, loads: Schedule, time: float, size: flo
     return spread(found.x)
 
 
-def stiffness(slope: object, x: Array, by: float = 1e-7) -> Array:
-    """Differentiate a slope by central differences; the matrix is symmetric."""
-    assert callable(slope)
-    moves = by * np.eye(len(x))
-    matrix = np.array([slope(x + move) - slope(x - move) for move in moves]) / (2 * by)
-    return (matrix + matrix.T) / 2
+def stiffness(scene: Scene, displacement: Array | float = 0.0, active: float = 1.0) -> Any:
+    """Differentiate all forces but those of the probes: sparse, shape (3 points, 3 points).
+
+    No point feels two others of which both coordinates differ by multiples of five, so that these change together.
+    """
+    rows, cols = scene.sheet.points
+    u = np.zeros((rows, cols, 3)) + displacement
+    number, (i, j) = np.arange(u.size).reshape(u.shape), np.mgrid[:rows, :cols]
+    made, entries = sheet(scene), []
+    for down, right, axis in itertools.product(range(5), range(5), range(3)):
+        change = np.zeros_like(u)
+        change[down::5, right::5, axis] = 1
+        felt = -tangent(scene, u, change, active, made)
+        row, column = i + (down - i + 2) % 5 - 2, j + (right - j + 2) % 5 - 2
+        near = (row >= 0) & (row < rows) & (column >= 0) & (column < cols)
+        by = np.repeat(number[row[near], column[near], axis], 3)
+        entries.append((felt[near].ravel(), number[near].ravel(), by))
+    values, to, of = (np.concatenate(each) for each in zip(*entries, strict=True))
+    return sparse.csc_array((values, (to, of)), shape=(u.size, u.size))

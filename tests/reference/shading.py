@@ -17,14 +17,7 @@ Array = NDArray[np.float64]
 
 
 def normals(position: Array) -> Array:
-    """Give unit normals from central differences, one-sided ones at the edges.
-
-    Args:
-        position: positions [m], shape (rows, cols, 3).
-
-    Returns:
-        Unit normals, toward the viewer at rest, shape (rows, cols, 3).
-    """
+    """Give unit normals, toward the viewer at rest, from central differences, one-sided ones at the edges."""
     right = np.gradient(position, axis=1)
     up = -np.gradient(position, axis=0)
     normal = np.cross(right, up)
@@ -33,16 +26,7 @@ def normals(position: Array) -> Array:
 
 
 def normals_at(normal: Array, u: Array, v: Array) -> Array:
-    """Interpolate normals bilinearly between mass points.
-
-    Args:
-        normal: unit normals of the mass points, shape (rows, cols, 3).
-        u: 0 at the left edge to 1 at the right one, any shape.
-        v: 0 at the top edge to 1 at the bottom one, the same shape.
-
-    Returns:
-        Normals of any length, shape (*u.shape, 3).
-    """
+    """Interpolate normals bilinearly between mass points at fractions u of the width and v of the height."""
     place = [v * (normal.shape[0] - 1), u * (normal.shape[1] - 1)]
     i, j = (np.clip(np.floor(p).astype(int), 0, count - 2) for p, count in zip(place, normal.shape, strict=False))
     s, t = (place[1] - j)[..., None], (place[0] - i)[..., None]
@@ -52,25 +36,14 @@ def normals_at(normal: Array, u: Array, v: Array) -> Array:
 
 
 def headlight(normal: Array, toward: Array) -> Array:
-    """Give the cosine between the direction of the light and the normal, 0 to 1.
-
-    Args:
-        normal: of any length, shape (..., 3).
-        toward: unit vector toward the light, shape (3,).
-    """
+    """Give the cosine between the unit vector toward the light and normals of any length, 0 to 1."""
     return np.asarray(np.abs(normal @ toward) / np.maximum(np.linalg.norm(normal, axis=-1), 1e-30))
 
 
 def sample(texture: NDArray[np.uint8], u: Array, v: Array) -> Array:
-    """Filter the texture bilinearly, clamped at its edge; texel (a, b) has its centre at ((a + 1/2)/w, (b + 1/2)/h).
+    """Filter the texture bilinearly, clamped at its edge, at fractions u of the width and v of the height; 0 to 255.
 
-    Args:
-        texture: colours, shape (height, width, 3).
-        u: 0 at the left edge to 1 at the right one, any shape.
-        v: 0 at the top edge to 1 at the bottom one, the same shape.
-
-    Returns:
-        Colours 0 to 255, shape (*u.shape, 3).
+    Texel (a, b) has its centre at ((a + 1/2)/w, (b + 1/2)/h).
     """
     height, width, _ = texture.shape
     x, y = u * width - 0.5, v * height - 0.5
@@ -94,14 +67,10 @@ def mean_of_fours(texture: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def minified(texture: NDArray[np.uint8], u: Array, v: Array, footprint: Array) -> tuple[Array, Array]:
-    """Filter a texture for samples each of which may show many of its texels.
+    """Filter a texture for samples each of which may show many of its texels, at places as for `sample`.
 
     Args:
-        texture: colours, shape (height, width, 3).
-        u: 0 at the left edge to 1 at the right one, any shape.
-        v: 0 at the top edge to 1 at the bottom one, the same shape.
-        footprint: the larger of a sample's width and height on the texture, in units of uniforms.SHARP texels; the same
-            shape.
+        footprint: the larger of a sample's width and height on the texture, in units of uniforms.SHARP texels.
 
     Returns:
         Colours, shape (*u.shape, 3); and the slope of the grey from texel to texel to the right and down, shape
@@ -147,14 +116,9 @@ def unit(vector: Array) -> Array:
 
 
 def points(camera: View, factor: int, depth: Array) -> Array:
-    """Find the points in space that the samples of a picture show [m], shape (height, width, 3).
+    """Find the points in space that the samples of a picture show [m], at depths along the direction of view [m].
 
-    Where nothing is seen, the values have no meaning.
-
-    Args:
-        camera: the camera.
-        factor: samples per pixel along each axis.
-        depth: along the direction of view [m], shape (height, width).
+    Where nothing is seen, the values have no meaning; `factor` samples a pixel and axis.
     """
     right, up, toward = camera.axes
     y, x = (np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5) / factor
@@ -167,13 +131,7 @@ def points(camera: View, factor: int, depth: Array) -> Array:
 
 
 def illuminate(camera: View, factor: int, depth: Array, normal: Array) -> tuple[Array, Array, Array, Array]:
-    """Find the vectors in space that decide how the samples of a picture are lit.
-
-    Args:
-        camera: the camera.
-        factor: samples per pixel along each axis.
-        depth: along the direction of view [m], shape (height, width).
-        normal: of any length, shape (height, width, 3).
+    """Find the vectors in space that decide how the samples of a picture are lit; arguments as for `points`.
 
     Returns:
         Unit vectors: the normal, the direction to the light, the direction to the eye; and the
@@ -204,19 +162,12 @@ def tissue(
     place: tuple[Array, Array, Array],
     rods: Sequence[Capsule],
 ) -> Array:
-    """Shade wet tissue; see `render/shading.py`.
+    """Shade wet tissue; see `render/shading.py`. Colours, shape (height, width, 3).
 
     Args:
-        scene: the scene.
-        camera: its camera.
-        texture: the picture on the sheet, shape (height, width, 3).
         normal: of the sheet, of any length, shape (height, width, 3).
         depth: along the direction of view [m], shape (height, width).
         place: u, v and footprint of the samples, the arguments of `minified`.
-        rods: the instruments.
-
-    Returns:
-        Colours, shape (height, width, 3).
     """
     light, factor = scene.render.light, scene.render.supersample
     colour, rises = minified(texture, *place)
@@ -259,12 +210,6 @@ def metal(camera: View, factor: int, depth: Array, normal: Array) -> Array:
 
 def meet(rods: Sequence[Capsule], camera: View, size: tuple[int, int], factor: int) -> tuple[Array, Array]:
     """Find the instruments that samples show, by search: the distance to a rod is convex along a line of sight.
-
-    Args:
-        rods: the instruments.
-        camera: the camera.
-        size: width and height of the picture [px].
-        factor: samples per pixel along each axis.
 
     Returns:
         Depths [m], infinite where there is none, shape (height, width); and normals of any length, shape (height,

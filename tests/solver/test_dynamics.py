@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import itertools
 import math
 import time
 from collections.abc import Iterator
@@ -29,6 +30,7 @@ from taichi_msm.terms.foundation import FoundationTerm
 from taichi_msm.terms.loads import ProbeTerm
 from taichi_msm.terms.springs import SpringTerm
 from tests import reference
+from tests.golden import Messages
 from tests.motion import dynamics_of, structure_of
 from tests.scenes import PRESS, SHEET, SPRINGS, plan_of, random_scene, scene, with_steps
 
@@ -42,7 +44,6 @@ def simulate(made: Scene, device: Device, layout: SheetLayout | None = None) -> 
     for _ in range(grid.frames):
         dynamics.advance(grid.steps_per_frame)
         frames.append(dynamics.displacement())
-    dynamics.close()
     return np.array(frames)
 
 
@@ -56,22 +57,11 @@ def assert_like_twin(made: Scene, device: Device, layout: SheetLayout | None = N
     np.testing.assert_allclose(simulate(made, device, layout), twin, rtol=0, atol=tolerance)
 
 
-# Each of terms of its own, so that all take long.
-QUICK_SCENES = [(0, "f32"), (1, "f64"), (2, "f32"), (3, "f32"), (3, "f64"), (4, "f64"), (5, "f64")]
+SLOW = [pytest.param(seed, precision, marks=pytest.mark.slow) for seed in range(8) for precision in ("f32", "f64")]
 
 
-@pytest.mark.parametrize(
-    ("seed", "precision"),
-    [
-        pytest.param(
-            seed,
-            precision,
-            marks=() if (seed, precision) in QUICK_SCENES else pytest.mark.slow,
-        )
-        for seed in range(8)
-        for precision in ("f32", "f64")
-    ],
-)
+# Each has terms of its own, and so a kernel.
+@pytest.mark.parametrize(("seed", "precision"), [(0, "f32"), (1, "f64"), (3, "f32"), (4, "f64"), (5, "f64"), *SLOW])
 def test_random_scene_is_like_the_twin(seed: int, precision: str, device: Device) -> None:
     assert_like_twin(random_scene(seed, precision), device)
 
@@ -86,25 +76,14 @@ def as_on_a_gpu(layout: SheetLayout) -> SheetLayout:
     return replace(with_lanes(layout, 1), workers=0, depth=1)
 
 
-# Each of a structure of its own, so that all take long: these, and as slow ones the others.
-FIXED = ("border", "corners", "none", ["top"], ["left"], ["left", "bottom"])
-QUICK_SHEETS = {
-    (2, 2): ("corners", "none", ["left"]),
-    (2, 9): ("border", "none", ["top"]),
-    (9, 2): ("corners", ["left", "bottom"]),
-    (3, 8): ("border", "none"),
-    (4, 17): ("border", "corners", ["top"], ["left", "bottom"]),
-}
+# Each has a structure of its own, and so a kernel.
+SHEETS = [
+    ([2, 2], "none"), ([2, 2], ["left"]), ([2, 9], "corners"), ([9, 2], ["left", "bottom"]), ([3, 8], "border"),
+    ([3, 8], "none"), ([4, 17], "corners"), ([4, 17], ["top"]), ([4, 17], ["left", "bottom"]),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("points", "fixed"),
-    [
-        pytest.param(list(points), fixed, marks=() if fixed in quick else pytest.mark.slow)
-        for points, quick in QUICK_SHEETS.items()
-        for fixed in FIXED
-    ],
-)
+@pytest.mark.parametrize(("points", "fixed"), SHEETS)
 def test_small_sheets_and_fixed_sides(points: list[int], fixed: Any, device: Device) -> None:
     sheet = {**SHEET, "points": points, "fixed": fixed}
     assert_like_twin(scene(sheet=sheet, probes=[{"force": [1, 2, 30], "falloff": 3, "offset": 6}]), device)
@@ -142,7 +121,7 @@ def test_bands_and_passes_do_not_change_the_bits(fixed: Any, device: Device) -> 
         assert simulate(made, device, layout).tobytes() == plain.tobytes(), (workers, depth)
 
 
-@pytest.mark.parametrize("workers", [3, pytest.param(4, marks=pytest.mark.slow), 10])
+@pytest.mark.parametrize("workers", [3, 10])
 def test_more_bands_than_threads_give_the_same_bits(workers: int, device: Device) -> None:
     # Bands that end at one border are those of the second and third worker, and it takes as many threads to step them
     # at one time; but one step a launch, nobody waits.
@@ -151,16 +130,13 @@ def test_more_bands_than_threads_give_the_same_bits(workers: int, device: Device
     for _ in range(plan_of(made).grid.steps):
         dynamics.advance(1)
     assert dynamics.displacement().tobytes() == simulate(made, device)[-1].tobytes()
-    dynamics.close()
 
 
 def test_the_depth_of_a_pass_is_chosen_from_the_size(device: Device) -> None:
     # 61 x 61 points are 132 kB and stay in the cache; 331 x 331 do not.
-    depths = [
-        structure_of(scene(sheet={**SHEET, "points": [n, n]}, time={"precision": "f32"}), device).depth
-        for n in (61, 331, 4096)
-    ]
-    assert depths == [1, 8, 8]
+    for points, depth in ((61, 1), (331, 8), (4096, 8)):
+        made = scene(sheet={**SHEET, "points": [points, points]}, time={"precision": "f32"})
+        assert structure_of(made, device).depth == depth
 
 
 def test_no_thread_of_a_gpu_takes_long() -> None:
@@ -203,93 +179,55 @@ def test_a_launch_ends_soon(device: Device, monkeypatch: pytest.MonkeyPatch) -> 
     assert dynamics.steps_done == 36
     dynamics.advance(64)
     assert dynamics.displacement().tobytes() == whole.tobytes()
-    dynamics.close()
 
 
 def test_a_frame_of_a_small_sheet_is_one_launch(device: Device) -> None:
-    made = scene(sheet={**SHEET, "points": [31, 31]})
-    dynamics = dynamics_of(made, device)
-    dynamics.advance(plan_of(made).grid.steps_per_frame)
-    assert plan_of(made).grid.steps_per_frame > 1
+    dynamics = dynamics_of(scene(), device)
+    dynamics.advance(plan_of(scene()).grid.steps_per_frame)
+    assert plan_of(scene()).grid.steps_per_frame > 1
     assert dynamics.launches == 1
-    dynamics.close()
 
 
 def test_absent_terms_are_left_out(device: Device) -> None:
     bare = structure_of(scene(springs={"structural": 1}, probes=[], damping=0), device).config
     assert bare.terms == (SpringTerm(True, False, False, False, False, False), ProbeTerm((), ()))
     assert not structure_of(scene(probes=[]), device).config.get(FoundationTerm), "loaded, but nothing ever loads"
-    assert structure_of(scene(), device).config.get(FoundationTerm)
-    assert structure_of(scene(), device).config.lanes == lanes("f64")
-
-
-@pytest.mark.parametrize(
-    ("springs", "fixed"),
-    [
-        pytest.param({"structural": 20, "shear": 10}, "border", id="both-border"),
-        pytest.param({"structural": 20, "shear": 10}, "none", id="both-none"),
-        pytest.param({"structural": 20}, "border", id="4-border", marks=pytest.mark.fuzz),
-        pytest.param({"structural": 20}, "none", id="4-none"),
-        pytest.param({"shear": 10}, "border", id="diagonal-border", marks=pytest.mark.fuzz),
-        pytest.param({"shear": 10}, "none", id="diagonal-none"),
-        pytest.param({}, "border", id="0-border", marks=pytest.mark.fuzz),
-        pytest.param({}, "none", id="0-none"),
-    ],
-)
-def test_the_shortest_spring_is_that_of_the_twin(springs: dict[str, Any], fixed: str, device: Device) -> None:
-    # Pushed along the sheet, at each of whose sides in turn springs are compressed the most.
-    found = []
-    for at, force in (
-        ([0.1, 0.4], [-30, 9, 0]),
-        ([0.9, 0.5], [30, 5, 2]),
-        ([0.4, 0.1], [3, 30, 0]),
-        ([0.5, 1], [5, 9, 1]),
-    ):
-        made = scene(
-            sheet={**SHEET, "fixed": fixed},
-            springs=springs,
-            probes=[{"at": at, "force": force, "offset": 6, "falloff": 20}],
-            time={"duration": 0.08},
-        )
-        dynamics = dynamics_of(made, device)
-        dynamics.advance(30)
-        u = dynamics.displacement()
-        assert dynamics.read().shortest_spring == pytest.approx(reference.shortest_spring(made, u), abs=1e-12)
-        found.append(dynamics.read().shortest_spring)
-        dynamics.close()
-    assert (min(found) < 0.999) == bool(springs)
+    full = structure_of(scene(), device).config
+    assert full.get(FoundationTerm)
+    assert full.get(DampingTerm)
+    assert full.lanes == lanes("f64")
 
 
 @pytest.mark.parametrize("precision", ["f32", "f64"])
-@pytest.mark.parametrize("ratio", [0.0, 1e-6, 1e-3, 0.03, 0.5])
+@pytest.mark.parametrize("ratio", [0.0, 1e-6, 0.5])
 def test_a_spring_that_is_pressed_to_a_point(ratio: float, precision: str, device: Device) -> None:
     # A step of 1 s moves the points of the right column, 1 kg each, by half their load; the next one shows the force.
-    sheet = {"points": [2, 2], "size": [1, 1], "mass": 1, "fixed": ["left"]}
+    sheet, load = {"points": [2, 2], "size": [1, 1], "mass": 1, "fixed": ["left"]}, [[0, 100], [0.5, 100], [0.5, 0]]
     made = scene(
         sheet=sheet,
         springs={"structural": 0.25, "shear": 0.125},
         damping=0,
-        probes=[
-            {"force": [2 * (ratio - 1), 0, 0], "falloff": 0, "offset": 0, "load": [[0, 100], [0.5, 100], [0.5, 0]]}
-        ],
+        probes=[{"force": [2 * (ratio - 1), 0, 0], "falloff": 0, "offset": 0, "load": load}],
         time={"duration": 2, "frames_per_second": 1, "step": 1, "precision": precision},
     )
     dynamics = dynamics_of(made, device)
     dynamics.advance(2)
     twin = reference.simulate(made)[2] - rest_positions(made.sheet)
     np.testing.assert_allclose(dynamics.displacement(), twin, rtol=0, atol=8 * ROUNDING[precision])
-    dynamics.close()
 
 
-def test_nothing_moves_without_a_load(device: Device) -> None:
+def test_nothing_moves_without_a_load_and_fixed_points_never(device: Device) -> None:
     assert not simulate(scene(probes=[], sheet={**SHEET, "fixed": "none"}), device).any()
-
-
-def test_fixed_points_stay_exactly(device: Device) -> None:
     u = simulate(scene(time={"precision": "f32"}), device)
     assert not u[:, [0, -1]].any()
     assert not u[:, :, [0, -1]].any()
     assert u[:, 1:-1, 1:-1].any()
+
+
+def motion_energy(made: Scene, u: NDArray[Any], difference: NDArray[Any]) -> float:
+    """Kinetic energy and that of the springs between points [J]."""
+    v = difference / plan_of(made).grid.step
+    return float(plan_of(made).material.mass * (v**2).sum() / 2) + reference.energy(made, u)
 
 
 def test_energy_does_not_drift(device: Device) -> None:
@@ -300,7 +238,7 @@ def test_energy_does_not_drift(device: Device) -> None:
         probes=[{"force": [0, 0, -300], "load": [[0, 0], [0.04, 100], [0.04, 0]], "falloff": 20}],
         time={"duration": 24.0},
     )
-    h, steps = plan_of(made).grid.step, plan_of(made).grid.steps_per_frame
+    steps, virtual = plan_of(made).grid.steps_per_frame, plan_of(made).material.virtual
     assert made.time.frames * steps > 1e4
     dynamics = dynamics_of(made, device)
     energies = []
@@ -309,27 +247,13 @@ def test_energy_does_not_drift(device: Device) -> None:
         before = dynamics.displacement()
         dynamics.advance(1)
         after = dynamics.displacement()
-        energies.append(energy(made, (before + after) / 2, (after - before) / h))
-    dynamics.close()
+        middle = (before + after) / 2
+        energies.append(motion_energy(made, middle, after - before) + virtual / 2 * (middle**2).sum())
     late = np.array(energies[10:])
     trend = np.polyfit(np.linspace(-0.5, 0.5, len(late)), late, 1)[0]
     # (w h)^2 / 8 = 1/8 of the energy of the highest mode is in the oscillation; the press excites low modes.
     assert late.std() < 0.02 * late.mean()
     assert abs(trend) < 1e-3 * late.mean()
-
-
-def energy(made: Scene, u: NDArray[Any], v: NDArray[Any]) -> float:
-    """Kinetic and potential energy [J] at the middle of a step."""
-    from tests.reference.neighbours import springs
-
-    total = 0.5 * plan_of(made).material.mass * (v**2).sum() + 0.5 * plan_of(made).material.virtual * (u**2).sum()
-    x = u + rest_positions(made.sheet)
-    for spring in springs(made):
-        if (spring.down, spring.right) > (0, 0):
-            here, there = spring.ends(made.sheet.points)
-            stretch = np.linalg.norm(x[there] - x[here], axis=-1) - spring.length
-            total += 0.5 * spring.stiffness * (stretch**2).sum()
-    return float(total)
 
 
 @pytest.mark.usefixtures("short_launches")
@@ -364,105 +288,54 @@ def test_a_state_is_gone_on_from_with_the_same_bits(change: dict[str, Any] | Non
         assert there.displacement.tobytes() == here.displacement.tobytes()
         assert there.difference.tobytes() == here.difference.tobytes()
     assert end.difference.any()
-    dynamics.close()
 
 
 @pytest.mark.usefixtures("short_launches")
-@pytest.mark.parametrize(("seed", "width"), [(0, 8), (3, 8), (4, 1)])
+@pytest.mark.parametrize(("seed", "width"), [(3, 8), (4, 1)])
 def test_the_energy_is_that_of_motion_and_springs(seed: int, width: int, device: Device) -> None:
     made = random_scene(seed)
     layout = structure_of(made, device)
     dynamics = dynamics_of(made, device, layout if width > 1 else as_on_a_gpu(layout))
     dynamics.advance(33)
-    state = dynamics.state()
-    assert made.springs is not None
-    without_virtual = made.model_copy(update={"springs": made.springs.model_copy(update={"virtual": 0.0})})
-    expected = energy(without_virtual, state.displacement, state.difference / plan_of(made).grid.step)
-    assert dynamics.read().energy == pytest.approx(expected, rel=1e-12)
-    assert dynamics.read().shortest_spring == pytest.approx(
-        reference.shortest_spring(made, state.displacement), rel=1e-12
-    )
-    dynamics.close()
+    (_, u, difference, *_), reading = dynamics.state(), dynamics.read()
+    assert reading.energy == pytest.approx(motion_energy(made, u, difference), rel=1e-12)
+    assert reading.shortest_spring == pytest.approx(reference.shortest_spring(made, u), rel=1e-12)
 
 
 @pytest.mark.parametrize("difference", ["central", "backward"])
 def test_just_under_the_limit_stays_bounded(difference: str, device: Device) -> None:
     coarse = scene(time={"duration": 1, "damping_difference": difference})
-    # The largest step below the limit that cuts a frame of its own rate into one.
-    rate = 1 / (0.99 * plan_of(coarse).stable_step)
-    frames = 100
-    made = scene(
-        probes=[{"force": [0, 0, -1000], "falloff": 20}],
-        time={
-            "duration": frames / rate * 1000,
-            "frames_per_second": rate / 1000,
-            "step": 1 / rate,
-            "damping_difference": difference,
-        },
-    )
+    # Frames of a thousand of the largest steps below the limit.
+    h = 0.99 * plan_of(coarse).stable_step
+    time = {"duration": 1e5 * h, "frames_per_second": 1 / h / 1000, "step": h, "damping_difference": difference}
+    made = scene(probes=[{"force": [0, 0, -1000], "falloff": 20}], time=time)
     dynamics = dynamics_of(made, device)
-    for _ in range(frames):
+    for _ in range(100):
         dynamics.advance(1000)
         largest = np.abs(dynamics.displacement()).max()
         assert largest < max(made.sheet.size), "bounded by the sheet, over 10^5 steps"
-    dynamics.close()
-
-
-def mirrored(at: list[float], force: list[float]) -> dict[str, Any]:
-    return {"at": at, "force": force, "load": [[0, 100]], "falloff": 10, "offset": 5}
-
-
-def test_symmetries(device: Device) -> None:
-    def motion(size: list[float], at: list[float], force: list[float], points: list[int]) -> NDArray[Any]:
-        return simulate(
-            scene(sheet={**SHEET, "points": points, "size": size, "fixed": "none"}, probes=[mirrored(at, force)]),
-            device,
-        )
-
-    plain = motion([0.3, 0.4], [0.3, 0.2], [1, 2, -3], [9, 11])
-    scale = 1e-9 * np.abs(plain).max()
-    # Mirror left and right: x changes sign.
-    mirror = motion([0.3, 0.4], [0.7, 0.2], [-1, 2, -3], [9, 11])
-    np.testing.assert_allclose(mirror[:, :, ::-1] * [-1, 1, 1], plain, atol=scale)
-    # Transpose: rows become columns; right becomes down, that is x becomes -y and y becomes -x.
-    transpose = motion([0.4, 0.3], [0.2, 0.3], [-2, -1, -3], [11, 9])
-    np.testing.assert_allclose(-transpose.swapaxes(1, 2)[..., [1, 0, 2]] * [1, 1, -1], plain, atol=scale)
-    # A quarter turn counter-clockwise: the top right corner goes to the top left one; (x, y) becomes (-y, x).
-    turned = motion([0.4, 0.3], [0.2, 0.7], [-2, 1, -3], [11, 9])
-    np.testing.assert_allclose(np.rot90(turned, -1, (1, 2))[..., [1, 0, 2]] * [1, -1, 1], plain, atol=scale)
 
 
 def test_a_restart_is_a_new_start(device: Device) -> None:
+    """Of any scene, where no layout is given."""
     other = scene(probes=[{**PRESS, "at": [0.2, 0.3]}], damping=0.02, sheet={**SHEET, "size": [0.4, 0.2], "mass": 2e-3})
-    dynamics = dynamics_of(scene(), device, replace(structure_of(scene(), device), workers=2))
-    dynamics.advance(77)
-    for made in (other, with_steps(other, 50), scene()):
-        dynamics.restart(plan_of(made))
-        frames = [dynamics.displacement()]
-        for _ in range(made.time.frames):
-            dynamics.advance(plan_of(made).grid.steps_per_frame)
-            frames.append(dynamics.displacement())
-        np.testing.assert_array_equal(frames, simulate(made, device))
-    dynamics.close()
+    in_bands = dynamics_of(scene(), device, replace(structure_of(scene(), device), workers=2))
+    others = scene(probes=[]), scene(time={"precision": "f32"}), scene(sheet={**SHEET, "points": [9, 12]})
+    for dynamics, scenes in (
+        (in_bands, (other, with_steps(other, 50), scene())),
+        (dynamics_of(scene(), device), others),
+    ):
+        dynamics.advance(77)
+        for made in scenes:
+            dynamics.restart(plan_of(made))
+            frames = [dynamics.displacement()]
+            for _ in range(made.time.frames):
+                dynamics.advance(plan_of(made).grid.steps_per_frame)
+                frames.append(dynamics.displacement())
+            np.testing.assert_array_equal(frames, simulate(made, device))
 
 
-def test_a_restart_may_be_that_of_any_scene(device: Device) -> None:
-    dynamics = dynamics_of(scene(), device)
-    other: list[dict[str, Any]] = [
-        {"probes": []},
-        {"time": {"precision": "f32"}},
-        {"sheet": {**SHEET, "points": [9, 12]}},
-    ]
-    for changes in other:
-        made = scene(**changes)
-        dynamics.restart(plan_of(made))
-        dynamics.advance(11)
-        fresh = dynamics_of(made, device)
-        fresh.advance(11)
-        assert dynamics.displacement().tobytes() == fresh.displacement().tobytes()
-
-
-@pytest.mark.parametrize("patience", [0, 1, 30])
+@pytest.mark.parametrize("patience", [0, 30])
 def test_workers_that_give_up_waiting_go_on_to_the_same_bits(
     patience: int, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -476,24 +349,19 @@ def test_workers_that_give_up_waiting_go_on_to_the_same_bits(
     monkeypatch.setattr(kernel_cpu, "MIN_BACKOFF_S", 0.001)
     monkeypatch.setattr(kernel_cpu, "MAX_BACKOFF_S", 0.002)
     for workers, depth in ((2, 1), (2, 4), (3, 2)):
-        together = dynamics_of(
-            made,
-            device,
-            replace(structure_of(made, device), workers=workers, depth=depth),
-        )
+        together = dynamics_of(made, device, replace(structure_of(made, device), workers=workers, depth=depth))
         for count in steps:
             together.advance(count)
             time.sleep(0.003)
-        assert together.state().displacement.tobytes() == alone.state().displacement.tobytes()
-        assert together.state().difference.tobytes() == alone.state().difference.tobytes()
+        for one, other in zip(together.state()[1:3], alone.state()[1:3], strict=True):
+            assert one.tobytes() == other.tobytes()
 
 
 def test_rests_grow_while_workers_give_up_and_are_forgotten_when_they_do_not(
     device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = scene(sheet={**SHEET, "points": [21, 19]}, time={"precision": "f32"})
-    scatter = dynamics_of(made, device, replace(structure_of(made, device), workers=2))._moving
-    assert isinstance(scatter, kernel_cpu.ScatterKernel)
+    scatter: Any = dynamics_of(made, device, replace(structure_of(made, device), workers=2))._moving
     now, taken, patient = 0.0, [0, 0], False
 
     def alone(done: int, end: int, *_: object) -> None:
@@ -506,40 +374,34 @@ def test_rests_grow_while_workers_give_up_and_are_forgotten_when_they_do_not(
         now, taken[1] = now + 0.001 * steps, taken[1] + steps
         return steps, not patient
 
-    had, waited = iter(range(100_000)), 0.0
+    def steps_together(count: int) -> int:
+        taken[:] = [0, 0]
+        scatter.advance(count, np.empty(0))
+        assert sum(taken) == count
+        return taken[1]
 
-    def wait_as_long_as_we_run() -> float:
-        nonlocal waited
-        waited += 1
-        return waited
-
+    had, waited = itertools.count(), itertools.count()
     monkeypatch.setattr(scatter, "_advance_alone", alone)
     monkeypatch.setattr(scatter, "_launch_together", together)
     monkeypatch.setattr("time.perf_counter", lambda: now)
     monkeypatch.setattr("time.process_time", lambda: next(had))
     # As long as nobody wants our cores, a worker that gives up is an accident, and rests stay the shortest.
     monkeypatch.setattr(process, "core_wait_s", lambda: 0.0)
-    scatter.advance(10_000, np.empty(0))
-    assert taken[1] > 1000
-    taken = [0, 0]
-    monkeypatch.setattr(process, "core_wait_s", wait_as_long_as_we_run)
-    scatter.advance(10_000, np.empty(0))
-    assert sum(taken) == 10_000
-    assert taken[1] < 100
+    assert steps_together(10_000) > 1000
+    # We wait as long as we run.
+    monkeypatch.setattr(process, "core_wait_s", lambda: float(next(waited)))
+    assert steps_together(10_000) < 100
     # During a rest nobody waits, which makes the next one no shorter.
-    taken = [0, 0]
     with monkeypatch.context() as patch:
         patch.setattr("time.process_time", lambda: now)
         patch.setattr(process, "core_wait_s", lambda: 0.001 * taken[1])
-        scatter.advance(10_000, np.empty(0))
-    assert taken[1] < 200
+        assert steps_together(10_000) < 200
     # Undisturbed for minutes, and then disturbed once: the rest is the shortest again.
     patient = True
-    scatter.advance(1_000_000, np.empty(0))
-    patient, taken = False, [0, 0]
-    scatter.advance(5, np.empty(0))
+    steps_together(1_000_000)
+    patient = False
     # One step in each launch of all; the rest of 2 ms takes pieces of one and two steps.
-    assert taken == [3, 2]
+    assert steps_together(5) == 2
 
 
 def test_giving_up_in_the_last_pass_of_a_launch_counts(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -554,7 +416,7 @@ def test_giving_up_in_the_last_pass_of_a_launch_counts(device: Device, monkeypat
 
 
 def test_a_sheet_that_was_interrupted_while_stepping_is_not_used(
-    device: Device, monkeypatch: pytest.MonkeyPatch
+    device: Device, monkeypatch: pytest.MonkeyPatch, message: Messages
 ) -> None:
     """Python may raise KeyboardInterrupt after a launch, before its steps are counted."""
     made = scene()
@@ -571,7 +433,7 @@ def test_a_sheet_that_was_interrupted_while_stepping_is_not_used(
         dynamics.advance(5)
     monkeypatch.undo()
     for use in (dynamics.state, dynamics.read, lambda: dynamics.advance(1)):
-        with pytest.raises(MsmError, match="restore a saved state"):
+        with message.raises(MsmError, "restore"):
             use()
     dynamics.restart(dynamics.plan, saved)
     dynamics.advance(5)
@@ -592,10 +454,3 @@ def test_a_second_sheet_of_the_same_terms_compiles_nothing(device: Device, monke
     dynamics = dynamics_of(other, device)
     dynamics.advance(5)
     dynamics.displacement()
-
-
-def test_damping_of_0_is_left_out(device: Device) -> None:
-    # Not multiplied by 1: what a scene does not use is not in its kernel.
-    assert not structure_of(scene(damping=0), device).config.get(DampingTerm)
-    assert structure_of(scene(), device).config.get(DampingTerm)
-    assert_like_twin(scene(damping=0, time={"duration": 0.08}), device)

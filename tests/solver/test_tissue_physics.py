@@ -23,7 +23,6 @@ from skfem.models.elasticity import linear_elasticity, plane_stress
 
 from taichi_msm.model.loads import evaluate_loads
 from taichi_msm.model.sheet import fixed_points, rest_positions, spacing
-from taichi_msm.model.tool_force import decay_integral
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.tools import Probe
 from taichi_msm.solver.state import State
@@ -77,41 +76,6 @@ def picture(folder: Path) -> str:
     return str(folder / "map.png")
 
 
-def stiffness(made: Scene, displacement: Array | None = None) -> Any:
-    """Differentiate all forces but the tools', with the foundation: sparse, shape (3 points, 3 points).
-
-    A spring between points at the distance l, whose direction is n, has  k (1 - L0 / l) (1 - n n^T) + k n n^T.
-    """
-    rows, cols = made.sheet.points
-    (dx, dy), parts, size = spacing(made.sheet), assembled(made), 3 * rows * cols
-    u = np.zeros((rows, cols, 3)) if displacement is None else displacement
-    number = np.arange(size).reshape(rows, cols, 3)
-    total = sparse.diags_array(np.repeat(parts.virtual.ravel(), 3)).tocsc()
-    for springs in parts.springs:
-        between = u[springs.there] - u[springs.here] + springs.offset
-        length = np.linalg.norm(between, axis=-1)[..., None, None]
-        slack = springs.unstretched[..., None, None] / length
-        along = between[..., :, None] * between[..., None, :] / length**2
-        block = springs.stiffness[..., None, None] * ((1 - slack) * np.eye(3) + slack * along)
-        here, there = number[springs.here], number[springs.there]
-        for sign, one, other in ((1, here, here), (1, there, there), (-1, here, there), (-1, there, here)):
-            row, column = np.broadcast_arrays(one[..., :, None], other[..., None, :])
-            entries = (sign * block).ravel(), (row.ravel(), column.ravel())
-            total += sparse.coo_array(entries, shape=(size, size)).tocsc()
-    laplacian = sparse.kron(_inner(rows), _second(cols)) / dx**2 + sparse.kron(_second(rows), _inner(cols)) / dy**2
-    return total + sparse.kron(parts.bending * laplacian.T @ laplacian, sparse.eye_array(3)).tocsc()
-
-
-def _inner(count: int) -> Any:
-    """Those of so many values that have two neighbours."""
-    return sparse.eye_array(count - 2, count, k=1)
-
-
-def _second(count: int) -> Any:
-    """Their second differences."""
-    return sparse.diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(count - 2, count))
-
-
 def moving(made: Scene, directions: tuple[int, ...] = (0, 1, 2)) -> NDArray[np.intp]:
     """The numbers of these directions of the points that move."""
     chosen = np.zeros((*made.sheet.points, 3), bool)
@@ -126,7 +90,7 @@ def tool_forces(made: Scene, time: float = 0.01) -> Array:
 def at_rest(made: Scene, directions: tuple[int, ...]) -> Array:
     """Where a small load moves the sheet in these directions; shape (rows, cols, 3)."""
     free, u = moving(made, directions), np.zeros((*made.sheet.points, 3))
-    u.ravel()[free] = spsolve(stiffness(made)[free][:, free], tool_forces(made).ravel()[free])
+    u.ravel()[free] = spsolve(reference.stiffness(made)[free][:, free], tool_forces(made).ravel()[free])
     return u
 
 
@@ -139,7 +103,6 @@ def assert_rests(made: Scene, displacement: Array, directions: tuple[int, ...], 
     dynamics.advance(1)
     # What is not linear in strains of 1e-6 and less.
     assert np.abs(dynamics.state().difference[..., directions]).max() < 1e-5 * thrown
-    dynamics.close()
 
 
 def error_at(coarse: Array, found: Array) -> float:
@@ -172,21 +135,6 @@ def pressure(made: Scene, x: Array, y: Array) -> Array:
     return np.multiply.outer(np.array(probe.total, float), decay) / weight(probe)
 
 
-@pytest.mark.parametrize("seed", range(12))
-def test_the_linear_stiffness_is_that_of_the_forces(seed: int, tmp_path: Path) -> None:
-    """Of a deformed sheet, so that every term of it counts."""
-    made = random_tissue(seed, picture(tmp_path))
-    rng, shape = np.random.default_rng(seed), (*made.sheet.points, 3)
-    here, way, small = 1e-3 * rng.normal(size=shape), rng.normal(size=shape), 3e-8
-    # At the end, when all tools press and so the foundation acts.
-    loads = evaluate_loads(plan_of(made), np.array([made.time.duration]))
-    ends = [reference.force(made, here + sign * small * way, loads, 0) for sign in (1, -1)]
-    found = (ends[1] - ends[0]).ravel() / (2 * small)
-    expected = stiffness(made, here) @ way.ravel()
-    # Of central differences over some 1e-5 of a cell: its square, and the rounding of lengths over it.
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
-
-
 @pytest.mark.parametrize("ratio", [1.0, 1.2, 1 / 1.5, math.sqrt(3), 1 / math.sqrt(3)])
 def test_uniform_strains_have_the_energy_of_plane_stress(ratio: float, device: Device) -> None:
     made = tissue((5, 6), size=(4 * 0.01, 5 * 0.01 * ratio), fixed="none")
@@ -194,7 +142,7 @@ def test_uniform_strains_have_the_energy_of_plane_stress(ratio: float, device: D
     none, area = np.zeros_like(x), math.prod(made.sheet.size)
     strains = [np.stack(one, axis=-1) for one in ([x, none, none], [none, y, none], [y / 2, x / 2, none])]
     flat = np.array(strains).reshape(3, -1)
-    found = flat @ (stiffness(made) @ flat.T) / area
+    found = flat @ (reference.stiffness(made) @ flat.T) / area
     expected = MEMBRANE * np.array([[9, 3, 0], [3, 9, 0], [0, 0, 3]]) / 8
     # Sums over some 100 springs.
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13 * MEMBRANE)
@@ -208,7 +156,6 @@ def test_uniform_strains_have_the_energy_of_plane_stress(ratio: float, device: D
         np.testing.assert_allclose(energy_density(plan_of(made), strain * one), everywhere, rtol=10 * strain)
         dynamics.restart(plan_of(made), State(1, strain * one, np.zeros_like(one)))
         assert dynamics.read().energy / area == pytest.approx(density, rel=10 * strain)
-    dynamics.close()
 
 
 def test_the_tension_at_rest_is_the_same_in_all_directions(tmp_path: Path) -> None:
@@ -290,20 +237,21 @@ def series(made: Scene) -> Array:
     return at_points @ amplitude @ at_points.T
 
 
-@pytest.mark.parametrize("tool", [pytest.param(EVERYWHERE, id="everywhere"), pytest.param(WIDE, id="tool")])
+BENT: dict[str, dict[str, Any]] = {
+    "plate": {"bending": "plate"},
+    "plate on a foundation": {"bending": 2e-4, "foundation": 1e4},
+    "membrane": {"pretension": 5},
+    "membrane on a foundation": {"pretension": 5, "foundation": 1e4},
+    "plate under tension": {"pretension": 0.5, "bending": "plate"},
+}
+
+
 @pytest.mark.parametrize(
-    "terms",
-    [
-        pytest.param({"bending": "plate"}, id="plate"),
-        pytest.param({"bending": 2e-4, "foundation": 1e4}, id="plate on a foundation"),
-        pytest.param({"pretension": 5}, id="membrane"),
-        pytest.param({"pretension": 5, "foundation": 1e4}, id="membrane on a foundation"),
-        pytest.param({"pretension": 0.5, "bending": "plate"}, id="plate under tension"),
-    ],
+    ("name", "everywhere"), [*((name, False) for name in BENT), ("plate", True), ("membrane on a foundation", True)]
 )
-def test_a_load_from_above_bends_it_like_the_double_series(
-    terms: dict[str, Any], tool: dict[str, Any], device: Device
-) -> None:
+def test_a_load_from_above_bends_it_like_the_double_series(name: str, everywhere: bool, device: Device) -> None:
+    tool, terms = EVERYWHERE if everywhere else WIDE, BENT[name]
+
     def made(points: int) -> Scene:
         return tissue((points, points), size=(0.08, 0.1), probes=[{**tool, "total": [0, 0, -1e-7]}], **terms)
 
@@ -323,7 +271,6 @@ def depth(points: int, device: Device) -> float:
     dynamics = dynamics_of(made, device)
     dynamics.advance(plan_of(made).grid.steps)
     found = -dynamics.displacement()[..., 2].min()
-    dynamics.close()
     return float(found)
 
 
@@ -353,7 +300,6 @@ def test_a_thrown_sheet_keeps_its_momenta(term: str, device: Device, tmp_path: P
     for _ in range(made.time.frames):
         dynamics.advance(plan_of(made).grid.steps_per_frame)
         found.append(momenta())
-    dynamics.close()
     # The tool lets go at the end of the first frame. From then on each step rounds once.
     rounding = plan_of(made).grid.steps * 2.0**-53
     for one in found[2:]:
@@ -388,12 +334,12 @@ def limited(name: str, folder: Path, **more: Any) -> Scene:
     return tissue((9, 11), foundation_active="always", **terms)
 
 
-def frequency(made: Scene, displacement: Array | None = None) -> float:
+def frequency(made: Scene, displacement: Array | float = 0.0) -> float:
     """The highest angular frequency of small motions [rad/s]; of a crumpled sheet, maybe of one that grows."""
     free = moving(made)
     scale = 1 / np.sqrt(np.repeat(assembled(made).mass.ravel(), 3)[free])
     weights = sparse.diags_array(scale)
-    matrix = weights @ stiffness(made, displacement)[free][:, free] @ weights
+    matrix = weights @ reference.stiffness(made, displacement)[free][:, free] @ weights
     largest = eigsh(matrix, 1, v0=np.random.default_rng(0).normal(size=len(free)), return_eigenvectors=False)
     return math.sqrt(abs(largest[0]))
 
@@ -413,7 +359,7 @@ def test_the_bound_holds_where_a_corner_is_stiff(tmp_path: Path) -> None:
     assert 1 <= highest_frequency(plan_of(made).material, made.sheet) / frequency(made) < 1.6
 
 
-@pytest.mark.parametrize("seed", range(16))
+@pytest.mark.parametrize("seed", range(8))
 def test_the_bound_holds_for_any_tissue(seed: int, tmp_path: Path) -> None:
     """At rest and as long as no spring is below half its length."""
     made, rng = random_tissue(seed, picture(tmp_path)), np.random.default_rng(seed)
@@ -423,52 +369,34 @@ def test_the_bound_holds_for_any_tissue(seed: int, tmp_path: Path) -> None:
         assert frequency(made, displacement) <= highest_frequency(plan_of(made).material, made.sheet)
 
 
-@pytest.mark.parametrize(
-    "name", ["uniform", "pretension", "stiff plate", "map, pretension, bending", "map, free edges", "free"]
-)
+@pytest.mark.parametrize("name", ["stiff plate", "map, pretension, bending", "map, free edges", "free"])
 def test_just_under_the_limit_tissue_stays_bounded(name: str, device: Device, tmp_path: Path) -> None:
     """Kicked at random places in the first step, and then left alone for 10^5."""
     rng, h = np.random.default_rng(1), 0.99 * plan_of(limited(name, tmp_path)).stable_step
-    kicks = [
-        {
-            "at": list(rng.random(2)),
-            "total": list(1e-2 * rng.normal(size=3)),
-            "falloff": 200,
-            "load": [[0, 100], [h, 0]],
-        }
-        for _ in range(8)
-    ]
+    brief = {"falloff": 200, "load": [[0, 100], [h, 0]]}
+    kicks = [{"at": list(rng.random(2)), "total": list(1e-2 * rng.normal(size=3)), **brief} for _ in range(8)]
     time = {"duration": 100_000 * h, "frames_per_second": 1 / (1000 * h), "step": h}
     dynamics = dynamics_of(limited(name, tmp_path, probes=kicks, time=time), device)
     energies = []
     for _ in range(100):
         dynamics.advance(1000)
         energies.append(dynamics.read().energy)
-    dynamics.close()
     # All of it but that of the foundation, with which it comes and goes.
     assert min(energies) > 0
     assert max(energies) < 4 * energies[0]
 
 
-@pytest.mark.parametrize("tool", [{"falloff": 300}, {"falloff": 300, "radius": 0.004}, {"falloff": 40, "radius": 0.05}])
-def test_the_weight_of_a_tool_is_its_integral_over_the_plane(tool: dict[str, Any]) -> None:
-    probe = Probe(total=[0, 0, 1], **tool)
-    assert decay_integral(probe) == pytest.approx(weight(probe), rel=1e-7)
-
-
-@pytest.mark.parametrize("fixed", ["border", "none"])
-def test_a_wide_sheet_gets_the_whole_of_a_tool(fixed: str, device: Device) -> None:
+def test_a_wide_sheet_gets_the_whole_of_a_tool(device: Device) -> None:
     """Of tissue and of springs, as the twin has it and as the first step of the kernel moves it."""
     total = [0.3, -0.2, -1.0]
     probe = {"at": [0.45, 0.52], "total": total, "radius": 0.006, "falloff": 300}
-    sheet = {"points": [121, 121], "size": [0.1, 0.1], "mass": 1e-5, "fixed": fixed}
-    for made in (tissue((121, 121), fixed=fixed, probes=[probe]), scene_of_springs(sheet=sheet, probes=[probe])):
+    sheet = {"points": [121, 121], "size": [0.1, 0.1], "mass": 1e-5, "fixed": "none"}
+    for made in (tissue((121, 121), fixed="none", probes=[probe]), scene_of_springs(sheet=sheet, probes=[probe])):
         np.testing.assert_allclose(tool_forces(made).sum(axis=(0, 1)), total, rtol=1e-3)
         dynamics = dynamics_of(made, device)
         dynamics.advance(1)
         # u_1 = h^2 F / m / 2.
         force = 2 / plan_of(made).grid.step ** 2 * assembled(made).mass[..., None] * dynamics.displacement()
-        dynamics.close()
         np.testing.assert_allclose(force.sum(axis=(0, 1)), total, rtol=1e-3)
 
 
@@ -480,19 +408,13 @@ def test_an_edge_gets_its_share_of_a_tool(at: list[float], share: float) -> None
 
 
 def sampled(grey: NDArray[Any], rows: Array, cols: Array, black: float, white: float) -> Array:
-    """The factor at places of the sheet, as fractions of its height and width, texel by texel."""
-    height, width = grey.shape
-    found = np.zeros((len(rows), len(cols)))
-    for i in range(len(rows)):
-        for j in range(len(cols)):
-            # Beyond the last texels it is constant.
-            down = min(max(rows[i] * height - 0.5, 0), height - 1)
-            across = min(max(cols[j] * width - 0.5, 0), width - 1)
-            for b in (math.floor(down), math.floor(down) + 1):
-                for a in (math.floor(across), math.floor(across) + 1):
-                    near = (1 - abs(down - b)) * (1 - abs(across - a))
-                    found[i, j] += near * grey[min(max(b, 0), height - 1), min(max(a, 0), width - 1)]
-    return black + (white - black) * found / np.iinfo(grey.dtype).max
+    """The factor at places of the sheet, as fractions of its height and width: of texels, constant beyond the last."""
+    for axis, places in ((0, rows), (1, cols)):
+        last = grey.shape[axis] - 1
+        middle = np.clip(places * (last + 1) - 0.5, 0, last)
+        near = np.maximum(1 - np.abs(middle[:, None] - np.arange(last + 1)), 0)
+        grey = np.moveaxis(np.tensordot(near, grey, (1, axis)), 0, axis)
+    return black + (white - black) * grey
 
 
 @pytest.mark.parametrize("texels", [(7, 5), (40, 60), (1, 3), (8, 11)])
@@ -505,16 +427,14 @@ def test_a_map_is_sampled_at_the_centres_of_cells(texels: tuple[int, int], kind:
     stiff = {"image": str(file), "range": [6, 0.5]}
     sheet = {"points": [9, 12], "size": [0.1, 0.1], "mass": 1e-3}
     of_springs = scene_of_springs(sheet=sheet, springs={"structural": 20, "map": stiff})
-    expected = sampled(grey, (np.arange(8) + 0.5) / 8, (np.arange(11) + 0.5) / 11, 6, 0.5)
+    expected = sampled(grey / np.iinfo(grey.dtype).max, (np.arange(8) + 0.5) / 8, (np.arange(11) + 0.5) / 11, 6, 0.5)
     for made in (tissue((9, 12), map=stiff), of_springs):
-        factors = plan_of(made).material.factors
-        assert factors is not None
+        factors: Any = plan_of(made).material.factors
         np.testing.assert_allclose(factors, expected, rtol=0, atol=1e-14 * 6)
 
 
 def test_a_map_of_the_foundation_is_sampled_at_the_points(tmp_path: Path) -> None:
     deep = {"image": picture(tmp_path), "range": [6, 0.5]}
-    factors = plan_of(tissue((9, 12), foundation=1, foundation_map=deep)).material.virtual_factors
-    assert factors is not None
-    expected = sampled(speckle(7, 5)[..., 0], np.linspace(0, 1, 9), np.linspace(0, 1, 12), 6, 0.5)
+    factors: Any = plan_of(tissue((9, 12), foundation=1, foundation_map=deep)).material.virtual_factors
+    expected = sampled(speckle(7, 5)[..., 0] / 255, np.linspace(0, 1, 9), np.linspace(0, 1, 12), 6, 0.5)
     np.testing.assert_allclose(factors, expected, rtol=0, atol=1e-14 * 6)

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from importlib.util import find_spec
@@ -15,10 +12,14 @@ import pytest
 
 from taichi_msm import load_scene, run
 from taichi_msm.cli.main import main
-from taichi_msm.errors import DeviceError, NotInstalledError
+from taichi_msm.errors import MsmError
 from taichi_msm.system import runtime
 from taichi_msm.system.compiler import COMPILERS, Compiler, active_compiler, compiler_label, result_versions
+from tests.golden import Messages
 from tests.outputs import results
+from tests.system import python
+
+PROGRAM = "import sys; from taichi_msm.__main__ import main; sys.exit(main())"
 
 # Run kernels with an error: one of a user, after one of ours was read; and one in the place of ours.
 ERRORS = """
@@ -61,92 +62,54 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[set[str]]:
     active_compiler.cache_clear()
 
 
-def test_taichi_is_taken_where_both_are_there(installed: set[str]) -> None:
-    assert active_compiler().name == "taichi"
-
-
-def test_quadrants_is_taken_where_it_is_alone(installed: set[str]) -> None:
-    installed.remove("taichi")
-    assert active_compiler().name == "quadrants"
-
-
-def test_the_environment_decides(installed: set[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TAICHI_MSM_COMPILER", "quadrants")
-    assert active_compiler().name == "quadrants"
-
-
 @pytest.mark.parametrize(
-    ("wanted", "there", "said"),
-    [
-        (
-            "qadrants",
-            {"taichi"},
-            "TAICHI_MSM_COMPILER: 'qadrants' is not a compiler; take taichi or quadrants; did you ",
-        ),
-        (
-            "quadrants",
-            {"taichi"},
-            "TAICHI_MSM_COMPILER: quadrants is not installed; pip install quadrants==1.4.0 (Python 3.12 to 3.14), or "
-            "unset TAICHI_MSM_COMPILER",
-        ),
-        (
-            "",
-            set(),
-            "no compiler is installed; pip install taichi==1.7.4 (Python 3.10 to 3.13) or "
-            "pip install quadrants==1.4.0 (Python 3.12 to 3.14)",
-        ),
-    ],
+    ("wanted", "there", "taken"),
+    [("", {"taichi", "quadrants"}, "taichi"), ("", {"quadrants"}, "quadrants"), ("quadrants", set(), "quadrants")],
+    ids=["both", "one", "named"],
 )
-def test_a_compiler_that_is_not_there(
-    wanted: str, there: set[str], said: str, installed: set[str], monkeypatch: pytest.MonkeyPatch
+def test_the_compiler_that_is_taken(
+    wanted: str, there: set[str], taken: str, installed: set[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    installed.intersection_update(there)
+    installed.intersection_update(there or installed)
     monkeypatch.setenv("TAICHI_MSM_COMPILER", wanted)
-    with pytest.raises((DeviceError, NotInstalledError)) as caught:
+    assert active_compiler().name == taken
+
+
+@pytest.mark.parametrize("wanted", ["qadrants", "quadrants", ""])
+def test_a_compiler_that_is_not_there(
+    wanted: str, installed: set[str], monkeypatch: pytest.MonkeyPatch, message: Messages
+) -> None:
+    installed.clear()
+    installed.update(["taichi"] if wanted else [])
+    monkeypatch.setenv("TAICHI_MSM_COMPILER", wanted)
+    with message.raises(MsmError, "quadrants"):
         active_compiler()
-    assert str(caught.value).startswith(said)
 
 
 @pytest.mark.parametrize(
     ("command", "code", "shown"), [("run", 2, ""), ("--version", 2, "taichi-msm 0.1.0\n"), ("check", 0, "image: ")]
 )
-def test_the_command_line_says_so_in_a_line_where_it_needs_one(command: str, code: int, shown: str, root: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "taichi_msm", command, *(() if command == "--version" else ("scenes/press.yaml",))],
-        cwd=root,
-        env={**os.environ, "TAICHI_MSM_COMPILER": "numba"},
-        capture_output=True,
-        text=True,
-    )
-    said = "TAICHI_MSM_COMPILER: 'numba' is not a compiler; take taichi or quadrants\n" if code else ""
-    assert (done.returncode, done.stdout[: len(shown) or None], done.stderr) == (code, shown, said)
+def test_the_command_line_says_so_in_a_line_where_it_needs_one(
+    command: str, code: int, shown: str, tmp_path: Path, root: Path, message: Messages
+) -> None:
+    arguments = () if command == "--version" else (str(root / "scenes" / "press.yaml"),)
+    done = python(tmp_path, PROGRAM, command, *arguments, TAICHI_MSM_COMPILER="numba")
+    assert (done.returncode, done.stdout[: len(shown) or None]) == (code, shown)
+    message(done.stderr)
 
 
-def test_a_compiler_that_cannot_be_imported(tmp_path: Path, root: Path) -> None:
+def test_a_compiler_that_cannot_be_imported(tmp_path: Path, root: Path, message: Messages) -> None:
     (tmp_path / active_compiler().name).mkdir()
     (tmp_path / active_compiler().name / "__init__.py").write_text("raise ImportError('libfoo.so is missing')")
-    done = subprocess.run(
-        [sys.executable, "-m", "taichi_msm", "run", root / "scenes" / "press.yaml"],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join((str(tmp_path), str(root)))},
-        capture_output=True,
-        text=True,
-    )
-    said = f"{active_compiler().title} cannot be imported: libfoo.so is missing; {active_compiler().remedy}\n"
-    assert (done.returncode, done.stdout, done.stderr) == (2, "", said)
+    done = python(tmp_path, PROGRAM, "run", str(root / "scenes" / "press.yaml"))
+    assert (done.returncode, done.stdout) == (2, "")
+    message(done.stderr, "libfoo.so is missing", hide=f"{active_compiler().title}|(?<=; ).*")
 
 
-def test_a_folder_with_its_name_is_no_compiler(tmp_path: Path, root: Path) -> None:
+def test_a_folder_with_its_name_is_no_compiler(tmp_path: Path) -> None:
     for name in COMPILERS:
         (tmp_path / name).mkdir()
-    done = subprocess.run(
-        [sys.executable, "-m", "taichi_msm", "--version"],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(root)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    done = python(tmp_path, PROGRAM, "--version")
     assert done.stdout.endswith(f"\n{active_compiler().title} {active_compiler().version}\n")
 
 
@@ -184,14 +147,10 @@ print(active_compiler().folder(), ti.lang.impl.current_cfg().offline_cache_file_
 
 
 @pytest.mark.parametrize("named", [True, False])
-def test_the_folder_of_compiled_kernels(named: bool, tmp_path: Path) -> None:
-    environment = {**os.environ, "HOME": str(tmp_path)}
-    del environment[active_compiler().folder_variable]
-    if named:
-        environment[active_compiler().folder_variable] = str(tmp_path / "kernels")
-    done = subprocess.run(
-        [sys.executable, "-c", FOLDERS], env=environment, capture_output=True, text=True, check=True, cwd=tmp_path
-    )
+def test_the_folder_of_compiled_kernels(named: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    variable = active_compiler().folder_variable
+    monkeypatch.delenv(variable)
+    done = python(tmp_path, FOLDERS, HOME=str(tmp_path), **({variable: str(tmp_path / "kernels")} if named else {}))
     ours, its = done.stdout.split("\n")[-2].split("|")
     assert ours == its == str(tmp_path / "kernels" if named else tmp_path / active_compiler().cache)
 
@@ -222,32 +181,16 @@ def test_nothing_is_replaced_in_a_version_that_was_not_tested() -> None:
     [("users", {}, True), ("ours", {}, False), ("ours", {"TAICHI_MSM_TRACEBACK": "1"}, True)],
 )
 def test_an_error_names_its_line_where_somebody_changes_kernels(
-    whose: str, variables: dict[str, str], told: bool, tmp_path: Path, root: Path
+    whose: str, variables: dict[str, str], told: bool, tmp_path: Path
 ) -> None:
-    (tmp_path / "kernels.py").write_text(ERRORS)
-    done = subprocess.run(
-        [sys.executable, tmp_path / "kernels.py", whose],
-        env={**os.environ, "PYTHONPATH": str(root), **variables},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    done = python(tmp_path, ERRORS, whose, **variables)
     assert 'Name "nowhere" is not defined' in done.stdout
-    assert ("kernels.py" in done.stdout and "^^^^" in done.stdout) == told
+    assert ("own_process.py" in done.stdout and "^^^^" in done.stdout) == told
 
 
 OTHER = next(one for one in COMPILERS.values() if one is not active_compiler())
 
 both = pytest.mark.skipif(find_spec(OTHER.name) is None, reason="needs both compilers")
-
-
-def by_other(*arguments: str) -> None:
-    """Run the program with the other compiler."""
-    subprocess.run(
-        [sys.executable, "-m", "taichi_msm", *arguments, "--quiet"],
-        env={**os.environ, "TAICHI_MSM_COMPILER": OTHER.name},
-        check=True,
-    )
 
 
 @both
@@ -267,7 +210,8 @@ def test_both_compilers_give_the_same_bytes(
     scene, settings = root / "scenes" / f"{name}.yaml", [*settings, "time.duration=0.12", "render.size=[160, 120]"]
     run(load_scene(scene, settings), tmp_path / "mine", threads=device.threads)
     words = [word for setting in settings for word in ("--set", setting)]
-    by_other("run", str(scene), "--threads", str(device.threads), *words, "--out", str(tmp_path / "other"))
+    command = ["run", str(scene), "--threads", str(device.threads), *words, "--out", str(tmp_path / "other")]
+    assert python(tmp_path, PROGRAM, *command, TAICHI_MSM_COMPILER=OTHER.name).returncode == 0
     found = results(tmp_path / "mine")
     assert len(found) > 3
     assert results(tmp_path / "other") == found
@@ -283,7 +227,8 @@ def test_the_other_compiler_continues_a_run_with_the_same_bytes(small: Path, dev
             raise KeyboardInterrupt
 
     assert run(made, small / "parts", threads=device.threads, progress=stop)["status"] == "interrupted"
-    by_other("run", "--resume", "parts", "--threads", str(device.threads))
+    command = ["run", "--resume", "parts", "--threads", str(device.threads)]
+    assert python(small, PROGRAM, *command, TAICHI_MSM_COMPILER=OTHER.name).returncode == 0
     assert results(small / "parts") == results(small / "whole")
     record = json.loads((small / "parts" / "run.json").read_text())
     assert {active_compiler().name, OTHER.name} <= set(record["versions"])

@@ -16,8 +16,10 @@ from taichi_msm.render.rasterizer import Rasterizer
 from taichi_msm.system import process as process_module
 from taichi_msm.system import runtime
 from taichi_msm.system.compiler import active_compiler
+from tests.golden import Messages
 from tests.motion import dynamics_of
 from tests.scenes import SHEET, scene, speckle
+from tests.system import python
 
 # Start, make every thread of the pool work, and tell of each thread its processor time [ticks] and its cores.
 WORK = """
@@ -59,11 +61,7 @@ def test_the_threads_that_are_pinned_are_those_that_work(tmp_path: Path) -> None
     cores = sorted(os.sched_getaffinity(0))
     if process_module.available_threads() != len(cores):
         pytest.skip("a quota keeps this process from using all of its cores")
-    # Taichi reads the source of a kernel from its file.
-    script = tmp_path / "work.py"
-    script.write_text(WORK)
-    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=True)
-    threads = json.loads(done.stdout)
+    threads = json.loads(python(tmp_path, WORK).stdout)
     workers = sorted((thread for thread in threads if not thread[0]), key=lambda thread: thread[1])[-len(cores) :]
     assert sorted(on for _, _, on in workers) == [[core] for core in cores]
     assert all(on == cores for main, ticks, on in threads if [main, ticks, on] not in workers)
@@ -109,13 +107,9 @@ print(core_wait_s() - before)
 
 @pytest.mark.skipif(process_module.core_wait_s() is None, reason="the system does not tell")
 def test_waiting_for_a_core_is_noticed(root: Path) -> None:
+    piped: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     environment = {**os.environ, "PYTHONPATH": str(root)}
-    both = [
-        subprocess.Popen(
-            [sys.executable, "-c", BESIDE], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
-        )
-        for _ in range(2)
-    ]
+    both = [subprocess.Popen([sys.executable, "-c", BESIDE], env=environment, **piped) for _ in range(2)]
     for process in both:
         assert process.stdout
         assert process.stdout.readline() == "ready\n"
@@ -123,8 +117,7 @@ def test_waiting_for_a_core_is_noticed(root: Path) -> None:
         assert process.stdin
         process.stdin.write("\n")
         process.stdin.flush()
-    waited = [float(process.communicate(timeout=60)[0]) for process in both]
-    assert max(waited) > 0.1
+    assert max(float(process.communicate(timeout=60)[0]) for process in both) > 0.1
 
 
 def test_where_the_system_does_not_tell_of_waiting(tmp_path: Path) -> None:
@@ -168,19 +161,12 @@ print(simulation.frame)
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
-def test_other_threads_and_forked_processes_are_refused(tmp_path: Path, root: Path) -> None:
+def test_other_threads_and_forked_processes_are_refused(tmp_path: Path, message: Messages) -> None:
     """Taichi would fail with text of its own, or hang."""
-    script = tmp_path / "elsewhere.py"
-    script.write_text(ELSEWHERE)
-    environment = {**os.environ, "PYTHONPATH": str(root)}
-    done = subprocess.run(
-        [sys.executable, str(script)], capture_output=True, text=True, timeout=60, check=True, env=environment
-    )
-    thread = f"{active_compiler().title} works in the thread that started it; simulate and draw there"
-    fork = f"{active_compiler().title} was started before this process was forked from another, and would hang here; "
-    fork += "start processes by multiprocessing's 'spawn' or 'forkserver'"
-    assert done.stdout.splitlines() == [*4 * [thread], *2 * [fork], "2"]
-    assert done.stderr == ""
+    done = python(tmp_path, ELSEWHERE)
+    *lines, frame = done.stdout.splitlines()
+    assert ([lines.count(line) for line in lines], frame, done.stderr) == ([4] * 4 + [2] * 2, "2", "")
+    message(lines[3:5], hide=active_compiler().title)
 
 
 # Two threads start at once, while a third one prints.
@@ -209,21 +195,19 @@ with ThreadPoolExecutor(2) as pool:
     results = sorted(map(str, pool.map(start, [threading.Barrier(2)] * 2)))
 done.set()
 counter.join()
-print(*results, runtime.ti.lang.impl.current_cfg().debug, sorted(os.environ.items() & given.items()), sep="; ")
+print(*results, runtime.ti.lang.impl.current_cfg().debug, sorted(os.environ.items() & given.items()), sep="|")
 """
 
 
-def test_environment_and_other_threads_change_nothing_at_the_start(tmp_path: Path, root: Path) -> None:
+def test_environment_and_other_threads_change_nothing_at_the_start(tmp_path: Path, message: Messages) -> None:
     """The compiler's variables for its arch, its threads and its types would come before our arguments."""
-    script, prefix = tmp_path / "at_once.py", active_compiler().prefix
     settings = {"ARCH": "opengl", "DEBUG": "1", "CPU_MAX_NUM_THREADS": "1", "LOG_LEVEL": "loud", "OFFLINE_CACHE": "no"}
-    given = {f"{prefix}_{name}": value for name, value in settings.items()}
-    script.write_text(f"given = {given}\n{AT_ONCE}")
-    environment = {**os.environ, **given, "PYTHONPATH": str(root)}
-    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=60, env=environment)
+    given = {f"{active_compiler().prefix}_{name}": value for name, value in settings.items()}
+    done = python(tmp_path, f"given = {given}\n{AT_ONCE}", **given)
     *lines, last = done.stdout.splitlines()
-    refused = f"{active_compiler().title} works in the thread that started it; simulate and draw there"
-    assert last == f"2; {refused}; False; {sorted(given.items())}"
+    threads, refused, debug, variables = last.split("|")
+    assert (threads, debug, variables) == ("2", "False", str(sorted(given.items())))
+    message(refused, hide=active_compiler().title)
     assert lines == [*map(str, range(len(lines) - 1)), f"end {len(lines) - 1}"]
     assert (done.returncode, done.stderr) == (0, "")
 
@@ -248,11 +232,8 @@ print(len(sums))
 """
 
 
-def test_taichi_starts_again_after_a_stop(tmp_path: Path, root: Path) -> None:
-    script = tmp_path / "again.py"
-    script.write_text(AGAIN)
-    environment = {**os.environ, "PYTHONPATH": str(root)}
-    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=60, env=environment)
+def test_taichi_starts_again_after_a_stop(tmp_path: Path) -> None:
+    done = python(tmp_path, AGAIN)
     assert (done.returncode, done.stdout, done.stderr) == (0, "1\n", "")
 
 

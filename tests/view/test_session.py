@@ -727,7 +727,7 @@ def bar_of(picture: np.ndarray) -> float:
     lines = [row[:, 0] for row in picture[:80] if (row[:70] == overlay.OUTLINE_GREY).all(axis=-1).any()]
     row = lines[len(lines) // 2]
     right = int(np.flatnonzero(row == overlay.OUTLINE_GREY)[-1])
-    return float((row[: right + 1] == 255).sum() / (overlay.BAR_LETTERS * 11))
+    return float((row[: right + 1] == 255).sum() / (overlay.BAR_LENGTH_LETTERS * 11))
 
 
 def test_the_force_felt_is_shown_with_a_bar(begin: Begin) -> None:

@@ -13,7 +13,13 @@ from taichi_msm.model.tools import path_problems
 from taichi_msm.scene.tools import Probe
 from taichi_msm.solver.planning import steer_plan
 from taichi_msm.terms.contact import ContactTerm
-from taichi_msm.view.tools import DEFAULT_FRICTION, HOVER_RADII, MAX_DEPTH_RADII, RISE_TIME_S, PositionControlledTool
+from taichi_msm.view.tools import (
+    DEFAULT_FRICTION,
+    HOVER_HEIGHT_RADII,
+    MAX_DEPTH_RADII,
+    RISE_TIME_S,
+    PositionControlledTool,
+)
 from tests.scenes import plan_of, scene
 
 RATE = 30.0
@@ -84,15 +90,15 @@ def test_every_frame_is_what_the_record_says(seed: int, rate: float) -> None:
 
 def test_a_press_goes_down_in_a_fifth_of_a_second_at_most_and_a_release_up() -> None:
     hand = tool(plan())
-    assert follow(hand, 0, 2) == [HOVER_RADII, HOVER_RADII]
+    assert follow(hand, 0, 2) == [HOVER_HEIGHT_RADII, HOVER_HEIGHT_RADII]
     hand.press((0.4, 0.6), 1)
     hand.set_strength(100)
     down = follow(hand, 2, 8)
-    stride = (HOVER_RADII + MAX_DEPTH_RADII) / (RISE_TIME_S * RATE)
-    assert down[:6] == pytest.approx([HOVER_RADII - stride * (n + 1) for n in range(6)], abs=1e-6)
+    stride = (HOVER_HEIGHT_RADII + MAX_DEPTH_RADII) / (RISE_TIME_S * RATE)
+    assert down[:6] == pytest.approx([HOVER_HEIGHT_RADII - stride * (n + 1) for n in range(6)], abs=1e-6)
     assert down[5:] == pytest.approx([-MAX_DEPTH_RADII] * 3)
     hand.release()
-    assert follow(hand, 10, 8)[5:] == pytest.approx([HOVER_RADII] * 3)
+    assert follow(hand, 10, 8)[5:] == pytest.approx([HOVER_HEIGHT_RADII] * 3)
     assert hand.position == (0.4, 0.6)
 
 
@@ -138,7 +144,7 @@ def test_a_click_shorter_than_a_frame_touches_nothing() -> None:
     hand = tool(plan())
     hand.press((0.4, 0.6), -1)
     hand.release()
-    assert follow(hand, 0, 3) == [HOVER_RADII] * 3
+    assert follow(hand, 0, 3) == [HOVER_HEIGHT_RADII] * 3
     assert not hand.gripping
 
 
