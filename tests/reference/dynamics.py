@@ -49,6 +49,14 @@ def lock(e: Array, m: float, factor: float) -> Array:
     return np.where(e > c, c / (1 - c / m) + (e - c) * factor, curved)
 
 
+def _integral(e: Array, m: float, factor: float) -> Array:
+    """Return the integral of lock(e) - e from 0."""
+    c = m * (1 - factor**-0.5)
+    inner, beyond = np.clip(e, 0, c), np.maximum(e - c, 0)
+    curved = -m * inner - m * m * np.log1p(-inner / m) - inner**2 / 2
+    return np.asarray(curved + beyond * (c / (1 - c / m) - c) + (factor - 1) * beyond**2 / 2)
+
+
 def foundation_force(scene: Scene, displacement: Array, made: Sheet | None = None) -> Array:
     """Return the force of the virtual springs while they are active [N], shape (rows, cols, 3)."""
     k = (made or sheet(scene)).virtual
@@ -112,11 +120,7 @@ def energy(scene: Scene, displacement: Array) -> float:
         held += float((springs.stiffness * strained).sum())
         if scene.tissue is not None and scene.tissue.stiffening is not None:
             keys, strain = scene.tissue.stiffening, length / springs.length - 1
-            # The integral of lock(e) - e from 0 to the strain, by Gauss and Legendre.
-            nodes, weights = np.polynomial.legendre.leggauss(60)
-            at = strain[..., None] * (nodes + 1) / 2
-            more = ((lock(at, keys.lock, keys.factor) - at) * weights).sum(axis=-1) * strain / 2
-            held += float((springs.stiffness * springs.length**2 * more).sum())
+            held += float((springs.stiffness * springs.length**2 * _integral(strain, keys.lock, keys.factor)).sum())
     return held
 
 

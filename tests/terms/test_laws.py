@@ -1,0 +1,253 @@
+"""Tissue that locks and relaxes: laws against their integrals, kernels against the twin, slopes and closed forms."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+from operator import attrgetter
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.integrate import quad
+
+from taichi_msm import Simulation
+from taichi_msm.errors import SceneError
+from taichi_msm.gradients.gradient import Adjoint, gradient
+from taichi_msm.load.check import check_scene
+from taichi_msm.model.loads import evaluate_frame_loads
+from taichi_msm.model.sheet import rest_positions
+from taichi_msm.scene.scene import Scene
+from taichi_msm.solver.planning import make_plan
+from taichi_msm.solver.state import State
+from taichi_msm.system.runtime import Device
+from taichi_msm.terms.elasticity import energy_density
+from taichi_msm.terms.law import NUMPY
+from taichi_msm.terms.locking import LockingLaw, build_locking
+from tests import reference
+from tests.golden import Messages
+from tests.motion import dynamics_of, structure_of
+from tests.reference.dynamics import Relaxation, internal_force, lock
+from tests.scenes import plan_of
+from tests.solver.test_dynamics import as_on_a_gpu, assert_like_twin, short_launches, with_lanes
+
+__all__ = ["short_launches"]
+
+STIFFENING = {"stiffening": {"lock": 0.02, "factor": 6}}
+LOCKING_FOUNDATION = {"foundation": {"young": 2e4, "depth": 0.015, "lock": 0.002, "factor": 5}}
+RELAXATION = {"relaxation": [{"share": 0.5, "time": 0.03}, {"share": 0.2, "time": 0.4}]}
+CASES = {
+    "sheet": STIFFENING,
+    "foundation": LOCKING_FOUNDATION,
+    "relaxation": RELAXATION,
+    "everything": {**STIFFENING, **LOCKING_FOUNDATION, **RELAXATION, "pretension": 3, "bending": 1e-7},
+}
+
+
+def pressed(case: str, **sections: Any) -> dict[str, Any]:
+    """A sheet that is pressed so far that the straight part of both laws is reached."""
+    tissue = {"young": 2e4, "thickness": 2e-3, "density": 1000, "damping": 30, "foundation": 1e6}
+    probe = {"total": [1.2, 0, -12], "at": [0.45, 0.5], "falloff": 100, "load": [[0, 0], [0.05, 100]]}
+    return {
+        "sheet": {"points": [6, 7], "size": [0.05, 0.06], **sections.pop("sheet", {})},
+        "tissue": {**tissue, "foundation_active": "always", **CASES[case]},
+        "probes": [probe],
+        "time": {"duration": 0.1, "frames_per_second": 40, "precision": "f64", **sections.pop("time", {})},
+        "output": [],
+    }
+
+
+def made(case: str, **sections: Any) -> Scene:
+    return Scene.model_validate(pressed(case, **sections))
+
+
+@pytest.mark.parametrize("factor", [1.5, 10.0, 1000.0])
+def test_the_law_and_its_integral(factor: float) -> None:
+    law, end = build_locking(NUMPY), 1 - factor**-0.5
+    for x in (-0.3, 1e-3, 0.05, 0.2, 0.5, 0.9, 1.5):
+        assert x * law.secant(x, end) == pytest.approx(float(lock(np.array(x), 1.0, factor)), rel=1e-14)
+        integral, _ = quad(lambda e: float(lock(np.array(e), 1.0, factor)), 0, x, points=[min(end, max(x, 0))])
+        assert law.energy(x, end) == pytest.approx(2 * integral, rel=1e-9)
+        slope = (lock(np.array(x + 1e-7), 1.0, factor) - lock(np.array(x - 1e-7), 1.0, factor)) / 2e-7
+        assert law.tangent(x, end) == pytest.approx(float(slope), rel=1e-5)
+
+
+def test_the_energy_keeps_its_digits_near_rest() -> None:
+    law = build_locking(NUMPY)
+    x = np.float32(10) ** np.arange(-6, 0, dtype=np.float32)
+    exact = 2 * (-x.astype(np.longdouble) - np.log1p(-x.astype(np.longdouble)))
+    np.testing.assert_allclose(law.energy(x, np.float32(0.99)), exact.astype(float), rtol=2e-6)
+
+
+def test_slopes_of_a_spring() -> None:
+    law, numbers, length = LockingLaw().build(NUMPY), (1 / (0.1 * 2.0), 0.6, 0.1), 2.0
+    edge, h = np.array([1.7, 0.9, 1.0]), 1e-6
+
+    def force(edge: NDArray[Any], k: float = 3.0, tau: float = 0.4) -> NDArray[Any]:
+        square = float(edge @ edge)
+        return np.asarray(law.pull(k, tau, square - length**2, square, length, *numbers) * edge)
+
+    p, square = np.array([0.3, -0.2, 0.5]), float(edge @ edge)
+    s, w, by_k, by_tau = law.slopes(3.0, 0.4, square - length**2, square, length, edge @ p, *numbers)
+    np.testing.assert_allclose(s * p + w * edge, (force(edge + h * p) - force(edge - h * p)) / (2 * h), rtol=1e-8)
+    np.testing.assert_allclose(by_k * edge, force(edge, k=4.0) - force(edge), rtol=1e-12)
+    np.testing.assert_allclose(by_tau * edge, force(edge, tau=1.4) - force(edge), rtol=1e-12)
+
+
+@pytest.mark.parametrize(("case", "fixed"), [(case, "border") for case in CASES] + [("sheet", ["left"])])
+def test_like_twin(case: str, fixed: Any, device: Device) -> None:
+    assert_like_twin(made(case, sheet={"fixed": fixed}), device)
+
+
+def test_the_case_reaches_the_straight_part() -> None:
+    scene = made("everything")
+    *_, u = reference.displacements(plan_of(scene))
+    assert reference.longest_spring(scene, u) - 1 > 0.02
+    assert -u[..., 2].min() > 0.002
+
+
+def test_energy(device: Device) -> None:
+    scene = made("everything")
+    with Simulation(scene, threads=device.threads) as simulation:
+        simulation.advance(4)
+        u, reading = simulation.positions() - rest_positions(scene.sheet), simulation._dynamics.read()
+        speed = simulation._dynamics.state().difference / plan_of(scene).grid.step
+    kinetic = (reference.sheet(scene).mass[..., None] * speed**2).sum() / 2
+    assert reading.energy == pytest.approx(reference.energy(scene, u) + kinetic, rel=1e-11)
+    plain = scene.model_copy(update={"tissue": scene.tissue.model_copy(update={"bending": 0.0})})  # type: ignore[union-attr]
+    height, width = scene.sheet.size
+    share = np.outer(*(np.r_[0.5, np.ones(n - 2), 0.5] / (n - 1) for n in scene.sheet.points))
+    total = (energy_density(plan_of(plain), u) * share).sum() * height * width
+    assert total == pytest.approx(reference.energy(plain, u), rel=1e-11)
+
+
+@pytest.mark.usefixtures("short_launches")
+def test_lanes_workers_and_passes_do_not_change_the_bits(device: Device) -> None:
+    scene = made("everything", sheet={"points": [11, 21]}, time={"precision": "f32"})
+
+    def state(layout: Any) -> bytes:
+        dynamics = dynamics_of(scene, device, layout)
+        dynamics.advance(plan_of(scene).grid.steps)
+        state = dynamics.state()
+        dynamics.close()
+        assert len(state.memory) == 6
+        return b"".join(array.tobytes() for array in state[1:])
+
+    layout = structure_of(scene, device)
+    plain = state(layout)
+    assert state(replace(with_lanes(layout, 4), workers=2)) == plain
+    assert state(as_on_a_gpu(layout)) == plain
+
+
+def test_steps_go_on_from_a_state(device: Device) -> None:
+    scene = made("everything")
+    plan, dynamics = plan_of(scene), dynamics_of(scene, device)
+    dynamics.advance(plan.grid.steps // 2 + 1)
+    saved = dynamics.state()
+    dynamics.restart(plan, State(*saved))
+    dynamics.advance(plan.grid.steps - saved.steps)
+    whole = dynamics_of(scene, device)
+    whole.advance(plan.grid.steps)
+    assert [part.tobytes() for part in dynamics.state()[1:]] == [part.tobytes() for part in whole.state()[1:]]
+
+
+def at_rest(case: str, **sections: Any) -> Scene:
+    return made(case, time={"motion": "quasistatic"}, **sections)
+
+
+@pytest.mark.parametrize("preloaded", [False, True])
+def test_at_rest(preloaded: bool, device: Device) -> None:
+    data = pressed("everything", time={"motion": "quasistatic"})
+    if preloaded:
+        data["probes"][0]["load"] = [[0, 50], [0.05, 100]]
+    scene = Scene.model_validate(data)
+    plan, made_sheet = make_plan(scene), reference.sheet(scene)
+    relaxation, free = Relaxation(scene, 1 / scene.time.frames_per_second), ~plan.fixed
+    with Simulation(scene, threads=device.threads) as simulation:
+        for frame in range(5):
+            if frame:
+                simulation.advance()
+            u = simulation.positions() - rest_positions(scene.sheet)
+            loads = evaluate_frame_loads(plan, frame)
+            elastic = internal_force(scene, u, loads, 0, made_sheet)
+            acting = relaxation.step(elastic) if frame else elastic
+            if frame == 0:
+                relaxation.begin(elastic)
+            surgical = reference.surgical_force(scene, loads, 0)
+            assert np.abs((acting + surgical)[free]).max() <= 2e-7 * max(1e-9, np.abs(elastic).max())
+
+
+def test_a_held_foundation_relaxes_as_prony_says(device: Device) -> None:
+    """A sheet without springs is held by its foundation alone: after a step, force and depth are proportional."""
+    shares, times = (0.5, 0.2), (0.03, 0.4)
+    data = pressed("relaxation", time={"motion": "quasistatic", "duration": 1.0, "frames_per_second": 200})
+    data["sheet"]["fixed"] = "none"
+    data["probes"] = [{"total": [0, 0, -1], "falloff": 1e-3, "load": [[0, 100]]}]
+    scene = Scene.model_validate(data)
+    with Simulation(scene, threads=device.threads) as simulation:
+        depths = [-simulation.positions()[3, 3, 2]]
+        for _ in range(200):
+            simulation.advance()
+            depths.append(-simulation.positions()[3, 3, 2])
+    # Creep under a constant force, by the convolution of the relaxation with the rate of the depth.
+    t, h = np.arange(201) / 200, 1 / 200
+    kernel = 1 - sum(shares) + sum(s * np.exp(-t / tau) for s, tau in zip(shares, times, strict=True))
+    exact = np.empty(201)
+    exact[0] = 1.0
+    for n in range(1, 201):
+        rates = np.diff(exact[:n])
+        middle = (kernel[1:] + kernel[:-1])[::-1] / 2
+        known = kernel[n] * exact[0] + (rates * middle[-n:][: n - 1]).sum()
+        exact[n] = exact[n - 1] + (1 - known) / ((kernel[0] + kernel[1]) / 2)
+    np.testing.assert_allclose(np.array(depths) / depths[0], exact, rtol=3e-3)
+    assert h < min(times)
+
+
+@pytest.mark.parametrize("motion", ["dynamic", "quasistatic"])
+def test_slopes_of_a_scene(motion: str, device: Device) -> None:
+    data = pressed("everything", time={"motion": motion})
+    del data["tissue"]["relaxation"]
+    adjoint = Adjoint(plan_of(Scene.model_validate(data)), device)
+    weights = np.random.default_rng(0).standard_normal(adjoint.run().shape)
+    found = adjoint.backward(weights)
+    keys = ["young", "pretension", "stiffening.lock", "stiffening.factor"]
+    for key in [*keys, "foundation.young", "foundation.lock", "foundation.factor"]:
+        path = f"tissue.{key}"
+
+        def at(scale: float, key: str = key) -> float:
+            changed = copy.deepcopy(data)
+            *outer, name = key.split(".")
+            section = changed["tissue"]
+            for part in outer:
+                section = section[part]
+            section[name] *= scale
+            return float((Adjoint(plan_of(Scene.model_validate(changed)), device).run() * weights).sum())
+
+        value = attrgetter(path)(Scene.model_validate(data))
+        slope = (at(1 + 1e-3) - at(1 - 1e-3)) / (2e-3 * value)
+        assert found.numbers[path] == pytest.approx(slope, rel=3e-3 if motion == "quasistatic" else 3e-4), path
+
+
+def test_no_gradient_of_relaxation(device: Device, message: Messages) -> None:
+    with message.raises(SceneError, "tissue.relaxation"):
+        gradient(pressed("relaxation"), lambda x: (0.0, 0 * x), threads=device.threads)
+
+
+@pytest.mark.parametrize(
+    "tissue",
+    [
+        {"stiffening": {"lock": 0}},
+        {"stiffening": {"lock": 0.1, "factor": 0.5}},
+        {"foundation": {"young": 1e4, "depth": 0.01, "factor": 3}},
+        {"relaxation": [{"share": 0.6, "time": 1}, {"share": 0.5, "time": 2}]},
+        {"relaxation": [{"share": 0.1, "time": 1}] * 5},
+        {"foundation_active": "loaded", **RELAXATION},
+    ],
+    ids=["no lock", "factor below 1", "factor without lock", "shares above 1", "five branches", "loaded"],
+)
+def test_what_is_refused(tissue: dict[str, Any], message: Messages) -> None:
+    data = pressed("sheet")
+    data["tissue"].update(tissue)
+    with message.raises(SceneError, "tissue"):
+        check_scene(data)
