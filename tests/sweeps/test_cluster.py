@@ -204,8 +204,8 @@ def cluster() -> Iterator[Callable[[int], str]]:
     with ExitStack() as stack:
 
         def start(threads: int) -> str:
-            options = {"protocol": "tcp", "host": "127.0.0.1", "dashboard_address": None}
-            started = distributed.LocalCluster(1, threads_per_worker=threads, processes=False, **options)
+            options = {"protocol": "tcp", "host": "127.0.0.1", "dashboard_address": ":0"}
+            started = distributed.LocalCluster(n_workers=1, threads_per_worker=threads, processes=False, **options)
             return str(stack.enter_context(started).scheduler_address)
 
         yield start
