@@ -356,7 +356,8 @@ def test_points_are_quarters_and_halves_of_the_cells() -> None:
 
 def test_sheets_without_a_study_of_points(device: Device, message: Messages) -> None:
     few, springs = points_study(tissue((6, 6)), device, 1.0), points_study(scene(), device, 1.0)
-    assert few.points == springs.points == springs.notes == []
+    assert few.points == springs.points == []
+    assert springs.notes == []
     message(few.notes, "7")
 
 

@@ -184,17 +184,16 @@ def test_a_damaged_picture_is_no_end(make: Make, ran: Path, message: Messages) -
 
 
 @pytest.mark.parametrize(("kept", "difference"), [("frames", 0), ("animation.gif", 10), ("trajectory.npz", 0)])
-def test_the_last_frame_comes_from_any_output(make: Make, ran: Path, kept: str, difference: float) -> None:
+def test_the_last_frame_comes_from_any_output(make: Make, ran: Path, kept: str, difference: float, pool: Pool) -> None:
     """An animation has fewer colours; what is drawn again is the same."""
     result = make(2)
     copy_runs(ran, result)
-    with Pool(1) as pool:
-        write(result, pool)
-        first = np.asarray(Image.open(result.directory / CONTACT)).astype(int)
-        for run, name in itertools.product(range(2), {"frames", "animation.gif", "trajectory.npz"} - {kept}):
-            path = result.run_directory(run) / name
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
-        assert write(result, pool)[1] == []
+    write(result, pool)
+    first = np.asarray(Image.open(result.directory / CONTACT)).astype(int)
+    for run, name in itertools.product(range(2), {"frames", "animation.gif", "trajectory.npz"} - {kept}):
+        path = result.run_directory(run) / name
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    assert write(result, pool)[1] == []
     assert np.abs(np.asarray(Image.open(result.directory / CONTACT)) - first).mean() <= difference
 
 
@@ -309,10 +308,12 @@ def test_a_data_set_names_its_complete_runs(make: Make) -> None:
     assert "numpy" in described["versions"]
 
 
-def test_runs_of_a_data_set_have_their_own_size(small: Path) -> None:
+def test_runs_of_a_data_set_have_their_own_size(small: Path, pool: Pool) -> None:
     sizes = [[16, 12], [12, 16]]
     vary = {"render.size": {"grid": sizes}}
-    outcomes = list(sweep("small.yaml", vary, "out", workers=1, overrides={"time.duration": 0.1, "output": ["png"]}))
+    outcomes = list(
+        sweep("small.yaml", vary, "out", executor=pool, overrides={"time.duration": 0.1, "output": ["png"]})
+    )
     assert {outcome.status for outcome in outcomes} == {"complete"}
     rows = json.loads(Path("out/dataset.json").read_text())["runs"]
     assert [row["size"] for row in rows] == sizes
