@@ -34,7 +34,7 @@ def test_a_mutant_is_another_program(mutant: Mutant, root: Path) -> None:
     ids=["moved", "elsewhere", "many functions", "twice", "nowhere"],
 )
 def test_a_mutant_that_fits_no_longer_says_what_to_do(function: str, find: str, message: Messages) -> None:
-    with message.raises(ValueError, function, hide=r"(?<=which of ).*(?= it is)"):
+    with message.raises(ValueError, "name", hide=r"(?<=which of ).*(?= it is)"):
         Mutant("name", "wrong", function, find, "", []).definition()
 
 
