@@ -101,7 +101,8 @@ def test_each_run_is_that_of_run_with_its_cells(many: Path, program: Program, me
     message(rows[statuses.index("refused")]["error"], "--set time.step=0.01", hide=LIMIT)
     worst = max((row for row in rows if row["error_estimate"]), key=lambda row: float(row["error_estimate"]))
     assert f"largest {float(worst['error_estimate']):.2g} (run {int(worst['run']):06})" in done.stdout
-    message(done.stdout, f"{statuses.count('complete')} complete", hide=SECONDS)
+    assert f"4 runs: {statuses.count('complete')} complete, {statuses.count('refused')} refused" in done.stdout
+    message(done.stdout, "4 runs", hide=rf"{LIMIT}|\d (?=complete|refused)|(?<=run )\d+|{SECONDS}")
     for row in rows:
         here = Path("out/runs") / f"{int(row['run']):06}"
         if row["status"] == "refused":
