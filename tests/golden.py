@@ -12,14 +12,30 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from typing import TypeVar
 
 import pytest
 import yaml
 
 FILE = Path(__file__).parent / "messages.yaml"
 
+AnyError = TypeVar("AnyError", bound=BaseException)
+
 # Messages by file of tests and by test.
 Golden = dict[str, dict[str, list[str]]]
+
+
+class Dumper(yaml.SafeDumper):
+    """Writes texts of several lines as blocks."""
+
+
+def _represent_text(dumper: Dumper, text: str) -> yaml.ScalarNode:
+    # A block cannot hold spaces at the end of a line.
+    lines = [line.rstrip() for line in text.split("\n")]
+    return dumper.represent_scalar("tag:yaml.org,2002:str", "\n".join(lines), style="|" if len(lines) > 1 else None)
+
+
+Dumper.add_representer(str, _represent_text)
 
 
 @cache
@@ -36,7 +52,7 @@ def write(changed: Golden) -> None:
             golden[tests] = {**golden.get(tests, {}), **messages}
         golden = {tests: dict(sorted(golden[tests].items())) for tests in sorted(golden)}
         file.seek(0)
-        yaml.safe_dump(golden, file, allow_unicode=True, width=120, sort_keys=False)
+        yaml.dump(golden, file, Dumper, allow_unicode=True, width=120, sort_keys=False)
         file.truncate()
 
 
@@ -64,6 +80,7 @@ class Messages:
         """
         text = message if isinstance(message, str) else "\n".join(message)
         text = re.sub(hide, "…", self._temporary.sub("TMP", text)).rstrip("\n")
+        text = "\n".join(line.rstrip() for line in text.split("\n"))
         for word in words:
             assert word in text
         if self._written is not None:
@@ -76,8 +93,8 @@ class Messages:
 
     @contextmanager
     def raises(
-        self, error: type[BaseException], *words: str, hide: str = r"(?!)"
-    ) -> Iterator[pytest.ExceptionInfo[BaseException]]:
+        self, error: type[AnyError] | tuple[type[AnyError], ...], *words: str, hide: str = r"(?!)"
+    ) -> Iterator[pytest.ExceptionInfo[AnyError]]:
         """Expect an error, and compare its message; see `__call__`."""
         with pytest.raises(error) as caught:
             yield caught

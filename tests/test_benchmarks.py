@@ -15,6 +15,7 @@ from benchmarks.drawing.measure import psnr
 from benchmarks.stepping import PEERS, measure, numpy_
 from benchmarks.stepping.problem import Array, Problem
 from taichi_msm.system.runtime import Device
+from tests.golden import Messages
 
 
 @pytest.fixture(autouse=True)
@@ -67,32 +68,28 @@ def test_a_right_answer_is_found_right(name: str, device: Device) -> None:
 
 @pytest.mark.usefixtures("in_this_process")
 @pytest.mark.parametrize("stepper", [Late, Lost])
-def test_a_wrong_answer_is_not_timed(stepper: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_wrong_answer_is_not_timed(stepper: Any, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
     peers = {"right": PEERS["NumPy"], "wrong": peer(monkeypatch, stepper)}
     right, wrong = race.race("benchmarks.stepping.measure", peers, 2, lambda text: None, points=13)
     assert (right.said, right.samples) == ("", [1.0, 1.0])
-    assert wrong.said.startswith("wrong: ")
+    message(wrong.said, "wrong", hide=r"\d\S*")
     assert not wrong.samples
 
 
 @pytest.mark.usefixtures("in_this_process")
-def test_a_peer_that_is_not_installed_is_skipped_with_its_word() -> None:
+def test_a_peer_that_is_not_installed_is_skipped_with_its_word(message: Messages) -> None:
     peers = {"nobody": "benchmarks.stepping.nobody", "NumPy": PEERS["NumPy"]}
     missing, there = race.race("benchmarks.stepping.measure", peers, 1, lambda text: None, points=13)
-    assert missing.said == "skipped: benchmarks.stepping.nobody is not installed"
+    message(missing.said, "benchmarks.stepping.nobody")
     assert not missing.samples
     assert there.samples
 
 
-def test_a_measurement_is_a_process_of_its_own() -> None:
-    assert process.call("json:dumps", obj=[1]) == "[1]"
+def test_a_measurement_is_a_process_of_its_own(monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
     with pytest.raises(process.FailedError, match="TypeError"):
         process.call("json:dumps", nothing=1)
-
-
-def test_a_peer_without_its_compiler_is_skipped_with_its_word(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
-    with pytest.raises(process.UnavailableError, match="is installed"):
+    with message.raises(process.UnavailableError):
         process.call("benchmarks.stepping.measure:check", peer=PEERS["C++, OpenMP"], points=5)
 
 
@@ -101,15 +98,15 @@ def test_the_load_reaches_every_point() -> None:
         assert share.min() > 0.01 * share.max()
 
 
-def test_the_page_shows_times_and_words() -> None:
+def test_the_page_shows_times_and_words(message: Messages) -> None:
     entries = [
         asdict(race.Entry("taichi_msm", answer=1e-7, compile=1.0, samples=[2e-6, 4e-6, 3e-6])),
         asdict(race.Entry("Numba", said="skipped: numba is not installed")),
     ]
-    text = " ".join(page.page({"machine": page.machine(), "rounds": 3, "stepping": {"31": entries}}).split())
-    assert "| taichi_msm | 3.00 us (2.00 to 4.00) | 1e-07 | 1.00 s |" in text
-    assert "| Numba | skipped: numba is not installed | - | - |" in text
-    assert page.NOT_MEASURED in text
+    text = page.page({"machine": page.machine(), "rounds": 3, "stepping": {"31": entries}})
+    rows = [" ".join(line.split()) for line in text.splitlines() if line.startswith("| ") and "--" not in line]
+    message(rows, "taichi_msm", "Numba", hide="[^|]*(?=: time)")
+    assert page.NOT_MEASURED in " ".join(text.split())
 
 
 def test_psnr_of_a_step_of_grey() -> None:

@@ -43,14 +43,6 @@ def test_one_oscillator_follows_the_discrete_solution(damping: float) -> None:
     np.testing.assert_allclose(z, exact, rtol=0, atol=200**2 * 1.2e-17)
 
 
-def test_undamped_oscillator_has_the_frequency_of_the_scheme() -> None:
-    made = scene(**ALONE, damping=0, time={"duration": 4.0, "step": 0.04})
-    z = np.array([u[0, 0, 2] for u in reference.displacements(plan_of(made))]) - 3.0 / 50.0
-    # sin(theta / 2) = w h / 2; and u_0 is an extremum, so the motion is a cosine.
-    theta = 2 * np.arcsin(5.0 * 0.04 / 2)
-    np.testing.assert_allclose(z, -3.0 / 50.0 * np.cos(theta * np.arange(len(z))), atol=1e-14)
-
-
 def test_backward_damping_is_the_literal_recurrence() -> None:
     made = scene(**ALONE, damping=4.0, time={"duration": 0.4, "step": 0.02, "damping_difference": "backward"})
     u = [0.0, 0.02**2 * 3.0 / 2.0 / 2]
@@ -90,7 +82,7 @@ def test_a_spring_without_length_has_no_force() -> None:
     np.testing.assert_allclose(force, 0, atol=1e-15)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 def test_the_density_of_energy_adds_up_to_the_energy_of_the_springs(seed: int, tmp_path: Path) -> None:
     """With a map, tension, free edges and cells that are not square; bending, which is no spring's, is left out."""
     Image.fromarray(speckle(7, 5)).save(tmp_path / "map.png")

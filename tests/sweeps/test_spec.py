@@ -16,10 +16,11 @@ from scipy.special import ndtri
 from scipy.stats import qmc
 
 from taichi_msm.errors import SceneError
-from taichi_msm.load.scene_file import ANY_CAMERA, CAMERA_FILE_KEYS, PICTURE_KEYS, load_plan
+from taichi_msm.load.scene_file import ANY_CAMERA, CAMERA_FILE_KEYS, PICTURE_KEYS, load_plan, parse_override
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_PATH
 from taichi_msm.sweeps.spec import Distribution, format_override, load_sweep, run_values, sample_run_values
+from tests.golden import Messages
 from tests.scenes import speckle
 
 
@@ -81,30 +82,14 @@ def test_grids_give_every_combination_the_last_key_fastest() -> None:
     assert values(None, a={"grid": [1, 2]}, b={"grid": ["x", [3, 4]]}) == [[1, "x"], [1, [3, 4]], [2, "x"], [2, [3, 4]]]
 
 
-@pytest.mark.parametrize(
-    "value",
-    [
-        0.1,
-        1e-7,
-        1 / 3,
-        5,
-        -2.5e300,
-        True,
-        None,
-        "none",
-        "a b, c",
-        "1e3",
-        "true",
-        "#a",
-        "ü",
-        "",
-        [0.1, [2, "x"]],
-        {"a": [1]},
-    ],
-)
-def test_a_cell_is_what_set_takes(value: Any) -> None:
-    from taichi_msm.load.scene_file import parse_override
+CELLS: list[Any] = [
+    *(0.1, 1e-7, 1 / 3, 5, -2.5e300, True, None, [0.1, [2, "x"]], {"a": [1]}),
+    *("none", "a b, c", "1e3", "true", "#a", "ü", ""),
+]
 
+
+@pytest.mark.parametrize("value", CELLS)
+def test_a_cell_is_what_set_takes(value: Any) -> None:
     assert parse_override(f"key={format_override(value)}").value == value
 
 
@@ -195,123 +180,66 @@ def test_every_key_of_a_scene_that_names_a_file_is_known() -> None:
 
 
 GOOD = {"scene": "small.yaml", "samples": 2, "vary": {"damping": {"uniform": [0.01, 0.02]}}}
-FAULTS: list[tuple[dict[str, Any], str]] = [
-    ({"sampels": 3}, "sampels: unknown key; did you mean 'samples'?"),
-    ({"scene": "none.yaml"}, "scene: none.yaml: no such file or directory"),
-    ({"samples": 0}, "samples: 0 is not allowed; expected a whole number, 1 to 10000000"),
-    ({"samples": None}, "samples: missing; expected the number of runs, as not every key is a grid"),
-    ({"vary": {}}, "vary: no keys; name at least one, such as tissue.young: {uniform: [1e4, 3e4]}"),
-    (
-        {"vary": {"damping": {"grid": [1]}}},
-        "samples: damping is a grid, which gives every combination; take choice, or leave out samples",
-    ),
-    ({"vary": {"damping": {"uniform": [3, 2]}}}, "vary.damping.uniform: 3 is above 2; give the lower number first"),
-    (
-        {"vary": {"damping": {"log_uniform": [0, 2]}}},
-        "vary.damping.log_uniform: 0 has no logarithm; take numbers above 0, or uniform",
-    ),
-    (
-        {"vary": {"damping": {"normal": [0, -2]}}},
-        "vary.damping.normal: a standard deviation of -2 is not possible; take 0 or more",
-    ),
-    (
-        {"vary": {"damping": {"uniform": [[1, 2], [3]]}}},
-        "vary.damping.uniform: [1, 2] and [3] differ in shape; give both as many numbers",
-    ),
-    (
-        {"vary": {"damping": {"uniform": ["a", "b"]}}},
-        'vary.damping.uniform: ["a", "b"] is not allowed; expected two numbers, or two lists of numbers of one shape',
-    ),
-    (
-        {"vary": {"damping": {"choice": []}}},
-        "vary.damping.choice: [] is not allowed; expected a list of values that is not empty",
-    ),
-    ({"vary": {"damping": {"unifrom": [1, 2]}}}, "vary.damping.unifrom: unknown key; did you mean 'uniform'?"),
-    (
-        {"vary": {"damping": {"uniform": [1, 2], "choice": [1]}}},
-        "vary.damping: expected one of uniform, log_uniform, normal, choice, grid",
-    ),
-    ({"vary": {"dampign": {"uniform": [1, 2]}}}, "vary.dampign: unknown key; did you mean 'damping'?"),
-    (
-        {"vary": {"damping": [0.01, 0.02]}},
-        "vary.damping: [0.01, 0.02] is no way to vary; take one, such as {uniform: [1, 2]} or {choice: [1, 2]}",
-    ),
-    (
-        {"vary": {"springs": {"shear": {"uniform": [1, 2]}}}},
-        "vary.springs: give each key by its dotted path, such as tissue.young: {uniform: [1e4, 3e4]}",
-    ),
-    ({"set": {"sheet.pionts": [3, 3]}}, "set.sheet.pionts: unknown key; did you mean 'points'?"),
-    (
-        {"set": {"probes.3.falloff": 5}},
-        "set.probes.3.falloff: no such item; the list has 1, numbered from 0, as in probes.0.falloff",
-    ),
-    ({"set": {"damping": 1}}, "vary: damping replaces damping, which comes before it; keep one"),
-    (
-        {"set": {"springs.shear": 3}, "vary": {"springs": {"choice": [{"shear": 1}]}}},
-        "vary: springs replaces springs.shear, which comes before it; keep one, or give springs first",
-    ),
-    ({"set": {"damping=1": 1}}, "set.damping=1: not a key; expected a dotted path such as sheet.points"),
-    ({"set": {"sprigns.shear": 1}}, "set.sprigns.shear: sprigns: unknown key; did you mean 'springs'?"),
-    (
-        {"vary": {"damping": {"choice": [math.nan]}}},
-        "vary.damping.choice: [NaN] has a number that is not finite; take others",
-    ),
-    (
-        {"vary": {"damping": {"uniform": [0, 1e31]}}},
-        "vary.damping.uniform: [0, 1e+31] is not allowed; expected two numbers, or two lists of numbers of one shape",
-    ),
-    (
-        {"vary": {"damping": {"uniform": [[0] * 21202, [1] * 21202]}}},
-        "vary: 21202 numbers, more than the 21201 that can vary; take fewer",
-    ),
-    (
-        {"vary": {"image": {"choice": ["a" * 300]}}},
-        f"vary.image.choice.0: {'a' * 60}...: no such file; name a picture relative to the sweep file",
-    ),
-    (
-        {"vary": {"image": {"choice": ["textures/c.png"]}}},
-        "vary.image.choice.0: textures/c.png: no such file; name a picture relative to the sweep file",
-    ),
-    (
-        {"vary": {"image": {"choice": "textures/*.jpg"}}},
-        'vary.image.choice: "textures/*.jpg" matches no picture; give a pattern relative to the sweep file',
-    ),
-    (
-        {"vary": {"image": {"choice": ["/etc/hostname"]}}},
-        "vary.image.choice.0: /etc/hostname is neither below the sweep file's folder nor below the scene's; "
-        "put the picture there",
-    ),
-    (
-        {"set": {"render.camera": {"calibration": "/etc/hostname"}}},
-        "set.render.camera: /etc/hostname is neither below the sweep file's folder nor below the scene's; "
-        "put the file there",
-    ),
-    (
-        {"vary": {"render.cameras.left.poses": {"choice": ["../a.txt", [[0, 0, 0, 0, 0, 0, 0, 1]]]}}},
-        "vary.render.cameras.left.poses.choice.0: ../a.txt is neither below the sweep file's folder nor below the "
-        "scene's; put the file there",
-    ),
-    (
-        {"set": {"render.camera.calibration": "a.yml"}},
-        "set.render.camera.calibration: a.yml: no such file; name a file relative to the sweep file",
-    ),
-    (
-        {"samples": None, "vary": {name: {"grid": list(range(4000))} for name in ("damping", "springs.shear")}},
-        "vary: 16000000 combinations, more than the 10000000 that can be run; take smaller grids",
-    ),
-]
 
 
-@pytest.mark.parametrize(("change", "message"), FAULTS, ids=[message[:50] for _, message in FAULTS])
-def test_a_fault_of_a_sweep_file_is_told_at_its_key(folder: Path, change: dict[str, Any], message: str) -> None:
+def vary(way: Any, key: str = "damping") -> dict[str, Any]:
+    return {"vary": {key: way}}
+
+
+# Changes of GOOD by their ids, and the key of the fault.
+FAULTS: dict[str, tuple[dict[str, Any], str]] = {
+    "unknown key": ({"sampels": 3}, "sampels"),
+    "no scene": ({"scene": "none.yaml"}, "scene"),
+    "no sample": ({"samples": 0}, "samples"),
+    "samples missing": ({"samples": None}, "samples"),
+    "nothing varies": ({"vary": {}}, "vary"),
+    "samples of a grid": (vary({"grid": [1]}), "samples"),
+    "upside down": (vary({"uniform": [3, 2]}), "vary.damping.uniform"),
+    "logarithm": (vary({"log_uniform": [0, 2]}), "vary.damping.log_uniform"),
+    "deviation": (vary({"normal": [0, -2]}), "vary.damping.normal"),
+    "shapes": (vary({"uniform": [[1, 2], [3]]}), "vary.damping.uniform"),
+    "no numbers": (vary({"uniform": ["a", "b"]}), "vary.damping.uniform"),
+    "no choice": (vary({"choice": []}), "vary.damping.choice"),
+    "unknown way": (vary({"unifrom": [1, 2]}), "vary.damping.unifrom"),
+    "two ways": (vary({"uniform": [1, 2], "choice": [1]}), "vary.damping"),
+    "no way": (vary([0.01, 0.02]), "vary.damping"),
+    "not finite": (vary({"choice": [math.nan]}), "vary.damping.choice"),
+    "too large": (vary({"uniform": [0, 1e31]}), "vary.damping.uniform"),
+    "dimensions": (vary({"uniform": [[0] * 21202, [1] * 21202]}), "vary"),
+    "unknown key varies": (vary({"uniform": [1, 2]}, "dampign"), "vary.dampign"),
+    "a section varies": (vary({"shear": {"uniform": [1, 2]}}, "springs"), "vary.springs"),
+    "long name": (vary({"choice": ["a" * 300]}, "image"), "vary.image.choice.0"),
+    "no picture": (vary({"choice": ["textures/c.png"]}, "image"), "vary.image.choice.0"),
+    "no match": (vary({"choice": "textures/*.jpg"}, "image"), "vary.image.choice"),
+    "picture outside": (vary({"choice": ["/etc/hostname"]}, "image"), "vary.image.choice.0"),
+    "poses outside": (
+        vary({"choice": ["../a.txt", [[0, 0, 0, 0, 0, 0, 0, 1]]]}, "render.cameras.left.poses"),
+        "vary.render.cameras.left.poses.choice.0",
+    ),
+    "unknown key set": ({"set": {"sheet.pionts": [3, 3]}}, "set.sheet.pionts"),
+    "no fourth probe": ({"set": {"probes.3.falloff": 5}}, "set.probes.3.falloff"),
+    "replaced": ({"set": {"damping": 1}}, "vary"),
+    "section replaced": ({"set": {"springs.shear": 3}, **vary({"choice": [{"shear": 1}]}, "springs")}, "vary"),
+    "equals sign": ({"set": {"damping=1": 1}}, "set.damping=1"),
+    "unknown section set": ({"set": {"sprigns.shear": 1}}, "set.sprigns.shear"),
+    "calibration outside": ({"set": {"render.camera": {"calibration": "/etc/hostname"}}}, "set.render.camera"),
+    "no calibration": ({"set": {"render.camera.calibration": "a.yml"}}, "set.render.camera.calibration"),
+    "combinations": (
+        {"samples": None, "vary": {key: {"grid": list(range(4000))} for key in ("damping", "springs.shear")}},
+        "vary",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_of_a_sweep_file_is_told_at_its_key(folder: Path, name: str, message: Messages) -> None:
+    change, key = FAULTS[name]
     data = {key: value for key, value in {**GOOD, **change}.items() if value is not None}
     # JSON is YAML.
     (folder / "many.yaml").write_text(json.dumps(data).replace("NaN", ".nan"))
-    with pytest.raises(SceneError) as raised:
+    with message.raises(SceneError, "many.yaml:1:", f": {key}: ") as raised:
         load_sweep("many.yaml")
-    (line,) = raised.value.lines
-    assert line.startswith("many.yaml:1:")
-    assert line.endswith(f": {message}")
+    assert "\n" not in str(raised.value)
 
 
 def test_all_faults_are_told_at_once_in_their_order(folder: Path) -> None:
@@ -326,18 +254,18 @@ def test_all_faults_are_told_at_once_in_their_order(folder: Path) -> None:
     ]
 
 
-def test_a_scene_and_a_sweep_are_told_apart(folder: Path) -> None:
-    with pytest.raises(SceneError, match=r"^small.yaml:1:1: a scene; use `taichi-msm run`, or name it by `scene:` in"):
+def test_a_scene_and_a_sweep_are_told_apart(folder: Path, message: Messages) -> None:
+    with message.raises(SceneError, "small.yaml:1:1", "taichi-msm run"):
         load_sweep("small.yaml")
     (folder / "many.yaml").write_text(json.dumps(GOOD))
-    with pytest.raises(SceneError, match=r"^many.yaml:1:1: a sweep; use `taichi-msm sweep`$"):
+    with message.raises(SceneError, "many.yaml:1:1", "taichi-msm sweep"):
         load_plan("many.yaml")
 
 
-def test_a_fault_of_the_scene_is_told_before_anything_runs(folder: Path) -> None:
+def test_a_fault_of_the_scene_is_told_before_anything_runs(folder: Path, message: Messages) -> None:
     (folder / "small.yaml").write_text((folder / "small.yaml").read_text() + "dampign: 1\n")
     (folder / "many.yaml").write_text(json.dumps(GOOD))
-    with pytest.raises(SceneError, match=r"^many.yaml:1:\d+: scene: dampign: unknown key; did you mean 'damping'\?$"):
+    with message.raises(SceneError, "many.yaml:1:", "dampign"):
         load_sweep("many.yaml")
 
 

@@ -13,13 +13,14 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 
 from taichi_msm import sweep
 from taichi_msm.errors import ArgumentError, MsmError, SceneError
@@ -31,8 +32,9 @@ from taichi_msm.sweeps.runs import Outcome, RunTask, SweepState, begin_sweep, ex
 from taichi_msm.sweeps.spec import load_sweep, make_sweep
 from taichi_msm.sweeps.sweep import finish_sweep, run_missing
 from tests.conftest import Program
+from tests.golden import Messages
 from tests.outputs import files, results
-from tests.scenes import SMALL
+from tests.scenes import SMALL, speckle
 from tests.telling import Telling
 
 # The step of 0.01 s is above the stability limit, so some runs are refused.
@@ -48,7 +50,12 @@ set: {output: [png, gif, trajectory, depth], time.duration: 0.2}
 """
 
 # Runs that are long enough to be ended in the middle.
-LONG = SWEEP.replace("time.duration: 0.2", "time.duration: 8")
+LONG = SWEEP.replace("time.duration: 0.2", "time.duration: 5")
+
+
+# What depends on the machine or on SciPy: errors and seconds; the step of a run that is refused.
+SECONDS = r"[\d.e-]+(?= \(run)|(?<=median )[\d.e-]+|[\d.]+ s\b"
+LIMIT = "(?<=limit ).*(?=, or auto)"
 
 
 @pytest.fixture
@@ -69,14 +76,6 @@ def runs(directory: Path | str) -> dict[str, bytes]:
     return {name: data for name, data in files(Path(directory) / "runs").items() if not name.endswith("run.json")}
 
 
-@pytest.fixture(scope="module")
-def pool() -> Iterator[Pool]:
-    """A process that has started once for many sweeps."""
-    pool = Pool(1)
-    yield pool
-    pool.shutdown()
-
-
 def go(executor: Executor, directory: str, part: tuple[int, int] = (1, 1)) -> None:
     """Take the runs of many.yaml, as the command does."""
     state = begin_sweep(load_sweep("many.yaml"), Path(directory), part)
@@ -89,7 +88,7 @@ def quiet(stage: str, done: int, total: int) -> None:
     """Report nothing."""
 
 
-def test_each_run_is_that_of_run_with_its_cells(many: Path, program: Program) -> None:
+def test_each_run_is_that_of_run_with_its_cells(many: Path, program: Program, message: Messages) -> None:
     done = program("sweep", "many.yaml", "--out", "out")
     assert done.returncode == 0, done.stderr
     rows = table("out")
@@ -99,11 +98,11 @@ def test_each_run_is_that_of_run_with_its_cells(many: Path, program: Program) ->
     ]
     statuses = [row["status"] for row in rows]
     assert sorted(set(statuses)) == ["complete", "refused"]
-    refused = rows[statuses.index("refused")]
-    assert refused["error"].startswith("--set time.step=0.01: time.step: 0.01 s is above the stability limit")
-    assert f"4 runs: {statuses.count('complete')} complete, {statuses.count('refused')} refused" in done.stdout
+    message(rows[statuses.index("refused")]["error"], "--set time.step=0.01", hide=LIMIT)
     worst = max((row for row in rows if row["error_estimate"]), key=lambda row: float(row["error_estimate"]))
     assert f"largest {float(worst['error_estimate']):.2g} (run {int(worst['run']):06})" in done.stdout
+    assert f"4 runs: {statuses.count('complete')} complete, {statuses.count('refused')} refused" in done.stdout
+    message(done.stdout, "4 runs", hide=rf"{LIMIT}|\d (?=complete|refused)|(?<=run )\d+|{SECONDS}")
     for row in rows:
         here = Path("out/runs") / f"{int(row['run']):06}"
         if row["status"] == "refused":
@@ -133,21 +132,32 @@ def test_it_goes_on_with_what_is_missing(many: Path, pool: Pool) -> None:
     assert (second / "run.json").read_bytes() == record, "it was run again"
 
 
-def test_shards_change_nothing(many: Path, pool: Pool) -> None:
-    go(pool, "whole")
+@pytest.fixture(scope="module")
+def whole(pool: Pool, tmp_path_factory: pytest.TempPathFactory) -> tuple[list[dict[str, str]], dict[str, bytes]]:
+    """The table and the runs of the sweep of `many`."""
+    folder = tmp_path_factory.mktemp("whole")
+    Image.fromarray(speckle(30, 40)).save(folder / "speckle.png")
+    (folder / "small.yaml").write_text(SMALL)
+    (folder / "many.yaml").write_text(SWEEP)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        go(pool, "out")
+        return table("out"), runs("out")
+
+
+def test_shards_change_nothing(many: Path, pool: Pool, whole: tuple[Any, Any]) -> None:
     for part in (2, 1, 3):
         go(pool, "parts", (part, 3))
-    assert runs("parts") == runs("whole")
+    assert runs("parts") == whole[1]
     assert not Path("parts/table.csv").exists()
     go(pool, "parts")
-    assert (table("parts"), runs("parts")) == (table("whole"), runs("whole"))
+    assert (table("parts"), runs("parts")) == whole
 
 
-def test_a_shard_of_the_command_writes_no_table(many: Path, program: Program) -> None:
+def test_a_shard_of_the_command_writes_no_table(many: Path, program: Program, message: Messages) -> None:
     done = program("sweep", "many.yaml", "--shard", "2/4", "--out", "out")
     assert done.returncode == 0
-    assert done.stdout.startswith("out: 1 run of part 2 of 4: 1 complete\n")
-    assert done.stdout.endswith("\nwithout --shard, the same command writes the table\n")
+    message(done.stdout, "part 2 of 4", "--shard", hide=SECONDS)
     assert sorted(str(path.relative_to("out")) for path in Path("out").glob("*/*")) == ["runs/000001"]
     assert [path.name for path in Path("out").glob("*.*")] == ["sweep.json"]
 
@@ -165,61 +175,55 @@ def test_a_kill_changes_nothing(many: Path, pool: Pool) -> None:
     assert (table("killed"), runs("killed")) == (table("whole"), runs("whole"))
 
 
-def test_a_signal_ends_it_and_says_how_to_go_on(many: Path) -> None:
+def test_a_signal_ends_it_and_says_how_to_go_on(many: Path, message: Messages) -> None:
     (many / "many.yaml").write_text(LONG)
     with Telling("sweep", "many.yaml", "--workers", "1", "--out", "out", stderr=subprocess.PIPE) as process:
         process.until("runs", 2)
         process.send_signal(signal.SIGINT)
         _, told = process.communicate()
     assert process.returncode == 130
-    assert "of 4 runs have ended; the same command goes on" in told
+    message(told.splitlines()[-1], "of 4 runs", hide=r"\d(?= of)")
     assert not Path("out/table.csv").exists()
 
 
-def test_another_sweep_in_the_folder_is_refused(many: Path, program: Program) -> None:
+CALIBRATION = "K: [50, 0, 20, 0, 50, 15, 0, 0, 1]\nD: [0, 0, 0, 0]\nwidth: 40\nheight: 30\n"
+
+
+def test_another_sweep_in_the_folder_is_refused(many: Path, program: Program, message: Messages) -> None:
+    text = SWEEP.replace("set: {", "set: {render.camera: {eye: [0, 0, 1], calibration: camera.yml}, ")
+    originals = {"many.yaml": text, "small.yaml": SMALL, "camera.yml": CALIBRATION}
+    for name, content in originals.items():
+        (many / name).write_text(content)
     register_sweep(Path("out"), load_sweep("many.yaml"))
     before = files(Path("out"))
-
-    def refusal() -> str:
+    sha256 = hashlib.sha256(CALIBRATION.encode()).hexdigest()
+    assert json.loads(before["sweep.json"])["files"]["camera.yml"] == sha256
+    for name, right, wrong, word in (
+        ("many.yaml", "seed: 1", "seed: 2", "seed"),
+        # Which has another number of keys, too.
+        ("many.yaml", text, "scene: small.yaml\nvary: {damping: {grid: [0.01, 0.02]}}\n", "samples"),
+        ("small.yaml", "falloff: 20", "falloff: 21", "scene"),
+        ("camera.yml", "50", "51", "camera.yml"),
+    ):
+        (many / name).write_text(originals[name].replace(right, wrong))
         done = program("sweep", "many.yaml", "--out", "out")
+        (many / name).write_text(originals[name])
         assert done.returncode == 2
-        return done.stderr
-
-    (many / "many.yaml").write_text(SWEEP.replace("seed: 1", "seed: 2"))
-    assert refusal() == "out: holds the runs of another sweep: seed differs; choose another --out\n"
-    (many / "many.yaml").write_text(SWEEP)
-    (many / "small.yaml").write_text(SMALL.replace("falloff: 20", "falloff: 21"))
-    assert "the scene file differs" in refusal()
-    (many / "small.yaml").write_text(SMALL)
+        message(done.stderr, "out", word)
     (many / "speckle.png").write_bytes((many / "speckle.png").read_bytes() + b"0")
-    assert "another sweep: speckle.png differs" in refusal()
-    # Which has another number of keys, too.
-    (many / "many.yaml").write_text("scene: small.yaml\nvary: {damping: {grid: [0.01, 0.02]}}\n")
-    assert "holds the runs of another sweep: samples differs" in refusal()
+    done = program("sweep", "many.yaml", "--out", "out")
+    assert done.returncode == 2
+    message(done.stderr, "out", "speckle.png")
     assert files(Path("out")) == before
 
 
-def test_a_sweep_with_another_calibration_is_another_one(many: Path, program: Program) -> None:
-    text = "K: [50, 0, 20, 0, 50, 15, 0, 0, 1]\nD: [0, 0, 0, 0]\nwidth: 40\nheight: 30\n"
-    (many / "camera.yml").write_text(text)
-    setting = "set: {render.camera: {eye: [0, 0, 1], calibration: camera.yml}, output: [], time.duration: 0.1}"
-    (many / "many.yaml").write_text(f"scene: small.yaml\nvary: {{damping: {{grid: [0.01]}}}}\n{setting}\n")
-    assert program("sweep", "many.yaml", "--out", "out").returncode == 0
-    sha256 = hashlib.sha256(text.encode()).hexdigest()
-    assert json.loads(Path("out/sweep.json").read_text())["files"]["camera.yml"] == sha256
-    assert json.loads(Path("out/runs/000000/run.json").read_text())["sha256"]["render.camera.calibration"] == sha256
-    (many / "camera.yml").write_text(text.replace("50", "51"))
-    done = program("sweep", "many.yaml", "--out", "out")
-    said = "out: holds the runs of another sweep: camera.yml differs; choose another --out\n"
-    assert (done.returncode, done.stderr) == (2, said)
-
-
-@pytest.mark.parametrize("content", ["", "[" * 4000, "3", "{}"])
-def test_a_damaged_record_is_told(many: Path, program: Program, content: str) -> None:
+@pytest.mark.parametrize("content", ["[" * 4000, "3", "{}"], ids=["nested", "number", "empty"])
+def test_a_damaged_record_is_told(many: Path, program: Program, content: str, message: Messages) -> None:
     register_sweep(Path("out"), load_sweep("many.yaml"))
     Path("out/sweep.json").write_text(content)
     done = program("sweep", "many.yaml", "--out", "out")
-    assert (done.returncode, done.stderr) == (4, "out/sweep.json: damaged; choose another --out\n")
+    assert done.returncode == 4
+    message(done.stderr, "out/sweep.json", "--out")
 
 
 def with_value(run: int, value: Any) -> Callable[[Any], Any]:
@@ -230,27 +234,24 @@ def with_value(run: int, value: Any) -> Callable[[Any], Any]:
 @pytest.mark.parametrize(
     "change",
     [
-        *(lambda kept: 3, lambda kept: [], lambda kept: [[1]] * 4, lambda kept: {"a": 1}, lambda kept: kept[::-1]),
+        *(lambda kept: 3, lambda kept: [[1]] * 4, lambda kept: kept[::-1]),
         *(with_value(2, math.nan), with_value(0, "5"), lambda kept: with_value(1, kept[1][0] * (1 + 2**-52))(kept)),
     ],
-    ids=range(8),
+    ids=range(6),
 )
 def test_values_that_are_not_those_of_the_sweep_file_are_refused(
-    many: Path, program: Program, change: Callable[[Any], Any]
+    many: Path, program: Program, change: Callable[[Any], Any], message: Messages
 ) -> None:
     register_sweep(Path("out"), load_sweep("many.yaml"))
     record = json.loads(Path("out/sweep.json").read_text())
     Path("out/sweep.json").write_text(json.dumps({**record, "values": change(record["values"])}))
     done = program("sweep", "many.yaml", "--out", "out")
-    assert (done.returncode, done.stderr) == (
-        4,
-        "out/sweep.json: its values are not those of the sweep file, as it is damaged or of another SciPy; choose "
-        "another --out\n",
-    )
+    assert done.returncode == 4
+    message(done.stderr, "out/sweep.json", "values")
 
 
-@pytest.mark.parametrize("name", ["sweep.json", "runs", "runs/000002"])
-def test_nothing_is_written_through_a_link(many: Path, program: Program, name: str) -> None:
+@pytest.mark.parametrize("name", ["sweep.json", "runs", "runs/000002"], ids=["record", "runs", "run"])
+def test_nothing_is_written_through_a_link(many: Path, program: Program, name: str, message: Messages) -> None:
     (many / "far").mkdir()
     link = many / "out" / name
     link.parent.mkdir(parents=True)
@@ -259,8 +260,8 @@ def test_nothing_is_written_through_a_link(many: Path, program: Program, name: s
         shutil.copy("out2/sweep.json", "out")
     link.symlink_to(many / "far")
     done = program("sweep", "many.yaml", "--out", "out")
-    said = f"out/{name}: a symbolic link that no run has put there; move it away or choose another folder\n"
-    assert (done.returncode, done.stderr) == (4, said)
+    assert done.returncode == 4
+    message(done.stderr, f"out/{name}", "link")
     assert not list((many / "far").iterdir())
 
 
@@ -318,76 +319,66 @@ def test_a_record_that_is_a_link_or_damaged_does_not_count(one_ended: Callable[.
     assert len(one_ended().missing) == 4
 
 
-def test_two_commands_for_a_folder_leave_one_table(many: Path, pool: Pool) -> None:
-    go(pool, "whole")
+def test_two_commands_for_a_folder_leave_one_table(many: Path, whole: tuple[Any, Any]) -> None:
     command = [sys.executable, "-m", "taichi_msm", "sweep", "many.yaml", "--workers", "1", "--out", "both", "--json"]
     processes = [subprocess.Popen(command, stdout=subprocess.PIPE) for _ in range(2)]
     answers = [json.loads(process.communicate()[0]) for process in processes]
     assert not [note for answer in answers for note in answer["notes"] if "could not be made" in note]
     # The later of both has seen all runs.
-    assert (table("both"), runs("both")) == (table("whole"), runs("whole"))
+    assert (table("both"), runs("both")) == whole
 
 
 def test_a_dry_run_writes_nothing(many: Path, program: Program) -> None:
-    done = program("sweep", "many.yaml", "--dry-run")
-    lines = done.stdout.splitlines()
+    whole, part = (program("sweep", "many.yaml", "--dry-run", *more).stdout for more in ((), ("--shard", "2/3")))
+    lines = whole.splitlines()
     assert lines[0] == "run,springs.structural,probes.0.at,time.step"
     assert [line.split(",")[0] for line in lines[1:5]] == ["0", "1", "2", "3"]
     assert lines[5].startswith("4 runs: about ")
-    assert not Path("output").exists()
-    answer = json.loads(program("sweep", "many.yaml", "--dry-run", "--json").stdout)
-    assert (answer["keys"], len(answer["values"])) == (["springs.structural", "probes.0.at", "time.step"], 4)
-
-
-def test_a_dry_run_of_a_shard_is_of_its_runs(many: Path, program: Program) -> None:
-    whole, part = (program("sweep", "many.yaml", "--dry-run", *more).stdout for more in ((), ("--shard", "2/3")))
-    assert part.splitlines()[:2] == [whole.splitlines()[n] for n in (0, 2)]
+    assert part.splitlines()[:2] == [lines[0], lines[2]]
     assert part.splitlines()[2].startswith("1 run: about ")
-    answer = json.loads(program("sweep", "many.yaml", "--dry-run", "--shard", "1/3", "--json").stdout)
-    assert (answer["runs"], len(answer["values"])) == ([0, 3], 2)
-    every = json.loads(program("sweep", "many.yaml", "--dry-run", "--json").stdout)
-    assert answer["disk_bytes"] == every["disk_bytes"] // 2
+    every, third = (
+        json.loads(program("sweep", "many.yaml", "--dry-run", "--json", *more).stdout)
+        for more in ((), ("--shard", "1/3"))
+    )
+    assert (every["keys"], len(every["values"])) == (["springs.structural", "probes.0.at", "time.step"], 4)
+    assert (third["runs"], len(third["values"])) == ([0, 3], 2)
+    assert third["disk_bytes"] == every["disk_bytes"] // 2
+    assert not Path("output").exists()
 
 
-def test_many_runs_must_be_meant(many: Path, program: Program) -> None:
+def test_many_runs_must_be_meant(many: Path, program: Program, message: Messages) -> None:
     (many / "many.yaml").write_text(SWEEP.replace("samples: 4", "samples: 1000000"))
     done = program("sweep", "many.yaml")
     assert done.returncode == 2
-    assert done.stderr.startswith("taichi-msm: 1000000 runs: about ")
-    assert "MiB on disk; of 64 that were checked, " in done.stderr
-    assert "; add --yes if that is meant" in done.stderr
+    message(done.stderr, "1000000 runs", "--yes", hide=rf"about .* on disk|\d+(?= will)|{LIMIT}")
     assert not Path("output").exists()
 
 
-@pytest.mark.parametrize("part", ["0/3", "4/3", "3", "a/b", "1/0"])
-def test_a_shard_is_a_part_of_the_runs(many: Path, program: Program, part: str) -> None:
-    done = program("sweep", "many.yaml", "--shard", part)
-    assert done.returncode == 2
-    assert f"{part} is no part; take I/N with 1 <= I <= N, such as 3/8" in done.stderr
+def test_a_shard_is_a_part_of_the_runs(many: Path, program: Program, message: Messages) -> None:
+    for part in ("0/3", "4/3", "3", "a/b", "1/0"):
+        done = program("sweep", "many.yaml", "--shard", part)
+        assert done.returncode == 2
+        message(done.stderr, part)
 
 
-def test_it_is_started_from_python_with_any_executor(many: Path, pool: Pool) -> None:
+def test_it_is_started_from_python_with_any_executor(many: Path, pool: Pool, message: Messages) -> None:
     vary = {"damping": {"grid": [0.01, 0.02]}}
     with ProcessPoolExecutor(1, get_context("spawn")) as executor:
         rows = sorted(sweep("small.yaml", vary, "out", overrides={"output": []}, executor=executor), key=number)
     assert [(row.run, row.status) for row in rows] == [(0, "complete"), (1, "complete")]
     assert [row["damping"] for row in table("out")] == ["0.01", "0.02"]
     # By its own processes, to the same.
-    assert sorted(sweep("small.yaml", vary, "other", overrides={"output": []}), key=number) == rows
-    with pytest.raises(SceneError, match=r"^vary\.dampign: unknown key; did you mean 'damping'\?$"):
+    assert sorted(sweep("small.yaml", vary, "other", overrides={"output": []}, workers=1), key=number) == rows
+    with message.raises(SceneError, "vary.dampign"):
         sweep("small.yaml", {"dampign": {"grid": [1]}}, "wrong")
-    for arguments, named, message in (
-        ((3, vary, "wrong"), {}, "^scene: 3; take the path of a scene file$"),
-        (("small.yaml", vary, "wrong"), {"workers": 0}, "^workers: 0; take a whole number, 1 to 1024, or None$"),
-        (
-            ("small.yaml", vary, "wrong"),
-            {"workers": 10**30},
-            "^workers: 10{30}; take a whole number, 1 to 1024, or None$",
-        ),
-        (("small.yaml", {"damping": 1j}, "wrong"), {}, "^vary, overrides: Object of type complex"),
-    ):
-        with pytest.raises(ArgumentError, match=message):
-            sweep(*arguments, **named)  # type: ignore[arg-type]
+    wrong: list[tuple[str, dict[str, Any]]] = [
+        ("scene", {"scene": 3}),
+        *(("workers", {"workers": number}) for number in (0, 10**30)),
+        ("vary", {"vary": {"damping": 1j}}),
+    ]
+    for key, argument in wrong:
+        with message.raises(ArgumentError, key):
+            sweep(**{"scene": "small.yaml", "vary": vary, "directory": "wrong", **argument})
     assert not Path("wrong").exists()
 
 
@@ -395,7 +386,9 @@ def number(row: Outcome) -> int:
     return row.run
 
 
-def test_a_run_that_cannot_be_is_refused_and_one_that_fails_is_tried_again(many: Path, pool: Pool) -> None:
+def test_a_run_that_cannot_be_is_refused_and_one_that_fails_is_tried_again(
+    many: Path, pool: Pool, message: Messages
+) -> None:
     whole = (many / "speckle.png").read_bytes()
     (many / "torn.png").write_bytes(whole[: len(whole) // 2])
     settings = {"vary": {"image": {"grid": ["speckle.png", "torn.png"]}}, "set": {"time.duration": 0.1}}
@@ -410,12 +403,9 @@ def test_a_run_that_cannot_be_is_refused_and_one_that_fails_is_tried_again(many:
         return sorted(state.done, key=number)
 
     first, second = take_all()
-    assert (first.status, first.error) == (
-        "failed",
-        "000000/frames: a file that no run has put there; move it away or choose another folder",
-    )
-    assert second.status == "refused"
-    assert second.error.startswith("image: torn.png cannot be decoded")
+    assert (first.status, second.status) == ("failed", "refused")
+    message(first.error, "000000/frames")
+    message(second.error, "image", "torn.png", hide=r"\(.*\)")
     (many / "out/runs/000000/frames").unlink()
     assert [row.status for row in take_all()] == ["complete", "refused"]
 
@@ -424,10 +414,10 @@ def end_at_once() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def test_a_pool_replaces_a_process_that_was_killed() -> None:
+def test_a_pool_replaces_a_process_that_was_killed(message: Messages) -> None:
     pool = Pool(2)
     try:
-        with pytest.raises(DiedError, match=r"^its process was ended by SIGKILL, as the system does when memory"):
+        with message.raises(DiedError, "SIGKILL"):
             pool.submit(end_at_once).result()
         first, second = (pool.submit(os.getpid).result() for _ in range(2))
         assert os.getpid() not in (first, second)
@@ -482,11 +472,11 @@ def test_a_run_whose_worker_died_is_taken_once_more(times: int, status: str) -> 
     assert ends[1].error == ("its process was ended by SIGKILL, twice" if times == 2 else "")
 
 
-def test_an_executor_that_takes_no_more_runs_is_an_error() -> None:
+def test_an_executor_that_takes_no_more_runs_is_an_error(message: Messages) -> None:
     executor = ProcessPoolExecutor(1, get_context("spawn"))
     with pytest.raises(Exception, match="terminated abruptly"):
         executor.submit(end_at_once).result()
-    with pytest.raises(MsmError, match=r"^ProcessPoolExecutor takes no more runs: .*; start the sweep again$"):
+    with message.raises(MsmError, "ProcessPoolExecutor", hide=r"(?<=runs: ).*(?=; )"):
         list(execute_tasks([RunTask(0, None, (), Path(), Path())], executor, lambda: None))  # type: ignore[arg-type]
 
 

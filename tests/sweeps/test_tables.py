@@ -34,6 +34,7 @@ from taichi_msm.sweeps.pool import Pool
 from taichi_msm.sweeps.runs import CONTACT, REPORT_FILES, Outcome, SweepResult, register_sweep
 from taichi_msm.sweeps.spec import make_sweep, run_values
 from taichi_msm.sweeps.tables import WITHOUT_MATPLOTLIB, WITHOUT_SALIB, assign_splits, write_reports
+from tests.golden import Messages
 
 VARY = {
     "damping": {"log_uniform": [1e-3, 1e-1]},
@@ -81,12 +82,11 @@ def copy_runs(ran: Path, result: SweepResult) -> None:
             shutil.copytree(ran, result.run_directory(outcome.run), dirs_exist_ok=True)
 
 
-def test_captions_are_short() -> None:
+def test_captions_are_short(message: Messages) -> None:
     keys = ["tissue.young", "probes.0.at", "probes.1.at", "probes.0.total.2", "render.light", "light"]
-    assert abbreviate_keys(keys) == ["young", "probes.0.at", "probes.1.at", "total.2", "render.light", "light"]
+    message(abbreviate_keys(keys))
     values = [23412.5, 1.2345e-5, 7, "textures/a.png", [0.51234, [1, 2.0]], {"eye": [0.1]}, True, None]
-    written = ["23400", "1.23e-05", "7", "a.png", "[0.512, [1, 2]]", "eye [0.1]", "true", "null"]
-    assert list(map(format_short, values)) == written
+    message(map(format_short, values))
 
 
 def test_the_split_follows_from_seed_and_number_alone() -> None:
@@ -112,7 +112,7 @@ def test_parameters_are_the_numbers_that_vary(make: Make) -> None:
     assert np.isnan(columns["max_displacement"]).tolist() == [run == 3 for run in range(8)]
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_sensitivity_of_a_linear_function(seed: int) -> None:
     # The variances of 3 x and y are as 9 to 1. The largest error with the first 40 seeds is 0.09.
     points = qmc.Sobol(2, seed=np.random.default_rng(seed)).random(64)
@@ -173,28 +173,27 @@ def test_the_same_results_give_the_same_bytes(make: Make, ran: Path) -> None:
     assert len(written[0]) == 6
 
 
-def test_a_damaged_picture_is_no_end(make: Make, ran: Path) -> None:
+def test_a_damaged_picture_is_no_end(make: Make, ran: Path, message: Messages) -> None:
     result = make()
     copy_runs(ran, result)
     damaged = result.run_directory(1) / "frames" / "0004.png"
     damaged.write_bytes(damaged.read_bytes()[:100])
-    names, (note,) = write(result)
+    names, notes = write(result)
     assert CONTACT in names
-    assert note.startswith(f"{CONTACT} lacks the frames of 1 runs, for example: {damaged} cannot be decoded")
+    message(notes, CONTACT, "0004.png", hide=r"(?<=decoded).*")
 
 
 @pytest.mark.parametrize(("kept", "difference"), [("frames", 0), ("animation.gif", 10), ("trajectory.npz", 0)])
-def test_the_last_frame_comes_from_any_output(make: Make, ran: Path, kept: str, difference: float) -> None:
+def test_the_last_frame_comes_from_any_output(make: Make, ran: Path, kept: str, difference: float, pool: Pool) -> None:
     """An animation has fewer colours; what is drawn again is the same."""
     result = make(2)
     copy_runs(ran, result)
-    with Pool(1) as pool:
-        write(result, pool)
-        first = np.asarray(Image.open(result.directory / CONTACT)).astype(int)
-        for run, name in itertools.product(range(2), {"frames", "animation.gif", "trajectory.npz"} - {kept}):
-            path = result.run_directory(run) / name
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
-        assert write(result, pool)[1] == []
+    write(result, pool)
+    first = np.asarray(Image.open(result.directory / CONTACT)).astype(int)
+    for run, name in itertools.product(range(2), {"frames", "animation.gif", "trajectory.npz"} - {kept}):
+        path = result.run_directory(run) / name
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    assert write(result, pool)[1] == []
     assert np.abs(np.asarray(Image.open(result.directory / CONTACT)) - first).mean() <= difference
 
 
@@ -309,10 +308,12 @@ def test_a_data_set_names_its_complete_runs(make: Make) -> None:
     assert "numpy" in described["versions"]
 
 
-def test_runs_of_a_data_set_have_their_own_size(small: Path) -> None:
+def test_runs_of_a_data_set_have_their_own_size(small: Path, pool: Pool) -> None:
     sizes = [[16, 12], [12, 16]]
     vary = {"render.size": {"grid": sizes}}
-    outcomes = list(sweep("small.yaml", vary, "out", workers=1, overrides={"time.duration": 0.1, "output": ["png"]}))
+    outcomes = list(
+        sweep("small.yaml", vary, "out", executor=pool, overrides={"time.duration": 0.1, "output": ["png"]})
+    )
     assert {outcome.status for outcome in outcomes} == {"complete"}
     rows = json.loads(Path("out/dataset.json").read_text())["runs"]
     assert [row["size"] for row in rows] == sizes
@@ -324,10 +325,10 @@ def test_runs_of_a_data_set_have_their_own_size(small: Path) -> None:
 
 
 @pytest.mark.parametrize("name", REPORT_FILES)
-def test_what_is_no_file_of_a_sweep_stays(make: Make, name: str) -> None:
+def test_what_is_no_file_of_a_sweep_stays(make: Make, name: str, message: Messages) -> None:
     result = make()
     shutil.rmtree(result.directory / "runs")
     (result.directory / name).write_text("mine")
-    with pytest.raises(ForeignError, match=name):
+    with message.raises(ForeignError, name):
         register_sweep(result.directory, result.sweep)
     assert (result.directory / name).read_text() == "mine"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -16,7 +15,6 @@ from PIL import Image
 
 from taichi_msm import load_scene, run
 from taichi_msm.errors import FilesError, SceneError
-from taichi_msm.model.loads import average_loads
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.system.runtime import Device
 from taichi_msm.view import overlay, recording
@@ -26,6 +24,7 @@ from taichi_msm.view.recording import Captures
 from taichi_msm.view.script import record_film
 from taichi_msm.view.session import Session, divide_frames
 from taichi_msm.view.tools import PositionControlledTool
+from tests.golden import Messages
 from tests.outputs import duration
 from tests.scenes import plan_of
 
@@ -92,15 +91,16 @@ def pixel_of(session: Session, row: int, col: int) -> tuple[float, float]:
 def test_a_press_at_a_pixel_dimples_what_is_seen_there(begin: Begin) -> None:
     session = begin(TILTED)
     rows, cols = session.scene.sheet.points
-    for row, col in [(8, 6), (12, 12), (17, 18)]:
+    for row, col, pull in [(8, 6, False), (12, 12, True), (17, 18, False)]:
         # The second and third time the sheet still swings, and the camera is elsewhere.
         session.handle(Turn(col - 6, 0))
-        pixel = pixel_of(session, row, col)
-        session.handle(Press(*pixel))
+        session.handle(Press(*pixel_of(session, row, col), pull=pull))
         advance(session, 12)
         cell = np.array(session.tool.position) * [cols - 1, rows - 1]
         assert cell == pytest.approx([col, row], abs=0.25), "a pixel is a fifth of a cell wide"
-        assert (-session.positions()[..., 2]).argmax() == row * cols + col
+        height = session.positions()[..., 2] * (1 if pull else -1)
+        assert height.argmax() == row * cols + col
+        assert height[row, col] > 0.003
         assert session.displacement() == pytest.approx(displacement(session)[row, col], rel=0.1)
         session.handle(Release())
         advance(session, 10)
@@ -150,7 +150,7 @@ def test_a_drag_moves_the_control_point_with_the_pointer(begin: Begin) -> None:
         ({"time.precision": "f64", "springs.virtual_active": "always"}, True),
         ({"time.step": 0.0025, "sheet.fixed": "none"}, False),
     ],
-    ids=["f32", "f64 beside the scene's probes", "free, given step"],
+    ids=["f32", "f64 with the scene's probes", "free, given step"],
 )
 def test_run_repeats_a_session_to_the_bit(overrides: dict[str, Any], play: bool, begin: Begin) -> None:
     session = begin({**TILTED, "render.size": [40, 30], **overrides}, play=play)
@@ -184,29 +184,6 @@ def test_run_repeats_a_session_to_the_bit(overrides: dict[str, Any], play: bool,
     # Seen as it was seen at the end.
     assert load_scene(written).render.wireframe
     assert load_scene(written).render.camera.eye == session.recorded_scene().render.camera.eye  # type: ignore[union-attr]
-
-
-def test_pulling_lifts_what_pushing_presses_down(begin: Begin) -> None:
-    session = begin(TILTED)
-    for pull, sign in [(False, -1), (True, 1)]:
-        session.handle(Press(*pixel_of(session, 12, 12), pull=pull))
-        advance(session, 10)
-        assert session.positions()[12, 12, 2] * sign > 0.003
-        session.handle(Key("r"))
-
-
-def test_virtual_springs_vanish_when_the_tool_is_released(begin: Begin) -> None:
-    session = begin({**TILTED, "springs.virtual": 500.0})
-    session.handle(Press(60, 50))
-    advance(session, 15)
-    session.handle(Release())
-    advance(session, 1)
-    recorded = session.recorded_scene()
-    count = plan_of(recorded).grid.steps_per_frame
-    active = average_loads(plan_of(recorded), 0, 16 * count).active
-    assert (active[: 15 * count] == 1).all()
-    assert active[15 * count] == 0.5, "the mean at the instant of the release"
-    assert (active[15 * count + 1 :] == 0).all()
 
 
 def test_time_stands_still_when_paused_and_goes_on_frame_by_frame(begin: Begin) -> None:
@@ -253,6 +230,15 @@ def test_percent_by_wheel_and_keys_stays_between_nothing_and_all(begin: Begin) -
         assert session.tool.strength == expected
 
 
+def test_the_light_goes_back_to_that_of_the_scene(begin: Begin) -> None:
+    session = begin({"render.shading": "tissue"})
+    shadings = []
+    for _ in range(2):
+        session.handle(Key("l"))
+        shadings.append(session.viewport.render.shading)
+    assert shadings == ["none", "tissue"]
+
+
 def test_every_key_changes_what_it_says(begin: Begin) -> None:
     session = begin(TILTED)
     session.handle(Press(60, 50))
@@ -286,10 +272,10 @@ def test_turning_follows_the_pointer(begin: Begin) -> None:
     assert session.viewport.view.axes[2, 2] > before, "pushed down, the sheet shows more of its face"
 
 
-def test_a_press_beside_the_sheet_says_so(begin: Begin) -> None:
+def test_a_press_beside_the_sheet_says_so(begin: Begin, message: Messages) -> None:
     session = begin(TILTED)
     session.handle(Press(2, 2))
-    assert session.notice == "no tissue at pixel 2, 2"
+    message(session.notice, "2, 2")
     advance(session, 4)
     assert (displacement(session) < AT_REST).all()
     assert not session.tool.engaged
@@ -329,14 +315,14 @@ def test_another_picture_of_the_same_name_stays(begin: Begin) -> None:
     assert load_scene("captures/session-1.yaml").image == "captures/speckle-2.png"
 
 
-def test_a_film_shows_as_much_time_as_went_by(begin: Begin) -> None:
+def test_a_film_shows_as_much_time_as_went_by_since_it_began(begin: Begin) -> None:
     session = begin({**TILTED, "time.frames_per_second": 10})
     assert (session.frame_rate, session.subframes) == (60, 6)
+    advance(session, 60)
     session.handle(Key("g"))
     for _ in range(6):
         # Slower than the film: every picture is of two of its frames.
-        for _ in range(12):
-            session.advance()
+        advance(session, 12)
         session.handle(StrengthChange(-5))
         session.picture()
     session.close()
@@ -345,26 +331,15 @@ def test_a_film_shows_as_much_time_as_went_by(begin: Begin) -> None:
     )
 
 
-def test_a_film_begins_when_it_is_begun(begin: Begin) -> None:
-    session = begin({**TILTED, "time.frames_per_second": 10})
-    advance(session, 60)
-    session.handle(Key("g"))
-    for _ in range(4):
-        advance(session, 6)
-        session.picture()
-    session.handle(Key("g"))
-    assert duration("captures/film-1.gif") == 500
-
-
-def test_a_film_without_a_picture_is_none(begin: Begin) -> None:
+def test_a_film_without_a_picture_is_none(begin: Begin, message: Messages) -> None:
     session = begin(TILTED)
     session.handle(Key("g"))
     session.handle(Key("g"))
-    assert session.notice == "no film was saved: it had no picture yet"
+    message(session.notice, "film")
     assert not Path("captures").exists()
 
 
-def test_a_film_that_cannot_go_on_ends_and_the_session_goes_on(begin: Begin) -> None:
+def test_a_film_that_cannot_go_on_ends_and_the_session_goes_on(begin: Begin, message: Messages) -> None:
     session = begin(TILTED)
     session.handle(Key("g"))
     session.picture()
@@ -372,7 +347,7 @@ def test_a_film_that_cannot_go_on_ends_and_the_session_goes_on(begin: Begin) -> 
     while not session.notice:
         session.advance()
         session.picture()
-    assert session.notice.startswith("captures: cannot write: ")
+    message(session.notice, "captures")
     assert not Path("captures").exists()
     session.handle(Key("g"))
     session.picture()
@@ -396,7 +371,9 @@ def test_a_film_shows_the_tissue_alone(begin: Begin) -> None:
     assert np.abs(shown.astype(int) - alone).mean() > 15
 
 
-def test_a_session_too_long_for_a_file_says_so_before(begin: Begin, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_session_too_long_for_a_file_says_so_before(
+    begin: Begin, monkeypatch: pytest.MonkeyPatch, message: Messages
+) -> None:
     for module in (live_session, recording):
         monkeypatch.setattr(module, "MAX_NODES", 1100)
     session = begin(TILTED)
@@ -406,9 +383,9 @@ def test_a_session_too_long_for_a_file_says_so_before(begin: Begin, monkeypatch:
         session.handle(Drag(50 + n % 20, 50))
         session.advance()
         told.append(session.notice)
-    assert told[200] == "this session will soon be too long for a scene: save it now (w), then reset it (r)"
+    message(told[200], "(w)", "(r)")
     assert sum(notice != "" for notice in told) <= 160, "once"
-    with pytest.raises(FilesError, match=r"^this session is too long for a scene file; reset it, and do less$"):
+    with message.raises(FilesError, "reset"):
         session.handle(Key("w"))
     assert list(Path("captures").iterdir()) == [Path("captures/speckle.png")]
     session.handle(Key("r"))
@@ -416,12 +393,12 @@ def test_a_session_too_long_for_a_file_says_so_before(begin: Begin, monkeypatch:
     assert load_scene("captures/session-1.yaml").time.duration == pytest.approx(1 / session.frame_rate)
 
 
-def test_a_film_ends_where_the_session_diverges(begin: Begin) -> None:
+def test_a_film_ends_where_the_session_diverges(begin: Begin, message: Messages) -> None:
     session = begin({**TILTED, "probes.0.force": [0, 0, -1e12]})
     said: list[str] = []
     record_film(session, Path("a.gif"), 2.0, [(2, Press(60, 50)), (90, Key("w"))], notify=said.append)
     assert said[0] == session.divergence_error
-    assert re.fullmatch(r"the film ends at 0\.\d+ s, before some of the script's events", said[1])
+    message(said[1], "script", hide=r"0\.\d+")
     assert duration("a.gif") < 500
 
 
@@ -453,24 +430,24 @@ def test_a_sheet_that_nothing_holds_may_fly_after_a_press(begin: Begin) -> None:
     assert displacement(session).max() > 10 * 0.3
 
 
-def test_what_cannot_be_kept_is_told_and_nothing_is_lost(begin: Begin) -> None:
+def test_what_cannot_be_kept_is_told_and_nothing_is_lost(begin: Begin, message: Messages) -> None:
     Path("captures").write_text("no folder")
     session = begin(TILTED)
     session.handle(Press(60, 50))
     advance(session, 5)
     for key in "pgw":
-        with pytest.raises(FilesError, match=r"^captures: cannot write: .*; choose another --out$"):
+        with message.raises(FilesError, "captures", "--out"):
             session.handle(Key(key))
     advance(session, 5)
     assert session.frame == 10
 
 
-def test_a_session_that_diverged_says_so_and_can_be_reset(begin: Begin) -> None:
+def test_a_session_that_diverged_says_so_and_can_be_reset(begin: Begin, message: Messages) -> None:
     # Strong enough to go wrong in the fourth frame, and not before.
     session = begin({**TILTED, "probes.0.force": [0, 0, -3e6]})
     session.handle(Press(60, 50))
     advance(session, 10)
-    assert session.divergence_error.startswith("diverged before ")
+    message(session.divergence_error, "diverged", hide=r"\d\S*")
     assert session.notice == session.divergence_error
     frame = session.frame
     advance(session, 3)
@@ -484,12 +461,9 @@ def test_a_session_that_diverged_says_so_and_can_be_reset(begin: Begin) -> None:
     assert np.isfinite(advance(session, 3)).all()
 
 
-@pytest.mark.parametrize(
-    ("rate", "step", "parts"),
-    [(25, "auto", 2), (30, "auto", 2), (60, "auto", 1), (10, "auto", 6), (120, "auto", 1), (24, "auto", 2)],
-)
-def test_a_session_has_as_many_frames_as_a_screen_shows(rate: float, step: Any, parts: int, small: Path) -> None:
-    scene = load_scene("small.yaml", {"time.frames_per_second": rate, "time.duration": 1, "time.step": step})
+@pytest.mark.parametrize(("rate", "parts"), [(25, 2), (30, 2), (60, 1), (10, 6), (120, 1), (24, 2)])
+def test_a_session_has_as_many_frames_as_a_screen_shows(rate: float, parts: int, small: Path) -> None:
+    scene = load_scene("small.yaml", {"time.frames_per_second": rate, "time.duration": 1})
     live, found = divide_frames(plan_of(scene))
     assert (live.scene.time.frames_per_second, found) == (rate * parts, parts)
 
@@ -502,36 +476,24 @@ def test_a_given_step_stays(small: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("overrides", "play", "expected"),
+    ("overrides", "play", "key"),
     [
-        ({"probes": []}, False, "probes: empty; the tool takes its force from the first probe, add one"),
-        ({"image": None, "output": []}, False, "image: missing; a session needs one, name it here or with --image"),
-        (
-            {"probes": [{"force": [0, 0, -1]}] * 16},
-            True,
-            "probes: 16 leave no room for the tool; remove one, or leave out --play",
-        ),
+        ({"probes": []}, False, "probes"),
+        ({"image": None, "output": []}, False, "image"),
+        ({"probes": [{"force": [0, 0, -1]}] * 16}, True, "probes"),
     ],
+    ids=["no probe", "no picture", "16 probes"],
 )
-def test_scenes_that_nobody_can_press(overrides: dict[str, Any], play: bool, expected: str, begin: Begin) -> None:
-    with pytest.raises(SceneError) as caught:
+def test_scenes_that_nobody_can_press(
+    overrides: dict[str, Any], play: bool, key: str, begin: Begin, message: Messages
+) -> None:
+    with message.raises(SceneError, key):
         begin(overrides, play=play)
-    assert caught.value.lines == (expected,)
 
 
-@pytest.mark.parametrize(
-    ("metres", "said"),
-    [
-        (0.0, "0 mm"),
-        (2.5e-9, "2.5e-09 m"),
-        (1.33e-7, "0.000133 mm"),
-        (8.284e-4, "0.828 mm"),
-        (0.0621, "62.1 mm"),
-        (12.3, "12.3 m"),
-    ],
-)
-def test_lengths_are_said_in_a_legible_unit(metres: float, said: str) -> None:
-    assert live_session.length(metres) == said
+def test_legible_units(message: Messages) -> None:
+    message(map(live_session.length, (0.0, 2.5e-9, 1.33e-7, 8.284e-4, 0.0621, 12.3)))
+    message(map(live_session.newtons, (0.0, 0.514, 9.63, 123.4)))
 
 
 ROD = {"probes.0.instrument": {"radius": 0.01, "shaft": [0.3, -0.2, 1], "length": 0.2}}
@@ -558,22 +520,6 @@ def test_the_instrument_is_under_the_pointer(begin: Begin) -> None:
     session.handle(Hover(20, 20))
     held = rod_pixels(session)
     assert any(abs(column - 60) <= 4 and abs(row - 55) <= 4 for column, row in held), "while it presses it stays"
-
-
-def test_without_an_instrument_the_pointer_changes_nothing(begin: Begin) -> None:
-    session = begin(TILTED)
-    before = session.picture()
-    session.handle(Hover(40, 60))
-    np.testing.assert_array_equal(session.picture(), before)
-
-
-def test_the_light_goes_back_to_that_of_the_scene(begin: Begin) -> None:
-    session = begin({**TILTED, "render.shading": "tissue"})
-    before = session.picture()
-    session.handle(Key("l"))
-    assert session.viewport.render.shading == "none"
-    session.handle(Key("l"))
-    np.testing.assert_array_equal(session.picture(), before)
 
 
 # A tool that can be held by position, as its instrument is wide enough to touch several points.
@@ -605,9 +551,11 @@ def moved(session: Session) -> PositionControlledTool:
     [
         ({}, False),
         ({"time.precision": "f64", "springs.virtual_active": "always"}, True),
-        ({"time.step": 0.0025, "time.frames_per_second": 20, "sheet.fixed": "none"}, False),
+        pytest.param(
+            *({"time.step": 0.0025, "time.frames_per_second": 20, "sheet.fixed": "none"}, False), marks=pytest.mark.slow
+        ),
     ],
-    ids=["f32", "f64 beside the scene's probes", "free, given step"],
+    ids=["f32", "f64 with the scene's probes", "free, given step"],
 )
 def test_run_repeats_a_session_by_position_to_the_bit(overrides: dict[str, Any], play: bool, begin: Begin) -> None:
     session = begin({**BY_HAND, "time.precision": "f32", "render.size": [40, 30], **overrides}, play=play)
@@ -691,35 +639,33 @@ def test_a_tool_that_the_scene_moves_is_held_by_position_from_the_start(begin: B
     assert (displacement(session) < AT_REST).all()
 
 
+FORCE: dict[str, Any] = {"force": [0, 0, -2000]}
+
+
 @pytest.mark.parametrize(
-    ("probes", "said"),
+    ("probe", "word"),
     [
-        (
-            [{"force": [0, 0, -2000]}],
-            "a tool that is held so needs an instrument; give a probe of the scene one",
-        ),
-        (
-            [{"path": [[0, 0.5, 0.5, 0.05]], "instrument": WIDE}],
-            "a tool that is held so needs a force; give a probe of the scene one",
-        ),
-        (
-            [{"force": [0, 0, -2000], "instrument": {**WIDE, "shaft": [0, 0, -1]}}],
-            "this tool cannot be held by position: its shaft leads down into the sheet; let it lead up",
-        ),
+        (FORCE, "instrument"),
+        ({"path": [[0, 0.5, 0.5, 0.05]], "instrument": WIDE}, "force"),
+        ({**FORCE, "instrument": {**WIDE, "shaft": [0, 0, -1]}}, "shaft"),
     ],
+    ids=["no instrument", "no force", "from below"],
 )
-def test_a_tool_that_cannot_be_held_otherwise(probes: list[dict[str, Any]], said: str, begin: Begin) -> None:
-    session = begin({**TILTED, "probes": probes})
+def test_a_tool_that_cannot_be_held_otherwise(
+    probe: dict[str, Any], word: str, begin: Begin, message: Messages
+) -> None:
+    session = begin({**TILTED, "probes": [probe]})
     tool = session.tool
     advance(session, 2)
     session.handle(Key("f"))
-    assert (session.notice, session.tool, session.frame) == (said, tool, 2)
+    message(session.notice, word)
+    assert (session.tool, session.frame) == (tool, 2)
 
 
-def test_a_tool_too_thin_for_the_points_says_so(begin: Begin) -> None:
+def test_a_tool_too_thin_for_the_points_says_so(begin: Begin, message: Messages) -> None:
     session = begin({**TILTED, "probes.0.instrument": {**WIDE, "radius": 0.01}})
     session.handle(Key("f"))
-    assert session.notice.startswith("probes.0: the points are 0.0125 m apart, more than half the radius")
+    message(session.notice, "probes.0", "radius")
 
 
 def bar_of(picture: np.ndarray) -> float:
@@ -730,7 +676,7 @@ def bar_of(picture: np.ndarray) -> float:
     return float((row[: right + 1] == 255).sum() / (overlay.BAR_LENGTH_LETTERS * 11))
 
 
-def test_the_force_felt_is_shown_with_a_bar(begin: Begin) -> None:
+def test_the_force_felt_is_shown_with_a_bar(begin: Begin, message: Messages) -> None:
     session = begin({**BY_HAND, "render.size": [240, 200]})
     session.handle(Key("f"))
     bare = session.picture()
@@ -741,25 +687,19 @@ def test_the_force_felt_is_shown_with_a_bar(begin: Begin) -> None:
         session.handle(Strength(percent))
         advance(session, 20)
         hardest = max(hardest, session.felt_force())
-    said = session._figure_lines("")[0]
-    assert said == f"press 45 mm deep  ·  {live_session.newtons(session.felt_force())}"
+    (figures, *_) = session._figure_lines("")
+    assert figures.endswith(live_session.newtons(session.felt_force()))
+    message(figures, "45 mm", hide=r"[\d.]+ N")
     bar = overlay.ValueBar(session.felt_force(), hardest, "N")
     assert bar_of(session.picture()) == pytest.approx(session.felt_force() / bar.end, abs=0.02)
     session.handle(Key("r"))
     session.handle(Strength(40))
-    assert session._figure_lines("")[0] == "next press 30 mm deep  ·  0 N"
+    message(session._figure_lines("")[0], "30 mm", "0 N")
     session.handle(Key("i"))
     session.handle(Key("i"))
     assert (session.picture()[40:70, :130] == bare[40:70, :130]).all(), "no bar any more"
 
 
-@pytest.mark.parametrize(
-    ("largest", "end"), [(0.5, 0.5), (0.51, 1), (1, 1), (1.01, 2), (2.4, 5), (7, 10), (0.3, 0.5), (3e-4, 5e-4)]
-)
+@pytest.mark.parametrize(("largest", "end"), [(0.51, 1), (1, 1), (1.01, 2), (2.4, 5), (7, 10), (3e-4, 5e-4)])
 def test_a_bar_ends_at_a_round_number(largest: float, end: float) -> None:
     assert overlay.ValueBar(0.1, largest, "N").end == pytest.approx(end)
-
-
-@pytest.mark.parametrize(("force", "said"), [(0.0, "0 N"), (0.514, "0.51 N"), (9.63, "9.6 N"), (123.4, "123 N")])
-def test_forces_are_said_with_the_digits_that_matter(force: float, said: str) -> None:
-    assert live_session.newtons(force) == said

@@ -38,10 +38,10 @@ def percents(hand: ForceControlledTool, first: int, count: int) -> list[float]:
     return found
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_every_frame_has_the_loads_of_the_record(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    hand, frames = tool(), 120
+    hand, frames = tool(), 90
     seen: list[Probe] = []
     for frame in range(frames):
         for _ in range(rng.integers(0, 3)):
@@ -78,19 +78,6 @@ def test_a_hand_takes_time_to_press_and_none_to_let_go() -> None:
     assert (12 / RATE, 100.0) in load
     assert (12 / RATE, 0.0) in load
     assert len(load) == 1 + 10 + 3, "what does not change needs no keys"
-
-
-def test_pulling_is_pressing_with_a_force_turned_around() -> None:
-    hand = tool()
-    hand.press((0.4, 0.6), -1)
-    assert percents(hand, 0, 10)[-1] == -100
-
-
-def test_a_click_shorter_than_a_frame_presses_for_one() -> None:
-    hand = tool()
-    hand.press((0.4, 0.6), 1)
-    hand.release()
-    assert percents(hand, 0, 3) == pytest.approx([10, 0, 0])
 
 
 def test_pressing_elsewhere_at_once_lets_go_for_a_frame() -> None:

@@ -27,6 +27,7 @@ from taichi_msm.view.events import Drag, Hover, Key, Press, Release, Strength, S
 from taichi_msm.view.script import load_script, schedule_events
 from taichi_msm.view.window import MAX_DELAY_S, QUIT, InputReader, Pacing, fit_picture, initial_window_size
 from tests.conftest import Program
+from tests.golden import Messages
 from tests.outputs import duration
 from tests.telling import Telling
 
@@ -39,10 +40,11 @@ events:
 """
 
 
-def test_a_script_is_done_and_filmed(small: Path, program: Program) -> None:
+def test_a_script_is_done_and_filmed(small: Path, program: Program, message: Messages) -> None:
     Path("script.yaml").write_text(SCRIPT)
     done = program("view", "small.yaml", "--record", "films/live.gif", "--seconds", "1", "--script", "script.yaml")
-    assert (done.returncode, done.stderr) == (0, "0.7 s: saved output/small-live/session-1.yaml\n")
+    assert done.returncode == 0
+    message(done.stderr, "0.7 s", "output/small-live/session-1.yaml")
     assert done.stdout == "films/live.gif\noutput/small-live/session-1.yaml\n"
     assert [path.name for path in Path("films").iterdir()] == ["live.gif"], "and nothing is left beside it"
     with Image.open("films/live.gif") as film:
@@ -55,117 +57,69 @@ def test_a_script_is_done_and_filmed(small: Path, program: Program) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "expected"),
+    "arguments",
     [
-        (["--record", "a.gif"], "taichi-msm: --record FILE.gif and --seconds N go together (see taichi-msm --help)"),
-        (["--seconds", "2"], "taichi-msm: --record FILE.gif and --seconds N go together (see taichi-msm --help)"),
-        (
-            ["--script", "a.yaml"],
-            "taichi-msm: --script needs --record; in the window you press with the mouse (see taichi-msm --help)",
-        ),
-        (
-            ["--record", "a.png", "--seconds", "1"],
-            "taichi-msm: Invalid value for --record: a.png is not the name of a GIF; let it end in .gif "
-            "(see taichi-msm --help)",
-        ),
-        (
-            ["--record", "a.gif", "--seconds", "0"],
-            "taichi-msm: Invalid value for '--seconds': 0.0 is not in the range 0<x<=3600. (see taichi-msm --help)",
-        ),
-        (
-            ["--record", "a.gif", "--seconds", "nan"],
-            "taichi-msm: Invalid value for --seconds: nan is not a number of seconds (see taichi-msm --help)",
-        ),
-        (["--record", "a.gif", "--seconds", "1", "--script", "no.yaml"], "no.yaml: no such file or directory"),
-        (
-            ["--record", "a.gif", "--seconds", "1", "--set", "probes=[]"],
-            "small.yaml: probes: empty; the tool takes its force from the first probe, add one",
-        ),
+        "--record a.gif",
+        "--script a.yaml",
+        "--record a.png --seconds 1",
+        "--record a.gif --seconds 0",
+        "--record a.gif --seconds nan",
+        "--record a.gif --seconds 1 --script no.yaml",
+        "--record a.gif --seconds 1 --set probes=[]",
     ],
 )
-def test_what_view_refuses(
-    arguments: list[str], expected: str, small: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["view", "small.yaml", *arguments]) == 2
+def test_what_view_refuses(arguments: str, small: Path, capsys: pytest.CaptureFixture[str], message: Messages) -> None:
+    assert main(["view", "small.yaml", *arguments.split()]) == 2
     said = capsys.readouterr()
-    assert (said.out, said.err) == ("", expected + "\n")
+    assert said.out == ""
+    # What click says of a range depends on its version.
+    message(said.err, hide=r"0\.0 is not.*(?= \(see)")
     assert sorted(path.name for path in small.iterdir()) == ["small.yaml", "speckle.png"]
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("", ["s.yaml:1:1: no keys; a script needs at least events"]),
-        ("- a", ['s.yaml:1:1: ["a"] is not a script; expected keys such as events']),
-        ("events: 3", ["s.yaml:1:1: events: 3 is not allowed; expected a list of mappings with t and do"]),
-        (
-            "events:\n  - {do: press, at: [1, 2]}",
-            ["s.yaml:2:5: events.0.t: missing; expected a number from 0 to 3600, in seconds"],
-        ),
-        (
-            "events:\n  - {t: 1, do: pres}",
-            [
-                's.yaml:2:12: events.0.do: "pres" is not allowed; '
-                "expected press, pull, drag, release, turn, percent or key; did you mean 'press'?"
-            ],
-        ),
-        ("events:\n  - {t: 1, do: press}", ["s.yaml:2:5: events.0.at: missing; press needs it"]),
-        ("events:\n  - {t: 1, do: release, at: [1, 2]}", ["s.yaml:2:25: events.0.at: release takes none; remove it"]),
-        (
-            "events:\n  - {t: 1, do: drag, at: [1, 2]}",
-            ["s.yaml:2:5: events.0: drag when nothing is pressed; put a press or a pull before it"],
-        ),
-        (
-            "events:\n  - {t: 1, do: press, at: [1, 2]}\n  - {t: 2, do: release}\n  - {t: 3, do: release}",
-            ["s.yaml:4:5: events.2: release when nothing is pressed; put a press or a pull before it"],
-        ),
-        (
-            "events:\n  - {t: 1, do: press, at: [39.4, 29.6]}\n  - {t: 2, do: pull, at: [-1, 2]}",
-            [
-                "s.yaml:2:23: events.0.at: [39.4, 29.6] is outside of the picture, which has 40 x 30 pixels",
-                "s.yaml:3:22: events.1.at: [-1, 2] is outside of the picture, which has 40 x 30 pixels",
-            ],
-        ),
-        (
-            "events:\n  - {t: 1.0e+9, do: turn, by: [1, 2], seconds: 1.0e+9}",
-            [
-                "s.yaml:2:6: events.0.t: 1000000000.0 is not allowed; expected a number from 0 to 3600, in seconds",
-                "s.yaml:2:39: events.0.seconds: 1000000000.0 is not allowed; "
-                "expected a number from 0 to 3600, in seconds",
-            ],
-        ),
-        (
-            "events:\n  - {t: 1, do: press, at: [1, 2], seconds: 1}",
-            ["s.yaml:2:35: events.0.seconds: press takes no time; remove it"],
-        ),
-        (
-            "events:\n  - {t: 1, do: key, name: q}",
-            [
-                "s.yaml:2:21: events.0.name: there is no key 'q' here; expected one of: up, down, f, c, t, o, m, "
-                "l, space, ., r, p, g, w, i, h"
-            ],
-        ),
-        (
-            "events:\n  - {t: 1, do: turn, by: [1, 2], seconds: 2}\n  - {t: 2, do: key, name: m}",
-            ["s.yaml:3:5: events.1: begins at 2 s, before the one above ends at 3 s; let them follow each other"],
-        ),
-        (
-            "events:\n  - {t: 1, do: percent, to: 101}\nfoo: 1",
-            [
-                "s.yaml:2:25: events.0.to: 101 is not allowed; expected for percent a number from -100 to 100",
-                "s.yaml:3:1: foo: unknown key; allowed: size, events",
-            ],
-        ),
-    ],
-)
+# Scripts with a fault, and where it is.
+FAULTS = {
+    "empty": ("", "1:1"),
+    "list": ("- a", "1:1"),
+    "events no list": ("events: 3", "1:1"),
+    "no time": ("events:\n  - {do: press, at: [1, 2]}", "2:5: events.0.t"),
+    "unknown action": ("events:\n  - {t: 1, do: pres}", "2:12: events.0.do"),
+    "no place": ("events:\n  - {t: 1, do: press}", "2:5: events.0.at"),
+    "place of a release": ("events:\n  - {t: 1, do: release, at: [1, 2]}", "2:25: events.0.at"),
+    "drag unpressed": ("events:\n  - {t: 1, do: drag, at: [1, 2]}", "2:5: events.0"),
+    "released twice": (
+        "events:\n  - {t: 1, do: press, at: [1, 2]}\n  - {t: 2, do: release}\n  - {t: 3, do: release}",
+        "4:5: events.2",
+    ),
+    "outside": (
+        "events:\n  - {t: 1, do: press, at: [39.4, 29.6]}\n  - {t: 2, do: pull, at: [-1, 2]}",
+        "2:23: events.0.at",
+        "3:22: events.1.at",
+    ),
+    "late": (
+        "events:\n  - {t: 1.0e+9, do: turn, by: [1, 2], seconds: 1.0e+9}",
+        "2:6: events.0.t",
+        "2:39: events.0.seconds",
+    ),
+    "press with seconds": ("events:\n  - {t: 1, do: press, at: [1, 2], seconds: 1}", "2:35: events.0.seconds"),
+    "unknown key": ("events:\n  - {t: 1, do: key, name: q}", "2:21: events.0.name"),
+    "overlap": (
+        "events:\n  - {t: 1, do: turn, by: [1, 2], seconds: 2}\n  - {t: 2, do: key, name: m}",
+        "3:5: events.1",
+    ),
+    "two faults": ("events:\n  - {t: 1, do: percent, to: 101}\nfoo: 1", "2:25: events.0.to", "3:1: foo"),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
 def test_what_is_wrong_with_a_script(
-    text: str, expected: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, message: Messages
 ) -> None:
+    text, *places = FAULTS[name]
     monkeypatch.chdir(tmp_path)
     Path("s.yaml").write_text(text)
-    with pytest.raises(SceneError) as caught:
+    with message.raises(SceneError, *places):
         load_script("s.yaml", (40, 30))
-    assert list(caught.value.lines) == expected
 
 
 def test_events_of_a_script(tmp_path: Path) -> None:
@@ -193,18 +147,17 @@ events:
     ]
 
 
-def test_without_a_display_it_says_what_to_do(small: Path, program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_display_it_says_what_to_do(
+    small: Path, program: Program, monkeypatch: pytest.MonkeyPatch, message: Messages
+) -> None:
     for display in ("", ":54321"):
         monkeypatch.setenv("DISPLAY", display)
         done = program("view", "small.yaml")
-        expected = (
-            "no window can be opened (SDL: x11,wayland not available); set DISPLAY (or WAYLAND_DISPLAY), or film "
-            "without one: --record FILE.gif --seconds N"
-        )
-        assert (done.returncode, done.stdout, done.stderr) == (2, "", expected + "\n")
+        assert (done.returncode, done.stdout) == (2, "")
+        message(done.stderr, "DISPLAY", "--record", hide=r"(?<=SDL: )[^)]*")
 
 
-def test_an_interrupted_film_leaves_the_one_that_was_there(small: Path) -> None:
+def test_an_interrupted_film_leaves_the_one_that_was_there(small: Path, message: Messages) -> None:
     Path("live.gif").write_bytes(b"before")
     filming = ["view", "small.yaml", "--record", "live.gif", "--seconds", "3600"]
     with Telling(*filming, stderr=subprocess.PIPE) as process:
@@ -212,7 +165,7 @@ def test_an_interrupted_film_leaves_the_one_that_was_there(small: Path) -> None:
         process.send_signal(signal.SIGINT)
         _, error = process.communicate(timeout=60)
         # On a slow machine lines of progress come first.
-        assert error.splitlines()[-1] == "interrupted; no film was written"
+        message(error.splitlines()[-1], "interrupted")
     assert process.returncode == 130
     assert Path("live.gif").read_bytes() == b"before"
     assert sorted(path.name for path in small.iterdir()) == ["live.gif", "small.yaml", "speckle.png"]
@@ -226,35 +179,30 @@ def test_a_script_is_taken_event_by_event(tmp_path: Path) -> None:
     assert [frame for frame, _ in islice(events, 3)] == [0, 1_000_000, 1_000_001]
 
 
-def test_a_film_that_cannot_be_written(small: Path, program: Program) -> None:
+def test_a_film_that_cannot_be_written(small: Path, program: Program, message: Messages) -> None:
     Path("films").write_text("no folder")
-    done = program("view", "small.yaml", "--record", "films/live.gif", "--seconds", "1")
-    assert (done.returncode, done.stderr) == (4, "films: cannot write: Not a directory; choose another --record\n")
     Path("folder.gif").mkdir()
-    done = program("view", "small.yaml", "--record", "folder.gif", "--seconds", "1")
-    assert (done.returncode, done.stderr) == (4, "folder.gif: a directory; choose another --record\n")
+    for film in ("films/live.gif", "folder.gif"):
+        done = program("view", "small.yaml", "--record", film, "--seconds", "1")
+        assert done.returncode == 4
+        message(done.stderr, film.split("/")[0], "--record")
 
 
-def test_what_goes_wrong_in_a_script_is_told_and_filmed(small: Path, program: Program) -> None:
-    Path("kept").write_text("no folder")
-    Path("script.yaml").write_text(
-        """\
+FAILING = """\
 events:
   - {t: 0.1, do: press, at: [0, 0]}
   - {t: 0.2, do: key, name: p}
   - {t: 5, do: release}
 """
-    )
-    size = ["--set", "render.camera=oblique"]
-    done = program(
-        "view", "small.yaml", "--record", "a.gif", "--seconds", "0.5", "--script", "script.yaml", "--out", "kept", *size
-    )
+
+
+def test_failures_of_a_script_are_told_and_filmed(small: Path, program: Program, message: Messages) -> None:
+    Path("kept").write_text("no folder")
+    Path("script.yaml").write_text(FAILING)
+    options = ["--seconds", "0.5", "--script", "script.yaml", "--out", "kept", "--set", "render.camera=oblique"]
+    done = program("view", "small.yaml", "--record", "a.gif", *options)
     assert done.returncode == 4
-    assert done.stderr.splitlines() == [
-        "0.1 s: no tissue at pixel 0, 0",
-        "the film ends at 0.5 s, before some of the script's events",
-        "kept: cannot write: Not a directory; choose another --out",
-    ]
+    message(done.stderr, "pixel 0, 0", "0.5 s", "kept")
     with Image.open("a.gif") as film:
         assert film.n_frames >= 1
 
@@ -310,36 +258,34 @@ def test_what_the_hand_does() -> None:
     assert understood(pygame.Event(pygame.QUIT)) == [QUIT]
 
 
-@pytest.mark.parametrize(
-    ("event", "name"),
-    [
-        (key(pygame.K_SPACE, " "), "space"),
-        (key(pygame.K_PERIOD, "."), "."),
-        (key(pygame.K_m, "m"), "m"),
-        (key(pygame.K_m, "M"), "m"),
-        (key(pygame.K_EQUALS, "="), "up"),
-        (key(pygame.K_KP_PLUS, "+"), "up"),
-        (key(pygame.K_UP), "up"),
-        (key(pygame.K_DOWN), "down"),
-        (key(pygame.K_MINUS, "-"), "down"),
-        (key(pygame.K_KP_MINUS, "-"), "down"),
-        (key(pygame.K_ESCAPE, "\x1b"), "q"),
-        # A French, a Swiss, and a Russian keyboard.
-        (key(pygame.K_SEMICOLON, ".", pygame.KSCAN_COMMA), "."),
-        (key(pygame.K_m, "m", pygame.KSCAN_SEMICOLON), "m"),
-        (key(pygame.K_1, "+", pygame.KSCAN_1), "up"),
-        (key(0x44C, "\u044c", pygame.KSCAN_M), "m"),
-        (key(pygame.K_c, "\x03"), None),
-        (key(pygame.K_TAB, "\t"), None),
-        (key(pygame.K_LCTRL), None),
-        (key(0xE9, "\u00e9", pygame.KSCAN_2), None),
+TYPED: dict[str | None, list[pygame.Event]] = {
+    "space": [key(pygame.K_SPACE, " ")],
+    ".": [key(pygame.K_PERIOD, "."), key(pygame.K_SEMICOLON, ".", pygame.KSCAN_COMMA)],
+    "up": [
+        *(key(pygame.K_EQUALS, "="), key(pygame.K_KP_PLUS, "+"), key(pygame.K_UP)),
+        key(pygame.K_1, "+", pygame.KSCAN_1),
     ],
-)
-def test_keys_are_what_they_type(event: pygame.Event, name: str | None) -> None:
-    hand = InputReader((400, 300))
+    "down": [key(pygame.K_DOWN), key(pygame.K_MINUS, "-"), key(pygame.K_KP_MINUS, "-")],
+    "q": [key(pygame.K_ESCAPE, "\x1b")],
+    # Of a French and a Russian keyboard, too.
+    "m": [
+        *(key(pygame.K_m, "m"), key(pygame.K_m, "M"), key(pygame.K_m, "m", pygame.KSCAN_SEMICOLON)),
+        key(0x44C, "\u044c", pygame.KSCAN_M),
+    ],
+    None: [
+        *(key(pygame.K_c, "\x03"), key(pygame.K_TAB, "\t"), key(pygame.K_LCTRL)),
+        key(0xE9, "\u00e9", pygame.KSCAN_2),
+    ],
+}
+
+
+@pytest.mark.parametrize("name", TYPED)
+def test_keys_are_what_they_type(name: str | None) -> None:
     expected = [Key(name)] if name else []
-    assert list(hand.events([event, key_up(event.key)], AREA)) == expected
-    assert list(hand.events([event] * 3, AREA)) == expected * (3 if name in ("up", "down") else 1), "held down"
+    for event in TYPED[name]:
+        hand = InputReader((400, 300))
+        assert list(hand.events([event, key_up(event.key)], AREA)) == expected
+        assert list(hand.events([event] * 3, AREA)) == expected * (3 if name in ("up", "down") else 1), "held down"
 
 
 def test_a_hand_lets_go_where_another_window_gets_the_release() -> None:
@@ -396,20 +342,20 @@ def shown(clock: Clock, stepping: float, drawing: float, seconds: float) -> tupl
 
 
 @pytest.mark.parametrize(
-    ("stepping", "drawing", "frames", "said"),
+    ("stepping", "drawing", "frames"),
     [
-        (0.002, 0.01, 500, "50 pictures/s"),
+        (0.002, 0.01, 500),
         # Pictures are slow: several frames for each, and time goes as it should.
-        (0.002, 0.07, 500, "13 pictures/s"),
+        (0.002, 0.07, 500),
         # Stepping is slow: no picture waits for more than it must, and time goes slower.
-        (0.05, 0.01, 190, "9 pictures/s  ·  too slow: 0.36 x real time"),
+        (0.05, 0.01, 190),
     ],
     ids=["fast", "slow pictures", "slow steps"],
 )
-def test_time_goes_as_fast_as_it_does_outside(stepping: float, drawing: float, frames: int, said: str) -> None:
+def test_time_goes_as_fast_as_it_does_outside(stepping: float, drawing: float, frames: int, message: Messages) -> None:
     found, words = shown(Clock(), stepping, drawing, 10.0)
     assert found == pytest.approx(frames, rel=0.03)
-    assert words == said
+    message(words)
 
 
 def test_what_was_missed_is_not_made_up_for() -> None:
@@ -559,7 +505,7 @@ def test_the_window(small: Path, screen: Screen) -> None:
     assert np.abs(after - before).max() > 50
 
 
-def test_the_window_by_position(small: Path, screen: Screen) -> None:
+def test_the_window_by_position_until_a_signal(small: Path, screen: Screen, message: Messages) -> None:
     live = Live(screen, "probes.0.instrument={radius: 0.04, shaft: [0.3, -0.2, 1], length: 0.3}")
     live.kept("picture", "p")
     live.hand("key", "f")
@@ -576,17 +522,9 @@ def test_the_window_by_position(small: Path, screen: Screen) -> None:
     # From 53 % of the greatest depth, a quarter of the sheet's shorter side, to as much above the sheet, and more.
     live.hand("keyup", "shift", "click", "--repeat", "20", "5")
     live.until(lambda scene: path(scene)[-1, 3] > 0.03, x=200)
-    live.hand("mouseup", "1", "key", "q")
-    assert live.process.communicate(timeout=60)[1] == ""
-
-
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_signals_close_the_window(small: Path, screen: Screen, number: int, code: int) -> None:
-    live = Live(screen)
-    live.kept("picture", "p")
-    live.process.send_signal(number)
-    assert live.process.communicate(timeout=60)[1].splitlines()[-1] == "interrupted"
-    assert live.process.returncode == code
+    live.process.send_signal(signal.SIGTERM)
+    message(live.process.communicate(timeout=60)[1].splitlines()[-1], "interrupted")
+    assert live.process.returncode == 143
 
 
 SHOWING = """\
