@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.time_grid import TimeGrid
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.planning import try_plan, with_time
 
@@ -235,6 +234,6 @@ def plan_of(made: Scene) -> Plan:
     return plan
 
 
-def scene_and_grid(made: Scene) -> tuple[Scene, TimeGrid]:
-    """The scene and its steps."""
-    return made, plan_of(made).grid
+def scene_and_grid(made: Scene) -> tuple[Plan]:
+    """The plan of a scene, as positional arguments."""
+    return (plan_of(made),)

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Literal
 
+from pydantic import model_validator
+from typing_extensions import Self
+
 from taichi_msm.scene.section import (
     MAX_POINTS,
     MAX_TOLERANCE,
@@ -18,6 +21,7 @@ from taichi_msm.scene.section import (
     StiffnessRatio,
     Tolerance,
     key,
+    scene_fault,
 )
 
 
@@ -103,6 +107,12 @@ class Foundation(Section):
     factor: StiffnessRatio = key(
         10.0, "largest stiffness of a foundation that locks, relative to that at rest", "a number from 1 to 1000"
     )
+
+    @model_validator(mode="after")
+    def _check_factor(self) -> Self:
+        if self.lock is None and self.factor != Foundation.model_fields["factor"].default:
+            raise scene_fault("goes with lock; give lock, a depth in metres, or remove factor", "factor")
+        return self
 
 
 class Tissue(Section):

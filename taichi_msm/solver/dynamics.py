@@ -245,6 +245,8 @@ class Dynamics:
     def _read_memory(self) -> NDArray[Any]:
         """Read the numbers that terms remember, shape (numbers, rows, cols)."""
         fields = [self._moving.arrays.get_fields(n, 1) for n in self.layout.config.memory_fields]
+        # Only some kernels step fixed mass points, whose memory has no effect.
+        fields = [np.where(self.plan.fixed, 0, field).astype(self._real) for field in fields]
         return np.concatenate([np.empty((0, self.layout.rows, self.layout.cols), self._real), *fields])
 
     def _require_consistent(self) -> None:

@@ -25,7 +25,7 @@ from taichi_msm.runs.checkpoint import (
 from taichi_msm.runs.manifest import Manifest, read_manifest
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.state import PeakForce, ProbeForces, RunProgress, Snapshot, State, TipForce
-from tests.scenes import scene, scene_and_grid
+from tests.scenes import plan_of, scene
 
 FRAMES = 3
 EVERY = 17  # steps a frame
@@ -36,8 +36,7 @@ def small_scene() -> Scene:
 
 
 def checkpoint_in(directory: Path) -> Checkpoint:
-    made, grid = scene_and_grid(small_scene())
-    return Checkpoint(directory / ".partial" / "checkpoint", made, grid)
+    return Checkpoint(directory / ".partial" / "checkpoint", plan_of(small_scene()))
 
 
 def position(frame: int) -> Any:
@@ -56,7 +55,7 @@ def manifest() -> Manifest:
 def state(**changes: Any) -> Snapshot:
     """The state of a run at its third frame."""
     steps: dict[str, Any] = {"steps": EVERY * (FRAMES - 1), "displacement": position(8), "difference": position(9)}
-    steps["contact"] = np.empty((0, 2, 3))
+    steps["memory"] = np.empty((0, 2, 3))
     progress = RunProgress(frame=FRAMES - 1, energy=1.0, peak=2.0, reach=3.0)
     kept = {key: changes.pop(key) for key in list(changes) if key in steps}
     felt = ProbeForces(forces(8), (PeakForce(0.1, (7.0, 8.0, 9.0)),))

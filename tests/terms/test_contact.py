@@ -90,7 +90,7 @@ def test_steps_go_on_from_a_state(device: Device) -> None:
     plan, dynamics = plan_of(made), dynamics_of(made, device)
     dynamics.advance(plan.grid.steps * 3 // 4 + 1)
     saved = dynamics.state()
-    assert len(saved.contact) == 3 * 3 + 4
+    assert len(saved.memory) == 3 * 3 + 4
     dynamics.restart(plan, State(*saved))
     dynamics.advance(plan.grid.steps - saved.steps)
     whole = dynamics_of(made, device)
@@ -144,7 +144,7 @@ def test_the_middle_line_pushes_up_and_the_surface_does_not(
     dynamics = Dynamics(plan, device)
     dynamics.restart(plan, State(1, displacement, np.zeros_like(displacement)))
     dynamics.advance(1)
-    assert dynamics.state().contact[:3, 4, 5] == pytest.approx([0, 0, pushed])
+    assert dynamics.state().memory[:3, 4, 5] == pytest.approx([0, 0, pushed])
     assert dynamics.displacement()[4, 5] == pytest.approx([0, 0, height + pushed])
 
 

@@ -211,6 +211,8 @@ def test_slopes_of_a_scene(motion: str, device: Device) -> None:
     adjoint = Adjoint(plan_of(Scene.model_validate(data)), device)
     weights = np.random.default_rng(0).standard_normal(adjoint.run().shape)
     found = adjoint.backward(weights)
+    # Shapes at rest are found to 1e-7 of the forces.
+    step = 1e-3 if motion == "quasistatic" else 1e-4
     keys = ["young", "pretension", "stiffening.lock", "stiffening.factor"]
     for key in [*keys, "foundation.young", "foundation.lock", "foundation.factor"]:
         path = f"tissue.{key}"
@@ -225,8 +227,8 @@ def test_slopes_of_a_scene(motion: str, device: Device) -> None:
             return float((Adjoint(plan_of(Scene.model_validate(changed)), device).run() * weights).sum())
 
         value = attrgetter(path)(Scene.model_validate(data))
-        slope = (at(1 + 1e-3) - at(1 - 1e-3)) / (2e-3 * value)
-        assert found.numbers[path] == pytest.approx(slope, rel=3e-3 if motion == "quasistatic" else 3e-4), path
+        slope = (at(1 + step) - at(1 - step)) / (2 * step * value)
+        assert found.numbers[path] == pytest.approx(slope, rel=3e-3 if motion == "quasistatic" else 1e-4), path
 
 
 def test_no_gradient_of_relaxation(device: Device, message: Messages) -> None:
