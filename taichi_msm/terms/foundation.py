@@ -32,7 +32,7 @@ class FoundationTerm(Term):
 
     by_area: bool  # whether K is smaller at an open edge, because mass points have less area there
     mapped: bool  # whether the factor of K at each mass point is read from a field
-    locks: bool  # whether it stiffens when it is pressed in
+    locks: bool = False  # whether it stiffens when it is pressed in
 
     @staticmethod
     def derive(scene: Scene) -> dict[str, Any]:

@@ -192,8 +192,8 @@ def test_a_held_foundation_relaxes_as_prony_says(device: Device) -> None:
             depths.append(-simulation.positions()[3, 3, 2])
     # Creep under a constant force, by the convolution of the relaxation with the rate of the depth.
     t, h = np.arange(201) / 200, 1 / 200
-    kernel = 1 - sum(shares) + sum(s * np.exp(-t / tau) for s, tau in zip(shares, times, strict=True))
-    exact = np.empty(201)
+    kernel = np.array(1 - sum(shares) + sum(s * np.exp(-t / tau) for s, tau in zip(shares, times, strict=True)))
+    exact: NDArray[np.float64] = np.empty(201)
     exact[0] = 1.0
     for n in range(1, 201):
         rates = np.diff(exact[:n])
