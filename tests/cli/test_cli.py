@@ -183,13 +183,13 @@ def test_ctrl_c_leaves_what_a_study_has_done(stage: str, runs: int, small: Path,
 
 def test_a_simulation_that_runs_away_stops_with_3(small: Path, program: Program, message: Messages) -> None:
     # Within the step's limit, but pressed with a force that folds the springs over.
-    done = program("run", "small.yaml", "--set", "probes.0.force=[0,0,-1e12]", "--out", "wild")
+    done = program("run", "small.yaml", "--set", "probes.0.force=[0,0,-1e12]", "--out", "wild", "--quiet")
     assert done.returncode == 3
     message(done.stderr, "step 1", "point (4, 5)", "probes.0.force", "wild/.partial/checkpoint/state.npz")
     with np.load(small / "wild/.partial/checkpoint/state.npz") as dump:
         assert dump["steps"] == 0
         assert np.isfinite(dump["displacement"]).all()
-    again = program("run", "--resume", "wild")
+    again = program("run", "--resume", "wild", "--quiet")
     assert (again.returncode, again.stderr) == (3, done.stderr.replace("small.yaml", "wild"))
     record = json.loads((small / "wild" / "run.json").read_text())
     assert (record["status"], record["frames"]) == ("diverged", 1)
@@ -615,7 +615,7 @@ def test_a_current_folder_that_is_gone_is_one_clear_line(here: Path, message: Me
 
 def test_numbers_too_large_are_no_warning(here: Path, message: Messages) -> None:
     force = "--set probes.0.force=[0,0,1e30] --set probes.0.load=[[0,1e30]] --set probes.0.offset=-50"
-    done = shell(f"msm {RUN} {force}")
+    done = shell(f"msm {RUN} --quiet {force}")
     assert done.returncode == 3
     message(done.stderr, "diverged")
 

@@ -173,7 +173,7 @@ def test_the_program_tells_of_rest(small: Path, program: Program, message: Messa
     pictures = [small / folder / "frames" / "0001.png" for folder in ("output/small", "again")]
     assert pictures[0].read_bytes() == pictures[1].read_bytes()
     gone = [*still, "--set", "sheet.fixed=none", "--set", "springs.virtual=0"]
-    diverged = program("run", "small.yaml", "--out", "gone", *gone)
+    diverged = program("run", "small.yaml", "--out", "gone", "--quiet", *gone)
     assert diverged.returncode == 3
     message(diverged.stderr, "frames in gone: 1", hide=r"\d+ evaluations, \S+")
 
