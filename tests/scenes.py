@@ -232,8 +232,3 @@ def plan_of(made: Scene) -> Plan:
     plan, _ = try_plan(made)
     assert plan is not None
     return plan
-
-
-def scene_and_grid(made: Scene) -> tuple[Plan]:
-    """The plan of a scene, as positional arguments."""
-    return (plan_of(made),)

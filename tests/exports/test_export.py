@@ -4,29 +4,29 @@ from __future__ import annotations
 
 import errno
 import json
+import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm.cli import console
 from taichi_msm.errors import FilesError, ForeignError
 from taichi_msm.exports import obj
 from taichi_msm.exports.export import export
-from taichi_msm.exports.formats import FORMATS
 from taichi_msm.runs import directory
-from taichi_msm.runs.finished import RESTORE_PICTURE, read_run
+from taichi_msm.runs.finished import read_run
 from taichi_msm.runs.run import run
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
+from tests.golden import Messages
 from tests.outputs import files
-from tests.runs.test_finished import RUN_AGAIN, change, change_scene, rewrite
+from tests.runs.test_finished import change, change_scene, rewrite
 from tests.scenes import speckle
 
 
@@ -35,20 +35,12 @@ def exported(results: Path, out: Path) -> list[str]:
     return export(results, "obj", out).files
 
 
-def test_every_format_has_its_module() -> None:
-    for name, row in FORMATS.items():
-        assert callable(import_module(f"taichi_msm.exports.{row.module or name}").write)
-
-
 def test_files_go_beside_the_results(results: Path, program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(results.parent)
     before = files(results)
     done = program("export", "results", "--format", "obj")
     assert (done.returncode, done.stdout, done.stderr) == (0, "results/export-obj: 8 files\n", "")
-    names = [f"export-obj/{name}" for name in ("0000.obj", "0004.obj", "picture.png", "surface.mtl")]
-    written = files(results)
-    assert set(names) < set(written)
-    assert {name: data for name, data in written.items() if not name.startswith("export-obj")} == before
+    assert {name: data for name, data in files(results).items() if not name.startswith("export-obj")} == before
 
 
 def test_json_is_all_there_is_on_stdout(results: Path, program: Program) -> None:
@@ -62,161 +54,127 @@ def test_json_is_all_there_is_on_stdout(results: Path, program: Program) -> None
     assert done.stdout == f"{results}/export-gltf: index.csv, surface.glb\n"
 
 
-def test_another_process_gives_the_same_bytes(results: Path) -> None:
-    """And does not start Taichi."""
-    exported(results, results / "here")
-    code = "import sys; from taichi_msm.cli.main import main; main(sys.argv[1:]); sys.exit('taichi' in sys.modules)"
-    arguments = ["export", str(results), "--format", "obj", "--out", str(results / "there"), "--quiet"]
-    subprocess.run([sys.executable, "-c", code, *arguments], check=True)
-    assert files(results / "there") == files(results / "here")
+WRONG = {
+    "nowhere": ["nowhere", "--format", "obj"],
+    "flow": ["results", "--format", "kitti"],
+    "tracks": ["results", "--format", "tapvid"],
+    "trajectory": ["without", "--format", "obj"],
+    "picture": ["moved", "--format", "gltf"],
+    "record as folder": ["results", "--format", "obj", "--out", "results/run.json"],
+    "long folder": ["results", "--format", "obj", "--out", 300 * "x"],
+    "long name": [300 * "x", "--format", "obj"],
+}
 
 
-@pytest.mark.parametrize(
-    ("arguments", "code", "error"),
-    [
-        (["nowhere", "--format", "obj"], 4, "nowhere: no results of a run; name the folder that `run --out` wrote"),
-        (
-            ["results", "--format", "kitti"],
-            4,
-            'results: kitti needs flow; run the scene again with --set "output=[png,gif,trajectory,flow,occlusion]"',
-        ),
-        (
-            ["results", "--format", "tapvid"],
-            4,
-            'results: tapvid needs tracks; run the scene again with --set "output=[png,gif,trajectory,tracks]"',
-        ),
-        (["", "--format", "obj"], 2, "taichi-msm: Invalid value for DIR: is empty; name a directory"),
-        (
-            ["results", "--format", "obj", "--out", ""],
-            2,
-            "taichi-msm: Invalid value for --out: is empty; name a directory",
-        ),
-        (["results"], 2, "taichi-msm: Missing option '--format'."),
-        (["results", "--format", "fbx"], 2, "taichi-msm: Invalid value for '--format': 'fbx' is not one of"),
-        (["--format", "obj"], 2, "taichi-msm: Missing argument 'DIR ...'."),
-    ],
-)
+@pytest.mark.parametrize("arguments", WRONG.values(), ids=WRONG)
 def test_what_is_wrong_is_one_line(
-    arguments: list[str], code: int, error: str, results: Path, program: Program, monkeypatch: pytest.MonkeyPatch
+    arguments: list[str], results: Path, program: Program, monkeypatch: pytest.MonkeyPatch, message: Messages
 ) -> None:
     monkeypatch.chdir(results.parent)
-    before = files(results.parent)
+    if arguments[0] in ("without", "moved"):
+        results.rename(arguments[0])
+        Path("without/trajectory.npz").unlink(missing_ok=True)
+        if arguments[0] == "moved":
+            change_scene(Path("moved"), image="/none/gone.png")
+    before = files(Path())
     done = program("export", *arguments)
-    assert (done.returncode, done.stdout) == (code, "")
-    assert done.stderr.startswith(error)
-    assert done.stderr.count("\n") == 1
-    assert files(results.parent) == before
-    assert not (results / "export-kitti").exists(), "a folder that was made for nothing goes"
-
-
-@pytest.mark.parametrize("name", ["vtk", "gltf", "obj"])
-def test_a_surface_needs_a_trajectory(name: str, results: Path, program: Program) -> None:
-    pytest.importorskip("vtkmodules" if name == "vtk" else "numpy")
-    (results / "trajectory.npz").unlink()
-    done = program("export", str(results), "--format", name)
-    again = 'run the scene again with --set "output=[png,gif,trajectory]"'
-    error = f"{results}: {name} needs trajectory; {again}\n"
-    assert (done.returncode, done.stderr) == (4, error)
-
-
-def test_a_picture_that_is_gone_is_named(results: Path, program: Program) -> None:
-    record = json.loads((results / "run.json").read_text())
-    record["scene"]["image"] = "gone.png"
-    (results / "run.json").write_text(json.dumps(record))
-    done = program("export", str(results), "--format", "gltf")
-    error = f"{results}: image: gone.png: no such file or directory; {RESTORE_PICTURE}\n"
-    assert (done.returncode, done.stderr) == (4, error)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (4, "", 1)
+    # From Python 3.14 on, a folder whose name is too long is one that is not there.
+    message(done.stderr, hide=r"x{300}(/export-obj: file name too long|: no results of a run.*)")
+    assert files(Path()) == before
+    assert not list(Path().glob("*/export-*")), "a folder that was made for nothing goes"
 
 
 def test_a_new_export_takes_the_place_of_the_earlier_one(results: Path) -> None:
-    """All of it: files of frames that the new one lacks go too, and so does what a killed process left."""
+    """All of it: files that the new one lacks go with their folders, and so does what a killed process left."""
     out = results / "here"
     names = exported(results, out)
     whole = files(out)
-    (out / ".partial" / "new").mkdir(parents=True)
-    stale = ["0099.obj", "0001.obj"]
+    stale = ["0099.obj", "0001.obj", "training/flow_occ/000000_10.png"]
     for name in (*stale, ".partial/new/0000.obj"):
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
         (out / name).write_text("of an earlier export")
     (out / "export.json").write_text(json.dumps({"files": stale + names}))
     assert exported(results, out) == names == sorted(set(whole) - {"export.json"})
     assert files(out) == whole
-    assert not (out / ".partial").exists()
+    assert {path.name for path in out.iterdir()} == {*names, "export.json"}
 
 
-def test_a_file_that_is_named_like_ours_is_not_touched(results: Path) -> None:
+def test_a_file_that_is_named_like_ours_is_not_touched(results: Path, message: Messages) -> None:
     out = results / "here"
     out.mkdir()
     for name in ("picture.png", "0000.obj"):
         (out / name).write_text("mine")
-        with pytest.raises(ForeignError, match=rf"^{out}/{name}: a file that no run has put there"):
+        with message.raises(ForeignError, name):
             exported(results, out)
         assert files(out) == {name: b"mine"}
         (out / name).unlink()
 
 
-def test_two_exports_do_not_write_into_one_folder(results: Path) -> None:
+def test_two_exports_do_not_write_into_one_folder(results: Path, message: Messages) -> None:
     out = results / "here"
-    refused: list[str] = []
 
     def second(done: int, total: int) -> None:
-        if done == 2 and not refused:
-            with pytest.raises(FilesError) as caught:
+        if done == 2:
+            with message.raises(FilesError, "--out"):
                 exported(results, out)
-            refused.append(str(caught.value))
 
     names = export(results, "obj", out, second).files
-    assert refused == [f"{out}: another export is writing there; choose another --out"]
     assert set(files(out)) == {*names, "export.json"}
 
 
+# Does not start the compiler either.
 KILLED = """
 import os, signal, sys
 from pathlib import Path
 from taichi_msm.exports.export import export
 
 def progress(done, total):
+    assert not {"taichi", "quadrants"} & set(sys.modules)
     if done == 3:
         os.kill(os.getpid(), signal.SIGKILL)
 
+export(Path(sys.argv[1]), "obj", Path(sys.argv[3]))
 export(Path(sys.argv[1]), "obj", Path(sys.argv[2]), progress)
 """
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="kills with SIGKILL")
-@pytest.mark.parametrize("name", ["obj", "gltf"])
-def test_an_export_that_is_killed_is_known_to_the_next_one(name: str, results: Path) -> None:
-    """Also to one of another format."""
-    out = results / "here"
+def test_an_export_that_is_killed_is_known_to_the_next_one(results: Path) -> None:
+    """Also to one of another format; and one that ends has the same bytes in another process."""
+    out, there = results / "here", results / "there"
     exported(results, out)
     before = files(out)
-    killed = subprocess.run([sys.executable, "-c", KILLED, str(results), str(out)], check=False)
-    assert killed.returncode < 0
+    killed = subprocess.run([sys.executable, "-c", KILLED, str(results), str(out), str(there)], check=False)
+    assert killed.returncode == -signal.SIGKILL
+    assert files(there) == before
     left = {path: data for path, data in files(out).items() if not path.startswith(".")}
     assert left == before
     assert set(files(out)) > set(before), "it had begun"
-    names = export(results, name, out).files
-    assert {path.name for path in out.iterdir()} == {*names, "export.json"}
+    for name in ("gltf", "obj"):
+        shutil.copytree(out, results / name)
+        names = export(results, name, results / name).files
+        assert {path.name for path in (results / name).iterdir()} == {*names, "export.json"}
+        assert name != "obj" or files(results / name) == before
 
 
-def test_a_record_that_was_made_up_takes_no_file_of_the_user(results: Path, program: Program) -> None:
+def test_a_record_that_was_made_up_takes_no_file_of_the_user(results: Path, message: Messages) -> None:
     out = results / "here"
-    exported(results, out)
+    names = exported(results, out)
     before = files(out)
     for listed in (["a/" * 5000 + "b"], ["../run.json", "training", 3], []):
-        (out / "export.json").write_text(json.dumps({"files": [*json.loads(before["export.json"])["files"], *listed]}))
-        done = program("export", str(results), "--format", "obj", "--out", str(out))
-        assert (done.returncode, done.stderr) == (0, "")
+        (out / "export.json").write_text(json.dumps({"files": [*names, *listed]}))
+        exported(results, out)
         assert files(out) == before
     (out / "notes.txt").write_text("mine")
-    (out / "export.json").write_text(json.dumps({"files": [*json.loads(before["export.json"])["files"], "notes.txt"]}))
-    done = program("export", str(results), "--format", "obj", "--out", str(out))
-    assert (done.returncode, (out / "notes.txt").read_text()) == (4, "mine")
-    assert done.stderr.startswith(f"{out}/notes.txt: a file that no run has put there")
+    (out / "export.json").write_text(json.dumps({"files": [*names, "notes.txt"]}))
+    with message.raises(ForeignError, "notes.txt"):
+        exported(results, out)
+    assert (out / "notes.txt").read_text() == "mine"
     for record in ("[" * 10**5, '{"files": [[]]}', '{"files": null}', "3", "{}"):
         (out / "export.json").write_text(record)
-        done = program("export", str(results), "--format", "obj", "--out", str(out))
-        assert (done.returncode, done.stderr.count("\n")) == (4, 1)
-        assert done.stderr.startswith(f"{out}/export.json: a file that no run has put there")
+        with message.raises(ForeignError, "export.json"):
+            exported(results, out)
 
 
 def test_many_files_are_compared_in_time_proportional_to_their_number(
@@ -241,17 +199,10 @@ def test_many_files_are_compared_in_time_proportional_to_their_number(
     assert count < len(calls) < 10 * count < count**2
 
 
-def test_files_of_another_format_go_with_their_folders(results: Path) -> None:
-    out = results / "here"
-    (out / "training" / "flow_occ").mkdir(parents=True)
-    (out / "training" / "flow_occ" / "000000_10.png").write_text("of an earlier export")
-    (out / "export.json").write_text(json.dumps({"files": ["training/flow_occ/000000_10.png"]}))
-    names = exported(results, out)
-    assert {path.name for path in out.iterdir()} == {*names, "export.json"}
-
-
 @pytest.mark.parametrize("moment", [0, 2])
-def test_a_run_that_publishes_meanwhile_is_noticed(moment: int, results: Path, device: Device) -> None:
+def test_a_run_that_publishes_meanwhile_is_noticed(
+    moment: int, results: Path, device: Device, message: Messages
+) -> None:
     """No file of an export is of another run than the others."""
     out = results / "here"
     exported(results, out)
@@ -262,18 +213,17 @@ def test_a_run_that_publishes_meanwhile_is_noticed(moment: int, results: Path, d
             run(read_run(results).scene, results, threads=device.threads, estimate_error=False)
 
     begun = (results / "trajectory.npz").stat().st_mtime_ns
-    with pytest.raises(FilesError) as caught:
+    with message.raises(FilesError):
         export(results, "obj", out, publish)
-    assert str(caught.value) == f"{results}: another run replaced these results while they were read; try again"
     assert files(out) == before
 
 
-def test_results_that_go_meanwhile_are_no_fault_of_the_files(results: Path) -> None:
+def test_results_that_go_meanwhile_are_no_fault_of_the_files(results: Path, message: Messages) -> None:
     def take_away(done: int, total: int) -> None:
         (results / "run.json").unlink(missing_ok=True)
         (results / "trajectory.npz").unlink(missing_ok=True)
 
-    with pytest.raises(FilesError, match="another run replaced these results"):
+    with message.raises(FilesError):
         export(results, "obj", results / "here", take_away)
 
 
@@ -286,114 +236,83 @@ def secret(results: Path) -> str:
 
 
 @pytest.mark.parametrize("name", ["gltf", "obj", "vtk"])
-def test_a_record_that_names_a_picture_elsewhere_gets_nothing_of_it(name: str, results: Path, program: Program) -> None:
+def test_a_record_that_names_a_picture_elsewhere_gets_nothing_of_it(
+    name: str, results: Path, message: Messages
+) -> None:
     pytest.importorskip("vtkmodules" if name == "vtk" else "numpy")
-    path = secret(results)
-    change_scene(results, image=path)
-    fault = f"{path} is not the file of the run, by its SHA-256"
-    done = program("export", str(results), "--format", name)
-    assert (done.returncode, done.stderr) == (4, f"{results}: image: {fault}; {RESTORE_PICTURE}\n")
-    change(results, sha256={})
-    assert program("export", str(results), "--format", name).stderr == done.stderr
-    assert not (results / f"export-{name}").exists()
+    change_scene(results, image=secret(results))
+    for digests in ({"image": "0" * 64}, {}):
+        change(results, sha256=digests)
+        with message.raises(FilesError, "secret.png"):
+            export(results, name)
+        assert not (results / f"export-{name}").exists()
 
 
-def test_a_record_that_names_a_map_elsewhere_gets_nothing_of_it_for_vtk(results: Path, program: Program) -> None:
+def test_a_record_that_names_a_map_elsewhere_gets_nothing_of_it_for_vtk(results: Path, message: Messages) -> None:
     pytest.importorskip("vtkmodules")
-    path = secret(results)
-    change_scene(results, springs={"map": {"image": path, "range": [1.0, 2.0]}})
-    done = program("export", str(results), "--format", "vtk")
-    fault = f"springs.map.image: {path} is not the file of the run, by its SHA-256"
-    assert (done.returncode, done.stderr) == (4, f"{results}: {fault}; {RESTORE_PICTURE}\n")
+    change_scene(results, springs={"map": {"image": secret(results), "range": [1.0, 2.0]}})
+    with message.raises(FilesError, "springs.map.image", "secret.png"):
+        export(results, "vtk")
 
 
 @pytest.mark.parametrize("name", ["trajectory.npz", "frames/0001.png", "frames"])
-def test_results_that_are_links_get_nothing_of_what_they_lead_to(name: str, results: Path) -> None:
+def test_results_that_are_links_get_nothing_of_what_they_lead_to(name: str, results: Path, message: Messages) -> None:
     (results.parent / "elsewhere").mkdir()
     moved = (results / name).rename(results.parent / "elsewhere" / Path(name).name)
     (results / name).symlink_to(moved)
     found = read_run(results)
-    with pytest.raises(FilesError, match="a symbolic link, which no run writes"):
+    with message.raises(FilesError, name):
         found.positions() if name == "trajectory.npz" else found.result_path("png", 1)
 
 
 @pytest.mark.parametrize("name", ["gltf", "obj", "vtk"])
-def test_positions_that_no_run_reaches_are_damage(name: str, results: Path, program: Program) -> None:
+def test_positions_that_no_run_reaches_are_damage(name: str, results: Path, message: Messages) -> None:
     pytest.importorskip("vtkmodules" if name == "vtk" else "numpy")
-
-    def far(position: NDArray[np.float64]) -> NDArray[np.float64]:
-        position[2:] *= 1e300
-        return position
-
-    rewrite(results, edit=far)
-    done = program("export", str(results), "--format", name)
-    assert (done.returncode, done.stderr) == (4, f"{results / 'trajectory.npz'}: {RUN_AGAIN}\n")
+    rewrite(results, edit=lambda position: position * np.array([1, 1, 1e300, 1e300, 1])[:, None, None, None])
+    with message.raises(FilesError, "trajectory.npz"):
+        export(results, name)
 
 
-def test_numbers_that_a_format_cannot_hold_are_one_line(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_numbers_that_a_format_cannot_hold_are_one_line(
+    results: Path, monkeypatch: pytest.MonkeyPatch, message: Messages
+) -> None:
     def overflow(*_: object) -> Iterator[list[str]]:
         yield [str(np.float32(1) * np.array([1e300]).astype(np.float32))]
 
     monkeypatch.setattr(obj, "write", overflow)
-    with pytest.raises(FilesError, match="its numbers are too large for obj; run the scene again"):
+    with message.raises(FilesError):
         exported(results, results / "here")
     assert not (results / "here").exists()
 
 
-def test_a_folder_that_cannot_be_is_named(results: Path, program: Program) -> None:
-    long = "x" * 300
-    done = program("export", str(results), "--format", "obj", "--out", long)
-    said = f"{long}: cannot write: File name too long; choose another --out\n"
-    assert (done.returncode, done.stderr) == (4, said)
-    done = program("export", long, "--format", "obj")
-    # From Python 3.14 on, such a folder is one that is not there.
-    longer = f"{long}/export-obj: file name too long\n"
-    absent = f"{long}: no results of a run; name the folder that `run --out` wrote\n"
-    assert (done.returncode, done.stderr) == (4, absent if sys.version_info >= (3, 14) else longer)
-
-
-def test_an_export_that_fails_leaves_the_earlier_one(results: Path) -> None:
-    out = results / "here"
-    exported(results, out)
-    before = files(out)
-    (results / "trajectory.npz").write_bytes(b"")
-    with pytest.raises(FilesError):
-        exported(results, out)
-    assert files(out) == before
-
-
 @pytest.mark.parametrize("name", ["notes.txt", "sub/0000.obj", "0000.obj.bak", "0000.obj/x"])
-def test_what_no_export_has_written_is_not_touched(name: str, results: Path, program: Program) -> None:
+def test_what_no_export_has_written_is_not_touched(name: str, results: Path, message: Messages) -> None:
     out = results / "here"
     (out / name).parent.mkdir(parents=True)
     (out / name).write_text("mine")
     calls = []
-    with pytest.raises(ForeignError) as refused:
+    with message.raises(ForeignError):
         export(results, "obj", out, lambda done, total: calls.append(done))
     assert calls == [0], "before anything is made"
-    assert str(refused.value).startswith(f"{out / name.partition('/')[0]}: a f")
     assert files(out) == {name: b"mine"}
-    assert program("export", str(results), "--format", "obj", "--out", str(results)).returncode == 4
+    with pytest.raises(ForeignError):
+        exported(results, results)
 
 
-def test_a_link_leads_nowhere(results: Path, program: Program) -> None:
+def test_a_link_leads_nowhere(results: Path, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
     """A folder that nobody named may have come with the results."""
-    (results.parent / "elsewhere").mkdir()
-    (results / "export-obj").symlink_to(results.parent / "elsewhere")
-    done = program("export", str(results), "--format", "obj")
-    said = "a symbolic link; name the folder it leads to with --out"
-    assert (done.returncode, done.stderr) == (4, f"{results / 'export-obj'}: {said}\n")
-    assert files(results.parent / "elsewhere") == {}
+    monkeypatch.chdir(results.parent)
+    Path("elsewhere").mkdir()
+    for link, runs in ((results / "export-obj", results), (Path("output"), [results, results])):
+        link.symlink_to(results.parent / "elsewhere")
+        with message.raises(FilesError, link.name):
+            export(runs, "obj")
+    assert files(Path("elsewhere")) == {}
 
 
-def test_a_file_in_the_place_of_the_folder_is_told(results: Path, program: Program) -> None:
-    done = program("export", str(results), "--format", "obj", "--out", str(results / "run.json"))
-    assert done.returncode == 4
-    assert done.stderr.startswith(f"{results / 'run.json'}: cannot write: ")
-    assert done.stderr.count("\n") == 1
-
-
-def test_a_full_disk_leaves_the_earlier_files(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_export_that_fails_leaves_the_earlier_one(
+    results: Path, monkeypatch: pytest.MonkeyPatch, message: Messages
+) -> None:
     out = results / "here"
     exported(results, out)
     before = files(out)
@@ -401,11 +320,14 @@ def test_a_full_disk_leaves_the_earlier_files(results: Path, monkeypatch: pytest
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(obj, "create_file", full)
-    with pytest.raises(FilesError, match=r"here: cannot write: No space left on device; free some space or choose"):
+    with monkeypatch.context() as patch:
+        patch.setattr(obj, "create_file", full)
+        for folder in (out, results / "nothing"):
+            with message.raises(FilesError, folder.name):
+                exported(results, folder)
+    (results / "trajectory.npz").write_bytes(b"")
+    with message.raises(FilesError, "trajectory.npz"):
         exported(results, out)
-    with pytest.raises(FilesError, match="cannot write"):
-        exported(results, results / "nothing")
     assert files(out) == before
     assert not (results / "nothing").exists()
 
@@ -431,16 +353,16 @@ def test_an_interrupted_export_changes_nothing(name: str, results: Path) -> None
 
 
 def test_the_command_says_that_it_was_interrupted(
-    results: Path, program: Program, monkeypatch: pytest.MonkeyPatch
+    results: Path, program: Program, monkeypatch: pytest.MonkeyPatch, message: Messages
 ) -> None:
-    monkeypatch.setattr("taichi_msm.system.process.Interruption.raise_if_requested", raise_interrupt)
+    def interrupt(_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("taichi_msm.system.process.Interruption.raise_if_requested", interrupt)
     done = program("export", str(results), "--format", "obj", "--json")
-    assert (done.returncode, done.stderr) == (130, "interrupted; nothing was written\n")
+    assert done.returncode == 130
+    message(done.stderr)
     assert json.loads(done.stdout)["status"] == "interrupted"
-
-
-def raise_interrupt(_: object) -> None:
-    raise KeyboardInterrupt
 
 
 def test_a_long_export_says_how_far_it_is(results: Path, program: Program, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,6 +19,8 @@ from taichi_msm.exports import gltf
 from taichi_msm.exports.export import export
 from taichi_msm.exports.gltf import key_frames
 from taichi_msm.exports.inputs import unit_normals
+from tests.golden import Messages
+from tests.runs.test_finished import change, change_scene
 from tests.scenes import speckle
 
 Array = NDArray[Any]
@@ -55,6 +57,10 @@ class Glb(NamedTuple):
         (mesh,) = self.document["meshes"]
         (primitive,) = mesh["primitives"]
         return dict(primitive)
+
+    def picture(self) -> Array:
+        (image,) = self.document["images"]
+        return np.asarray(Image.open(io.BytesIO(self.view(image["bufferView"]))))
 
     def attribute(self, name: str) -> Array:
         return self.accessor(self.primitive["attributes"][name])
@@ -114,6 +120,8 @@ def test_the_surface_faces_the_viewer_and_has_the_picture_upright(glb: Path) -> 
     area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert (area[:, 2] > 0).all(), "counter-clockwise from above"
     np.testing.assert_array_equal(found.attribute("NORMAL"), np.tile([0, 0, 1], (99, 1)))
+    # Where neighbours are in one place there is no normal, and a mesh must have one.
+    np.testing.assert_array_equal(unit_normals(np.zeros((3, 4, 3), np.float32)), np.tile([0, 0, 1], (12, 1)))
     # From the upper left, like the picture's rows.
     places = dict(zip(map(tuple, found.attribute("TEXCOORD_0").tolist()), found.attribute("POSITION"), strict=True))
     np.testing.assert_allclose(places[0.0, 0.0], [-0.2, 0.15, 0], atol=ROUNDING)
@@ -129,14 +137,7 @@ def test_the_material_shows_the_picture_on_both_sides(glb: Path) -> None:
     assert material["pbrMetallicRoughness"]["baseColorTexture"] == {"index": 0}
     assert (texture["source"], texture["sampler"], found.primitive["material"]) == (0, 0, 0)
     assert (image["mimeType"], sampler["wrapS"], sampler["wrapT"]) == ("image/png", 33071, 33071)
-    picture = np.asarray(Image.open(io.BytesIO(found.view(image["bufferView"]))))
-    np.testing.assert_array_equal(picture, speckle(30, 40))
-
-
-def test_normals_are_never_0() -> None:
-    """Where neighbours are in one place there is none, and a mesh must have one."""
-    found = unit_normals(np.zeros((3, 4, 3), np.float32))
-    np.testing.assert_array_equal(found, np.tile([0, 0, 1], (12, 1)))
+    np.testing.assert_array_equal(found.picture(), speckle(30, 40))
 
 
 def test_accessors_tell_their_bounds(glb: Path) -> None:
@@ -150,24 +151,15 @@ def test_accessors_tell_their_bounds(glb: Path) -> None:
     assert {view["byteOffset"] % 4 for view in found.document["bufferViews"]} == {0}
 
 
-def changed(results: Path, **sections: Any) -> None:
-    """Change keys of run.json, and of the scene in it."""
-    record = json.loads((results / "run.json").read_text())
-    record["scene"] |= sections.pop("scene", {})
-    (results / "run.json").write_text(json.dumps(record | sections))
-
-
 def test_the_part_of_the_picture_that_the_sheet_has(results: Path) -> None:
-    changed(results, scene={"region": [5, 7, 20, 10]})
+    change_scene(results, region=[5, 7, 20, 10])
     export(results, "gltf", results / "out")
     found = read_glb(results / "out" / "surface.glb")
-    (image,) = found.document["images"]
-    picture = np.asarray(Image.open(io.BytesIO(found.view(image["bufferView"]))))
-    np.testing.assert_array_equal(picture, speckle(30, 40)[7:17, 5:25])
+    np.testing.assert_array_equal(found.picture(), speckle(30, 40)[7:17, 5:25])
 
 
 def without_picture(results: Path) -> Path:
-    changed(results, scene={"image": None, "output": ["trajectory"]})
+    change_scene(results, image=None, output=["trajectory"])
     export(results, "gltf", results / "bare")
     return results / "bare" / "surface.glb"
 
@@ -175,7 +167,7 @@ def without_picture(results: Path) -> Path:
 def with_one_frame(results: Path) -> Path:
     first = positions(results)[:1]
     np.savez(results / "trajectory.npz", time=np.zeros(1), position=first)
-    changed(results, frames=1)
+    change(results, frames=1)
     export(results, "gltf", results / "still")
     return results / "still" / "surface.glb"
 
@@ -250,10 +242,6 @@ def error_of(position: Array, frames: list[int]) -> float:
     return worst
 
 
-def test_all_frames_are_key_frames_where_they_are_few() -> None:
-    assert key_frames(motion(20), 20) == (list(range(20)), 0.0)
-
-
 def test_key_frames_are_where_the_motion_is_sudden() -> None:
     position = motion(300)
     found = key_frames(position, 25)
@@ -269,29 +257,26 @@ def test_key_frames_are_where_the_motion_is_sudden() -> None:
 
 def test_more_key_frames_than_are_needed_are_not_taken() -> None:
     straight = np.linspace(0, 1, 50)[:, None, None, None] * np.ones((2, 2, 3))
-    still = np.zeros((50, 2, 2, 3))
-    assert key_frames(still, 10) == ([0, 49], 0.0)
-    found = key_frames(straight, 10)
-    assert found.error <= 2 * ROUNDING**2 * 50
+    assert key_frames(np.zeros((50, 2, 2, 3)), 10) == ([0, 49], 0.0)
+    assert key_frames(straight, 10).error <= 2 * ROUNDING**2 * 50
+    assert key_frames(motion(20), 20) == (list(range(20)), 0.0), "all where they are few"
 
 
-def test_a_run_of_many_frames_is_told_by_key_frames(ran: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gltf, "MAX_TARGETS", 2)
-    done = export(ran, "gltf", tmp_path)
-    found, expected = read_glb(tmp_path / "surface.glb"), positions(ran)
-    keys = key_frames(expected, 3)
-    assert len(found.primitive["targets"]) == 2
-    said = "3 of 5 frames are key frames; between them no point is farther than"
-    assert done.notes == [f"{said} {keys.error:.2g} m from where it was"]
-    apart = [found.at(frame / 10) - expected[frame].reshape(-1, 3) for frame in range(5)]
-    assert np.linalg.norm(apart, axis=-1).max() == pytest.approx(keys.error, rel=1e-5)
-
-
-def test_a_sheet_of_many_points_has_fewer_key_frames(
-    ran: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("limit", "value", "targets"),
+    [("MAX_TARGETS", 2, 2), ("MAX_TARGETS_BYTES", 3 * 99 * 24, 3)],
+    ids=["frames", "points"],
+)
+def test_a_run_of_many_frames_or_points_is_told_by_key_frames(
+    limit: str, value: int, targets: int, ran: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, message: Messages
 ) -> None:
     """So that a file stays of a size that browsers load."""
-    monkeypatch.setattr(gltf, "MAX_TARGETS_BYTES", 3 * 99 * 24)
-    export(ran, "gltf", tmp_path)
-    targets = read_glb(tmp_path / "surface.glb").primitive["targets"]
-    assert len(targets) == 3
+    monkeypatch.setattr(gltf, limit, value)
+    done = export(ran, "gltf", tmp_path)
+    found, expected = read_glb(tmp_path / "surface.glb"), positions(ran)
+    keys = key_frames(expected, targets + 1)
+    assert len(found.primitive["targets"]) == targets
+    assert f" {keys.error:.2g} m " in done.notes[0]
+    message(done.notes, hide=r"(?<=than )\S+")
+    apart = [found.at(frame / 10) - expected[frame].reshape(-1, 3) for frame in range(5)]
+    assert np.linalg.norm(apart, axis=-1).max() == pytest.approx(keys.error, rel=1e-5)

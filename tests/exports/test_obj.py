@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,7 @@ from PIL import Image
 
 from taichi_msm.exports.export import export
 from taichi_msm.exports.inputs import unit_normals
+from tests.runs.test_finished import change_scene
 from tests.scenes import speckle
 
 
@@ -49,17 +49,12 @@ def test_the_surface_faces_the_viewer_and_has_the_picture_upright(out: Path) -> 
     np.testing.assert_allclose(coordinates, places[:, :2] / (0.4, 0.3) + 0.5, rtol=0, atol=1e-8)
 
 
-def test_all_files_share_a_material_with_the_picture(out: Path) -> None:
+def test_all_files_share_a_material_with_the_picture(out: Path, results: Path) -> None:
     for path in out.glob("*.obj"):
         assert rows(path, "mtllib") == [["surface.mtl"]]
         assert rows(path, "usemtl") == rows(out / "surface.mtl", "newmtl") == [["sheet"]]
     assert rows(out / "surface.mtl", "map_Kd") == [["picture.png"]]
     np.testing.assert_array_equal(np.asarray(Image.open(out / "picture.png")), speckle(30, 40))
-
-
-def test_a_run_without_a_picture(results: Path) -> None:
-    record = json.loads((results / "run.json").read_text())
-    record["scene"] |= {"image": None, "output": ["trajectory"]}
-    (results / "run.json").write_text(json.dumps(record))
+    change_scene(results, image=None, output=["trajectory"])
     assert "picture.png" not in export(results, "obj", results / "out").files
     assert rows(results / "out" / "surface.mtl", "map_Kd") == []

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from taichi_msm.errors import NotInstalledError
 from taichi_msm.exports.export import export
 from taichi_msm.exports.vtk import speed
 from taichi_msm.model.sheet import area_shares, rest_positions
 from taichi_msm.runs.finished import read_run
 from tests import reference
-from tests.conftest import Program
+from tests.golden import Messages
 
 
 @pytest.fixture(scope="module")
@@ -64,6 +65,9 @@ def test_the_surface_faces_the_viewer_and_has_the_picture_upright(out: Path) -> 
     from vtkmodules.vtkFiltersGeometry import vtkGeometryFilter
 
     grid, found = read(out / "0000.vtu")
+    for name, unit in (("displacement", "m"), ("speed", "m/s"), ("energy_density", "J/m2")):
+        array = grid.GetPointData().GetArray(name)
+        assert array.GetInformation().Get(array.UNITS_LABEL()) == unit
     assert grid.GetPointData().GetTCoords().GetName() == "texture"
     assert grid.GetPointData().GetVectors().GetName() == "displacement"
     np.testing.assert_allclose(found["texture"], found["points"][:, :2] / (0.4, 0.3) + 0.5, rtol=0, atol=1e-15)
@@ -75,13 +79,6 @@ def test_the_surface_faces_the_viewer_and_has_the_picture_upright(out: Path) -> 
     normals.Update()
     data = normals.GetOutput().GetPointData().GetNormals()
     assert [data.GetTuple(n) for n in range(data.GetNumberOfTuples())] == [(0, 0, 1)] * 99
-
-
-def test_arrays_know_their_units(out: Path) -> None:
-    data = read(out / "0001.vtu")[0].GetPointData()
-    for name, unit in (("displacement", "m"), ("speed", "m/s"), ("energy_density", "J/m2")):
-        array = data.GetArray(name)
-        assert array.GetInformation().Get(array.UNITS_LABEL()) == unit
 
 
 def test_the_collection_has_the_time_of_every_file(out: Path) -> None:
@@ -104,20 +101,16 @@ def test_the_speed_is_of_order_2() -> None:
         errors.append(max(np.abs(speed(position, time, n) - exact[n]).max() for n in range(1, frames)))
         # One-sided: half a frame's time the acceleration, and less.
         assert np.abs(speed(position, time, frames) - exact[-1]).max() < 10 / frames / 2
+    assert (speed(np.ones((1, 2, 3, 3)), np.zeros(1), 0) == 0).all(), "of a frame alone"
     # h^2 / 6 times the third derivative, 20 at most.
     assert errors[0] < 20 / 20**2 / 6
     assert np.log2(np.divide(errors[:-1], errors[1:])) == pytest.approx([2, 2], abs=0.05)
 
 
-def test_a_frame_alone_is_at_rest() -> None:
-    assert (speed(np.ones((1, 2, 3, 3)), np.zeros(1), 0) == 0).all()
-
-
 def test_without_vtk_there_is_one_line(
-    ran: Path, tmp_path: Path, program: Program, monkeypatch: pytest.MonkeyPatch
+    ran: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, message: Messages
 ) -> None:
     monkeypatch.setitem(sys.modules, "vtkmodules.vtkIOXML", None)
-    done = program("export", str(ran), "--format", "vtk", "--out", str(tmp_path / "out"))
-    error = "--format vtk: needs VTK, which is not installed; pip install vtk\n"
-    assert (done.returncode, done.stdout, done.stderr) == (2, "", error)
+    with message.raises(NotInstalledError, "VTK"):
+        export(ran, "vtk", tmp_path / "out")
     assert not (tmp_path / "out").exists()

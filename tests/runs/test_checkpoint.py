@@ -25,6 +25,7 @@ from taichi_msm.runs.checkpoint import (
 from taichi_msm.runs.manifest import Manifest, read_manifest
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.state import PeakForce, ProbeForces, RunProgress, Snapshot, State, TipForce
+from tests.golden import Messages
 from tests.scenes import plan_of, scene
 
 FRAMES = 3
@@ -100,11 +101,11 @@ def read(out: Path) -> list[Any]:
 @pytest.mark.parametrize(
     ("name", "harmless", "every"),
     [
-        (MANIFEST_FILE, 0.0, 1),
+        (MANIFEST_FILE, 0.0, 20),
         (POSITIONS_FILE, 0.0, 5),
         (FORCES_FILE, 0.0, 5),
-        (STATE_FILE, 0.25, 5),
-        pytest.param(POSITIONS_FILE, 0.0, 1, marks=pytest.mark.fuzz),
+        (STATE_FILE, 0.25, 20),
+        pytest.param(MANIFEST_FILE, 0.0, 1, marks=pytest.mark.fuzz),
         pytest.param(STATE_FILE, 0.25, 1, marks=pytest.mark.fuzz),
     ],
 )
@@ -163,35 +164,27 @@ FORGED: dict[str, Callable[[dict[str, Any]], object]] = {
 
 
 @pytest.mark.parametrize("case", FORGED)
-def test_a_forged_state_is_refused(case: str, out: Path) -> None:
+def test_a_forged_state_is_refused(case: str, out: Path, message: Messages) -> None:
     path = out / ".partial" / "checkpoint" / STATE_FILE
     repacked(path, lambda arrays: None)
     read(out)
     repacked(path, FORGED[case])
-    with pytest.raises(DamagedError, match="is damaged; run the scene again"):
+    with message.raises(DamagedError):
         read(out)
 
 
-def test_an_array_that_claims_to_be_huge_takes_no_memory(out: Path) -> None:
+@pytest.mark.parametrize("compression", [zipfile.ZIP_STORED, zipfile.ZIP_BZIP2], ids=["header", "bzip2"])
+def test_an_array_that_claims_to_be_huge_takes_no_memory(compression: int, out: Path) -> None:
+    """A few bytes of bzip2 may be gigabytes too, whatever the archive says of them."""
     path = out / ".partial" / "checkpoint" / STATE_FILE
     with zipfile.ZipFile(path) as found:
         entries = {name: found.read(name) for name in found.namelist()}
-    header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (10**5, 10**5, 3)})
-    entries["displacement.npy"] = header.getvalue()
-    with zipfile.ZipFile(path, "w") as made:
-        for name, data in entries.items():
-            made.writestr(name, data)
-    with pytest.raises(DamagedError):
-        read(out)
-
-
-def test_a_compressed_array_takes_no_memory(out: Path) -> None:
-    """A few bytes of bzip2 may be gigabytes, whatever the archive says of them."""
-    path = out / ".partial" / "checkpoint" / STATE_FILE
-    with zipfile.ZipFile(path) as whole:
-        entries = {name: whole.read(name) for name in whole.namelist()}
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_BZIP2) as made:
+    if compression == zipfile.ZIP_STORED:
+        header = io.BytesIO()
+        shape = (10**5, 10**5, 3)
+        np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": shape})
+        entries["displacement.npy"] = header.getvalue()
+    with zipfile.ZipFile(path, "w", compression) as made:
         for name, data in entries.items():
             made.writestr(name, data)
     with pytest.raises(DamagedError):
@@ -233,37 +226,39 @@ def test_frames_that_are_exchanged_are_found(out: Path) -> None:
         read(out)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"folder": 3},
-        {"versions": ["taichi"]},
-        {"versions": {"taichi": 1}},
-        {"overrides": "a=1"},
-        {"estimate": {"error": 1}},
-        {"estimate": {"steps_per_frame": "x", "error": [], "rounding": 0, "in_f64": 0, "order": 2}},
-        {"arch": None},
-        {"arch": "toaster"},
-        {"estimate": {"steps_per_frame": 1, "error": -math.inf, "rounding": 0, "in_f64": 0, "order": 2}},
-        {"estimate": {"steps_per_frame": 1, "error": math.nan, "rounding": 0, "in_f64": 0, "order": 2}},
-        {"sha256": {"image": 3}},
-        {"given": {}},
-        {"scene": {**small_scene().model_dump(mode="json"), "output": ["exe"]}},
-        {"scene": {**small_scene().model_dump(mode="json"), "time": {"duration": 0.4, "step": 0.2}}},
-    ],
-)
-def test_a_forged_plan_is_refused(change: dict[str, Any], out: Path) -> None:
+ESTIMATE: dict[str, Any] = {"steps_per_frame": 1, "error": None, "rounding": 0, "in_f64": 0, "order": 2}
+
+PLANS: dict[str, dict[str, Any]] = {
+    "folder": {"folder": 3},
+    "versions in a list": {"versions": ["taichi"]},
+    "version": {"versions": {"taichi": 1}},
+    "overrides": {"overrides": "a=1"},
+    "no estimate": {"estimate": {"error": 1}},
+    "steps": {"estimate": {**ESTIMATE, "steps_per_frame": "x"}},
+    "error below 0": {"estimate": {**ESTIMATE, "error": -math.inf}},
+    "error not a number": {"estimate": {**ESTIMATE, "error": math.nan}},
+    "no arch": {"arch": None},
+    "unknown arch": {"arch": "toaster"},
+    "digest": {"sha256": {"image": 3}},
+    "given": {"given": {}},
+    "output": {"scene": {**small_scene().model_dump(mode="json"), "output": ["exe"]}},
+    "step": {"scene": {**small_scene().model_dump(mode="json"), "time": {"duration": 0.4, "step": 0.2}}},
+}
+
+
+@pytest.mark.parametrize("change", PLANS.values(), ids=PLANS)
+def test_a_forged_plan_is_refused(change: dict[str, Any], out: Path, message: Messages) -> None:
     path = out / ".partial" / "checkpoint" / MANIFEST_FILE
     path.write_bytes(dump_with_checksum({**manifest().as_json(), **change}))
-    with pytest.raises(DamagedError, match=r"manifest\.json is"):
+    with message.raises(DamagedError, MANIFEST_FILE):
         read_manifest(out)
 
 
-def test_a_seal_is_broken_by_what_is_still_valid_json() -> None:
+def test_a_seal_is_broken_by_what_is_still_valid_json(message: Messages) -> None:
     sealed = dump_with_checksum({"frames": 12, "name": "a"})
     for changed in (sealed.replace(b"12", b"13"), sealed.replace(b'"a"', b'"b"'), sealed.replace(b"name", b"nane")):
         assert changed != sealed
-        with pytest.raises(ValueError, match="damaged"):
+        with message.raises(ValueError):
             load_with_checksum(changed)
 
 

@@ -28,8 +28,9 @@ from taichi_msm.runs.encoder import Encoder, encode_stream
 from taichi_msm.runs.media import EncodingJob
 from taichi_msm.runs.writer import ResultWriter
 from taichi_msm.scene.scene import Scene
+from tests.golden import Messages
 from tests.outputs import files
-from tests.scenes import scene, scene_and_grid, speckle
+from tests.scenes import plan_of, scene, speckle
 
 ROWS, COLS = 3, 4
 WIDTH, HEIGHT = 40, 24
@@ -41,10 +42,10 @@ import sys
 from pathlib import Path
 from taichi_msm.render.labels import FrameOutputs
 from taichi_msm.runs.writer import ResultWriter
-from tests.scenes import scene_and_grid
+from tests.scenes import plan_of
 from tests.runs.test_files import picture, position, small_scene
 
-with ResultWriter(Path(sys.argv[1]), *scene_and_grid(small_scene())) as writer:
+with ResultWriter(Path(sys.argv[1]), plan_of(small_scene())) as writer:
     for frame in itertools.count():
         writer.add(position(frame), {"": FrameOutputs(picture(frame))})
         if frame == 10:
@@ -71,11 +72,12 @@ def picture(frame: int) -> NDArray[np.uint8]:
 
 
 def write(directory: Path, frames: int, scene: Scene, *, beside: bool = True) -> list[str]:
-    with ResultWriter(directory, *scene_and_grid(scene), encode_in_subprocess=beside) as writer:
+    with ResultWriter(directory, plan_of(scene), encode_in_subprocess=beside) as writer:
         for frame in range(frames):
             writer.add(position(frame), {"": FrameOutputs(picture(frame) if scene.draws else None)})
         names: list[str] = writer.publish({})["outputs"]
         assert writer.frames == frames
+        assert 0 < writer.encode_seconds < 60 or not scene.draws
     return names
 
 
@@ -104,24 +106,20 @@ def test_equal_runs_write_equal_bytes(beside: bool, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("outputs", "names"),
     [
-        (("png",), ["frames", "run.json"]),
-        (("gif",), ["animation.gif", "run.json"]),
-        (("trajectory",), ["trajectory.npz", "run.json"]),
+        (["png"], ["frames", "run.json"]),
+        (["gif"], ["animation.gif", "run.json"]),
+        (["trajectory"], ["trajectory.npz", "run.json"]),
+        ([], ["run.json"]),
     ],
 )
-def test_only_the_outputs_asked_for_are_there(tmp_path: Path, outputs: tuple[str, ...], names: list[str]) -> None:
+def test_only_the_outputs_asked_for_are_there(tmp_path: Path, outputs: list[str], names: list[str]) -> None:
     """Also those that an earlier run left go, but no file of the user's."""
     write(tmp_path, 4, small_scene())
     (tmp_path / "notes.txt").write_text("mine")
-    assert write(tmp_path, 3, small_scene(*outputs)) == names
+    assert write(tmp_path, 3, small_scene(*outputs) if outputs else scene(output=[])) == names
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*names, "notes.txt"])
     if "png" in outputs:
         assert len(list((tmp_path / "frames").iterdir())) == 3
-
-
-def test_a_run_without_outputs_writes_its_record(tmp_path: Path) -> None:
-    assert write(tmp_path, 3, scene(output=[])) == ["run.json"]
-    assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
 
 
 @pytest.mark.parametrize(("precision", "dtype"), [("f32", np.float32), ("f64", np.float64)])
@@ -142,7 +140,7 @@ def test_a_trajectory_may_be_longer_than_4_gib(tmp_path: Path, monkeypatch: pyte
         assert trajectory["position"].shape == (20, ROWS, COLS, 3)
 
 
-@pytest.mark.parametrize("light", [1.25, pytest.param(0.7, marks=pytest.mark.fuzz), 0.25])
+@pytest.mark.parametrize("light", [1.25, 0.25])
 def test_the_animation_is_like_its_frames(tmp_path: Path, light: float) -> None:
     """The palette, made from the first frame, foresees later ones in other light, and the background."""
     first = np.empty((16, 16, 3), np.uint8)
@@ -151,7 +149,7 @@ def test_the_animation_is_like_its_frames(tmp_path: Path, light: float) -> None:
     later[:8] = (first[:8] * light).astype(np.uint8)
     background = (1, 99, 255)
     first[:, 0] = later[:, 0] = background
-    with ResultWriter(tmp_path, *scene_and_grid(small_scene("gif", background=background, size=[16, 16]))) as writer:
+    with ResultWriter(tmp_path, plan_of(small_scene("gif", background=background, size=[16, 16]))) as writer:
         writer.add(position(0), {"": FrameOutputs(first)})
         writer.add(position(1), {"": FrameOutputs(later)})
         writer.publish({})
@@ -168,15 +166,13 @@ def test_leaving_without_publishing_leaves_what_was_there(beside: bool, tmp_path
     write(tmp_path / "out", 3, small_scene())
     before = files(tmp_path / "out")
     for directory in (tmp_path / "out", tmp_path / "fresh"):
-        with ResultWriter(directory, *scene_and_grid(small_scene()), encode_in_subprocess=beside) as writer:
+        with ResultWriter(directory, plan_of(small_scene()), encode_in_subprocess=beside) as writer:
             writer.add(position(9), {"": FrameOutputs(picture(9))})
     assert files(tmp_path / "out") == before
     assert not (tmp_path / "fresh").exists()
 
 
-@pytest.mark.parametrize(
-    ("rows", "frames"), [pytest.param(0, 1, marks=pytest.mark.fuzz), (HEIGHT // 2, 1), (HEIGHT, 2)]
-)
+@pytest.mark.parametrize(("rows", "frames"), [(HEIGHT // 2, 1), (HEIGHT, 2)])
 def test_an_interrupted_hand_over_leaves_whole_frames(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rows: int, frames: int
 ) -> None:
@@ -187,7 +183,7 @@ def test_an_interrupted_hand_over_leaves_whole_frames(
         raise KeyboardInterrupt
 
     add = Encoder.add
-    with ResultWriter(tmp_path / "interrupted", *scene_and_grid(small_scene())) as writer:
+    with ResultWriter(tmp_path / "interrupted", plan_of(small_scene())) as writer:
         writer.add(position(0), {"": FrameOutputs(picture(0))})
         with monkeypatch.context() as patch:
             patch.setattr(Encoder, "add", interrupted)
@@ -219,7 +215,7 @@ def test_an_interruption_while_a_picture_is_encoded_here_leaves_whole_frames(
         time.sleep(0.3)  # until the main thread has heard of it
         return original(*arguments, **keywords)
 
-    with ResultWriter(tmp_path / "interrupted", *scene_and_grid(small_scene()), encode_in_subprocess=False) as writer:
+    with ResultWriter(tmp_path / "interrupted", plan_of(small_scene()), encode_in_subprocess=False) as writer:
         writer.add(position(0), {"": FrameOutputs(picture(0))})
         with monkeypatch.context() as patch:
             patch.setattr(owner, part, interrupted)
@@ -251,43 +247,21 @@ def test_an_encoder_in_a_hurry_takes_no_more_pictures(taken: int, tmp_path: Path
     assert sorted(path.name for path in (tmp_path / "frames").glob("*")) == [f"000{n}.png" for n in range(frames)]
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="no such signal")
-def test_in_a_hurry_frames_are_given_up_and_those_left_are_whole(tmp_path: Path) -> None:
-    made = small_scene(size=[1500, 1000])
-    large = [speckle(1000, 1500, frame) for frame in range(7)]
-    with ResultWriter(tmp_path, *scene_and_grid(made)) as writer:
-        for frame, shown in enumerate(large):
-            writer.add(position(frame), {"": FrameOutputs(shown)})
-        writer.finish(discard_queued=True)
-        writer.publish({})
-        frames = writer.frames
-    # On a busy machine the encoder may be done before it is told to hurry; see the test below.
-    assert 0 < frames <= 7
-    assert sorted(path.name for path in (tmp_path / "frames").iterdir()) == [f"000{n}.png" for n in range(frames)]
-    for frame in range(frames):
-        with Image.open(tmp_path / "frames" / f"000{frame}.png") as image:
-            np.testing.assert_array_equal(np.asarray(image), large[frame])
-    with Image.open(tmp_path / "animation.gif") as image:
-        assert getattr(image, "n_frames", 1) == frames
-    with np.load(tmp_path / "trajectory.npz") as trajectory:
-        assert len(trajectory["position"]) == frames
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="no sessions")
 def test_ctrl_c_does_not_reach_the_encoder(tmp_path: Path) -> None:
-    with ResultWriter(tmp_path, *scene_and_grid(small_scene())) as writer:
+    with ResultWriter(tmp_path, plan_of(small_scene())) as writer:
         assert isinstance(writer._encoder, Encoder)
         assert os.getsid(writer._encoder._process.pid) != os.getsid(0)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no such signal")
 def test_who_waits_for_a_stopped_encoder_can_stop_waiting(tmp_path: Path) -> None:
-    """And then has it finish what it has."""
+    """And then has it finish what it has: whole frames, as many everywhere."""
 
     def stop() -> None:
         raise KeyboardInterrupt
 
-    with ResultWriter(tmp_path, *scene_and_grid(small_scene())) as writer:
+    with ResultWriter(tmp_path / "stopped", plan_of(small_scene())) as writer:
         assert isinstance(writer._encoder, Encoder)
         os.kill(writer._encoder._process.pid, signal.SIGSTOP)
         for frame in range(3):
@@ -296,31 +270,27 @@ def test_who_waits_for_a_stopped_encoder_can_stop_waiting(tmp_path: Path) -> Non
             writer.finish(stop)
         writer.finish(discard_queued=True)
         writer.publish({})
-        assert writer.frames <= 3
-
-
-@pytest.mark.parametrize("beside", [True, False])
-def test_the_time_spent_encoding_is_told(beside: bool, tmp_path: Path) -> None:
-    with ResultWriter(tmp_path, *scene_and_grid(small_scene()), encode_in_subprocess=beside) as writer:
-        writer.add(position(0), {"": FrameOutputs(picture(0))})
-        writer.finish()
-        assert 0 < writer.encode_seconds < 60
+        assert 0 < writer.frames <= 3
+    write(tmp_path / "whole", writer.frames, small_scene())
+    assert files(tmp_path / "stopped") == files(tmp_path / "whole")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="kills with SIGKILL")
-def test_a_killed_run_leaves_the_results_and_the_next_one_goes_on(tmp_path: Path, root: Path) -> None:
+def test_a_killed_run_leaves_the_results_and_the_next_one_goes_on(
+    tmp_path: Path, root: Path, message: Messages
+) -> None:
     write(tmp_path, 3, small_scene())
     before = files(tmp_path)
     command = [sys.executable, "-c", ENDLESS, str(tmp_path)]
     with subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as run:
         assert run.stdout
         encoder = int(run.stdout.readline())
-        with pytest.raises(FilesError, match="another run is writing there"):
+        with message.raises(FilesError):
             write(tmp_path, 2, small_scene())
         os.kill(encoder, signal.SIGSTOP)
         run.kill()
         run.wait()
-        with pytest.raises(FilesError, match="another run is writing there"):
+        with message.raises(FilesError):
             write(tmp_path, 2, small_scene())
         os.kill(encoder, signal.SIGCONT)
         run.communicate()  # until the encoder has ended too
@@ -336,17 +306,14 @@ def full_disk(*_: object, **__: object) -> None:
 
 @pytest.mark.parametrize("target", ["checkpoint.create_file", "checkpoint.replacing", "writer.write_new_file"])
 def test_a_full_disk_is_one_line_and_changes_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, target: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, target: str, message: Messages
 ) -> None:
     """When the positions are written, the manifest or the record."""
     write(tmp_path, 3, small_scene())
     before = files(tmp_path)
     monkeypatch.setattr(f"taichi_msm.runs.{target}", full_disk)
-    with pytest.raises(FilesError) as told:
+    with message.raises(FilesError, "--out"):
         write(tmp_path, 2, small_scene())
-    assert str(told.value) == (
-        f"{tmp_path}: cannot write: No space left on device; free some space or choose another --out"
-    )
     assert files(tmp_path) == before
 
 
@@ -354,25 +321,26 @@ def test_a_full_disk_is_one_line_and_changes_nothing(
 @pytest.mark.parametrize(
     ("points", "limit"),
     [
-        pytest.param(100, 4096, id="many positions fail at once"),
-        pytest.param(2, 40, id="few wait in a buffer until the end"),
-        pytest.param(100, 100 * 100 * 3 * 8 + 200, id="the positions fit but not their headers"),
+        pytest.param(100, 4096, id="many"),
+        pytest.param(2, 40, id="few"),  # wait in a buffer until the end
+        pytest.param(100, 100 * 100 * 3 * 8 + 200, id="headers"),
     ],
 )
-def test_positions_that_cannot_be_written(tmp_path: Path, points: int, limit: int) -> None:
+def test_positions_that_cannot_be_written(tmp_path: Path, points: int, limit: int, message: Messages) -> None:
+
     import resource
 
     sheet = {"points": [points, points], "size": [0.3, 0.4], "mass": 1e-3}
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
 
     def run() -> None:
-        with ResultWriter(tmp_path, *scene_and_grid(scene(sheet=sheet, output=["trajectory"]))) as writer:
+        with ResultWriter(tmp_path, plan_of(scene(sheet=sheet, output=["trajectory"]))) as writer:
             resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
             writer.add(np.zeros((points, points, 3)), {"": FrameOutputs()})
             writer.publish({})
 
     try:
-        with pytest.raises(FilesError, match="cannot write: File too large; choose another --out"):
+        with message.raises(FilesError, "--out"):
             run()
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
@@ -383,7 +351,7 @@ def refused(directory: Path, meanwhile: Callable[[ResultWriter], None] = lambda 
     """The error of a run of many frames in whose course something happens."""
 
     def run() -> None:
-        with ResultWriter(directory, *scene_and_grid(small_scene()), encode_in_subprocess=beside) as writer:
+        with ResultWriter(directory, plan_of(small_scene()), encode_in_subprocess=beside) as writer:
             meanwhile(writer)
             for frame in range(1000):
                 writer.add(position(frame), {"": FrameOutputs(picture(frame))})
@@ -394,47 +362,45 @@ def refused(directory: Path, meanwhile: Callable[[ResultWriter], None] = lambda 
     return str(told.value)
 
 
-def test_a_file_in_the_place_of_the_directory(tmp_path: Path) -> None:
+def test_a_file_in_the_place_of_the_directory(tmp_path: Path, message: Messages) -> None:
     (tmp_path / "out").write_text("mine")
-    assert refused(tmp_path / "out") == (f"{tmp_path / 'out'}: cannot write: Not a directory; choose another --out")
+    message(refused(tmp_path / "out"), "--out")
+    assert (tmp_path / "out").read_text() == "mine"
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write everywhere")
 def test_a_directory_that_cannot_be_written(tmp_path: Path) -> None:
     tmp_path.chmod(0o500)
-    assert "Permission denied; choose another --out" in refused(tmp_path / "out")
+    assert "Permission denied" in refused(tmp_path / "out")
 
 
 @pytest.mark.parametrize("beside", [True, False])
-def test_what_stops_the_encoder_is_told(beside: bool, tmp_path: Path) -> None:
+def test_what_stops_the_encoder_is_told(beside: bool, tmp_path: Path, message: Messages) -> None:
     def block(_: ResultWriter) -> None:
         (tmp_path / ".partial" / "new" / "frames").write_text("in the way")
 
-    assert refused(tmp_path, block, beside=beside) == f"{tmp_path}: cannot write: File exists; choose another --out"
+    message(refused(tmp_path, block, beside=beside), "--out")
     assert (tmp_path / ".partial" / "new" / "frames").read_text() == "in the way"
 
 
-def test_an_encoder_that_is_killed_is_told(tmp_path: Path) -> None:
+def test_an_encoder_that_is_killed_is_told(tmp_path: Path, message: Messages) -> None:
     def kill(writer: ResultWriter) -> None:
         assert isinstance(writer._encoder, Encoder)
         writer._encoder._process.kill()
 
-    assert "cannot write: the encoder ended with exit code" in refused(tmp_path, kill)
+    message(refused(tmp_path, kill), "encoder")
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="open files stay there")
-def test_a_directory_that_vanishes(tmp_path: Path) -> None:
-    def vanish(_: ResultWriter) -> None:
-        shutil.rmtree(tmp_path / "out")
-
-    assert "No such file or directory; choose another --out" in refused(tmp_path / "out", vanish)
+def test_a_directory_that_vanishes(tmp_path: Path, message: Messages) -> None:
+    message(refused(tmp_path / "out", lambda _: shutil.rmtree(tmp_path / "out")), "--out")
     assert not (tmp_path / "out").exists()
 
 
 def test_the_record_is_strict_json(tmp_path: Path) -> None:
-    with ResultWriter(tmp_path, *scene_and_grid(scene())) as writer:
-        with pytest.raises(ValueError, match="not JSON compliant"):
+    with ResultWriter(tmp_path, plan_of(scene())) as writer:
+        with pytest.raises(ValueError, match="JSON"):
             writer.publish({"step": float("nan")})
         writer.publish({"image": "Schleimhaut-Ä.png", "odd": "\udcff.png"})
     text = (tmp_path / "run.json").read_bytes().decode()

@@ -11,19 +11,23 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from taichi_msm import ArgumentError, FilesError, Playback, Simulation, resume, run
+from taichi_msm import ArgumentError, FilesError, Playback, Simulation, run
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.model.surface import place_capsules
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
+from tests.golden import Messages
 from tests.outputs import files, results
 from tests.reference import labels as twin
 from tests.reference.drawing import refine as refined
-from tests.runs.test_resume import interrupted, published
+from tests.scenes import SMALL, speckle
 
 ALL = "output=[png, coordinates, depth, normals, flow, occlusion, instrument, tracks, trajectory]"
 OBLIQUE = "render.camera=oblique"
 ROD = "probes.0.instrument={radius: 0.01, shaft: [1, -0.5, 0.6], length: 0.2}"
+
+
+Results = tuple[Path, dict[str, NDArray[Any]]]
 
 
 def small_scene(*overrides: str) -> Scene:
@@ -38,18 +42,28 @@ def read_flow(path: Path) -> NDArray[np.float32]:
     return np.frombuffer(data, "<f4", offset=12).reshape(height, width, 2)
 
 
-def made(directory: str, device: Device, *overrides: str) -> tuple[Path, dict[str, NDArray[Any]]]:
-    """The results of a run with all labels, and its trajectory."""
-    record = run(small_scene(ALL, *overrides), directory, threads=device.threads)
+def made(directory: str, device: Device, *overrides: str) -> Results:
+    """The results of a run, and its trajectory."""
+    record = run(small_scene(*overrides), directory, threads=device.threads, estimate_error=False)
     assert record["status"] == "complete"
     with np.load(f"{directory}/trajectory.npz") as archive:
         return Path(directory), dict(archive)
 
 
-@pytest.mark.parametrize("camera", ["top", "oblique"])
-def test_labels_are_those_of_the_twin(camera: str, small: Path, device: Device) -> None:
-    done, trajectory = made("out", device, f"render.camera={camera}", ROD)
-    scene, position = small_scene(f"render.camera={camera}", ROD), trajectory["position"].astype(float)
+@pytest.fixture(scope="module")
+def labelled(device: Device, tmp_path_factory: pytest.TempPathFactory) -> Results:
+    """The results of a run with all labels of a rod, seen obliquely, and its trajectory; to be read only."""
+    here = tmp_path_factory.mktemp("labelled")
+    Image.fromarray(speckle(30, 40)).save(here / "speckle.png")
+    (here / "small.yaml").write_text(SMALL)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(here)
+        return here / made("out", device, ALL, OBLIQUE, ROD)[0], dict(np.load("out/trajectory.npz"))
+
+
+def test_labels_are_those_of_the_twin(labelled: Results, small: Path) -> None:
+    done, trajectory = labelled
+    scene, position = small_scene(OBLIQUE, ROD), trajectory["position"].astype(float)
     for frame in range(5):
         placed = place_capsules(scene, position[frame], trajectory["time"][frame])
         coordinates, depth, instrument = twin.labels(scene, position[frame], placed)
@@ -76,39 +90,33 @@ def test_labels_are_those_of_the_twin(camera: str, small: Path, device: Device) 
     assert not (done / "occlusion/0004.png").exists()
 
 
-def test_tracks_are_those_of_the_twin(small: Path, device: Device) -> None:
-    done, trajectory = made("out", device, OBLIQUE)
-    with np.load(done / "tracks.npz") as archive:
-        tracks = dict(archive)
-    middle = (np.arange(5) + 0.5) / 5
-    np.testing.assert_allclose(tracks["coordinates"], [[x, y] for y in middle for x in middle], rtol=1e-6)
-    assert (tracks["points"].dtype, tracks["points"].shape) == (np.float32, (25, 5, 2))
-    assert (tracks["occluded"].dtype, tracks["occluded"].shape) == (np.bool_, (25, 5))
-    for frame, position in enumerate(trajectory["position"].astype(float)):
-        pixels, hidden = twin.find(small_scene(OBLIQUE), tracks["coordinates"].astype(float), position)
-        np.testing.assert_allclose(tracks["points"][:, frame], pixels, atol=1e-3)
-        np.testing.assert_array_equal(tracks["occluded"][:, frame], hidden)
-
-
 @pytest.mark.parametrize("refine", [0, 3])
 def test_tracks_are_on_the_drawn_surface(refine: int, small: Path, device: Device) -> None:
     """Also within cells: 7 points across are not on the edges of 10 cells."""
-    done, trajectory = made("out", device, OBLIQUE, f"render.refine={refine}", "render.tracks=7")
+    seen = OBLIQUE, f"render.refine={refine}", "render.tracks=7"
+    done, trajectory = made("out", device, "output=[tracks, trajectory]", *seen)
     with np.load(done / "tracks.npz") as archive:
         tracks = dict(archive)
-    assert (tracks["position"].dtype, tracks["position"].shape) == (np.float32, (49, 5, 3))
+    middle = (np.arange(7) + 0.5) / 7
+    np.testing.assert_allclose(tracks["coordinates"], [[x, y] for y in middle for x in middle], rtol=1e-6)
+    for name, dtype, shape in (
+        ("points", "f4", (49, 5, 2)),
+        ("occluded", "?", (49, 5)),
+        ("position", "f4", (49, 5, 3)),
+    ):
+        assert (tracks[name].dtype, tracks[name].shape) == (dtype, shape)
     projection = np.array(json.loads((done / "camera.json").read_text())["projection"])
     for frame, position in enumerate(trajectory["position"].astype(float)):
-        expected = twin.between(refined(position, refine), tracks["coordinates"].astype(float))
         # Rounded once to single precision, of at most half a metre.
+        expected = twin.between(refined(position, refine), tracks["coordinates"].astype(float))
         np.testing.assert_allclose(tracks["position"][:, frame], expected, rtol=0, atol=2**-25)
-        seen = np.concatenate([tracks["position"][:, frame], np.ones((49, 1))], axis=-1) @ projection.T
-        np.testing.assert_allclose(seen[:, :2] / seen[:, 2:], tracks["points"][:, frame], atol=1e-4)
+        projected = np.concatenate([tracks["position"][:, frame], np.ones((49, 1))], axis=-1) @ projection.T
+        np.testing.assert_allclose(projected[:, :2] / projected[:, 2:], tracks["points"][:, frame], atol=1e-4)
 
 
 @pytest.mark.parametrize("camera", ["top", "oblique", "{eye: [0.1, -0.3, 0.3], fov: 60, up: [0.2, 1, 0]}"])
 def test_the_camera_projects_material_points_to_their_pixels(camera: str, small: Path, device: Device) -> None:
-    done, trajectory = made("out", device, f"render.camera={camera}")
+    done, trajectory = made("out", device, f"render.camera={camera}", "output=[depth, trajectory]")
     written = json.loads((done / "camera.json").read_text())
     assert written["size"] == [40, 30]
     projection = np.array(written["projection"])
@@ -128,80 +136,48 @@ def test_the_camera_projects_material_points_to_their_pixels(camera: str, small:
             np.testing.assert_allclose(seen_at[:2] / seen_at[2], pixel, atol=1e-4)
 
 
-def test_labels_do_not_depend_on_the_samples_of_the_picture(small: Path, device: Device) -> None:
-    once, _ = made("once", device, ROD, OBLIQUE)
-    twice, _ = made("twice", device, ROD, OBLIQUE, "render.supersample=2")
-    one, two = results(once), results(twice)
+def test_labels_do_not_depend_on_the_samples_of_the_picture(labelled: Results, small: Path, device: Device) -> None:
+    twice, _ = made("twice", device, ALL, ROD, OBLIQUE, "render.supersample=2")
+    one, two = results(labelled[0]), results(twice)
     assert {name for name in one if one[name] != two[name]} == {f"frames/{n:04}.png" for n in range(5)}
 
 
-def test_labels_need_no_picture(small: Path, device: Device) -> None:
+def test_labels_need_no_picture_and_masks_alone_no_camera(small: Path, device: Device) -> None:
     scene = small_scene("output=[flow, tracks]").model_copy(update={"image": None})
-    record = run(scene, "out", threads=device.threads)
+    record = run(scene, "out", threads=device.threads, estimate_error=False)
     assert record["outputs"] == ["flow", "tracks.npz", "camera.json", "run.json"]
     assert sorted(results(Path("out"))) == ["camera.json", *(f"flow/{n:04}.flo" for n in range(4)), "tracks.npz"]
+    masks = small_scene("output=[occlusion, instrument]")
+    run(masks, "masks", threads=device.threads, estimate_error=False)
+    assert not Path("masks/camera.json").exists()
 
 
-def test_masks_alone_need_no_camera(small: Path, device: Device) -> None:
-    run(small_scene("output=[occlusion, instrument]"), "out", threads=device.threads)
-    assert not Path("out/camera.json").exists()
-
-
-def test_a_run_with_labels_that_is_interrupted_goes_on_to_the_same_bits(small: Path, device: Device) -> None:
-    overrides = (ALL, ROD, "time.frames_per_second=40")
-    run(small_scene(*overrides), "whole", threads=device.threads)
-    record = interrupted(small_scene(*overrides), "part", device)
-    frames = record["frames"]
-    part = published(Path("part"))
-    assert len([name for name in part if name.startswith("depth/")]) == frames
-    assert len([name for name in part if name.startswith("flow/")]) == frames - 1
-    with np.load("part/tracks.npz") as archive:
-        assert archive["points"].shape == (25, frames, 2)
-    assert resume("part", threads=device.threads)["status"] == "complete"
-    assert results(Path("part")) == results(Path("whole"))
-
-
-def test_labels_of_an_earlier_run_go_and_other_files_stay(small: Path, device: Device) -> None:
-    made("out", device)
+def test_labels_of_an_earlier_run_go_and_other_files_stay(small: Path, device: Device, message: Messages) -> None:
+    short = small_scene("output=[depth]", "time.duration=0.2")
+    made("out", device, ALL)
     Path("out/flow/notes.txt").write_text("mine")
-    run(small_scene("output=[depth]", "time.duration=0.2"), "out", threads=device.threads)
+    run(short, "out", threads=device.threads, estimate_error=False)
     found = files(Path("out"))
     assert found.pop("flow/notes.txt") == b"mine"
     assert sorted(found) == ["camera.json", "depth/0000.tiff", "depth/0001.tiff", "depth/0002.tiff", "run.json"]
+    Path("out/run.json").unlink()
+    with message.raises(FilesError, "depth/0000.tiff"):
+        run(short, "out", threads=device.threads, estimate_error=False)
 
 
-def test_files_in_the_place_of_labels_are_not_overwritten(small: Path, device: Device) -> None:
-    Path("out/depth").mkdir(parents=True)
-    Path("out/depth/0001.tiff").write_text("mine")
-    with pytest.raises(FilesError, match=r"depth/0001.tiff"):
-        run(small_scene("output=[depth]"), "out", threads=device.threads)
-    assert Path("out/depth/0001.tiff").read_text() == "mine"
-
-
-def test_labels_and_flow_from_python(small: Path, device: Device) -> None:
-    done, trajectory = made("out", device, OBLIQUE, ROD)
+def test_labels_and_flow_from_python(labelled: Results, small: Path, device: Device) -> None:
+    done, _ = labelled
     with Simulation(small_scene(OBLIQUE, ROD), threads=device.threads) as simulation:
-        first = simulation.labels()
-        simulation.advance(3)
-        third = simulation.labels()
-        np.testing.assert_array_equal(third.coordinates, np.load(done / "coordinates/0003.npy"))
-        ahead = simulation.flow(first)
-        back = simulation.flow(third, positions=trajectory["position"][0], time=0.0)
-    # There and back again: of what both frames show, the flow back is where the flow ahead came from.
-    rows, columns = np.nonzero((ahead.flow[..., 0] < 1e9) & (ahead.occlusion == 0))
-    flow = ahead.flow[rows, columns]
-    there = np.stack([columns, rows], axis=-1) + flow
-    near = np.round(there).astype(int)
-    inside = ((near >= 1) & (near < [39, 29])).all(axis=-1) & (np.abs(there - near) < 0.05).all(axis=-1)
-    returned = back.flow[near[inside, 1], near[inside, 0]]
-    good = returned[:, 0] < 1e9
-    assert good.sum() > 5
-    # The flow changes by less than its own size from pixel to pixel, here over 0.05 px.
-    assert np.abs(flow[inside][good] + returned[good]).max() < 0.05 * np.abs(flow).max() + 0.01
+        simulation.advance(2)
+        before = simulation.labels()
+        simulation.advance()
+        labels, flow = simulation.labels(), simulation.flow(before)
+    np.testing.assert_array_equal(labels.coordinates, np.load(done / "coordinates/0003.npy"))
+    np.testing.assert_array_equal(flow.flow, read_flow(done / "flow/0002.flo"))
 
 
-def test_a_run_is_played_back(small: Path, device: Device) -> None:
-    done, trajectory = made("out", device, OBLIQUE, ROD)
+def test_a_run_is_played_back(labelled: Results, device: Device, message: Messages) -> None:
+    done, trajectory = labelled
     with Playback(done, threads=device.threads) as playback:
         np.testing.assert_array_equal(playback.positions, trajectory["position"])
         np.testing.assert_array_equal(playback.time, trajectory["time"])
@@ -213,24 +189,24 @@ def test_a_run_is_played_back(small: Path, device: Device) -> None:
         still = playback.flow(4, 4).flow
         assert np.abs(still[still[..., 0] < 1e9]).max() < 1e-3
         for frame in (-1, 5, 1.0, True):
-            with pytest.raises(ArgumentError, match=r"frame: .*; take a whole number, 0 to 4"):
+            with message.raises(ArgumentError, "frame"):
                 playback.draw(frame)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(
-    ("call", "said"),
-    [
-        (lambda one: one.flow("labels"), "before: take what `labels` gave"),
-        (lambda one: one.flow(one.labels()._replace(coordinates=np.zeros((3, 3, 2)))), "before: take what"),
-        (lambda one: one.flow(one.labels()._replace(coordinates="none")), "before: "),
-        (lambda one: one.flow(one.labels()._replace(coordinates=one.labels().coordinates * 7)), "before: take what"),
-        (lambda one: one.locate([[0.5, 1.5]]), "coordinates: float64 of shape"),
-        (lambda one: one.locate([0.5, 0.5]), "coordinates: float64 of shape"),
-        (lambda one: one.locate([[np.nan, 0.5]]), "coordinates: float64 of shape"),
-        (lambda one: one.labels(positions=np.zeros((3, 3))), "positions: float64 of shape"),
-        (lambda one: one.draw(time="now"), "time: 'now'; take a number"),
-    ],
-)
-def test_wrong_arguments(call: Any, said: str, small: Path, device: Device) -> None:
-    with Simulation(small_scene(), threads=device.threads) as simulation, pytest.raises(ArgumentError, match=said):
+WRONG: dict[str, Any] = {
+    "no labels": lambda one: one.flow("labels"),
+    "another shape": lambda one: one.flow(one.labels()._replace(coordinates=np.zeros((3, 3, 2)))),
+    "no array": lambda one: one.flow(one.labels()._replace(coordinates="none")),
+    "other numbers": lambda one: one.flow(one.labels()._replace(coordinates=one.labels().coordinates * 7)),
+    "outside": lambda one: one.locate([[0.5, 1.5]]),
+    "a pair": lambda one: one.locate([0.5, 0.5]),
+    "not a number": lambda one: one.locate([[np.nan, 0.5]]),
+    "positions": lambda one: one.labels(positions=np.zeros((3, 3))),
+    "time": lambda one: one.draw(time="now"),
+}
+
+
+@pytest.mark.parametrize("call", WRONG.values(), ids=WRONG)
+def test_wrong_arguments(call: Any, small: Path, device: Device, message: Messages) -> None:
+    with Simulation(small_scene(), threads=device.threads) as simulation, message.raises(ArgumentError):
         call(simulation)

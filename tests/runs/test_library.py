@@ -6,7 +6,7 @@ import copy
 import pickle
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -32,10 +32,16 @@ from taichi_msm import (
 )
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.render.camera import view
+from taichi_msm.render.labels import FrameOutputs
+from taichi_msm.runs.finished import read_run
+from taichi_msm.runs.run import free_cores
 from taichi_msm.solver.planning import with_time
+from taichi_msm.system import process
+from taichi_msm.system.compiler import active_compiler
 from taichi_msm.system.process import processor_name
 from taichi_msm.system.runtime import Device
 from tests import reference
+from tests.golden import Messages
 from tests.scenes import PRESS, SHEET, plan_of, scene, speckle
 
 HAND = {"at": [[0, 0.5, 0.5]], "force": [0, 0, -20], "falloff": 20, "offset": 0}
@@ -48,38 +54,14 @@ def simulation(device: Device) -> Iterator[Simulation]:
         yield simulation
 
 
-def test_what_is_exported_is_there_and_nothing_else() -> None:
+def test_what_is_exported_is_there_and_nothing_else(message: Messages) -> None:
     for name in taichi_msm.__all__:
         exported = getattr(taichi_msm, name)
         assert exported.__name__ == name
         assert exported.__doc__
     assert (Path(taichi_msm.__file__).parent / "py.typed").exists()
-    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+    with message.raises(AttributeError, "nothing"):
         taichi_msm.nothing  # noqa: B018
-
-
-@pytest.mark.parametrize("shape", [(9, 11), (9, 12, 3), (8, 11, 3), (9, 11, 4), (2001, 2001, 3), (0,)])
-def test_positions_of_another_shape_are_refused(shape: tuple[int, ...], simulation: Simulation) -> None:
-    with pytest.raises(ArgumentError, match=r"positions: float64 of shape .*; take numbers of shape \(9, 11, 3\)"):
-        simulation.draw(positions=np.zeros(shape))
-    with pytest.raises(ArgumentError, match="positions: <U1"):
-        simulation.draw(positions=np.full((9, 11, 3), "a"))
-
-
-@pytest.mark.parametrize(
-    "texture",
-    [
-        np.zeros((4, 5), np.uint8),
-        np.zeros((4, 5, 3)),
-        np.zeros((4, 5, 4), np.uint8),
-        np.zeros((0, 5, 3), np.uint8),
-        np.zeros((1, 70000, 3), np.uint8),
-    ],
-    ids=["grey", "float", "alpha", "empty", "long"],
-)
-def test_what_is_no_picture_is_refused(texture: Any, device: Device) -> None:
-    with pytest.raises(ArgumentError, match="is not a picture; take uint8 of shape"):
-        Simulation(scene(), threads=device.threads, texture=texture)
 
 
 def test_a_camera_is_given_as_in_a_scene(simulation: Simulation) -> None:
@@ -90,49 +72,77 @@ def test_a_camera_is_given_as_in_a_scene(simulation: Simulation) -> None:
     assert (simulation.draw("oblique") != simulation.draw()).any()
 
 
-@pytest.mark.parametrize(
-    ("camera", "said"),
-    [
-        (3, "camera: 3 is not allowed; expected top, oblique, or"),
-        ("side", 'camera: "side" is not allowed; expected top, oblique, or'),
-        ({"eye": [0, 0]}, r"camera.eye: \[0, 0\] is not allowed; expected three numbers"),
-        ({"eye": [0, 0, 0]}, r"render.camera.eye: \[0.0, 0.0, 0.0\] is also the target; move one of them"),
-    ],
-)
-def test_a_wrong_camera_is_refused(camera: Any, said: str, simulation: Simulation) -> None:
-    with pytest.raises(SceneError, match=said):
-        simulation.draw(camera)
+NO_TIMES: list[Any] = [10**400, -(10**400), np.inf, np.float16(np.nan), np.complex64(1), True, "1", [0.1]]
+
+WRONG: dict[str, tuple[Callable[[Simulation, Any], object], list[Any]]] = {
+    "positions": (
+        lambda one, value: one.draw(positions=value),
+        [
+            *(np.zeros(shape) for shape in [(9, 11), (9, 12, 3), (8, 11, 3), (9, 11, 4), (2001, 2001, 3), (0,)]),
+            *(np.full((9, 11, 3), "a"), [[1], [1, 2]]),
+        ],
+    ),
+    "texture": (
+        lambda one, value: Simulation(one.scene, threads=2, texture=value),
+        [
+            *(np.zeros(shape, np.uint8) for shape in [(4, 5), (4, 5, 4), (0, 5, 3), (1, 70000, 3)]),
+            np.zeros((4, 5, 3)),
+        ],
+    ),
+    "camera": (Simulation.draw, [3, "side", {"eye": [0, 0]}, {"eye": [0, 0, 0]}]),
+    "frames": (Simulation.advance, [-1, 1.5, "2", None]),
+    "frames played": (lambda one, value: one.play(value), [-1]),
+    # Taichi would abort the process, or start them all.
+    "threads": (lambda one, value: Simulation(one.scene, threads=value), [0, -1, 10**6, True, 1.5, "2"]),
+    "pixel": (Simulation.pick, [3, None, ("a", 1), (1, 2, 3), (np.inf, 1), [[1], [1, 2]]]),
+    "probes": (Simulation.steer, [3]),
+    "probe": (Simulation.steer, [[{"force": [1]}]]),
+    "time of labels": (lambda one, value: one.labels(time=value), NO_TIMES),
+    "time of a picture": (lambda one, value: one.draw(time=value), NO_TIMES),
+    "saved": (Simulation.restore, [3]),
+    "path of a scene": (lambda _, value: load_scene(value), [{"sheet": {}}]),
+    "overrides": (lambda _, value: load_scene("small.yaml", value), [None, 3, {3: 3}, [3], "damping=1"]),
+    "directory of a run": (lambda one, value: run(one.scene, value, threads=2), [None, 3, "a\0b"]),
+    "directory to resume": (lambda _, value: resume(value), [None, 3, "a\0b"]),
+    "directory to read": (lambda _, value: read_run(value), ["a\0b"]),
+    "update": (lambda one, value: one.scene.model_copy(update=value), [3, {3: 3}]),
+    "keys without names": (lambda _, value: Sheet(*value), [((3, 3), (1, 1), 1)]),
+}
 
 
-@pytest.mark.parametrize("frames", [-1, 1.5, "2", None])
-def test_a_wrong_number_of_frames_is_refused(frames: Any, simulation: Simulation) -> None:
-    with pytest.raises(ArgumentError, match="frames cannot be simulated; take a whole number, 0 or more"):
-        simulation.advance(frames)
+# How NumPy of some version writes a number, and why it makes no array; and many digits.
+OF_NUMPY = r"(np\.float16\()?nan\)?|(np\.complex64)?\(1\+0j\)|setting an array.*(?=; take)|0{99,}"
 
 
-def test_scenes_made_in_python_are_checked(device: Device, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_arguments_are_refused(name: str, simulation: Simulation, small: Path, message: Messages) -> None:
+    call, values = WRONG[name]
+    for value in values:
+        with message.raises(SceneError if name in ("camera", "probe") else ArgumentError, hide=OF_NUMPY):
+            call(simulation, value)
+
+
+def test_scenes_made_in_python_are_checked(device: Device, tmp_path: Path, message: Messages) -> None:
     good = scene()
-    with pytest.raises(SceneError) as caught:
+    with message.raises(SceneError, "sheet.mass", "shaer"):
         Scene(sheet={"points": [3, 3], "size": [1, 1], "mass": 0}, springs={}, time={"duration": 1}, output=(), shaer=1)
-    assert caught.value.lines == (
-        "sheet.mass: 0 is not allowed; expected a number above 0, in kg",
-        "shaer: unknown key; did you mean 'sheet'?",
-    )
-    with pytest.raises(SceneError, match="damping: -1 is not allowed"):
+    with message.raises(SceneError, "damping"):
         good.model_copy(update={"damping": -1})
-    with pytest.raises(SceneError, match="supersample: 9 is not allowed"):
+    with message.raises(SceneError, "damping"):
+        good.damping = 3
+    with message.raises(SceneError, "supersample"):
         Render(supersample=9)
-    with pytest.raises(SceneError, match="force: missing"):
+    with message.raises(SceneError, "force"):
         Probe()
     broken = {"sheet": SHEET, "springs": {}, "time": {"duration": -1}, "output": []}
     unstable = with_time(good, step=0.04)
     assert plan_of(good).stable_step < 0.04
     for attempt in (lambda made: Simulation(made, threads=device.threads), lambda made: run(made, tmp_path / "out")):
-        with pytest.raises(SceneError, match=r"time\.duration: -1 is not allowed"):
+        with message.raises(SceneError, "time.duration"):
             attempt(broken)
-        with pytest.raises(SceneError, match=r"time\.step: 0\.04 s is"):
+        with message.raises(SceneError, "time.step"):
             attempt(unstable)
-        with pytest.raises(ArgumentError, match="str is no scene; take what load_scene returns"):
+        with message.raises(ArgumentError, "load_scene"):
             attempt("scenes/press.yaml")
     assert not (tmp_path / "out").exists()
     with Simulation(good.model_dump(), threads=device.threads) as simulation:
@@ -152,21 +162,19 @@ def test_a_tool_that_stands_can_be_put_elsewhere(device: Device) -> None:
         np.testing.assert_array_equal(steered.positions(), expected.positions())
 
 
-@pytest.mark.parametrize("probes", [[], [PRESS, PRESS], [{**PRESS, "at": [[0, 0.5, 0.5], [1, 0.6, 0.5]]}]])
-def test_what_needs_another_kernel_is_refused(probes: Any, simulation: Simulation) -> None:
+@pytest.mark.parametrize(
+    "probes", [[], [PRESS, PRESS], [{**PRESS, "at": [[0, 0.5, 0.5], [1, 0.6, 0.5]]}]], ids=["none", "two", "moving"]
+)
+def test_what_needs_another_kernel_is_refused(probes: Any, simulation: Simulation, message: Messages) -> None:
     simulation.advance()
     before = simulation.scene
-    with pytest.raises(
-        ArgumentError, match=r"cannot change .* restart with the new scene|the scene has 1; give all of them"
-    ):
+    with message.raises(ArgumentError):
         simulation.steer(probes)
-    with pytest.raises(SceneError, match=r"probes.0.force: \[1\] is not allowed"):
-        simulation.steer([{"force": [1]}])
     assert simulation.scene == before
     simulation.advance()
 
 
-def test_restarted_it_is_a_new_simulation(simulation: Simulation, device: Device) -> None:
+def test_restarted_it_is_a_new_simulation(simulation: Simulation, device: Device, message: Messages) -> None:
     simulation.advance(3)
     simulation.restart()
     assert (simulation.frame, simulation.time, simulation.steps) == (0, 0.0, 0)
@@ -178,7 +186,7 @@ def test_restarted_it_is_a_new_simulation(simulation: Simulation, device: Device
         expected.advance(2)
         np.testing.assert_array_equal(simulation.positions(), expected.positions())
         np.testing.assert_array_equal(simulation.draw(), expected.draw())
-    with pytest.raises(SceneError, match=r"time\.step"):
+    with message.raises(SceneError, "time.step"):
         simulation.restart(with_time(other, step=0.04))
     assert simulation.scene == other
 
@@ -258,42 +266,27 @@ def test_in_a_notebook_nothing_is_said() -> None:
     assert (done.stdout, done.stderr) == ("", "")
 
 
-def test_a_divergence_says_where_it_is(device: Device) -> None:
-    made = scene(probes=[{"force": [0, 0, 1e12], "falloff": 20, "at": [0.5, 0.5]}])
-    with Simulation(made, threads=device.threads) as simulation, pytest.raises(DivergedError) as caught:
-        simulation.advance(10)
-    error = caught.value
-    assert error.step > 0
-    assert error.time == pytest.approx(error.step * plan_of(made).grid.step)
-    assert f"point {error.point}" in str(error)
-    again = pickle.loads(pickle.dumps(error))
-    assert (str(again), again.step, again.time, again.point) == (str(error), error.step, error.time, error.point)
-
-
 def test_a_pickled_scene_error_has_its_lines() -> None:
     again = pickle.loads(pickle.dumps(SceneError(["first", "second"])))
     assert (str(again), again.lines) == ("first\nsecond", ("first", "second"))
 
 
-def test_all_errors_are_ours(simulation: Simulation) -> None:
+def test_all_errors_are_ours(simulation: Simulation, message: Messages) -> None:
     assert issubclass(ArgumentError, MsmError)
     assert issubclass(ArgumentError, ValueError)
+    with message.raises(MsmError):
+        simulation.diagnose()
     simulation.close()
     calls = (simulation.advance, simulation.draw, simulation.velocities, simulation.restart, simulation.compile)
     for call in (*calls, simulation.save):
-        with pytest.raises(MsmError, match="this simulation is closed"):
+        with message.raises(MsmError):
             call()
     assert np.isfinite(simulation.positions()).all()
 
 
-@pytest.mark.parametrize("threads", [0, -1, 10**6, True, 1.5, "2"])
-def test_a_wrong_number_of_threads_is_refused(threads: Any, device: Device) -> None:
-    # Taichi would abort the process, or start them all.
-    with pytest.raises(ArgumentError, match=r"threads: .*; take a whole number, 1 to 1024, or None"):
-        Simulation(scene(), threads=threads)
-
-
-def test_what_was_saved_elsewhere_is_not_gone_on_with(simulation: Simulation, device: Device) -> None:
+def test_what_was_saved_elsewhere_is_not_gone_on_with(
+    simulation: Simulation, device: Device, message: Messages
+) -> None:
     simulation.advance(3)
     before = simulation.positions()
     others = (
@@ -304,88 +297,113 @@ def test_what_was_saved_elsewhere_is_not_gone_on_with(simulation: Simulation, de
     for other in others:
         with Simulation(other, threads=device.threads) as elsewhere:
             elsewhere.advance(1)
-            with pytest.raises(ArgumentError, match="saved with this scene's points, probes, precision and step"):
+            with message.raises(ArgumentError, "saved"):
                 simulation.restore(elsewhere.save())
-    with pytest.raises(ArgumentError, match="int is not what `save` returns"):
-        simulation.restore(3)  # type: ignore[arg-type]
     np.testing.assert_array_equal(simulation.positions(), before)
     simulation.advance()
 
 
-def test_nothing_is_diagnosed_of_a_sound_simulation(simulation: Simulation) -> None:
-    simulation.advance(2)
-    with pytest.raises(MsmError, match="has not diverged"):
-        simulation.diagnose()
-
-
-@pytest.mark.parametrize("pixel", [3, None, ("a", 1), (1, 2, 3), (np.inf, 1), [[1], [1, 2]]])
-def test_what_is_no_pixel_is_refused(pixel: Any, simulation: Simulation) -> None:
-    with pytest.raises(ArgumentError, match="pixel: "):
-        simulation.pick(pixel)
-
-
-def test_rows_of_unequal_length_are_refused(simulation: Simulation) -> None:
-    with pytest.raises(ArgumentError, match="positions: "):
-        simulation.draw(positions=[[1], [1, 2]])  # type: ignore[arg-type]
-    with pytest.raises(ArgumentError, match="frames cannot be simulated"):
-        simulation.play(-1)
-    with pytest.raises(ArgumentError, match="probes: 3"):
-        simulation.steer(3)  # type: ignore[arg-type]
-    with pytest.raises(SceneError) as caught:
-        simulation.draw("side")
-    assert caught.value.lines[0].startswith('render.camera: "side" is not allowed')
-    assert len(caught.value.lines) == 1
-
-
-def test_sections_take_keys_by_name_and_stay_as_they_are(simulation: Simulation) -> None:
-    made = simulation.scene
-    with pytest.raises(ArgumentError, match="Sheet takes its keys by name: points, size, mass, fixed"):
-        Sheet((3, 3), (1, 1), 1)  # type: ignore[call-arg]
-    with pytest.raises(
-        SceneError, match=r"damping: a scene cannot be changed; use model_copy\(update={'damping': ...}\)"
-    ):
-        made.damping = 3
-    for update in (3, {3: 3}):
-        with pytest.raises(ArgumentError, match=r"update: .*; take a mapping from keys to values"):
-            made.model_copy(update=update)  # type: ignore[arg-type]
-
-
-def test_a_mapping_is_no_path_of_a_scene() -> None:
-    with pytest.raises(ArgumentError, match=r"^path: a mapping; Scene\(\*\*mapping\)"):
-        load_scene({"sheet": {}})  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("overrides", [None, 3, {3: 3}, [3], "damping=1"])
-def test_overrides_are_texts(overrides: Any, small: Path) -> None:
-    with pytest.raises(ArgumentError, match="overrides: "):
-        load_scene("small.yaml", overrides)
-
-
-@pytest.mark.parametrize("directory", [None, 3, "a\0b"])
-def test_a_directory_is_a_path(directory: Any, device: Device) -> None:
-    with pytest.raises(ArgumentError, match=r"directory: .*; take a path"):
-        run(scene(), directory, threads=device.threads)
-    with pytest.raises(ArgumentError, match=r"directory: .*; take a path"):
-        resume(directory)
-
-
-NO_TIMES = [10**400, -(10**400), np.inf, np.float16(np.nan), np.complex64(1), True, "1", [0.1]]
-
-
-@pytest.mark.parametrize("time", NO_TIMES, ids=lambda time: repr(time)[:20])
-def test_what_is_no_time_is_refused(time: Any, simulation: Simulation) -> None:
-    for call in (simulation.labels, simulation.draw):
-        with pytest.raises(ArgumentError, match=r"^time: .*; take a number, in seconds, or None for now$"):
-            call(time=time)
-
-
-@pytest.mark.parametrize("call", [pickle.dumps, copy.copy, copy.deepcopy])
-def test_a_simulation_that_is_pickled_names_what_can_be(call: Any, simulation: Simulation, device: Device) -> None:
-    with pytest.raises(MsmError) as caught:
-        call(simulation)
-    remedy = "keep its `scene` and what `save` returns, and `restore` that in a new one"
-    assert str(caught.value) == f"a Simulation cannot be pickled or copied; {remedy}"
+def test_a_simulation_that_is_pickled_names_what_can_be(
+    simulation: Simulation, device: Device, message: Messages
+) -> None:
+    for call in (pickle.dumps, copy.copy, copy.deepcopy):
+        with message.raises(MsmError, "restore"):
+            call(simulation)
     saved, made = pickle.loads(pickle.dumps((simulation.save(), simulation.scene)))
     with Simulation(made, threads=device.threads) as other:
         other.restore(saved)
         np.testing.assert_array_equal(other.positions(), simulation.positions())
+
+
+def test_frames_positions_and_pictures(device: Device) -> None:
+    made = scene(render={"size": [40, 30], "refine": 1})
+    twin = reference.simulate(made)
+    with Simulation(made, threads=device.threads, texture=speckle(30, 40)) as simulation:
+        np.testing.assert_array_equal(simulation.positions(), twin[0])
+        simulation.advance(3)
+        assert simulation.frame == 3
+        assert simulation.time == pytest.approx(0.12)
+        np.testing.assert_allclose(simulation.positions(), twin[3], atol=1e-13)
+        apart = np.abs(simulation.draw().astype(int) - reference.draw(made, twin[3], speckle(30, 40)))
+        assert (apart > 1).mean() < 0.01
+        simulation.advance(0)
+        assert simulation.frame == 3
+    assert simulation.progress.max_displacement == pytest.approx(np.linalg.norm(twin[:4] - twin[0], axis=-1).max())
+
+
+def test_kernels_are_compiled_once_in_a_process(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    observed, own = [], Simulation.observe
+
+    def observe(simulation: Simulation, *given: Any) -> FrameOutputs:
+        observed.append(given)
+        return own(simulation, *given)
+
+    monkeypatch.setattr(Simulation, "observe", observe)
+    for refine, drawn in ((3, 2), (2, 2), (0, 4)):  # Only whether the sheet is refined is compiled.
+        made = scene(render={"size": [40, 30], "refine": refine}, image="any.png", output=["png"])
+        with Simulation(made, threads=device.threads, texture=speckle(30, 40)) as simulation:
+            if refine == 3:
+                monkeypatch.setattr("taichi_msm.runs.simulation._compiled_kernels", set())
+            simulation.compile()
+        assert len(observed) == drawn
+
+
+def test_positions_of_a_frame_stay_as_they_were(device: Device) -> None:
+    with Simulation(scene(), threads=device.threads) as simulation:
+        simulation.advance()
+        before = simulation.positions()
+        copy = before.copy()
+        simulation.advance()
+        np.testing.assert_array_equal(before, copy)
+        assert not before.flags.writeable
+
+
+def test_after_a_divergence_the_last_good_frame_is_there(device: Device, message: Messages) -> None:
+    # At 0.1 s the load jumps to what tears the sheet apart.
+    made = scene(probes=[{"force": [0, 0, 1], "load": [[0, 0], [0.1, 100], [0.1, 1e15]], "falloff": 20}])
+    with Simulation(made, threads=device.threads) as simulation:
+        simulation.advance(2)
+        good = simulation.positions()
+        with message.raises(DivergedError, "0.12 s", hide=r"point .*? is \S+") as caught:
+            simulation.advance(5)
+        np.testing.assert_array_equal(simulation.positions(), good)
+    error = caught.value
+    assert isinstance(error, DivergedError)
+    assert error.step > 0
+    assert error.time == pytest.approx(error.step * plan_of(made).grid.step)
+    assert f"point {error.point}" in str(error)
+    again = pickle.loads(pickle.dumps(error))
+    assert (str(again), again.step, again.time, again.point) == (str(error), error.step, error.time, error.point)
+
+
+def test_a_sheet_that_nothing_holds_may_fly_away(device: Device) -> None:
+    # F = 0.05 N on each point of 1 g for 0.8 s: u = F t^2 / (2 m) = 16 m, forty sheets away, and no error of Verlet.
+    made = scene(
+        sheet={"points": [2, 2], "size": [0.4, 0.4], "mass": 1e-3, "fixed": "none"},
+        springs={"structural": 20},
+        damping=0,
+        probes=[{"force": [0, 0, 0.05], "falloff": 0, "offset": 0}],
+        time={"duration": 0.8},
+    )
+    with Simulation(made, threads=device.threads) as simulation:
+        simulation.advance(20)
+        np.testing.assert_allclose(simulation.positions()[..., 2], 16.0, rtol=1e-12)
+
+
+def test_one_device_a_process(device: Device, message: Messages) -> None:
+    with message.raises(taichi_msm.DeviceError, hide=active_compiler().title):
+        Simulation(scene(), threads=device.threads + 1)
+
+
+def test_the_encoder_has_a_core_of_its_own_while_it_works(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(process, "available_threads", lambda: 4)
+    made = scene(render={"size": [512, 512]}, time={"step": 0.001})
+    assert free_cores(plan_of(made)) == 4, "nothing to encode"
+    made = made.model_copy(update={"image": "a.png", "output": ("gif",)})
+    assert free_cores(plan_of(made)) == 3
+    # 40 steps of 10^6 points a frame take longer than its 512 x 512 pixels.
+    large = made.sheet.model_copy(update={"points": (1000, 1000)})
+    large_scene = made.model_copy(update={"sheet": large})
+    assert free_cores(plan_of(large_scene)) == 4
+    monkeypatch.setattr(process, "available_threads", lambda: 1)
+    assert free_cores(plan_of(made)) == 1

@@ -25,6 +25,7 @@ from taichi_msm.solver.rest import FORCE_TOLERANCE, build_dynamics
 from taichi_msm.study.study import run_study
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
+from tests.golden import Messages
 from tests.scenes import plan_of
 from tests.solver.test_rest import NEVER, PRESSED, PUSH, TISSUE, at_rest
 
@@ -114,15 +115,10 @@ def test_a_run_tells_how_well_the_forces_balance(device: Device, tmp_path: Path)
     assert (estimate["error"], record["error_estimate_reason"]) == (None, "quasistatic")
     assert estimate["mesh_error"]
     assert record["notes"][0].startswith("error: mesh ")
-    assert record["notes"][1] == "error: none due to a time step, as the sheet is at rest"
-    assert np.load(tmp_path / "out" / "trajectory.npz")["position"].shape == (FRAMES + 1, *made.sheet.points, 3)
-
-
-def test_a_run_that_begins_pressed_is_read_again(device: Device, tmp_path: Path) -> None:
-    made = at_rest([PUSH], output=["trajectory"])
-    run(made, tmp_path, threads=device.threads)
-    positions = read_run(tmp_path).positions()
-    assert (positions[0] - rest_positions(made.sheet))[..., 2].min() < -1e-3
+    assert "time step" in record["notes"][1]
+    positions = read_run(tmp_path / "out").positions()
+    assert positions.shape == (FRAMES + 1, *made.sheet.points, 3)
+    assert (positions[0] - rest_positions(made.sheet))[..., 2].min() < -1e-3, "it begins pressed"
 
 
 def test_an_interrupted_run_ends_with_the_same_bits(device: Device, tmp_path: Path) -> None:
@@ -146,82 +142,59 @@ def test_an_interrupted_run_ends_with_the_same_bits(device: Device, tmp_path: Pa
     assert positions[0] == positions[1]
 
 
-@pytest.mark.parametrize(("load", "frames"), [([[0, 100]], 0), ([[0, 0], [1, 100]], 1)])
+@pytest.mark.parametrize(("load", "frames"), [([[0, 100]], 0), ([[0, 0], [1, 100]], 1)], ids=["at first", "later"])
 def test_what_never_rests_is_a_divergence(
-    load: list[list[float]], frames: int, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    load: list[list[float]],
+    frames: int,
+    device: Device,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    message: Messages,
 ) -> None:
     monkeypatch.setattr("taichi_msm.solver.rest.MAX_EVALUATIONS", 20)
     made = at_rest([{**PUSH, "load": load}], output=["trajectory"], **NEVER)
     record = run(made, tmp_path / "out", threads=device.threads)
     assert (record["status"], record["frames"]) == ("diverged", frames)
-    assert record["error"].startswith(f"diverged at {frames} s, frame {frames}: no shape was found in which the forces")
-    assert "after 220 evaluations, 0.1" in record["error"]
-    assert record["error"].endswith("1e-07 was wanted; nothing holds the sheet; fix a side, or give it a foundation")
+    message(record["error"], "220 evaluations", hide=r"0\.1\d+")
     assert (record["dump"] is None) == (frames == 0)
     assert json.loads((tmp_path / "out" / "run.json").read_text())["frames"] == frames
 
 
-def test_the_program_tells_of_rest(small: Path, program: Program) -> None:
+def test_the_program_tells_of_rest(small: Path, program: Program, message: Messages) -> None:
     still = ["--set", "time.motion=quasistatic"]
-    checked = program("check", "small.yaml", *still)
-    assert "99 points, 5 frames, each at rest, in f64\n" in checked.stdout
+    assert "99 points, 5 frames, each at rest, in f64\n" in program("check", "small.yaml", *still).stdout
     facts = json.loads(program("check", "small.yaml", "--json", *still).stdout)
     assert (facts["step"], facts["stable_step"], facts["steps"], facts["precision"]) == (None, None, None, "f64")
     ran = program("run", "small.yaml", *still)
     assert ran.returncode == 0
-    assert "5 frames, at rest to " in ran.stdout
-    assert " of the largest force, " in ran.stdout
+    assert re.search(r"5 frames, at rest to .* of the largest force, ", ran.stdout)
     again = program("run", "--again", "output/small", "--out", "again")
     assert again.returncode == 0
     pictures = [small / folder / "frames" / "0001.png" for folder in ("output/small", "again")]
     assert pictures[0].read_bytes() == pictures[1].read_bytes()
     gone = [*still, "--set", "sheet.fixed=none", "--set", "springs.virtual=0"]
-    diverged = program("run", "small.yaml", "--out", "gone", *gone)
+    diverged = program("run", "small.yaml", "--out", "gone", "--quiet", *gone)
     assert diverged.returncode == 3
-    assert diverged.stderr.startswith("small.yaml: diverged at 0.1 s, frame 1: no shape was found in which the forces")
-    assert "; frames in gone: 1; last good state: " in diverged.stderr
+    message(diverged.stderr, "frames in gone: 1", hide=r"\d+ evaluations, \S+")
 
 
-REFUSED = [
-    ("time.tolerance=1e-3", "time.tolerance: is for the time step, and motion: quasistatic takes none; remove the"),
-    ("time.precision=f32", "time.precision: f32 is too coarse for motion: quasistatic; take auto or f64"),
-    ("time.motion=static", 'time.motion: "static" is not allowed; expected dynamic or quasistatic; did you mean'),
-]
-
-
-@pytest.mark.parametrize(("change", "said"), REFUSED)
-def test_what_does_not_go_with_rest(change: str, said: str, small: Path, program: Program) -> None:
-    text = (small / "small.yaml").read_text().replace(", mass: 1.0e-3", "").replace("10}", "10, motion: quasistatic}")
-    (small / "still.yaml").write_text(text)
-    assert program("check", "still.yaml").returncode == 0
-    refused = program("check", "still.yaml", "--set", change)
-    assert refused.returncode == 2
-    assert said in refused.stderr
-    assert refused.stderr.count("\n") == 1
-
-
-def test_mass_and_density_are_missed_only_in_motion(small: Path) -> None:
-    with pytest.raises(SceneError, match=r"sheet.mass: missing; with springs expected"):
-        load_scene("small.yaml", ["sheet.mass="])
+def test_what_does_not_go_with_rest(small: Path, device: Device, message: Messages) -> None:
     load_scene("small.yaml", ["sheet.mass=", "time.motion=quasistatic"])
-    with pytest.raises(SceneError, match=r"tissue.density: missing; expected a number above 0, in kg/m3"):
-        at_rest_checked(time={"motion": "dynamic"})
-    at_rest_checked()
-
-
-def at_rest_checked(**sections: Any) -> None:
-    check_scene(at_rest([PUSH], **sections))
-
-
-def test_friction_and_gpus_and_studies_are_refused(device: Device) -> None:
-    with pytest.raises(SceneError, match=r"probes.0.friction: 0.2 needs time.motion: dynamic, as at rest nothing slid"):
+    for change in ("time.tolerance=1e-3", "time.precision=f32", "time.motion=static"):
+        with message.raises(SceneError, change.partition("=")[0]):
+            load_scene("small.yaml", ["time.motion=quasistatic", change])
+    with message.raises(SceneError, "probes.0.friction"):
         Simulation(at_rest([{**PRESSED, "friction": 0.2}]))
-    with pytest.raises(
-        DeviceError, match=r"--arch vulkan: time.motion: quasistatic runs on a CPU only; take --arch cp"
-    ):
+    with message.raises(DeviceError, "--arch vulkan"):
         choose_layout(plan_of(at_rest([PUSH])), Device("vulkan", 1))
-    with pytest.raises(SceneError, match=r"time.motion: quasistatic takes no steps, which a study compares; set time"):
+    with message.raises(SceneError, "time.motion"):
         run_study(at_rest([PUSH]), "rest", threads=device.threads)
+    # And what is missed only in motion.
+    with message.raises(SceneError, "sheet.mass"):
+        load_scene("small.yaml", ["sheet.mass="])
+    check_scene(at_rest([PUSH]))
+    with message.raises(SceneError, "tissue.density"):
+        check_scene(at_rest([PUSH], time={"motion": "dynamic"}))
 
 
 def test_a_pilot_that_never_rests_leaves_the_error_unknown(
