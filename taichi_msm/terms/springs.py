@@ -63,7 +63,7 @@ class SpringTerm(Term):
     by_area: bool  # whether springs along an open edge are softer, because they belong to one cell
     mapped: bool  # whether each stiffness is read from an array, with 0 for springs beyond an edge
     tense: bool  # whether the sheet is under tension at rest
-    law: Law  # of the springs
+    law: Law = LinearLaw()  # of the springs
 
     reach: ClassVar[int] = 1
     reductions: ClassVar[tuple[str, ...]] = ("min", "max", "sum", "sum", "sum", "sum", "sum", "sum")

@@ -37,7 +37,7 @@ __all__ = ["short_launches"]
 STIFFENING = {"stiffening": {"lock": 0.02, "factor": 6}}
 LOCKING_FOUNDATION = {"foundation": {"young": 2e4, "depth": 0.015, "lock": 0.002, "factor": 5}}
 RELAXATION = {"relaxation": [{"share": 0.5, "time": 0.03}, {"share": 0.2, "time": 0.4}]}
-CASES = {
+CASES: dict[str, dict[str, Any]] = {
     "sheet": STIFFENING,
     "foundation": LOCKING_FOUNDATION,
     "relaxation": RELAXATION,
