@@ -29,7 +29,7 @@ def test_what_is_no_file_or_never_ends_is_not_read(tmp_path: Path, message: Mess
     with (tmp_path / "sparse").open("wb") as file:
         file.truncate(20 << 30)
     for path in (tmp_path / "pipe", Path("/dev/zero"), tmp_path / "sparse", tmp_path):
-        with message.raises(OSError):
+        with message.raises(OSError, hide=r": \d+$"):
             read_regular(path, 1 << 20)
 
 

@@ -33,6 +33,9 @@ def data_set(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         "time.duration": (FRAMES - 1) / 25,
         "render.size": [WIDTH, HEIGHT],
         "render.tracks": TRACKS,
+        # One kernel draws pictures and labels.
+        "render.supersample": 1,
+        "render.shading": "none",
         "output": ["png", "depth", "flow", "occlusion", "tracks"],
     }
     vary = {"probes.1.at": {"uniform": [[0.55, 0.5], [0.65, 0.6]]}}

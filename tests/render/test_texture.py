@@ -19,7 +19,7 @@ from tests.golden import Messages
 from tests.scenes import speckle
 
 # The words of Pillow, which depend on its version.
-OF_PILLOW = r"(?<=\()[^()]*(?=\); )"
+OF_PILLOW = r"(?<= \().*(?=\); )"
 
 BACKGROUND = (10, 20, 30)
 ORIENTATION = 0x0112
