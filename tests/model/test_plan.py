@@ -44,7 +44,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
         return function(*arguments)
 
     for module, name in DERIVED:
-        function: Any = getattr(module, name)
+        function: Callable[..., Any] = getattr(module, name)
         for other in [one for key, one in sys.modules.items() if key.startswith(taichi_msm.__name__)]:
             if getattr(other, name, None) is function:
                 monkeypatch.setattr(other, name, partial(count, name, function))
