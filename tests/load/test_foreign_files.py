@@ -13,35 +13,30 @@ import pytest
 from taichi_msm.errors import FilesError
 from taichi_msm.runs.finished import read_run
 from taichi_msm.system.files import private_folder, read_regular
+from tests.golden import Messages
 
 
-def test_a_file_comes_whole_up_to_its_limit(tmp_path: Path) -> None:
+def test_a_file_comes_whole_up_to_its_limit(tmp_path: Path, message: Messages) -> None:
     (tmp_path / "a").write_bytes(b"123")
     assert read_regular(tmp_path / "a", 3) == b"123"
-    with pytest.raises(OSError, match="larger than"):
+    with message.raises(OSError):
         read_regular(tmp_path / "a", 2)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
-def test_what_is_no_file_or_never_ends_is_not_read(tmp_path: Path) -> None:
+def test_what_is_no_file_or_never_ends_is_not_read(tmp_path: Path, message: Messages) -> None:
     os.mkfifo(tmp_path / "pipe")
     with (tmp_path / "sparse").open("wb") as file:
         file.truncate(20 << 30)
-    for path, said in (
-        (tmp_path / "pipe", "not a regular file"),
-        (Path("/dev/zero"), "not a regular file"),
-        (tmp_path / "sparse", "larger than 1,048,576 bytes"),
-        (tmp_path, "Is a directory"),
-    ):
-        with pytest.raises(OSError, match=said):
+    for path in (tmp_path / "pipe", Path("/dev/zero"), tmp_path / "sparse", tmp_path):
+        with message.raises(OSError, hide=r": \d+$"):
             read_regular(path, 1 << 20)
 
 
-def test_a_record_that_fills_memory_is_one_line(results: Path) -> None:
+def test_a_record_that_fills_memory_is_one_line(results: Path, message: Messages) -> None:
     os.truncate(results / "run.json", 20 << 30)
-    with pytest.raises(FilesError) as caught:
+    with message.raises(FilesError, "run.json"):
         read_run(results)
-    assert str(caught.value) == f"{results / 'run.json'}: larger than 268,435,456 bytes"
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="the temporary directory is the user's")

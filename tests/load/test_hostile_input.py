@@ -20,7 +20,7 @@ from PIL import Image
 
 from taichi_msm.errors import SceneError
 from taichi_msm.load.scene_file import load_scene
-from taichi_msm.render.texture import image_size, load_texture
+from taichi_msm.render.texture import image_problems, image_size, load_texture
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.motion import dynamics_of
@@ -31,14 +31,11 @@ resource: Any = pytest.importorskip("resource")
 
 SCENES, OVERRIDES, PICTURES, VALID, BROKEN = 20_000, 2_000, 5_000, 500, 1_500
 
-# Of these so many are tried by default, and all by -m fuzz.
-PART = 10
 
-
-def tries(all_of_them: int) -> pytest.MarkDecorator:
-    """Give a test the argument `tries`."""
+def tries(all_of_them: int, part: int = 10) -> pytest.MarkDecorator:
+    """Give a test the argument `tries`: a part of them by default, and all by -m fuzz."""
     return pytest.mark.parametrize(
-        "tries", [all_of_them // PART, pytest.param(all_of_them, marks=pytest.mark.fuzz)], ids=["some", "all"]
+        "tries", [all_of_them // part, pytest.param(all_of_them, marks=pytest.mark.fuzz)], ids=["some", "all"]
     )
 
 
@@ -124,8 +121,7 @@ def pictures() -> list[bytes]:
         *(("JPEG", mode, {"exif": turned}) for mode in ("RGB", "L", "CMYK")),
         *(("WEBP", mode, {"lossless": mode == "RGBA"}) for mode in ("RGB", "RGBA")),
         *(("TIFF", "RGB", {"compression": name}) for name in ("raw", "tiff_lzw", "jpeg", "tiff_deflate")),
-        ("BMP", "RGB", {}),
-        ("GIF", "P", {}),
+        *(("BMP", "RGB", {}), ("GIF", "P", {})),
     ]
     made = []
     for form, mode, options in kinds:
@@ -147,6 +143,7 @@ def test_damaged_pictures(tries: int, here: Path, capfd: pytest.CaptureFixture[s
 
     def read() -> None:
         image_size(scene)
+        list(image_problems(scene))
         texture = load_texture(scene)
         assert texture.dtype == np.uint8
         assert texture.ndim == 3
@@ -171,29 +168,20 @@ def valid_scene(rng: random.Random) -> dict[str, Any]:
     load = [[t / 100, rng.uniform(-100, 100)] for t in sorted(rng.sample(range(100), rng.randrange(1, 5)))]
     if rng.random() < 0.5:
         load.append([load[-1][0], rng.uniform(-100, 100)])
+    probe = {
+        "at": [rng.random(), rng.random()],
+        "force": [rng.uniform(-1e3, 1e3) for _ in range(3)],
+        "load": load,
+        "falloff": rng.choice((0, size(1e-3, 1e3))),
+        "offset": rng.uniform(0, 20),
+    }
+    sheet = {"points": [5, 7], "size": [size(0.01, 10), size(0.01, 10)], "mass": size(1e-6, 1e3)}
+    springs = {name: size(1e-3, 1e6) for name in ("structural", "shear", "virtual")}
     return {
-        "sheet": {
-            "points": [5, 7],
-            "size": [size(0.01, 10), size(0.01, 10)],
-            "mass": size(1e-6, 1e3),
-            "fixed": rng.choice(("border", "none")),
-        },
-        "springs": {
-            "structural": size(1e-3, 1e6),
-            "shear": size(1e-3, 1e6),
-            "virtual": size(1e-3, 1e6),
-            "virtual_active": rng.choice(("loaded", "always")),
-        },
+        "sheet": {**sheet, "fixed": rng.choice(("border", "none"))},
+        "springs": {**springs, "virtual_active": rng.choice(("loaded", "always"))},
         "damping": size(1e-6, 10),
-        "probes": [
-            {
-                "at": [rng.random(), rng.random()],
-                "force": [rng.uniform(-1e3, 1e3) for _ in range(3)],
-                "load": load,
-                "falloff": rng.choice((0, size(1e-3, 1e3))),
-                "offset": rng.uniform(0, 20),
-            }
-        ],
+        "probes": [probe],
         "time": {
             "duration": rng.randrange(1, 10) / rate,
             "frames_per_second": rate,
@@ -205,22 +193,17 @@ def valid_scene(rng: random.Random) -> dict[str, Any]:
 
 
 def write(scene: dict[str, Any]) -> str:
-    """Write a scene, one key a line."""
+    """Write a scene, one key a line; JSON is YAML, but for what is no number."""
     lines = []
     for key, value in scene.items():
-        if key in ("sheet", "springs", "time"):
-            lines += [f"{key}:", *(f"  {name}: {flow(one)}" for name, one in value.items())]
-        elif key == "probes":
-            first, *others = (f"{name}: {flow(one)}" for name, one in value[0].items())
-            lines += ["probes:", f"- {first}", *(f"  {other}" for other in others)]
-        else:
-            lines.append(f"{key}: {flow(value)}")
-    return "\n".join(lines) + "\n"
-
-
-def flow(value: Any) -> str:
-    """Write a value on one line: JSON is YAML, but for what is no number."""
-    return json.dumps(value).replace("Infinity", ".inf").replace("NaN", ".nan")
+        if key not in ("sheet", "springs", "probes", "time"):
+            lines.append(f"{key}: {json.dumps(value)}")
+            continue
+        section = [f"  {name}: {json.dumps(one)}" for name, one in (value[0] if key == "probes" else value).items()]
+        if key == "probes":
+            section[0] = section[0].replace("  ", "- ", 1)
+        lines += [f"{key}:", *section]
+    return "\n".join(lines).replace("Infinity", ".inf").replace("NaN", ".nan") + "\n"
 
 
 @tries(VALID)

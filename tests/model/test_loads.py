@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.integrate import quad
 
 from taichi_msm.model.loads import LoadBounds, average_loads, evaluate_loads, keyframe_times
@@ -15,12 +16,6 @@ from tests.scenes import PRESS, SPRINGS, plan_of, scene
 # 25 frames a second in 4 steps of 0.01 s.
 STEPS = {"duration": 1.0, "step": 0.01}
 SOFT = {**SPRINGS, "structural": 0.1, "shear": 0.1, "virtual": 0.1}
-
-
-def percent(load: list[list[float]], **changes: Any) -> list[float]:
-    """Percent at the steps 0 to 5, that is at 0 s to 0.05 s."""
-    made = scene(springs=SOFT, probes=[{"force": [100, 0, 0], "load": load}], time=STEPS, **changes)
-    return [round(float(value), 5) for value in average_loads(plan_of(made), 0, 6).strength[:, 0, 0]]
 
 
 @pytest.mark.parametrize(
@@ -44,7 +39,8 @@ def percent(load: list[list[float]], **changes: Any) -> list[float]:
     ],
 )
 def test_percent(load: list[list[float]], expected: list[float]) -> None:
-    assert percent(load) == pytest.approx(expected, abs=1.1e-5)
+    made = scene(springs=SOFT, probes=[{"force": [100, 0, 0], "load": load}], time=STEPS)
+    assert average_loads(plan_of(made), 0, 6).strength[:, 0, 0] == pytest.approx(expected, abs=1.1e-5)
 
 
 def test_what_no_key_is_near_is_the_value_itself() -> None:
@@ -150,11 +146,8 @@ def test_virtual_springs_while_loaded(loads: list[list[list[float]]], expected: 
     probes = [{"force": [0, 0, 1], "load": load} for load in loads]
     made = scene(springs=SOFT, probes=probes, time=STEPS)
     assert average_loads(plan_of(made), 0, 6).active.tolist() == pytest.approx(expected, abs=1e-12)
-
-
-def test_virtual_springs_always() -> None:
-    made = scene(springs={**SOFT, "virtual_active": "always"}, probes=[], time=STEPS)
-    assert average_loads(plan_of(made), 0, 3).active.tolist() == [1, 1, 1]
+    made = scene(springs={**SOFT, "virtual_active": "always"}, probes=probes, time=STEPS)
+    assert average_loads(plan_of(made), 0, 6).active.tolist() == [1] * 6
 
 
 def test_a_schedule_does_not_depend_on_where_it_is_cut() -> None:
@@ -179,15 +172,6 @@ def test_keys_that_change_nothing_change_no_bit() -> None:
     assert bits(load, 6) == bits([*load, [0.06, 70], [0.06, 0], [0.08, 5]], 6)
 
 
-def test_a_control_point_moves_between_its_keys_and_is_held_outside() -> None:
-    keys = [[0.01, 0, 0], [0.03, 1, 0.5]]
-    made = scene(springs=SOFT, probes=[{"force": [0, 0, 1], "at": keys}], time=STEPS)
-    point = average_loads(plan_of(made), 0, 6).point[:, 0]
-    # The sheet is 0.4 m wide and 0.3 m high, its centre the origin, y up.
-    expected = [[-0.2, 0.15], [-0.2, 0.15], [0, 0.075], [0.2, 0], [0.2, 0], [0.2, 0]]
-    np.testing.assert_allclose(point, expected, atol=1e-15)
-
-
 @pytest.mark.parametrize("keys", [[[0, 0, 0], [0.02, 0, 0], [0.02, 1, 1]], [[0.02, 0, 0], [0.02, 1, 1]]])
 def test_a_jump_of_the_control_point_shares_the_force_between_both_places(keys: list[list[float]]) -> None:
     probe = {"force": [0, 0, 8], "at": keys, "load": [[0, 100], [0.02, 100], [0.02, 50]]}
@@ -200,11 +184,16 @@ def test_a_jump_of_the_control_point_shares_the_force_between_both_places(keys: 
     np.testing.assert_allclose(found.point[3:, 1], [[0.2, -0.15]] * 2)
 
 
-def test_before_and_after_a_jump_the_control_point_is_where_its_keys_have_it() -> None:
-    # The jump is between two steps; before it the control point moves, and after it too.
-    at = [[0, 0, 0], [0.024, 0.6, 0], [0.024, 1, 1], [0.044, 0.5, 1]]
-    made = scene(springs=SOFT, probes=[{"force": [0, 0, 8], "at": at}], time=STEPS)
-    x = average_loads(plan_of(made), 0, 5).point[..., 0] / 0.4 + 0.5
+def test_a_control_point_is_where_its_keys_have_it() -> None:
+    def places(at: list[list[float]]) -> NDArray[np.float64]:
+        made = scene(springs=SOFT, probes=[{"force": [0, 0, 8], "at": at}], time=STEPS)
+        return average_loads(plan_of(made), 0, 6).point
+
+    # Between its keys, and held before and after. The sheet is 0.4 m wide and 0.3 m high, its centre the origin, y up.
+    expected = [[-0.2, 0.15], [-0.2, 0.15], [0, 0.075], [0.2, 0], [0.2, 0], [0.2, 0]]
+    np.testing.assert_allclose(places([[0.01, 0, 0], [0.03, 1, 0.5]])[:, 0], expected, atol=1e-15)
+    # A jump between two steps; before it the control point moves, and after it too.
+    x = places([[0, 0, 0], [0.024, 0.6, 0], [0.024, 1, 1], [0.044, 0.5, 1]])[..., 0] / 0.4 + 0.5
     np.testing.assert_allclose(x[[0, 1, 2, 3], 0], [0, 0.25, 0.5, 0.6], atol=1e-12)
     np.testing.assert_allclose(x[[2, 3, 4], 1], [1, 0.85, 0.6], atol=1e-12)
 

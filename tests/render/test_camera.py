@@ -13,6 +13,7 @@ from taichi_msm.scene.camera import Camera
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_SUPERSAMPLE
 from taichi_msm.system.runtime import Device
+from tests.golden import Messages
 from tests.scenes import scene
 
 
@@ -67,21 +68,28 @@ def test_the_distance_of_the_target_does_not_matter(away: float) -> None:
     assert view(far).near == view(near).near < 1e-6
 
 
-def test_cameras_that_see_nothing_are_refused() -> None:
-    assert [str(p) for p in camera_problems(with_camera({"eye": [0, 0, 0]}))] == [
-        "render.camera.eye: [0.0, 0.0, 0.0] is also the target; move one of them"
-    ]
-    assert [str(p) for p in camera_problems(with_camera({"eye": [0, 2, 0]}))] == [
-        "render.camera.up: [0.0, 1.0, 0.0] is zero or along the line of sight; take a direction across it"
-    ]
-    assert not list(camera_problems(with_camera({"eye": [0, 0, 1]})))
+@pytest.mark.parametrize(
+    ("key", "camera"),
+    [
+        *(("eye", {"eye": [0.1, 0.2, away], "target": [0.1, 0.2, 0]}) for away in (0, 1e-300, 1e-31)),
+        ("up", {"eye": [0, 2, 0]}),
+        *(("up", {"eye": [0, 0, 1], "up": zero}) for zero in ([0, 0, 0], [0, 0, 1e-300])),
+        # Kernels have the camera's matrix in f32, where 1e30 m times 4.7e8 px, for the smallest angle, overflows.
+        ("eye", {"eye": [0, 0, 1e30], "target": [1e30, 0, 0], "fov": 1e-3}),
+    ],
+    ids=["at the target", "near the target", "nearer", "up along the view", "no up", "tiny up", "far"],
+)
+def test_cameras_that_see_nothing_are_refused(key: str, camera: dict[str, Any], message: Messages) -> None:
+    made = with_camera(camera, size=(100, 8192))
+    with message.raises(SceneError, f"render.camera.{key}") as caught:
+        view(made)
+    assert [str(problem) for problem in camera_problems(made)] == [str(caught.value)]
 
 
 @pytest.mark.parametrize("fov", [0, 1e-300, 9.99e-4, 180])
-def test_an_angle_that_no_picture_can_have_is_refused(fov: float) -> None:
-    with pytest.raises(SceneError) as caught:
+def test_an_angle_that_no_picture_can_have_is_refused(fov: float, message: Messages) -> None:
+    with message.raises(SceneError, f"fov: {fov}"):
         Camera(eye=(0, 0, 1), fov=fov)
-    assert str(caught.value) == f"fov: {fov} is not allowed; expected a number from 0.001 to below 180, in degrees"
 
 
 @pytest.mark.parametrize("length", [5e-324, 1e-300, 1e-160, 1e-30, 1e30])
@@ -92,27 +100,10 @@ def test_the_length_of_up_does_not_matter(length: float) -> None:
     np.testing.assert_allclose(found, expected, rtol=0, atol=4 * np.finfo(float).eps)
 
 
-@pytest.mark.parametrize("away", [0, 1e-300, 1e-31])
-def test_an_eye_at_its_target_is_told_of(away: float) -> None:
-    with pytest.raises(SceneError, match="is also the target; move one of them"):
-        view(with_camera({"eye": [0.1, 0.2, away], "target": [0.1, 0.2, 0]}))
-
-
-@pytest.mark.parametrize("zero", [[0, 0, 0], [0, 0, 1e-300]])
-def test_no_direction_up_is_told_of(zero: list[float]) -> None:
-    with pytest.raises(SceneError, match="is zero or along the line of sight"):
-        view(with_camera({"eye": [0, 0, 1], "up": zero}))
-
-
-def test_an_eye_too_far_for_its_angle_is_told_of() -> None:
-    """Kernels have the camera's matrix in f32, where 1e30 m times 4.7e8 px, for the smallest angle, overflows."""
-    far = {"eye": [0, 0, 1e30], "target": [1e30, 0, 0], "fov": 1e-3}
-    made = with_camera({**far, "fov": 40})
+def test_a_far_eye_of_a_wide_angle_has_a_finite_matrix() -> None:
+    made = with_camera({"eye": [0, 0, 1e30], "target": [1e30, 0, 0], "fov": 40}, size=(100, 8192))
+    assert not list(camera_problems(made))
     assert np.isfinite((view(made).matrix * MAX_SUPERSAMPLE).astype(np.float32)).all()
-    with pytest.raises(SceneError) as caught:
-        view(with_camera(far, size=(100, 8192)))
-    said = "render.camera.eye: [0.0, 0.0, 1e+30] is too far away for 0.001 degrees; move it nearer or widen fov"
-    assert str(caught.value) == said
 
 
 @pytest.mark.parametrize("distance", [1e-30, 1e-15, 1.0, 1e15, 1e30])

@@ -78,7 +78,7 @@ def test_coordinates_and_depth_are_those_of_the_twin(shape: Any, camera: Any, de
 def test_points_are_found_and_hidden_as_the_twin_says(shape: Any, refine: int, camera: Any, device: Device) -> None:
     made = drawable(camera=camera, refine=refine)
     position = shape(made)
-    coordinates = np.random.default_rng(9).uniform(0, 1, (3000, 2)).astype(np.float32)
+    coordinates = np.random.default_rng(9).uniform(0, 1, (1000, 2)).astype(np.float32)
     found = locate_points(made, coordinates, position, view(made))
     pixels, hidden = twin.find(made, coordinates.astype(float), position)
     np.testing.assert_array_equal(np.isnan(found.pixels), np.isnan(pixels))
@@ -93,7 +93,7 @@ def test_points_are_found_and_hidden_as_the_twin_says(shape: Any, refine: int, c
 def test_on_a_gpu_the_same_points_are_found(shape: Any, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """The form for a GPU, on the CPU: with the lists in one launch, and in many."""
     made = with_instruments(drawable(camera="oblique", refine=2))
-    position, coordinates = shape(made), np.random.default_rng(9).uniform(0, 1, (3000, 2)).astype(np.float32)
+    position, coordinates = shape(made), np.random.default_rng(9).uniform(0, 1, (1000, 2)).astype(np.float32)
     placed = place_capsules(made, position, 0)
     expected = locate_points(made, coordinates, position, view(made), placed)
     monkeypatch.setattr(tracking, "lanes", lambda precision: 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Any
 
 import cv2
@@ -21,6 +22,7 @@ from taichi_msm.render.tracking import compute_flow, locate_points
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests import reference
+from tests.golden import Messages
 from tests.reference import labels as twin
 from tests.render.test_labels import crumpled, folded, look
 from tests.render.test_rasterizer import assert_alike_in_other_tiles, dented, difference, drawable, with_instruments
@@ -40,10 +42,11 @@ LENSES: dict[str, dict[str, Any]] = {
 }
 EVERY_LENS = pytest.mark.parametrize("lens", LENSES)
 
-# Kernels of pictures take long to compile.
-A_LENS_OF_EACH_MODEL = pytest.mark.parametrize(
-    "lens", [pytest.param(lens, marks=() if lens in ("fold", "fisheye") else pytest.mark.slow) for lens in LENSES]
-)
+
+def cases(*quick: tuple[Any, ...], **values: Any) -> pytest.MarkDecorator:
+    """All combinations of parameters, of which only some are quick: kernels take long to compile."""
+    every = [pytest.param(*case, marks=() if case in quick else pytest.mark.slow) for case in product(*values.values())]
+    return pytest.mark.parametrize(",".join(values), every)
 
 
 def seen_through(lens: str, points: tuple[int, int] = (9, 11), **render: Any) -> Scene:
@@ -166,22 +169,18 @@ def test_pictures_are_like_the_twins(lens: str, render: dict[str, Any], device: 
         assert 0.2 < (drawn.max(axis=-1) > 0).mean() < 0.95
 
 
-@A_LENS_OF_EACH_MODEL
-def test_large_cells_are_bent(lens: str, device: Device) -> None:
+@cases(("fold", 0), ("fisheye", 3), lens=LENSES, refine=(0, 3))
+def test_large_cells_are_bent(lens: str, refine: int, device: Device) -> None:
     """Sides of cells 90 pixels long bend by up to 8 px, more than a tile, outward and inward."""
     intrinsics = {"fx": 150, "fy": 150, "cx": 99.5, "cy": 74.5}
     camera = {"eye": [0, 0, 0.33], "intrinsics": intrinsics, **LENSES[lens]}
-    for refine in (0, 3):
-        made = drawable((2, 3), camera=camera, size=[200, 150], refine=refine)
-        position = rest_positions(made.sheet)
-        found, (coordinates, _, _) = look(made, position), twin.labels(made, position)
-        np.testing.assert_allclose(found.coordinates, coordinates, atol=1e-5)
+    made = drawable((2, 3), camera=camera, size=[200, 150], refine=refine)
+    position = rest_positions(made.sheet)
+    found, (coordinates, _, _) = look(made, position), twin.labels(made, position)
+    np.testing.assert_allclose(found.coordinates, coordinates, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    "lens", [pytest.param(lens, marks=() if lens == "fisheye" else pytest.mark.slow) for lens in LENSES]
-)
-@pytest.mark.parametrize("lanes", [pytest.param(1, marks=pytest.mark.slow), 4])
+@cases(("fisheye", 4), lens=LENSES, lanes=(1, 4))
 def test_the_shape_of_a_tile_does_not_change_the_bits(lens: str, lanes: int, device: Device) -> None:
     renders: list[dict[str, Any]] = [{"shading": "tissue", "size": [79, 57]}, {"wireframe": True, "supersample": 3}]
     for render in renders:
@@ -189,14 +188,7 @@ def test_the_shape_of_a_tile_does_not_change_the_bits(lens: str, lanes: int, dev
         assert_alike_in_other_tiles(made, texture, folded(made), lanes)
 
 
-@pytest.mark.parametrize(
-    ("lens", "shape"),
-    [
-        pytest.param(lens, shape, marks=() if shape is folded or lens in ("fold", "fisheye") else pytest.mark.slow)
-        for lens in LENSES
-        for shape in (dented, folded, crumpled)
-    ],
-)
+@cases(*((lens, folded) for lens in LENSES), ("fold", crumpled), lens=LENSES, shape=(dented, folded, crumpled))
 def test_labels_are_on_the_ray_of_each_pixel(lens: str, shape: Any, device: Device) -> None:
     made = seen_through(lens)
     position = shape(made)
@@ -220,11 +212,15 @@ def test_labels_are_on_the_ray_of_each_pixel(lens: str, shape: Any, device: Devi
     assert (still.occlusion > 0).sum() <= 3
 
 
-@EVERY_LENS
-@pytest.mark.parametrize("shape", [dented, folded, crumpled])
-@pytest.mark.parametrize("lanes", [None, 1])
+@cases(
+    *((lens, folded, None) for lens in LENSES),
+    *((lens, crumpled, 1) for lens in ("fold", "fisheye")),
+    lens=LENSES,
+    shape=(dented, folded, crumpled),
+    lanes=(None, 1),
+)
 def test_points_are_found_and_hidden_as_the_twin_says(
-    lanes: int | None, shape: Any, lens: str, device: Device, monkeypatch: pytest.MonkeyPatch
+    lens: str, shape: Any, lanes: int | None, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = seen_through(lens)
     position = shape(made)
@@ -294,22 +290,14 @@ def test_a_lens_without_coefficients_has_the_bits_of_none(device: Device) -> Non
 
 
 @pytest.mark.parametrize(
-    ("camera", "said"),
+    "camera",
     [
-        (
-            {"distortion": {"k1": -0.5}},
-            "render.camera.distortion: folds back at 32 px from the principal point, and the picture reaches 53 px; "
-            "take coefficients that are good to there, or set outside: background",
-        ),
-        (
-            {"distortion": {"model": "fisheye", "k1": 3.0}, "intrinsics": {**INTRINSICS, "fx": 4, "fy": 4}},
-            "render.camera.distortion: reaches 88 degrees at 49 px from the principal point, and the picture reaches "
-            "53 px; take coefficients that are good to there, or set outside: background",
-        ),
+        {"distortion": {"k1": -0.5}},
+        {"distortion": {"model": "fisheye", "k1": 3.0}, "intrinsics": {**INTRINSICS, "fx": 4, "fy": 4}},
     ],
+    ids=["pinhole", "fisheye"],
 )
-def test_a_lens_that_does_not_reach_the_corners_is_refused(camera: dict[str, Any], said: str) -> None:
+def test_a_lens_that_does_not_reach_the_corners_is_refused(camera: dict[str, Any], message: Messages) -> None:
     made = drawable(camera={"eye": [0, 0, 0.3], "intrinsics": INTRINSICS, **camera})
-    with pytest.raises(SceneError) as caught:
+    with message.raises(SceneError, "render.camera.distortion", "53 px"):
         view(made)
-    assert str(caught.value) == said

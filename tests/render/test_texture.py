@@ -18,6 +18,9 @@ from taichi_msm.scene.scene import Scene
 from tests.golden import Messages
 from tests.scenes import speckle
 
+# The words of Pillow, which depend on its version.
+OF_PILLOW = r"(?<= \().*(?=\); )"
+
 BACKGROUND = (10, 20, 30)
 ORIENTATION = 0x0112
 
@@ -51,11 +54,12 @@ def faults(image: str | None, **keys: Any) -> list[str]:
     return [str(problem) for problem in image_problems(scene(image, **keys))]
 
 
-def refusal(image: str, **keys: Any) -> str:
-    with pytest.raises(SceneError) as caught:
+def assert_refused(message: Messages, image: str, key: str = "image", *, known: bool = True, **keys: Any) -> None:
+    """A picture is refused in one line, which is known before its pixels are read."""
+    with message.raises(SceneError, key, hide=OF_PILLOW) as caught:
         load_texture(scene(image, **keys))
-    (line,) = caught.value.lines
-    return line
+    (line,) = str(caught.value).splitlines()
+    assert faults(image, **keys) == [line] * known
 
 
 def assert_texture(image: str, expected: Any, **keys: Any) -> None:
@@ -80,82 +84,60 @@ def test_lossless_formats_keep_every_bit(name: str) -> None:
     assert_texture(name, COLOURS)
 
 
-def test_jpeg() -> None:
-    Image.new("RGB", (16, 8), (200, 100, 50)).save("a.jpg", quality=100, subsampling=0)
-    texture = load_texture(scene("a.jpg"))
-    assert texture.shape == (8, 16, 3)
-    # Rounding to whole Y, Cb, Cr and back is within 2 of each colour.
-    assert np.abs(texture.astype(int) - [200, 100, 50]).max() <= 2
+PALETTE = Image.new("P", (3, 1))
+PALETTE.putpalette([255, 0, 0, 0, 255, 0, 0, 0, 255])
+PALETTE.putdata([2, 0, 1])
 
 
-def test_one_pixel() -> None:
-    Image.new("RGB", (1, 1), (1, 2, 3)).save("a.png")
-    assert_texture("a.png", [[[1, 2, 3]]])
+def picture(*pixels: Any, kind: Any = np.uint8) -> Image.Image:
+    """A picture of one row."""
+    return Image.fromarray(np.array([pixels], dtype=kind))
 
 
-@pytest.mark.parametrize("name", ["a.png", "a.tif"])
-def test_16_bit_grey_is_scaled_to_the_nearest(name: str) -> None:
-    Image.fromarray(np.array([[0, 128, 129, 257, 32768, 65535]], dtype=np.uint16)).save(name)
-    # v / 257: 0, 0.498, 0.502, 1, 127.502, 255
-    assert_texture(name, grey(0, 0, 1, 1, 128, 255))
-
-
-def test_big_endian_16_bit_grey() -> None:
-    Image.frombytes("I;16B", (2, 1), bytes([0x01, 0x01, 0xFF, 0xFF])).save("a.tif")
-    assert_texture("a.tif", grey(1, 255))
-
-
-def test_black_and_white() -> None:
-    image = Image.new("1", (2, 1))
-    image.putpixel((1, 0), 1)
-    image.save("a.png")
-    assert_texture("a.png", grey(0, 255))
-
-
-def test_grey() -> None:
-    Image.fromarray(np.array([[0, 77, 255]], dtype=np.uint8)).save("a.png")
-    assert_texture("a.png", grey(0, 77, 255))
-
-
-def test_grey_with_alpha_lies_on_the_background() -> None:
-    Image.fromarray(np.array([[[200, 255], [200, 0]]], dtype=np.uint8)).save("a.png")
-    assert_texture("a.png", [[[200, 200, 200], BACKGROUND]])
-
-
-def test_colour_with_alpha_lies_on_the_background() -> None:
-    pixels = [[[200, 100, 50, 255], [200, 100, 50, 0], [200, 100, 50, 51]]]
-    Image.fromarray(np.array(pixels, dtype=np.uint8)).save("a.png")
-    # 51 / 255 is a fifth: 10 + 190 / 5, 20 + 80 / 5, 30 + 20 / 5
-    assert_texture("a.png", [[[200, 100, 50], BACKGROUND, [48, 36, 34]]])
-
-
-@pytest.fixture
-def palette() -> Image.Image:
-    image = Image.new("P", (3, 1))
-    image.putpalette([255, 0, 0, 0, 255, 0, 0, 0, 255])
-    image.putdata([2, 0, 1])
-    return image
-
-
-def test_palette(palette: Image.Image) -> None:
-    palette.save("a.png")
-    assert_texture("a.png", [[[0, 0, 255], [255, 0, 0], [0, 255, 0]]])
-
-
-@pytest.mark.parametrize("transparency", [0, bytes([0, 255, 255])], ids=["index", "bytes"])
-def test_palette_with_transparency(palette: Image.Image, transparency: int | bytes) -> None:
-    palette.save("a.png", transparency=transparency)
-    assert_texture("a.png", [[[0, 0, 255], BACKGROUND, [0, 255, 0]]])
-
-
-def test_a_transparent_colour() -> None:
-    Image.fromarray(COLOURS[:1]).save("a.png", transparency=(0, 255, 0))
-    assert_texture("a.png", [[[255, 0, 0], BACKGROUND, [0, 0, 255]]])
-
-
-def test_cmyk() -> None:
-    Image.frombytes("CMYK", (3, 1), bytes([0, 0, 0, 0, 255, 0, 0, 0, 0, 0, 0, 255])).save("a.tif")
-    assert_texture("a.tif", [[[255, 255, 255], [0, 255, 255], [0, 0, 0]]])
+@pytest.mark.parametrize(
+    ("stored", "expected", "options"),
+    [
+        pytest.param(picture(0, 77, 255), grey(0, 77, 255), {}, id="grey"),
+        pytest.param(picture(False, True, kind=bool), grey(0, 255), {}, id="black and white"),
+        # v / 257: 0, 0.498, 0.502, 1, 127.502, 255
+        pytest.param(
+            picture(0, 128, 129, 257, 32768, 65535, kind=np.uint16), grey(0, 0, 1, 1, 128, 255), {}, id="16 bits"
+        ),
+        pytest.param(Image.frombytes("I;16B", (2, 1), b"\x01\x01\xff\xff"), grey(1, 255), {}, id="big-endian"),
+        pytest.param(picture([200, 255], [200, 0]), [[[200, 200, 200], BACKGROUND]], {}, id="grey with alpha"),
+        # 51 / 255 is a fifth: 10 + 190 / 5, 20 + 80 / 5, 30 + 20 / 5
+        pytest.param(
+            picture([200, 100, 50, 255], [200, 100, 50, 0], [200, 100, 50, 51]),
+            [[[200, 100, 50], BACKGROUND, [48, 36, 34]]],
+            {},
+            id="alpha",
+        ),
+        pytest.param(PALETTE, [[[0, 0, 255], [255, 0, 0], [0, 255, 0]]], {}, id="palette"),
+        *(
+            pytest.param(
+                PALETTE, [[[0, 0, 255], BACKGROUND, [0, 255, 0]]], {"transparency": clear}, id=f"clear {clear!r}"
+            )
+            for clear in (0, bytes([0, 255, 255]))
+        ),
+        pytest.param(
+            Image.fromarray(COLOURS[:1]),
+            [[[255, 0, 0], BACKGROUND, [0, 0, 255]]],
+            {"transparency": (0, 255, 0)},
+            id="transparent colour",
+        ),
+        pytest.param(
+            Image.frombytes("CMYK", (3, 1), bytes([0, 0, 0, 0, 255, 0, 0, 0, 0, 0, 0, 255])),
+            [[[255, 255, 255], [0, 255, 255], [0, 0, 0]]],
+            {},
+            id="CMYK",
+        ),
+    ],
+)
+def test_pixels_of_every_kind(stored: Image.Image, expected: Any, options: dict[str, Any]) -> None:
+    names = {"CMYK": ["a.tif"], "I;16B": ["a.tif"], "I;16": ["a.png", "a.tif"]}.get(stored.mode, ["a.png"])
+    for name in names:
+        stored.save(name, **options)
+        assert_texture(name, expected)
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.tif", "a.webp"])
@@ -184,9 +166,12 @@ def test_exif_orientation(name: str, orientation: int, upright: NDArray[np.uint8
 def test_exif_orientation_of_a_jpeg_turns_its_size() -> None:
     exif = Image.Exif()
     exif[ORIENTATION] = 6
-    Image.new("RGB", (16, 8)).save("a.jpg", exif=exif)
+    Image.new("RGB", (16, 8), (200, 100, 50)).save("a.jpg", quality=100, subsampling=0, exif=exif)
+    texture = load_texture(scene("a.jpg"))
     assert image_size(scene("a.jpg")) == (8, 16)
-    assert load_texture(scene("a.jpg")).shape == (16, 8, 3)
+    assert texture.shape == (16, 8, 3)
+    # Rounding to whole Y, Cb, Cr and back is within 2 of each colour.
+    assert np.abs(texture.astype(int) - [200, 100, 50]).max() <= 2
 
 
 def test_the_first_of_several_pictures() -> None:
@@ -203,64 +188,45 @@ def test_region() -> None:
 
 
 @pytest.mark.parametrize(
-    ("region", "fault"),
-    [
-        ([1, 0, 3, 2], "region: [1, 0, 3, 2] ends at 4, 2; the image has 3 x 2 pixels"),
-        ([0, 1, 3, 2], "region: [0, 1, 3, 2] ends at 3, 3; the image has 3 x 2 pixels"),
-        ([-1, 0, 2, 2], "region: [-1, 0, 2, 2] needs x and y of 0 or more, width and height above 0"),
-        ([0, -1, 2, 2], "region: [0, -1, 2, 2] needs x and y of 0 or more, width and height above 0"),
-        ([0, 0, 0, 2], "region: [0, 0, 0, 2] needs x and y of 0 or more, width and height above 0"),
-        ([0, 0, 2, 0], "region: [0, 0, 2, 0] needs x and y of 0 or more, width and height above 0"),
-    ],
+    "region", [[1, 0, 3, 2], [0, 1, 3, 2], [-1, 0, 2, 2], [0, -1, 2, 2], [0, 0, 0, 2], [0, 0, 2, 0]]
 )
-def test_a_region_outside_the_image(region: list[int], fault: str) -> None:
+def test_a_region_outside_the_image(region: list[int], message: Messages) -> None:
     Image.fromarray(COLOURS).save("a.png")
-    assert faults("a.png", region=region) == [fault]
-    assert refusal("a.png", region=region) == fault
+    assert_refused(message, "a.png", "region", region=region)
 
 
-def test_a_region_without_an_image() -> None:
+def test_without_an_image(message: Messages) -> None:
     assert faults(None, region=[0, 0, 9, 9]) == []
     assert faults(None, region=[0, 0, 9, 0]) != []
     assert faults(None) == []
     assert image_size(scene(None)) is None
+    with message.raises(SceneError, "image"):
+        load_texture(scene(None))
 
 
-def gif_named_png(name: str) -> None:
-    Image.new("P", (3, 3)).save(name, format="GIF", save_all=True, append_images=[Image.new("P", (3, 3), 1)])
+def large_file(name: str) -> None:
+    with Path(name).open("wb") as file:
+        file.truncate(2**31 + 1)
 
 
 @pytest.mark.parametrize(
-    ("make", "fault"),
+    "make",
     [
-        (lambda _: None, "no such file or directory; name a picture that can be read"),
-        (lambda name: Path(name).mkdir(), "is a directory; name a picture"),
-        (os.mkfifo, "is not a regular file; name a picture"),
-        (lambda name: Path(name).symlink_to("/dev/zero"), "is not a regular file; name a picture"),
-        (
-            lambda name: Path(name).write_text("text"),
-            "is not a PNG, JPEG, WebP, BMP or TIFF picture; convert it",
-        ),
-        (lambda name: Path(name).touch(), "is not a PNG, JPEG, WebP, BMP or TIFF picture; convert it"),
-        (gif_named_png, "is not a PNG, JPEG, WebP, BMP or TIFF picture; convert it"),
-        (
-            lambda name: Image.new("F", (3, 3)).save(name, format="TIFF"),
-            "has pixels of kind F; save it as 8-bit RGB",
-        ),
-        (
-            lambda name: Image.new("I", (3, 3)).save(name, format="TIFF"),
-            "has pixels of kind I; save it as 8-bit RGB",
-        ),
+        pytest.param(lambda _: None, id="missing"),
+        pytest.param(os.mkdir, id="folder"),
+        pytest.param(os.mkfifo, id="pipe"),
+        pytest.param(lambda name: Path(name).symlink_to("/dev/zero"), id="device"),
+        pytest.param(lambda name: Path(name).write_text("text"), id="text"),
+        pytest.param(lambda name: Path(name).touch(), id="empty"),
+        pytest.param(lambda name: Image.new("P", (3, 3)).save(name, "GIF"), id="GIF"),
+        pytest.param(lambda name: Image.new("F", (3, 3)).save(name, "TIFF"), id="float"),
+        pytest.param(lambda name: Image.new("I", (3, 3)).save(name, "TIFF"), id="32 bits"),
+        pytest.param(large_file, id="large"),
     ],
-    ids=["missing", "directory", "pipe", "device", "text", "empty", "gif", "float", "32 bits"],
 )
-def test_files_that_are_no_pictures(make: Any, fault: str) -> None:
+def test_files_that_are_no_pictures(make: Any, message: Messages) -> None:
     make("a.png")
-    colon = ":" if fault.startswith("no such") else ""
-    expected = f"image: a.png{colon} {fault}"
-    assert faults("a.png") == [expected]
-    assert refusal("a.png") == expected
-    assert image_size(scene("a.png")) is None
+    assert_refused(message, "a.png", "image: a.png")
 
 
 def test_a_link_is_followed() -> None:
@@ -314,117 +280,72 @@ def test_greys_of_a_profile_become_srgb_and_maps_stay() -> None:
     np.testing.assert_array_equal(read_grey("a.png"), 128)
 
 
-@pytest.mark.parametrize("broken", [b"no profile", profile()[:300]])
-def test_a_broken_profile_is_refused(broken: bytes) -> None:
+@pytest.mark.parametrize("broken", [b"no profile", profile()[:300]], ids=["text", "half"])
+def test_a_broken_profile_is_refused(broken: bytes, message: Messages) -> None:
     Image.fromarray(COLOURS).save("a.png", icc_profile=broken)
-    line = refusal("a.png")
-    assert line.startswith("image: a.png has a colour profile that cannot be used (cannot ")
-    assert line.endswith("); save it as sRGB")
-
-
-def test_a_profile_of_other_pixels_is_refused() -> None:
+    assert_refused(message, "a.png", "image: a.png", known=False)
     Image.new("CMYK", (2, 2)).save("a.tif", icc_profile=profile())
-    assert refusal("a.tif") == "image: a.tif has pixels of kind CMYK and a colour profile of RGB; save it as sRGB"
-
-
-def test_a_file_of_any_size_is_not_read() -> None:
-    with Path("a.png").open("wb") as file:
-        file.truncate(2**31 + 1)
-    assert faults("a.png") == ["image: a.png is larger than 2 GiB; scale it down"]
+    assert_refused(message, "a.tif", "image: a.tif", known=False)
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.bmp", "a.tif", "a.webp"])
-def test_truncated_pictures(name: str) -> None:
-    rng = np.random.default_rng(1)
-    Image.fromarray(rng.integers(0, 256, (64, 64, 3), dtype=np.uint8)).save(name)
-    whole = Path(name).read_bytes()
-    Path(name).write_bytes(whole[: len(whole) // 2])
-    line = refusal(name)
-    assert line.startswith(f"image: {name} ")
-    assert line.endswith(("; save it again", "; convert it"))
+def test_truncated_pictures(name: str, message: Messages) -> None:
+    Image.fromarray(speckle(64, 64)).save(name)
+    os.truncate(name, Path(name).stat().st_size // 2)
+    assert_refused(message, name, f"image: {name}", known=name == "a.webp")
 
 
-def test_a_picture_that_may_not_be_read(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_picture_that_may_not_be_read(monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
     def forbidden(*args: Any, **kwargs: Any) -> None:
         raise PermissionError
 
     Image.fromarray(COLOURS).save("secret.png")
     monkeypatch.setattr(Image, "open", forbidden)
-    assert refusal("secret.png") == "image: secret.png may not be read; change its permissions"
+    assert_refused(message, "secret.png")
 
 
-def test_a_name_is_one_line_that_steers_no_terminal() -> None:
+def test_a_name_is_one_line_that_steers_no_terminal(message: Messages) -> None:
     name = "a\n\x1b[31m.png"
     Image.fromarray(COLOURS).save(name)
-    Path(name).write_bytes(Path(name).read_bytes()[:45])
-    assert refusal(name).startswith("image: a\\n\\x1b[31m.png cannot be decoded (")
+    os.truncate(name, 45)
+    assert_refused(message, name, "image: a\\n\\x1b[31m.png", known=False)
 
 
-def test_broken_pictures_bring_up_no_other_error() -> None:
-    rng = np.random.default_rng(1)
-    picture = Image.fromarray(rng.integers(0, 256, (8, 8, 3), dtype=np.uint8))
-    refused = 0
-    for name in ("a.png", "a.jpg", "a.bmp", "a.tif", "a.webp"):
-        picture.save(name)
-        whole = bytearray(Path(name).read_bytes())
-        for _ in range(60):
-            broken = whole.copy()
-            for at in rng.integers(0, len(whole), 3):
-                broken[at] = rng.integers(0, 256)
-            Path(name).write_bytes(broken)
-            list(image_problems(scene(name)))
-            try:
-                load_texture(scene(name))
-            except SceneError:
-                refused += 1
-    assert refused > 50
-
-
-def test_a_jpeg_of_too_many_scans(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_jpeg_of_too_many_scans(message: Messages) -> None:
     """Each goes over all pixels; those of a preview in the file, and what follows its end, do not count."""
-    monkeypatch.chdir(tmp_path)
     file = io.BytesIO()
     preview = Image.Exif()
     preview[0x9286] = b"\xff\xda" * 40
     Image.fromarray(speckle(300, 500)).save(file, "JPEG", progressive=True, exif=preview)
     whole = file.getvalue()
     last = whole[whole.rfind(b"\xff\xc4", 0, whole.rfind(b"\xff\xda")) : -2]
-    made = scene(image="a.jpg")
-    for copies, refused in ((0, False), (1300, False), (1400, True)):
-        Path("a.jpg").write_bytes(whole[:-2] + copies * last + b"\xff\xd9" + b"\xff\xda" * 4000)
-        found = [str(problem) for problem in image_problems(made)]
-        assert found == (
-            [f"image: a.jpg has {copies + 10} scans, and 1333 are allowed; save it again"] if refused else []
-        )
-    with pytest.raises(SceneError, match="has 1410 scans"):
-        load_texture(made)
+    Path("a.jpg").write_bytes(whole[:-2] + 1300 * last + b"\xff\xd9" + b"\xff\xda" * 4000)
+    assert faults("a.jpg") == []
+    Path("a.jpg").write_bytes(whole[:-2] + 1400 * last + b"\xff\xd9")
+    assert_refused(message, "a.jpg", "image: a.jpg has 1410 scans")
     # A baseline one has scans too.
     file = io.BytesIO()
     Image.fromarray(speckle(300, 500)).save(file, "JPEG")
     whole = file.getvalue()
     Path("a.jpg").write_bytes(whole[:-2] + 1400 * whole[whole.rfind(b"\xff\xda") : -2] + b"\xff\xd9")
-    assert ["1401 scans" in str(problem) for problem in image_problems(made)] == [True]
+    assert_refused(message, "a.jpg", "image: a.jpg has 1401 scans")
 
 
-def test_a_picture_of_too_many_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_picture_of_too_many_rows(message: Messages) -> None:
     """Pillow needs 24 bytes a row besides the pixels: a column of 89 million took 3 GB and 12 s."""
-    monkeypatch.chdir(tmp_path)
     for size in ((1, 65536), (65536, 1)):
         Image.new("L", size).save("a.png")
-        expected = f"image: a.png has {size[0]} x {size[1]} pixels; a side may have at most 65535, cut it"
-        assert [str(problem) for problem in image_problems(scene(image="a.png"))] == [expected]
+        assert_refused(message, "a.png", f"image: a.png has {size[0]} x {size[1]} pixels")
     Image.new("L", (1, 65535)).save("a.png")
-    assert load_texture(scene(image="a.png")).shape == (65535, 1, 3)
+    assert load_texture(scene("a.png")).shape == (65535, 1, 3)
 
 
-def test_a_picture_of_too_many_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_picture_of_too_many_pixels(monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
     Image.new("1", (2000, 1500)).save("a.png")
     # Pillow warns of more pixels than this and refuses twice as many: 3 million are refused both ways.
     for limit in (2_000_000, 1_000_000):
         monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", limit)
-        expected = f"image: a.png has more than {limit // 10**6} million pixels; scale it down"
-        assert faults("a.png") == [expected]
-        assert refusal("a.png") == expected
+        assert_refused(message, "a.png", "image: a.png")
 
 
 def test_the_size_is_read_from_the_header_alone(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -445,8 +366,3 @@ def test_no_warning_is_left_behind() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         load_texture(scene("a.jpg"))
-
-
-def test_a_scene_without_a_picture(message: Messages) -> None:
-    with message.raises(SceneError, "image"):
-        load_texture(scene(None))
