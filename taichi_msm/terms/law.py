@@ -102,3 +102,6 @@ class LinearLaw(Law):
             return stretch * stretch * k
 
         return LawFunctions(pull, slopes, by_numbers, energy)
+
+
+LINEAR = LinearLaw()

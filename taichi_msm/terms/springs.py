@@ -36,7 +36,7 @@ from taichi_msm.model.sheet import Material, largest_mean, spacing
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.terms.base import AREA_SHARE, DX, DY, HAS_LEFT, HAS_RIGHT, KernelConfig, Term
-from taichi_msm.terms.law import Law, LinearLaw
+from taichi_msm.terms.law import LINEAR, Law
 from taichi_msm.terms.locking import LockingLaw, law_numbers, make_stiffening
 
 # Families of springs.
@@ -63,7 +63,7 @@ class SpringTerm(Term):
     by_area: bool  # whether springs along an open edge are softer, because they belong to one cell
     mapped: bool  # whether each stiffness is read from an array, with 0 for springs beyond an edge
     tense: bool  # whether the sheet is under tension at rest
-    law: Law = LinearLaw()  # of the springs
+    law: Law = LINEAR  # of the springs
 
     reach: ClassVar[int] = 1
     reductions: ClassVar[tuple[str, ...]] = ("min", "max", "sum", "sum", "sum", "sum", "sum", "sum")
@@ -397,7 +397,7 @@ class SpringTerm(Term):
 
 def spring_law(material: Material) -> Law:
     """Return the law of the springs."""
-    return LinearLaw() if material.stiffening is None else LockingLaw()
+    return LINEAR if material.stiffening is None else LockingLaw()
 
 
 def _unmapped_bound(material: Material) -> float:
