@@ -5,10 +5,12 @@ from __future__ import annotations
 import copy
 from dataclasses import replace
 from operator import attrgetter
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from numpy.typing import NDArray
 from scipy.integrate import quad
 
@@ -26,6 +28,7 @@ from taichi_msm.terms.elasticity import energy_density
 from taichi_msm.terms.law import NUMPY
 from taichi_msm.terms.locking import LockingLaw, build_locking
 from tests import reference
+from tests.conftest import Program
 from tests.golden import Messages
 from tests.motion import dynamics_of, structure_of
 from tests.reference.dynamics import Relaxation, internal_force, lock
@@ -229,6 +232,13 @@ def test_slopes_of_a_scene(motion: str, device: Device) -> None:
         value = attrgetter(path)(Scene.model_validate(data))
         slope = (at(1 + step) - at(1 - step)) / (2 * step * value)
         assert found.numbers[path] == pytest.approx(slope, rel=3e-3 if motion == "quasistatic" else 1e-4), path
+
+
+def test_check_reports_the_cost_of_the_limit(tmp_path: Path, program: Program) -> None:
+    data = pressed("sheet") | {"time": {"duration": 0.1, "frames_per_second": 40}}
+    data["tissue"] |= {"foundation": 0, "stiffening": {"lock": 0.1}}
+    (tmp_path / "s.yaml").write_text(yaml.safe_dump(data))
+    assert "s, 3.2 times shorter than without lock)" in program("check", str(tmp_path / "s.yaml")).stdout
 
 
 def test_no_gradient_of_relaxation(device: Device, message: Messages) -> None:

@@ -1,0 +1,115 @@
+"""The golden file holds every message of the program; here are those that no other test provokes."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from taichi_msm.errors import ArgumentError, SceneError
+from taichi_msm.fitting.fit import fit
+from taichi_msm.load.scene_file import load_scene
+from taichi_msm.runs.simulation import Simulation
+from tests.golden import Messages, read
+from tests.scenes import scene
+
+EYE = "eye: [0, 0, 1]"
+PINHOLE = f"render.camera={{{EYE}, distortion: {{model: pinhole, k1: 0.1}}"
+
+OVERRIDES = {
+    "fisheye coefficient": f"render.camera={{{EYE}, distortion: {{model: fisheye, p1: 0.1}}}}",
+    "outside alone": f"render.camera={{{EYE}, outside: background}}",
+    "beside alone": "render.camera={beside: left, baseline: 0.01}",
+    "no cameras": "render.cameras={}",
+    "name of a preset": f"render.cameras={{top: {{{EYE}}}}}",
+    "step and tolerance": "time={duration: 0.4, step: 1.0e-3, tolerance: 0.01}",
+}
+
+
+@pytest.mark.parametrize("name", OVERRIDES)
+def test_keys_that_exclude_each_other(name: str, small: Path, message: Messages) -> None:
+    with message.raises(SceneError):
+        load_scene("small.yaml", [OVERRIDES[name]])
+
+
+@pytest.mark.parametrize(
+    "text", ["width: 640\nmatrix: [1, 2]\n", "\xff", "x" * (2 << 20)], ids=["keys", "bytes", "long"]
+)
+def test_a_calibration_that_is_none(text: str, small: Path, message: Messages) -> None:
+    Path("c.yaml").write_bytes(text.encode("latin-1"))
+    with message.raises(SceneError, "render.camera.calibration"):
+        load_scene("small.yaml", ["render.camera={calibration: c.yaml, eye: [0, 0, 1]}"])
+
+
+def test_a_calibration_without_a_size_is_not_scaled(small: Path, message: Messages) -> None:
+    Path("c.yaml").write_text("camera_matrix: [[500, 0, 20], [0, 500, 15], [0, 0, 1]]\ndist_coeffs: [0, 0, 0, 0]\n")
+    with message.raises(SceneError, "render.camera.calibration"):
+        load_scene("small.yaml", ["render.camera={calibration: c.yaml, scale: true, eye: [0, 0, 1]}"])
+
+
+def test_no_frames_are_played(message: Messages) -> None:
+    with Simulation(scene(), threads=1) as simulation, message.raises(ArgumentError, "frames"):
+        simulation.play(0)
+
+
+@pytest.mark.parametrize(
+    ("free", "options"),
+    [
+        (["tissue.young"], {"bounds": {"tissue.young": (2.0, 1.0)}}),
+        (["probes.0.total"], {}),
+        (["tissue.young"], {"drift": 0.0}),
+        (["tissue.young"], {"correlation": 3.0}),
+    ],
+    ids=["bounds", "a list", "seconds", "correlation of positions"],
+)
+def test_a_fit_that_cannot_be_asked_for(free: list[str], options: dict[str, object], message: Messages) -> None:
+    tissue = {"young": 1e3, "thickness": 0.01, "density": 1000}
+    made = scene(springs=None, damping=0, tissue=tissue, sheet={"points": [4, 5], "size": [0.3, 0.4]},
+                 probes=[{"total": [0, 0, 1]}])  # fmt: skip
+    observed = {"time": np.arange(11) / 25, "position": np.zeros((11, 4, 5, 3))}
+    with message.raises((ArgumentError, SceneError)):
+        fit(made, observed, free, workers=1, **options)  # type: ignore[arg-type]
+
+
+# Messages of processes that die at the wrong moment, of foreign machines and of defects, by their longest fixed part.
+NOT_PROVOKED = {
+    "a run of the fit ended early:",
+    "another command for the same folder has ended meanwhile",
+    "lost the scheduler at",
+    "no run close to its value succeeds;",
+    "the pool was shut down",
+    "the scheduler does not answer",
+}
+
+
+def longest_part(node: ast.AST) -> str:
+    parts = [part.value for part in ast.walk(node) if isinstance(part, ast.Constant) and isinstance(part.value, str)]
+    return re.sub(r"\s+", " ", max(parts, key=len, default="")).strip()
+
+
+def messages_of(file: Path) -> set[str]:
+    """The longest fixed part of every message that a file raises or reports, if it has two words."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        arguments: list[ast.expr] = []
+        if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
+            arguments = node.exc.args
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] in ("Problem", "scene_fault"):
+            arguments = node.args
+        found |= {part for part in map(longest_part, arguments) if len(part) > 13 and " " in part}
+    return found
+
+
+def test_every_message_has_a_case(root: Path) -> None:
+    texts = [text for tests in read().values() for messages in tests.values() for text in messages]
+    golden = re.sub(r"\s+", " ", "\n".join(texts))
+    missing = {
+        part: file.name
+        for file in (root / "taichi_msm").rglob("*.py")
+        for part in messages_of(file)
+        if part not in golden and part not in NOT_PROVOKED
+    }
+    assert not missing
