@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from taichi_msm.scene.camera import Camera, Distortion, Intrinsics, Pose
     from taichi_msm.scene.render import Light, Render
     from taichi_msm.scene.scene import Scene, Time
-    from taichi_msm.scene.sheet import Foundation, Sheet, Springs, StiffnessMap, Tissue
+    from taichi_msm.scene.sheet import Foundation, RelaxationBranch, Sheet, Springs, Stiffening, StiffnessMap, Tissue
     from taichi_msm.scene.tools import Instrument, Probe
     from taichi_msm.solver.state import TipForce
     from taichi_msm.sweeps.runs import Outcome
@@ -57,7 +57,9 @@ _MODULES = {
     **dict.fromkeys(("Camera", "Distortion", "Intrinsics", "Pose"), "scene.camera"),
     **dict.fromkeys(("Light", "Render"), "scene.render"),
     **dict.fromkeys(("Scene", "Time"), "scene.scene"),
-    **dict.fromkeys(("Foundation", "Sheet", "Springs", "StiffnessMap", "Tissue"), "scene.sheet"),
+    **dict.fromkeys(
+        ("Foundation", "RelaxationBranch", "Sheet", "Springs", "Stiffening", "StiffnessMap", "Tissue"), "scene.sheet"
+    ),
     **dict.fromkeys(("Instrument", "Probe"), "scene.tools"),
     "load_scene": "load.scene_file",
     "Simulation": "runs.simulation",
@@ -87,6 +89,7 @@ __all__ = [
     "Playback",
     "Pose",
     "Probe",
+    "RelaxationBranch",
     "Render",
     "Scene",
     "SceneError",
@@ -94,6 +97,7 @@ __all__ = [
     "Sight",
     "Simulation",
     "Springs",
+    "Stiffening",
     "StiffnessMap",
     "Surface",
     "Time",

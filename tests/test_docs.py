@@ -178,6 +178,8 @@ def test_the_table_of_keys_has_their_limits() -> None:
                 assert "above 0" in key["expects"], key
             elif low == 0 and high > 1e20:
                 assert "0 or more" in key["expects"], key
+            elif (above := key.get("exclusiveMinimum")) is not None:
+                assert f"above {above:g} and below {key['exclusiveMaximum']:g}" in key["expects"], key
             else:
                 below = key.get("exclusiveMaximum")
                 limits = f"{low:g} to {high:g}" if below is None else f"from {low:g} to below {below:g}"

@@ -79,7 +79,7 @@ class MapImage(NamedTuple):
 Maps = Mapping[str, MapImage]
 
 
-class Stiffening(NamedTuple):
+class LockNumbers(NamedTuple):
     """Numbers of a law that locks, see `terms.locking`."""
 
     lock: float  # m: strain of a spring; of the foundation a depth [m]
@@ -100,9 +100,9 @@ class Material:
     virtual: float  # stiffness K of the virtual springs [N/m]; 0 if they are never active
     always_active: bool  # whether the virtual springs are always active; else only under load
     bending: float  # D dx dy [N m3]
-    stiffening: Stiffening | None  # of the springs; None if they are linear
+    stiffening: LockNumbers | None  # of the springs; None if they are linear
     relaxation: tuple[tuple[float, float], ...]  # share and time [s] of every branch
-    virtual_stiffening: Stiffening | None  # of the virtual springs, its lock in metres; None if they are linear
+    virtual_stiffening: LockNumbers | None  # of the virtual springs, its lock in metres; None if they are linear
     by_area: bool  # whether mass points and springs at an edge are lighter and softer, as in tissue
     factors: Array | None  # factor of the stiffness of every cell, shape (rows - 1, cols - 1); None without a map
     virtual_factors: Array | None  # factor of K at every mass point, shape (rows, cols); None without a map

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
-from pydantic import model_validator
+from pydantic import SerializerFunctionWrapHandler, model_serializer, model_validator
 from typing_extensions import Self
 
 from taichi_msm.scene.section import (
@@ -79,15 +79,15 @@ class Springs(Section):
     map: StiffnessMap | None = key(None, "map of a factor of structural and shear", "a mapping with image and range")
 
 
-class Locking(Section):
+class Stiffening(Section):
     """Tissue that locks when it is stretched: its stiffness grows with the strain, up to a factor."""
 
     lock: Positive = key(..., "strain at which the springs lock", "a number above 0, a strain without a unit")
     factor: StiffnessRatio = key(10.0, "largest stiffness, relative to that at rest", "a number from 1 to 1000")
 
 
-class Branch(Section):
-    """Branch of the stress relaxation."""
+class RelaxationBranch(Section):
+    """RelaxationBranch of the stress relaxation."""
 
     share: OpenUnitInterval = key(..., "share of the elastic forces that relaxes", "a number above 0 and below 1")
     time: Positive = key(..., "relaxation time [s]", "a number above 0, in s")
@@ -107,6 +107,11 @@ class Foundation(Section):
     factor: StiffnessRatio = key(
         10.0, "largest stiffness of a foundation that locks, relative to that at rest", "a number from 1 to 1000"
     )
+
+    @model_serializer(mode="wrap")
+    def _dump_used_keys(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Omit lock and factor of a linear foundation."""
+        return {name: value for name, value in dump(self).items() if self.lock or name in ("young", "depth")}
 
     @model_validator(mode="after")
     def _check_factor(self) -> Self:
@@ -141,10 +146,10 @@ class Tissue(Section):
         "bending stiffness D [N m]; plate: E t^3 / (12 (1 - nu^2)); all sides must be fixed, and are hinged",
         "plate, or a number, 0 or more, in N m",
     )
-    stiffening: Locking | None = key(
+    stiffening: Stiffening | None = key(
         None, "sheet that locks when it is stretched", "a mapping: {lock: [a strain], factor: [default 10]}"
     )
-    relaxation: tuple[Branch, ...] = key(
+    relaxation: tuple[RelaxationBranch, ...] = key(
         (),
         "stress relaxation of all elastic forces, in up to 4 branches with shares below 1 in all; a foundation must "
         "always be active",

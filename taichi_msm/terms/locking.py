@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
-from taichi_msm.model.sheet import Stiffening
+from taichi_msm.model.sheet import LockNumbers
 from taichi_msm.terms.law import Law, LawFunctions, Operations
 
 # Up to this y, atanh(y) - y is computed by its series.
@@ -62,12 +62,12 @@ def build_locking(operations: Operations) -> LockingFunctions:
     return LockingFunctions(secant, tangent, energy)
 
 
-def make_stiffening(lock: float | None, factor: float) -> Stiffening | None:
+def make_stiffening(lock: float | None, factor: float) -> LockNumbers | None:
     """Return the numbers of a law that locks; None for a linear law."""
-    return None if lock is None or factor == 1 else Stiffening(lock, factor)
+    return None if lock is None or factor == 1 else LockNumbers(lock, factor)
 
 
-def law_numbers(stiffening: Stiffening | None, length: float) -> tuple[float, ...]:
+def law_numbers(stiffening: LockNumbers | None, length: float) -> tuple[float, ...]:
     """Return 1 / (m L0), x0 and m for a spring of length L0 [m]; none for a linear law. For the foundation L0 is 1."""
     if stiffening is None:
         return ()
@@ -82,14 +82,17 @@ class LockingLaw(Law):
 
     def build(self, operations: Operations) -> LawFunctions:
         """Build the functions of the law."""
-        sqrt, maximum = operations.sqrt, operations.maximum
+        sqrt, maximum, minimum = operations.sqrt, operations.maximum, operations.minimum
         secant, tangent, integral = (operations.wrap(function) for function in build_locking(operations))
 
         def pull(k, tau, square_difference, square, length, scale, end, lock):
+            # As `secant`, with one division for all. That x has an error of rounding / m does not matter here.
             root = sqrt(square)
-            share = square_difference / (square + length * root)
-            ratio = secant(share * root * scale, end)
-            return share * ((k + tau) * ratio - tau)
+            x = (root - length) * scale
+            inner, beyond = minimum(maximum(x, 0), end), maximum(x, end)
+            divisor = (1 - inner) * (1 - inner) * beyond
+            factor = (k + tau) * (beyond - inner * end) - tau * divisor
+            return square_difference * factor / ((square + length * root) * divisor)
 
         def slopes(k, tau, square_difference, square, length, along, scale, end, lock):
             root = sqrt(square)

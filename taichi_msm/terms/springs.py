@@ -188,7 +188,8 @@ class SpringTerm(Term):
             to: ti.template(), q: ti.template(),
         ):  # fmt: skip
             """Return the force of a spring of a family, for k - tau, 0 beyond an edge, L^2 - L0^2, L^2 and L0."""
-            tension, numbers = sheet.constants[first_tension + family], numbers_of(sheet, family)
+            numbers = numbers_of(sheet, family)
+            tension = sheet.constants[first_tension + family] if ti.static(tense) else 0.0
             share = pull(masked(k, exists), tension, square_difference, square, length, *numbers)
             total = [share * to[c] for c in ti.static(range(3))]
             if ti.static(tense):

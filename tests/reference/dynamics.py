@@ -147,7 +147,12 @@ def surgical_force(scene: Scene, loads: Schedule, n: int) -> Array:
 def force(scene: Scene, displacement: Array, loads: Schedule, n: int, made: Sheet | None = None) -> Array:
     """Add up all forces except the damping at one step (eq. 1), row n of the schedule; as `elastic_force`."""
     made = made or sheet(scene)
-    return internal_force(scene, displacement, loads, n, made) + surgical_force(scene, loads, n)
+    return (
+        elastic_force(scene, displacement, made)
+        + bending_force(scene, displacement, made)
+        + surgical_force(scene, loads, n)
+        + loads.active[n] * foundation_force(scene, displacement, made)
+    )
 
 
 def internal_force(scene: Scene, displacement: Array, loads: Schedule, n: int, made: Sheet) -> Array:
@@ -215,6 +220,8 @@ def steps(plan: Plan, made: Sheet | None = None) -> Iterator[tuple[Array, Contac
     relaxation = Relaxation(scene, h)
 
     def acceleration(u: Array, n: int) -> Array:
+        if scene.tissue is None or not scene.tissue.relaxation:
+            return np.asarray(force(scene, u, loads, n, made) / m)
         elastic = internal_force(scene, u, loads, n, made)
         return np.asarray((relaxation.step(elastic) + surgical_force(scene, loads, n)) / m)
 
