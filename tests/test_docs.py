@@ -281,7 +281,8 @@ def test_the_example_of_a_docstring_gives_what_it_shows(name: str, examples_fold
         assert outcome.failed == 0, f"the example of {name} fails; see above"
 
 
-@pytest.mark.parametrize("points", [pytest.param("31, 31", marks=pytest.mark.slow, id="exact"), "13, 13"])
+@pytest.mark.slow
+@pytest.mark.parametrize("points", [pytest.param("31, 31", id="exact"), "13, 13"])
 def test_the_fit_shown_is_what_it_finds(
     points: str, examples_folder: Path, program: Program, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -101,6 +101,7 @@ def test_the_map_comes_back_as_well_known_as_is_said(result: Any) -> None:
     assert not result.model_rejected
 
 
+@pytest.mark.slow
 def test_a_common_factor_of_the_forces_comes_back_with_the_map(device: Device, message: Messages) -> None:
     """From forces that are 30 % too small, which would make the tissue too soft on its foundation."""
     observed = seen_in(scene(), device, TRUTH, np.array([1.0, 2.0]), 3e-6)

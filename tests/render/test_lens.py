@@ -151,7 +151,7 @@ def test_tangential_distortion_folds_too(coefficients: tuple[float, ...]) -> Non
     [
         pytest.param("endoscope", {}, marks=pytest.mark.slow),
         pytest.param("endoscope", {"wireframe": True, "supersample": 2}, marks=pytest.mark.slow),
-        ("fold", {"shading": "tissue", "light": {"relief": -0.2, "vignette": 0.3}}),
+        pytest.param("fold", {"shading": "tissue", "light": {"relief": -0.2, "vignette": 0.3}}, marks=pytest.mark.slow),
         ("fisheye", {"shading": "tissue", "wireframe": True}),
         pytest.param("pincushion", {"supersample": 2}, marks=pytest.mark.slow),
     ],

@@ -112,7 +112,7 @@ def test_an_orthographic_pair_has_the_same_disparity_everywhere(small: Path, dev
     np.testing.assert_allclose(sight, [[18, 15]], atol=1e-5)
 
 
-@pytest.mark.parametrize("shading", ["headlight", "tissue"])
+@pytest.mark.parametrize("shading", [pytest.param("headlight", marks=pytest.mark.slow), "tissue"])
 def test_the_light_is_that_of_the_main_camera(shading: str, device: Device) -> None:
     side = {"eye": [0.35, 0.1, 0.3], "up": [0.1, 1, 0]}
     cameras = {"main": {"eye": [-0.3, 0.05, 0.35]}, "side": side, "beside": {"beside": "main", "baseline": 0.06}}

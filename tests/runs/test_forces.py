@@ -44,7 +44,11 @@ def expected_forces(made: Scene) -> Array:
 
 @pytest.mark.parametrize(
     ("precision", "difference", "error"),
-    [("f32", "central", 2e-3), ("f64", "central", 1e-13), ("f64", "backward", 1e-13)],
+    [
+        pytest.param("f32", "central", 2e-3, marks=pytest.mark.slow),
+        ("f64", "central", 1e-13),
+        ("f64", "backward", 1e-13),
+    ],
 )
 def test_the_force_of_a_tool_is_that_of_the_twin(precision: str, difference: str, error: float, device: Device) -> None:
     """In f32, positions of 0.1 m are rounded by 4e-9 m, and pushes are 1e-5 m."""
