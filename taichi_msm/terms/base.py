@@ -235,9 +235,9 @@ class KernelConfig:
 
         return Operations(ti.sqrt, log, ti.max, ti.min, ti.select, ti.func)
 
-    def compile_law(self, law: Law) -> LawFunctions:
-        """Wrap the functions of a law for kernels."""
-        return LawFunctions(*(self.ti.func(function) for function in law.build(self.operations)))
+    def compile_law(self, law: Law, *, tense: bool) -> LawFunctions:
+        """Wrap the functions of a law for kernels; see `Law.build`."""
+        return LawFunctions(*(self.ti.func(function) for function in law.build(self.operations, tense=tense)))
 
     def get(self, kind: type[AnyTerm]) -> AnyTerm | None:
         """Return the term of a class; None if the scene does not have it."""

@@ -71,16 +71,21 @@ class Law(ABC):
     number_count: ClassVar[int] = 0  # count of numbers of a spring
 
     @abstractmethod
-    def build(self, operations: Operations) -> LawFunctions:
-        """Build the functions of the law."""
+    def build(self, operations: Operations, *, tense: bool = True) -> LawFunctions:
+        """Build the functions of the law.
+
+        Args:
+            operations: of NumPy or Taichi.
+            tense: whether any tau is not 0; otherwise `pull` ignores it.
+        """
 
 
 @dataclass(frozen=True)
 class LinearLaw(Law):
     """f(e) = e."""
 
-    def build(self, operations: Operations) -> LawFunctions:
-        """Build the functions of the law."""
+    def build(self, operations: Operations, *, tense: bool = True) -> LawFunctions:
+        """Build the functions of the law; see `Law.build`."""
         sqrt, maximum = operations.sqrt, operations.maximum
 
         def pull(k, tau, square_difference, square, length):

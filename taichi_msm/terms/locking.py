@@ -80,8 +80,8 @@ class LockingLaw(Law):
 
     number_count: ClassVar[int] = 3
 
-    def build(self, operations: Operations) -> LawFunctions:
-        """Build the functions of the law."""
+    def build(self, operations: Operations, *, tense: bool = True) -> LawFunctions:
+        """Build the functions of the law; see `Law.build`."""
         sqrt, maximum, minimum = operations.sqrt, operations.maximum, operations.minimum
         secant, tangent, integral = (operations.wrap(function) for function in build_locking(operations))
 
@@ -91,8 +91,18 @@ class LockingLaw(Law):
             x = (root - length) * scale
             inner, beyond = minimum(maximum(x, 0), end), maximum(x, end)
             divisor = (1 - inner) * (1 - inner) * beyond
-            factor = (k + tau) * (beyond - inner * end) - tau * divisor
-            return square_difference * factor / ((square + length * root) * divisor)
+            return (
+                square_difference
+                * ((k + tau) * (beyond - inner * end) - tau * divisor)
+                / ((square + length * root) * divisor)
+            )
+
+        def pull_untensed(k, tau, square_difference, square, length, scale, end, lock):
+            root = sqrt(square)
+            x = (root - length) * scale
+            inner, beyond = minimum(maximum(x, 0), end), maximum(x, end)
+            divisor = (square + length * root) * ((1 - inner) * (1 - inner) * beyond)
+            return k * square_difference * (beyond - inner * end) / divisor
 
         def slopes(k, tau, square_difference, square, length, along, scale, end, lock):
             root = sqrt(square)
@@ -114,4 +124,4 @@ class LockingLaw(Law):
             stretch = share / (1 + sqrt(maximum(share + 1, 0)))
             return (k + tau) * (lock * lock) * integral(stretch / lock, end) - tau * stretch * stretch
 
-        return LawFunctions(pull, slopes, by_numbers, energy)
+        return LawFunctions(pull if tense else pull_untensed, slopes, by_numbers, energy)

@@ -173,7 +173,7 @@ class SpringTerm(Term):
         tense, mapped, by_area = self.tense, self.mapped, self.by_area and not self.mapped
         masks_edges, real, first = self.open_edges and not self.mapped, config.real, config.first_constant(SpringTerm)
         first_tension, numbers_of = first + FIRST_TENSION, self.build_numbers(config)
-        pull = config.compile_law(self.law).pull
+        pull = config.compile_law(self.law, tense=self.tense).pull
 
         @ti.func
         def masked(k, exists):
@@ -189,7 +189,7 @@ class SpringTerm(Term):
         ):  # fmt: skip
             """Return the force of a spring of a family, for k - tau, 0 beyond an edge, L^2 - L0^2, L^2 and L0."""
             numbers = numbers_of(sheet, family)
-            tension = sheet.constants[first_tension + family] if ti.static(tense) else 0.0
+            tension = sheet.constants[first_tension + family]
             share = pull(masked(k, exists), tension, square_difference, square, length, *numbers)
             total = [share * to[c] for c in ti.static(range(3))]
             if ti.static(tense):
@@ -262,7 +262,12 @@ class SpringTerm(Term):
 
         with a linear law. The map from p to this change is symmetric.
         """
-        ti, tense, count, law = config.ti, self.tense, self.law.number_count, config.compile_law(self.law)
+        ti, tense, count, law = (
+            config.ti,
+            self.tense,
+            self.law.number_count,
+            config.compile_law(self.law, tense=self.tense),
+        )
         slopes, by_numbers = law.slopes, law.by_numbers
         first_tension, numbers_of = config.first_constant(SpringTerm) + FIRST_TENSION, self.build_numbers(config)
 
@@ -335,7 +340,7 @@ class SpringTerm(Term):
         tense, open_edges, vector, first = self.tense, self.open_edges, config.vector, config.first_measure(SpringTerm)
         _, _, of_row, of_column, of_diagonal = self.build_spring_forces(config)
         first_tension, numbers_of = config.first_constant(SpringTerm) + FIRST_TENSION, self.build_numbers(config)
-        energy = config.compile_law(self.law).energy
+        energy = config.compile_law(self.law, tense=self.tense).energy
         # For each family: its index, and the offsets in rows and columns from one end to the other.
         structural = ((ALONG_ROW, 0, (1,)), (ALONG_COLUMN, 1, (0,))) if self.structural else ()
         families = structural + (((DIAGONAL, 1, (-1, 1)),) if self.shear else ())
