@@ -62,5 +62,5 @@ def energy_growth_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
         yield (
             f"the energy grew {progress.energy_growth:.3g} times after {release_time(plan):.6g} s, when no probe was "
             "active any more: the steps are too long for springs that were pressed together, and the motion from "
-            f"there on means nothing; try time.step: {plan.grid.step / 2:.6g}, press less, or take more damping"
+            f"there on is invalid; try time.step: {plan.grid.step / 2:.6g}, press less, or take more damping"
         )

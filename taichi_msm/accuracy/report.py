@@ -313,7 +313,7 @@ def error_line(
         scale: Pixels per metre; None without a picture.
     """
     if estimate is not None and estimate.error == math.inf:
-        return "error not known: a pilot run diverged, or steps do not resolve the damping"
+        return "error not known: a companion run diverged, or steps do not resolve the damping"
     parts, errors = [], [mesh.error] if mesh is not None and mesh.error < math.inf else []
     if estimate is not None:
         bound = _bound_words(estimate.at_most or not estimate.parted, estimate.at_least)

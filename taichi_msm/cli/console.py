@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 STAGES = {
     "start": "starting",
-    "pilot": "pilot runs",
+    "pilot": "companion runs",
     "compile": "compiling the kernels",
     "check": "checking the finished frames",
     "redraw": "drawing finished frames",

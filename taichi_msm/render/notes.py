@@ -42,7 +42,7 @@ def drawing_warnings(scene: Scene) -> Iterator[str]:
             )
         if instrument.radius > 0.25 * max(scene.sheet.size):
             yield (
-                f"probes.{index}.instrument: {instrument.radius:g} m is a wide rod for a sheet of "
+                f"probes.{index}.instrument: {instrument.radius:g} m is a wide capsule for a sheet of "
                 f"{max(scene.sheet.size):g} m; the radius is in metres"
             )
 
