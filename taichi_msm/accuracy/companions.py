@@ -69,11 +69,11 @@ def choose_companion_runs(plan: Plan, *, requested: bool = False) -> CompanionRu
         mesh = plan.scene.tissue is not None and (requested or affords_companions(plan, MESH_COST))
         return CompanionRuns(mesh=mesh, cost=MESH_COST if mesh else 0.0, reason=QUASISTATIC_REASON)
     steps, coarse, fine = plan.grid.steps_per_frame, coarse_steps(plan), fine_steps(plan)
-    mesh_cost = (CONTACT_MESH_COST if plan.tools else MESH_COST) if plan.scene.tissue is not None else 0.0
+    mesh_cost = (CONTACT_MESH_COST if plan.has_contact else MESH_COST) if plan.scene.tissue is not None else 0.0
     # For a run in f32, a fine companion run needs another one in f64 with the run's own steps.
     fine_cost = fine / steps + (plan.grid.precision == "f32")
     cost = (1 + mesh_cost) * coarse / steps if coarse else fine_cost + mesh_cost
-    if coarse and plan.tools:
+    if coarse and plan.has_contact:
         cost = coarse / steps + mesh_cost  # With contact the meshes are compared with the run, not with its companion.
     if not requested and not affords_companions(plan, cost):
         return CompanionRuns(

@@ -39,8 +39,8 @@ def displacement_bound(
     """
     # A tool moves the tissue that it holds along its path.
     bound = MAX_SHEET_SIZES * max(plan.scene.sheet.size) + sum(tool.path_length + tool.radius for tool in plan.tools)
-    # Here springs connect every mass point to a fixed one; shear springs alone may skip every other mass point.
-    if plan.scene.sheet.fixed not in ("none", ()) and min(plan.material.across, plan.material.down) > 0:
+    # Here springs connect every mass point to a held one; shear springs alone may skip every other mass point.
+    if plan.is_held and min(plan.material.across, plan.material.down) > 0:
         return bound
     if plan.material.virtual > 0 and not plan.material.always_active:
         # The virtual springs may accelerate a mass point from far away, and release it when it is fast.

@@ -44,6 +44,7 @@ from taichi_msm.errors import DivergedError, Pause, ProgressCallback, SceneError
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import MAX_CELL_ASPECT, Maps, cell_aspect_ratio, spacing
 from taichi_msm.model.tool_force import sum_probe_forces
+from taichi_msm.model.tools import capsule_tools
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_POINTS
 from taichi_msm.scene.sheet import Sheet
@@ -146,7 +147,7 @@ def coarser_plan(plan: Plan, ratio: float = 0.5) -> Plan | None:
 
 def mesh_companion_plan(plan: Plan) -> Plan | None:
     """Plan the first companion run on a coarser mesh; None as from `coarser_plan`."""
-    return coarser_plan(plan, CONTACT_CELL_RATIO) if plan.tools else coarser_plan(plan)
+    return coarser_plan(plan, CONTACT_CELL_RATIO) if plan.has_contact else coarser_plan(plan)
 
 
 def _with_equal_force(probe: Probe, sheet: Sheet, coarse: Sheet) -> Probe:
@@ -190,12 +191,12 @@ class MeshCompanion:
 
     def __init__(self, plan: Plan, coarse: Plan, device: Device, cores: int | None = None) -> None:
         self._material, steps = plan.material, plan.grid.steps_per_frame
-        coarsest = None if plan.tools else coarser_plan(coarse)
+        coarsest = None if plan.has_contact else coarser_plan(coarse)
         plans = [coarse] if coarsest is None else [coarse, coarsest]
         self._sheets = []
         for sheet in plans:
             # Tools must not move too far in a step.
-            min_steps = math.ceil(plan.grid.steps_per_frame / 2) if plan.tools else 1
+            min_steps = math.ceil(plan.grid.steps_per_frame / 2) if plan.has_contact else 1
             steps = 1 if plan.scene.time.at_rest else max(math.ceil(steps / 2), stable_steps(sheet), min_steps)
             exact = sheet.with_grid(precision="f64", steps_per_frame=steps)
             self._sheets.append(build_dynamics(exact, device, cores=cores))
@@ -204,9 +205,9 @@ class MeshCompanion:
         self._ratio = min((fine - 1) / (coarse - 1) for fine, coarse in zip(*points[:2], strict=True))
         self._differences = [0.0 for _ in plans]
         self._sampling_error = sampling_force_error(plan.scene)
-        self._contact = bool(plan.tools)
+        self._contact = plan.has_contact
         cell = max(spacing(plan.scene.sheet))
-        self._narrow = any(tool.radius < MIN_RADIUS_CELLS * cell for tool in plan.tools)
+        self._narrow = any(tool.radius < MIN_RADIUS_CELLS * cell for tool in capsule_tools(plan.tools))
         self._largest, self._shortest_spring = 0.0, 1.0
         self._second_run: MeshCompanion | None = None
 

@@ -28,9 +28,9 @@ from taichi_msm.accuracy.time_step import TimeStepCompanion, TimeStepEstimate, c
 from taichi_msm.errors import Pause, ProgressCallback
 from taichi_msm.model import tool_force
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.sheet import has_fixed_border
+from taichi_msm.model.sheet import has_fixed_border, held_points
 from taichi_msm.model.tool_force import ProbeRecord
-from taichi_msm.model.tools import COARSE_TIP_PHRASE, MAX_REFINEMENT, path_warnings
+from taichi_msm.model.tools import COARSE_TIP_PHRASE, MAX_REFINEMENT, Clamp, path_warnings
 from taichi_msm.scene.section import MAX_POINTS
 from taichi_msm.scene.sheet import Foundation
 from taichi_msm.solver.dynamics import Dynamics
@@ -111,7 +111,7 @@ class RunErrorEstimator:
         self._time_step = TimeStepCompanion(plan, steps, device, cores) if estimates_step else None
         coarse = mesh_companion_plan(plan) if companions.mesh and known.mesh is None else None
         # The meshes are compared with the coarse time-step companion if there is one, except in contact.
-        self._mesh_follows_coarse = self._coarse and not plan.tools
+        self._mesh_follows_coarse = self._coarse and not plan.has_contact
         reference = plan.with_grid(steps_per_frame=steps) if self._mesh_follows_coarse else plan
         self._mesh = None if coarse is None else MeshCompanion(reference, coarse, device, cores)
         self._squared_errors, self._contact_frames, self._max_force = np.zeros((3, len(plan.tools)))
@@ -193,9 +193,10 @@ class RunErrorEstimator:
             known = known._replace(estimate=estimate)
         if self._mesh is not None:
             known = known._replace(mesh=self._mesh.estimate)
-            if self._plan.tools and self._all_forces and not self._max_force.all():
+            meets = self._max_force[[not isinstance(tool, Clamp) for tool in self._plan.tools]].all()
+            if self._all_forces and not meets:
                 known = known._replace(mesh=MeshEstimate(math.inf, NO_CONTACT))
-            elif self._plan.tools and known.estimate is not None and known.estimate.error > MAX_DIFFERENCE:
+            elif self._plan.has_contact and known.estimate is not None and known.estimate.error > MAX_DIFFERENCE:
                 known = known._replace(mesh=MeshEstimate(math.inf, LARGE_STEP_ERROR))
         return known._replace(force=self._force_estimate(known)) if self._plan.tools else known
 
@@ -207,12 +208,17 @@ class RunErrorEstimator:
             return ForceEstimate(None, "the forces of the frames before the run was continued are not kept")
         if mesh.error == math.inf:
             return ForceEstimate(None, mesh.doubt)
+        if not self._max_force.any():
+            return ForceEstimate(0.0)
         root_mean_square = np.sqrt(self._squared_errors / np.maximum(self._contact_frames, 1)).max()
         relative = float(root_mean_square / self._max_force.max())
         if relative > FORCE_ERROR_FACTOR * MAX_DIFFERENCE:
             return ForceEstimate(None, NOT_CONVERGED)
+        relative = max(relative, MIN_MESH_ERROR_SHARE * mesh.error)
+        if not self._plan.has_contact:
+            return ForceEstimate(relative)
         displacement_error = max(mesh.error, known.estimate.error if known.estimate is not None else 0.0)
-        return ForceEstimate(min(max(relative, MIN_MESH_ERROR_SHARE * mesh.error), displacement_error))
+        return ForceEstimate(min(relative, displacement_error))
 
 
 def run_warnings(
@@ -366,7 +372,8 @@ def _step_remedy(plan: Plan, estimate: TimeStepEstimate, affords: Callable[[Plan
     if estimate.rounding > REMEDY_THRESHOLD / 2:
         remedies.append("time.precision: f64")
         if max(plan.material.across, plan.material.down, plan.material.shear) > 0:
-            of_tissue = "tissue.pretension or bending" if has_fixed_border(plan.fixed) else "tissue.foundation"
+            is_closed = has_fixed_border(held_points(plan.scene, plan.fixed))
+            of_tissue = "tissue.pretension or bending" if is_closed else "tissue.foundation"
             support = "springs.virtual" if plan.scene.tissue is None else of_tissue
             remedies.append(f"more {support}, where the sheet buckles")
     if estimate.in_f64 > REMEDY_THRESHOLD / 2:

@@ -81,7 +81,7 @@ class TimeStepEstimate:
 def convergence_order(plan: Plan) -> int:
     """Return the order of the method: 1 with damping by backward differences or with contact, else 2."""
     backward = plan.scene.time.damping_difference == "backward" and plan.material.drag > 0
-    return 1 if backward or plan.tools else 2
+    return 1 if backward or plan.has_contact else 2
 
 
 def estimate_error(
@@ -158,7 +158,7 @@ class TimeStepCompanion:
         # A run in f64 is itself the second run.
         needs_same_step = plan.grid.precision != "f64" and not coarse
         self._same_step = Dynamics(exact, device, cores=cores) if needs_same_step else None
-        self._margin = COARSE_MARGIN * CONTACT_MARGIN if plan.tools else 1.0
+        self._margin = COARSE_MARGIN * CONTACT_MARGIN if plan.has_contact else 1.0
         self._overlap = overlap(plan.tools, plan.scene.time.duration) is not None
         if coarse:
             factor = (plan.grid.steps_per_frame / steps) ** self._order - 1
@@ -198,7 +198,7 @@ class TimeStepCompanion:
             exact = companion + (companion - same_step) / (ratio**self._order - 1) if self._parted else companion
             self._error = max(self._error, max_norm(displacement - exact))
             # With contact the extrapolated displacement may be far too large.
-            best = exact if not self._plan.tools else companion if ratio > 1 else displacement
+            best = exact if not self._plan.has_contact else companion if ratio > 1 else displacement
             self._largest = max(self._largest, max_norm(best))
             if self._same_step:
                 self._in_f64 = max(self._in_f64, max_norm(same_step - exact))
@@ -224,7 +224,7 @@ class TimeStepCompanion:
         error, rounding, in_f64 = (relative(each) for each in (self._error, self._rounding, self._in_f64))
         if not self._same_step:
             rounding, in_f64 = 0.0 if self._parted else error, error
-        steps, contact = self._plan.grid.steps_per_frame, bool(self._plan.tools)
+        steps, contact = self._plan.grid.steps_per_frame, self._plan.has_contact
         at_least = contact and (self._overlap or error > MAX_TOLERANCE)
         return TimeStepEstimate(steps, error, rounding, in_f64, self._order, self._parted, at_least, contact)
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from taichi_msm.errors import Problem
 from taichi_msm.images import file_sha256, read_grey
 from taichi_msm.scene.scene import Scene
-from taichi_msm.scene.section import MAX_POINTS
+from taichi_msm.scene.section import MAX_POINTS, Side
 from taichi_msm.scene.sheet import Sheet, StiffnessMap
 
 # Largest number of branches of the stress relaxation.
@@ -27,6 +27,9 @@ MAX_BRANCHES = 4
 
 # A larger ratio of the sides of a cell would require springs of negative stiffness.
 MAX_CELL_ASPECT = math.sqrt(3)
+
+# Mass points of each side, as indices of an array of shape (rows, cols).
+SIDES: dict[Side, Any] = {"top": np.s_[0], "bottom": np.s_[-1], "left": np.s_[:, 0], "right": np.s_[:, -1]}
 
 Array = NDArray[np.float64]
 
@@ -59,13 +62,25 @@ def fixed_points(sheet: Sheet) -> NDArray[np.bool_]:
     if sheet.fixed == "corners":
         fixed[np.ix_((0, -1), (0, -1))] = True
         return fixed
-    named = {"border": ("top", "bottom", "left", "right"), "none": ()}
-    sides = named[sheet.fixed] if isinstance(sheet.fixed, str) else sheet.fixed
-    fixed[0] |= "top" in sides
-    fixed[-1] |= "bottom" in sides
-    fixed[:, 0] |= "left" in sides
-    fixed[:, -1] |= "right" in sides
+    for side in fixed_sides(sheet):
+        fixed[SIDES[side]] = True
     return fixed
+
+
+def fixed_sides(sheet: Sheet) -> tuple[Side, ...]:
+    """Return the sides of which every mass point is fixed."""
+    if isinstance(sheet.fixed, str):
+        return tuple(SIDES) if sheet.fixed == "border" else ()
+    return sheet.fixed
+
+
+def held_points(scene: Scene, fixed: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return whether each mass point is fixed or clamped, both of shape (rows, cols)."""
+    held = fixed.copy()
+    for probe in scene.probes:
+        if probe.clamp is not None:
+            held[SIDES[probe.clamp]] = True
+    return held
 
 
 class MapImage(NamedTuple):
@@ -253,11 +268,11 @@ def tissue_problems(scene: Scene, fixed: NDArray[np.bool_], factors: Array | Non
     if tissue.relaxation and tissue.foundation_stiffness and tissue.foundation_active == "loaded":
         text = "loaded, but tissue that relaxes needs a foundation at all times; set foundation_active: always"
         yield Problem(("tissue", "foundation_active"), text)
-    if not has_fixed_border(fixed):
+    if not has_fixed_border(held_points(scene, fixed)):
         bending = "plate" if tissue.bending == "plate" else f"{tissue.bending:g} N m"
         for name, value in (("pretension", f"{tissue.pretension:g} N/m"), ("bending", bending)):
             if getattr(tissue, name) != 0:
-                text = f"{value} needs every side fixed; set sheet.fixed: border, or {name}: 0"
+                text = f"{value} needs every side fixed or clamped; set sheet.fixed: border, or {name}: 0"
                 yield Problem(("tissue", name), text)
     if tissue.pretension > 0:
         softest = 1.0 if factors is None else float(factors.min())

@@ -173,10 +173,12 @@ def place_capsules(scene: Scene, position: NDArray[np.floating], time: float) ->
     moved = {tool.probe: tool for tool in build_tools(scene.probes, scene.sheet)}
     placed = []
     for index, probe in enumerate(scene.probes):
+        if probe.instrument is None:
+            continue
         if index in moved:
             tool = moved[index]
             placed.append(Capsule(tool.tip_centre(np.array([time]))[0], tool.axis, tool.length, tool.radius))
-        elif probe.instrument is not None:
+        else:
             placed.append(place_capsule(probe.instrument, scene, position, control_point(probe, scene.sheet, time)))
     return placed
 

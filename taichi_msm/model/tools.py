@@ -1,7 +1,10 @@
-"""Position-controlled tools: capsules that touch the sheet along paths, and their grips. Scene: `probes` with `path`.
+"""Position-controlled tools: capsules that touch the sheet along paths, and clamps. Scene: `probes` with `path`.
 
 A capsule consists of all points within `radius` of its axis, c(t) + s a with 0 <= s <= length, where c is the centre of
-its round tip and a the unit vector along its shaft.
+its round tip and a the unit vector along its shaft. It can grip the mass points at its tip.
+
+A clamp holds a side of the sheet from the start. It is a tool of radius 0, which touches nothing, and c is its
+displacement.
 """
 
 from __future__ import annotations
@@ -15,15 +18,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import Problem
-from taichi_msm.model.sheet import spacing
+from taichi_msm.model.sheet import SIDES, fixed_points, fixed_sides, rest_positions, spacing
 from taichi_msm.model.time_grid import TimeGrid
 from taichi_msm.scene.scene import Scene
-from taichi_msm.scene.section import FRAME_TOLERANCE
+from taichi_msm.scene.section import FRAME_TOLERANCE, Side
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Probe
 
 # Largest displacement of a tool in a step, in radii of the tool.
 MAX_STRIDE_RADII = 0.5
+
+# Largest displacement of a clamp between two equilibria, in lengths of the shortest spring at rest.
+MAX_STRIDE_SPRINGS = 0.5
 
 # A larger spacing of the mass points, in radii of the tool, makes the contact force rough and issues a warning.
 MAX_SPACING_RADII = 0.5
@@ -51,6 +57,7 @@ class Tool:
     radius: float  # of tip and shaft [m]
     friction: float  # Coulomb's coefficient
     grips: tuple[tuple[float, float], ...]  # start and end of every grip [s]
+    stride: float  # largest displacement between two equilibria, and of a capsule in a step [m]
 
     @property
     def path_length(self) -> float:
@@ -97,18 +104,37 @@ class Tool:
         return bool((np.linalg.norm(r - s[:, None] * self.axis, axis=1) < self.radius * (1 + 1e-6)).any())
 
     def substep_times(self, begin: float, end: float) -> Array:
-        """Divide a time interval [s] so that the tool moves by at most MAX_STRIDE_RADII radii in each subinterval.
+        """Divide a time interval [s] so that the tool moves by at most its stride in each subinterval.
 
         Returns:
             Ends of the subintervals [s].
         """
-        count, max_stride = 1, MAX_STRIDE_RADII * self.radius * (1 + 1e-9)
+        count, max_stride = 1, self.stride * (1 + 1e-9)
         while True:
             times = np.linspace(begin, end, count + 1)
             longest = float(np.linalg.norm(np.diff(self.tip_centre(times), axis=0), axis=1).max())
             if longest <= max_stride:
                 return times[1:]
             count = max(count + 1, int(count * longest / max_stride))
+
+
+@dataclass(frozen=True, eq=False)
+class Clamp(Tool):
+    """A side of the sheet that is held from the start; `tip_centres` and `heights` are its displacements."""
+
+    side: Side
+    points: NDArray[np.bool_]  # whether the clamp holds each mass point, shape (rows, cols)
+    rest_tip: Array  # mean rest position of its mass points [m], shape (3,)
+
+    def lowest_point(self, t: float) -> tuple[float, float, float]:
+        """Return the mean position of its mass points, x, y and z [m], at a time t [s]."""
+        x, y, z = (self.rest_tip + self.tip_centre(np.array([t]))[0]).tolist()
+        return x, y, z
+
+
+def capsule_tools(tools: Sequence[Tool]) -> list[Tool]:
+    """Return the tools that have a capsule, in their order."""
+    return [tool for tool in tools if not isinstance(tool, Clamp)]
 
 
 def build_tools(probes: Sequence[Probe], sheet: Sheet) -> tuple[Tool, ...]:
@@ -119,16 +145,33 @@ def build_tools(probes: Sequence[Probe], sheet: Sheet) -> tuple[Tool, ...]:
         sheet: the sheet; paths are fractions of its size.
     """
     height, width = sheet.size
-    tools = []
+    tools: list[Tool] = []
     for index, probe in enumerate(probes):
         if probe.path is None:
+            continue
+        if probe.clamp is not None:
+            earlier = [tool for tool in tools if isinstance(tool, Clamp)]
+            tools.append(_build_clamp(index, probe.clamp, np.array(probe.path, dtype=float), sheet, earlier))
             continue
         assert probe.instrument is not None
         instrument, (time, across, down, heights) = probe.instrument, np.array(probe.path, dtype=float).T
         tip_centres = np.stack([(across - 0.5) * width, (0.5 - down) * height, heights + instrument.radius], axis=1)
         shape = unit_vector(instrument.shaft), instrument.length, instrument.radius
-        tools.append(Tool(index, time, tip_centres, heights, *shape, probe.friction, probe.grip))
+        stride = MAX_STRIDE_RADII * instrument.radius
+        tools.append(Tool(index, time, tip_centres, heights, *shape, probe.friction, probe.grip, stride))
     return tuple(tools)
+
+
+def _build_clamp(probe: int, side: Side, path: Array, sheet: Sheet, earlier: Sequence[Clamp]) -> Clamp:
+    """Build the clamp of a side, without the mass points that are fixed or belong to earlier clamps."""
+    points = np.zeros(sheet.points, dtype=bool)
+    points[SIDES[side]] = True
+    for taken in (fixed_points(sheet), *(clamp.points for clamp in earlier)):
+        points &= ~taken
+    rest_tip = rest_positions(sheet)[points].sum(axis=0) / max(1, points.sum())
+    capsule = np.array([0.0, 0.0, 1.0]), 0.0, 0.0
+    stride = MAX_STRIDE_SPRINGS * min(spacing(sheet))
+    return Clamp(probe, path[:, 0], path[:, 1:], path[:, 3], *capsule, 0.0, (), stride, side, points, rest_tip)
 
 
 def unit_vector(shaft: Sequence[float]) -> Array:
@@ -145,9 +188,12 @@ def grip_frames(grip: tuple[float, float], rate: float) -> range:
 
 
 def path_problems(scene: Scene, tools: Sequence[Tool], grid: TimeGrid) -> Iterator[Problem]:
-    """Report tools inside the sheet at the start, tools too fast for the time step, and quasi-static friction."""
+    """Report tools inside the sheet at the start or too fast, quasi-static friction, and clamps that hold nothing."""
     for tool in tools:
         key = ("probes", tool.probe, "path")
+        if isinstance(tool, Clamp):
+            yield from _clamp_problems(tool, scene)
+            continue
         depth = tool.radius - _distance_to_sheet(tool, scene.sheet)
         if depth > 1e-9 * tool.radius:
             text = f"the instrument is {depth:.3g} m in the sheet at rest at 0 s; begin above it, at a greater height"
@@ -160,6 +206,19 @@ def path_problems(scene: Scene, tools: Sequence[Tool], grid: TimeGrid) -> Iterat
             yield Problem((*key, fault[0]), fault[1])
 
 
+def _clamp_problems(clamp: Clamp, scene: Scene) -> Iterator[Problem]:
+    """Report a clamp of fixed mass points, or of none, and a path that does not begin at rest."""
+    key, begin = ("probes", clamp.probe), [float(clamp.times[0]), *clamp.tip_centres[0].tolist()]
+    if clamp.side in fixed_sides(scene.sheet):
+        yield Problem((*key, "clamp"), f"{clamp.side} is in sheet.fixed; remove it there, or clamp another side")
+    elif not clamp.points.any():
+        text = f"{clamp.side} has no mass point that is neither fixed nor held by a clamp before it; remove one of them"
+        yield Problem((*key, "clamp"), text)
+    if any(begin):
+        text = f"is {begin}; a clamp begins at rest at 0 s, so put [0, 0, 0, 0] first"
+        yield Problem((*key, "path", 0), text)
+
+
 def too_fast(tool: Tool, grid: TimeGrid, first: int = 0) -> tuple[int, str] | None:
     """Check the speed of a tool against the time step.
 
@@ -169,14 +228,15 @@ def too_fast(tool: Tool, grid: TimeGrid, first: int = 0) -> tuple[int, str] | No
         first: index of the keyframe at which the check begins.
 
     Returns:
-        The index of the keyframe at the end of the fastest segment, and a message; None if the tool is slow enough.
+        The index of the keyframe at the end of the fastest segment, and a message; None if the tool is slow enough, or
+        a clamp.
     """
     stride, key = tool.max_stride(grid.step, first)
-    if stride <= MAX_STRIDE_RADII * tool.radius * (1 + 1e-9):
+    if isinstance(tool, Clamp) or stride <= tool.stride * (1 + 1e-9):
         return None
     return key, (
         f"moves {stride:.3g} m in a step of {grid.step:.3g} s, over half the radius of its "
-        f"instrument; move at most {MAX_STRIDE_RADII * tool.radius / grid.step:.3g} m/s, or take a smaller step"
+        f"instrument; move at most {tool.stride / grid.step:.3g} m/s, or take a smaller step"
     )
 
 
@@ -190,10 +250,10 @@ def min_steps_per_frame(tools: Sequence[Tool], grid: TimeGrid, least: int) -> in
     """
 
     def speed_ratio(tool: Tool) -> float:
-        return tool.max_stride(1 / grid.frames_per_second / least)[0] / (MAX_STRIDE_RADII * tool.radius)
+        return tool.max_stride(1 / grid.frames_per_second / least)[0] / tool.stride
 
     # With n times the steps, the largest displacement in a step is at least 1 / n of the previous one.
-    while (ratio := max(map(speed_ratio, tools), default=0.0)) > 1 + 1e-9:
+    while (ratio := max(map(speed_ratio, capsule_tools(tools)), default=0.0)) > 1 + 1e-9:
         least = max(least + 1, math.ceil(least * ratio * (1 - 1e-9)))
     return least
 
@@ -202,7 +262,13 @@ def path_warnings(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:
     """Warn of implausible paths and grips, of tools too thin for the mesh, and of tools that intersect."""
     spacing_max, side, end = max(spacing(scene.sheet)), max(scene.sheet.size), scene.time.duration
     for tool in tools:
-        if (height_max := float(np.abs(tool.heights).max())) > side:
+        if isinstance(tool, Clamp):
+            if (distance := float(np.linalg.norm(tool.tip_centres, axis=1).max())) > side:
+                yield (
+                    f"probes.{tool.probe}.path: a displacement of {distance:g} m, and the sheet is {side:g} m long; "
+                    "displacements are in metres"
+                )
+        elif (height_max := float(np.abs(tool.heights).max())) > side:
             yield (
                 f"probes.{tool.probe}.path: a height of {height_max:g} m beside a sheet of {side:g} m; "
                 "heights are in metres"
@@ -214,7 +280,7 @@ def path_warnings(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:
                 yield f"probes.{tool.probe}.grip begins at {begin:g} s, not before the end of the scene at {end:g} s"
             elif scene.time.at_rest and not grip_frames((begin, until), scene.time.frames_per_second):
                 yield f"probes.{tool.probe}.grip from {begin:g} to {until:g} s holds nothing: no frame is between them"
-        if spacing_max > MAX_SPACING_RADII * tool.radius:
+        if not isinstance(tool, Clamp) and spacing_max > MAX_SPACING_RADII * tool.radius:
             points = [int(np.ceil(length / (MAX_SPACING_RADII * tool.radius))) + 1 for length in scene.sheet.size]
             affordable = math.prod(points) <= MAX_REFINEMENT * math.prod(scene.sheet.points)
             remedy = f"try sheet.points: {points}" if affordable else "take a wider tip"
@@ -242,7 +308,7 @@ def overlap(tools: Sequence[Tool], duration: float) -> tuple[int, int, float] | 
         The indices of their probes, and the first time [s]; None if no tools intersect.
     """
     times = np.linspace(0, duration, 1025)
-    for a, b in combinations(tools, 2):
+    for a, b in combinations(capsule_tools(tools), 2):
         distance = _axis_distance(a, b, a.tip_centre(times) - b.tip_centre(times))
         intersecting = np.flatnonzero(distance < (1 - 1e-9) * (a.radius + b.radius))
         if intersecting.size:

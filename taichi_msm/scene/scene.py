@@ -140,7 +140,7 @@ class Scene(Section):
     probes: Annotated[tuple[Probe, ...], Field(max_length=MAX_PROBES)] = key(
         (),
         "the tools",
-        f"a list of at most {MAX_PROBES} mappings with at, total or force, load, or with path and instrument",
+        f"a list of at most {MAX_PROBES} mappings with at, total or force, load, or with path and instrument or clamp",
     )
     time: Time = key(..., "duration, frames and time steps", "a mapping with at least duration")
     render: Render = key(Render(), "drawing of the frames", "a mapping")

@@ -264,7 +264,8 @@ Side = Literal["top", "bottom", "left", "right"]
 Vector = tuple[Number, Number, Number]
 # Position on the sheet as a fraction of its width or height. A tool may come from beyond the edge, but much larger
 # numbers are probably pixels.
-SheetFraction = Annotated[Number, Field(ge=-1, le=2)]
+MIN_FRACTION, MAX_FRACTION = -1, 2
+SheetFraction = Annotated[Number, Field(ge=MIN_FRACTION, le=MAX_FRACTION)]
 
 
 def key(default: Any, description: str, expects: str) -> Any:

@@ -139,11 +139,11 @@ class Tissue(Section):
     )
     damping: NotNegative = key(0.0, "C / m [1/s]", "a number, 0 or more, in 1/s")
     pretension: NotNegative = key(
-        0.0, "tension S of the sheet at rest [N/m]; all sides must be fixed", "a number, 0 or more, in N/m"
+        0.0, "tension S of the sheet at rest [N/m]; all sides must be fixed or clamped", "a number, 0 or more, in N/m"
     )
     bending: Literal["plate"] | NotNegative = key(
         0.0,
-        "bending stiffness D [N m]; plate: E t^3 / (12 (1 - nu^2)); all sides must be fixed, and are hinged",
+        "bending stiffness D [N m]; plate: E t^3 / (12 (1 - nu^2)); all sides must be fixed or clamped, and are hinged",
         "plate, or a number, 0 or more, in N m",
     )
     stiffening: Stiffening | None = key(

@@ -18,12 +18,15 @@ from typing_extensions import Self
 
 from taichi_msm.scene.section import (
     DEFAULT_OFFSET,
+    MAX_FRACTION,
+    MIN_FRACTION,
     MIN_MAGNITUDE,
     NotNegative,
     Number,
     Positive,
     Section,
     SheetFraction,
+    Side,
     Vector,
     key,
     scene_fault,
@@ -49,25 +52,40 @@ class Instrument(Section):
 _FORCE_KEYS = {"at", "total", "force", "load", "falloff", "radius", "offset"}
 _PATH_KEYS = {"friction", "grip"}
 
-# Keyframes of a path: t [s], across, down, height [m]; and of a control point: t [s], across, down.
-PathKeyframe = tuple[Number, SheetFraction, SheetFraction, Number]
+# Keyframes of a path: t [s], across, down, height [m], of a clamp t [s], x, y, z [m]; and of a control point: t [s],
+# across, down.
+PathKeyframe = tuple[Number, Number, Number, Number]
 PointKeyframe = tuple[Number, SheetFraction, SheetFraction]
+
+_PATH_EXPECTS = (
+    "keys [[t, across, down, height], ...], t in seconds, across and down from -1 to 2, height in metres; or, with "
+    "clamp, keys [[t, x, y, z], ...] in seconds and metres"
+)
 
 
 class Probe(Section):
-    """Tool, either force-controlled (eq. 5) or position-controlled along a path."""
+    """Tool, either force-controlled (eq. 5) or position-controlled along a path: an instrument or a clamp."""
 
     model_config = ConfigDict(
         json_schema_extra={
-            "oneOf": [{"required": list(names)} for names in (("total",), ("force",), ("path", "instrument"))]
+            "oneOf": [
+                {"required": list(names)}
+                for names in (("total",), ("force",), ("path", "instrument"), ("path", "clamp"))
+            ]
         }
     )
 
+    clamp: Side | None = key(
+        None,
+        "in place of an instrument: side of the sheet that is held and moved along path",
+        "top, bottom, left or right",
+    )
     path: Annotated[tuple[PathKeyframe, ...], Field(min_length=1)] | None = key(
         None,
         "in place of a force: position of the instrument; keyframes [[t, across, down, height], ...], linear between, "
-        "constant outside; height: of the lowest point of its round tip above the sheet at rest [m]",
-        "keys [[t, across, down, height], ...], t in seconds, across and down from -1 to 2, height in metres",
+        "constant outside; height: of the lowest point of its round tip above the sheet at rest [m]; of a clamp its "
+        "displacement, keyframes [[t, x, y, z], ...] [m], the first one [0, 0, 0, 0]",
+        _PATH_EXPECTS,
     )
     at: tuple[SheetFraction, SheetFraction] | Annotated[tuple[PointKeyframe, ...], Field(min_length=1)] = key(
         (0.5, 0.5),
@@ -124,10 +142,10 @@ class Probe(Section):
     @field_validator("force", mode="after")
     @classmethod
     def _check_one_force(cls, force: Vector | None, info: ValidationInfo) -> Vector | None:
-        if not {"path", "total"} <= info.data.keys():
+        if not {"clamp", "path", "total"} <= info.data.keys():
             return force  # A fault of these keys is reported separately.
         total = info.data["total"]
-        if force is None and total is None and info.data["path"] is None:
+        if force is None and total is None and info.data["path"] is None and info.data["clamp"] is None:
             raise scene_fault(
                 "missing; expected total (whole tool) or, with springs, force (one point): [x, y, z] in newtons; or "
                 "path, for a tool that is moved"
@@ -175,6 +193,17 @@ class Probe(Section):
                 )
         return path
 
+    @field_validator("path", mode="after")
+    @classmethod
+    def _check_fractions(
+        cls, path: tuple[PathKeyframe, ...] | None, info: ValidationInfo
+    ) -> tuple[PathKeyframe, ...] | None:
+        for n, keyframe in enumerate(path or ()):
+            for axis in (1, 2):
+                if info.data.get("clamp", "") is None and not MIN_FRACTION <= keyframe[axis] <= MAX_FRACTION:
+                    raise scene_fault(f"{keyframe[axis]:g} is not allowed; expected {_PATH_EXPECTS}", n, axis)
+        return path
+
     @field_validator("grip", mode="after")
     @classmethod
     def _check_grips_are_separate(cls, grip: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
@@ -190,6 +219,13 @@ class Probe(Section):
     @model_validator(mode="after")
     def _check_kind(self) -> Self:
         given = self.model_fields_set
+        if self.clamp is not None:
+            if self.path is None:
+                raise scene_fault("missing; with clamp expected keys [[t, x, y, z], ...], t in seconds", "path")
+            for name in sorted((_FORCE_KEYS | _PATH_KEYS | {"instrument"}) & given):
+                if getattr(self, name) not in (None, 0.0, ()):
+                    raise scene_fault("does not go with clamp, which has a path only; remove one of them", name)
+            return self
         if self.path is None:
             for name in _PATH_KEYS & given:
                 if getattr(self, name):
@@ -205,5 +241,7 @@ class Probe(Section):
     @model_serializer(mode="wrap")
     def _dump_kind(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Omit the keys of the other kind of tool, which would be invalid when the scene is read again."""
-        omitted = (_PATH_KEYS | {"path"}) if self.path is None else _FORCE_KEYS
+        omitted = _FORCE_KEYS | {"clamp"} if self.path is not None else _PATH_KEYS | {"clamp", "path"}
+        if self.clamp is not None:
+            omitted = _FORCE_KEYS | _PATH_KEYS | {"instrument"}
         return {name: value for name, value in dump(self).items() if name not in omitted}

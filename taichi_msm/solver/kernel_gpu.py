@@ -62,7 +62,8 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
     """Build the Taichi function that steps a mass point."""
     real, vector, columns, springs = config.real, config.vector, config.first_column(None), config.require(SpringTerm)
     structural, shear = springs.structural, springs.shear
-    masks_edges = springs.open_edges and not springs.mapped
+    masks_edges = springs.masks_edges
+    share_of_row, share_of_column = springs.build_shares(config)
     along, to_other_row, of_row, of_column, of_diagonal = springs.build_spring_forces(config)
     move, corrections = build_point_step(config), [term.build_correction(config) for term in config.terms]
     resolving = [correction.resolve for correction in corrections if correction]
@@ -77,6 +78,7 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
                 k, length, exists = vector(1), ti.abs(up), vector(1)
                 if ti.static(right == 0):
                     k *= of_column(sheet, lower, b)
+                    exists = share_of_column(sheet, exists, b)
                 else:
                     k *= of_diagonal(sheet, lower, b + ti.static(min(right, 0)))
                     length = ti.sqrt(dx * dx + up * up)
@@ -94,7 +96,7 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
         if ti.static(masks_edges):
             exists = sheet.by_column[HAS_RIGHT * sheet.width + b]
         k, u = of_row(sheet, i, kind, b) * vector(1), [sheet.u[c][here] for c in ti.static(range(3))]
-        return along(sheet, here + 1, u, k, exists)
+        return along(sheet, here + 1, u, k, share_of_row(exists, kind))
 
     @ti.func
     def step(sheet: ti.template(), loads: ti.template(), now, i, b, n):

@@ -337,6 +337,8 @@ def _fill_omitted_keys(before: Probe, given: Probe | Mapping[str, Any] | None) -
         return before
     if not (before.moved and isinstance(given, Mapping) and "path" in given):
         return given
+    if before.clamp is not None:
+        return {"clamp": before.clamp, **given}
     return {"instrument": before.instrument, "friction": before.friction, "grip": before.grip, **given}
 
 
@@ -377,6 +379,9 @@ class _PathChange:
         if not self._is_later():
             text = f"is at {self._given.path[0][0]:g} s, and it is {now:g} s; give only times after that"
             yield Problem((*key, "path", 0), text)
+            return
+        if self._given.clamp != self._before.clamp:
+            yield Problem((*key, "clamp"), "cannot change; restart with the new scene")
             return
         grid, sheet = self._plan.grid, self._plan.scene.sheet
         (old_tool,), (tool,) = build_tools((self._before,), sheet), build_tools((self.probe,), sheet)

@@ -3,7 +3,7 @@
 A frame has converged when the largest residual force on a mass point is at most FORCE_TOLERANCE of the largest force of
 a spring, a load or the foundation. FIRE (`kernel_rest`) minimises the energy from the previous frame with fictitious
 masses, so a buckled sheet stays on its branch. If position-controlled tools move by more than half a radius between two
-frames, intermediate shapes are found first, with a larger tolerance.
+frames, or clamps by more than half the shortest spring, intermediate shapes are found first, with a larger tolerance.
 
 An equilibrium can be unstable: a flat sheet compressed in its plane stays flat without a perturbation. Each frame is
 therefore perturbed once, when the residual reaches PERTURBATION_TOLERANCE: every mass point is displaced at random, at
@@ -29,6 +29,7 @@ from taichi_msm.errors import DivergedError, Pause
 from taichi_msm.model.loads import evaluate_frame_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
+from taichi_msm.model.tools import Clamp
 from taichi_msm.scene.section import MIN_MAGNITUDE
 from taichi_msm.solver.arrays import InitialData, SheetLayout
 from taichi_msm.solver.dynamics import Dynamics
@@ -37,7 +38,7 @@ from taichi_msm.solver.state import Reading, State, largest_displacement
 from taichi_msm.system.runtime import Device
 from taichi_msm.terms import fictitious_masses
 from taichi_msm.terms.contact import ContactTerm
-from taichi_msm.terms.contact_rest import holds, memory_after_grips, set_tools, touched_points
+from taichi_msm.terms.contact_rest import grips, memory_after_grips, set_tools, touched_points
 
 # Residual forces, relative to the largest force: at convergence, at the perturbation, and at convergence of a sheet
 # that can be unstable.
@@ -156,9 +157,9 @@ class QuasiStatics(Dynamics):
         """Find the equilibrium of a frame."""
         self.evaluations = 0
         relaxation, before, loads = self._relaxation, self._last_state, evaluate_frame_loads(self.plan, frame)
-        tools, contact_before = len(self.plan.tools), before.memory[self._contact]
+        tools, contact_before = self.plan.tools, before.memory[self._contact]
         contact = memory_after_grips(self.plan, frame, before.displacement, contact_before)
-        held_before, held = holds(tools, contact_before), holds(tools, contact)
+        held_before, held = grips(tools, contact_before), grips(tools, contact)
         if tools:
             relaxation.arrays.set_fields(self.layout.config.first_field(ContactTerm), contact)
         if self._interrupted:
@@ -169,7 +170,8 @@ class QuasiStatics(Dynamics):
             row = self._columns(loads, frame)
             set_tools(self.plan, frame, time, row[0, self.layout.config.first_column(ContactTerm) :])
             # After a release the flat shape is tried even if a tool is in the way.
-            free = not loads.strength.any() and not held and (held_before or not self._meets_tool(time))
+            free = not (loads.strength.any() or held or self._is_clamp_displaced(time))
+            free = free and (held_before or not self._meets_tool(time))
             if free and self._try_flat(row):
                 residual = 0.0
             else:
@@ -189,6 +191,11 @@ class QuasiStatics(Dynamics):
         """Return whether a tool at a time [s] touches the current sheet."""
         position = rest_positions(self.plan.scene.sheet) + self._read_arrays(differences=False)[0]
         return any(tool.touches(position[~self.plan.fixed], time) for tool in self.plan.tools)
+
+    def _is_clamp_displaced(self, time: float) -> bool:
+        """Return whether any clamp is displaced at a time [s]."""
+        clamps = [tool for tool in self.plan.tools if isinstance(tool, Clamp)]
+        return any(clamp.tip_centre(np.array([time])).any() for clamp in clamps)
 
     def _try_flat(self, row: NDArray[Any]) -> bool:
         """Return whether the flat shape is an equilibrium; if so, keep it."""
@@ -246,7 +253,8 @@ class QuasiStatics(Dynamics):
         stiffest = 1.0 if material.factors is None else float(material.factors.max())
         # Rounding may shorten a spring by 1e-9.
         compressed = super().read().shortest_spring < 1 - material.tension / stiffest - 1e-9
-        return compressed or bool(self._touched().any())
+        capsules = [n for n, tool in enumerate(self.plan.tools) if not isinstance(tool, Clamp)]
+        return compressed or bool(self._touched()[capsules].any())
 
     def _perturb(self, force: float) -> None:
         """Displace every mass point at random, reproducibly, by at most the displacement due to a force [N]."""
@@ -263,7 +271,7 @@ class QuasiStatics(Dynamics):
         remedy = (
             "the sheet may hang slack, fold or wrinkle; give it a foundation, pretension or bending, or take less load"
         )
-        if not (plan.fixed.any() or plan.material.virtual > 0):
+        if not (plan.is_held or plan.material.virtual > 0):
             remedy = "nothing holds the sheet; fix a side, or give it a foundation"
         elif (self._touched().sum(axis=0) > 1).any():
             remedy = "two tools press on one point; keep them apart"

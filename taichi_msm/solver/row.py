@@ -28,7 +28,8 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
     """
     vector, columns, springs = config.vector, config.first_column(None), config.require(SpringTerm)
     structural, shear = springs.structural, springs.shear
-    masks_edges = springs.open_edges and not springs.mapped
+    masks_edges = springs.masks_edges
+    share_of_row, share_of_column = springs.build_shares(config)
     along, to_other_row, of_row, of_column, of_diagonal = springs.build_spring_forces(config)
 
     @ti.func
@@ -55,7 +56,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
             has_right = sheet.by_column[HAS_RIGHT * width + 0]
         u = [sheet.u[c][row] for c in ti.static(range(3))]
         if ti.static(structural):
-            first = along(sheet, row + 1, u, of_row(sheet, i, kind, 0), has_right)
+            first = along(sheet, row + 1, u, of_row(sheet, i, kind, 0), share_of_row(has_right, kind))
             for c in ti.static(range(3)):
                 left[c] = first[c]
         if ti.static(shear):
@@ -84,7 +85,10 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
                     force[c] = to_left[c]
                     last[c] += to_left[c]
             if ti.static(structural):
-                straight = to_other_row(sheet, next_at + b, 0, u, up, ti.abs(up), of_column(sheet, lower, b), exists)
+                straight = to_other_row(
+                    sheet, next_at + b, 0, u, up, ti.abs(up), of_column(sheet, lower, b),
+                    share_of_column(sheet, exists, b),
+                )  # fmt: skip
                 for c in ti.static(range(3)):
                     force[c] += straight[c]
                     this[c] += straight[c]
@@ -98,7 +102,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
             for c in ti.static(range(3)):
                 force[c] = carried[c][carry + b] - force[c]
             if ti.static(structural):
-                right = along(sheet, row + b + 1, u, of_row(sheet, i, kind, b), has_right)
+                right = along(sheet, row + b + 1, u, of_row(sheet, i, kind, b), share_of_row(has_right, kind))
                 for c in ti.static(range(3)):
                     force[c] += left[c] - right[c]
                     left[c] = right[c]

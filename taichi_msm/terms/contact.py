@@ -8,9 +8,10 @@ the probes. With the displacement u after the step, the centre c of a capsule's 
     with friction mu:      w = the part of (u + correction - u_before) - (c - c_before) perpendicular to n
                            correction -= w min(1, mu (radius - |r'|) / |w|)
 
-A grip holds the mass points that are within 1.5 radii of the tip's centre when it begins: u = u_then + c - c_then. In a
-step, a correction has the effect of the force m (1 + g h / 2) / h^2 times the correction (see `damping`). The sum of
-all corrections therefore yields the force of the tool.
+A grip holds the mass points that are within 1.5 radii of the tip's centre when it begins: u = u_then + c - c_then. A
+clamp, a tool of radius 0, holds its mass points from the start: u = c. In a step, a correction has the effect of the
+force m (1 + g h / 2) / h^2 times the correction (see `damping`). The sum of all corrections therefore yields the force
+of the tool.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -26,7 +27,7 @@ from typing_extensions import Self
 
 from taichi_msm.model.loads import Schedule
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.tools import GRIP_RADII
+from taichi_msm.model.tools import GRIP_RADII, Clamp
 from taichi_msm.scene.section import FRAME_TOLERANCE
 from taichi_msm.terms.base import (
     DY,
@@ -77,7 +78,7 @@ class ContactTerm(Term):
     def from_plan(cls, plan: Plan) -> Self | None:
         """Return the term's configuration; None without position-controlled tools."""
         tools = plan.tools
-        grips = any(tool.grips for tool in tools)
+        grips = any(tool.grips or isinstance(tool, Clamp) for tool in tools)
         return cls(len(tools), tuple(tool.friction > 0 for tool in tools), grips) if tools else None
 
     @property
@@ -85,6 +86,14 @@ class ContactTerm(Term):
         """The corrections of every tool, and with grips the held mass points."""
         names = tuple(f"correction {tool} {axis}" for tool in range(self.tools) for axis in "xyz")
         return (*names, "holder", *(f"held {axis}" for axis in "xyz")) if self.grips else names
+
+    def fields(self, plan: Plan) -> NDArray[Any]:
+        """Return the initial values of the fields, in which clamps hold their mass points."""
+        fields = super().fields(plan)
+        for n, tool in enumerate(plan.tools):
+            if isinstance(tool, Clamp):
+                fields[CORRECTIONS * self.tools + HOLDER, tool.points] = n + 1
+        return fields
 
     @property
     def column_count(self) -> int:
@@ -105,6 +114,9 @@ class ContactTerm(Term):
             tool_columns[:, TIP_AFTER:TIP_BEFORE], tool_columns[:, TIP_BEFORE:GRIP_STATE] = centres[1:], centres[:-1]
             inverse = [1 / slope if abs(slope) > MIN_DISTANCE_M else 1 / MIN_DISTANCE_M for slope in tool.axis[1:]]
             tool_columns[:, AXIS:] = *tool.axis, tool.length, tool.radius, tool.friction, *inverse
+            if isinstance(tool, Clamp):
+                tool_columns[:, GRIP_STATE] = GRIP_CONTINUES
+                tool_columns[:, GRIP_SHIFT:AXIS] = centres[1:]
             for begin, end in tool.grips:
                 # The first steps at or after these times, up to rounding.
                 start, stop = (

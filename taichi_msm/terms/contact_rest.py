@@ -11,14 +11,14 @@ iteration.
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.model.tools import GRIP_RADII, Tool, grip_frames
+from taichi_msm.model.tools import GRIP_RADII, Clamp, Tool, grip_frames
 from taichi_msm.terms.base import DY, MOBILITY, REST_X, TOP_Y, KernelConfig
 from taichi_msm.terms.contact_layout import (
     COLUMNS,
@@ -136,9 +136,11 @@ def touched_points(tools: int, memory: Array) -> NDArray[np.bool_]:
     return np.asarray(touched)
 
 
-def holds(tools: int, memory: Array) -> bool:
-    """Return whether any tool holds a mass point; see `touched_points`."""
-    return len(memory) > CORRECTIONS * tools and bool(memory[CORRECTIONS * tools + HOLDER].any())
+def grips(tools: Sequence[Tool], memory: Array) -> bool:
+    """Return whether the tip of any tool holds a mass point; see `touched_points`."""
+    capsules = [n + 1 for n, tool in enumerate(tools) if not isinstance(tool, Clamp)]
+    begin = CORRECTIONS * len(tools) + HOLDER
+    return bool(np.isin(memory[begin : begin + 1], capsules).any())
 
 
 def set_tools(plan: Plan, frame: int, time: float, columns: Array) -> None:
@@ -147,7 +149,9 @@ def set_tools(plan: Plan, frame: int, time: float, columns: Array) -> None:
         of_tool, centre = columns[COLUMNS + TOOL_COLUMNS * n :], tool.tip_centre(np.array([time]))[0]
         of_tool[TIP_AFTER : TIP_AFTER + 3] = centre
         start = _grip_start(plan, tool, frame)
-        if start is not None:
+        if isinstance(tool, Clamp):
+            of_tool[GRIP_SHIFT : GRIP_SHIFT + 3] = centre
+        elif start is not None:
             of_tool[GRIP_SHIFT : GRIP_SHIFT + 3] = centre - _centre_at_grip(plan, tool, start)
 
 
@@ -163,13 +167,15 @@ def memory_after_grips(plan: Plan, frame: int, displacement: Array, before: Arra
     tools, memory = plan.tools, before.copy()
     if len(memory) == CORRECTIONS * len(tools):
         return memory
-    grips = memory[CORRECTIONS * len(tools) :]
-    holder, held_displacement = grips[HOLDER], grips[HOLD_DISPLACEMENT:]
+    fields = memory[CORRECTIONS * len(tools) :]
+    holder, held_displacement = fields[HOLDER], fields[HOLD_DISPLACEMENT:]
     position = rest_positions(plan.scene.sheet) + displacement
     starts = [_grip_start(plan, tool, frame) for tool in tools]
-    for n, start in enumerate(starts):
+    for n, (tool, start) in enumerate(zip(tools, starts, strict=True)):
         if start is None or start == frame:
             holder[holder == n + 1] = 0
+        if isinstance(tool, Clamp):
+            holder[tool.points] = n + 1
     for n, (tool, start) in enumerate(zip(tools, starts, strict=True)):
         if start == frame:
             distance = np.linalg.norm(position - _centre_at_grip(plan, tool, frame), axis=-1)

@@ -69,6 +69,16 @@ class SpringTerm(Term):
     reductions: ClassVar[tuple[str, ...]] = ("min", "max", "sum", "sum", "sum", "sum", "sum", "sum")
 
     @property
+    def tense_edges(self) -> bool:
+        """Whether the sheet is under tension at rest, and mass points at an edge can move, because they are clamped."""
+        return self.tense and self.open_edges
+
+    @property
+    def masks_edges(self) -> bool:
+        """Whether the forces of springs need to know which springs exist."""
+        return self.open_edges and (self.tense or not self.mapped)
+
+    @property
     def constant_count(self) -> int:  # type: ignore[override]
         """Number of the sheet's constants that belong to the term."""
         return FIRST_NUMBER + 3 * self.law.number_count
@@ -162,6 +172,30 @@ class SpringTerm(Term):
 
         return numbers_of
 
+    def build_shares(self, config: KernelConfig) -> tuple[Callable[..., Any], Callable[..., Any]]:
+        """Build the Taichi functions share_of_row(exists, kind) and share_of_column(sheet, exists, b).
+
+        In a sheet with `tense_edges` the argument `exists` of a spring's force is the share of its cells that exist,
+        because its tension is their sum. Elsewhere they return `exists` as it is.
+        """
+        ti, real, tense_edges = config.ti, config.real, self.tense_edges
+
+        @ti.func
+        def share_of_row(exists, kind):
+            if ti.static(tense_edges):
+                return exists * ti.select(kind == 1, ti.cast(1, real), ti.cast(0.5, real))
+            else:  # noqa: RET505
+                return exists
+
+        @ti.func
+        def share_of_column(sheet: ti.template(), exists, b):
+            if ti.static(tense_edges):
+                return exists * sheet.by_column[(AREA_SHARE + 1) * sheet.width + b]
+            else:  # noqa: RET505
+                return exists
+
+        return share_of_row, share_of_column
+
     def build_spring_forces(self, config: KernelConfig) -> tuple[Callable[..., Any], ...]:
         """Build the Taichi functions that compute the forces of springs and their stiffness.
 
@@ -171,16 +205,26 @@ class SpringTerm(Term):
         """
         ti = config.ti
         tense, mapped, by_area = self.tense, self.mapped, self.by_area and not self.mapped
-        masks_edges, real, first = self.open_edges and not self.mapped, config.real, config.first_constant(SpringTerm)
+        masks_edges, real, first = self.masks_edges, config.real, config.first_constant(SpringTerm)
+        tense_edges, vector = self.tense_edges, config.vector
         first_tension, numbers_of = first + FIRST_TENSION, self.build_numbers(config)
         pull = config.compile_law(self.law, tense=self.tense).pull
 
         @ti.func
         def masked(k, exists):
-            if ti.static(masks_edges):
+            if ti.static(tense_edges):
+                return ti.select(exists > 0, k, vector(0))
+            elif ti.static(masks_edges):  # noqa: RET505
                 return k * exists
-            else:  # noqa: RET505
+            else:
                 return k
+
+        @ti.func
+        def tension_of(sheet: ti.template(), family: ti.template(), exists):
+            if ti.static(tense_edges):
+                return sheet.constants[first_tension + family] * exists
+            else:  # noqa: RET505
+                return sheet.constants[first_tension + family]
 
         @ti.func
         def force(
@@ -188,8 +232,7 @@ class SpringTerm(Term):
             to: ti.template(), q: ti.template(),
         ):  # fmt: skip
             """Return the force of a spring of a family, for k - tau, 0 beyond an edge, L^2 - L0^2, L^2 and L0."""
-            numbers = numbers_of(sheet, family)
-            tension = sheet.constants[first_tension + family]
+            tension, numbers = tension_of(sheet, family, exists), numbers_of(sheet, family)
             share = pull(masked(k, exists), tension, square_difference, square, length, *numbers)
             total = [share * to[c] for c in ti.static(range(3))]
             if ti.static(tense):
@@ -302,6 +345,7 @@ class SpringTerm(Term):
         ti = config.ti
         structural, shear, vector = self.structural, self.shear, config.vector
         along, to_other_row, of_row, of_column, of_diagonal = self.build_spring_forces(config)
+        share_of_row, share_of_column = self.build_shares(config)
 
         @ti.func
         def larger(largest, force: ti.template()):
@@ -318,17 +362,17 @@ class SpringTerm(Term):
             dx, dy = sheet.constants[DX], sheet.constants[DY]
             here, below, lower = row.i * sheet.width + b, (row.i + 1) * sheet.width + b, row.i + 1
             if ti.static(structural):
-                k = vector(0) + of_row(sheet, row.i, row.kind, b)
-                largest = larger(largest, along(sheet, here + 1, u, k * has_right, vector(1)))
+                k, in_row = vector(0) + of_row(sheet, row.i, row.kind, b), share_of_row(has_right, row.kind)
+                largest = larger(largest, along(sheet, here + 1, u, k * has_right, in_row))
             if lower < sheet.rows:
                 if ti.static(structural):
-                    k = vector(0) + of_column(sheet, lower, b)
-                    largest = larger(largest, to_other_row(sheet, below, 0, u, 0 - dy, dy, k, vector(1)))
+                    k, in_column = vector(0) + of_column(sheet, lower, b), share_of_column(sheet, vector(1), b)
+                    largest = larger(largest, to_other_row(sheet, below, 0, u, 0 - dy, dy, k, in_column))
                 if ti.static(shear):
                     diagonal = ti.sqrt(dx * dx + dy * dy)
                     for right, exists in ti.static(((-1, has_left), (1, has_right))):
                         k = vector(0) + of_diagonal(sheet, lower, b + ti.static(min(right, 0)))
-                        force = to_other_row(sheet, below + right, right, u, 0 - dy, diagonal, k * exists, vector(1))
+                        force = to_other_row(sheet, below + right, right, u, 0 - dy, diagonal, k * exists, exists)
                         largest = larger(largest, force)
             return largest
 
@@ -339,6 +383,8 @@ class SpringTerm(Term):
         ti = config.ti
         tense, open_edges, vector, first = self.tense, self.open_edges, config.vector, config.first_measure(SpringTerm)
         _, _, of_row, of_column, of_diagonal = self.build_spring_forces(config)
+        share_of_row, share_of_column = self.build_shares(config)
+        tense_edges = self.tense_edges
         first_tension, numbers_of = config.first_constant(SpringTerm) + FIRST_TENSION, self.build_numbers(config)
         energy = config.compile_law(self.law, tense=self.tense).energy
         # For each family: its index, and the offsets in rows and columns from one end to the other.
@@ -380,6 +426,17 @@ class SpringTerm(Term):
                         measures[first + MIN_STRAIN] = ti.min(measures[first + MIN_STRAIN], share)
                         measures[first + MAX_STRAIN] = ti.max(measures[first + MAX_STRAIN], share)
                         stretch_sum += energy(k, tension, share, *numbers)
+                        if ti.static(tense_edges):
+                            cells = vector(1)
+                            if ti.static(right != 0):
+                                cells = sheet.by_column[
+                                    ti.static(HAS_LEFT if right < 0 else HAS_RIGHT) * sheet.width + b
+                                ]
+                            if ti.static(family == ALONG_ROW):
+                                cells = share_of_row(cells, kind)
+                            if ti.static(family == ALONG_COLUMN):
+                                cells = share_of_column(sheet, cells, b)
+                            squared = ti.select(cells > 0, squared, vector(0)) * cells
                         tension_sum += squared
                     measures[first + STRETCH_SUMS + family] += stretch_sum
                     if ti.static(tense):
@@ -397,8 +454,9 @@ class SpringTerm(Term):
         if material.factors is None:
             return None
         pads = ((0, 0), (0, 1)), ((1, 1), (0, 0)), ((1, 1), (0, 1))
-        families = zip(spring_stiffness(material, material.factors), material.tensions, pads, strict=True)
-        return np.concatenate([np.pad(np.maximum(k - tension, 0), pad) for k, tension, pad in families])
+        unmapped = spring_stiffness(material, np.ones_like(material.factors))
+        families = zip(spring_stiffness(material, material.factors), unmapped, pads, strict=True)
+        return np.concatenate([np.pad(np.maximum(k - k1 * material.tension, 0), pad) for k, k1, pad in families])
 
 
 def spring_law(material: Material) -> Law:

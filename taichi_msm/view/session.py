@@ -55,7 +55,7 @@ class Session:
 
     A force-controlled tool has the force, falloff and offset of the scene's first probe with a force. A
     position-controlled tool has the instrument and friction of the first probe with a path, otherwise the first
-    instrument. The first probe determines which one is the initial tool.
+    instrument. The first of these probes determines which one is the initial tool. Clamps always hold the sheet.
 
     Args:
         scene: the scene.
@@ -98,11 +98,12 @@ class Session:
         scene = plan.scene
         self._captures = captures
         self._film: Film | None = None
-        self._scene_probes = scene.probes if play else ()
+        self._scene_probes = tuple(probe for probe in scene.probes if play or probe.clamp is not None)
         # Without outputs, their kernels are not compiled.
         self._plan = replace(plan, scene=scene.model_copy(update={"output": ()}))
         self._force_tool, self._position_tool = _force_tool(plan), _position_tool(plan)
-        tool = self._position_tool if scene.probes[0].moved else self._force_tool
+        first = next(probe for probe in scene.probes if probe.clamp is None)
+        tool = self._position_tool if first.moved else self._force_tool
         assert tool is not None
         self.tool = tool
         plan = self._with_tool(tool)
@@ -403,6 +404,8 @@ def _require_usable(scene: Scene, *, play: bool) -> None:
     errors = {
         "image: missing; a session needs one, name it here or with --image": scene.image is None,
         "probes: empty; the tool takes its force from the first probe, add one": not scene.probes,
+        "probes: a clamp is no tool of a session; add a probe with a force": bool(scene.probes)
+        and all(probe.clamp is not None for probe in scene.probes),
         f"probes: {MAX_PROBES} leave no room for the tool; remove one, or leave out --play": play
         and len(scene.probes) == MAX_PROBES,
     }

@@ -1,4 +1,4 @@
-"""The reference for tools that are moved: contact, friction and grips, point by point."""
+"""The reference for tools that are moved: contact, friction, grips and clamps, point by point."""
 
 from __future__ import annotations
 
@@ -31,6 +31,13 @@ class Contact:
         self._taken = np.zeros((*shape, 3))
         self._since = np.zeros((len(plan.scene.probes), 3))
         self._grip: dict[int, int | None] = {}
+        self._clamps = [index for index, probe in enumerate(plan.scene.probes) if probe.clamp is not None]
+        last_row, last_column = shape[0] - 1, shape[1] - 1
+        for i, j in np.argwhere(~plan.fixed):
+            sides = {"top": i == 0, "bottom": i == last_row, "left": j == 0, "right": j == last_column}
+            for index in self._clamps:
+                if self.holder[i, j] < 0 and sides[str(plan.scene.probes[index].clamp)]:
+                    self.holder[i, j] = index
 
     def after(self, n: int, u: Array, following: Array) -> Array:
         """Resolve the contact in step n, which led from u to `following` [m]; returns u_{n+1}."""
@@ -43,9 +50,13 @@ class Contact:
                 index = tool.probe
                 before, after = (tool.tip_centre(np.array([step / grid.steps_per_second]))[0] for step in (n, n + 1))
                 push = np.zeros(3)
-                if held == index:
+                if held == index and index in self._clamps:
+                    keys = np.array(plan.scene.probes[index].path)
+                    t = (n + 1) / grid.steps_per_second
+                    push = [np.interp(t, keys[:, 0], keys[:, 1 + axis]) for axis in range(3)] - following[i, j]
+                elif held == index:
                     push = self._taken[i, j] + after - self._since[index] - following[i, j]
-                elif held < 0:
+                elif held < 0 and index not in self._clamps:
                     r = self._rest[i, j] + following[i, j] - after
                     r -= np.clip(r @ tool.axis, 0, tool.length) * tool.axis
                     distance = float(np.linalg.norm(r))
@@ -70,14 +81,15 @@ class Contact:
         plan, grid = self._plan, self._plan.grid
         t, equal = n / grid.steps_per_second, 1e-6 / grid.frames_per_second
         now = {}
-        for tool in plan.tools:
+        tools = [tool for tool in plan.tools if tool.probe not in self._clamps]
+        for tool in tools:
             holds = [k for k, (begin, end) in enumerate(tool.grips) if begin - equal <= t < end - equal]
             now[tool.probe] = holds[0] if holds else None
         begun = [probe for probe, grip in now.items() if grip is not None and self._grip.get(probe) != grip]
         for probe, grip in now.items():
             if grip is None or probe in begun:
                 self.holder[self.holder == probe] = -1
-        for tool in plan.tools:
+        for tool in tools:
             if tool.probe in begun:
                 middle = tool.tip_centre(np.array([t]))[0]
                 near = np.linalg.norm(self._rest + u - middle, axis=-1) <= 1.5 * tool.radius

@@ -703,3 +703,17 @@ def test_the_force_felt_is_shown_with_a_bar(begin: Begin, message: Messages) -> 
 @pytest.mark.parametrize(("largest", "end"), [(0.51, 1), (1, 1), (1.01, 2), (2.4, 5), (7, 10), (3e-4, 5e-4)])
 def test_a_bar_ends_at_a_round_number(largest: float, end: float) -> None:
     assert overlay.ValueBar(0.1, largest, "N").end == pytest.approx(end)
+
+
+def test_a_clamp_holds_its_side_in_a_session(begin: Begin, message: Messages) -> None:
+    """It is no tool of the session, which needs another one, and acts whether the scene is played or not."""
+    clamp = {"clamp": "right", "path": [[0, 0, 0, 0], [0.2, 0.01, 0, 0]]}
+    force = {"force": [0, 0, -2000], "falloff": 60}
+    held = {**TILTED, "sheet.fixed": ["left"], "probes": [clamp, force]}
+    session = begin({name: value for name, value in held.items() if not name.startswith("probes.")})
+    advance(session, 5 * session.subframes)
+    assert displacement(session)[1:-1, -1] == pytest.approx(0.01, abs=AT_REST)
+    assert not displacement(session)[:, 0].any()
+    session.picture()
+    with message.raises(SceneError, "probes"):
+        begin({"sheet.fixed": ["left"], "probes": [clamp]})

@@ -1,0 +1,338 @@
+"""Clamps, sides that are held and moved: against the twin, a closed form, and what must hold of any clamp."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from taichi_msm import Simulation, run
+from taichi_msm.accuracy.mesh import mesh_companion_plan
+from taichi_msm.errors import SceneError
+from taichi_msm.gradients.gradient import require_differentiable
+from taichi_msm.load.check import check_scene
+from taichi_msm.model.loads import evaluate_frame_loads
+from taichi_msm.model.sheet import rest_positions
+from taichi_msm.model.surface import place_capsules
+from taichi_msm.model.tools import Clamp, overlap, path_warnings
+from taichi_msm.scene.scene import Scene
+from taichi_msm.solver.dynamics import choose_layout
+from taichi_msm.solver.planning import try_plan
+from taichi_msm.solver.rest import QuasiStatics
+from taichi_msm.solver.state import State
+from taichi_msm.system.runtime import Device
+from tests import reference
+from tests.golden import Messages
+from tests.motion import dynamics_of, structure_of
+from tests.runs.test_forces import expected_forces
+from tests.scenes import plan_of, speckle
+from tests.solver.test_dynamics import as_on_a_gpu, assert_like_twin, short_launches, with_lanes
+from tests.solver.test_rest import at_rest, nearly_flat
+from tests.terms.test_contact import moved, states, touching
+
+__all__ = ["short_launches"]
+
+RIGHT = {"clamp": "right", "path": [[0, 0, 0, 0], [0.2, 0.01, 0.004, 0.02], [0.4, 0.02, 0, -0.01]]}
+TOP = {"clamp": "top", "path": [[0, 0, 0, 0], [0.1, 0, 0.006, 0], [0.4, -0.004, 0.006, 0.01]]}
+# Its tip comes near the right side, and would grip points of it.
+HOOK = moved([0, 0.9, 0.5, 0.001], [0.1, 0.95, 0.5, -0.02], [0.4, 0.8, 0.4, 0.03], grip=[[0, 0.3]], friction=0.3)
+
+LEFT = {"points": [9, 11], "size": [0.3, 0.4], "fixed": ["left"]}
+HELD = {"points": [9, 11], "size": [0.3, 0.4], "fixed": ["left", "bottom"]}
+TENSE = {"young": 1e3, "thickness": 0.01, "density": 1000, "pretension": 1, "bending": 3e-4, "damping": 5}
+
+CASES: dict[str, Scene] = {
+    "one side": touching([RIGHT], sheet=LEFT),
+    "a corner of two": touching([TOP, RIGHT], sheet=LEFT),
+    "a corner that is fixed": touching([RIGHT], sheet=HELD),
+    "with a rod": touching([HOOK, RIGHT], sheet=HELD),
+    "nothing fixed": touching([RIGHT], sheet={**LEFT, "fixed": "none"}),
+    "tension and bending": touching([TOP, RIGHT], sheet=HELD, tissue=TENSE),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_like_twin(case: str, device: Device) -> None:
+    assert_like_twin(CASES[case], device)
+
+
+def test_like_twin_in_f32_and_with_backward_damping(device: Device) -> None:
+    made = touching([TOP, RIGHT], sheet=LEFT, time={"precision": "f32", "damping_difference": "backward"})
+    assert_like_twin(made, device)
+
+
+@pytest.mark.parametrize("case", ["a corner of two", "tension and bending", "with a rod"])
+def test_the_force_is_that_of_the_twin(case: str, device: Device) -> None:
+    """And the tip is the mean place of the points that the clamp holds."""
+    made, expected = CASES[case], expected_forces(CASES[case])
+    with Simulation(made, threads=device.threads) as simulation:
+        for each in expected:
+            simulation.advance()
+            forces = np.array([one.force for one in simulation.forces()])
+            assert np.abs(forces - each).max() < 1e-11 * np.abs(expected).max()
+        for tool, one in zip(plan_of(made).tools, simulation.forces(), strict=True):
+            if isinstance(tool, Clamp):
+                assert one.tip == pytest.approx(simulation.positions()[tool.points].mean(axis=0))
+
+
+def test_what_a_clamp_holds(device: Device) -> None:
+    """Not the fixed corner, and of two clamps the earlier one the corner that they share."""
+    made = touching([TOP, RIGHT], sheet=HELD)
+    top, right = plan_of(made).tools
+    with Simulation(made, threads=device.threads) as simulation:
+        for frame in range(10):
+            u = simulation.positions() - rest_positions(made.sheet)
+            for clamp, points, keys in ((top, np.s_[0, 1:], TOP), (right, np.s_[1:-1, -1], RIGHT)):
+                times, *place = np.array(keys["path"]).T
+                there = [np.interp(frame / 25, times, each) for each in place]
+                np.testing.assert_allclose(u[points], np.broadcast_to(there, u[points].shape), rtol=0, atol=1e-15)
+                assert isinstance(clamp, Clamp)
+                assert clamp.points.sum() == len(u[points])
+            assert not u[:, 0].any()
+            assert not u[-1].any()
+            simulation.advance()
+
+
+@pytest.mark.usefixtures("short_launches")
+@pytest.mark.parametrize("case", ["with a rod", "a corner of two"])
+def test_lanes_workers_and_passes_do_not_change_the_bits(case: str, device: Device) -> None:
+    made = CASES[case]
+    made = made.model_copy(update={"time": made.time.model_copy(update={"precision": "f32", "duration": 0.12})})
+    layout = structure_of(made, device)
+    plain = states(made, device, layout)
+    assert states(made, device, replace(with_lanes(layout, 4), workers=2, depth=3)) == plain
+    assert states(made, device, as_on_a_gpu(layout)) == plain
+
+
+def test_bending_at_a_clamp_has_the_same_bits_on_two_workers_and_a_gpu(device: Device) -> None:
+    made = CASES["tension and bending"]
+    made = made.model_copy(update={"time": made.time.model_copy(update={"duration": 0.08})})
+    layout = structure_of(made, device)
+    plain = states(made, device, layout)
+    assert states(made, device, replace(with_lanes(layout, 1), workers=2)) == plain
+    assert states(made, device, as_on_a_gpu(layout)) == plain
+
+
+def test_steps_go_on_from_a_state(device: Device) -> None:
+    made = CASES["with a rod"]
+    plan, dynamics = plan_of(made), dynamics_of(made, device)
+    dynamics.advance(plan.grid.steps // 2 + 1)
+    saved = dynamics.state()
+    dynamics.restart(plan, State(*saved))
+    dynamics.advance(plan.grid.steps - saved.steps)
+    whole = dynamics_of(made, device)
+    whole.advance(plan.grid.steps)
+    assert [part.tobytes() for part in dynamics.state()[1:]] == [part.tobytes() for part in whole.state()[1:]]
+
+
+# At rest.
+
+PULL = {"clamp": "right", "path": [[0, 0, 0, 0], [1, 0.02, 0.005, 0.01], [2, 0, 0, 0]]}
+
+
+def test_at_rest_like_scipy(device: Device) -> None:
+    plan = plan_of(at_rest([PULL], sheet={**LEFT, "points": [7, 9]}))
+    rest, clamp = QuasiStatics(plan, device), plan.tools[0]
+    assert isinstance(clamp, Clamp)
+    rest.advance(1)
+    u, loads = rest.displacement(), evaluate_frame_loads(plan, 1)
+    np.testing.assert_allclose(u[clamp.points], np.tile([0.02, 0.005, 0.01], (7, 1)), rtol=0, atol=1e-15)
+    start = nearly_flat(plan)
+    start[clamp.points] = [0.02, 0.005, 0.01]
+    twin = reference.equilibrium(plan, loads, start, clamp.points)
+    np.testing.assert_allclose(u, twin, rtol=0, atol=2e-6 * 0.02)
+    others = reference.force(plan.scene, u, loads, 0)[clamp.points].sum(axis=0)
+    np.testing.assert_allclose(rest.tool_forces()[0], -others, rtol=0, atol=1e-6 * np.abs(others).max())
+
+
+@pytest.mark.parametrize("mapped", [False, True])
+def test_under_tension_force_and_energy_are_those_of_the_twin(
+    mapped: bool, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Image.fromarray(speckle(6, 7)[..., 0]).save("grey.png")
+    maps = {"map": {"image": "grey.png", "range": [1, 3]}} if mapped else {}
+    sides = [{**PULL, "clamp": "top"}, PULL]
+    plan = plan_of(at_rest(sides, sheet={**HELD, "points": [6, 8]}, tissue={**TENSE, **maps}))
+    rest = QuasiStatics(plan, device)
+    rest.advance(1)
+    u, loads = rest.displacement(), evaluate_frame_loads(plan, 1)
+    force = reference.force(plan.scene, u, loads, 0)
+    expected = [-force[clamp.points].sum(axis=0) for clamp in plan.tools if isinstance(clamp, Clamp)]
+    np.testing.assert_allclose(rest.tool_forces(), expected, rtol=0, atol=1e-9 * np.abs(expected).max())
+    assert rest.read().energy == pytest.approx(reference.energy(plan.scene, u), rel=1e-9)
+
+
+def test_back_at_its_place_the_sheet_is_flat(device: Device) -> None:
+    rest = QuasiStatics(plan_of(at_rest([PULL], sheet=LEFT, time={"duration": 2})), device)
+    rest.advance(2)
+    assert not rest.displacement().any()
+    assert not rest.tool_forces().any()
+
+
+def test_it_advances_by_half_the_shortest_spring_at_most(device: Device) -> None:
+    plan = plan_of(at_rest([PULL], sheet=LEFT))
+    (clamp,) = plan.tools
+    # Rows are 37.5 mm apart, columns 40 mm.
+    far = replace(clamp, tip_centres=np.array([[0, 0, 0], [0.1, 0, 0], [0, 0, 0]]))
+    assert len(clamp.substep_times(0, 1)) == 2 - (np.hypot(0.02, np.hypot(0.005, 0.01)) <= 0.0375 / 2)
+    assert len(far.substep_times(0, 1)) == 6
+
+
+def strip(length: float, *, strain: float = 1e-4, cells: int = 4, **sections: Any) -> Scene:
+    """A strip of a width of 20 mm that is pulled at rest, with free long edges."""
+    sheet = {"points": [cells + 1, round(cells * length / 0.02) + 1], "size": [0.02, length], "fixed": ["left"]}
+    pull = {"clamp": "right", "path": [[0, 0, 0, 0], [1, strain * length, 0, 0]]}
+    return at_rest([pull], sheet=sheet, tissue={"young": 3e4, "thickness": 2e-3}, **sections)
+
+
+def test_a_strip_resists_by_its_modulus_and_section(device: Device) -> None:
+    """The sheet is in plane stress, and its long edges are free: F = E t w strain.
+
+    Its ends cannot narrow, which makes it stiffer, by as much whatever its length: two strips differ in compliance by
+    their difference in length over E t w. The lattice has this modulus exactly, but for the square of the strain.
+    """
+    stiffness, compliance = 3e4 * 2e-3 * 0.02, []
+    for length in (0.06, 0.10):
+        with Simulation(strip(length), threads=device.threads) as simulation:
+            simulation.advance()
+            force, *across = simulation.forces()[0].force
+        np.testing.assert_allclose(across, 0, atol=1e-6 * force)
+        assert 1 < force / (stiffness * 1e-4) < 1.05
+        compliance.append(1e-4 * length / force)
+    assert compliance[1] - compliance[0] == pytest.approx((0.10 - 0.06) / stiffness, rel=1e-3)
+
+
+def test_lanes_do_not_change_the_bits_at_rest(device: Device) -> None:
+    plan = plan_of(at_rest([PULL], sheet=LEFT))
+    layout, shapes = choose_layout(plan, device), []
+    for each in (layout, with_lanes(layout, 1)):
+        rest = QuasiStatics(plan, device, each)
+        rest.advance(1)
+        shapes.append(rest.displacement().tobytes() + rest.tool_forces().tobytes())
+    assert shapes[0] == shapes[1]
+
+
+@pytest.mark.parametrize("motion", ["dynamic", "quasistatic"])
+def test_a_run_goes_on_with_the_same_bits(motion: str, device: Device) -> None:
+    made = touching([RIGHT], sheet=LEFT, time={"motion": motion, "precision": "auto", "duration": 0.24})
+    with Simulation(made, threads=device.threads) as simulation:
+        simulation.advance(2)
+        saved = simulation.save()
+        simulation.advance(4)
+        expected = simulation.positions().tobytes(), simulation.forces()
+        simulation.restore(saved)
+        simulation.advance(4)
+        assert (simulation.positions().tobytes(), simulation.forces()) == expected
+
+
+# What a clamp is to the rest of the program.
+
+
+def test_a_run_estimates_the_error_of_the_force(tmp_path: Path) -> None:
+    record = run(strip(0.06, cells=8), tmp_path / "out", estimate_error=True)
+    estimate: Any = record["error_estimate"]
+    assert 0 < estimate["mesh_error"] < 0.05
+    assert 0 < estimate["force_error"] < 0.05
+    assert not [note for note in record["notes"] if "instrument" in note or "tip" in note]
+
+
+def test_a_clamp_that_stays_has_an_error_of_0(tmp_path: Path) -> None:
+    estimate: Any = run(strip(0.06, strain=0.0, cells=8), tmp_path / "out", estimate_error=True)["error_estimate"]
+    assert estimate["force_error"] == 0
+
+
+def test_a_coarser_mesh_has_a_clamp_of_its_own_points() -> None:
+    plan = plan_of(strip(0.06, cells=8))
+    coarse = mesh_companion_plan(plan)
+    assert coarse is not None
+    assert coarse.scene.sheet.points == (5, 13)
+    (clamp,) = coarse.tools
+    assert isinstance(clamp, Clamp)
+    assert clamp.points.sum() == 5
+
+
+def test_nothing_is_drawn_and_nothing_touches() -> None:
+    made = touching([RIGHT, TOP], sheet=LEFT)
+    plan = plan_of(made)
+    assert not place_capsules(made, rest_positions(made.sheet), 0.2)
+    assert not made.has_instruments
+    assert not plan.has_contact
+    assert overlap(plan.tools, 0.4) is None
+    assert not list(path_warnings(made, plan.tools))
+
+
+def test_units_and_times_that_cannot_be_meant_are_noted(message: Messages) -> None:
+    made = touching([{"clamp": "right", "path": [[0, 0, 0, 0], [300, 12, 0, 0]]}], sheet=LEFT)
+    message(path_warnings(made, plan_of(made).tools), "12 m", "ends at 300 s")
+
+
+def test_a_path_may_be_long_and_a_scene_is_read_again() -> None:
+    made = touching([{"clamp": "right", "path": [[0, 0, 0, 0], [0.4, 3, -5, 0]]}], sheet=LEFT)
+    assert Scene.model_validate(made.model_dump()) == made
+    assert set(made.model_dump()["probes"][0]) == {"clamp", "path"}
+    assert "clamp" not in touching([HOOK]).model_dump()["probes"][0]
+
+
+def test_a_clamped_side_counts_as_fixed_for_tension_and_bending(message: Messages) -> None:
+    assert not try_plan(CASES["tension and bending"])[1]
+    message(map(str, try_plan(touching([TOP], sheet=HELD, tissue=TENSE))[1]), "pretension", "bending")
+
+
+REFUSED: dict[str, dict[str, Any]] = {
+    "instrument": {**RIGHT, "instrument": HOOK["instrument"]},
+    "grip": {**RIGHT, "grip": [[0, 1]]},
+    "friction": {**RIGHT, "friction": 0.1},
+    "load": {**RIGHT, "load": [[0, 100]]},
+    "at": {**RIGHT, "at": [0.5, 0.5]},
+    "total": {**RIGHT, "total": [0, 0, -1]},
+    "path": {"clamp": "right"},
+    "clamp": {**RIGHT, "clamp": "rihgt"},
+    "path.0": {"clamp": "right", "path": [[0, 0, 0.001, 0]]},
+    "path.1": {"clamp": "right", "path": [[0, 0, 0, 0], [0, 0.001, 0, 0]]},
+}
+
+
+@pytest.mark.parametrize("key", REFUSED)
+def test_what_a_clamp_cannot_be_is_refused(key: str, message: Messages) -> None:
+    keys = {"sheet": LEFT, "tissue": {"young": 1e3, "thickness": 0.01, "density": 1000}, "time": {"duration": 0.4}}
+    with message.raises(SceneError, f"probes.0.{key}: "):
+        check_scene({**keys, "output": [], "probes": [REFUSED[key]]})
+
+
+def test_a_side_is_held_once(message: Messages) -> None:
+    problems = [
+        problem
+        for probes, fixed in (([RIGHT], "border"), ([RIGHT, RIGHT], ["left"]))
+        for problem in try_plan(touching(probes, sheet={**LEFT, "fixed": fixed}))[1]
+    ]
+    message(map(str, problems), "probes.0.clamp: ", "probes.1.clamp: ")
+
+
+def test_it_has_no_gradient(message: Messages) -> None:
+    with message.raises(SceneError, "probes.0.path"):
+        require_differentiable(plan_of(CASES["one side"]))
+
+
+@pytest.mark.parametrize("motion", ["dynamic", "quasistatic"])
+def test_a_clamp_that_is_steered_does_what_its_path_does(motion: str, device: Device, message: Messages) -> None:
+    time = {"motion": motion, "precision": "auto"}
+    path = [[frame / 25, 0.002 * frame, 0.001 * frame**2, 0.001 * frame] for frame in range(6)]
+    made = touching([{"clamp": "right", "path": path}], sheet=LEFT, time=time)
+    short = touching([{"clamp": "right", "path": path[:1]}], sheet=LEFT, time=time)
+    with (
+        Simulation(made, threads=device.threads) as expected,
+        Simulation(short, threads=device.threads) as steered,
+    ):
+        for key in path[1:]:
+            steered.steer([{"path": [key]}])
+            steered.advance()
+            expected.advance()
+            assert steered.positions().tobytes() == expected.positions().tobytes()
+            assert steered.forces() == expected.forces()
+        with message.raises(SceneError, "probes.0.clamp"):
+            steered.steer([{"clamp": "top", "path": [[1, 0, 0, 0]]}])
