@@ -33,6 +33,7 @@ from taichi_msm.model.sheet import (
 )
 from taichi_msm.model.time_grid import TimeGrid
 from taichi_msm.model.tools import MAX_STRIDE_RADII, Tool, build_tools, path_problems, too_fast
+from taichi_msm.model.verlet import stability_limit
 from taichi_msm.scene.scene import Scene, Time
 from taichi_msm.scene.section import FRAME_TOLERANCE
 from taichi_msm.scene.sheet import Sheet
@@ -196,10 +197,7 @@ def choose_precision(plan: Plan, arch: str) -> Plan:
 
 
 def stable_step(material: Material, sheet: Sheet, difference: str) -> float:
-    """Compute the largest stable step.
-
-    With the highest angular frequency w and g = C / m, it is 2 / w for central differences of the damping, and
-    (sqrt(g^2 + 4 w^2) - g) / w^2 for backward differences, which the code rearranges to avoid cancellation.
+    """Compute the largest stable step of a sheet, see `verlet.stability_limit`.
 
     Args:
         material: coefficients of the sheet.
@@ -209,10 +207,7 @@ def stable_step(material: Material, sheet: Sheet, difference: str) -> float:
     Returns:
         The step [s]; infinite without stiffness and damping.
     """
-    w = highest_frequency(material, sheet)
-    g = material.drag if difference == "backward" else 0.0
-    limit = math.hypot(g, 2 * w) + g
-    return 4 / limit if limit > 0 else math.inf
+    return stability_limit(highest_frequency(material, sheet), material.drag, difference)
 
 
 def stable_steps(plan: Plan) -> int:
