@@ -40,6 +40,7 @@ from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import area_shares
 from taichi_msm.model.verlet import coefficients
 from taichi_msm.solver.arrays import SheetLayout, from_lanes, to_lanes
+from taichi_msm.solver.backoff import Backoff
 from taichi_msm.solver.bands import MOMENT_ROWS
 from taichi_msm.solver.dynamics import STEPS_PER_TABLE, Dynamics
 from taichi_msm.solver.kernel_cpu import MAX_CHECKS, PAGE
@@ -112,7 +113,7 @@ class MotionAdjoint:
     """
 
     def __init__(self, plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> None:
-        self._forward = Dynamics(plan, device, layout, cores)
+        self._forward, self._backoff = Dynamics(plan, device, layout, cores), Backoff()
         self._allocate()
 
     def restart(self, plan: Plan) -> None:
@@ -327,10 +328,13 @@ class MotionAdjoint:
         ])  # fmt: skip
 
     def _launch(self, kernel: int, sizes: NDArray[np.int64], *arguments: Any) -> None:
-        """Launch a kernel of `adjoint_kernels`; if a worker gives up, a single worker finishes the launch."""
-        code, workers = self.layout.config, self.layout.workers
+        """Launch a kernel of `adjoint_kernels`; if a worker times out, a single worker finishes the launch."""
+        config, workers = self.layout.config, self.layout.workers
         progress = np.zeros(STRIDE * workers, np.int64)
-        for parallel in (True, False) if workers > 1 else (False,):
+        with compilation_options():
+            if workers > 1 and not self._backoff.is_active:
+                self._backoff.start_launch()
+                adjoint_kernels(config, parallel=True)[kernel](sizes, progress, *arguments)
+                self._backoff.end_launch(timed_out=bool((progress[::STRIDE] < sizes[0]).any()))
             if (progress[::STRIDE] < sizes[0]).any():
-                with compilation_options():
-                    adjoint_kernels(code, parallel=parallel)[kernel](sizes, progress, *arguments)
+                adjoint_kernels(config, parallel=False)[kernel](sizes, progress, *arguments)

@@ -155,7 +155,7 @@ def try_plan(scene: Scene, maps: Maps | None = None) -> tuple[Plan | None, list[
     if problems:
         return None, problems
     plan = _plan(scene, maps, fixed, material)
-    return plan, [*_step_problems(plan), *path_problems(scene, plan.tools, plan.grid)]
+    return plan, [*_step_problems(plan), *precision_problems(plan), *path_problems(scene, plan.tools, plan.grid)]
 
 
 def plan_variant(plan: Plan, scene: Scene) -> Plan:
@@ -253,7 +253,7 @@ def freeze_grid(plan: Plan) -> Plan:
 
 
 def _step_problems(plan: Plan) -> Iterator[Problem]:
-    """Check that a given step is stable and divides a frame, and that lengths and gain are in the range of f32."""
+    """Check that a given step is stable and divides a frame."""
     if plan.scene.time.at_rest:
         return
     given, limit, frame = plan.scene.time.step, plan.stable_step, 1 / plan.grid.frames_per_second
@@ -266,6 +266,10 @@ def _step_problems(plan: Plan) -> Iterator[Problem]:
     elif abs(frame / given - round(frame / given)) > FRAME_TOLERANCE * max(1.0, frame / given):
         text = f"{given:g} s does not divide a frame of {frame:.9g} s; try {frame / math.ceil(frame / given):.9g}"
         yield Problem(("time", "step"), text)
+
+
+def precision_problems(plan: Plan) -> Iterator[Problem]:
+    """Check that lengths and gain are in the range of the precision."""
     if plan.grid.precision == "f64":
         return
     cells, size, step, mass = spacing(plan.scene.sheet), plan.scene.sheet.size, plan.grid.step, plan.material.mass

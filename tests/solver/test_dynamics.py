@@ -18,7 +18,7 @@ from taichi_msm.errors import MsmError
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_POINTS
-from taichi_msm.solver import kernel_cpu, kernel_gpu
+from taichi_msm.solver import backoff, kernel_cpu, kernel_gpu
 from taichi_msm.solver.arrays import SheetLayout
 from taichi_msm.solver.dynamics import POINTS_PER_WORKER
 from taichi_msm.system import process
@@ -346,8 +346,8 @@ def test_workers_that_give_up_waiting_go_on_to_the_same_bits(
     for count in steps:
         alone.advance(count)
     monkeypatch.setattr(kernel_cpu, "MAX_CHECKS", patience)
-    monkeypatch.setattr(kernel_cpu, "MIN_BACKOFF_S", 0.001)
-    monkeypatch.setattr(kernel_cpu, "MAX_BACKOFF_S", 0.002)
+    monkeypatch.setattr(backoff, "MIN_BACKOFF_S", 0.001)
+    monkeypatch.setattr(backoff, "MAX_BACKOFF_S", 0.002)
     for workers, depth in ((2, 1), (2, 4), (3, 2)):
         together = dynamics_of(made, device, replace(structure_of(made, device), workers=workers, depth=depth))
         for count in steps:
@@ -412,7 +412,7 @@ def test_giving_up_in_the_last_pass_of_a_launch_counts(device: Device, monkeypat
     assert isinstance(scatter, kernel_cpu.ScatterKernel)
     for _ in range(200):
         dynamics.advance(8)
-    assert scatter._backoff_until > 0
+    assert scatter._backoff._until > 0
 
 
 def test_a_sheet_that_was_interrupted_while_stepping_is_not_used(
