@@ -20,6 +20,7 @@ from taichi_msm.errors import ArgumentError, MsmError, SceneError
 from taichi_msm.gradients import motion, rest
 from taichi_msm.gradients.chain_rule import Derivatives
 from taichi_msm.gradients.gradient import Adjoint, with_stiffness_map
+from taichi_msm.gradients.kernel_motion import adjoint_kernels
 from taichi_msm.gradients.motion import MotionAdjoint
 from taichi_msm.model.loads import average_loads
 from taichi_msm.model.plan import Plan
@@ -282,11 +283,11 @@ def test_the_bits_depend_neither_on_workers_nor_on_segments(
     # After that a single worker sweeps, until the back-off ends.
     monkeypatch.setattr(backoff, "MIN_BACKOFF_S", 1000.0)
     monkeypatch.setattr(backoff, "MAX_BACKOFF_S", 1000.0)
-    launches, kernels = [], motion.adjoint_kernels
+    launches: list[bool] = []
 
     def counted(config: KernelConfig, *, parallel: bool) -> Any:
         launches.append(parallel)
-        return kernels(config, parallel=parallel)
+        return adjoint_kernels(config, parallel=parallel)
 
     monkeypatch.setattr(motion, "adjoint_kernels", counted)
     assert bits(3) == alone
