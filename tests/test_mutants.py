@@ -25,11 +25,11 @@ def test_a_mutant_is_another_program(mutant: Mutant, root: Path) -> None:
 @pytest.mark.parametrize(
     ("function", "find"),
     [
-        ("no_such_function", "2 *  w)\n+ g"),
-        ("stable_step", "(0.5 - down) * height"),
+        ("no_such_function", "2 *  frequency)\n+ g"),
+        ("stability_limit", "(0.5 - down) * height"),
         ("__init__", "self"),
-        ("stable_step", "g"),
-        ("stable_step", "no such code"),
+        ("stability_limit", "g"),
+        ("stability_limit", "no such code"),
     ],
     ids=["moved", "elsewhere", "many functions", "twice", "nowhere"],
 )

@@ -15,7 +15,8 @@ from taichi_msm.model.sheet import axes
 from taichi_msm.model.surface import to_positions
 from taichi_msm.model.tool_force import control_points, probe_force
 from taichi_msm.scene.scene import Scene
-from taichi_msm.solver.dynamics import Dynamics, ForceRecorder
+from taichi_msm.solver.dynamics import ForceRecorder
+from taichi_msm.solver.sheet_solver import SheetSolver
 from taichi_msm.solver.state import RunProgress, Snapshot, largest_displacement
 
 # Budget of all trial runs together, in steps times mass points, about ten seconds. It is counted rather than timed, so
@@ -36,7 +37,7 @@ class Diagnosis:
     last_sound_state: Snapshot | None
 
 
-def diagnose(dynamics: Dynamics, start: Snapshot | None, pause: Pause) -> Diagnosis:
+def diagnose(dynamics: SheetSolver, start: Snapshot | None, pause: Pause) -> Diagnosis:
     """Find the step, the mass point and the likely cause of a divergence within the current frame.
 
     Args:
@@ -81,7 +82,7 @@ def diagnose(dynamics: Dynamics, start: Snapshot | None, pause: Pause) -> Diagno
     return Diagnosis(message, last_sound_state)
 
 
-def _likely_cause(dynamics: Dynamics, bad_step: int, point: tuple[int, int], pause: Pause) -> str:
+def _likely_cause(dynamics: SheetSolver, bad_step: int, point: tuple[int, int], pause: Pause) -> str:
     """Describe the likely cause: the time step if a finer one does not diverge, else a force or a path."""
     plan, grid = dynamics.plan, dynamics.plan.grid
     frames, finest_step, budget = -(-bad_step // grid.steps_per_frame), math.inf, MAX_NODE_STEPS
@@ -106,7 +107,7 @@ def _likely_cause(dynamics: Dynamics, bad_step: int, point: tuple[int, int], pau
     return f"{cause}; take less, or a time.step below {grid.step:.6g} s; finer steps would take too long to try here"
 
 
-def _is_stable(dynamics: Dynamics, plan: Plan, frames: int, pause: Pause) -> bool:
+def _is_stable(dynamics: SheetSolver, plan: Plan, frames: int, pause: Pause) -> bool:
     """Return whether the first frames from rest have no fault."""
     dynamics.restart(plan)
     monitor = DivergenceMonitor(plan)

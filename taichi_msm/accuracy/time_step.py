@@ -29,6 +29,7 @@ from taichi_msm.errors import Pause, ProgressCallback, SceneError
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.tools import overlap
+from taichi_msm.model.verlet import convergence_order
 from taichi_msm.scene.section import MAX_TOLERANCE
 from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.system.runtime import Device
@@ -76,12 +77,6 @@ class TimeStepEstimate:
     parted: bool = True
     at_least: bool = False
     at_most: bool = False
-
-
-def convergence_order(plan: Plan) -> int:
-    """Return the order of the method: 1 with damping by backward differences or with contact, else 2."""
-    backward = plan.scene.time.damping_difference == "backward" and plan.material.drag > 0
-    return 1 if backward or plan.has_contact else 2
 
 
 def estimate_error(

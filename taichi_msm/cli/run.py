@@ -212,6 +212,8 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
 
 def _lock_cost(plan: Plan) -> str:
     """Describe the cost of tissue that locks; return an empty string without it."""
+    if plan.material.stiffening is None and plan.material.virtual_stiffening is None:
+        return ""
     from taichi_msm.solver.planning import stable_step
 
     linear = replace(plan.material, stiffening=None, virtual_stiffening=None)

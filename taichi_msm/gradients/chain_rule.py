@@ -1,7 +1,7 @@
 """Chain rule from the coefficients of a sheet to the numbers of its scene.
 
 Closed forms lead from the scene to a `Material`, and on to the coefficients of a time step (`derive` of every term,
-`damping.coefficients`). They are differentiated by complex steps, exactly but for rounding: f(x + i h) is
+`verlet.coefficients`). They are differentiated by complex steps, exactly but for rounding: f(x + i h) is
 f(x) + i h f'(x) with an h so small that its square vanishes. Loads are linear in the percents of the load and in the
 components of the force, and control points are linear in their keyframes. Hence the derivative with respect to one of
 these values follows from the schedule in which it is 1 and all others are 0.
@@ -20,12 +20,12 @@ from pydantic import BaseModel
 from taichi_msm.model.loads import Schedule
 from taichi_msm.model.plan import Plan, ProbeSegment
 from taichi_msm.model.tool_force import control_points
+from taichi_msm.model.verlet import coefficients
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import Section
 from taichi_msm.scene.sheet import Foundation
 from taichi_msm.scene.tools import Probe
 from taichi_msm.terms import derive_material
-from taichi_msm.terms.damping import coefficients
 from taichi_msm.terms.springs import spring_stiffness
 
 Array = NDArray[np.float64]

@@ -38,14 +38,15 @@ from taichi_msm.gradients.kernel_motion import (
 from taichi_msm.model.loads import average_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import area_shares
-from taichi_msm.solver.arrays import from_lanes, to_lanes
+from taichi_msm.model.verlet import coefficients
+from taichi_msm.solver.arrays import SheetLayout, from_lanes, to_lanes
+from taichi_msm.solver.backoff import Backoff
 from taichi_msm.solver.bands import MOMENT_ROWS
 from taichi_msm.solver.dynamics import STEPS_PER_TABLE, Dynamics
 from taichi_msm.solver.kernel_cpu import MAX_CHECKS, PAGE
-from taichi_msm.solver.state import State, largest_displacement
-from taichi_msm.system.runtime import Memory, compilation_options, write_vectors
+from taichi_msm.solver.state import largest_displacement
+from taichi_msm.system.runtime import Device, Memory, compilation_options, write_vectors
 from taichi_msm.terms.base import GAIN
-from taichi_msm.terms.damping import coefficients
 from taichi_msm.terms.foundation import point_shares
 from taichi_msm.terms.loads import ProbeTerm
 
@@ -101,25 +102,41 @@ class _Arrays(NamedTuple):
     derivatives: Any
 
 
-class MotionAdjoint(Dynamics):
-    """Dynamic sheet and its adjoint; the plan must be in f64 and have a stiffness map."""
+class MotionAdjoint:
+    """Dynamic sheet and its adjoint.
 
-    # Layout, number of steps and number of standing slots of the allocated arrays.
-    _allocated: tuple[Any, ...] = ()
+    Args:
+        plan: the plan, in f64 and with a stiffness map.
+        device: a CPU.
+        layout: replaces the layout chosen by `choose_layout`, for tests.
+        cores: number of CPU cores; None for all.
+    """
 
-    def restart(self, plan: Plan, state: State | None = None) -> None:
-        """Restart with the same scene or another.
+    def __init__(self, plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> None:
+        self._forward, self._backoff = Dynamics(plan, device, layout, cores), Backoff()
+        self._allocate()
 
-        Args:
-            plan: plan of the scene.
-            state: initial state; None for the state of rest.
-        """
-        super().restart(plan, state)
-        self._decay_gradients = self.layout.config.require(ProbeTerm).decay_gradients(plan)
-        key = self.layout, plan.grid.steps, len(self._decay_gradients)
-        if key != self._allocated:
+    def restart(self, plan: Plan) -> None:
+        """Restart with the same scene or another."""
+        before = self.layout, self.plan.grid.steps
+        self._forward.restart(plan)
+        if (self.layout, plan.grid.steps) != before:
             self._allocate()
-            self._allocated = key
+
+    @property
+    def plan(self) -> Plan:
+        """The current plan."""
+        return self._forward.plan
+
+    @property
+    def layout(self) -> SheetLayout:
+        """The memory layout, and the configuration of the kernels."""
+        return self._forward.layout
+
+    @property
+    def _decay_parts(self) -> int:
+        """Number of parts of the derivatives that contain those of the decays of standing slots."""
+        return 2 * self.layout.config.require(ProbeTerm).moves.count(False)
 
     def _allocate(self) -> None:
         plan = self.plan
@@ -143,7 +160,7 @@ class MotionAdjoint(Dynamics):
             vector(checkpoint_rows), vector(checkpoint_rows),
             vector(self._segment * layout.rows + self._worker_rows), vector(layout.rows),
             vector(ADJOINT_PARTS * layout.rows + self._worker_rows), vector(layout.rows),
-            scalar((SUM_PARTS + 2 * len(self._decay_gradients)) * layout.rows + row_sums),
+            scalar((SUM_PARTS + self._decay_parts) * layout.rows + row_sums),
         )  # fmt: skip
 
     def run(self, pause: Pause = lambda: None) -> Array:
@@ -162,11 +179,11 @@ class MotionAdjoint(Dynamics):
         monitor, frames = DivergenceMonitor(plan), np.zeros((grid.frames + 1, *plan.scene.sheet.points, 3))
         stops = {*range(0, grid.steps + 1, grid.steps_per_frame), *range(0, grid.steps, self._segment)}
         for n in sorted(stops):
-            self.advance(n - self.steps_done, pause)
+            self._forward.advance(n - self._forward.steps_done, pause)
             if n % self._segment == 0 and n < grid.steps:
                 self._store_checkpoint(n // self._segment)
             if n and n % grid.steps_per_frame == 0:
-                reading = self.read()
+                reading = self._forward.read()
                 fault = monitor.check_frame(reading)
                 if fault:
                     message = divergence.format_message(grid.time(n), n, fault, exact=False)
@@ -194,7 +211,7 @@ class MotionAdjoint(Dynamics):
             parts = start[..., c], 0 * start[..., c], start[..., c]
             write_vectors(arrays.adjoint[c], to_lanes(layout, np.concatenate(parts)))
         zeros = np.zeros((SUM_PARTS * layout.rows, layout.cols))
-        decay_gradients = self._decay_gradients.reshape(-1, layout.cols)
+        decay_gradients = layout.config.require(ProbeTerm).decay_gradients(self.plan).reshape(-1, layout.cols)
         write_vectors(arrays.derivatives, to_lanes(layout, np.concatenate([zeros, decay_gradients])))
         loads, self._buffer, work = LoadGradient(self.plan), BUFFERS, np.zeros(2)
         block = max(1, STEPS_PER_TABLE // self._segment) * self._segment
@@ -204,7 +221,7 @@ class MotionAdjoint(Dynamics):
 
     def _sweep_block(self, first: int, end: int, by_frame: Array, loads: LoadGradient, pause: Pause) -> Array:
         """Sweep backward over a block of segments; return the work of the loads on p after step 0 and in step 0."""
-        table, h = self._table(first, end - first), self.plan.grid.step
+        table, h = self._forward.sheet.step_table(first, end - first), self.plan.grid.step
         by_slot = np.zeros((end - first, len(self.plan.slots), LOAD_DERIVATIVES))
         at = end
         for begin in reversed(range(first, end, self._segment)):
@@ -225,9 +242,9 @@ class MotionAdjoint(Dynamics):
         return np.array([work[int(first == 0) :].sum(), work[: int(first == 0)].sum()])
 
     def _store_checkpoint(self, segment: int) -> None:
-        arrays, first = self._arrays, segment * self._shape_entries
-        self._copy_shape(0, first, self._moving.arrays.u, arrays.checkpoints)
-        self._copy_shape(0, first, self._moving.arrays.d, arrays.checkpoint_differences)
+        arrays, sheet, first = self._arrays, self._forward.sheet.kernel.arrays, segment * self._shape_entries
+        self._copy_shape(0, first, sheet.u, arrays.checkpoints)
+        self._copy_shape(0, first, sheet.d, arrays.checkpoint_differences)
 
     @property
     def _shape_entries(self) -> int:
@@ -279,7 +296,7 @@ class MotionAdjoint(Dynamics):
         layout = self.layout
         rows, cols, derivatives = layout.rows, layout.cols, self._arrays.derivatives.to_numpy()
         parts = from_lanes(layout, derivatives, SUM_PARTS * rows).reshape(SUM_PARTS, rows, cols)
-        first = (SUM_PARTS + 2 * len(self._decay_gradients)) * rows * layout.width
+        first = (SUM_PARTS + self._decay_parts) * rows * layout.width
         # The sums of a row are added lane by lane, and then row by row.
         row_sums = derivatives[first : first + ROW_SUMS * rows].reshape(rows, ROW_SUMS, -1)
         sums = row_sums.sum(axis=2).sum(axis=0)
@@ -295,7 +312,7 @@ class MotionAdjoint(Dynamics):
     @property
     def _sheet_arrays(self) -> tuple[Any, ...]:
         """Read-only arrays of the sheet."""
-        arrays = self._moving.arrays
+        arrays = self._forward.sheet.kernel.arrays
         return arrays.constants, arrays.by_column, arrays.stiffness, arrays.fields
 
     def _max_launch_steps(self) -> int:
@@ -311,10 +328,13 @@ class MotionAdjoint(Dynamics):
         ])  # fmt: skip
 
     def _launch(self, kernel: int, sizes: NDArray[np.int64], *arguments: Any) -> None:
-        """Launch a kernel of `adjoint_kernels`; if a worker gives up, a single worker finishes the launch."""
-        code, workers = self.layout.config, self.layout.workers
+        """Launch a kernel of `adjoint_kernels`; if a worker times out, a single worker finishes the launch."""
+        config, workers = self.layout.config, self.layout.workers
         progress = np.zeros(STRIDE * workers, np.int64)
-        for parallel in (True, False) if workers > 1 else (False,):
+        with compilation_options():
+            if workers > 1 and not self._backoff.is_active:
+                self._backoff.start_launch()
+                adjoint_kernels(config, parallel=True)[kernel](sizes, progress, *arguments)
+                self._backoff.end_launch(timed_out=bool((progress[::STRIDE] < sizes[0]).any()))
             if (progress[::STRIDE] < sizes[0]).any():
-                with compilation_options():
-                    adjoint_kernels(code, parallel=parallel)[kernel](sizes, progress, *arguments)
+                adjoint_kernels(config, parallel=False)[kernel](sizes, progress, *arguments)

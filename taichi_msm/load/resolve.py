@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from taichi_msm.accuracy.mesh import MeshEstimate, choose_points
 from taichi_msm.accuracy.time_step import TimeStepEstimate, choose_step
-from taichi_msm.errors import ProgressCallback
+from taichi_msm.errors import ProgressCallback, SceneError
 from taichi_msm.load.check import check_scene
 from taichi_msm.model.plan import Plan
 from taichi_msm.solver import planning
@@ -37,10 +37,13 @@ def resolve(plan: Plan, device: Device, progress: ProgressCallback = lambda done
         progress: callback with the progress of the trial runs.
 
     Raises:
-        SceneError: when a tolerance cannot be met.
+        SceneError: when a tolerance cannot be met, or the precision of the device does not suffice.
     """
     estimate = mesh = None
     plan = planning.choose_precision(plan, device.arch)
+    # The scene was checked for a CPU, where `auto` may choose another precision.
+    if problems := [str(problem) for problem in planning.precision_problems(plan)]:
+        raise SceneError(problems)
     if plan.scene.sheet.tolerance is not None:
         plan, mesh = choose_points(plan, device, check_scene, progress)
     if plan.scene.time.tolerance is not None:

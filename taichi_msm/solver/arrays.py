@@ -159,10 +159,23 @@ class SheetArrays:
         return self._memory.array(self._layout.config.precision, self._layout.config.lanes, count * self._layout.width)
 
 
-class StepKernel(Protocol):
-    """A sheet in the memory of a device, with the kernels that step and read it."""
+class SheetKernel(Protocol):
+    """A sheet in the memory of a device, with the kernel that reads it."""
 
     arrays: SheetArrays
+
+    def read(self, differences: bool, values: NDArray[Any], measures: NDArray[Any]) -> None:
+        """Read displacements or last differences, and measure every row.
+
+        Args:
+            differences: whether to read last differences instead of displacements.
+            values: output [m], shape (rows, cols, 3).
+            measures: output, shape (rows, measures).
+        """
+
+
+class StepKernel(SheetKernel, Protocol):
+    """A sheet in the memory of a device, with the kernels that step and read it."""
 
     def __init__(self, layout: SheetLayout, start: InitialData) -> None: ...
 
@@ -176,15 +189,6 @@ class StepKernel(Protocol):
 
     def compile(self, table: NDArray[Any]) -> None:
         """Compile all kernels without taking a step."""
-
-    def read(self, differences: bool, values: NDArray[Any], measures: NDArray[Any]) -> None:
-        """Read displacements or last differences, and measure every row.
-
-        Args:
-            differences: whether to read last differences instead of displacements.
-            values: output [m], shape (rows, cols, 3).
-            measures: output, shape (rows, measures).
-        """
 
 
 def point_forces(config: KernelConfig) -> list[Callable[..., Any]]:

@@ -1,8 +1,6 @@
 """The sheet in motion: Verlet steps by kernel 1, with few launches per frame, and the forces of probes at frames.
 
-The state of a mass point is its displacement u_n = x_n - X and the last difference d_n = u_n - u_{n-1}; `terms.damping`
-contains their update. This is the position form (eq. 6 to 9), rearranged to avoid cancellation: in f32 it resolves
-small displacements of a large sheet.
+`model.verlet` contains the update rule.
 """
 
 from __future__ import annotations
@@ -13,34 +11,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import ArgumentError, DeviceError, MsmError, Pause
-from taichi_msm.model.loads import FrameLoad, Schedule, average_loads, decay
+from taichi_msm.errors import DeviceError, MsmError, Pause
+from taichi_msm.model.loads import FrameLoad, decay
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.sheet import area_shares, axes, rest_positions, spacing
+from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.surface import surface_point
 from taichi_msm.model.tool_force import probe_force
+from taichi_msm.model.verlet import mean_force
 from taichi_msm.solver.arrays import NUMBER_BYTES, InitialData, SheetLayout, StepKernel
 from taichi_msm.solver.contact_corrections import sum_corrections
 from taichi_msm.solver.kernel_cpu import ScatterKernel
 from taichi_msm.solver.kernel_gpu import STEPS_PER_LAUNCH, GatherKernel
+from taichi_msm.solver.planned_sheet import PlannedSheet
 from taichi_msm.solver.state import PeakForce, ProbeForces, Reading, State, TipForce
 from taichi_msm.system.process import available_threads
 from taichi_msm.system.runtime import Device, lanes
 from taichi_msm.terms import build_terms
-from taichi_msm.terms.base import (
-    AREA_SHARE,
-    COLUMN_ROWS,
-    GAIN,
-    HAS_LEFT,
-    HAS_RIGHT,
-    MOBILITY,
-    REST_X,
-    SQUARED_MOTION,
-    KernelConfig,
-)
-from taichi_msm.terms.damping import coefficients
-from taichi_msm.terms.loads import ProbeTerm, decay_parameters
-from taichi_msm.terms.springs import MAX_STRAIN, MIN_STRAIN, SpringTerm
+from taichi_msm.terms.base import KernelConfig
 
 # With fewer mass points per worker, an additional worker costs more waiting time than it saves.
 POINTS_PER_WORKER = 450
@@ -102,7 +89,6 @@ class Dynamics:
         cores: largest number of CPU cores; by default all available cores.
 
     Attributes:
-        plan: the current plan.
         layout: the memory layout, and the configuration of the kernels.
         steps_done: number of steps taken.
         launches: number of launches, each followed by a call of `pause`.
@@ -113,7 +99,7 @@ class Dynamics:
     def __init__(self, plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> None:
         self._device, self._given_layout, self._cores = device, layout, cores
         self.launches = 0
-        self._sheet: StepKernel | None = None
+        self._sheet: PlannedSheet[StepKernel] | None = None
         self.restart(plan)
 
     def restart(self, plan: Plan, state: State | None = None) -> None:
@@ -123,12 +109,11 @@ class Dynamics:
             plan: the plan.
             state: state to continue from, of a sheet with the same mass points and steps; by default the sheet at rest.
         """
-        self.plan = plan
         self.layout = self._given_layout or choose_layout(plan, self._device, self._cores)
-        self._real = np.dtype(np.float32 if self.layout.config.precision == "f32" else np.float64)
         self.steps_done, self.inconsistent = 0 if state is None else state.steps, True
+        self._sheet = None  # Frees its memory before the new sheet is allocated.
+        self._sheet = PlannedSheet(plan, self.layout, _build_kernel, state)
         self._tabulate(STEPS_PER_TABLE)
-        self._place(state)
         self.inconsistent = False
 
     def steer(self, plan: Plan) -> None:
@@ -140,17 +125,7 @@ class Dynamics:
         Raises:
             ArgumentError: when the new probes require other kernels.
         """
-        config, terms = self.layout.config, build_terms(plan)
-        probes = next(term for term in terms if isinstance(term, ProbeTerm))
-        if [tool.probe for tool in plan.tools] != [tool.probe for tool in self.plan.tools]:
-            raise ArgumentError("probes: which of them have a path cannot change; restart with the new scene")
-        for term in terms:
-            compiled = config.get(type(term))
-            if compiled and (reason := term.supports(compiled)):
-                raise ArgumentError(f"probes: {reason}")
-        if decay_parameters(plan) != decay_parameters(self.plan):
-            self._moving.arrays.set_fields(self.layout.config.first_field(ProbeTerm), probes.fields(plan))
-        self.plan = plan
+        self.sheet.steer(plan)
         # A caller that steers usually steers again at the next frame, so the table has only the steps of one frame.
         self._tabulate(plan.grid.steps_per_frame)
 
@@ -172,12 +147,12 @@ class Dynamics:
             max_steps = STEPS_PER_LAUNCH
         self._require_consistent()
         if steps and self.steps_done % self.plan.grid.steps_per_frame == 0:
-            sum_corrections(self.layout, self._moving.arrays, clear=True)
+            sum_corrections(self.layout, self.sheet.kernel.arrays, clear=True)
         end = self.steps_done + steps
         while self.steps_done < end:
             count = min(max_steps, end - self.steps_done)
             self.inconsistent = True
-            self._moving.advance(count, self._next_loads(count))
+            self.sheet.kernel.advance(count, self._next_loads(count))
             self.steps_done += count
             self.inconsistent = False
             self.launches += 1
@@ -185,7 +160,7 @@ class Dynamics:
 
     def compile(self) -> None:
         """Compile all kernels without taking a step."""
-        self._moving.compile(self._loads)
+        self.sheet.kernel.compile(self._loads)
         self.displacement()
         self.tool_forces()
 
@@ -196,58 +171,24 @@ class Dynamics:
     def state(self) -> State:
         """Read the state on which the next steps depend."""
         self._require_consistent()
-        u, d = self._read_arrays(differences=False)[0], self._read_arrays(differences=True)[0]
-        return State(self.steps_done, u, d, self._read_memory())
+        u, d = (self.sheet.read_arrays(differences=differences)[0] for differences in (False, True))
+        return State(self.steps_done, u, d, self.sheet.read_memory())
 
     def read(self) -> Reading:
         """Read the displacements and measure the sheet, in the scene's precision."""
         self._require_consistent()
-        displacement, measures = self._read_arrays(differences=False)
-        config, plan = self.layout.config, self.plan
-        springs = measures[:, config.first_measure(SpringTerm) :]
-        # The measures are (L^2 - L0^2) / L0^2.
-        extremes = springs[:, MIN_STRAIN].min(), springs[:, MAX_STRAIN].max()
-        shortest, longest = (math.sqrt(max(0.0, 1.0 + float(extreme))) for extreme in extremes)
-        sums = measures.sum(axis=0, dtype=np.float64)
-        energy = self._kinetic_energy(sums)
-        for term in config.terms:
-            first = config.first_measure(type(term))
-            energy += term.energy(sums[first : first + len(term.reductions)], plan)
-        return Reading(self.steps_done, displacement, shortest, longest, energy / 2)
-
-    def _kinetic_energy(self, sums: NDArray[Any]) -> float:
-        """Compute twice the kinetic energy [J] from the reduced measures."""
-        return self.plan.material.mass * float(sums[SQUARED_MOTION]) / self.plan.grid.step**2
-
-    def _read_arrays(self, *, differences: bool) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Read displacements or last differences [m], shape (rows, cols, 3), and the measures of every row."""
-        rows, cols, config = self.layout.rows, self.layout.cols, self.layout.config
-        values, measures = (
-            np.empty((rows, cols, 3), self._real),
-            np.empty((rows, config.first_measure(None)), self._real),
-        )
-        self._moving.read(differences, values, measures)
-        return values, measures
+        return self.sheet.read(self.steps_done, moving=True)
 
     def tool_forces(self) -> NDArray[np.float64]:
         """Compute at a frame the mean force of each position-controlled tool since the previous frame.
 
-        It is the sum over mass points, and the mean over steps, of m (1 + g h / 2) / h^2 times the contact correction,
-        or of m / h^2 times the correction with backward differences of the damping; m is the mass of a mass point.
+        It is the force with the effect of the contact corrections (`verlet.mean_force`), summed over mass points.
 
         Returns:
             Forces on the sheet [N], shape (tools, 3).
         """
-        _, gain, _ = coefficients(self.plan)
-        sums = sum_corrections(self.layout, self._moving.arrays, clear=False)
-        return sums / (gain * self.plan.grid.steps_per_frame)
-
-    def _read_memory(self) -> NDArray[Any]:
-        """Read the numbers that terms remember, shape (numbers, rows, cols)."""
-        fields = [self._moving.arrays.get_fields(n, 1) for n in self.layout.config.memory_fields]
-        # Only some kernels step fixed mass points, whose memory has no effect.
-        fields = [np.where(self.plan.fixed, 0, field).astype(self._real) for field in fields]
-        return np.concatenate([np.empty((0, self.layout.rows, self.layout.cols), self._real), *fields])
+        sums = sum_corrections(self.layout, self.sheet.kernel.arrays, clear=False)
+        return mean_force(self.plan, sums, self.plan.grid.steps_per_frame)
 
     def _require_consistent(self) -> None:
         if self.inconsistent:
@@ -258,9 +199,15 @@ class Dynamics:
         self._sheet = None
 
     @property
-    def _moving(self) -> StepKernel:
+    def sheet(self) -> PlannedSheet[StepKernel]:
+        """The sheet in the memory of the device."""
         assert self._sheet is not None, "it is closed"
         return self._sheet
+
+    @property
+    def plan(self) -> Plan:
+        """The current plan."""
+        return self.sheet.plan
 
     def _next_loads(self, count: int) -> NDArray[Any]:
         """Return the rows of the load table for the next steps, shape (count, columns)."""
@@ -272,58 +219,12 @@ class Dynamics:
 
     def _tabulate(self, count: int) -> None:
         """Compute the load table of the next steps."""
-        self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, count)
+        self._first_tabled, self._loads = self.steps_done, self.sheet.step_table(self.steps_done, count)
 
-    def _table(self, first: int, count: int) -> NDArray[Any]:
-        """Compute the load table of steps first, ..., first + count - 1, shape (count, columns)."""
-        _, gain, first_gain = coefficients(self.plan)
-        table = self._columns(average_loads(self.plan, first, count), first)
-        table[:, GAIN] = gain
-        if first == 0:
-            table[0, GAIN] = first_gain
-        return table
 
-    def _columns(self, loads: Schedule, first: int) -> NDArray[Any]:
-        """Compute the load table from step `first` on, with a gain of 0, shape (steps, columns)."""
-        config = self.layout.config
-        table = np.zeros((len(loads.active), config.first_column(None)))
-        for term in config.terms:
-            first_column = config.first_column(type(term))
-            table[:, first_column : first_column + term.column_count] = term.columns(self.plan, loads, first)
-        # Loads too large for f32 become infinite; the next reading of the sheet detects it.
-        with np.errstate(over="ignore"):
-            return table.astype(self._real)
-
-    def _place(self, state: State | None) -> None:
-        """Allocate and fill the arrays of the sheet."""
-        layout, plan, sheet = self.layout, self.plan, self.plan.scene.sheet
-        moves, column, areas = ~plan.fixed, np.arange(layout.cols), area_shares(sheet)
-        # One row of each kind: first, middle, last.
-        kinds = [0, layout.rows // 2, -1]
-        shares = areas[kinds] if layout.config.by_area else np.ones((3, layout.cols))
-        by_column = np.empty((COLUMN_ROWS, layout.cols))
-        by_column[MOBILITY : MOBILITY + 3] = moves[kinds] / shares
-        # Springs along columns read the shares of a middle row even in a sheet of two rows.
-        by_column[AREA_SHARE : AREA_SHARE + 3] = areas[0], 2 * areas[0], areas[-1]
-        by_column[REST_X] = axes(sheet)[0]
-        by_column[HAS_LEFT] = column > 0
-        by_column[HAS_RIGHT] = column < layout.cols - 1
-        constants = (
-            *spacing(sheet),
-            sheet.size[0] / 2,
-            *(n for term in layout.config.terms for n in term.constants(plan)),
-        )
-        fields = np.concatenate([term.fields(plan) for term in layout.config.terms])
-        if state is not None and len(state.memory):
-            fields[layout.config.memory_fields] = state.memory
-        stiffness = layout.config.require(SpringTerm).stiffness_array(plan)
-        self._sheet = None  # Frees its memory before the new sheet is allocated.
-        self._sheet = self._build_kernel(InitialData(np.array(constants), by_column, fields, stiffness, state))
-
-    def _build_kernel(self, start: InitialData) -> StepKernel:
-        """Build the kernel for the device."""
-        kind: type[StepKernel] = ScatterKernel if self.layout.workers else GatherKernel
-        return kind(self.layout, start)
+def _build_kernel(layout: SheetLayout, start: InitialData) -> StepKernel:
+    """Build the kernel for the device."""
+    return (ScatterKernel if layout.workers else GatherKernel)(layout, start)
 
 
 Array = NDArray[np.float64]

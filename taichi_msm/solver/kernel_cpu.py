@@ -1,12 +1,11 @@
 """Kernel 1 on a CPU: passes over the rows that evaluate every spring once and step the rows in place.
 
 A launch takes several steps with one worker or with several (`bands`). After the timeout of a worker, further launches
-continue until all workers have taken the same steps. A single worker then steps for a back-off period.
+continue until all workers have taken the same steps. A single worker then steps for a while (`backoff`).
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
-import time
 from collections.abc import Callable
 from functools import cache
 from typing import Any
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.solver.arrays import NUMBER_BYTES, InitialData, SheetArrays, SheetLayout, build_read
+from taichi_msm.solver.backoff import Backoff
 from taichi_msm.solver.bands import (
     COUNTER_STRIDE,
     MOMENT_ROWS,
@@ -25,7 +25,6 @@ from taichi_msm.solver.bands import (
     WORKER_STRIDE,
     build_advance,
 )
-from taichi_msm.system import process
 from taichi_msm.system.compiler import active_compiler
 from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, compilation_options, ti
 from taichi_msm.terms.base import KernelConfig
@@ -37,14 +36,6 @@ PAGE = 4096
 # Number of checks, in about 1.3 ms, after which a worker stops waiting for its neighbour.
 MAX_CHECKS = round(1.32e-3 / active_compiler().poll_s)
 
-# Back-off period in which a single worker steps after a timeout [s]. If other programs compete for the cores, it is
-# four times the last period, halved for every BACKOFF_HALF_LIFE_S of parallel steps since then; otherwise it is the
-# minimum.
-MIN_BACKOFF_S, MAX_BACKOFF_S, BACKOFF_HALF_LIFE_S = 0.002, 0.2, 0.02
-
-# Other programs compete for the cores if threads have waited for a core for more than this share of their CPU time.
-MAX_WAIT_SHARE = 0.2
-
 
 class ScatterKernel:
     """A `StepKernel` in the memory of a CPU."""
@@ -53,12 +44,7 @@ class ScatterKernel:
         self._layout = layout
         self._parallel_kernel, self._read = _kernels(layout.config, parallel=layout.workers > 1)
         self._serial_kernel, _ = _kernels(layout.config, parallel=False)
-        self._steps = 0
-        self._backoff = self._backoff_until = 0.0
-        # Duration of parallel steps since the last back-off [s].
-        self._parallel_s = 0.0
-        # CPU time of this process, and time waited for a core, at the end of the last back-off [s].
-        self._cpu_time, self._wait_time = 0.0, 0.0
+        self._steps, self._backoff = 0, Backoff()
         self._first_row, self._end_row = int(layout.fixed_rows[0]), layout.rows - int(layout.fixed_rows[1])
         # The sheet's rows, two copies for every border of every worker, and moments.
         self._borders = self._border_rows()
@@ -79,7 +65,7 @@ class ScatterKernel:
             return
         first = 0
         while first < count:
-            if time.perf_counter() < self._backoff_until:
+            if self._backoff.is_active:
                 first = self._advance_in_backoff(first, count, table)
             else:
                 first = self._advance_together(first, count, table)
@@ -105,7 +91,7 @@ class ScatterKernel:
         """Advance with a single worker until the back-off ends; return the number of the next step."""
         # The duration of a step is unknown, so the number of steps per launch starts small and doubles.
         piece = self._layout.depth
-        while first < end and time.perf_counter() < self._backoff_until:
+        while first < end and self._backoff.is_active:
             until = min(first + piece, end)
             self._advance_alone(first, until, table)
             first, piece = until, 2 * piece
@@ -114,25 +100,10 @@ class ScatterKernel:
 
     def _advance_together(self, first: int, end: int, table: NDArray[Any]) -> int:
         """Advance with all workers; return the number of the next step, below `end` after a timeout."""
-        if self._backoff_until:
-            # The measurement excludes the back-off, because a single worker rarely waits for a core.
-            self._cpu_time, self._wait_time = time.process_time(), process.core_wait_s() or 0.0
-            self._backoff_until = 0.0
-        start = time.perf_counter()
+        self._backoff.start_launch()
         count, timed_out = self._launch_together(first, end, table)
-        now = time.perf_counter()
-        if timed_out:
-            backoff = 4 * self._backoff * 0.5 ** (self._parallel_s / BACKOFF_HALF_LIFE_S) if self._is_crowded() else 0.0
-            self._backoff = min(max(backoff, MIN_BACKOFF_S), MAX_BACKOFF_S)
-            self._parallel_s, self._backoff_until = 0.0, now + self._backoff
-        else:
-            self._parallel_s += now - start
+        self._backoff.end_launch(timed_out=timed_out)
         return first + count
-
-    def _is_crowded(self) -> bool:
-        """Return whether other programs have competed for the cores since the last back-off; True if unknown."""
-        cpu_time, wait_time = time.process_time(), process.core_wait_s()
-        return wait_time is None or wait_time - self._wait_time > MAX_WAIT_SHARE * (cpu_time - self._cpu_time)
 
     def _launch_together(self, first: int, end: int, table: NDArray[Any]) -> tuple[int, bool]:
         """Launch all workers; return the number of steps taken, and whether a worker timed out."""

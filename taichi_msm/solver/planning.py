@@ -33,6 +33,7 @@ from taichi_msm.model.sheet import (
 )
 from taichi_msm.model.time_grid import TimeGrid
 from taichi_msm.model.tools import MAX_STRIDE_RADII, Tool, build_tools, path_problems, too_fast
+from taichi_msm.model.verlet import stability_limit
 from taichi_msm.scene.scene import Scene, Time
 from taichi_msm.scene.section import FRAME_TOLERANCE
 from taichi_msm.scene.sheet import Sheet
@@ -154,7 +155,7 @@ def try_plan(scene: Scene, maps: Maps | None = None) -> tuple[Plan | None, list[
     if problems:
         return None, problems
     plan = _plan(scene, maps, fixed, material)
-    return plan, [*_step_problems(plan), *path_problems(scene, plan.tools, plan.grid)]
+    return plan, [*_step_problems(plan), *precision_problems(plan), *path_problems(scene, plan.tools, plan.grid)]
 
 
 def plan_variant(plan: Plan, scene: Scene) -> Plan:
@@ -196,10 +197,7 @@ def choose_precision(plan: Plan, arch: str) -> Plan:
 
 
 def stable_step(material: Material, sheet: Sheet, difference: str) -> float:
-    """Compute the largest stable step.
-
-    With the highest angular frequency w and g = C / m, it is 2 / w for central differences of the damping, and
-    (sqrt(g^2 + 4 w^2) - g) / w^2 for backward differences, which the code rearranges to avoid cancellation.
+    """Compute the largest stable step of a sheet, see `verlet.stability_limit`.
 
     Args:
         material: coefficients of the sheet.
@@ -209,10 +207,7 @@ def stable_step(material: Material, sheet: Sheet, difference: str) -> float:
     Returns:
         The step [s]; infinite without stiffness and damping.
     """
-    w = highest_frequency(material, sheet)
-    g = material.drag if difference == "backward" else 0.0
-    limit = math.hypot(g, 2 * w) + g
-    return 4 / limit if limit > 0 else math.inf
+    return stability_limit(highest_frequency(material, sheet), material.drag, difference)
 
 
 def stable_steps(plan: Plan) -> int:
@@ -258,7 +253,7 @@ def freeze_grid(plan: Plan) -> Plan:
 
 
 def _step_problems(plan: Plan) -> Iterator[Problem]:
-    """Check that a given step is stable and divides a frame, and that lengths and gain are in the range of f32."""
+    """Check that a given step is stable and divides a frame."""
     if plan.scene.time.at_rest:
         return
     given, limit, frame = plan.scene.time.step, plan.stable_step, 1 / plan.grid.frames_per_second
@@ -271,6 +266,10 @@ def _step_problems(plan: Plan) -> Iterator[Problem]:
     elif abs(frame / given - round(frame / given)) > FRAME_TOLERANCE * max(1.0, frame / given):
         text = f"{given:g} s does not divide a frame of {frame:.9g} s; try {frame / math.ceil(frame / given):.9g}"
         yield Problem(("time", "step"), text)
+
+
+def precision_problems(plan: Plan) -> Iterator[Problem]:
+    """Check that lengths and gain are in the range of the precision."""
     if plan.grid.precision == "f64":
         return
     cells, size, step, mass = spacing(plan.scene.sheet), plan.scene.sheet.size, plan.grid.step, plan.material.mass

@@ -25,15 +25,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import DivergedError, Pause
+from taichi_msm.errors import DivergedError, MsmError, Pause
 from taichi_msm.model.loads import evaluate_frame_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.tools import Clamp
 from taichi_msm.scene.section import MIN_MAGNITUDE
 from taichi_msm.solver.arrays import InitialData, SheetLayout
-from taichi_msm.solver.dynamics import Dynamics
+from taichi_msm.solver.dynamics import Dynamics, choose_layout
 from taichi_msm.solver.kernel_rest import Relaxation
+from taichi_msm.solver.planned_sheet import PlannedSheet
+from taichi_msm.solver.sheet_solver import SheetSolver
 from taichi_msm.solver.state import Reading, State, largest_displacement
 from taichi_msm.system.runtime import Device
 from taichi_msm.terms import fictitious_masses
@@ -56,13 +58,26 @@ EVALUATIONS_PER_LAUNCH, POINT_EVALUATIONS_PER_LAUNCH = 64, 40_000_000
 Array = NDArray[np.float64]
 
 
-class QuasiStatics(Dynamics):
-    """The sheet in quasi-static motion, with the interface of `Dynamics`; a frame counts as a step.
+class QuasiStatics:
+    """The sheet in quasi-static motion, a `SheetSolver`; a frame counts as a step.
+
+    Args:
+        plan: the plan.
+        device: the device.
+        layout: replaces the layout chosen by `choose_layout`, for tests.
+        cores: largest number of CPU cores; by default all available cores.
 
     Attributes:
+        layout: the memory layout, and the configuration of the kernels.
+        steps_done: number of the last frame found.
         evaluations: number of evaluations of the forces for the last frame.
         residual: largest residual force of the last frame, relative to the largest force.
     """
+
+    def __init__(self, plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> None:
+        self._device, self._given_layout, self._cores = device, layout, cores
+        self._sheet: PlannedSheet[Relaxation] | None = None
+        self.restart(plan)
 
     def restart(self, plan: Plan, state: State | None = None) -> None:
         """Restart with the same or another plan.
@@ -72,8 +87,17 @@ class QuasiStatics(Dynamics):
             state: state to continue from; by default the first call of `advance` also finds the first frame.
         """
         self.evaluations, self.residual = 0, 0.0
-        self._last_frame = state
-        super().restart(plan, state)
+        self._last_frame, self._interrupted = state, False
+        self.layout = self._given_layout or choose_layout(plan, self._device, self._cores)
+        self.steps_done = 0 if state is None else state.steps
+        # A mass point without stiffness would have mass 0.
+        self._masses = np.maximum(fictitious_masses(plan), MIN_MAGNITUDE)
+        self._sheet = None  # Frees its memory before the new sheet is allocated.
+        self._sheet = PlannedSheet(plan, self.layout, self._build_kernel, state)
+
+    def steer(self, plan: Plan) -> None:
+        """Continue with a plan that differs in its probes only, see `PlannedSheet.steer`."""
+        self.sheet.steer(plan)
 
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
         """Find the equilibria of the next frames, and of the first frame if it is still missing.
@@ -85,21 +109,24 @@ class QuasiStatics(Dynamics):
         Raises:
             DivergedError: when the iteration does not converge.
         """
-        self._require_consistent()
         end = self.steps_done + steps
         while self._last_frame is None or self.steps_done < end:
             frame = self.steps_done + (self._last_frame is not None)
             self._settle(frame, pause)
             self.steps_done = frame
-            displacement = self._read_arrays(differences=False)[0]
-            self._last_frame = State(frame, displacement, np.zeros_like(displacement), self._read_memory())
+            displacement = self.sheet.read_arrays(differences=False)[0]
+            self._last_frame = State(frame, displacement, np.zeros_like(displacement), self.sheet.read_memory())
 
     def compile(self) -> None:
         """Compile all kernels without moving a mass point."""
-        row = self._columns(evaluate_frame_loads(self.plan, 0), 0)
+        row = self.sheet.load_table(evaluate_frame_loads(self.plan, 0), 0)
         self._relaxation.relax(0, 0.0, row)
         self._relaxation.scale(row)
         self.displacement()
+
+    def displacement(self) -> Array:
+        """Read the displacements x - X [m], shape (rows, cols, 3)."""
+        return self.read().displacement
 
     def state(self) -> State:
         """Return the state of the last frame found, on which the next frames depend."""
@@ -107,7 +134,7 @@ class QuasiStatics(Dynamics):
 
     def read(self) -> Reading:
         """Read the displacements and measure the sheet; its energy is that of springs and bending."""
-        reading = super().read()
+        reading = self.sheet.read(self.steps_done, moving=False)
         return reading._replace(residual=self.residual, evaluations=self.evaluations)
 
     def tool_forces(self) -> Array:
@@ -115,28 +142,46 @@ class QuasiStatics(Dynamics):
 
         It is opposite to the sum of all other forces on the mass points that the tool touches or holds.
         """
+        touched, force = self._touched().astype(float), self.sheet.read_arrays(differences=True)[0]
         # Subtraction from 0 avoids -0.
-        return 0.0 - np.einsum("tij,ijk->tk", self._touched().astype(float), self._read_arrays(differences=True)[0])
+        return 0.0 - np.einsum("tij,ijk->tk", touched, force)
 
     def _touched(self) -> NDArray[np.bool_]:
         """Return whether each tool touches or holds each mass point, shape (tools, rows, cols)."""
-        return touched_points(len(self.plan.tools), self._read_memory()[self._contact])
+        return touched_points(len(self.plan.tools), self.sheet.read_memory()[self._contact])
 
     @property
     def _contact(self) -> slice:
         """The part of the memory that belongs to contact."""
         return self.layout.config.memory_slice(ContactTerm)
 
-    def _build_kernel(self, start: InitialData) -> Any:
-        self._interrupted = False
-        # A mass point without stiffness would have mass 0.
-        self._masses = np.maximum(fictitious_masses(self.plan), MIN_MAGNITUDE)
-        return Relaxation(self.layout, start, self._masses)
+    def close(self) -> None:
+        """Release the memory."""
+        self._sheet = None
+
+    @property
+    def sheet(self) -> PlannedSheet[Relaxation]:
+        """The sheet in memory."""
+        if self._sheet is None:
+            raise MsmError("interrupted while the sheet was restarted; restart the scene")
+        return self._sheet
+
+    @property
+    def plan(self) -> Plan:
+        """The current plan."""
+        return self.sheet.plan
+
+    @property
+    def inconsistent(self) -> bool:
+        """Whether an exception interrupted `restart`."""
+        return self._sheet is None
+
+    def _build_kernel(self, layout: SheetLayout, start: InitialData) -> Relaxation:
+        return Relaxation(layout, start, self._masses)
 
     @property
     def _relaxation(self) -> Relaxation:
-        assert isinstance(self._sheet, Relaxation), "it is closed"
-        return self._sheet
+        return self.sheet.kernel
 
     @property
     def _last_state(self) -> State:
@@ -146,12 +191,6 @@ class QuasiStatics(Dynamics):
         shape = self.layout.rows, self.layout.cols
         memory = np.zeros((len(self.layout.config.memory_fields), *shape))
         return State(0, np.zeros((*shape, 3)), np.zeros((*shape, 3)), memory)
-
-    def _tabulate(self, count: int) -> None:
-        """Do nothing, because the loads of a frame are evaluated for each frame."""
-
-    def _kinetic_energy(self, _sums: NDArray[Any]) -> float:
-        return 0.0
 
     def _settle(self, frame: int, pause: Pause) -> None:
         """Find the equilibrium of a frame."""
@@ -167,7 +206,7 @@ class QuasiStatics(Dynamics):
         self._interrupted, residual = True, 0.0
         *intermediate, end = self._shape_times(frame)
         for time in (*intermediate, end):
-            row = self._columns(loads, frame)
+            row = self.sheet.load_table(loads, frame)
             set_tools(self.plan, frame, time, row[0, self.layout.config.first_column(ContactTerm) :])
             # After a release the flat shape is tried even if a tool is in the way.
             free = not (loads.strength.any() or held or self._is_clamp_displaced(time))
@@ -189,7 +228,7 @@ class QuasiStatics(Dynamics):
 
     def _meets_tool(self, time: float) -> bool:
         """Return whether a tool at a time [s] touches the current sheet."""
-        position = rest_positions(self.plan.scene.sheet) + self._read_arrays(differences=False)[0]
+        position = rest_positions(self.plan.scene.sheet) + self.sheet.read_arrays(differences=False)[0]
         return any(tool.touches(position[~self.plan.fixed], time) for tool in self.plan.tools)
 
     def _is_clamp_displaced(self, time: float) -> bool:
@@ -199,7 +238,7 @@ class QuasiStatics(Dynamics):
 
     def _try_flat(self, row: NDArray[Any]) -> bool:
         """Return whether the flat shape is an equilibrium; if so, keep it."""
-        relaxation, shape = self._relaxation, self._read_arrays(differences=False)[0]
+        relaxation, shape = self._relaxation, self.sheet.read_arrays(differences=False)[0]
         relaxation.place(np.zeros_like(shape))
         count, force = relaxation.relax(1, 0.0, row)
         self.evaluations += count
@@ -252,7 +291,7 @@ class QuasiStatics(Dynamics):
         material = self.plan.material
         stiffest = 1.0 if material.factors is None else float(material.factors.max())
         # Rounding may shorten a spring by 1e-9.
-        compressed = super().read().shortest_spring < 1 - material.tension / stiffest - 1e-9
+        compressed = self.read().shortest_spring < 1 - material.tension / stiffest - 1e-9
         capsules = [n for n, tool in enumerate(self.plan.tools) if not isinstance(tool, Clamp)]
         return compressed or bool(self._touched()[capsules].any())
 
@@ -262,12 +301,12 @@ class QuasiStatics(Dynamics):
         # This generator returns the same numbers in every version of NumPy.
         noise = 2 * np.random.RandomState(0).random_sample((rows, cols, 3)) - 1
         moves = (~self.plan.fixed / self._masses)[..., None]
-        self._relaxation.place(self._read_arrays(differences=False)[0] + force * noise * moves)
+        self._relaxation.place(self.sheet.read_arrays(differences=False)[0] + force * noise * moves)
 
     def _diverged(self, frame: int, residual: float, evaluations: int) -> DivergedError:
         """Build the error of an iteration that did not converge."""
         plan, time = self.plan, frame / self.plan.grid.frames_per_second
-        row, column, *_ = largest_displacement(self._read_arrays(differences=True)[0])
+        row, column, *_ = largest_displacement(self.sheet.read_arrays(differences=True)[0])
         remedy = (
             "the sheet may hang slack, fold or wrinkle; give it a foundation, pretension or bending, or take less load"
         )
@@ -283,6 +322,8 @@ class QuasiStatics(Dynamics):
         return DivergedError(message, frame, time, (row, column))
 
 
-def build_dynamics(plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> Dynamics:
+def build_dynamics(
+    plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None
+) -> SheetSolver:
     """Build the dynamic or quasi-static solver of a plan, with the arguments of `Dynamics`."""
     return (QuasiStatics if plan.scene.time.at_rest else Dynamics)(plan, device, layout, cores)

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
+from taichi_msm.model import verlet
 from taichi_msm.model.loads import Schedule
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.tools import GRIP_RADII, Clamp
@@ -63,7 +64,6 @@ from taichi_msm.terms.contact_layout import (
     build_penetration,
 )
 from taichi_msm.terms.contact_rest import build_project_out, build_remove_contact
-from taichi_msm.terms.damping import coefficients
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class ContactTerm(Term):
         """Compute the positions of the tools before and after every step and the states of their grips."""
         grid, steps = plan.grid, first + np.arange(len(loads.active) + 1)
         t, frame = steps / grid.steps_per_second, 1 / grid.frames_per_second
-        _, gain, first_gain = coefficients(plan)
+        _, gain, first_gain = verlet.coefficients(plan)
         columns = np.zeros((len(loads.active), self.column_count))
         # The first step has another gain, so the force of its corrections differs.
         columns[:, WEIGHT] = np.where(steps[:-1] == 0, gain / first_gain, 1.0)

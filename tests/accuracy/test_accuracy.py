@@ -18,12 +18,12 @@ from taichi_msm.accuracy.time_step import (
     TimeStepEstimate,
     TimeStepTrials,
     choose_step,
-    convergence_order,
     estimate_error,
     max_norm,
 )
 from taichi_msm.errors import SceneError
 from taichi_msm.model.plan import Plan
+from taichi_msm.model.verlet import convergence_order
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.planning import with_time

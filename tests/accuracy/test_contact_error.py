@@ -19,12 +19,12 @@ from taichi_msm.accuracy.time_step import (
     TimeStepEstimate,
     choose_step,
     combine_estimates,
-    convergence_order,
     estimate_error,
     max_norm,
 )
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.tools import overlap, path_warnings
+from taichi_msm.model.verlet import convergence_order
 from taichi_msm.runs.run import run
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.dynamics import Dynamics

@@ -20,12 +20,15 @@ from taichi_msm.errors import ArgumentError, MsmError, SceneError
 from taichi_msm.gradients import motion, rest
 from taichi_msm.gradients.chain_rule import Derivatives
 from taichi_msm.gradients.gradient import Adjoint, with_stiffness_map
+from taichi_msm.gradients.kernel_motion import adjoint_kernels
 from taichi_msm.gradients.motion import MotionAdjoint
 from taichi_msm.model.loads import average_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
+from taichi_msm.solver import backoff
 from taichi_msm.solver.dynamics import choose_layout
 from taichi_msm.system.runtime import Device
+from taichi_msm.terms.base import KernelConfig
 from tests import reference
 from tests.golden import Messages
 from tests.reference.sheet import Sheet, sheet
@@ -277,6 +280,18 @@ def test_the_bits_depend_neither_on_workers_nor_on_segments(
     # Workers that give up at once.
     monkeypatch.setattr(motion, "MAX_WAIT_CHECKS", 0)
     assert bits(3) == alone
+    # After that a single worker sweeps, until the back-off ends.
+    monkeypatch.setattr(backoff, "MIN_BACKOFF_S", 1000.0)
+    monkeypatch.setattr(backoff, "MAX_BACKOFF_S", 1000.0)
+    launches: list[bool] = []
+
+    def counted(config: KernelConfig, *, parallel: bool) -> Any:
+        launches.append(parallel)
+        return adjoint_kernels(config, parallel=parallel)
+
+    monkeypatch.setattr(motion, "adjoint_kernels", counted)
+    assert bits(3) == alone
+    assert not any(launches[launches.index(False) :])
 
 
 def test_positions_are_those_of_a_simulation(image: str, device: Device) -> None:

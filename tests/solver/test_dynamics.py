@@ -18,7 +18,7 @@ from taichi_msm.errors import MsmError
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_POINTS
-from taichi_msm.solver import kernel_cpu, kernel_gpu
+from taichi_msm.solver import backoff, kernel_cpu, kernel_gpu
 from taichi_msm.solver.arrays import SheetLayout
 from taichi_msm.solver.dynamics import POINTS_PER_WORKER
 from taichi_msm.system import process
@@ -346,8 +346,8 @@ def test_workers_that_give_up_waiting_go_on_to_the_same_bits(
     for count in steps:
         alone.advance(count)
     monkeypatch.setattr(kernel_cpu, "MAX_CHECKS", patience)
-    monkeypatch.setattr(kernel_cpu, "MIN_BACKOFF_S", 0.001)
-    monkeypatch.setattr(kernel_cpu, "MAX_BACKOFF_S", 0.002)
+    monkeypatch.setattr(backoff, "MIN_BACKOFF_S", 0.001)
+    monkeypatch.setattr(backoff, "MAX_BACKOFF_S", 0.002)
     for workers, depth in ((2, 1), (2, 4), (3, 2)):
         together = dynamics_of(made, device, replace(structure_of(made, device), workers=workers, depth=depth))
         for count in steps:
@@ -361,7 +361,7 @@ def test_rests_grow_while_workers_give_up_and_are_forgotten_when_they_do_not(
     device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = scene(sheet={**SHEET, "points": [21, 19]}, time={"precision": "f32"})
-    scatter: Any = dynamics_of(made, device, replace(structure_of(made, device), workers=2))._moving
+    scatter: Any = dynamics_of(made, device, replace(structure_of(made, device), workers=2)).sheet.kernel
     now, taken, patient = 0.0, [0, 0], False
 
     def alone(done: int, end: int, *_: object) -> None:
@@ -408,11 +408,11 @@ def test_giving_up_in_the_last_pass_of_a_launch_counts(device: Device, monkeypat
     made = scene(sheet={**SHEET, "points": [101, 101]}, time={"precision": "f32"})
     monkeypatch.setattr(kernel_cpu, "MAX_CHECKS", 0)
     dynamics = dynamics_of(made, device, replace(structure_of(made, device), workers=2, depth=8))
-    scatter = dynamics._moving
+    scatter = dynamics.sheet.kernel
     assert isinstance(scatter, kernel_cpu.ScatterKernel)
     for _ in range(200):
         dynamics.advance(8)
-    assert scatter._backoff_until > 0
+    assert scatter._backoff._until > 0
 
 
 def test_a_sheet_that_was_interrupted_while_stepping_is_not_used(
@@ -422,13 +422,13 @@ def test_a_sheet_that_was_interrupted_while_stepping_is_not_used(
     made = scene()
     dynamics = dynamics_of(made, device)
     dynamics.advance(10)
-    saved, advance = dynamics.state(), dynamics._moving.advance
+    saved, advance = dynamics.state(), dynamics.sheet.kernel.advance
 
     def interrupted(*arguments: Any) -> None:
         advance(*arguments)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(dynamics._moving, "advance", interrupted)
+    monkeypatch.setattr(dynamics.sheet.kernel, "advance", interrupted)
     with pytest.raises(KeyboardInterrupt):
         dynamics.advance(5)
     monkeypatch.undo()

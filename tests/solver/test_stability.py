@@ -6,8 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from taichi_msm.errors import SceneError
+from taichi_msm.load.resolve import resolve
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.solver.planning import try_plan
+from taichi_msm.system.runtime import Device
 from taichi_msm.terms import highest_frequency
 from tests import reference
 from tests.golden import Messages
@@ -79,3 +82,8 @@ def test_what_f32_cannot_hold_is_refused(changes: dict[str, Any], message: Messa
     single = scene(**sections | {"time": {**sections.get("time", {}), "precision": "f32"}})
     message(map(str, try_plan(single)[1]), "f32", "f64")
     assert not try_plan(scene(**sections))[1]
+    # `auto` takes f64 on a CPU, and f32 on a GPU.
+    auto = plan_of(scene(**sections | {"time": {**sections.get("time", {}), "precision": "auto"}}))
+    assert auto.grid.precision == resolve(auto, Device("cpu", 1)).plan.grid.precision == "f64"
+    with message.raises(SceneError, "f32", "f64"):
+        resolve(auto, Device("vulkan", 1))

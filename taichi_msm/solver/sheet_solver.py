@@ -1,0 +1,60 @@
+"""The interface of both solvers of a sheet: in motion (`dynamics`) and in quasi-static equilibrium (`rest`)."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.errors import Pause
+from taichi_msm.model.plan import Plan
+from taichi_msm.solver.arrays import SheetLayout
+from taichi_msm.solver.state import Reading, State
+
+
+class SheetSolver(Protocol):
+    """A sheet that advances by steps; in quasi-static motion a frame counts as a step.
+
+    Attributes:
+        layout: the memory layout, and the configuration of the kernels.
+        steps_done: number of steps taken.
+    """
+
+    layout: SheetLayout
+    steps_done: int
+
+    @property
+    def plan(self) -> Plan:
+        """The current plan."""
+
+    @property
+    def inconsistent(self) -> bool:
+        """Whether an interruption left the arrays inconsistent; all methods but `restart` then raise MsmError."""
+
+    def restart(self, plan: Plan, state: State | None = None) -> None:
+        """Restart with the same or another plan, from a state of it or from the sheet at rest."""
+
+    def steer(self, plan: Plan) -> None:
+        """Continue with a plan that differs in its probes only, with the same kernels and the same steps."""
+
+    def advance(self, steps: int, pause: Pause = lambda: None) -> None:
+        """Advance by a number of steps; an exception from `pause` interrupts, and another call continues."""
+
+    def compile(self) -> None:
+        """Compile all kernels without moving a mass point."""
+
+    def displacement(self) -> NDArray[Any]:
+        """Read the displacements x - X [m], shape (rows, cols, 3), in the scene's precision."""
+
+    def state(self) -> State:
+        """Read the state on which the next steps depend."""
+
+    def read(self) -> Reading:
+        """Read the displacements and measure the sheet, in the scene's precision."""
+
+    def tool_forces(self) -> NDArray[np.float64]:
+        """Compute the forces of the position-controlled tools on the sheet at a frame [N], shape (tools, 3)."""
+
+    def close(self) -> None:
+        """Release the memory of the device."""
