@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from taichi_msm.errors import NotInstalledError, SceneError, did_you_mean
+from taichi_msm.fitting.table_numbers import parse_number
 from taichi_msm.images import irregular_kind
 
 Row = list[str]
@@ -34,6 +35,9 @@ SEPARATORS = {"tabs": "\t", "semicolons": ";", "commas": ",", "bars": "|", "wide
 SPACES = {"wide spaces": re.compile(r"\s{2,}"), "spaces": re.compile(r"\s+(?![\[(])")}
 
 BYTE_ORDER_MARKS = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
+
+# Fewest columns of a table: time, depth and force.
+MIN_COLUMNS = 3
 
 # A letter that numbers do not have.
 LETTER = re.compile(r"[^\W\d_eE]")
@@ -90,11 +94,14 @@ def read_text(name: str, is_header: Callable[[Row], bool]) -> Grid:
         SceneError: when the file cannot be read, or is not a text.
     """
     rows, separator = [], ""
-    for line in re.split(r"\r\n|\r|\n", _decode(name, _read_bytes(name))):
-        headers = ((mark, _split_header(line, mark)) for mark in SEPARATORS) if LETTER.search(line) else ()
-        if header := next((header for header in headers if is_header(header[1])), None):
-            separator = header[0]
-        rows.append(header[1] if header else _split(line, separator))
+    lines = re.split(r"\r\n|\r|\n", _decode(name, _read_bytes(name)))
+    for n, line in enumerate(lines):
+        headers = {}
+        if LETTER.search(line):
+            headers = {mark: row for mark in SEPARATORS if is_header(row := _split_header(line, mark))}
+        if headers:
+            separator = _separator(headers, lines[n + 1 :])
+        rows.append(headers[separator] if headers else _split(line, separator))
     return Grid(name, "", rows, separator)
 
 
@@ -120,6 +127,8 @@ def read_workbook(name: str) -> dict[str, Grid | None]:
             warnings.simplefilter("ignore")
             # The values as saved, and the formulas for cells that were saved without one.
             values, formulas = (openpyxl.load_workbook(io.BytesIO(data), data_only=saved) for saved in (True, False))
+        if not values.sheetnames:
+            raise ValueError("no sheets")
         return {
             sheet.title: _sheet(name, sheet, formulas[sheet.title]) if hasattr(sheet, "iter_rows") else None
             for sheet in map(values.__getitem__, values.sheetnames)
@@ -197,6 +206,16 @@ def _stripped(cells: Row) -> Row:
     while cells and not cells[-1]:
         cells.pop()
     return cells
+
+
+def _separator(headers: dict[str, Row], lines: list[str]) -> str:
+    """Return the first separator of a header that separates numbers of the next line of numbers, or the first one."""
+    line = next((line for line in lines if line.strip() and not LETTER.search(line)), "")
+
+    def count(separator: str) -> int:
+        return sum(parse_number(cell) is not None for cell in _split(line, separator)[: len(headers[separator])])
+
+    return next((separator for separator in headers if count(separator) >= MIN_COLUMNS), next(iter(headers)))
 
 
 def _split_header(line: str, separator: str) -> Row:
