@@ -14,8 +14,8 @@ GROUPS = {
     mark: re.compile(rf"[+-]?[1-9]\d{{0,2}}(?:\{other}\d{{3}})+\{mark}\d+", re.ASCII) for mark, other in (",.", ".,")
 }
 
-# A cell that stands for a value, valid or not: a number, NaN, or an error, a formula or a date of a workbook.
-VALUE_START = re.compile(r"[+\-\N{MINUS SIGN}]?[.,]?\d|[+-]?(nan|inf)|[#=]|a date", re.ASCII | re.IGNORECASE)
+# A cell that stands for a value, valid or not: a number, NaN, or an error or a formula of a workbook.
+VALUE_START = re.compile(r"[+\-\N{MINUS SIGN}]?[.,]?\d|[+-]?(nan|inf)|[#=]", re.ASCII | re.IGNORECASE)
 
 
 def decimal_mark(cell: str) -> str:

@@ -199,13 +199,17 @@ def test_names_of_force(name: str, read: Read) -> None:
 
 
 def test_of_two_candidates_the_one_nearest_0_is_taken_and_named(read: Read, message: Messages) -> None:
-    # 0.4 mm are nearer 0 than 5 um would be if units were ignored.
-    line = "{t:.1f}{s}9{d:.2f}{s}{d:.2f}{s}{f:.3f}"
-    test = read("Time [s];Position [um];Extension [mm];Force [N]\n" + rows(";", line))
-    assert_is_test(test)
+    # 90 um are nearer 0 than 0.4 mm.
+    test = read("Time, s;Position, um;Extension, mm;Force, N\n" + rows(";", "{t:.1f}{s}9{d:.1f}{s}0.4{s}{f:.3f}"))
+    np.testing.assert_allclose(test.depth, 1e-3 * DEPTH + 9e-5, rtol=1e-12)
     message(test.notes, "Extension", "Position")
-    # Columns without a unit are no candidates.
-    assert read("Time [s];Strain of Extension;Extension [mm];Force [N]\n" + rows(";", line)).notes == ()
+    line = "{t:.1f}{s}9{d:.2f}{s}{d:.2f}{s}{f:.3f}"
+    test = read("Time, s;Position, mm;Extension, mm;Force, N\n" + rows(";", line))
+    assert_is_test(test)
+    assert len(test.notes) == 1
+    # Neither columns without a unit nor names in brackets are candidates.
+    for other in ("Position", "Strain (Extension), mm"):
+        assert read(f"Time, s;{other};Extension, mm;Force, N\n" + rows(";", line)).notes == ()
 
 
 def test_columns_are_chosen(read: Read, message: Messages) -> None:
@@ -289,8 +293,9 @@ def test_a_test_that_tears_is_noted(read: Read, message: Messages) -> None:
         strip(lambda t: t if t < 0.2 else 0.07 + 0.13 * np.exp(8 * (0.2 - t)), lambda t: min(t, 0.2) + 1e-3 * t),
         strip(lambda t: min(t, 2 - t), lambda t: min(t, 2 - t)),
         strip(lambda t: t if t < 1.5 else 0.8),
+        strip(lambda t: t if t < 1.5 else 0.3, lambda t: 9 - t),
     ],
-    ids=["relaxes", "unloaded", "falls less"],
+    ids=["relaxes", "unloaded", "falls less", "depth falls"],
 )
 def test_other_falls_of_the_force_are_not_noted(text: str, read: Read) -> None:
     assert read(text).notes == ()
@@ -418,6 +423,7 @@ def test_a_workbook_is_read(save: Save, message: Messages) -> None:
     # An upper-case suffix, a shifted table, texts as numbers, a note at its side.
     shifted: list[list[Any]] = [[], *([None, *row] for row in SHEET)]
     shifted[7] = [None, "0.3", "0.15", "0.3", 16.9, None, "a note"]
+    shifted.insert(8, [None] * 6 + ["a note"])
     path = save({"FF2": shifted})
     assert_is_test(read_machine_test(path.rename(path.with_suffix(".XLSX"))))
 
@@ -462,6 +468,8 @@ SHEET_FAULTS: dict[str, tuple[list[list[Any]], Callable[[Any], object], list[str
     "gap": (SHEET, put("B14", None), ["FF2!B14", "Force standard", "empty"]),
     "two decimal marks": (SHEET, put("B14", "0,5"), ["FF2!B14", "0,5"]),
     "error": (SHEET, put("B14", "#DIV/0!"), ["FF2!B14", "#DIV/0!"]),
+    "row of errors": ([*SHEET[:-1], ["#N/A"] * 4], lambda book: None, ["FF2!A15", "#N/A"]),
+    "row of formulas": ([*SHEET[:-1], ["=A14"] * 4], lambda book: None, ["FF2!A15", "=A14"]),
     "date": (SHEET, put("A14", datetime(2023, 4, 3)), ["FF2!A14", "date"]),
     "word": (SHEET, put("B14", "over"), ["FF2!B14", "over"]),
     "time again": (SHEET, put("A14", 0.5), ["FF2!A14", "0.5"]),
