@@ -87,6 +87,7 @@ EXPORTS: dict[str, tuple[str, list[str], float]] = {
     "bars": (TABLE.replace(";", "|"), [], 1),
     "spaces": (TABLE.replace(";", " "), [], 1),
     "aligned": ("# Temps d'essai (s)   Weg (mm)  Kraft (N)\n" + rows("    "), [], 1),
+    "commented names": ("# Time(s) Depth(mm) Force(N)\n" + rows(" "), [], 1),
     "aligned commas": ("Time, s   Position (z), mm   Fz, N\n" + rows("   "), [], 1),
     "aligned decimal commas": ("Time, s   Position (z), mm   Fz, N\n" + comma(rows("   ")), [], 1),
     "commas and spaces": ("Time (s),  Depth (mm),  Force (N)\n" + rows(",  "), [], 1),
@@ -293,9 +294,9 @@ def test_a_test_that_tears_is_noted(read: Read, message: Messages) -> None:
         strip(lambda t: t if t < 0.2 else 0.07 + 0.13 * np.exp(8 * (0.2 - t)), lambda t: min(t, 0.2) + 1e-3 * t),
         strip(lambda t: min(t, 2 - t), lambda t: min(t, 2 - t)),
         strip(lambda t: t if t < 1.5 else 0.8),
-        strip(lambda t: t if t < 1.5 else 0.3, lambda t: 9 - t),
+        strip(lambda t: t if t < 0.2 else 0.07 + 0.13 * np.exp(8 * (0.2 - t)), lambda t: 9 - min(t, 0.2)),
     ],
-    ids=["relaxes", "unloaded", "falls less", "depth falls"],
+    ids=["relaxes", "unloaded", "falls less", "relaxes after the depth fell"],
 )
 def test_other_falls_of_the_force_are_not_noted(text: str, read: Read) -> None:
     assert read(text).notes == ()
