@@ -1,0 +1,534 @@
+"""Tables of testing machines, as they write them, and damaged ones."""
+
+from __future__ import annotations
+
+import random
+import sys
+import zipfile
+from collections.abc import Callable
+from contextlib import suppress
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from taichi_msm.errors import NotInstalledError, SceneError
+from taichi_msm.fitting.machine_tables import MachineTest, cut_window, read_machine_test
+from tests.golden import Messages
+
+COUNT = 12
+TIME = 0.1 * np.arange(COUNT)
+DEPTH = 1e-4 * np.arange(COUNT)
+FORCE = 0.05 * np.arange(COUNT)
+NUMBERS = list(zip(TIME, DEPTH, FORCE, strict=True))
+
+
+def rows(separator: str = ";", line: str = "{t:.1f}{s}{d:.2f}{s}{f:.3f}", count: int = COUNT) -> str:
+    """Rows of numbers: time [s], depth [mm] and force [N]."""
+    return "\n".join(line.format(s=separator, t=0.1 * n, d=0.1 * n, f=0.05 * n) for n in range(count)) + "\n"
+
+
+def comma(text: str) -> str:
+    return text.replace(".", ",")
+
+
+TABLE = "Time [s];Depth [mm];Force [N]\n" + rows()
+
+MACH_1 = f"""<Mach-1 File>
+<INFO>
+Date:\tThu, Feb 17, 2022
+Time:\t15:13:47.698
+Load Cell Name:\t250N - SN: 1811864
+<END INFO>
+<Move Relative>
+Stage Axis:\tPosition (z)
+Amplitude, mm:\t-150.0000
+<DATA>
+Time, s\tPosition (z), mm\tFz, gf
+{rows("{s}", "{t:.6f}{s}-{d:.6f}{s}-{f:.6f}").replace("{s}", chr(9))}<END DATA>
+
+"""
+LABVIEW = f"""LabVIEW Measurement\t
+Writer_Version\t2
+Separator\tTab
+Decimal_Separator\t,
+***End_of_Header***\t
+\t
+Channels\t2\t\t
+Samples\t12\t12\t
+***End_of_Header***\t\t\t
+X_Value\tTravel (mm)\tLoad (N)\tComment
+{comma(rows(chr(9)))}"""
+ZWICK = "\n".join(
+    [
+        '"Prüfdatum";"03.04.2023"',
+        '"Probe 1";"Probe 1";"Probe 1";"Probe 1"',
+        '"Prüfzeit";"Standardkraft";"Standardweg";"Werkzeugabstand"',
+        '"s";"N";"mm";"mm"',
+        comma(rows(";", "{t:.1f}{s}{f:.3f}{s}{d:.2f}{s}17.23")),
+    ]
+)
+BLUEHILL = (
+    'Results Table 1\n"","Load at Break (N)","Extension at Break (mm)","Time at Break (s)"\n"1","0.5","1.1","1.1"\n\n'
+    '"Time","Extension","Load","Tensile strain (Extension)","Load rate"\n"(s)","(mm)","(N)","(%)","(N/s)"\n'
+    + rows(",", '"{t:.5f}"{s}"{d:.5f}"{s}"{f:.5f}"{s}"0.1"{s}"0.0"')
+)
+TEXTURE_ANALYSER = "PROBE TEST1\n\nForce\tDistance\tTime\ng\tmm\tsec\n" + rows("\t", "{f:.3f}{s}{d:.2f}{s}{t:.1f}")
+
+GF = 9.80665e-3
+
+# Tables as machines write them, the choices of columns, and the unit of force in newtons.
+EXPORTS: dict[str, tuple[str, list[str], float]] = {
+    "semicolons": (TABLE, [], 1),
+    "commas": (TABLE.replace(";", ","), [], 1),
+    "tabs": (TABLE.replace(";", "\t"), [], 1),
+    "bars": (TABLE.replace(";", "|"), [], 1),
+    "spaces": (TABLE.replace(";", " "), [], 1),
+    "aligned": ("# Temps d'essai (s)   Weg (mm)  Kraft (N)\n" + rows("    "), [], 1),
+    "decimal commas": (TABLE.splitlines()[0] + "\n" + comma(rows()), [], 1),
+    "quoted decimal commas": (
+        '"Time, s","Depth, mm","Force, N"\n' + comma(rows(";", '"{t:.1f}"{s}"{d:.2f}"{s}"{f:.3f}"')).replace(";", ","),
+        [],
+        1,
+    ),
+    "minus": (TABLE.replace(";0", ";\N{MINUS SIGN}0").replace(";1", ";\N{MINUS SIGN}1"), [], 1),
+    "exponents": ("Time_s;Depth_mm;Force_N\n" + rows(";", "{t:.3E}{s}{d:+.3e}{s}{f:.4E}"), [], 1),
+    "comments": ("% of a rig\n" + TABLE.replace("\n0.5", "\n# paused\n\n0.5"), [], 1),
+    "comma in names": (TABLE.replace(" [s]", ", s").replace(" [mm]", " / mm").replace(" [N]", " in N"), [], 1),
+    "footer": (TABLE + "\nMaximum force;0.55\nOperator;A\n", [], 1),
+    "carriage returns": (TABLE.replace("\n", "\r\n"), [], 1),
+    "empty cells at the end": (TABLE.replace("\n", ";;\n"), [], 1),
+    "Zwick": (ZWICK, [], 1),
+    "Instron": (BLUEHILL, [], 1),
+    "Mach-1": (MACH_1, [], GF),
+    "texture analyser": (TEXTURE_ANALYSER, [], GF),
+    "LabVIEW": (LABVIEW, ["time=X_Value, s"], 1),
+}
+
+
+@pytest.fixture
+def read(tmp_path: Path) -> Callable[..., MachineTest]:
+    """Read a text as a table."""
+
+    def read_text(text: str | bytes, *columns: str, block: int | None = None) -> MachineTest:
+        path = tmp_path / "test.csv"
+        path.write_bytes(text.encode() if isinstance(text, str) else text)
+        return read_machine_test(path, columns, block=block)
+
+    return read_text
+
+
+Read = Callable[..., MachineTest]
+
+
+def assert_is_test(test: MachineTest, newtons: float = 1) -> None:
+    # Scales round once.
+    np.testing.assert_allclose(test.time, TIME, rtol=1e-15, atol=1e-16)
+    np.testing.assert_allclose(test.depth, DEPTH, rtol=1e-14)
+    np.testing.assert_allclose(test.force, FORCE * newtons, rtol=1e-14)
+    assert test.time.dtype == test.depth.dtype == test.force.dtype == np.float64
+
+
+@pytest.mark.parametrize("name", EXPORTS)
+def test_exports_of_machines_are_read(name: str, read: Read) -> None:
+    text, columns, newtons = EXPORTS[name]
+    test = read(text, *columns)
+    assert_is_test(test, newtons)
+    assert test.notes == ()
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "cp1252"])
+@pytest.mark.parametrize("suffix", [".csv", ".tsv", ".txt", ".TXT"])
+def test_encodings_are_detected(encoding: str, suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"test{suffix}"
+    path.write_bytes(ZWICK.encode(encoding))
+    assert_is_test(read_machine_test(str(path)))
+
+
+@pytest.mark.parametrize(
+    ("quantity", "unit", "scale"),
+    [
+        *(("time", *unit) for unit in (("s", 1), ("ms", 1e-3), ("min", 60), ("sec", 1))),
+        *(
+            ("depth", *unit)
+            for unit in (("m", 1), ("cm", 1e-2), ("mm", 1e-3), ("um", 1e-6), ("µm", 1e-6), ("μm", 1e-6))
+        ),
+        *(
+            ("force", *unit)
+            for unit in (("N", 1), ("mN", 1e-3), ("kN", 1e3), ("gf", GF), ("kgf", 1e3 * GF), ("KN", 1e3))
+        ),
+    ],
+)
+def test_units_are_converted(quantity: str, unit: str, scale: float, read: Read) -> None:
+    units = {"time": "s", "depth": "mm", "force": "N"} | {quantity: unit}
+    values = {"time": TIME, "depth": 1e3 * DEPTH * (1 if quantity == "depth" else 1e-3), "force": FORCE}
+    values[quantity] = values[quantity] * scale
+    in_header = "Time [{time}];depth, {depth};FORCE ({force})\n".format(**units)
+    in_row = "Time;depth;FORCE\n[{time}];{depth};({force})\n".format(**units)
+    chosen = [f"{key}={name}, {units[key]}" for key, name in (("time", "time"), ("depth", "Depth"), ("force", "Force"))]
+    for test in (read(in_header + rows()), read(in_row + rows()), read("Time;depth;FORCE\n" + rows(), *chosen)):
+        for name, expected in values.items():
+            np.testing.assert_allclose(getattr(test, name), expected, rtol=1e-14, atol=1e-16)
+
+
+@pytest.mark.parametrize("name", ["Time", "temps d'essai", "ZEIT", "Prüfzeit", "Test time"])
+def test_names_of_time(name: str, read: Read) -> None:
+    assert_is_test(read(TABLE.replace("Time", name)))
+
+
+NAMES_OF_DEPTH = """Depth Displacement indentation Extension Elongation Allongement Stroke Position Travel Weg
+Standardweg Distance"""
+
+
+@pytest.mark.parametrize("name", [*NAMES_OF_DEPTH.split(), "Position (z)", "Compressive extension"])
+def test_names_of_depth(name: str, read: Read) -> None:
+    assert_is_test(read(TABLE.replace("Depth", name)))
+
+
+@pytest.mark.parametrize(
+    "name", ["force", "Load", "Fz", "Kraft", "Force standard", "Standardkraft", "Indentation force"]
+)
+def test_names_of_force(name: str, read: Read) -> None:
+    assert_is_test(read(TABLE.replace("Force", name)))
+
+
+def test_of_two_candidates_the_one_nearest_0_is_taken_and_named(read: Read, message: Messages) -> None:
+    # 0.4 mm are nearer 0 than 5 um would be if units were ignored.
+    line = "{t:.1f}{s}9{d:.2f}{s}{d:.2f}{s}{f:.3f}"
+    test = read("Time [s];Position [um];Extension [mm];Force [N]\n" + rows(";", line))
+    assert_is_test(test)
+    message(test.notes, "Extension", "Position")
+    # Columns without a unit are no candidates.
+    assert read("Time [s];Strain of Extension;Extension [mm];Force [N]\n" + rows(";", line)).notes == ()
+
+
+def test_columns_are_chosen(read: Read, message: Messages) -> None:
+    line = "{t:.1f}{s}9{d:.2f}{s}{d:.2f}{s}{f:.3f}"
+    table = "Time [s];Position [mm];Traverse;Force [N]\n" + rows(";", line)
+    for choice in ("depth=Traverse, mm", "depth = traverse ,mm"):
+        assert_is_test(read(table, choice))
+    assert_is_test(read(table.replace("Traverse", "Traverse (mm)"), "depth=Traverse"))
+    assert_is_test(read(table.replace("Traverse", "Traverse (mm)"), "depth=Traverse (mm)"))
+    assert_is_test(read(table.replace("Traverse", "x"), "depth=x, mm"))
+    # The unit given counts.
+    test = read(table.replace("Traverse", "Traverse (m)"), "depth=Traverse, mm")
+    assert_is_test(test)
+    message(test.notes, "depth", "mm")
+
+
+@pytest.mark.parametrize("sign", [(1, 1), (-1, 1), (1, -1), (-1, -1)])
+def test_largest_magnitudes_are_positive(sign: tuple[int, int], read: Read) -> None:
+    numbers = "\n".join(f"{t};{sign[0] * (1e3 * d - 0.3)};{sign[1] * (f - 0.1)}" for t, d, f in NUMBERS)
+    test = read(f"Time, s;Depth, mm;Force, N\n{numbers}")
+    np.testing.assert_allclose(test.depth, DEPTH - 3e-4, atol=1e-15)
+    np.testing.assert_allclose(test.force, FORCE - 0.1, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("line", "unit", "digit"),
+    [("{f:.3f}", "N", 1e-3), ("{f:.2f}", "mN", 1e-5), ("{f:.5E}", "N", 1e-7), ("{f:g}", "gf", 1e-2 * GF)],
+)
+def test_digit_is_the_last_of_the_forces(line: str, unit: str, digit: float, read: Read) -> None:
+    test = read(f"Time, s;Depth, mm;Force, {unit}\n" + rows(";", f"{{t:.6f}}{{s}}{{d:.6f}}{{s}}{line}"))
+    assert test.digit == pytest.approx(digit, rel=1e-12)
+
+
+def test_grouped_thousands_are_read(read: Read) -> None:
+    table = '"Time","Depth","Force"\n"(s)","(mm)","(N)"\n' + "".join(
+        f'"{n}.00","{n}.00","{f:,.2f}"\n' for n, f in enumerate(1000.5 * np.arange(COUNT))
+    )
+    for text in (table, table.replace('","', '";"').translate(str.maketrans(",.", ".,"))):
+        np.testing.assert_array_equal(read(text).force, 1000.5 * np.arange(COUNT))
+
+
+def test_blocks_are_chosen(read: Read, message: Messages) -> None:
+    second = MACH_1[MACH_1.index("<Move") :].replace("\t-0.5", "\t-0.6")
+    # The line of a wait has a number, and three rows are no block.
+    wait = "<Wait>\nTime, s:\t10.0\n<END DATA>\nTime, s\tPosition (z), mm\tFz, gf\n0.0\t0.0\t0.0\n"
+    text = MACH_1 + wait + second
+    with message.raises(SceneError, "--block", "2"):
+        read(text)
+    assert_is_test(read(text, block=1), GF)
+    test = read(text, block=2)
+    message([test.name], "block 2")
+    assert test.force[-1] == pytest.approx(0.65 * GF)
+    assert test.depth[5] == pytest.approx(0.6e-3)
+    for block in (0, 3):
+        with message.raises(SceneError, "--block"):
+            read(text, block=block)
+    assert_is_test(read(MACH_1, block=1), GF)
+
+
+def strip(torn: Callable[[float], float], depth: Callable[[float], float] = lambda t: t, count: int = 200) -> str:
+    """Table of a test of two seconds: depth [mm] and force [N] as functions of time."""
+    times = np.linspace(0, 2, count)
+    return "Time, s;Extension, mm;Force, N\n" + "".join(f"{t};{depth(t)};{torn(t)}\n" for t in times)
+
+
+def test_a_test_that_tears_is_noted(read: Read, message: Messages) -> None:
+    test = read(strip(lambda t: t if t < 1.5 else 0.3))
+    message(test.notes, "tore", "--window")
+    # Until it tears it is a test without a note, and after that too.
+    cut = cut_window(test, 0.5, 1.45)
+    assert cut.notes == ()
+    assert (cut.time[0] >= 0.5, cut.time[-1] <= 1.45) == (True, True)
+    assert len(cut.time) == len(cut.depth) == len(cut.force) == 95
+    assert cut_window(test, 0, 1.9).notes == test.notes
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        # Held from 0.2 s on, relaxing to a third, with a drift of the depth; pulled back.
+        strip(lambda t: t if t < 0.2 else 0.07 + 0.13 * np.exp(8 * (0.2 - t)), lambda t: min(t, 0.2) + 1e-3 * t),
+        strip(lambda t: min(t, 2 - t), lambda t: min(t, 2 - t)),
+        strip(lambda t: t if t < 1.5 else 0.8),
+    ],
+    ids=["relaxes", "unloaded", "falls less"],
+)
+def test_other_falls_of_the_force_are_not_noted(text: str, read: Read) -> None:
+    assert read(text).notes == ()
+
+
+def test_a_window_needs_rows(read: Read, message: Messages) -> None:
+    test = read(TABLE)
+    assert_is_test(cut_window(test, 0, 2))
+    for window in ((0.0, 0.85), (1.0, 0.0), (5.0, 9.0)):
+        with message.raises(SceneError, "--window"):
+            cut_window(test, *window)
+
+
+HEADER = TABLE.splitlines()[0]
+FAULTS: dict[str, tuple[str | bytes, list[str], list[str]]] = {
+    "empty": ("", [], ["empty"]),
+    "blank": ("\n \n\t\n", [], ["empty"]),
+    "no names": (rows(), [], ["--columns"]),
+    "no depth": (TABLE.replace("Depth", "Traverse"), [], ["csv:1", "depth", "Traverse"]),
+    "names in one cell": ("time/depth/force\n" + rows(), [], ["csv:1"]),
+    "no unit": (TABLE.replace(" [mm]", ""), [], ["csv:1", "Depth", '--columns "depth=Depth, mm"']),
+    "other unit": (TABLE.replace("[N]", "[lbf]"), [], ["Force [lbf]", "kgf"]),
+    "megaunit": (TABLE.replace("[N]", "[MN]"), [], ["Force [MN]"]),
+    "unit of another quantity": (TABLE.replace("[N]", "[mm]"), [], ["Force [mm]", "unit"]),
+    "repeated name": (HEADER + ";Force [N]\n" + rows(";", "{t}{s}{d}{s}{f}{s}{f}"), [], ["csv:1", "Force [N]", "2"]),
+    "gap": (TABLE.replace("0.5;0.50;0.250", "0.5;;0.250"), [], ["csv:7", "Depth [mm]", "empty"]),
+    "gap at the end": (TABLE.replace("0.5;0.50;0.250", "0.5;0.50;"), [], ["csv:7", "Force [N]", "empty"]),
+    "NaN": (TABLE.replace("0.250", "NaN"), [], ["csv:7", "Force [N]", "NaN"]),
+    "row of NaN": (TABLE.replace("1.1;1.10;0.550", "nan;nan;nan"), [], ["csv:13", "nan"]),
+    "infinity": (TABLE.replace("0.250", "-inf"), [], ["csv:7", "Force [N]", "-inf"]),
+    "too large": (TABLE.replace("0.250", "1e31"), [], ["csv:7", "Force [N]", "1e31"]),
+    "word": (TABLE.replace("0.250", "over"), [], ["csv:7", "Force [N]", "over"]),
+    "row of words": (TABLE.replace("0.5;0.50;0.250", "a;b;c"), [], ["csv:7", "a, b, c"]),
+    "first row of words": (TABLE.replace("0.0;0.00;0.000", "a;b;c"), [], ["csv:2", "a, b, c"]),
+    "time of day": (TABLE.replace("\n0.5", "\n12:00:05"), [], ["csv:7", "Time [s]", "12:00:05"]),
+    "same time": (TABLE.replace("\n0.5", "\n0.4"), [], ["csv:7", "Time [s]", "0.4"]),
+    "earlier time": (TABLE.replace("\n0.5", "\n0.05"), [], ["csv:7", "Time [s]", "0.05"]),
+    "few rows": (HEADER + "\n" + rows(count=9), [], ["csv:1", "9", "10"]),
+    "no rows": (HEADER, [], ["csv:1", "0", "10"]),
+    "decimal commas between commas": (HEADER.replace(";", ",") + "\n" + comma(rows(",")), [], ["csv:2", "6", "3"]),
+    "other separator": (HEADER.replace(";", ",") + "\n" + rows(), [], ["csv:2", "commas"]),
+    "two decimal marks": (TABLE.replace("0.250", "0,250"), [], ["csv:7", "Force [N]", "0,250"]),
+    "more cells than names": (TABLE.replace("0.250", "0.250;1"), [], ["csv:7", "4", "3"]),
+    "force at rest": (HEADER + "\n" + rows(line="{t}{s}{d}{s}0.0"), [], ["csv:1", "Force [N]", "--columns"]),
+    "workbook by another name": (b"PK\x03\x04\0\0", [], [".xlsx"]),
+    "old workbook": (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", [], [".xlsx"]),
+    "binary": (b"\xff\xfe\x00", [], ["text"]),
+    "zeros": (b"\0" * 64, [], ["text"]),
+    "column of no quantity": (TABLE, ["strain=Strain, mm"], ["--columns", "strain"]),
+    "column without a name": (TABLE, ["depth="], ["--columns", "depth="]),
+    "column chosen twice": (TABLE, ["depth=Depth", "depth=Time"], ["--columns", "depth"]),
+    "missing column": (TABLE, ["depth=Traverse, mm"], ["csv:1", "Traverse"]),
+    "unknown unit": (TABLE, ["depth=Depth, in"], ["csv:1", "Depth, in", "mm"]),
+    "column for two quantities": (TABLE, ["depth=Force [N], mm"], ["csv:1", "force"]),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_is_one_line_with_its_place(name: str, read: Read, message: Messages) -> None:
+    text, columns, words = FAULTS[name]
+    with message.raises(SceneError, *words) as caught:
+        read(text, *columns)
+    assert len(caught.value.lines) == 1
+
+
+def test_a_file_that_cannot_be_read_is_one_line(tmp_path: Path, message: Messages) -> None:
+    with (tmp_path / "large.csv").open("wb") as file:
+        file.truncate(1 << 30)
+    for path in (tmp_path / "missing.csv", tmp_path, tmp_path / "large.csv", "a\0b"):
+        with message.raises(SceneError):
+            read_machine_test(path)
+    (tmp_path / "text.csv").write_text(TABLE)
+    with message.raises(SceneError, "--sheet"):
+        read_machine_test(tmp_path / "text.csv", sheet="FF2")
+
+
+# A table of a workbook: names, units, and rows of numbers.
+SHEET: list[list[Any]] = [
+    ["FF2", "FF2", "FF2", "FF2"],
+    ["Temps d'essai", "Force standard", "Allongement", "Ecartement entre outils"],
+    ["s", "N", "mm", "mm"],
+    *([0.1 * n, 0.05 * n, 0.1 * n, 17.2 - 0.1 * n] for n in range(COUNT)),
+]
+
+
+def add_chart_sheet(book: Any) -> None:
+    from openpyxl.chart import LineChart
+
+    book.create_chartsheet("Chart").add_chart(LineChart())
+
+
+@pytest.fixture
+def save(tmp_path: Path) -> Callable[..., Path]:
+    """Save a workbook of sheets by name, after a change."""
+    openpyxl: Any = pytest.importorskip("openpyxl")
+
+    def save_workbook(sheets: dict[str, list[list[Any]]], change: Callable[[Any], object] = lambda book: None) -> Path:
+        book = openpyxl.Workbook()
+        book.remove(book.active)
+        for name, cells in sheets.items():
+            sheet = book.create_sheet(name)
+            for row in cells:
+                sheet.append(row)
+        change(book)
+        book.save(tmp_path / "tests.xlsx")
+        return tmp_path / "tests.xlsx"
+
+    return save_workbook
+
+
+Save = Callable[..., Path]
+
+
+def test_a_workbook_is_read(save: Save, message: Messages) -> None:
+    summary = [["", "Fmax", "dL(Fmax)"], ["", "N", "mm"], ["FF2", 0.55, 1.1]]
+    test = read_machine_test(save({"Paramètres": [["Norme d'essai"]], "Résultats": summary, "FF2": SHEET, "Empty": []}))
+    assert_is_test(test)
+    assert test.digit == pytest.approx(1e-2)
+    message([test.name], "FF2")
+    # An upper-case suffix, a shifted table, texts as numbers, a note at its side.
+    shifted: list[list[Any]] = [[], *([None, *row] for row in SHEET)]
+    shifted[7] = [None, "0.3", "0.15", "0.3", 16.9, None, "a note"]
+    path = save({"FF2": shifted})
+    assert_is_test(read_machine_test(path.rename(path.with_suffix(".XLSX"))))
+
+
+def test_a_sheet_is_chosen(save: Save, message: Messages) -> None:
+    path = save({"notes": [["x"]], "FF1": SHEET, "FF2": SHEET}, add_chart_sheet)
+    with message.raises(SceneError, "--sheet", "FF1, FF2"):
+        read_machine_test(path)
+    for name in ("FF2", "ff2"):
+        assert_is_test(read_machine_test(path, sheet=name))
+    for name in ("FF3", "notes", "Chart"):
+        with message.raises(SceneError, name):
+            read_machine_test(path, sheet=name)
+
+
+def test_blocks_of_a_sheet_are_chosen(save: Save, message: Messages) -> None:
+    path = save({"FF2": [*SHEET, [], *SHEET[1:]]})
+    with message.raises(SceneError, "--block"):
+        read_machine_test(path)
+    assert_is_test(read_machine_test(path, block=2))
+
+
+def put(cell: str, value: object) -> Callable[[Any], None]:
+    def change(book: Any) -> None:
+        book["FF2"][cell] = value
+
+    return change
+
+
+SHEET_FAULTS: dict[str, tuple[list[list[Any]], Callable[[Any], object], list[str]]] = {
+    "empty sheet": ([], lambda book: None, ["FF2", "empty"]),
+    "chart sheet": ([], lambda book: (add_chart_sheet(book), book.remove(book["FF2"])), ["Chart"]),
+    "several sheets without a table": ([], lambda book: book.create_sheet("FF3"), ["FF2, FF3"]),
+    "merged names": (SHEET, lambda book: book["FF2"].merge_cells("B2:C2"), ["FF2!B2", "merged"]),
+    "names merged with an unnamed column": (SHEET, lambda book: book["FF2"].merge_cells("C2:D2"), ["FF2!C2", "merged"]),
+    "formula without a value": (SHEET, put("C14", "=B14*2"), ["FF2!C14", "Allongement", "=B14*2"]),
+    "column of formulas": (
+        [[*row[:2], f"=A{n}" if n > 3 else row[2], row[3]] for n, row in enumerate(SHEET, 1)],
+        lambda book: None,
+        ["FF2!C4", "=A4"],
+    ),
+    "gap": (SHEET, put("B14", None), ["FF2!B14", "Force standard", "empty"]),
+    "two decimal marks": (SHEET, put("B14", "0,5"), ["FF2!B14", "0,5"]),
+    "error": (SHEET, put("B14", "#DIV/0!"), ["FF2!B14", "#DIV/0!"]),
+    "date": (SHEET, put("A14", datetime(2023, 4, 3)), ["FF2!A14", "date"]),
+    "word": (SHEET, put("B14", "over"), ["FF2!B14", "over"]),
+    "time again": (SHEET, put("A14", 0.5), ["FF2!A14", "0.5"]),
+    "no unit": (SHEET, put("C3", None), ["FF2!C2", "Allongement", "--columns"]),
+    "cell far away": (SHEET, put("XFD1048576", 1), ["FF2", "cells"]),
+}
+
+
+@pytest.mark.parametrize("name", SHEET_FAULTS)
+def test_a_fault_of_a_sheet_is_one_line_with_its_cell(name: str, save: Save, message: Messages) -> None:
+    cells, change, words = SHEET_FAULTS[name]
+    with message.raises(SceneError, *words) as caught:
+        read_machine_test(save({"FF2": cells}, change))
+    assert len(caught.value.lines) == 1
+
+
+def test_a_damaged_workbook_is_one_line(tmp_path: Path, message: Messages) -> None:
+    pytest.importorskip("openpyxl")
+    (tmp_path / "tests.xlsx").write_text(TABLE)
+    with message.raises(SceneError, "tests.xlsx"):
+        read_machine_test(tmp_path / "tests.xlsx")
+
+
+def test_without_openpyxl_the_error_is_how_to_install_it(monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
+    monkeypatch.setitem(sys.modules, "openpyxl", None)
+    with message.raises(NotInstalledError, "openpyxl"):
+        read_machine_test("tests.xlsx")
+
+
+def damaged(data: bytes, chance: random.Random) -> bytes:
+    """Change, remove, repeat or insert some bytes."""
+    for _ in range(chance.randint(1, 4)):
+        start = chance.randrange(len(data))
+        end = min(len(data), start + chance.choice([1, 1, 1, 4, 40]))
+        put_in = chance.choice(
+            [b"", data[start:end] * 2, bytes(chance.choices(b'0123456789eE+-,.;\t "\n#%=', k=end - start))]
+        )
+        data = data[:start] + chance.choice([put_in, chance.randbytes(end - start)]) + data[end:]
+        data = data or b" "
+    return data
+
+
+TRIES = pytest.mark.parametrize("tries", [10, pytest.param(1000, marks=pytest.mark.fuzz)], ids=["some", "all"])
+
+
+def try_read(path: Path, data: bytes) -> None:
+    """Read a table that may be damaged: it is a test, or a SceneError."""
+    path.write_bytes(data)
+    with suppress(SceneError):
+        test = read_machine_test(path)
+        assert len(test.time) == len(test.depth) == len(test.force) >= 10
+        assert np.isfinite([test.time, test.depth, test.force]).all()
+        assert (np.diff(test.time) > 0).all()
+        assert test.depth[np.abs(test.depth).argmax()] > 0
+
+
+@TRIES
+def test_damaged_texts_bring_no_other_error(tries: int, tmp_path: Path) -> None:
+    chance = random.Random(0)
+    for text, _, _ in EXPORTS.values():
+        for encoding in ("utf-8", "utf-16"):
+            for _ in range(tries):
+                try_read(tmp_path / "test.csv", damaged(text.encode(encoding), chance))
+
+
+@TRIES
+def test_damaged_workbooks_bring_no_other_error(tries: int, save: Save, tmp_path: Path) -> None:
+    chance = random.Random(0)
+    with zipfile.ZipFile(save({"FF2": SHEET, "notes": [["x"]]})) as book:
+        parts = {name: book.read(name) for name in book.namelist()}
+    for _ in range(tries):
+        # Damage inside a part, as a damaged archive has a wrong checksum.
+        name = chance.choice(list(parts))
+        with zipfile.ZipFile(tmp_path / "parts.zip", "w") as book:
+            for part, data in parts.items():
+                book.writestr(part, damaged(data, chance) if part == name else data)
+        data = (tmp_path / "parts.zip").read_bytes()
+        try_read(tmp_path / "tests.xlsx", data)
+        try_read(tmp_path / "tests.xlsx", damaged(data, chance))
