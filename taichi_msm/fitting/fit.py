@@ -278,7 +278,7 @@ def _rejection(
     if reason is None and len(forces):
         name = f"chi-square{suffix} of the forces"
         reason = rejection.by_chi_square(float(forces @ forces), len(forces), len(forces), name)
-    if reason is not None and observations.forces is not None:
+    if reason is not None and observations.forces is not None and misfit.count[0]:
         reason += _larger_part(
             uncertainties.residuals[: misfit.count[0]], forces, observations.forces, solution.predicted.forces
         )

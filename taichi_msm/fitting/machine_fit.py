@@ -165,17 +165,20 @@ def _explain(fitted: FittedTest, *, fits_contact: bool) -> Iterator[str]:
             f"{rounded(100 * max(model_fall, 0.0))} %: relaxation? Free the shares and times of tissue.relaxation"
         )
         return
-    rising = slice(0, int(loading.force.argmax()) + 1)
+    at_peak = float(travel[loading.force.argmax()])
+    rising = slice(0, int(np.argmax(travel >= (1 - HELD_SHARE) * at_peak)) + 1)
     depth, measured, model = travel[rising], loading.force[rising], predicted[rising]
-    residual, total = model - measured, float(np.sum((model - measured) ** 2))
+    residual = model - measured
     # A shift of the depth by a changes the model's force by a dF/dd.
-    slope = np.gradient(model) / np.maximum(np.gradient(depth), 1e-9 * reach) * (depth > 0)
-    shift = float(residual @ slope) / max(float(slope @ slope), 1e-300)
-    explained = 1 - float(np.sum((residual - shift * slope) ** 2)) / max(total, 1e-300)
-    if not fits_contact and abs(shift) > MIN_CONTACT_SHARE * reach and explained > 0.7:
+    moves = np.gradient(depth) > 1e-3 * reach / len(depth)
+    slope = np.where(moves, np.gradient(model) / np.where(moves, np.gradient(depth), 1.0), 0.0)
+    # A curvature changes the model's force by a factor that is linear in depth.
+    (shift, *_), by_contact = _explained(residual, slope)
+    _, by_curvature = _explained(residual, model, model * depth / reach)
+    if not fits_contact and abs(shift) > MIN_CONTACT_SHARE * reach and by_contact > max(0.7, by_curvature - 0.05):
         yield (
             f"a contact at {fitted.contact + shift:.4g} m of the table, not {fitted.contact:.4g} m, would explain "
-            f"{rounded(100 * explained)} % of the residual: give --contact, or --free contact"
+            f"{rounded(100 * by_contact)} % of the residual: give --contact, or --free contact"
         )
         return
     halves = [float(np.interp(0.5 * depth[-1], np.maximum.accumulate(depth), force)) for force in (measured, model)]
@@ -186,3 +189,11 @@ def _explain(fitted: FittedTest, *, fits_contact: bool) -> Iterator[str]:
             f"at half the depth the force is {rounded(shares[0])} % of that at the peak, and the model's "
             f"{rounded(shares[1])} %: the tissue stiffens {way} with the depth: lock? Free or change it"
         )
+
+
+def _explained(residual: Array, *columns: Array) -> tuple[Array, float]:
+    """Return the coefficients of a linear fit of a residual, and the share of its square that the fit explains."""
+    matrix = np.stack(columns, axis=1)
+    coefficients = np.linalg.lstsq(matrix, residual, rcond=None)[0]
+    rest = residual - matrix @ coefficients
+    return coefficients, 1 - float(rest @ rest) / max(float(residual @ residual), 1e-300)

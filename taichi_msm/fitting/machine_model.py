@@ -108,7 +108,7 @@ def machine_parameters(
     contacts = contact_keys(len(tests))
     for key in free:
         if key.partition(".")[0] == "contact" and key not in contacts:
-            raise SceneError([f"--free {key}: of {len(tests)} tables; take {' or '.join(contacts)}"])
+            raise SceneError([f"--free {key}: there is no such table; take {' or '.join(contacts)}"])
         if f"{key}.".startswith(f"probes.{probe}.path."):
             raise SceneError([f"--free {key}: the path is that of the table; name contact, its depth of contact"])
     of_scene = [key for key in free if key not in contacts]
@@ -127,9 +127,9 @@ def _contact_parameter(key: str, test: Loading, bounds: Bounds | None) -> Parame
     low, high = test.contact_range
     if bounds is not None:
         low, high = max(low, bounds[0]), min(high, bounds[1])
-    if not low <= test.contact <= high or low == high:
-        found = f"{test.contact:.4g} m, where the search begins, is outside {low:.4g} to {high:.4g} m"
-        raise SceneError([f"--bounds {key}: {found}; take other bounds, or another start by --contact"])
+    if not (low <= test.contact <= high and low < high):
+        found = f"the search begins at {test.contact:.4g} m, and the table's depths end at {test.contact_range[1]:.4g} m"
+        raise SceneError([f"--bounds {key}: {found}; take bounds around the start, or another start by --contact"])
     return Parameter(key, test.contact, low, high, high - low)
 
 
