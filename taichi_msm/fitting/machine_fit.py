@@ -194,6 +194,6 @@ def _explain(fitted: FittedTest, *, fits_contact: bool) -> Iterator[str]:
 def _explained(residual: Array, *columns: Array) -> tuple[Array, float]:
     """Return the coefficients of a linear fit of a residual, and the share of its square that the fit explains."""
     matrix = np.stack(columns, axis=1)
-    coefficients = np.linalg.lstsq(matrix, residual, rcond=None)[0]
+    coefficients = np.asarray(np.linalg.lstsq(matrix, residual, rcond=None)[0], np.float64)
     rest = residual - matrix @ coefficients
     return coefficients, 1 - float(rest @ rest) / max(float(residual @ residual), 1e-300)

@@ -128,7 +128,8 @@ def _contact_parameter(key: str, test: Loading, bounds: Bounds | None) -> Parame
     if bounds is not None:
         low, high = max(low, bounds[0]), min(high, bounds[1])
     if not (low <= test.contact <= high and low < high):
-        found = f"the search begins at {test.contact:.4g} m, and the table's depths end at {test.contact_range[1]:.4g} m"
+        end = test.contact_range[1]
+        found = f"the search begins at {test.contact:.4g} m, and the table's depths end at {end:.4g} m"
         raise SceneError([f"--bounds {key}: {found}; take bounds around the start, or another start by --contact"])
     return Parameter(key, test.contact, low, high, high - low)
 
