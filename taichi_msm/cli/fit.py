@@ -40,6 +40,14 @@ from taichi_msm.system.process import Interruption
 @click.option("--drift", type=float, metavar="SECONDS", help="How long errors of one track are alike [s].")
 @click.option("--profile", is_flag=True, help="Find intervals by going to their ends; takes more runs.")
 @click.option("--resolution", type=int, metavar="R", help="Fields along a side of a map that is fitted.")
+@click.option("--columns", metavar="NAME=COLUMN", multiple=True, help='Of tables: a column, as "depth=Traverse, mm".')
+@click.option("--sheet", metavar="SHEET", help="Of tables: sheet of a workbook.")
+@click.option("--block", type=int, metavar="N", help="Of tables: block of rows in a file, from 1.")
+@click.option("--window", metavar="T0,T1", help="Of tables: first and last time that are used [s].")
+@click.option("--rate", type=float, metavar="RATE", help="Of tables: frames per second.  [default: 10, 200 in all]")
+@click.option(
+    "--contact", type=float, metavar="DEPTH", multiple=True, help="Of tables: depth of contact [m], once or per table."
+)
 @click.option("--out", metavar="DIR", help="Directory for the fit.  [default: output/<name of the scene file>-fit]")
 @workers_option(help="Number of worker processes.  [default: by the duration of the first run]")
 @json_option
@@ -57,14 +65,27 @@ def fit(
     drift: float | None,
     profile: bool,
     resolution: int | None,
+    columns: tuple[str, ...],
+    sheet: str | None,
+    block: int | None,
+    window: str | None,
+    rate: float | None,
+    contact: tuple[float, ...],
     out: str | None,
     workers: int | None,
     as_json: bool,
 ) -> int:
-    """Estimate parameters of SCENE from OBSERVED data, with confidence intervals."""
+    """Estimate parameters of SCENE from OBSERVED data, with confidence intervals.
+
+    OBSERVED: positions or pixels of points, an .npz; or one or more tables of a testing machine, .csv, .tsv, .txt or
+    .xlsx, with time, depth and force.
+    """
+    from taichi_msm.fitting.machine_fit import is_table
     from taichi_msm.load.scene_file import load_scene
 
-    # Both options accept several words, of which click assigns all but the first to `more`.
+    # Both options accept several words, of which click assigns all but the first to `more`; so does OBSERVED.
+    tables = [word for word in more if is_table(word)]
+    more = tuple(word for word in more if not is_table(word))
     free = (*free, *(word for word in more if "=" not in word))
     limits: dict[str, tuple[float, float]] = {}
     for key, interval in map(parse_bounds, (*bounds, *(word for word in more if "=" in word))):
@@ -82,7 +103,7 @@ def fit(
         with ProgressDisplay(quiet=as_json) as bar:
             result = fit_scene(
                 loaded,
-                observed,
+                [observed, *tables] if tables else observed,
                 free,
                 bounds=limits,
                 forces=None if forces is None else parse_forces(forces),
@@ -95,6 +116,12 @@ def fit(
                 correlation=correlation,
                 drift=drift,
                 resolution=resolution,
+                columns=columns,
+                sheet=sheet,
+                block=block,
+                window=None if window is None else parse_window(window),
+                rate=rate,
+                contact=contact,
             )
     except KeyboardInterrupt:
         return report_interruption(interruption, as_json)
@@ -104,7 +131,8 @@ def fit(
     if as_json:
         print_json({"directory": str(directory), **result.as_json()})
     else:
-        click.echo("\n".join(map(printable, [f"{directory}: fit of {observed}", *result.summary()])))
+        title = f"{directory}: fit of {', '.join([observed, *tables])}"
+        click.echo("\n".join(map(printable, [title, *result.summary()])))
     return DONE
 
 
@@ -131,3 +159,12 @@ def parse_forces(text: str) -> tuple[str, float]:
     except ValueError:
         message = f"{text}: expected FILE,SIGMA, such as forces.csv,0.01"
         raise click.BadParameter(message, param_hint="--forces") from None
+
+
+def parse_window(text: str) -> tuple[float, float]:
+    """Parse T0,T1."""
+    first, _, last = text.partition(",")
+    try:
+        return float(first), float(last)
+    except ValueError:
+        raise click.BadParameter(f"{text}: expected T0,T1, such as 0.5,12", param_hint="--window") from None

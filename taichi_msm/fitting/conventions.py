@@ -101,7 +101,7 @@ def force_unit(observations: Observations, *predictions: Prediction) -> Iterator
             return
 
 
-def _opposed(observed: Array, predicted: Array, sigma: float | None) -> list[int]:
+def _opposed(observed: Array, predicted: Array, sigma: float | Array | None) -> list[int]:
     """Return the components (last axis) with a significant size and a cosine below `MAX_COSINE`."""
     known = np.isfinite(observed) & np.isfinite(predicted)
     first, second = (np.where(known, array, 0.0).reshape(-1, known.shape[-1]) for array in (observed, predicted))
@@ -115,7 +115,7 @@ def _opposed(observed: Array, predicted: Array, sigma: float | None) -> list[int
     return np.flatnonzero(is_large & ((first * second).sum(axis=0) < MAX_COSINE * lengths[0] * lengths[1])).tolist()
 
 
-def _ratio(observed: Array, predicted: Array, sigma: float) -> float:
+def _ratio(observed: Array, predicted: Array, sigma: float | Array) -> float:
     """Return the ratio of observed to predicted forces; 0: insignificant, or not parallel."""
     known = np.isfinite(observed)
     measured, expected = observed[known], predicted[known]

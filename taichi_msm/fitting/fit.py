@@ -35,6 +35,14 @@ from taichi_msm.fitting.least_squares import (
     uncertainty,
     unseen,
 )
+from taichi_msm.fitting.machine_fit import (
+    TABLE_OPTIONS,
+    explanations,
+    fitted_tests,
+    read_machine_problem,
+    table_paths,
+)
+from taichi_msm.fitting.machine_model import MachineProblem
 from taichi_msm.fitting.observations import Forces, read_observations, with_sigma
 from taichi_msm.fitting.parameters import (
     Bounds,
@@ -43,12 +51,11 @@ from taichi_msm.fitting.parameters import (
     as_data,
     make_parameters,
     require_types,
-    with_values,
 )
 from taichi_msm.fitting.predict import FitProblem, Prediction, Runs, without_outputs
 from taichi_msm.fitting.report import publication, write_report
 from taichi_msm.fitting.result import Estimate, FitResult, FittedMap
-from taichi_msm.fitting.stiffness_map import KEY, fit_map, map_settings
+from taichi_msm.fitting.stiffness_map import KEY, MapSettings, fit_map, map_settings
 from taichi_msm.load.check import check_scene
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.scene.scene import Scene
@@ -58,7 +65,7 @@ Array = NDArray[np.float64]
 
 def fit(
     scene: str | Path | Scene | Mapping[str, Any],
-    observed: str | Path | Mapping[str, Any],
+    observed: str | Path | Mapping[str, Any] | Sequence[str | Path],
     free: Sequence[str],
     *,
     bounds: Mapping[str, Bounds] | None = None,
@@ -75,9 +82,11 @@ def fit(
         observed: an .npz file, or a mapping of arrays: `time` [s], shape (T,); `coordinates` of points, across and
             down, shape (N, 2); `position` [m], shape (N, T, 3), or `pixel` [px] of the scene's camera, shape (N, T, 2);
             NaN where not observed; optionally `sigma`, the standard deviation of their errors. Or a run's
-            trajectory.npz or tracks.npz.
+            trajectory.npz or tracks.npz. Or one or more tables of a testing machine, .csv, .tsv, .txt or .xlsx, with
+            time, depth and force: the scene's only position-controlled tool follows them.
         free: keys of the parameters, as dotted paths such as tissue.young or probes.0.total.2; or tissue.map, a map
-            of R x R cells, alone or with a component of a force, which scales all forces by a common factor.
+            of R x R cells, alone or with a component of a force, which scales all forces by a common factor. With
+            tables also contact, or contact.0, ... of several: the depth of contact [m of the table].
         bounds: smallest and largest values by key; for tissue.map, of the factors.
         forces: a forces.csv of the same motion, and the standard deviation of its forces [N].
         directory: receives fit.json, scene.yaml, fit.png and a map's pictures; None: nothing is written.
@@ -86,7 +95,9 @@ def fit(
             the fit, and nothing is written.
         **method: sigma: standard deviation instead of the file's; robust: whether to downweight outliers; profile:
             whether to compute profile intervals; correlation: correlation length of the errors of tracks [px]; drift:
-            correlation time of the errors of a track [s]; resolution: R of a map.
+            correlation time of the errors of a track [s]; resolution: R of a map. Of tables: columns: chosen columns,
+            such as ["depth=Traverse, mm"]; sheet, block: of those in a file; window: first and last time [s]; rate:
+            frames per second; contact: depths of contact [m of the table], one or one per table.
 
     Returns:
         The estimates; `identifiable` is False if the data do not determine a parameter.
@@ -111,17 +122,50 @@ def fit(
         if (tolerance := getattr(initial, section).tolerance) is not None:
             fault = "is for one run, and a fit compares many; remove it, and take what `run` chose for it"
             raise SceneError([f"{section}.tolerance: {tolerance:g} {fault}"])
-    observations = with_sigma(read_observations(observed, initial.time.frames_per_second), method.get("sigma"))
     if repeated := [key for n, key in enumerate(free) if key in free[:n]]:
         raise SceneError([f"--free {repeated[0]}: given twice; leave one of them out"])
-    settings = map_settings(initial, free, bounds or {}, method.get("resolution"))
+    if tables := table_paths(observed):
+        problem: FitProblem = read_machine_problem(tables, initial, free, bounds or {}, forces, method)
+        settings = None
+    else:
+        problem, settings = _read_problem(observed, initial, free, bounds or {}, forces, method)
+    with ExitStack() as stack:
+        if directory is not None:
+            stack.enter_context(writing(directory))
+            publisher = stack.enter_context(publication(Path(directory)))
+        if settings is not None:
+            name = str(Path(directory or "", FittedMap.FILE))
+            result = fit_map(initial, problem.observations, settings, name, progress)
+        else:
+            runs = stack.enter_context(Runs(problem, workers, progress))
+            result = _fit(runs, initial, method)
+        result = replace(result, seconds=time.perf_counter() - start)
+        if directory is not None:
+            progress("write", 0, 0)
+            write_report(result, publisher)
+    return result
+
+
+def _read_problem(
+    observed: Any,
+    initial: Scene,
+    free: Sequence[str],
+    bounds: Mapping[str, Bounds],
+    forces: tuple[str | Path, float] | None,
+    method: Method,
+) -> tuple[FitProblem, MapSettings | None]:
+    """Read observations of points and forces, and check them; returns also the settings of a map."""
+    observations = with_sigma(read_observations(observed, initial.time.frames_per_second), method.get("sigma"))
+    if unused := [name for name in TABLE_OPTIONS if method.get(name)]:
+        raise SceneError([f"--{unused[0]}: is of tables of a testing machine; leave it out"])
+    settings = map_settings(initial, free, bounds, method.get("resolution"))
     number_options = {
         "forces": forces,
         **{name: method.get(name) for name in ("robust", "profile", "correlation", "drift")},
     }
     if settings is not None and (conflicting := [name for name, value in number_options.items() if value]):
         raise SceneError([f"--free {KEY}: --{conflicting[0]} is of fits of numbers; leave it out"])
-    parameters = () if settings is not None else make_parameters(initial, free, bounds or {})
+    parameters = () if settings is not None else make_parameters(initial, free, bounds)
     if forces is not None:
         observations = replace(observations, forces=read_forces(forces[0], forces[1], len(initial.probes)))
     if (correlation := method.get("correlation")) is not None:
@@ -135,21 +179,7 @@ def fit(
         raise SceneError([f"--drift {drift:g}: take a number of seconds above 0"])
     if settings is None and (found := list(faults(observations, initial, len(parameters)))):
         raise SceneError(found)
-    with ExitStack() as stack:
-        if directory is not None:
-            stack.enter_context(writing(directory))
-            publisher = stack.enter_context(publication(Path(directory)))
-        if settings is not None:
-            result = fit_map(initial, observations, settings, str(Path(directory or "", FittedMap.FILE)), progress)
-        else:
-            problem = FitProblem(secrets.token_hex(8), without_outputs(initial), parameters, observations)
-            runs = stack.enter_context(Runs(problem, workers, progress))
-            result = _fit(runs, initial, method)
-        result = replace(result, seconds=time.perf_counter() - start)
-        if directory is not None:
-            progress("write", 0, 0)
-            write_report(result, publisher)
-    return result
+    return FitProblem(secrets.token_hex(8), without_outputs(initial), parameters, observations), settings
 
 
 def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
@@ -161,17 +191,24 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
     first = runs.first(start)
     same_camera = not any(parameter.key.startswith("render.") for parameter in parameters)
     same_signs = all(parameter.is_log for parameter in parameters)
-    found = list(faults_at_start(observations, scene, first, same_camera=same_camera, same_signs=same_signs))
+    machine = runs.job if isinstance(runs.job, MachineProblem) else None
+    found = (
+        []
+        if machine
+        else list(faults_at_start(observations, scene, first, same_camera=same_camera, same_signs=same_signs))
+    )
     if not any(probe.moved for probe in scene.probes):
         # The forces of force-controlled tools do not depend on the tissue.
         found += force_unit(observations, first)
     if found:
         raise SceneError(found)
-    motion = largest_motion(observations, scene) or 1.0
+    motion = 1.0 if machine else largest_motion(observations, scene) or 1.0
     misfit = Misfit(observations, motion, robust=method.get("robust", False))
     search = Search(runs, misfit)
+    if machine:
+        search.remember(start, first)
     solution = search.best(start)
-    if found := list(faults_at_solution(observations, scene, first, solution.predicted)):
+    if not machine and (found := list(faults_at_solution(observations, scene, first, solution.predicted))):
         raise SceneError(found)
     uncertainties = uncertainty(misfit, solution, search.jacobian(solution), error_correlation)
     profiles = Profiler(parameters, misfit, solution, uncertainties).profiles(runs) if method.get("profile") else None
@@ -181,15 +218,18 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
     ]
     unidentified = unseen(parameters, solution.x, uncertainties, forces=observations.forces is not None)
     values, forces = np.split(misfit.of(solution.predicted), misfit.count[:1])
+    rejection_reason = _rejection(misfit, solution, uncertainties, error_correlation)
+    fitted_values = {parameter.key: estimate.value for parameter, estimate in zip(parameters, estimates, strict=True)}
+    tests = fitted_tests(machine, fitted_values, solution.predicted.forces) if machine else ()
     return FitResult(
         parameters={parameter.key: estimate for parameter, estimate in zip(parameters, estimates, strict=True)},
         correlation=uncertainties.correlation.tolist(),
-        residual=float(np.sqrt(np.mean(values**2))),
+        residual=float(np.sqrt(np.mean(values**2))) if len(values) else None,
         residual_force=float(np.sqrt(np.mean(forces**2))) if len(forces) else None,
-        sigma=uncertainties.scales.values,
+        sigma=uncertainties.scales.values if len(values) else None,
         unit=observations.unit,
-        sigma_force=None if observations.forces is None else observations.forces.sigma,
-        rejection=_rejection(misfit, solution, uncertainties, error_correlation),
+        sigma_force=None if observations.forces is None else float(np.mean(observations.forces.sigma)),
+        rejection=rejection_reason,
         chi_square=float(uncertainties.residuals @ uncertainties.residuals) if observations.sigma is not None else None,
         degrees_of_freedom=uncertainties.freedom,
         identifiable=all(estimate.identifiable for estimate in estimates),
@@ -197,16 +237,23 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
         mesh_error=mesh,
         runs=runs.count,
         notes=[
-            *force_unit(observations, first),
+            *([] if machine else force_unit(observations, first)),
+            *(note for fitted in tests for note in fitted.loading.test.notes),
             *result_module.search_notes(solution, parameters, fits_well=search.fits_well(solution)),
             *result_module.mesh_notes(parameters, solution.x, uncertainties, shifts),
             *result_module.correlation_notes(parameters, uncertainties, unidentified),
+            *(
+                explanations(tests, fits_contact=any(parameter.key.startswith("contact") for parameter in parameters))
+                if rejection_reason
+                else ()
+            ),
             *result_module.residual_notes(observations, solution, uncertainties, motion, error_correlation),
         ],
-        scene=Scene(**with_values(as_data(scene), parameters, [estimate.value for estimate in estimates])),
+        scene=Scene(**runs.job.fitted_data(as_data(scene), fitted_values)),
         observations=observations,
         fitted=solution.predicted.values,
         fitted_forces=solution.predicted.forces,
+        tests=tests,
         curves={
             parameter.key: _curve(parameter, n, solution.x, uncertainties, profiles)
             for n, parameter in enumerate(parameters)
@@ -231,7 +278,7 @@ def _rejection(
     if reason is None and len(forces):
         name = f"chi-square{suffix} of the forces"
         reason = rejection.by_chi_square(float(forces @ forces), len(forces), len(forces), name)
-    if reason is not None and observations.forces is not None:
+    if reason is not None and observations.forces is not None and misfit.count[0]:
         reason += _larger_part(
             uncertainties.residuals[: misfit.count[0]], forces, observations.forces, solution.predicted.forces
         )

@@ -58,7 +58,7 @@ class Scales(NamedTuple):
     """Standard deviations of the residuals."""
 
     values: float  # [m] or [px]
-    forces: float  # [N]
+    forces: float | Array  # [N], of all or of each
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +103,7 @@ class Misfit:
 
     def scaled(self, rows: Array, scales: Scales) -> Array:
         """Divide rows, shape (numbers, ...), by their standard deviations."""
-        deviations = np.repeat(scales, self.count)
+        deviations = np.concatenate([np.broadcast_to(scale, n) for scale, n in zip(scales, self.count, strict=True)])
         return rows / deviations.reshape(-1, *(1,) * (rows.ndim - 1))
 
     def residuals(self, predicted: Prediction, scales: Scales) -> Array:
@@ -173,8 +173,11 @@ class Search:
                 solution.predicted.forces - observations.forces.force,
                 MAX_RESIDUAL_SHARE**2 * np.nanmean(observations.forces.force**2),
             )
-            if np.nanmean(residuals**2) > max(limit, (MAX_RESIDUAL_SIGMAS * observations.forces.sigma) ** 2):
+            variance = float(np.mean(np.square(observations.forces.sigma)))
+            if np.nanmean(residuals**2) > max(limit, MAX_RESIDUAL_SIGMAS**2 * variance):
                 return False
+        if not self._misfit.count[0]:
+            return True
         sigma = self._misfit.sigma(solution.predicted, len(solution.x))
         return sigma <= (
             MAX_RESIDUAL_SHARE * self._misfit.motion
@@ -183,8 +186,15 @@ class Search:
         )
 
     def jacobian(self, solution: Solution) -> Array:
-        """Return the Jacobian of the predictions by x, by central differences, shape (numbers, parameters)."""
-        return self._differences(solution.x, solution.predicted, signs=(1, -1))
+        """Return the Jacobian of the predictions by x, shape (numbers, parameters).
+
+        Differences are central, or forward for machine tests, whose many frames take long and whose forces are smooth.
+        """
+        return self._differences(solution.x, solution.predicted, signs=(1, -1) if self._misfit.count[0] else (1,))
+
+    def remember(self, x: Array, predicted: Prediction) -> None:
+        """Store a prediction that is known."""
+        self._known[x.tobytes()] = predicted
 
     def _predict(self, x: Array) -> Prediction | None:
         """Predict at x, with a cache."""
@@ -292,11 +302,12 @@ class Search:
         return self._misfit.cost(self._misfit.residuals(predicted, scales))
 
     def _alternative_starts(self) -> list[Array]:
-        """Return a Sobol sequence of starts within the bounds, at least 8 per parameter."""
+        """Return a Sobol sequence of starts within the bounds, at least 8 per parameter, or 8 for machine tests."""
         from scipy.stats import qmc
 
         low, high = (np.clip(limit, -MAX_START_LOG, MAX_START_LOG) for limit in self._limits)
-        shares = qmc.Sobol(len(low), seed=1).random_base2((8 * len(low) - 1).bit_length())
+        count = 8 * len(low) if self._misfit.count[0] else 8
+        shares = qmc.Sobol(len(low), seed=1).random_base2((count - 1).bit_length())
         return list(qmc.scale(shares, low, high))
 
 

@@ -135,13 +135,13 @@ def observe_at_rest(scene: Scene, observations: Observations) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Forces:
-    """Forces of tools on the sheet, as in a forces.csv."""
+    """Forces of tools on the sheet, as in a forces.csv, or along the tool's direction, as in machine tests."""
 
     name: str  # of the file, in messages
     time: Array  # of every row [s], shape (rows,)
-    probe: NDArray[np.intp]  # index of the tool, shape (rows,)
-    force: Array  # [N], shape (rows, 3); NaN: not measured
-    sigma: float  # standard deviation of each component's error [N]
+    probe: NDArray[np.intp]  # index of the tool, or of the machine test, shape (rows,)
+    force: Array  # [N], shape (rows, 3), or (rows, 1) along the tool's direction; NaN: not measured
+    sigma: float | Array  # standard deviation of each component's error [N], of all or of each measured one
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,7 +29,7 @@ SECTIONS = ("tissue", "springs", "damping", "sheet", "probes", "render.camera", 
 FIXED_KEYS = ("tolerance", "grip", "shaft", "points")
 
 # Keys of coordinates and times, which are fitted linearly.
-COORDINATE_KEYS = ("at", "path", "offset", "load")
+COORDINATE_KEYS = ("at", "path", "offset", "load", "contact")
 
 # Default bound of a logarithmic parameter: a factor of 1000 from the initial value.
 MAX_LOG = math.log(1000)
@@ -204,6 +204,12 @@ class Method(TypedDict, total=False):
     correlation: float | None
     drift: float | None
     resolution: int | None
+    columns: Sequence[str] | None
+    sheet: str | None
+    block: int | None
+    window: tuple[float, float] | None
+    rate: float | None
+    contact: Sequence[float] | None
 
 
 def require_types(observed: Any, free: Any, method: Mapping[str, Any], **others: Any) -> None:
@@ -226,6 +232,10 @@ def _is_path(value: Any) -> bool:
     return isinstance(value, (str, Path)) and "\0" not in str(value)
 
 
+def _is_sequence(value: Any, item: Callable[[Any], bool]) -> bool:
+    return isinstance(value, Sequence) and not isinstance(value, str) and all(map(item, value))
+
+
 def _is_pair(value: Any, first: Callable[[Any], bool]) -> bool:
     return isinstance(value, Sequence) and len(value) == 2 and first(value[0]) and _is_number(value[1])
 
@@ -233,8 +243,8 @@ def _is_pair(value: Any, first: Callable[[Any], bool]) -> bool:
 # Check and description of each argument.
 _TYPES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "observed": (
-        lambda it: _is_path(it) or isinstance(it, Mapping),
-        "the path of an .npz file, or a mapping of arrays",
+        lambda it: _is_path(it) or isinstance(it, Mapping) or _is_sequence(it, _is_path),
+        "the path of an .npz file or of a table, a list of tables, or a mapping of arrays",
     ),
     "free": (
         lambda it: isinstance(it, Sequence) and not isinstance(it, str) and all(isinstance(key, str) for key in it),
@@ -256,6 +266,12 @@ _TYPES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "sigma": (_is_number, "a number, or None"),
     "correlation": (_is_number, "a number of pixels, or None"),
     "drift": (_is_number, "a number of seconds, or None"),
+    "columns": (lambda it: _is_sequence(it, lambda one: isinstance(one, str)), "a list such as ['depth=Traverse, mm']"),
+    "sheet": (lambda it: isinstance(it, str), "the name of a sheet, or None"),
+    "block": (lambda it: _is_number(it, Integral), "a whole number from 1, or None"),
+    "window": (lambda it: _is_pair(it, _is_number), "the first and the last time in seconds, such as (0.5, 12)"),
+    "rate": (_is_number, "a number of frames per second, or None"),
+    "contact": (lambda it: _is_sequence(it, _is_number), "a list of depths in metres, such as [0.002]"),
     "resolution": (lambda it: _is_number(it, Integral), "a whole number, or None"),
     **dict.fromkeys(("robust", "profile"), (lambda it: isinstance(it, bool), "True or False")),
 }

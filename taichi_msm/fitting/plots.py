@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import BinaryIO
 
 import numpy as np
@@ -19,6 +20,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, ScalarForm
 from numpy.typing import NDArray
 
 from taichi_msm.errors import printable
+from taichi_msm.fitting.machine_plots import MACHINE_PANELS
 from taichi_msm.fitting.result import FitResult, FittedMap
 from taichi_msm.fitting.tikhonov import SmoothnessWeight
 from taichi_msm.plot_style import BLUE, DPI, GREY, ORANGE, SILVER, STYLE, TWO_COLUMN_WIDTH, VERMILION
@@ -46,7 +48,7 @@ def _figure(result: FitResult) -> Figure:
         result.observations.is_observed.any(axis=0).sum(),
     )
     # A single time shows no motion, a single point no map of residuals.
-    plots = [
+    plots: list[Callable[[Axes, FitResult], None]] = [
         plot_panel
         for plot_panel, is_shown in (
             (_plot_motion, time_count > 1),
@@ -55,7 +57,10 @@ def _figure(result: FitResult) -> Figure:
         )
         if is_shown
     ]
-    plots += [_plot_forces] if forces else []
+    if result.tests:
+        plots = [partial(plot_panel, fitted=fitted) for fitted in result.tests for plot_panel in MACHINE_PANELS]
+    elif forces:
+        plots.append(_plot_forces)
     count = len(plots) + len(result.parameters) + 3 * (result.map is not None)
     rows = math.ceil(count / COLUMN_COUNT)
     engine = ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, wait
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -50,6 +50,14 @@ class FitProblem:
     parameters: tuple[Parameter, ...]
     observations: Observations
 
+    def build_model(self, threads: int | None) -> ForwardModel:
+        """Build the forward model on a number of threads; None: all cores."""
+        return ForwardModel(self, threads)
+
+    def fitted_data(self, data: dict[str, Any], values: Mapping[str, float]) -> dict[str, Any]:
+        """Return a scene's data with parameter values by key."""
+        return with_values(data, self.parameters, [values[parameter.key] for parameter in self.parameters])
+
 
 def without_outputs(scene: Scene) -> Scene:
     """Return a scene in f64, without image and outputs."""
@@ -61,9 +69,9 @@ class ForwardModel:
     """Forward model of a fit: a simulation that is restarted for every prediction."""
 
     def __init__(self, job: FitProblem, threads: int | None) -> None:
-        self.job, self._data = job, as_data(job.scene)
+        self.job, self.data = job, as_data(job.scene)
         plan = check_scene(job.scene)
-        self._maps, self._threads = plan.maps, threads
+        self.maps, self._threads = plan.maps, threads
         self._simulation: Simulation | None = None
         observations = job.observations
         times = (
@@ -95,7 +103,10 @@ class ForwardModel:
             SceneError: when the scene with these values is not valid, or has too few mass points to be coarsened.
             DivergedError: when the run diverges.
         """
-        plan = self.plan(x)
+        return self._run(*self.start(self.plan(x), steps, coarse), to_end, pause)
+
+    def start(self, plan: Plan, steps: int | None, coarse: int) -> tuple[Simulation, Plan]:
+        """Restart the simulation, and return it with the plan as it is run; arguments as of `predict`."""
         for _ in range(coarse):
             if (coarser := coarser_plan(plan)) is None:
                 raise SceneError(["sheet.points: too few to take half of them"])
@@ -106,7 +117,7 @@ class ForwardModel:
             self._simulation = Simulation(plan, threads=self._threads)
         else:
             self._simulation.restart(plan)
-        return self._run(self._simulation, plan, to_end, pause)
+        return self._simulation, plan
 
     def compile(self, x: Array, pause: Pause = lambda: None) -> None:
         """Compile the kernels for the parameters at x; raises a SceneError as `predict` does."""
@@ -128,8 +139,8 @@ class ForwardModel:
         ]
         if not np.isfinite(values).all():
             raise SceneError(["the values are out of range"])
-        data = with_values(self._data, self.job.parameters, values)
-        return check_scene(Scene(**data), self._maps)
+        data = with_values(self.data, self.job.parameters, values)
+        return check_scene(Scene(**data), self.maps)
 
     def _run(self, simulation: Simulation, plan: Plan, to_end: bool, pause: Pause) -> Prediction:
         observations, scene = self.job.observations, plan.scene
@@ -177,7 +188,7 @@ def predict(job: FitProblem, x: Array, steps: int | None) -> Prediction | None:
         for model in _cached_models.values():
             model.close()
         _cached_models.clear()
-        _cached_models[job.token] = ForwardModel(job, threads=1)
+        _cached_models[job.token] = job.build_model(threads=1)
     return _cached_models[job.token].try_predict(x, steps)
 
 
@@ -217,7 +228,7 @@ class Runs:
     def __init__(self, job: FitProblem, workers: int | None, progress: StageProgressCallback) -> None:
         self.job, self.count, self.expected = job, 0, 0
         self._workers, self._progress = workers, progress
-        self._predictor = ForwardModel(job, threads=None)
+        self._predictor = job.build_model(threads=None)
         self._pool: Pool | None = None
         self._seconds = 0.0
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.fitting.least_squares import ErrorCorrelation, ProfilePoint, Solution, Uncertainty, UnidentifiedGroup
+from taichi_msm.fitting.machine_fit import FittedTest
 from taichi_msm.fitting.observations import Observations
 from taichi_msm.fitting.parameters import Parameter, rounded
 from taichi_msm.fitting.tikhonov import SmoothnessWeight
@@ -105,10 +106,10 @@ class FitResult:
     Attributes:
         parameters: estimates, by key.
         correlation: correlation matrix of the parameters, in their order.
-        residual: root mean square of predicted minus observed values [m] or [px].
+        residual: root mean square of predicted minus observed values [m] or [px]; None without points.
         residual_force: root mean square of predicted minus observed forces [N]; None without forces.
         sigma_force: given standard deviation of the forces [N]; None without forces.
-        sigma: standard deviation of the values [m] or [px], given or estimated.
+        sigma: standard deviation of the values [m] or [px], given or estimated; None without points.
         unit: unit of residual and sigma, m or px.
         chi_square: sum of (predicted - observed)^2 / sigma^2; None without a given sigma.
         rejection: reason for rejecting the model; None: not rejected.
@@ -125,15 +126,16 @@ class FitResult:
         fitted_forces: predicted forces of the fitted scene [N], shape (rows, 3).
         curves: profiles of the parameters by key, or their quadratic approximations.
         map: estimated map; None for a fit of numbers.
+        tests: the machine tests with their fitted forces.
     """
 
     parameters: dict[str, Estimate] = field(default_factory=dict)
     correlation: list[list[float]] = field(default_factory=list)
-    residual: float
+    residual: float | None
     residual_force: float | None = None
     sigma_force: float | None = None
     rejection: str | None = None
-    sigma: float
+    sigma: float | None
     unit: str
     chi_square: float | None
     degrees_of_freedom: int
@@ -149,6 +151,7 @@ class FitResult:
     fitted_forces: Array = field(repr=False, default_factory=lambda: np.empty((0, 3)))
     curves: dict[str, list[ProfilePoint]] = field(repr=False, default_factory=dict)
     map: FittedMap | None = None
+    tests: tuple[FittedTest, ...] = ()
 
     @property
     def model_rejected(self) -> bool:
@@ -165,6 +168,7 @@ class FitResult:
             **{name: getattr(self, name) for name in (*names.split(), "runs", "seconds", "notes")},
             "unseen": [item.as_json() for item in self.unseen],
             **({} if self.map is None else {"map": self.map.as_json()}),
+            **({"tests": [fitted.as_json() for fitted in self.tests]} if self.tests else {}),
         }
 
     def summary(self) -> list[str]:
@@ -183,15 +187,24 @@ class FitResult:
         chi_text = ""
         if self.chi_square is not None:
             chi_text = f", chi-square {self.chi_square:.3g} for {self.degrees_of_freedom} degrees of freedom"
+        lines += [_format_test(fitted) + chi_text for fitted in self.tests]
         force_text = "" if self.residual_force is None else f", {self.residual_force:.3g} N"
-        lines.append(
-            f"residual {self.residual:.3g} {self.unit} of {points} points at {times} times{force_text}{chi_text}"
-        )
+        if self.residual is not None:
+            lines.append(
+                f"residual {self.residual:.3g} {self.unit} of {points} points at {times} times{force_text}{chi_text}"
+            )
         if self.mesh_error is not None:
             qualifier = "at most about " if any(probe.moved for probe in self.scene.probes) else ""
             error = f"{qualifier}{rounded(100 * self.mesh_error)} % of the largest displacement"
             lines.append(f"mesh error of the fitted scene: {error}")
         return [*lines, *self.notes, f"{self.runs} runs, {self.seconds:.1f} s"]
+
+
+def _format_test(fitted: FittedTest) -> str:
+    loading = fitted.loading
+    share = rounded(100 * fitted.residual / loading.peak)
+    residual = f"residual {fitted.residual:.3g} N, {share} % of the peak, at {len(loading.force)} frames"
+    return f"{loading.test.name}: {residual}; noise {loading.noise:.2g} N, contact at {fitted.contact:.4g} m"
 
 
 def _format_estimate(estimate: Estimate) -> str:
@@ -264,6 +277,8 @@ def residual_notes(
     if uncertainties.factor > 1.5:
         factor = rounded(math.sqrt(uncertainties.factor))
         yield f"the residual is {factor} times sigma, and the intervals are widened by this factor"
+    if not observations.values.size:
+        return
     residuals = solution.predicted.values - observations.values
     if np.sqrt(np.nanmean(residuals**2)) < max(1e-6 * motion, 0.1 * (observations.sigma or 0.0)):
         if observations.sigma is None:

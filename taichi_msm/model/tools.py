@@ -194,7 +194,7 @@ def path_problems(scene: Scene, tools: Sequence[Tool], grid: TimeGrid) -> Iterat
         if isinstance(tool, Clamp):
             yield from _clamp_problems(tool, scene)
             continue
-        depth = tool.radius - _distance_to_sheet(tool, scene.sheet)
+        depth = tool.radius - distance_to_sheet(tool, scene.sheet)
         if depth > 1e-9 * tool.radius:
             text = f"the instrument is {depth:.3g} m in the sheet at rest at 0 s; begin above it, at a greater height"
             yield Problem(key, text)
@@ -337,7 +337,7 @@ def _axis_distance(a: Tool, b: Tool, offset: Array) -> Array:
     return distance
 
 
-def _distance_to_sheet(tool: Tool, sheet: Sheet) -> float:
+def distance_to_sheet(tool: Tool, sheet: Sheet) -> float:
     """Return the distance of a tool's axis at 0 s from the sheet at rest [m]."""
     start, half = tool.tip_centre(np.zeros(1))[0], np.array([sheet.size[1] / 2, sheet.size[0] / 2, 0.0])
 

@@ -1,0 +1,150 @@
+"""Forward model of machine tests: a run per test with the same parameters, and the forces at its frames."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.errors import Pause, SceneError
+from taichi_msm.fitting.machine_test import Approach, Loading
+from taichi_msm.fitting.observations import Forces, Observations
+from taichi_msm.fitting.parameters import Bounds, Parameter, make_parameters, with_values
+from taichi_msm.fitting.predict import FitProblem, ForwardModel, Prediction
+from taichi_msm.load.check import check_scene
+from taichi_msm.model.plan import Plan
+from taichi_msm.runs.simulation import Simulation
+from taichi_msm.scene.scene import Scene
+
+Array = NDArray[np.float64]
+
+
+def contact_keys(count: int) -> list[str]:
+    """Return the keys of the depths of contact of a number of tests."""
+    return ["contact"] if count == 1 else [f"contact.{n}" for n in range(count)]
+
+
+@dataclass(frozen=True, eq=False)
+class MachineProblem(FitProblem):
+    """Scene, parameters and machine tests of a fit."""
+
+    tests: tuple[Loading, ...]
+    approach: Approach
+
+    def build_model(self, threads: int | None) -> ForwardModel:
+        """Build the forward model of the tests."""
+        return MachineModel(self, threads)
+
+    def fitted_data(self, data: dict[str, Any], values: Mapping[str, float]) -> dict[str, Any]:
+        """Return a scene's data with parameter values by key, and with the path and the times of the first test."""
+        return self.place(data, values, 0)
+
+    def place(self, data: dict[str, Any], values: Mapping[str, float], n: int) -> dict[str, Any]:
+        """Return a scene's data with parameter values, by key, and with the path and the times of test n."""
+        of_scene = [parameter for parameter in self.parameters if parameter.key not in contact_keys(len(self.tests))]
+        data = with_values(data, of_scene, [values[parameter.key] for parameter in of_scene])
+        return self.tests[n].place(data, self.approach, values.get(contact_keys(len(self.tests))[n]))
+
+
+class MachineModel(ForwardModel):
+    """Forward model of machine tests; its values are empty, its forces of shape (frames of all tests, 1)."""
+
+    job: MachineProblem
+
+    def predict(
+        self,
+        x: Array,
+        steps: int | None = None,
+        *,
+        coarse: int = 0,
+        to_end: bool = False,  # noqa: ARG002  # The runs end with their tests.
+        pause: Pause = lambda: None,
+    ) -> Prediction:
+        """Simulate all tests with the parameters at x; arguments and errors as of `ForwardModel.predict`."""
+        forces, most_steps = [], 0
+        for n in range(len(self.job.tests)):
+            simulation, plan = self.start(self.plan(x, n), steps, coarse)
+            forces.append(self._forces(simulation, plan.grid.frames, pause))
+            most_steps = max(most_steps, plan.grid.steps_per_frame)
+        return Prediction(np.empty((0, 0, 3)), np.concatenate(forces)[:, None], most_steps, np.zeros(1))
+
+    def plan(self, x: Array, n: int = 0) -> Plan:
+        """Plan the scene of test n with the parameters at x; SceneError: it is not valid."""
+        values = {
+            parameter.key: parameter.value(coordinate)
+            for parameter, coordinate in zip(self.job.parameters, x.tolist(), strict=True)
+        }
+        if not np.isfinite(list(values.values())).all():
+            raise SceneError(["the values are out of range"])
+        return check_scene(Scene(**self.job.place(self.data, values, n)), self.maps)
+
+    def _forces(self, simulation: Simulation, frames: int, pause: Pause) -> Array:
+        """Return the forces along the tool's direction at the frames of a run [N], shape (frames + 1,)."""
+        forces = []
+        for frame in range(frames + 1):
+            simulation.advance(min(frame, 1), pause)
+            forces.append(simulation.forces()[self.job.approach.probe].force)
+        return np.array(forces) @ self.job.approach.direction
+
+
+def machine_parameters(
+    scene: Scene, tests: Sequence[Loading], free: Sequence[str], bounds: Mapping[str, Bounds], probe: int
+) -> tuple[Parameter, ...]:
+    """Build the parameters of the keys `free`, among them depths of contact.
+
+    Args:
+        scene: the scene with its initial values.
+        tests: the machine tests.
+        free: keys.
+        bounds: smallest and largest values by key.
+        probe: index of the tool.
+
+    Raises:
+        SceneError: lists all faults.
+    """
+    contacts = contact_keys(len(tests))
+    for key in free:
+        if key.partition(".")[0] == "contact" and key not in contacts:
+            raise SceneError([f"--free {key}: there is no such table; take {' or '.join(contacts)}"])
+        if f"{key}.".startswith(f"probes.{probe}.path."):
+            raise SceneError([f"--free {key}: the path is that of the table; name contact, its depth of contact"])
+    of_scene = [key for key in free if key not in contacts]
+    parameters = {}
+    if of_scene or not free:
+        limits = {key: ends for key, ends in bounds.items() if key not in free or key not in contacts}
+        parameters = {parameter.key: parameter for parameter in make_parameters(scene, of_scene, limits)}
+    for key, test in zip(contacts, tests, strict=True):
+        if key in free:
+            parameters[key] = _contact_parameter(key, test, bounds.get(key))
+    return tuple(parameters[key] for key in free)
+
+
+def _contact_parameter(key: str, test: Loading, bounds: Bounds | None) -> Parameter:
+    """Build the parameter of a depth of contact [m of the table], in units of the range of depths."""
+    low, high = test.contact_range
+    if bounds is not None:
+        low, high = max(low, bounds[0]), min(high, bounds[1])
+    if not (low <= test.contact <= high and low < high):
+        end = test.contact_range[1]
+        found = f"the search begins at {test.contact:.4g} m, and the table's depths end at {end:.4g} m"
+        raise SceneError([f"--bounds {key}: {found}; take bounds around the start, or another start by --contact"])
+    return Parameter(key, test.contact, low, high, high - low)
+
+
+def observe_tests(tests: Sequence[Loading]) -> Observations:
+    """Return the forces of machine tests as observations without points."""
+    name = ", ".join(loading.test.name for loading in tests)
+    lengths = [len(loading.force) for loading in tests]
+    forces = Forces(
+        name,
+        np.concatenate([loading.scene_time for loading in tests]),
+        np.repeat(np.arange(len(tests)), lengths),
+        np.concatenate([loading.force for loading in tests])[:, None],
+        np.repeat([loading.noise for loading in tests], lengths),
+    )
+    empty = np.empty((0, 0, 3))
+    # The unit of no value; with a sigma, none is estimated.
+    return Observations(name, "position", np.empty(0), np.empty((0, 2)), empty, 1.0, forces)

@@ -1,0 +1,233 @@
+"""Test of a testing machine as a scene, whose position-controlled tool follows the depths of the table.
+
+The tool moves along a line, from the first contact with the sheet at rest. Until the table's depth exceeds the depth of
+contact, it waits there.
+
+Frames are equidistant in time. The equilibria of tissue without relaxation do not depend on time: their frames are
+equidistant in depth, from slightly above the contact to the greatest depth, and later rows are not used. The depth and
+the force of a frame are means over the rows within half a frame, or interpolated if there are none.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.errors import SceneError
+from taichi_msm.fitting.machine_tables import MachineTest
+from taichi_msm.model.tools import Tool, build_tools, distance_to_sheet
+from taichi_msm.scene.scene import Scene
+
+Array = NDArray[np.float64]
+
+# Default frames per second, and largest number of frames at this default.
+FRAMES_PER_SECOND, MAX_FRAMES = 10.0, 200
+
+# Frames of an equilibrium without relaxation, and the share of the depths that they cover above the contact.
+DEPTH_FRAMES, MARGIN_SHARE = 100, 0.05
+
+# Rows from which the noise is estimated.
+NOISE_SHARE, MIN_NOISE_ROWS = 0.05, 10
+
+# Ratio of the standard deviation to the median of the magnitudes, of normal errors.
+DEVIATION_PER_MEDIAN = 1.48
+
+# Forces above this are due to contact [noise].
+CONTACT_NOISES = 5.0
+
+# Accuracy of predicted forces, as a share of the peak: the smallest noise.
+FORCE_ACCURACY = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class Approach:
+    """Line of a position-controlled tool, from its first contact with the sheet at rest."""
+
+    probe: int  # index of the tool in the scene
+    start: Array  # centre of the tip at first contact [m], shape (3,)
+    direction: Array  # unit vector, shape (3,)
+    radius: float  # of the tip [m]
+    size: tuple[float, float]  # height and width of the sheet [m]
+
+    def keyframes(self, times: Array, travel: Array) -> list[list[float]]:
+        """Return the path of the tool.
+
+        Args:
+            times: times of the keyframes [s], shape (n,).
+            travel: distance from the first contact at these times [m], shape (n,).
+
+        Returns:
+            Keyframes [t, across, down, height].
+        """
+        height, width = self.size
+        x, y, z = (self.start + travel[:, None] * self.direction).T
+        return np.stack([times, x / width + 0.5, 0.5 - y / height, z - self.radius], axis=1).tolist()
+
+
+def find_approach(scene: Scene) -> Approach:
+    """Return the line of the scene's tool; SceneError: not one position-controlled tool, or it misses the sheet."""
+    tools = build_tools(scene.probes, scene.sheet)
+    if len(tools) != 1:
+        fault = f"{len(tools)} position-controlled tools, and a table of a testing machine is of one"
+        raise SceneError([f"probes: {fault}; give one probe a path and an instrument, and no other"])
+    (tool,) = tools
+    key, offsets = f"probes.{tool.probe}.path", tool.tip_centres - tool.tip_centres[0]
+    farthest = offsets[np.linalg.norm(offsets, axis=1).argmax()]
+    if not farthest.any():
+        raise SceneError([f"{key}: stays at one place; give it a second key, in the direction of the test"])
+    direction = farthest / np.linalg.norm(farthest)
+    start = _first_contact(tool, direction, scene)
+    if start is None:
+        raise SceneError([f"{key}: the line from its first key to the farthest misses the sheet; direct it there"])
+    return Approach(tool.probe, start, direction, tool.radius, scene.sheet.size)
+
+
+def _first_contact(tool: Tool, direction: Array, scene: Scene) -> Array | None:
+    """Return the centre of the tip at first contact [m], shape (3,); None if the tool misses the sheet."""
+    start, tolerance = tool.tip_centres[0], 1e-9 * tool.radius
+    travel, reach = 0.0, float(np.linalg.norm(start)) + tool.length + math.hypot(*scene.sheet.size)
+    # The distance from the sheet changes by at most the travel, so that the tool may advance by it (sphere tracing).
+    for _ in range(1000):
+        centre = start + travel * direction
+        placed = replace(tool, times=np.zeros(1), tip_centres=centre[None], heights=centre[2:] - tool.radius)
+        gap = distance_to_sheet(placed, scene.sheet) - tool.radius
+        if gap <= tolerance:
+            return np.asarray(centre)
+        travel += gap
+        if travel > reach:
+            break
+    return None
+
+
+@dataclass(frozen=True, eq=False)
+class Loading:
+    """A machine test at the frames of its scene."""
+
+    test: MachineTest  # with the mean force before contact subtracted
+    rate: float  # frames per second of the scene
+    time: Array  # of the table at every frame [s], shape (frames,)
+    depth: Array  # of the table at every frame [m], shape (frames,)
+    force: Array  # measured, along the tool's direction [N], shape (frames,)
+    noise: float  # standard deviation of the force [N]
+    contact: float  # depth of contact [m of the table]
+
+    @property
+    def scene_time(self) -> Array:
+        """Times of the frames in the scene [s], shape (frames,)."""
+        return np.arange(len(self.depth)) / self.rate
+
+    @property
+    def peak(self) -> float:
+        """Largest measured force of a frame [N]."""
+        return float(self.force.max())
+
+    @property
+    def contact_range(self) -> tuple[float, float]:
+        """Smallest and largest depth of contact with a motion of the tool [m of the table]."""
+        return float(self.depth[0]), float(self.depth.max())
+
+    def travel(self, contact: float | None = None) -> Array:
+        """Return the distance of the tool from its first contact at every frame [m], shape (frames,)."""
+        travel = np.maximum(self.depth - (self.contact if contact is None else contact), 0.0)
+        travel[0] = 0.0
+        return travel
+
+    def place(self, data: dict[str, Any], approach: Approach, contact: float | None = None) -> dict[str, Any]:
+        """Return a scene's data with the path of the tool, and the times, of this test.
+
+        Args:
+            data: a scene.
+            approach: line of its tool.
+            contact: depth of contact [m of the table]; None: that of the test.
+        """
+        probes = list(data["probes"])
+        path = approach.keyframes(self.scene_time, self.travel(contact))
+        probes[approach.probe] = {**probes[approach.probe], "path": path}
+        times = {"duration": (len(self.depth) - 1) / self.rate, "frames_per_second": self.rate}
+        return {**data, "probes": probes, "time": {**data["time"], **times}}
+
+
+def build_loading(test: MachineTest, scene: Scene, rate: float | None = None, contact: float | None = None) -> Loading:
+    """Compute noise, contact and frames of a machine test.
+
+    Args:
+        test: the test.
+        scene: the scene; its motion and relaxation determine the frames.
+        rate: frames per second; None: 10 or less, or equidistant in depth.
+        contact: depth of contact [m of the table]; None: found from the forces.
+
+    Raises:
+        SceneError: when the force does not rise with the depth, or the depth of contact is outside the table.
+    """
+    count = max(MIN_NOISE_ROWS, math.ceil(NOISE_SHARE * len(test.force)))
+    offset = float(np.median(test.force[:count]))
+    noise = max(DEVIATION_PER_MEDIAN * float(np.median(np.abs(test.force[:count] - offset))), test.digit)
+    test = replace(test, force=test.force - offset, time=test.time - test.time[0])
+    peak = int(test.force.argmax())
+    noise = max(noise, FORCE_ACCURACY * float(test.force[peak]))
+    # The last row without a significant force before the peak; the first row if there is none.
+    without_force = np.flatnonzero(test.force[: peak + 1] <= CONTACT_NOISES * noise)
+    contact_row = int(without_force[-1]) if len(without_force) else 0
+    if contact_row == peak:
+        fault = f"the force never exceeds its noise, {noise:.3g} N, by {CONTACT_NOISES:g} times"
+        raise SceneError([f"{test.name}: {fault}; choose the force by --columns, or cut the table by --window"])
+    if test.depth[peak] <= test.depth[contact_row]:
+        fault = (
+            f"the depth falls from {test.depth[contact_row]:.4g} to {test.depth[peak]:.4g} m while the force rises to "
+            f"{test.force[peak]:.4g} N: is it counted against the motion of the tool?"
+        )
+        raise SceneError([f"{test.name}: {fault} Choose another by --columns, or change its sign"])
+    if contact is None:
+        contact = float(test.depth[contact_row])
+    elif not test.depth.min() <= contact < test.depth.max():
+        limits = f"{test.depth.min():.4g} to {test.depth.max():.4g} m"
+        raise SceneError([f"--contact {contact:g}: {test.name}: the depths of the table are {limits}"])
+    if rate is None and scene.time.at_rest and not (scene.tissue and scene.tissue.relaxation):
+        return _in_depth(test, noise, contact)
+    if rate is None:
+        rate = min(FRAMES_PER_SECOND, MAX_FRAMES / float(test.time[-1]))
+    frames = max(1, math.ceil(float(test.time[-1]) * rate - 1e-6))
+    time = np.arange(frames + 1) / rate
+    depth, force = _means(test.time, time, 0.5 / rate, (test.depth, test.force))
+    return Loading(test, rate, time, depth, force, noise, contact)
+
+
+def _in_depth(test: MachineTest, noise: float, contact: float) -> Loading:
+    """Compute frames that are equidistant in depth, up to the greatest one."""
+    rows = int(test.depth.argmax()) + 1
+    deepest = float(test.depth[rows - 1])
+    first = max(contact - MARGIN_SHARE * (deepest - contact), float(test.depth[:rows].min()))
+    depth = np.linspace(first, deepest, DEPTH_FRAMES + 1)
+    order = np.argsort(test.depth[:rows], kind="stable")
+    half = 0.5 * (depth[1] - depth[0])
+    columns = [values[:rows][order] for values in (test.depth, test.force, test.time)]
+    depth, force, time = _means(columns[0], depth, half, columns)
+    return Loading(test, DEPTH_FRAMES / max(float(test.time[rows - 1]), 1e-3), time, depth, force, noise, contact)
+
+
+def _means(coordinate: Array, at: Array, half_width: float, columns: Sequence[Array]) -> list[Array]:
+    """Average columns over the rows within `half_width` of each coordinate, or interpolate them.
+
+    Args:
+        coordinate: of every row, increasing, shape (rows,).
+        at: coordinates of the results, shape (n,).
+        half_width: largest distance of averaged rows.
+        columns: values of every row, each of shape (rows,).
+
+    Returns:
+        The means of each column, shape (n,).
+    """
+    # Rows on the border of two frames belong to both, up to rounding.
+    reach = half_width * (1 + 1e-6)
+    low, high = np.searchsorted(coordinate, at - reach, "left"), np.searchsorted(coordinate, at + reach, "right")
+    means = []
+    for column in columns:
+        sums = np.append(0.0, np.cumsum(column))
+        mean = (sums[high] - sums[low]) / np.maximum(high - low, 1)
+        means.append(np.where(high > low, mean, np.interp(at, coordinate, column)))
+    return means
