@@ -280,7 +280,11 @@ def run_warnings(
     if progress.max_displacement == 0 and progress.frame > 0:
         yield "nothing moved: does a probe press where and when it should?"
     foundation = scene.tissue.foundation if scene.tissue is not None else None
-    if isinstance(foundation, Foundation) and progress.deepest > MAX_DEPTH_RATIO * foundation.depth:
+    if (
+        isinstance(foundation, Foundation)
+        and not foundation.lock
+        and progress.deepest > MAX_DEPTH_RATIO * foundation.depth
+    ):
         yield (
             f"the sheet was pressed {1000 * progress.deepest:.3g} mm into the {1000 * foundation.depth:.3g} mm of "
             "tissue.foundation.depth: beyond a third tissue gets much stiffer than this foundation, so that the true "

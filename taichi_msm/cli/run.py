@@ -218,7 +218,7 @@ def _lock_cost(plan: Plan) -> str:
 
     linear = replace(plan.material, stiffening=None, virtual_stiffening=None)
     ratio = stable_step(linear, plan.scene.sheet, plan.scene.time.damping_difference) / plan.stable_step
-    return f", {ratio:.2g} times shorter than without lock" if ratio > 1 else ""
+    return f", {ratio:.2g} times shorter than without lock" if ratio > 1.01 else ""
 
 
 @program.command()

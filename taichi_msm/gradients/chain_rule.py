@@ -180,9 +180,11 @@ def _material_paths(scene: Scene) -> Iterator[tuple[str, ...]]:
         static = [("springs", name) for name in ("structural", "shear", "virtual")]
         dynamic = [("sheet", "mass"), ("damping",)]
     elif isinstance(scene.tissue.foundation, Foundation):
-        foundation = ["young", "depth", *(("lock", "factor") if scene.tissue.foundation.lock else ())]
+        law = scene.tissue.foundation
+        foundation = ["young", "depth", *(("lock", "factor") if law.lock and law.factor > 1 else ())]
         static[2:3] = [("tissue", "foundation", name) for name in foundation]
-    if scene.tissue is not None and scene.tissue.stiffening is not None:
+    # A factor of 1 is a linear law, which has no derivative by it.
+    if scene.tissue is not None and scene.tissue.stiffening is not None and scene.tissue.stiffening.factor > 1:
         static += [("tissue", "stiffening", name) for name in ("lock", "factor")]
     for path in static if scene.time.at_rest else static + dynamic:
         value = _value(scene, path)

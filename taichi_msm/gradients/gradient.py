@@ -30,7 +30,9 @@ Array = NDArray[np.float64]
 def require_differentiable(plan: Plan) -> None:
     """Raise a SceneError if a scene has position-controlled tools or stress relaxation, and thus no gradient."""
     if plan.material.relaxation:
-        raise SceneError(["tissue.relaxation: has no gradient; remove it, or fit such scenes by differences"])
+        raise SceneError(
+            ["tissue.relaxation: has no gradient, and no map is fitted with it; remove it, or fit numbers"]
+        )
     for tool in plan.tools:
         reason = "a tool with a path has no gradient, as points meet and leave it; fit such scenes by differences"
         raise SceneError([f"probes.{tool.probe}.path: {reason}"])

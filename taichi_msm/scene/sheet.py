@@ -87,7 +87,7 @@ class Stiffening(Section):
 
 
 class RelaxationBranch(Section):
-    """RelaxationBranch of the stress relaxation."""
+    """Branch of the stress relaxation."""
 
     share: OpenUnitInterval = key(..., "share of the elastic forces that relaxes", "a number above 0 and below 1")
     time: Positive = key(..., "relaxation time [s]", "a number above 0, in s")
@@ -115,7 +115,7 @@ class Foundation(Section):
 
     @model_validator(mode="after")
     def _check_factor(self) -> Self:
-        if self.lock is None and self.factor != Foundation.model_fields["factor"].default:
+        if self.lock is None and "factor" in self.model_fields_set:
             raise scene_fault("goes with lock; give lock, a depth in metres, or remove factor", "factor")
         return self
 

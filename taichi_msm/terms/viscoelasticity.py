@@ -27,8 +27,8 @@ from taichi_msm.model.plan import Plan
 from taichi_msm.scene.scene import Scene
 from taichi_msm.terms.base import KernelConfig, Term
 
-# Columns of the load table: the factor of f; at rest, whether the memory changes; for each branch the factors of s and
-# of f in its next memory.
+# Columns of the load table: the factor of f; at rest, whether the memory changes; for each branch g = 1 - exp(-x) and
+# c, with which s decreases by g (s + c f). In f32, exp(-x) itself would lose the digits of a small x.
 FACTOR, UPDATE, BRANCHES, BRANCH_COLUMNS = 0, 1, 2, 2
 
 
@@ -65,13 +65,13 @@ class ViscoelasticTerm(Term):
         """Compute the factors of every step, or of the frame; see `Term.columns`."""
         h = 1 / plan.grid.frames_per_second if self.at_rest else plan.grid.step
         shares, times = np.array(plan.material.relaxation).T
-        decay = np.exp(-h / times)
-        phi = -np.expm1(-h / times) / (h / times)
+        decrease = -np.expm1(-h / times)
+        phi = decrease / (h / times)
         columns = np.empty((len(loads.active), self.column_count))
         columns[:, FACTOR], columns[:, UPDATE] = 1 - shares.sum() + (shares * phi).sum(), 0
-        columns[:, BRANCHES::2], columns[:, BRANCHES + 1 :: 2] = decay, -shares * phi * (1 - decay)
+        columns[:, BRANCHES::2], columns[:, BRANCHES + 1 :: 2] = decrease, shares * phi
         if self.at_rest and first == 0:
-            columns[:, FACTOR], columns[:, BRANCHES + 1 :: 2] = 1, shares * (decay - phi)
+            columns[:, FACTOR], columns[:, BRANCHES + 1 :: 2] = 1, shares * (phi - 1 + decrease) / decrease
         return columns
 
     def mark_update(self, columns: NDArray[Any]) -> bool:
@@ -97,8 +97,8 @@ class ViscoelasticTerm(Term):
                     force[c] += s
                     if ti.static(at_rest):
                         if now[first + UPDATE] > 0:
-                            sheet.fields[place] = now[column] * s + now[column + 1] * elastic
+                            sheet.fields[place] = s - now[column] * (s + now[column + 1] * elastic)
                     else:
-                        sheet.fields[place] = now[column] * s + now[column + 1] * elastic
+                        sheet.fields[place] = s - now[column] * (s + now[column + 1] * elastic)
 
         return (relax,)
