@@ -6,11 +6,13 @@ import json
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from taichi_msm import SceneError, Simulation, fit, load_scene
+from taichi_msm.cli.fit import parse_window
 from taichi_msm.fitting.machine_fit import FittedTest, explanations
 from taichi_msm.fitting.machine_tables import MachineTest
 from taichi_msm.fitting.machine_test import CONTACT_NOISES, DEPTH_FRAMES, MAX_FRAMES, build_loading, find_approach
@@ -280,7 +282,7 @@ def test_reasons_are_those_that_the_table_shows(case: str, message: Messages) ->
         ({"free": ["contact.1"]}, "contact.1"),
         ({"free": ["probes.0.path.0.3"]}, "path"),
         ({"free": ["contact"], "bounds": {"contact": (5e-3, 6e-3)}}, "bounds"),
-        ({"rate": 0.25}, "frames"),
+        ({"rate": 0.1}, "frames"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
@@ -288,6 +290,12 @@ def test_options_of_other_fits_are_refused(pressed: str, options: dict[str, Any]
     free = ["tissue.foundation.young", "tissue.foundation.lock"]
     with message.raises(SceneError, word):
         fit(scene(), pressed, **{"free": free, **options})
+
+
+def test_a_window_is_two_numbers(message: Messages) -> None:
+    assert parse_window("0.5,12") == (0.5, 12.0)
+    with message.raises(click.BadParameter, "0.5"):
+        parse_window("0.5")
 
 
 def test_several_files_that_are_not_tables_are_refused(message: Messages) -> None:
