@@ -226,6 +226,7 @@ def test_the_depth_of_contact_is_found_within_bounds(pressed: str) -> None:
     assert result.tests[0].contact == contact.value
 
 
+@pytest.mark.slow
 def test_several_tables_have_the_same_tissue_and_contacts_of_their_own(pressed: str) -> None:
     result = fit(
         scene(relaxation=[BRANCH], foundation={**FOUNDATION, "young": 1.5e4}),
@@ -239,6 +240,7 @@ def test_several_tables_have_the_same_tissue_and_contacts_of_their_own(pressed: 
     assert result.tests[1].contact == pytest.approx(CONTACT, abs=2e-5)
 
 
+@pytest.mark.slow
 def test_a_share_without_information_is_not_identifiable(pressed: str) -> None:
     branches = [BRANCH, {"share": 1e-3, "time": 1e4}]
     free = ["tissue.relaxation.1.share", "tissue.relaxation.1.time"]
@@ -247,6 +249,7 @@ def test_a_share_without_information_is_not_identifiable(pressed: str) -> None:
     assert sum(branch.share for branch in result.scene.tissue.relaxation) < 1 if result.scene.tissue else False
 
 
+@pytest.mark.slow
 def test_a_model_without_relaxation_is_rejected_with_the_reason(pressed: str, message: Messages) -> None:
     result = fit(scene(), pressed, ["tissue.foundation.young"], contact=[CONTACT], workers=1)
     assert result.model_rejected

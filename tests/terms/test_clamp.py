@@ -108,6 +108,7 @@ def test_lanes_workers_and_passes_do_not_change_the_bits(case: str, device: Devi
     assert states(made, device, as_on_a_gpu(layout)) == plain
 
 
+@pytest.mark.slow
 def test_bending_at_a_clamp_has_the_same_bits_on_two_workers_and_a_gpu(device: Device) -> None:
     made = CASES["tension and bending"]
     made = made.model_copy(update={"time": made.time.model_copy(update={"duration": 0.08})})
