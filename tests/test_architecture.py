@@ -14,7 +14,7 @@ PACKAGE = Path(__file__).parent.parent / "taichi_msm"
 LAYERS = [
     {"errors", "plot_style", "version"},
     {"system"},
-    {"images"},
+    {"images", "lenses"},
     {"scene"},
     {"model"},
     {"terms"},
