@@ -18,6 +18,7 @@ from benchmarks.race import Progress
 from benchmarks.whole_run import SCENE, command
 from taichi_msm.model.surface import place_capsules
 from taichi_msm.render.camera import view
+from taichi_msm.render.labels import requested_labels
 from taichi_msm.render.rasterizer import Rasterizer, drawing_config
 from taichi_msm.render.tracking import compute_flow
 from taichi_msm.scene import outputs
@@ -66,7 +67,8 @@ def variants(problem: Problem) -> dict[str, Callable[[], Any]]:
         return problem.scene.model_copy(update={"render": render})
 
     def picture(made: Scene, *, picture: bool = True, labels: bool = False) -> Callable[[], Any]:
-        drawing = Rasterizer(made, problem.texture, drawing_config(made, picture=picture, labels=labels))
+        names = requested_labels(()) if labels else frozenset[str]()
+        drawing = Rasterizer(made, problem.texture, drawing_config(made, picture=picture, labels=names))
         return lambda: drawing.look(position, None, place_capsules(made, position, 0.2))
 
     def pinhole(lens: dict[str, Any]) -> Scene:

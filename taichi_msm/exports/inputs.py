@@ -132,8 +132,8 @@ def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
     with reading(path):
         # The limit is sufficient for 100,000 poses.
         camera = json.loads(read_regular(run.require_own_file(path, "tracks"), 1 << 25))
-        # A fisheye lens distorts even without coefficients.
-        is_distorted = camera.get("model") == "fisheye" or bool(np.any(camera.get("distortion", ())))
+        # Lenses other than the rational one distort even without coefficients.
+        is_distorted = camera.get("model", "pinhole") != "pinhole" or bool(np.any(camera.get("distortion", ())))
         is_pinhole = "intrinsics" in camera
     if not is_pinhole:
         fault = f"{name} needs a pinhole, and {path} has none"

@@ -23,6 +23,7 @@ from taichi_msm.accuracy.companions import choose_companion_runs
 from taichi_msm.errors import Problem, SceneError
 from taichi_msm.model.plan import Plan
 from taichi_msm.render import texture
+from taichi_msm.render.labels import LABELS
 from taichi_msm.scene.camera import Camera
 from taichi_msm.scene.outputs import OUTPUTS
 from taichi_msm.scene.scene import Scene
@@ -51,7 +52,7 @@ IMAGE_PIXEL_BYTES = 20  # per pixel of the image file, while it is decoded and c
 DISTORTION_BYTES = 100  # per sample with lens distortion, while the undistortion map is computed and copied
 VIDEO_PIXEL_BYTES = 80  # per pixel of a video, mostly in the frames of the encoder's look-ahead
 LABEL_PIXEL_BYTES = 60  # per pixel with labels
-NORMAL_PIXEL_BYTES = 24  # per pixel with a normal
+LABEL_PLANE_BYTES = 8  # per pixel and value of an optional label
 TRACK_BYTES = 21  # per tracked point and frame, until the run ends
 
 # Upper bounds of the overhead of a file, without a byte per row of a PNG, and of run.json without its scene [bytes].
@@ -214,7 +215,8 @@ def drawing_bytes(scene: Scene) -> int:
     distorted = sum(isinstance(camera, Camera) and camera.distortion is not None for camera in cameras)
     sample_bytes += width * height * factor**2 * DISTORTION_BYTES * distorted
     pixel_bytes = PIXEL_BYTES + (LABEL_PIXEL_BYTES if scene.labels_pixels else 0)
-    pixel_bytes += NORMAL_PIXEL_BYTES if "normals" in scene.output else 0
+    optional = (label for name, label in LABELS.items() if label.is_optional and name in scene.output)
+    pixel_bytes += sum(LABEL_PLANE_BYTES * len(label.planes) for label in optional)
     pixel_bytes += VIDEO_PIXEL_BYTES if "mp4" in scene.output else 0
     pixels = width * height * len(cameras)
     return rows * cols * POINT_BYTES + sample_bytes + pixels * pixel_bytes + image_pixels * IMAGE_PIXEL_BYTES

@@ -1,47 +1,23 @@
-"""Cameras: extrinsics over time, projection matrices, and lens distortion.
-
-Lens distortion follows OpenCV's rational and fisheye models. It maps normalised image coordinates (x, y), the
-intersection of a line of sight with the plane at depth 1 in OpenCV's axes (x right, y down), to distorted ones. With
-r = |(x, y)| and q = r^2, the rational model is
-
-    x' = x R + 2 p1 x y + p2 (q + 2 x^2),    y' = y R + p1 (q + 2 y^2) + 2 p2 x y,
-    R = (1 + k1 q + k2 q^2 + k3 q^3) / (1 + k4 q + k5 q^2 + k6 q^3),
-
-and the fisheye, with t = atan(r),    (x', y') = (x, y) t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) / r.
-
-Source: OpenCV's documentation of calib3d, "Detailed Description" and "Fisheye camera model".
-"""
+"""Cameras: extrinsics over time, projection matrices, and lens distortion (lens.py) in pixels."""
 
 from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Sequence
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
 from taichi_msm.errors import Key, Problem, SceneError
+from taichi_msm.lenses.model import MAX_RADIUS
+from taichi_msm.render.lens import IDENTITY_LENS, Lens
 from taichi_msm.scene.camera import Camera
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import FRAME_TOLERANCE, MAX_SUPERSAMPLE, MIN_MAGNITUDE
 
 Array = NDArray[np.float64]
-
-# Maximum valid radius of any lens.
-MAX_RADIUS = math.tan(math.radians(88))
-
-# Smaller coefficients have no effect within the maximum radius, and division by them may overflow.
-MIN_COEFFICIENT = 1e-100
-
-# Maximum residual of the undistortion, in normalised image coordinates; well below 1e-6 px.
-UNDISTORTION_TOLERANCE = 1e-11
-
-# At smaller radii the quotient t / r of a fisheye is rounded to 1.
-MIN_RADIUS = 1e-8
 
 # The oblique preset: direction of the eye, 50 degrees above the sheet at its lower edge; field of view [degrees].
 OBLIQUE_DIRECTION = np.array([0.0, -0.64, 0.77])
@@ -58,158 +34,6 @@ MAX_GAP_S, MAX_GAP_RATIO = 1e5, 5
 
 # Signs that convert the axes right, up, toward the camera to OpenCV's right, down, forward.
 OPENCV_SIGNS = np.array([[1.0], [-1.0], [-1.0]])
-
-
-class Lens(NamedTuple):
-    """A lens distortion model and its coefficients.
-
-    Attributes:
-        fisheye: whether the model is the fisheye; otherwise it is the rational model.
-        coefficients: all coefficients of the model, in OpenCV's order.
-    """
-
-    fisheye: bool
-    coefficients: tuple[float, ...]
-
-    @property
-    def limit(self) -> float:
-        """Largest valid radius r: the distortion folds back there, or the angle from the axis reaches 88 degrees."""
-        return _limit(self)
-
-    def distort(self, points: Array) -> Array:
-        """Return the distorted coordinates of normalised image coordinates, both of shape (..., 2)."""
-        return self._distort_with_jacobian(points)[0]
-
-    def jacobian(self, points: Array) -> Array:
-        """Return the Jacobian of `distort`, shape (..., 2, 2); the rows are those of the distorted coordinates."""
-        return self._distort_with_jacobian(points)[1]
-
-    def undistort(self, distorted: Array) -> Array:
-        """Invert `distort` by Newton's method, starting from the solution without tangential distortion.
-
-        Args:
-            distorted: distorted normalised image coordinates, shape (..., 2).
-
-        Returns:
-            Undistorted coordinates, shape (..., 2); NaN without a solution within the limit of the lens.
-        """
-        limit = self.limit
-        # Without the limit itself, which may be a pole.
-        radii = limit * np.sin(np.linspace(0, np.pi / 2, 4097)[:-1])
-        distorted_radius = np.linalg.norm(distorted, axis=-1, keepdims=True)
-        radius = np.interp(distorted_radius, self._radial_distortion(radii)[0], radii)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            points = np.where(distorted_radius > 0, distorted * (radius / distorted_radius), 0.0)
-        error = np.full(distorted_radius.shape[:-1], np.inf)
-        for _ in range(50):
-            image, jacobian = self._distort_with_jacobian(points)
-            residual = distorted - image
-            error = np.abs(residual).max(axis=-1)
-            if not (error > UNDISTORTION_TOLERANCE).any():
-                break
-            (a, b), (c, d) = np.moveaxis(jacobian, (-2, -1), (0, 1))
-            with np.errstate(invalid="ignore", divide="ignore"):
-                step = np.stack(
-                    [d * residual[..., 0] - b * residual[..., 1], a * residual[..., 1] - c * residual[..., 0]], axis=-1
-                )
-                points = points + step / (a * d - b * c)[..., None]
-                # Beyond the limit there may be a second solution.
-                points *= np.minimum(1, limit / np.linalg.norm(points, axis=-1, keepdims=True))
-        is_converged = (error <= UNDISTORTION_TOLERANCE) & (np.linalg.norm(points, axis=-1) < limit)
-        return np.where(is_converged[..., None], points, np.nan)
-
-    def _radial_distortion(self, r: Array) -> tuple[Array, Array]:
-        """Return the distorted radius R r without tangential distortion, and its derivative with respect to r."""
-        if self.fisheye:
-            t = np.arctan(r)
-            polynomial = _fisheye_polynomial(self)
-            return polynomial(t), polynomial.deriv()(t) / (1 + r * r)
-        numerator, denominator = _rational_factors(self)
-        q = r * r
-        ratio = numerator(q) / denominator(q)
-        slope = (numerator.deriv()(q) - ratio * denominator.deriv()(q)) / denominator(q)
-        return r * ratio, ratio + 2 * q * slope
-
-    def _distort_with_jacobian(self, points: Array) -> tuple[Array, Array]:
-        x, y = points[..., 0], points[..., 1]
-        q = x * x + y * y
-        r = np.sqrt(q)
-        distorted_radius, growth = self._radial_distortion(r)
-        is_central = r < MIN_RADIUS
-        safe_radius = np.where(is_central, 1.0, r)
-        ratio = np.where(is_central, 1.0, distorted_radius / safe_radius)
-        # The derivative of the ratio with respect to r, divided by r.
-        slope = np.where(is_central, 0.0, (growth - ratio) / (safe_radius * safe_radius))
-        p1, p2 = (0.0, 0.0) if self.fisheye else self.coefficients[2:4]
-        distorted = np.stack(
-            [x * ratio + 2 * p1 * x * y + p2 * (q + 2 * x * x), y * ratio + p1 * (q + 2 * y * y) + 2 * p2 * x * y],
-            axis=-1,
-        )
-        dx_dy = slope * x * y + 2 * p1 * x + 2 * p2 * y
-        dx_dx = ratio + slope * x * x + 2 * p1 * y + 6 * p2 * x
-        dy_dy = ratio + slope * y * y + 6 * p1 * y + 2 * p2 * x
-        return distorted, np.stack([np.stack([dx_dx, dx_dy], axis=-1), np.stack([dx_dy, dy_dy], axis=-1)], axis=-2)
-
-
-def _rational_factors(lens: Lens) -> tuple[Polynomial, Polynomial]:
-    """Return numerator and denominator of R as polynomials in q."""
-    k1, k2, _, _, k3, k4, k5, k6 = lens.coefficients
-    return Polynomial([1, k1, k2, k3]), Polynomial([1, k4, k5, k6])
-
-
-def _fisheye_polynomial(lens: Lens) -> Polynomial:
-    """Return the distorted radius of a fisheye as a polynomial in t."""
-    k1, k2, k3, k4 = lens.coefficients
-    return Polynomial([0, 1, 0, k1, 0, k2, 0, k3, 0, k4])
-
-
-@lru_cache(maxsize=16)
-def _limit(lens: Lens) -> float:
-    """Compute the least radius at which the distortion folds or has a pole, at most `MAX_RADIUS`."""
-    if lens.fisheye:
-        fold_angles = _positive_roots(_fisheye_polynomial(lens).deriv())
-        return min(MAX_RADIUS, math.tan(min([*fold_angles, math.radians(88)])))
-    numerator, denominator = _rational_factors(lens)
-    q = Polynomial([0, 1])
-    growth = (numerator + 2 * q * numerator.deriv()) * denominator - 2 * q * numerator * denominator.deriv()
-    radial = float(min([MAX_RADIUS, *np.sqrt([*_positive_roots(growth), *_positive_roots(denominator)])]))
-    tangential = math.hypot(*lens.coefficients[2:4])
-    if tangential <= MIN_COEFFICIENT:
-        return radial
-    # The first fold due to tangential distortion is searched among these radii, and then refined.
-    radii = radial * np.linspace(0, 1, 4097)[:-1]
-    folded_indices = np.flatnonzero(_min_determinant(lens, radii, tangential) <= 0)
-    if not len(folded_indices):
-        return radial
-    from scipy.optimize import brentq
-
-    return float(
-        brentq(lambda r: _min_determinant(lens, r, tangential), radii[folded_indices[0] - 1], radii[folded_indices[0]])
-    )
-
-
-def _min_determinant(lens: Lens, r: Any, tangential: float) -> Any:
-    """Return the minimum of the Jacobian's determinant over all points at a radius r.
-
-    With a = `tangential` r, and g the derivative of R r, the determinant is g R - 4 a^2 + 2 a (g + 3 R) c + 16 a^2 c^2,
-    where c is the cosine of the angle between the point and (p2, p1). The Jacobian is symmetric, and on the axis it is
-    the identity; so the lens does not fold within a circle where the minimum is positive.
-    """
-    r = np.maximum(r, MIN_RADIUS)
-    distorted_radius, g = lens._radial_distortion(r)
-    ratio, a = distorted_radius / r, tangential * r
-    c = np.maximum(-(g + 3 * ratio) / (16 * a), -1)
-    return g * ratio - 4 * a * a + 2 * a * (g + 3 * ratio) * c + 16 * a * a * c * c
-
-
-def _positive_roots(polynomial: Polynomial) -> list[float]:
-    # Leading zeros would add roots at infinity.
-    roots = polynomial.trim(MIN_COEFFICIENT).roots()
-    return [float(root.real) for root in roots if root.real > 0 and abs(root.imag) <= 1e-9 * abs(root)]
-
-
-# The lens without distortion.
-IDENTITY_LENS = Lens(fisheye=False, coefficients=(0.0,) * 8)
 
 
 class View(NamedTuple):
@@ -252,8 +76,8 @@ class View(NamedTuple):
 
     @property
     def lens_model(self) -> str:
-        """Lens model, "pinhole" or "fisheye"; empty without lens distortion."""
-        return "" if self.lens is None else "fisheye" if self.lens.fisheye else "pinhole"
+        """Name of the lens model; empty without lens distortion."""
+        return "" if self.lens is None else self.lens.model
 
     @property
     def optics(self) -> tuple[object, ...]:
@@ -320,7 +144,7 @@ def calibration(camera: View) -> dict[str, Any]:
         lens distortion. For a pinhole camera also, in OpenCV's axes (x right, y down, z forward), "pose": 3 x 4 matrix
         from the world to the camera; "intrinsics": 3 x 3 matrix to the same pixels; "calibration": 3 x 3 matrix to
         OpenCV's pixels, where the centre of the first one is (0, 0); "model" and "distortion": lens model and its
-        coefficients in OpenCV's order.
+        coefficients in its order.
     """
     matrices: dict[str, Any] = {"projection": camera.matrix[:3].tolist()}
     if camera.pinhole:
@@ -329,7 +153,7 @@ def calibration(camera: View) -> dict[str, Any]:
         matrices["pose"] = pose(camera)
         lens = camera.lens or IDENTITY_LENS
         matrices["calibration"] = [[focal_x, 0.0, x - 0.5], [0.0, focal_y, y - 0.5], [0.0, 0.0, 1.0]]
-        matrices["model"] = "fisheye" if lens.fisheye else "pinhole"
+        matrices["model"] = lens.model
         matrices["distortion"] = list(lens.coefficients)
     return matrices
 
@@ -587,7 +411,7 @@ def _pinhole(camera: Camera, scene: Scene, time: float) -> View:
     matrix = np.array([[*row, -row @ eye] for row in rows])
     near, size = 1e-6 * math.hypot(*scene.sheet.size), np.array([columns, lines], float)
     distortion = camera.distortion
-    lens = None if distortion is None else Lens(distortion.model == "fisheye", distortion.coefficients)
+    lens = None if distortion is None else Lens(distortion.model, distortion.coefficients)
     scale, centre = np.array([focal_x, focal_y]), np.array([x, y])
     lens = None if lens == IDENTITY_LENS else lens
     return View(matrix, near, axes, eye, scale, centre, size, distance, pinhole=True, lens=lens)

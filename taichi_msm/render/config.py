@@ -22,7 +22,7 @@ Arguments that the functions of kernel 2 share, and that their docstrings omit:
     entry                 first entry of a tile in the G-buffer
     left, top             first column and row of a tile [samples]
     x, y                  columns and rows of the undistorted samples of a tile, one number per lane
-    lens                  lens model, "pinhole" or "fisheye"; empty without lens distortion
+    lens                  name of the lens model; empty without lens distortion
     first, end, ended     first index of a launch; index after the last one; counter of finished threads (`end_thread`)
 
 Modules with kernels have no `from __future__ import annotations`, because Taichi reads the annotations.
@@ -65,9 +65,8 @@ class DrawingConfig(NamedTuple):
         instruments: whether the scene has instruments.
         metal: whether instruments are shaded.
         picture: whether colours are written.
-        labels: whether labels are written; requires one sample per pixel.
-        normals: whether the labels include normals.
-        lens: lens model, "pinhole" or "fisheye"; empty without lens distortion.
+        labels: names of the labels that are written; they require one sample per pixel.
+        lens: name of the lens model; empty without lens distortion.
         lanes: number of samples in a tile.
     """
 
@@ -81,8 +80,7 @@ class DrawingConfig(NamedTuple):
     instruments: bool
     metal: bool
     picture: bool
-    labels: bool
-    normals: bool
+    labels: frozenset[str]
     lens: str
     lanes: int
 
@@ -168,8 +166,7 @@ class DrawingConfig(NamedTuple):
 def _planes(config: DrawingConfig) -> Any:
     """Number the planes that a configuration needs."""
     needed = {
-        **{name: config.labels for label in LABELS.values() for name in label.planes},
-        **dict.fromkeys(LABELS["normals"].planes, config.normals),
+        **{plane: name in config.labels for name, label in LABELS.items() for plane in label.planes},
         **dict.fromkeys(("depth", "texel_x", "texel_y"), True),  # of the visible surface; texture coordinates [texels]
         "light": config.headlit,  # reflected share of the headlight
         "wire": config.wireframe,  # opacity of the mesh's lines

@@ -325,7 +325,7 @@ def cover_tile_with_capsule(entry, x, y, index, band: ti.template()):
         store_visible(entry + plane.normal_x, visible, n_x, samples)
         store_visible(entry + plane.normal_y, visible, n_y, samples)
         store_visible(entry + plane.normal_z, visible, n_z, samples)
-    if ti.static(band.config.normals):
+    if ti.static("normals" in band.config.labels):
         # In OpenCV's axes.
         store_visible_unit(entry + plane.facet_x, visible, [n_x, n_y * (-1.0), n_z * (-1.0)], samples)
 
@@ -505,10 +505,10 @@ def store_surface(
     along = (quad_row + t) * quad_side
     store_visible(entry + plane.texel_x, visible, cell.fraction_x + across * cell.texels_across + cell.texel_x, samples)
     store_visible(entry + plane.texel_y, visible, cell.fraction_y + along * cell.texels_down + cell.texel_y, samples)
-    if ti.static(config.labels):
+    if ti.static("coordinates" in config.labels):
         store_visible(entry + plane.across, visible, (cell.j + across) / cell.cols, samples)
         store_visible(entry + plane.down, visible, (cell.i + along) / cell.rows, samples)
-    if ti.static(config.normals):
+    if ti.static("normals" in config.labels):
         store_visible_unit(entry + plane.facet_x, visible, facet(x, y, triangle, band.uniforms), samples)
     if ti.static(config.headlit):
         normal = normal_at(across, along, cell, sheet)

@@ -14,7 +14,7 @@ from taichi_msm.render import uniforms as uni
 from taichi_msm.render.config import INFINITY, Band, Bytes, DrawingConfig, Floats, Integers, clear_tile
 from taichi_msm.render.coverage import NORMAL_STRIDE, DrawnSheet, cover_capsules, cover_cell, store_normal
 from taichi_msm.render.geometry import NODE_STRIDE, SCREEN, may_cover_rows, project
-from taichi_msm.render.labels import label_width
+from taichi_msm.render.labels import label_offsets
 from taichi_msm.render.lens_kernels import DISTORTED_STRIDE, store_distorted
 from taichi_msm.render.lens_table import bounds, tiled_map
 from taichi_msm.render.shading import Appearance, PixelArrays, resolve
@@ -87,7 +87,7 @@ class Bands:
         # Without labels the argument is unused; passing a Taichi array takes half the time of a NumPy array.
         labels: Any = self._nodes
         if config.labels:
-            labels = np.zeros(label_width(normals=config.normals) * width * height, np.float32)
+            labels = np.zeros(label_offsets(config.labels)[""] * width * height, np.float32)
         sizes[[uni.ROWS_TAKEN, uni.ROWS_PROJECTED, uni.BANDS_TAKEN]] = 0
         with compilation_options(optimised=False):
             self._draw(

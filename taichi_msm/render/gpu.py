@@ -26,7 +26,7 @@ from taichi_msm.render.geometry import (
     project,
     triangle_bounds,
 )
-from taichi_msm.render.labels import label_width
+from taichi_msm.render.labels import label_offsets
 from taichi_msm.render.lens_kernels import DISTORTED_STRIDE, store_distorted
 from taichi_msm.render.shading import Appearance, PixelArrays, resolve
 from taichi_msm.system.launches import VULKAN_THREADS, Launches, end_thread
@@ -66,7 +66,7 @@ class Threads:
             config.float_vector, height * config.supersample * samples_across * config.map_planes + strip
         )
         self._colours = launches.array(np.uint8, 3 * width * height if config.picture else 1)
-        label_count = label_width(normals=config.normals) if config.labels else 0
+        label_count = label_offsets(config.labels)[""]
         self._labels = launches.array(np.float32, max(label_count * width * height, 1))
 
     def set_undistortion_map(self, table: NDArray[np.float32]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from itertools import accumulate
 from typing import Any, NamedTuple
 
@@ -42,60 +43,70 @@ class Label(NamedTuple):
         missing_value: value in pixels without a visible surface.
         sheet_only: whether pixels of instruments also have the missing value.
         dtype: type of the values.
-        offset: number of values per pixel of the labels before it.
+        is_optional: whether it is written only on request.
     """
 
     planes: tuple[str, ...]
     missing_value: float
     sheet_only: bool
     dtype: type[np.generic]
-    offset: int = 0
+    is_optional: bool = False
 
 
-def _consecutive(**labels: Label) -> dict[str, Label]:
-    """Assign consecutive offsets to the labels."""
-    offsets = accumulate((len(label.planes) for label in labels.values()), initial=0)
-    return {name: label._replace(offset=offset) for (name, label), offset in zip(labels.items(), offsets, strict=False)}
+# The fields of `Labels`.
+LABELS = {
+    "coordinates": Label(("across", "down"), math.nan, sheet_only=True, dtype=np.float32),
+    "depth": Label(("depth",), 0.0, sheet_only=False, dtype=np.float32),
+    "instrument": Label(("instrument",), 0.0, sheet_only=False, dtype=np.uint8),
+    "normals": Label(("facet_x", "facet_y", "facet_z"), math.nan, sheet_only=False, dtype=np.float32, is_optional=True),
+}
 
 
-# The fields of `Labels`. Normals come last, because they are optional.
-LABELS = _consecutive(
-    coordinates=Label(("across", "down"), math.nan, sheet_only=True, dtype=np.float32),
-    depth=Label(("depth",), 0.0, sheet_only=False, dtype=np.float32),
-    instrument=Label(("instrument",), 0.0, sheet_only=False, dtype=np.uint8),
-    normals=Label(("facet_x", "facet_y", "facet_z"), math.nan, sheet_only=False, dtype=np.float32),
-)
+def requested_labels(outputs: Collection[str]) -> frozenset[str]:
+    """Return the names of the labels that outputs need: the optional ones among them, and all others."""
+    return frozenset(name for name, label in LABELS.items() if name in outputs or not label.is_optional)
 
 
-def label_width(*, normals: bool) -> int:
-    """Return the number of values per pixel, with or without normals."""
-    return LABELS["normals"].offset + normals * len(LABELS["normals"].planes)
+def label_offsets(names: Collection[str]) -> dict[str, int]:
+    """Return the number of values per pixel before each label, and under "" that of all."""
+    chosen = [name for name in LABELS if name in names]
+    counts = accumulate((len(LABELS[name].planes) for name in chosen), initial=0)
+    return dict(zip([*chosen, ""], counts, strict=True))
 
 
-def label_channels(plane: Any) -> list[tuple[int, int, int, Label]]:
+def label_channels(plane: Any, names: Collection[str]) -> list[tuple[int, int, int, int, Label]]:
     """List the G-buffer planes that contain labels; a label without planes is 0.
 
     Args:
         plane: index of each plane of the G-buffer, by name.
+        names: names of the labels that are written.
 
     Returns:
-        For each plane its index, its position in the label, the number of planes of the label, and the label.
+        For each plane its index, the number of values per pixel before the label, its position in the label, the number
+        of planes of the label, and the label.
     """
     return [
-        (getattr(plane, name), n, len(label.planes), label)
-        for label in LABELS.values()
-        for n, name in enumerate(label.planes)
-        if hasattr(plane, name)
+        (getattr(plane, plane_name), offset, n, len(LABELS[name].planes), LABELS[name])
+        for name, offset in label_offsets(names).items()
+        if name
+        for n, plane_name in enumerate(LABELS[name].planes)
+        if hasattr(plane, plane_name)
     ]
 
 
-def labels_of(numbers: NDArray[np.float32], size: tuple[int, int]) -> Labels:
-    """Convert the output of kernel 2 to labels, for a picture of a size (width, height) [px]."""
+def labels_of(numbers: NDArray[np.float32], size: tuple[int, int], names: Collection[str]) -> Labels:
+    """Convert the output of kernel 2 to labels.
+
+    Args:
+        numbers: values of the pixels, one label after the other.
+        size: width and height of the picture [px].
+        names: names of the labels that are written.
+    """
     (width, height), arrays = size, {}
-    for name, label in LABELS.items():
-        count = len(label.planes)
-        values = numbers.reshape(-1, width * height)[label.offset : label.offset + count]
-        if len(values):
+    for name, offset in label_offsets(names).items():
+        if name:
+            label, count = LABELS[name], len(LABELS[name].planes)
+            values = numbers.reshape(-1, width * height)[offset : offset + count]
             arrays[name] = values.reshape((height, width, count)[: 2 + (count > 1)]).astype(label.dtype, copy=False)
     # Rounding may move coordinates beyond the sheet's edge.
     arrays["coordinates"] = arrays["coordinates"].clip(0, 1)

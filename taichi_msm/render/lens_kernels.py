@@ -1,9 +1,15 @@
 """Lens distortion in kernels: distorted points, and bounding boxes of distorted cells and triangles.
 
-The formulas are those of camera.py, the bounds those of `lens_table.VisibleRegion`. Undistorted points are in samples
-of the picture of the same camera without lens distortion.
+The formulas are those of `lenses`, the bounds those of `lens_table.VisibleRegion`. Undistorted points are in samples of
+the picture of the same camera without lens distortion.
 """
 
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+from taichi_msm.lenses import MODELS
+from taichi_msm.lenses.model import Operations
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.lens_table import INVALID_COORDINATE
 from taichi_msm.system.runtime import ti
@@ -33,6 +39,12 @@ def arctangent(tangent):
     return total * half_tangent * 2.0**HALVINGS
 
 
+@cache
+def compile_lens(lens: str) -> Callable[..., Any]:
+    """Wrap the formula of a lens model for kernels."""
+    return ti.func(MODELS[lens].build(Operations(ti.sqrt, arctangent, ti.max, ti.func)))
+
+
 @ti.func
 def distorted_point(x, y, uniforms: ti.template(), lens: ti.template()):
     """Distort a point.
@@ -48,23 +60,12 @@ def distorted_point(x, y, uniforms: ti.template(), lens: ti.template()):
     if not is_valid:
         factor = uniforms[uni.LENS_RADIUS] / ti.sqrt(squared_radius)
         a, b = a * factor, b * factor
-    k = [uniforms[uni.LENS + n] for n in ti.static(range(8))]
-    q = a * a + b * b
-    if ti.static(lens == "fisheye"):
-        r = ti.max(ti.sqrt(q), 1e-8)
-        t = arctangent(r)
-        p = t * t
-        ratio = t * (1.0 + p * (k[0] + p * (k[1] + p * (k[2] + p * k[3])))) / r
-        a, b = a * ratio, b * ratio
-    else:
-        ratio = (1.0 + q * (k[0] + q * (k[1] + q * k[4]))) / (1.0 + q * (k[5] + q * (k[6] + q * k[7])))
-        mixed = 2.0 * a * b
-        distorted_a = a * ratio + k[2] * mixed + k[3] * (q + 2.0 * a * a)
-        b = b * ratio + k[2] * (q + 2.0 * b * b) + k[3] * mixed
-        a = distorted_a
+    k = [uniforms[uni.LENS + n] for n in ti.static(range(len(MODELS[lens].coefficients)))]
+    distort = ti.static(compile_lens(lens))
+    distorted_a, distorted_b = distort(a, b, *k)
     return (
-        uniforms[uni.PICTURE_X] + uniforms[uni.FOCAL_X] * a,
-        uniforms[uni.PICTURE_Y] + uniforms[uni.FOCAL_Y] * b,
+        uniforms[uni.PICTURE_X] + uniforms[uni.FOCAL_X] * distorted_a,
+        uniforms[uni.PICTURE_Y] + uniforms[uni.FOCAL_Y] * distorted_b,
         is_valid,
     )
 

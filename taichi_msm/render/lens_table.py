@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.render.camera import Lens, View, border_points
+from taichi_msm.render.camera import View, border_points
+from taichi_msm.render.lens import Lens
 
 if TYPE_CHECKING:
     from taichi_msm.render.config import DrawingConfig

@@ -8,7 +8,7 @@ to the machine code (docs/decisions/0010); casts, floor and abs of vectors are w
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -28,15 +28,14 @@ from taichi_msm.system.runtime import lanes
 
 
 def drawing_config(
-    scene: Scene, *, picture: bool = True, labels: bool = False, normals: bool = False, lens: str | None = None
+    scene: Scene, *, picture: bool = True, labels: Collection[str] = (), lens: str | None = None
 ) -> DrawingConfig:
     """Return the compile-time configuration of kernel 2 for a scene.
 
     Args:
         scene: the scene.
         picture: whether colours are drawn.
-        labels: whether labels are written; with a picture, this requires one sample per pixel.
-        normals: whether the labels include normals.
+        labels: names of the labels that are written; with a picture, they require one sample per pixel.
         lens: lens model of the camera, as `View.lens_model`; by default that of the scene's main camera.
     """
     render = scene.render
@@ -52,8 +51,7 @@ def drawing_config(
         instruments=scene.has_instruments,
         metal=picture and scene.has_instruments,
         picture=picture,
-        labels=labels,
-        normals=labels and normals,
+        labels=frozenset(labels),
         lens=view_at(scene, 0.0).lens_model if lens is None else lens,
         lanes=lanes("f32"),
     )
@@ -112,7 +110,7 @@ class Rasterizer:
         picture, labels = self._backend.draw(np.ascontiguousarray(position, np.float32), uniforms, self._sizes)
         return FrameOutputs(
             np.ascontiguousarray(picture) if self.config.picture else None,
-            labels_of(labels, self.scene.render.size) if self.config.labels else None,
+            labels_of(labels, self.scene.render.size, self.config.labels) if self.config.labels else None,
         )
 
     def _update_undistortion_map(self, camera: View) -> None:

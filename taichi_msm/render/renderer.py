@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from taichi_msm.errors import ArgumentError, as_array, did_you_mean, is_real_array
 from taichi_msm.model.surface import Capsule
 from taichi_msm.render.camera import View, is_moving, view, view_at
-from taichi_msm.render.labels import Flow, FrameOutputs, Labels, Sight, Stereo, track_grid
+from taichi_msm.render.labels import LABELS, Flow, FrameOutputs, Labels, Sight, Stereo, requested_labels, track_grid
 from taichi_msm.render.texture import load_texture
 from taichi_msm.scene.camera import Camera
 from taichi_msm.scene.render import PRESETS, Render
@@ -100,23 +100,24 @@ class Renderer:
         Returns:
             Colours, shape (height, width, 3).
         """
-        return self._rasterizer(style, picture=True, labels=False, camera=shot.view).draw(*shot)
+        return self._rasterizer(style, picture=True, camera=shot.view).draw(*shot)
 
     def is_compiled(self, style: Render, camera: View) -> bool:
         """Return whether the kernel of `draw` is compiled already, for a style and a camera."""
-        return self._key(style, picture=True, labels=False, camera=camera) in self._rasterizers
+        return self._key(style, picture=True, camera=camera) in self._rasterizers
 
     def kernels(self) -> tuple[object, ...]:
         """Return all compile-time settings of the kernels of `observe`, as a cache key."""
         from taichi_msm.render.rasterizer import drawing_config
 
         scene, lenses = self.scene, [view.lens_model for view in self._views.values()]
-        config_of = partial(drawing_config, scene, picture=scene.draws, labels=scene.labels_pixels)
+        labels = requested_labels(scene.output) if scene.labels_pixels else ()
+        config_of = partial(drawing_config, scene, picture=scene.draws, labels=labels)
         return (*(config_of(lens=lens) for lens in lenses), scene.output)
 
     def labels(self, shot: Shot) -> Labels:
         """Return the labels of a shot, with normals."""
-        return self._labels(shot, normals=True)
+        return self._labels(shot, LABELS)
 
     def flow(self, before: Labels, shot: Shot) -> Flow:
         """Compute the optical flow to a shot.
@@ -166,13 +167,13 @@ class Renderer:
         scene = self.scene
         # Labels require a sample at the centre of each pixel, which supersampling does not have.
         is_single_sample = scene.render.supersample == 1
-        normals = "normals" in scene.output
+        requested = requested_labels(scene.output)
         observed = FrameOutputs()
         if scene.draws:
-            labels = scene.labels_pixels and is_single_sample
-            observed = self._rasterizer(picture=True, labels=labels, normals=normals, camera=shot.view).look(*shot)
+            labels = requested if scene.labels_pixels and is_single_sample else frozenset[str]()
+            observed = self._rasterizer(picture=True, labels=labels, camera=shot.view).look(*shot)
         if scene.labels_pixels and observed.labels is None:
-            observed = observed._replace(labels=self._labels(shot, normals=normals))
+            observed = observed._replace(labels=self._labels(shot, requested))
         if observed.labels is not None and scene.asks_for("stereo") and shot.view.baseline:
             observed = observed._replace(stereo=Stereo(shot.view.disparity(observed.labels.depth)))
         if before is not None and scene.asks_for("flow"):
@@ -185,30 +186,27 @@ class Renderer:
         """Free the memory."""
         self._rasterizers.clear()
 
-    def _labels(self, shot: Shot, *, normals: bool) -> Labels:
-        labels = self._rasterizer(picture=False, labels=True, normals=normals, camera=shot.view).look(*shot).labels
+    def _labels(self, shot: Shot, names: Collection[str]) -> Labels:
+        labels = self._rasterizer(picture=False, labels=names, camera=shot.view).look(*shot).labels
         assert labels is not None
         return labels
 
     def _rasterizer(
-        self, style: Render | None = None, *, picture: bool, labels: bool, camera: View, normals: bool = False
+        self, style: Render | None = None, *, picture: bool, labels: Collection[str] = (), camera: View
     ) -> Rasterizer:
-        key = self._key(style or self.scene.render, picture=picture, labels=labels, camera=camera, normals=normals)
+        key = self._key(style or self.scene.render, picture=picture, labels=labels, camera=camera)
         if key not in self._rasterizers:
             from taichi_msm.render.rasterizer import Rasterizer, drawing_config
 
             scene = self.scene if style is None else self.scene.model_copy(update={"render": style})
             texture = self._texture() if picture else np.zeros((1, 1, 3), np.uint8)
-            config = drawing_config(scene, picture=picture, labels=labels, normals=normals, lens=camera.lens_model)
+            config = drawing_config(scene, picture=picture, labels=labels, lens=camera.lens_model)
             self._rasterizers[key] = Rasterizer(scene, texture, config)
         return self._rasterizers[key]
 
-    def _key(
-        self, style: Render, *, picture: bool, labels: bool, camera: View, normals: bool = False
-    ) -> tuple[object, ...]:
+    def _key(self, style: Render, *, picture: bool, labels: Collection[str] = (), camera: View) -> tuple[object, ...]:
         """Return all settings in which the rasterisers of this scene differ."""
-        outputs = picture, labels, labels and normals
-        return *outputs, camera.optics, style.shading, style.wireframe, self.scene.has_instruments
+        return picture, frozenset(labels), camera.optics, style.shading, style.wireframe, self.scene.has_instruments
 
     def _texture(self) -> NDArray[np.uint8]:
         """Return the texture, loaded again only if the scene names another picture."""

@@ -171,22 +171,22 @@ def write_labels(
         row, end_row: first row of pixels; end of the rows that are written.
         output: arrays of the picture, written.
     """
-    plane, channels = ti.static((config.plane, label_channels(config.plane)))
+    plane, channels = ti.static((config.plane, label_channels(config.plane, config.labels)))
     is_covered = samples[entry + plane.depth] < INFINITY
     is_sheet = is_covered
     if ti.static(config.instruments):
         is_sheet = is_sheet & (samples[entry + plane.instrument] <= 0.0)
     values = [
-        ti.select(is_sheet if ti.static(label.sheet_only) else is_covered, samples[entry + offset], label.missing_value)
-        for offset, _number, _count, label in ti.static(channels)
+        ti.select(is_sheet if ti.static(label.sheet_only) else is_covered, samples[entry + vector], label.missing_value)
+        for vector, _offset, _number, _count, label in ti.static(channels)
     ]
     for line in ti.static(range(config.tile_height)):
         for n in ti.static(range(config.tile_width)):
             if row + line < end_row and left + n < width:
                 pixel = (row + line) * width + left + n
                 for channel, value in ti.static(zip(channels, values, strict=True)):
-                    _, number, count, label = ti.static(channel)
-                    index = label.offset * output.pixels + count * pixel + number
+                    _, first, number, count = ti.static(channel[:4])
+                    index = first * output.pixels + count * pixel + number
                     output.labels[index] = value[line * config.tile_width + n]
 
 
@@ -211,7 +211,7 @@ def resolve(
         for tile in range(left * factor // tile_width, (right * factor + tile_width - 1) // tile_width):
             entry = first + (tile_row * tiles_across + tile) * config.planes
             column, top = tile * tile_width, tile_row * tile_height
-            if ti.static(config.labels):
+            if ti.static(len(config.labels) > 0):
                 write_labels(entry, column, row + top, end_row, width, samples, output, config)
             if ti.static(config.picture):
                 map_entry = map_start + (tile_row * tiles_across + tile) * config.map_planes

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import pairwise
 from typing import Annotated, Any, Literal
 
@@ -11,12 +12,15 @@ from pydantic import (
     StrictBool,
     ValidationError,
     ValidationInfo,
+    create_model,
     field_validator,
     model_serializer,
     model_validator,
 )
 from typing_extensions import Self
 
+from taichi_msm.lenses import MODELS
+from taichi_msm.lenses.model import MAX_COEFFICIENT
 from taichi_msm.scene.calibration import CameraFileError, pose_fault, read_calibration, read_poses
 from taichi_msm.scene.section import (
     MIN_FOV,
@@ -30,15 +34,9 @@ from taichi_msm.scene.section import (
     scene_fault,
 )
 
-# Coefficients of OpenCV's models of lens distortion, in its order.
-COEFFICIENTS = {
-    "pinhole": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
-    "fisheye": ("k1", "k2", "k3", "k4"),
-}
-
-_MAX_COEFFICIENT = 1e6
-_COEFFICIENT = f"a number, {-_MAX_COEFFICIENT:g} to {_MAX_COEFFICIENT:g}"
-Coefficient = Annotated[Number, Field(ge=-_MAX_COEFFICIENT, le=_MAX_COEFFICIENT)]
+_COEFFICIENT = "a number, {:g} to {:g}"
+Coefficient = Annotated[Number, Field(ge=-MAX_COEFFICIENT, le=MAX_COEFFICIENT)]
+_ANY_COEFFICIENT = _COEFFICIENT.format(-MAX_COEFFICIENT, MAX_COEFFICIENT)
 
 
 class Intrinsics(Section):
@@ -46,35 +44,54 @@ class Intrinsics(Section):
 
     fx: Positive = key(..., "horizontal focal length [px]", "a number above 0, in pixels")
     fy: Positive = key(..., "vertical focal length [px]", "a number above 0, in pixels")
-    cx: Coefficient = key(..., "horizontal principal point [px]; the centre of the first pixel is 0", _COEFFICIENT)
-    cy: Coefficient = key(..., "vertical principal point [px]; the centre of the first pixel is 0", _COEFFICIENT)
+    cx: Coefficient = key(..., "horizontal principal point [px]; the centre of the first pixel is 0", _ANY_COEFFICIENT)
+    cy: Coefficient = key(..., "vertical principal point [px]; the centre of the first pixel is 0", _ANY_COEFFICIENT)
 
 
-class Distortion(Section):
-    """Lens distortion: OpenCV's rational model or its fisheye model."""
+def _alternatives(names: Iterable[str]) -> str:
+    *others, last = names
+    return f"{', '.join(others)} or {last}" if others else last
 
-    model: Literal["pinhole", "fisheye"] = key(
-        "pinhole", "pinhole: OpenCV's rational model; fisheye: its fisheye model, with k1 to k4", "pinhole or fisheye"
+
+class _Model(Section):
+    model: Literal[tuple(MODELS)] = key(  # type: ignore[valid-type]
+        "pinhole",
+        "; ".join(f"{name}: {model.meaning}" for name, model in MODELS.items()),
+        _alternatives(MODELS),
     )
-    k1: Coefficient = key(0.0, "radial coefficient", _COEFFICIENT)
-    k2: Coefficient = key(0.0, "radial coefficient", _COEFFICIENT)
-    k3: Coefficient = key(0.0, "radial coefficient", _COEFFICIENT)
-    k4: Coefficient = key(0.0, "radial coefficient; of the rational model in the denominator", _COEFFICIENT)
-    k5: Coefficient = key(0.0, "radial coefficient in the denominator", _COEFFICIENT)
-    k6: Coefficient = key(0.0, "radial coefficient in the denominator", _COEFFICIENT)
-    p1: Coefficient = key(0.0, "tangential coefficient", _COEFFICIENT)
-    p2: Coefficient = key(0.0, "tangential coefficient", _COEFFICIENT)
+
+
+def _coefficient_keys() -> dict[str, Any]:
+    """Return the keys of all coefficients, for pydantic; a key of several models has the meaning of the first."""
+    coefficients = {name: row for model in reversed(MODELS.values()) for name, row in model.coefficients.items()}
+    return {
+        name: (
+            Annotated[Number, Field(ge=row.least, le=MAX_COEFFICIENT)],
+            key(0.0, row.meaning, _COEFFICIENT.format(row.least, MAX_COEFFICIENT)),
+        )
+        for name, row in sorted(coefficients.items())
+    }
+
+
+_Coefficients: Any = create_model("_Coefficients", __base__=_Model, **_coefficient_keys())
+
+
+class Distortion(_Coefficients):  # type: ignore[misc]
+    """Lens distortion: a lens model and its coefficients, a key each."""
 
     @property
     def coefficients(self) -> tuple[float, ...]:
-        """Coefficients of the model, in OpenCV's order."""
-        return tuple(getattr(self, name) for name in COEFFICIENTS[self.model])
+        """Coefficients of the model, in its order."""
+        return tuple(getattr(self, name) for name in MODELS[self.model].coefficients)
 
     @model_validator(mode="after")
     def _check_coefficients_of_model(self) -> Self:
-        for name in sorted(self.model_fields_set - {"model", *COEFFICIENTS[self.model]}):
+        own = MODELS[self.model].coefficients
+        for name in sorted(self.model_fields_set - {"model", *own}):
             if getattr(self, name):
-                raise scene_fault("goes with model: pinhole; a fisheye has k1, k2, k3 and k4", name)
+                models = _alternatives(model for model, row in MODELS.items() if name in row.coefficients)
+                *names, last = own
+                raise scene_fault(f"goes with model: {models}; a {self.model} has {', '.join(names)} and {last}", name)
         return self
 
 
@@ -115,7 +132,7 @@ class Camera(Section):
     distortion: Distortion | None = key(
         None,
         "lens distortion, in OpenCV's terms",
-        "a mapping with k1, k2, p1, p2, k3 to k6, or with model: fisheye and k1 to k4",
+        "a mapping with k1, k2, p1, p2, k3 to k6, or with another model and its coefficients",
     )
     outside: Literal["refuse", "background"] = key(
         "refuse",
@@ -266,7 +283,7 @@ class Camera(Section):
         if any(calibration.coefficients):
             model = "fisheye" if calibration.fisheye else "pinhole"
             # OpenCV omits trailing coefficients of the rational model.
-            coefficients = zip(COEFFICIENTS[model], calibration.coefficients, strict=False)
+            coefficients = zip(MODELS[model].coefficients, calibration.coefficients, strict=False)
             update["distortion"] = {"model": model, **dict(coefficients)}
         elif calibration.fisheye:
             update["distortion"] = {"model": "fisheye"}

@@ -15,7 +15,7 @@ def distort(camera: View, x: Array, y: Array) -> tuple[Array, Array]:
     assert camera.lens is not None
     k = camera.lens.coefficients
     r = np.hypot(x, y)
-    if camera.lens.fisheye:
+    if camera.lens.model == "fisheye":
         t = np.arctan(r)
         ratio = t * (1 + k[0] * t**2 + k[1] * t**4 + k[2] * t**6 + k[3] * t**8) / np.maximum(r, 1e-9)
         return x * ratio, y * ratio

@@ -12,7 +12,7 @@ from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.surface import place_capsules
 from taichi_msm.render import tracking
 from taichi_msm.render.camera import view
-from taichi_msm.render.labels import Labels
+from taichi_msm.render.labels import Labels, requested_labels
 from taichi_msm.render.rasterizer import Rasterizer, drawing_config
 from taichi_msm.render.renderer import Renderer, Shot
 from taichi_msm.render.tracking import compute_flow, locate_points
@@ -27,7 +27,7 @@ CAMERAS = pytest.mark.parametrize("camera", ["top", "oblique", NEAR], ids=["top"
 
 
 def look(made: Scene, position: Array) -> Labels:
-    config = drawing_config(made, picture=False, labels=True)
+    config = drawing_config(made, picture=False, labels=requested_labels(()))
     placed = place_capsules(made, position, 0)
     found = Rasterizer(made, np.zeros((1, 1, 3), np.uint8), config).look(position, rods=placed).labels
     assert found is not None

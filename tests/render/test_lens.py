@@ -11,11 +11,13 @@ import pytest
 from numpy.typing import NDArray
 
 from taichi_msm.errors import SceneError
+from taichi_msm.lenses import MODELS
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.surface import place_capsules
-from taichi_msm.render import tracking
-from taichi_msm.render.camera import Lens, calibration, view
+from taichi_msm.render import tracking, uniforms
+from taichi_msm.render.camera import calibration, view
 from taichi_msm.render.labels import track_grid
+from taichi_msm.render.lens import Lens
 from taichi_msm.render.picking import pick
 from taichi_msm.render.rasterizer import Rasterizer, drawing_config
 from taichi_msm.render.tracking import compute_flow, locate_points
@@ -54,12 +56,18 @@ def seen_through(lens: str, points: tuple[int, int] = (9, 11), **render: Any) ->
     return with_instruments(drawable(points, camera=camera, **render))
 
 
+PROJECT: dict[str, Any] = {
+    "pinhole": cv2.projectPoints,
+    "fisheye": cv2.fisheye.projectPoints,
+}
+
+
 def opencv(made: Scene, points: Array) -> Array:
     """Project points with OpenCV, from what camera.json says; indices of pixels, shape (n, 2)."""
     written = calibration(view(made))
     matrix, turn = np.array(written["calibration"]), np.array(written["pose"])
-    project = cv2.fisheye.projectPoints if written["model"] == "fisheye" else cv2.projectPoints
     distortion, axis = np.array(written["distortion"]), cv2.Rodrigues(turn[:, :3])[0]
+    project = PROJECT[written["model"]]
     return np.asarray(project(points.reshape(-1, 1, 3), axis, turn[:, 3], matrix, distortion)[0][:, 0])
 
 
@@ -77,11 +85,11 @@ def surface_positions(made: Scene, coordinates: Array, position: Array) -> Array
 @pytest.mark.parametrize(
     "lens",
     [
-        Lens(False, (-0.5, 0.2, 1e-3, -2e-3, 0, 0, 0, 0)),
-        Lens(False, (-0.5, 0, 0, 0, 0, 0, 0, 0)),
-        Lens(False, (0.3, 0.1, 1e-3, 1e-3, 0.05, 0.4, 0.1, 0.01)),
-        Lens(True, (-0.05, 0.01, -0.003, 0.001)),
-        Lens(True, (-0.5, 0, 0, 0)),
+        Lens("pinhole", (-0.5, 0.2, 1e-3, -2e-3, 0, 0, 0, 0)),
+        Lens("pinhole", (-0.5, 0, 0, 0, 0, 0, 0, 0)),
+        Lens("pinhole", (0.3, 0.1, 1e-3, 1e-3, 0.05, 0.4, 0.1, 0.01)),
+        Lens("fisheye", (-0.05, 0.01, -0.003, 0.001)),
+        Lens("fisheye", (-0.5, 0, 0, 0)),
     ],
     ids=str,
 )
@@ -90,8 +98,7 @@ def test_places_are_those_of_opencv_and_back(lens: Lens) -> None:
     away, turn = min(lens.limit * 0.98, 2.5) * rng.uniform(0, 1, 5000), rng.uniform(0, 2 * np.pi, 5000)
     place = np.stack([away * np.cos(turn), away * np.sin(turn)], axis=-1)
     points, none = np.concatenate([place, np.ones((5000, 1))], axis=1)[:, None], np.zeros(3)
-    project = cv2.fisheye.projectPoints if lens.fisheye else cv2.projectPoints
-    expected = project(points, none, none, np.eye(3), np.array(lens.coefficients))[0][:, 0]
+    expected = PROJECT[lens.model](points, none, none, np.eye(3), np.array(lens.coefficients))[0][:, 0]
     seen = lens.distort(place)
     np.testing.assert_allclose(seen, expected, atol=1e-13)
     # 1e-6 px where the focal length is 1000 px; nothing is nearer to the axis and seen there too.
@@ -102,7 +109,7 @@ def test_places_are_those_of_opencv_and_back(lens: Lens) -> None:
 
 
 def test_beyond_the_fold_there_is_nothing() -> None:
-    lens = Lens(False, (-0.5, 0, 0, 0, 0, 0, 0, 0))
+    lens = Lens("pinhole", (-0.5, 0, 0, 0, 0, 0, 0, 0))
     # r - r^3 / 2 is largest, sqrt(8 / 27), at r = sqrt(2 / 3).
     assert lens.limit == pytest.approx(np.sqrt(2 / 3))
     rim = np.sqrt(8 / 27)
@@ -110,18 +117,24 @@ def test_beyond_the_fold_there_is_nothing() -> None:
     np.testing.assert_array_equal(np.isnan(found[:, 0]), [False, False, True])
     np.testing.assert_array_equal(found[0], [0, 0])
     # Before a pole, here at r = sqrt(5), everything is seen.
-    lens = Lens(False, (-0.2, 0.02, 0, 0, 0, -0.2, 0, 0))
+    lens = Lens("pinhole", (-0.2, 0.02, 0, 0, 0, -0.2, 0, 0))
     place = np.array([[0.0, 1e-3], [0.0, 1.0], [2.0, 0.0], [2.2, 0.0]])
     np.testing.assert_allclose(lens.undistort(lens.distort(place)), place, atol=1e-9)
     # t - t^3 / 2 is largest at t = sqrt(2 / 3).
-    assert Lens(True, (-0.5, 0, 0, 0)).limit == pytest.approx(np.tan(np.sqrt(2 / 3)))
+    assert Lens("fisheye", (-0.5, 0, 0, 0)).limit == pytest.approx(np.tan(np.sqrt(2 / 3)))
+
+
+def test_every_lens_fits_into_the_uniforms() -> None:
+    assert max(len(model.coefficients) for model in MODELS.values()) <= uniforms.LENS_RADIUS - uniforms.LENS
 
 
 @pytest.mark.parametrize("key", range(8))
 def test_denormal_coefficients_change_nothing(key: int) -> None:
     """A polynomial that one of them leads would have zeros where numbers overflow."""
-    assert Lens(False, tuple(5e-324 * (each == key) for each in range(8))).limit == Lens(False, (0,) * 8).limit
-    assert Lens(True, tuple(5e-324 * (each == key % 4) for each in range(4))).limit == Lens(True, (0,) * 4).limit
+    assert Lens("pinhole", tuple(5e-324 * (each == key) for each in range(8))).limit == Lens("pinhole", (0,) * 8).limit
+    assert (
+        Lens("fisheye", tuple(5e-324 * (each == key % 4) for each in range(4))).limit == Lens("fisheye", (0,) * 4).limit
+    )
 
 
 @pytest.mark.parametrize(
@@ -136,14 +149,14 @@ def test_denormal_coefficients_change_nothing(key: int) -> None:
 )
 def test_tangential_distortion_folds_too(coefficients: tuple[float, ...]) -> None:
     """Where the determinant of the derivatives gets 0, at some angle, and not before."""
-    lens = Lens(False, coefficients)
+    lens = Lens("pinhole", coefficients)
     angle = np.linspace(0, 2 * np.pi, 721)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     least = [np.linalg.det(lens.jacobian(share * lens.limit * circle)).min() for share in np.linspace(0.01, 1.01, 101)]
     assert min(least[:-2]) > 0
     assert least[-1] < 0
     # Of y + 3 p1 y^2, the distorted place below the axis without all else, the derivative is 0 at y = -1 / (6 p1).
-    assert Lens(False, (0, 0, 0.05, 0, 0, 0, 0, 0)).limit == pytest.approx(1 / 0.3)
+    assert Lens("pinhole", (0, 0, 0.05, 0, 0, 0, 0, 0)).limit == pytest.approx(1 / 0.3)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from taichi_msm import Playback, Simulation, run
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.surface import Capsule, place_capsules
 from taichi_msm.render.camera import view
-from taichi_msm.render.labels import Labels
+from taichi_msm.render.labels import LABELS, Labels, requested_labels
 from taichi_msm.render.rasterizer import Rasterizer, drawing_config
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
@@ -37,7 +37,7 @@ EVERY_CAMERA = pytest.mark.parametrize("camera", CAMERAS)
 
 
 def look(made: Scene, position: Array, placed: list[Capsule] | None = None, **config: Any) -> Labels:
-    kernel = drawing_config(made, picture=False, labels=True, normals=True)._replace(**config)
+    kernel = drawing_config(made, picture=False, labels=LABELS)._replace(**config)
     found = Rasterizer(made, speckle(9, 9), kernel).look(position, rods=placed or []).labels
     assert found is not None
     return found
@@ -140,7 +140,8 @@ def test_other_labels_keep_their_bits(device: Device) -> None:
     made = with_instruments(drawable(camera=CAMERAS["endoscope"]))
     position = folded(made)
     labels, without = (
-        look(made, position, place_capsules(made, position, 0), normals=asked) for asked in (True, False)
+        look(made, position, place_capsules(made, position, 0), labels=requested_labels(asked))
+        for asked in (LABELS, ())
     )
     assert labels.normals.shape == (60, 80, 3)
     assert without.normals.shape == (0, 0, 3)

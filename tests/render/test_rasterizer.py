@@ -14,7 +14,7 @@ from taichi_msm.model.surface import place_capsules
 from taichi_msm.render import bins, gpu, tracking
 from taichi_msm.render.camera import view
 from taichi_msm.render.cpu import Bands
-from taichi_msm.render.labels import track_grid
+from taichi_msm.render.labels import LABELS, track_grid
 from taichi_msm.render.rasterizer import Rasterizer, drawing_config
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system import launches
@@ -127,7 +127,7 @@ def test_what_passes_behind_the_camera_is_looked_for_only_where_it_may_be_seen(
 
 def assert_alike_in_other_tiles(made: Scene, texture: NDArray[np.uint8], position: NDArray[Any], lanes: int) -> None:
     """Pictures and labels have the same bits if so many pixels are drawn at a time; labels have one sample a pixel."""
-    config = drawing_config(made, labels=made.render.supersample == 1, normals=True)
+    config = drawing_config(made, labels=LABELS if made.render.supersample == 1 else ())
     placed = place_capsules(made, position, 0)
     expected = Rasterizer(made, texture, config).look(position, rods=placed)
     other = Rasterizer(made, texture, config._replace(lanes=lanes)).look(position, rods=placed)

@@ -21,7 +21,7 @@ from taichi_msm.load.scene_file import load_scene
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.surface import place_capsules
 from taichi_msm.render.camera import view
-from taichi_msm.render.labels import track_grid
+from taichi_msm.render.labels import requested_labels, track_grid
 from taichi_msm.render.rasterizer import Rasterizer, drawing_config
 from taichi_msm.render.tracking import compute_flow, locate_points
 from taichi_msm.runs.arrays import read_flo
@@ -185,13 +185,13 @@ def looks(made: Scene, texture: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
     """Draw and find, on the device that was started."""
     position, view_now = draped(made), view(made)
     placed = place_capsules(made, position, 0)
-    found = Rasterizer(made, texture, drawing_config(made, labels=made.render.supersample == 1)).look(
-        position, rods=placed
-    )
+    found = Rasterizer(
+        made, texture, drawing_config(made, labels=requested_labels(()) if made.render.supersample == 1 else ())
+    ).look(position, rods=placed)
     seen: dict[str, NDArray[Any]] = {"picture": np.asarray(found.picture)}
     labels = found.labels
     if labels is None:  # Several samples a pixel.
-        config = drawing_config(made, picture=False, labels=True)
+        config = drawing_config(made, picture=False, labels=requested_labels(()))
         labels = Rasterizer(made, texture, config).look(position, rods=placed).labels
     assert labels is not None
     seen |= {name: value for name, value in labels._asdict().items() if value.size}

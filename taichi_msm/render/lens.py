@@ -1,0 +1,96 @@
+"""A lens: a model with its coefficients, and its inverse."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.lenses import MODELS
+from taichi_msm.lenses.dual import DUAL, Dual
+from taichi_msm.lenses.model import NUMPY
+
+Array = NDArray[np.float64]
+
+# Maximum residual of the undistortion, in normalised image coordinates; well below 1e-6 px.
+UNDISTORTION_TOLERANCE = 1e-11
+
+
+class Lens(NamedTuple):
+    """A lens distortion model and its coefficients.
+
+    Attributes:
+        model: name of the model.
+        coefficients: all coefficients of the model, in its order.
+    """
+
+    model: str
+    coefficients: tuple[float, ...]
+
+    @property
+    def limit(self) -> float:
+        """Largest valid radius r: the distortion folds back there, or the angle from the axis reaches 88 degrees."""
+        return _limit(self)
+
+    def distort(self, points: Array) -> Array:
+        """Return the distorted coordinates of normalised image coordinates, both of shape (..., 2)."""
+        distort = MODELS[self.model].build(NUMPY)
+        return np.stack(distort(points[..., 0], points[..., 1], *self.coefficients), axis=-1)
+
+    def jacobian(self, points: Array) -> Array:
+        """Return the Jacobian of `distort`, shape (..., 2, 2); the rows are those of the distorted coordinates."""
+        return self._distort_with_jacobian(points)[1]
+
+    def undistort(self, distorted: Array) -> Array:
+        """Invert `distort` by Newton's method, starting from the solution without tangential distortion.
+
+        Args:
+            distorted: distorted normalised image coordinates, shape (..., 2).
+
+        Returns:
+            Undistorted coordinates, shape (..., 2); NaN without a solution within the limit of the lens.
+        """
+        limit = self.limit
+        # Without the limit itself, which may be a pole.
+        radii = limit * np.sin(np.linspace(0, np.pi / 2, 4097)[:-1])
+        radial = self._replace(coefficients=MODELS[self.model].without_tangential(self.coefficients))
+        profile = radial.distort(np.stack([radii, 0 * radii], axis=-1))[..., 0]
+        distorted_radius = np.linalg.norm(distorted, axis=-1, keepdims=True)
+        radius = np.interp(distorted_radius, profile, radii)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            points = np.where(distorted_radius > 0, distorted * (radius / distorted_radius), 0.0)
+        error = np.full(distorted_radius.shape[:-1], np.inf)
+        for _ in range(50):
+            image, jacobian = self._distort_with_jacobian(points)
+            residual = distorted - image
+            error = np.abs(residual).max(axis=-1)
+            if not (error > UNDISTORTION_TOLERANCE).any():
+                break
+            (a, b), (c, d) = np.moveaxis(jacobian, (-2, -1), (0, 1))
+            with np.errstate(invalid="ignore", divide="ignore"):
+                step = np.stack(
+                    [d * residual[..., 0] - b * residual[..., 1], a * residual[..., 1] - c * residual[..., 0]], axis=-1
+                )
+                points = points + step / (a * d - b * c)[..., None]
+                # Beyond the limit there may be a second solution.
+                points *= np.minimum(1, limit / np.linalg.norm(points, axis=-1, keepdims=True))
+        is_converged = (error <= UNDISTORTION_TOLERANCE) & (np.linalg.norm(points, axis=-1) < limit)
+        return np.where(is_converged[..., None], points, np.nan)
+
+    def _distort_with_jacobian(self, points: Array) -> tuple[Array, Array]:
+        distort, unit = MODELS[self.model].build(DUAL), np.eye(2).reshape(2, 2, *(1,) * (points.ndim - 1))
+        x, y = (Dual(points[..., n], np.broadcast_to(unit[n], (2, *points.shape[:-1]))) for n in (0, 1))
+        distorted = distort(x, y, *self.coefficients)
+        jacobian = np.stack([np.moveaxis(number.slope, 0, -1) for number in distorted], axis=-2)
+        return np.stack([number.value for number in distorted], axis=-1), jacobian
+
+
+@lru_cache(maxsize=16)
+def _limit(lens: Lens) -> float:
+    return MODELS[lens.model].limit(lens.coefficients)
+
+
+# The lens without distortion.
+IDENTITY_LENS = Lens("pinhole", (0.0,) * 8)
