@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import SceneError
 from taichi_msm.fitting.machine_tables import MachineTest
-from taichi_msm.model.tools import Tool, build_tools, distance_to_sheet
+from taichi_msm.model.tools import Clamp, Tool, build_tools, distance_to_sheet
 from taichi_msm.scene.scene import Scene
 
 Array = NDArray[np.float64]
@@ -76,6 +76,9 @@ def find_approach(scene: Scene) -> Approach:
         fault = f"{len(tools)} position-controlled tools, and a table of a testing machine is of one"
         raise SceneError([f"probes: {fault}; give one probe a path and an instrument, and no other"])
     (tool,) = tools
+    if isinstance(tool, Clamp):
+        fault = "a clamp does not follow a table; fit its forces with --forces, or press with an instrument"
+        raise SceneError([f"probes.{tool.probe}.clamp: {fault}"])
     key, offsets = f"probes.{tool.probe}.path", tool.tip_centres - tool.tip_centres[0]
     farthest = offsets[np.linalg.norm(offsets, axis=1).argmax()]
     if not farthest.any():

@@ -295,6 +295,14 @@ def test_options_of_other_fits_are_refused(pressed: str, options: dict[str, Any]
         fit(scene(), pressed, **{"free": free, **options})
 
 
+def test_a_clamp_follows_no_table(message: Messages) -> None:
+    made = scene().model_dump(mode="json", exclude_none=True)
+    made["sheet"]["fixed"] = ["left"]
+    made["probes"] = [{"clamp": "right", "path": [[0, 0, 0, 0], [1, 1e-3, 0, 0]]}]
+    with message.raises(SceneError, "probes.0.clamp"):
+        find_approach(Scene.model_validate(made))
+
+
 def test_a_window_is_two_numbers(message: Messages) -> None:
     assert parse_window("0.5,12") == (0.5, 12.0)
     with message.raises(click.BadParameter, "0.5"):
