@@ -50,7 +50,9 @@ def validate(data: dict[str, Any]) -> tuple[Plan | None, list[Problem]]:
         problems += new_problems
         if scene is not None:
             plan, new_problems = _check_combinations(scene)
-            problems += new_problems
+            # The speed of a tool depends on the step, which a replaced section would change.
+            replaced = {problem.path[0] for problem in problems} & {"sheet", "tissue", "springs", "time"}
+            problems += [problem for problem in new_problems if not (replaced and "path" in problem.path)]
             break
         data = _replace_faulty(data, new_problems)
     return (None if problems else plan), problems

@@ -201,6 +201,17 @@ def test_the_fewest_steps_in_which_no_tool_moves_too_far() -> None:
     assert min_steps_per_frame((), plan.grid, 1) == 1
 
 
+def test_a_fault_of_tissue_brings_no_fault_of_a_path() -> None:
+    # In a step of this scene it moves little, but much in a frame.
+    fast = moved([0, 0.5, 0.5, 0.001], [0.02, 0.5, 0.5, -0.03])
+    data = touching([fast]).model_dump(mode="json", exclude_none=True)
+    check_scene(data)
+    data["tissue"]["yuong"] = data["tissue"].pop("young")
+    with pytest.raises(SceneError) as caught:
+        check_scene(data)
+    assert {line.split(":")[0] for line in caught.value.lines} == {"tissue.yuong", "tissue.young"}
+
+
 def test_units_and_times_that_cannot_be_meant_are_noted(message: Messages) -> None:
     late = {**PRESSED, "path": [[0, 0.5, 0.5, 1], [300, 0.5, 0.5, -5]], "grip": [[2, 3]]}
     made = touching([late])
