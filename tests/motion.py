@@ -11,6 +11,7 @@ from taichi_msm.accuracy.report import run_warnings
 from taichi_msm.accuracy.time_step import TimeStepEstimate, max_norm
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.tool_force import probe_records
+from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.arrays import SheetLayout
 from taichi_msm.solver.dynamics import Dynamics, choose_layout
@@ -54,6 +55,24 @@ def true_error(plan: Plan, device: Device, fine: int) -> float:
     finer = plan.with_grid(precision="f64", steps_per_frame=fine * plan.grid.steps_per_frame)
     reference = frames_on(finer, device)
     return max_norm(frames_on(plan, device) - reference) / max_norm(reference)
+
+
+def assert_steered_like(made: Scene, short: Scene, device: Device) -> None:
+    """A scene steered keyframe by keyframe, from its first one, moves to the bit like the scene with the whole path."""
+    path: Any = made.probes[0].path
+    with (
+        Simulation(made, threads=device.threads) as expected,
+        Simulation(short, threads=device.threads) as steered,
+    ):
+        for key in path[1:]:
+            steered.steer([{"path": [key]}])
+            steered.advance()
+            expected.advance()
+            assert steered.positions().tobytes() == expected.positions().tobytes()
+            assert steered.forces() == expected.forces()
+        assert steered.scene.probes[0].path is not None
+        if not made.probes[0].grip and not made.probes[0].clamp:
+            assert len(steered.scene.probes[0].path) < 6
 
 
 def notes_of(made: Scene, progress: RunProgress, estimate: TimeStepEstimate | None, **more: Any) -> list[str]:

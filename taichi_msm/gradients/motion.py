@@ -64,11 +64,11 @@ Array = NDArray[np.float64]
 
 
 def segment_steps(steps: int, shape_bytes: int) -> int:
-    """Return the length of a segment [steps], whose displacements take about as much memory as all checkpoints.
+    """Return the length of a segment [steps]. Its displacements and all checkpoints need about equal memory.
 
     Args:
         steps: number of steps of the run.
-        shape_bytes: memory of the displacements of a step [bytes]; a checkpoint takes twice as much.
+        shape_bytes: memory of the displacements of a step [bytes], half of that of a checkpoint.
     """
     return min(steps, max(math.ceil(math.sqrt(2 * steps)), SEGMENT_BYTES // shape_bytes))
 

@@ -168,7 +168,7 @@ class Render(Section):
         return self.all_cameras[self.main]
 
     def with_main(self, camera: AnyCamera) -> Self:
-        """Return a copy with another main camera; cameras `beside` it move with it."""
+        """Return a copy with another main camera. The other camera of a stereo pair follows it."""
         if self.cameras is None:
             return self.model_copy(update={"camera": camera})
         return self.model_copy(update={"cameras": {**self.cameras, self.main: camera}})

@@ -100,35 +100,38 @@ class FoundationTerm(Term):
 
     def build_forces(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
         """Build the Taichi function that adds -K u, or with a law -K u_x, -K u_y and K f(-u_z)."""
-        ti, locks, column, share = config.ti, self.locks, config.first_column(FoundationTerm), self.build_share(config)
-        secant, _ = self._build_law(config)
+        ti, (secant, _) = config.ti, self._build_law(config)
 
         @ti.func
-        def add(force: ti.template(), sheet: ti.template(), entry: ti.template(), now: ti.template()):
-            k = share(sheet, entry, now[column])
-            for c in ti.static(range(3)):
-                if ti.static(locks and c == 2):
-                    force[c] = force[c] - k * (entry.u[c] * secant(sheet, entry.u[c]))
-                else:
-                    force[c] = force[c] - k * entry.u[c]
+        def ratio(sheet: ti.template(), entry: ti.template()):
+            return secant(sheet, entry.u[2])
 
-        return (add,)
+        return (self._build_add(config, ratio),)
 
     def build_tangents(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
         """Build the Taichi function that adds the linearised change of the force."""
+        ti, (_, tangent) = config.ti, self._build_law(config)
+
+        @ti.func
+        def ratio(sheet: ti.template(), entry: ti.template()):
+            return tangent(sheet, entry.shape[2])
+
+        return (self._build_add(config, ratio),)
+
+    def _build_add(self, config: KernelConfig, ratio: Callable[..., Any]) -> Callable[..., Any]:
+        """Build the Taichi function that adds -K u, along z times ratio(sheet, entry) if the foundation locks."""
         ti, locks, column, share = config.ti, self.locks, config.first_column(FoundationTerm), self.build_share(config)
-        _, tangent = self._build_law(config)
 
         @ti.func
         def add(force: ti.template(), sheet: ti.template(), entry: ti.template(), now: ti.template()):
             k = share(sheet, entry, now[column])
             for c in ti.static(range(3)):
                 if ti.static(locks and c == 2):
-                    force[c] = force[c] - k * (entry.u[c] * tangent(sheet, entry.shape[c]))
+                    force[c] = force[c] - k * (entry.u[c] * ratio(sheet, entry))
                 else:
                     force[c] = force[c] - k * entry.u[c]
 
-        return (add,)
+        return add
 
     def build_derivatives(self, config: KernelConfig) -> Callable[..., Any]:
         """Build the Taichi function derive(sheet, p, u), derivatives of minus the product of p with the force.

@@ -447,8 +447,8 @@ class SpringTerm(Term):
     def stiffness_array(self, plan: Plan) -> NDArray[Any] | None:
         """Return the kernels' array of stiffnesses k - tau [N/m], shape (3 rows + 2, cols); None without a map.
 
-        It contains the springs along rows, in as many rows as the sheet has, followed by those along columns and by the
-        diagonals, with one row more each. The first and last rows of these, and entries beyond the last column, are 0.
+        Its parts are the springs along rows (one row per row of the sheet), along columns and along diagonals (rows + 1
+        each). The first and the last row of the latter two, and entries beyond the last column, are 0.
         """
         material = plan.material
         if material.factors is None:

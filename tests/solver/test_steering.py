@@ -11,6 +11,7 @@ from taichi_msm import ArgumentError, Probe, SceneError, Simulation
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.golden import Messages
+from tests.motion import assert_steered_like
 from tests.scenes import plan_of
 from tests.terms.test_contact import HELD, PRESSED, ROD, RUBBED, moved, touching
 
@@ -33,21 +34,8 @@ def test_a_tool_that_is_steered_frame_by_frame_does_what_the_path_of_all_frames_
 ) -> None:
     """To the bit, also while it holds points."""
     made = guided(probe)
-    path: Any = made.probes[0].path
-    short = made.model_copy(update={"probes": [made.probes[0].model_copy(update={"path": path[:1]})]})
-    with (
-        Simulation(made, threads=device.threads) as expected,
-        Simulation(short, threads=device.threads) as steered,
-    ):
-        for key in path[1:]:
-            steered.steer([{"path": [key]}])
-            steered.advance()
-            expected.advance()
-            assert steered.positions().tobytes() == expected.positions().tobytes()
-            assert steered.forces() == expected.forces()
-        assert steered.scene.probes[0].path is not None
-        if not made.probes[0].grip:
-            assert len(steered.scene.probes[0].path) < 6
+    probes = [made.probes[0].model_copy(update={"path": (made.probes[0].path or ())[:1]})]
+    assert_steered_like(made, made.model_copy(update={"probes": probes}), device)
 
 
 def test_between_its_keys_a_tool_goes_straight_on_from_where_it_is(device: Device) -> None:

@@ -27,7 +27,7 @@ from taichi_msm.solver.state import State
 from taichi_msm.system.runtime import Device
 from tests import reference
 from tests.golden import Messages
-from tests.motion import dynamics_of, structure_of
+from tests.motion import assert_steered_like, dynamics_of, structure_of
 from tests.runs.test_forces import expected_forces
 from tests.scenes import plan_of, speckle
 from tests.solver.test_dynamics import as_on_a_gpu, assert_like_twin, short_launches, with_lanes
@@ -325,15 +325,6 @@ def test_a_clamp_that_is_steered_does_what_its_path_does(motion: str, device: De
     path = [[frame / 25, 0.002 * frame, 0.001 * frame**2, 0.001 * frame] for frame in range(6)]
     made = touching([{"clamp": "right", "path": path}], sheet=LEFT, time=time)
     short = touching([{"clamp": "right", "path": path[:1]}], sheet=LEFT, time=time)
-    with (
-        Simulation(made, threads=device.threads) as expected,
-        Simulation(short, threads=device.threads) as steered,
-    ):
-        for key in path[1:]:
-            steered.steer([{"path": [key]}])
-            steered.advance()
-            expected.advance()
-            assert steered.positions().tobytes() == expected.positions().tobytes()
-            assert steered.forces() == expected.forces()
-        with message.raises(SceneError, "probes.0.clamp"):
-            steered.steer([{"clamp": "top", "path": [[1, 0, 0, 0]]}])
+    assert_steered_like(made, short, device)
+    with Simulation(short, threads=device.threads) as steered, message.raises(SceneError, "probes.0.clamp"):
+        steered.steer([{"clamp": "top", "path": [[1, 0, 0, 0]]}])
