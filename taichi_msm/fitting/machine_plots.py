@@ -45,7 +45,7 @@ def _plot_residual(axes: Axes, _result: FitResult, fitted: FittedTest) -> None:
     limit = 1.1 * float(np.abs(fitted.force - loading.force).max())
     share = 100 * fitted.residual / loading.peak
     axes.set(xlabel="time [s]", ylabel="fitted minus measured [N]", ylim=(-limit, limit))
-    axes.set_title(f"Residual, {share:.2g} % of the peak (rms)")
+    axes.set_title(f"Residual, {share:.2g} % rms of peak")
     axes.legend()
 
 
