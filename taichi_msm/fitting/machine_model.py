@@ -44,9 +44,18 @@ class MachineProblem(FitProblem):
 
     def place(self, data: dict[str, Any], values: Mapping[str, float], n: int) -> dict[str, Any]:
         """Return a scene's data with parameter values, by key, and with the path and the times of test n."""
+        contact = values.get(contact_keys(len(self.tests))[n])
+        return self.tests[n].place(self.with_scene_values(data, values), self.approach, contact)
+
+    def with_scene_values(self, data: dict[str, Any], values: Mapping[str, float]) -> dict[str, Any]:
+        """Return a scene's data with parameter values by key, except depths of contact."""
         of_scene = [parameter for parameter in self.parameters if parameter.key not in contact_keys(len(self.tests))]
-        data = with_values(data, of_scene, [values[parameter.key] for parameter in of_scene])
-        return self.tests[n].place(data, self.approach, values.get(contact_keys(len(self.tests))[n]))
+        return with_values(data, of_scene, [values[parameter.key] for parameter in of_scene])
+
+    def reach(self, values: Mapping[str, float]) -> float:
+        """Return the greatest travel of all tests [m] with parameter values by key."""
+        keys = contact_keys(len(self.tests))
+        return max(float(test.travel(values.get(key)).max()) for test, key in zip(self.tests, keys, strict=True))
 
 
 class MachineModel(ForwardModel):
@@ -67,21 +76,25 @@ class MachineModel(ForwardModel):
         forces, most_steps = [], 0
         for n in range(len(self.job.tests)):
             simulation, plan = self.start(self.plan(x, n), steps, coarse)
-            forces.append(self._forces(simulation, plan.grid.frames, pause))
+            forces.append(self.forces(simulation, plan.grid.frames, pause))
             most_steps = max(most_steps, plan.grid.steps_per_frame)
         return Prediction(np.empty((0, 0, 3)), np.concatenate(forces)[:, None], most_steps, np.zeros(1))
 
     def plan(self, x: Array, n: int = 0) -> Plan:
         """Plan the scene of test n with the parameters at x; SceneError: it is not valid."""
+        return check_scene(Scene(**self.job.place(self.data, self.values(x), n)), self.maps)
+
+    def values(self, x: Array) -> dict[str, float]:
+        """Return the parameter values by key at x; SceneError: they are out of range."""
         values = {
             parameter.key: parameter.value(coordinate)
             for parameter, coordinate in zip(self.job.parameters, x.tolist(), strict=True)
         }
         if not np.isfinite(list(values.values())).all():
             raise SceneError(["the values are out of range"])
-        return check_scene(Scene(**self.job.place(self.data, values, n)), self.maps)
+        return values
 
-    def _forces(self, simulation: Simulation, frames: int, pause: Pause) -> Array:
+    def forces(self, simulation: Simulation, frames: int, pause: Pause) -> Array:
         """Return the forces along the tool's direction at the frames of a run [N], shape (frames + 1,)."""
         forces = []
         for frame in range(frames + 1):
@@ -143,7 +156,7 @@ def observe_tests(tests: Sequence[Loading]) -> Observations:
         np.concatenate([loading.scene_time for loading in tests]),
         np.repeat(np.arange(len(tests)), lengths),
         np.concatenate([loading.force for loading in tests])[:, None],
-        np.repeat([loading.noise for loading in tests], lengths),
+        np.repeat([loading.sigma for loading in tests], lengths),
     )
     empty = np.empty((0, 0, 3))
     # The unit of no value; with a sigma, none is estimated.
