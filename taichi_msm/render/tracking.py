@@ -11,13 +11,13 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.model.surface import Capsule
+from taichi_msm.model.surface import Solid
 from taichi_msm.render import geometry, lens_kernels
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.bins import BOUNDS_STRIDE, build_bins, store_bounds
 from taichi_msm.render.camera import View
 from taichi_msm.render.config import INFINITY, Bytes, Doubles, Floats, Integers
-from taichi_msm.render.coverage import intersect_capsule
+from taichi_msm.render.coverage import intersect_instrument
 from taichi_msm.render.geometry import NODE_STRIDE
 from taichi_msm.render.labels import NO_FLOW, Flow, Sight
 from taichi_msm.render.lens_table import undistorted_view
@@ -41,7 +41,7 @@ CELLS_AROUND_NODE = 4
 NOT_VISIBLE = math.nan
 
 
-def locate_points(scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Capsule] = ()) -> Sight:
+def locate_points(scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Solid] = ()) -> Sight:
     """Project material points into the picture, and determine their occlusion.
 
     Args:
@@ -58,7 +58,7 @@ def locate_points(scene: Scene, coordinates: Array, position: Array, view: View,
     return Sight(pixels, hidden.view(np.bool_))
 
 
-def compute_flow(scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Capsule] = ()) -> Flow:
+def compute_flow(scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Solid] = ()) -> Flow:
     """Compute the optical flow and the occlusion of another frame's pixels.
 
     Args:
@@ -77,7 +77,7 @@ def compute_flow(scene: Scene, coordinates: Array, position: Array, view: View, 
 
 
 def _track(
-    scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Capsule], *, as_flow: bool
+    scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Solid], *, as_flow: bool
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Return the pixels of material points, `as_flow` relative to another frame's pixels, and their occlusion."""
     total = len(coordinates)
@@ -96,7 +96,7 @@ def _track(
         uni.set_lens(uniform_values, view, 1, view.lens.limit)
     uniforms = launches.upload(uniform_values)
     sizes = uni.sizes_of(scene, np.empty((0, 3), np.int32))
-    sizes[[uni.CAPSULE_COUNT, uni.WIDTH, uni.HEIGHT]] = len(rods), width, height
+    sizes[[uni.INSTRUMENT_COUNT, uni.WIDTH, uni.HEIGHT]] = len(rods), width, height
     nodes, cell = (launches.array(np.float64, n) for n in (rows * cols * NODE_STRIDE, cells * CELL_STRIDE))
     bounds = launches.array(np.int32, cells * BOUNDS_STRIDE)
     with compilation_options(optimised=False):
@@ -119,7 +119,9 @@ def _track(
     # Iterations per point: one per cell, and one per triangle.
     rounds = 1 + 2 * (scene.render.refine + 1) ** 2
     for listed, count in launches.chunks(int(bins.lengths.max()), rounds):
-        launches.launch(_kernel(view.lens_model), total, listed, count, *arguments, rounds=count * rounds + len(rods))
+        launches.launch(
+            _kernel(view.lens_model, scene.shapes), total, listed, count, *arguments, rounds=count * rounds + len(rods)
+        )
     launches.require_completion()
     return launches.download(pixels).reshape(-1, 2), launches.download(hidden)
 
@@ -240,22 +242,22 @@ def _cell_occludes(
 
 
 @ti.func
-def _capsule_occludes(x, y, depth, uniforms: ti.template(), sizes: ti.template()):
+def _instrument_occludes(x, y, depth, uniforms: ti.template(), sizes: ti.template(), shapes: ti.template()):
     """Return whether an instrument occludes a point at (x, y) and `depth`."""
     occluded = False
-    for index in range(sizes[uni.CAPSULE_COUNT]):
-        capsule = uni.CAPSULES + index * uni.CAPSULE_STRIDE
-        is_between = x >= uniforms[capsule + uni.LEFT] and x <= uniforms[capsule + uni.RIGHT]
-        if is_between and y >= uniforms[capsule + uni.TOP] and y <= uniforms[capsule + uni.BOTTOM]:
-            hit_depth, _, _, _ = intersect_capsule(x, y, index, uniforms)
+    for index in range(sizes[uni.INSTRUMENT_COUNT]):
+        base = uni.INSTRUMENTS + index * uni.INSTRUMENT_STRIDE
+        is_between = x >= uniforms[base + uni.LEFT] and x <= uniforms[base + uni.RIGHT]
+        if is_between and y >= uniforms[base + uni.TOP] and y <= uniforms[base + uni.BOTTOM]:
+            hit_depth, _, _, _ = intersect_instrument(x, y, index, uniforms, shapes)
             if hit_depth < depth and geometry.w_at(hit_depth, uniforms) > uniforms[uni.NEAR]:
                 occluded = True
     return occluded
 
 
 @cache
-def _kernel(lens: str) -> Callable[..., None]:
-    """Return the kernel that locates points, for a lens model; empty without lens distortion."""
+def _kernel(lens: str, shapes: tuple[str, ...]) -> Callable[..., None]:
+    """Return the kernel that locates points, for a lens model, empty without lens distortion, and instruments."""
 
     @ti.kernel
     def locate_kernel(
@@ -318,7 +320,10 @@ def _kernel(lens: str) -> Callable[..., None]:
                                         undistorted_x, undistorted_y, depth, entries[n], own_cell, own_triangle,
                                         cols, subdivisions, near, nodes, cell,
                                     )  # fmt: skip
-                        is_hidden = is_hidden or _capsule_occludes(undistorted_x, undistorted_y, depth, uniforms, sizes)
+                        if ti.static(len(shapes) > 0):
+                            is_hidden = is_hidden or _instrument_occludes(
+                                undistorted_x, undistorted_y, depth, uniforms, sizes, shapes
+                            )
                     if not is_valid:
                         x, y = ti.cast(NOT_VISIBLE, ti.f64), ti.cast(NOT_VISIBLE, ti.f64)
             if as_flow > 0:
