@@ -57,7 +57,7 @@ def window_keys() -> str:
 def outputs(*sources: str) -> str:
     """Give the table of the outputs with these sources."""
     chosen = [output for output in OUTPUTS.values() if output.source in sources]
-    lines = [f"| `{output.name}` | `{output.file}` | {output.description} |" for output in chosen]
+    lines = [f"| `{output.entry}` | `{output.file}` | {output.description} |" for output in chosen]
     return "| `output` | file (that of frame 0) | what it holds |\n|---|---|---|\n" + "\n".join(lines) + "\n"
 
 

@@ -89,6 +89,18 @@ class CameraFileError(Exception):
     """The file cannot be used; the message contains its name, the reason and the remedy."""
 
 
+class StereoPose(NamedTuple):
+    """Pose of the right camera of a stereo pair: X_right = rotation X_left + translation.
+
+    Attributes:
+        rotation: rows of the matrix.
+        translation: vector [m].
+    """
+
+    rotation: tuple[tuple[float, ...], ...]
+    translation: tuple[float, ...]
+
+
 class Calibration(NamedTuple):
     """Calibration of a camera, in OpenCV's conventions.
 
@@ -99,6 +111,7 @@ class Calibration(NamedTuple):
         coefficients: distortion coefficients in OpenCV's order: k1, k2, p1, p2, k3, k4, k5, k6, of a fisheye k1 to k4;
             trailing ones may be missing.
         size: width and height of the pictures [px]; None if the file does not contain them.
+        right: pose of the right camera of a stereo pair, where that was asked for.
     """
 
     focal: tuple[float, float]
@@ -106,6 +119,7 @@ class Calibration(NamedTuple):
     fisheye: bool
     coefficients: tuple[float, ...]
     size: tuple[int, int] | None
+    right: StereoPose | None = None
 
 
 def read_calibration(path: str) -> Calibration:

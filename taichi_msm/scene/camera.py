@@ -21,7 +21,7 @@ from typing_extensions import Self
 
 from taichi_msm.lenses import MODELS
 from taichi_msm.lenses.model import MAX_COEFFICIENT
-from taichi_msm.scene.calibration import CameraFileError, pose_fault, read_calibration, read_poses
+from taichi_msm.scene.calibration import Calibration, CameraFileError, pose_fault, read_calibration, read_poses
 from taichi_msm.scene.section import (
     MIN_FOV,
     MIN_MAGNITUDE,
@@ -95,12 +95,14 @@ class Distortion(_Coefficients):  # type: ignore[misc]
         return self
 
 
+Rotation = tuple[Vector, Vector, Vector]
+_ROTATION = "three rows of three numbers: an orthonormal matrix"
+
+
 class Pose(Section):
     """Extrinsics of a camera, in OpenCV's axes: x right, y down, z forward."""
 
-    rotation: tuple[Vector, Vector, Vector] = key(
-        ..., "rotation from the world's axes to the camera's", "three rows of three numbers: an orthonormal matrix"
-    )
+    rotation: Rotation = key(..., "rotation from the world's axes to the camera's", _ROTATION)
     translation: Vector = key(..., "world's origin in the camera's axes [m]", "three numbers: [x, y, z] in metres")
 
 
@@ -152,14 +154,25 @@ class Camera(Section):
     )
     beside: Annotated[str, Field(strict=True, min_length=1)] | None = key(
         None,
-        "in `cameras`, in place of all other keys except baseline: name of the reference camera of a stereo pair, of "
-        "which this camera is a translated copy",
+        "in `cameras`, in place of eye, pose and poses: name of the reference camera of a stereo pair, with which this "
+        "camera moves",
         "the name of another camera",
     )
     baseline: Number | None = key(
         None,
-        "distance from the camera named by beside, along the x axis of that camera [m]",
+        "with beside: this camera is a copy of the reference camera, at this distance along its x axis [m]",
         "a number but 0, in metres",
+    )
+    rotation: Rotation | None = key(
+        None,
+        "with beside, in place of baseline: R of OpenCV's stereoCalibrate, from the axes of the reference camera to "
+        "those of this one; without intrinsics, calibration and fov, this camera has the lens of the reference camera",
+        _ROTATION,
+    )
+    translation: Vector | None = key(
+        None,
+        "with rotation: T of OpenCV's stereoCalibrate in metres, X_this = R X_reference + T",
+        "three numbers: [x, y, z] in metres",
     )
     eye: Vector | VectorKeyframes | None = key(
         None,
@@ -182,6 +195,11 @@ class Camera(Section):
         "vertical field of view, without distortion [degrees]",
         f"a number from {MIN_FOV:g} to below 180, in degrees",
     )
+
+    @property
+    def has_own_lens(self) -> bool:
+        """Whether a camera with a reference camera has intrinsics of its own."""
+        return self.intrinsics is not None or "fov" in self.model_fields_set
 
     @property
     def moves(self) -> bool:
@@ -218,15 +236,10 @@ class Camera(Section):
     def _check_combination(self) -> Self:
         given = {name for name in self.model_fields_set if getattr(self, name) is not None}
         if self.beside is not None:
-            for name in sorted(given - {"beside", "baseline"}):
-                raise scene_fault(
-                    "is given together with beside, and a camera beside another is like that; remove it", name
-                )
-            if self.baseline is None or abs(self.baseline) < MIN_MAGNITUDE:
-                fault = "missing" if self.baseline is None else f"{self.baseline:g} puts it where {self.beside} is"
-                raise scene_fault(f"{fault}; expected a number but 0, in metres", "baseline")
-        elif self.baseline is not None:
-            raise scene_fault("goes with beside, the name of another camera; add it or remove this", "baseline")
+            self._check_pair(given)
+        for name in ("baseline", "rotation", "translation") if self.beside is None else ():
+            if name in given:
+                raise scene_fault("goes with beside, the name of another camera; add it or remove this", name)
         if self.scale and self.calibration is None:
             raise scene_fault("goes with calibration; remove it", "scale")
         if self.outside == "background" and self.distortion is None and self.calibration is None:
@@ -239,13 +252,35 @@ class Camera(Section):
             raise scene_fault("goes with eye; a pose has a direction of its own", name)
         return self
 
+    def _check_pair(self, given: set[str]) -> None:
+        """Check the keys of a camera with a reference camera."""
+        for name in sorted({"eye", "pose", "poses", "target", "up"} & given):
+            raise scene_fault("is given together with beside, which places the camera; remove it", name)
+        if self.baseline is not None:
+            for name in sorted(given - {"beside", "baseline"}):
+                message = f"is given together with baseline, and this camera is then a copy of {self.beside}"
+                raise scene_fault(f"{message}; remove it, or take rotation and translation in place of baseline", name)
+            if abs(self.baseline) < MIN_MAGNITUDE:
+                fault = f"{self.baseline:g} puts it where {self.beside} is"
+                raise scene_fault(f"{fault}; expected a number but 0, in metres", "baseline")
+        elif missing := {"rotation", "translation"} - given:
+            for name in {"rotation", "translation"} & given:
+                raise scene_fault(f"goes with {missing.pop()}; add it", name)
+            if self.calibration is None:
+                message = "missing; expected a number but 0, in metres, or rotation and translation in its place"
+                raise scene_fault(message, "baseline")
+        if self.distortion is not None and not self.has_own_lens:
+            message = f"goes with intrinsics or fov; without them this camera has the lens of {self.beside}"
+            raise scene_fault(message, "distortion")
+
     @model_serializer(mode="wrap")
     def _dump_used_keys(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Omit keys that others replace, because their defaults would be invalid when the scene is read again."""
-        if self.beside is not None:
-            return {name: value for name, value in dump(self).items() if name in ("beside", "baseline")}
         needed = {"eye", "target", "up"} if self.eye is not None else {"pose", "poses"} & self.model_fields_set
-        needed |= {"intrinsics"} if self.intrinsics is not None else {"fov"}
+        if self.beside is not None:
+            needed = {"beside", "baseline"} if self.baseline is not None else {"beside", "rotation", "translation"}
+        if self.beside is None or self.has_own_lens:
+            needed |= {"intrinsics"} if self.intrinsics is not None else {"fov"}
         needed |= {name for name in ("distortion", "outside") if name in self.model_fields_set}
         return {name: value for name, value in dump(self).items() if name in needed}
 
@@ -280,6 +315,7 @@ class Camera(Section):
         intrinsics = {"fx": fx * scale_x, "fy": fy * scale_y}
         intrinsics |= {"cx": (cx + 0.5) * scale_x - 0.5, "cy": (cy + 0.5) * scale_y - 0.5}
         update: dict[str, Any] = {"calibration": None, "scale": False, "intrinsics": intrinsics}
+        update |= self._pair_of(calibration)
         if any(calibration.coefficients):
             model = "fisheye" if calibration.fisheye else "pinhole"
             # OpenCV omits trailing coefficients of the rational model.
@@ -297,6 +333,17 @@ class Camera(Section):
                 f"{self.calibration}: {values} for pictures of this size are out of range; calibrate at a size near it",
                 "scale",
             ) from None
+
+    def _pair_of(self, calibration: Calibration) -> dict[str, Any]:
+        """Return rotation and translation of a stereo calibration, for a camera with a reference camera."""
+        if self.beside is None or calibration.right is None:
+            if self.beside is not None and self.rotation is None:
+                remedy = "set calibration_eye: right for a stereo file with R and T, or add rotation and translation"
+                raise scene_fault(f"{self.calibration}: has no place next to {self.beside}; {remedy}", "calibration")
+            return {}
+        if self.rotation is not None:
+            raise scene_fault(f"is given together with R and T of {self.calibration}; remove one of them", "rotation")
+        return calibration.right._asdict()
 
 
 def _given(info: ValidationInfo) -> set[str]:

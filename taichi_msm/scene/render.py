@@ -74,7 +74,8 @@ class Render(Section):
         None,
         "in place of camera: several cameras by name, each with its own folder of files; the first is the main camera, "
         "whose light is in all pictures",
-        "names of a-z, 0-9, _ and -, each with top, oblique, {eye: [x, y, z], ...} or {beside: NAME, baseline: metres}",
+        "names of a-z, 0-9, _ and -, each with top, oblique, {eye: [x, y, z], ...}, {beside: NAME, baseline: metres} "
+        "or {beside: NAME, rotation: 3 x 3, translation: [x, y, z], ...}",
     )
     shading: Literal["none", "headlight", "tissue"] = key(
         "headlight",
@@ -174,24 +175,21 @@ class Render(Section):
         return self.model_copy(update={"cameras": {**self.cameras, self.main: camera}})
 
     def origin(self, name: str) -> tuple[AnyCamera, float]:
-        """Return the reference camera of a camera that is `beside` another one.
+        """Return the camera of which a camera with a `baseline` is a translated copy.
 
         Returns:
-            The reference camera, or the camera itself if it has none; the distance of the camera from it, along its
-            x axis [m].
+            That camera, or the camera itself if it is not a copy; the distance between them, along the x axis [m].
         """
         camera, distance = self.all_cameras[name], 0.0
-        while isinstance(camera, Camera) and camera.beside is not None:
-            distance += camera.baseline or 0.0
+        while isinstance(camera, Camera) and camera.beside is not None and camera.baseline is not None:
+            distance += camera.baseline
             camera = self.all_cameras[camera.beside]
         return camera, distance
 
-    def baseline(self, name: str) -> float:
-        """Return the distance from a camera to the first camera that is `beside` it [m], or 0 if there is none."""
-        for camera in self.all_cameras.values():
-            if isinstance(camera, Camera) and camera.beside == name and camera.baseline is not None:
-                return camera.baseline
-        return 0.0
+    def companion(self, name: str) -> str:
+        """Return the name of the first camera that is `beside` a camera, or "" if there is none."""
+        cameras = self.all_cameras.items()
+        return next((other for other, camera in cameras if isinstance(camera, Camera) and camera.beside == name), "")
 
 
 def _check_beside(name: str, cameras: Mapping[str, AnyCamera]) -> None:

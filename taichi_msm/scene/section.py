@@ -22,7 +22,7 @@ from pydantic_core import PydanticCustomError
 from typing_extensions import Self
 
 from taichi_msm.errors import ArgumentError, Key, Problem, SceneError, did_you_mean
-from taichi_msm.scene.outputs import OUTPUTS
+from taichi_msm.scene.outputs import ENTRIES
 
 # Limits of a number's magnitude, so that products and quotients of two numbers neither overflow nor underflow.
 MAX_MAGNITUDE = 1e30
@@ -285,7 +285,7 @@ if TYPE_CHECKING:
     OutputName = str
 else:
     ModelMetaclass = type(BaseModel)
-    OutputName = Literal[tuple(OUTPUTS)]
+    OutputName = Literal[tuple(ENTRIES)]
 
 
 class _SectionMeta(ModelMetaclass):
