@@ -15,6 +15,7 @@ LAYERS = [
     {"errors", "plot_style", "version"},
     {"system"},
     {"images", "lenses"},
+    {"camera_files"},
     {"scene"},
     {"model"},
     {"terms"},
