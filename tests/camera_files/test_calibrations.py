@@ -15,6 +15,7 @@ import pytest
 from taichi_msm import load_scene
 from taichi_msm.camera_files.calibrations import read_calibration
 from taichi_msm.camera_files.text import CameraFileError
+from taichi_msm.cli.main import main
 from taichi_msm.errors import SceneError
 from taichi_msm.render.camera import view
 from taichi_msm.scene.camera import Camera
@@ -384,6 +385,18 @@ def test_models_are_honoured(text: str, fisheye: bool, small: Path) -> None:
     assert read_calibration("camera.yml").model == ("fisheye" if fisheye else "pinhole")
     Path("camera.yml").write_text(K + "distortion_model: none")
     assert camera_of("camera.yml").distortion is None
+
+
+def test_check_prints_what_was_read(small: Path, capsys: pytest.CaptureFixture[str], message: Messages) -> None:
+    Path("pair.yml").write_text(stereo("K", "D", "1", "2"))
+    cameras = "{left: {eye: [0, 0, 0.4], calibration: pair.yml}, right: {eye: [0, 0, 0.4], intrinsics: INTRINSICS}}"
+    intrinsics = "{fx: 20, fy: 15, cx: 19.5, cy: 14.5}"
+    value = cameras.replace("INTRINSICS", intrinsics)
+    assert not main(["check", "small.yaml", "--set", f"render.cameras={value}", "--set", "output=[]"])
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("render.")]
+    # 20 px on both sides of the centre are 45 degrees at a focal length of 20 px.
+    assert "fov 90.0 x 90.0 degrees" in lines[1]
+    message(lines, "render.cameras.left: pinhole, 40 x 30 px", "k1 -0.3")
 
 
 def test_files_are_in_the_folder_of_the_scene(small: Path, message: Messages) -> None:
