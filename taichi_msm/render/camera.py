@@ -331,16 +331,12 @@ def _extrinsics_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
         tolerance = FRAME_TOLERANCE / scene.time.frames_per_second
         gap = camera.poses[min(1, len(camera.poses) - 1)][0] - max(begin, 0.0)  # type: ignore[operator]
         if gap > MAX_GAP_S or (len(camera.poses) > 2 and gap > MAX_GAP_RATIO * duration):
-            message = (
-                f"its first poses are {gap:.6g} s apart, and the scene lasts {duration:g} s; write times in seconds"
-            )
-            yield Problem(
-                ("poses",), f"{message}, nanoseconds divided by 1e9, or name the columns in a header, with t [ns]"
-            )
+            message = f"its first poses are {gap:.6g} s apart, and the scene lasts {duration:g} s"
+            yield Problem(("poses",), f"{message}; set poses_time, the unit of its times: ms, us or ns")
             return
         if begin > tolerance or end < duration - tolerance:  # type: ignore[operator]
             message = f"covers {begin:.12g} s to {end:.12g} s, but the scene goes from 0 s to {duration:g} s"
-            remedy = "its times are those of the scene: subtract the first one from all"
+            remedy = "set poses_start: 0 to begin at the first pose, or another time of the file"
             if begin <= tolerance:  # type: ignore[operator]
                 remedy = "shorten time.duration or give the poses of all of it"
             yield Problem(("poses",), f"{message}; {remedy}")

@@ -19,9 +19,13 @@ from pydantic import (
 )
 from typing_extensions import Self
 
+from taichi_msm.camera_files.calibration import Calibration
+from taichi_msm.camera_files.calibrations import read_calibration
+from taichi_msm.camera_files.text import CameraFileError
+from taichi_msm.camera_files.trajectories import PoseKeys, read_poses
+from taichi_msm.camera_files.trajectory import pose_fault
 from taichi_msm.lenses import MODELS
 from taichi_msm.lenses.model import MAX_COEFFICIENT
-from taichi_msm.scene.calibration import Calibration, CameraFileError, pose_fault, read_calibration, read_poses
 from taichi_msm.scene.section import (
     MIN_FOV,
     MIN_MAGNITUDE,
@@ -120,8 +124,15 @@ class Camera(Section):
 
     calibration: FilePath | None = key(
         None,
-        "in place of fov and distortion: calibration file of OpenCV, ROS or STIR, relative to the scene file",
+        "in place of fov and distortion: calibration file of OpenCV, ROS, SCARED, STIR, StereoMIS, Kalibr or COLMAP, "
+        "relative to the scene file",
         "the path of a file",
+    )
+    calibration_eye: Literal["left", "right"] = key(
+        "left", "camera of the calibration of a stereo pair", "left or right"
+    )
+    calibration_unit: Literal["m", "mm"] | None = key(
+        None, "unit of lengths in the calibration, the distance of the cameras of a stereo pair", "m or mm"
     )
     scale: StrictBool = key(
         False, "whether a calibration for another picture size is scaled to this one", "true or false"
@@ -148,9 +159,24 @@ class Camera(Section):
     )
     poses: FilePath | PoseRows | None = key(
         None,
-        "in place of eye, target and up: trajectory of the camera, a file in TUM's format, relative to the scene file, "
-        "or its rows [t, tx, ty, tz, qx, qy, qz, qw], from the camera to the world",
+        "in place of eye, target and up: trajectory of the camera, a file of TUM, EuRoC, KITTI or COLMAP, relative to "
+        "the scene file, or its rows [t, tx, ty, tz, qx, qy, qz, qw], from the camera to the world",
         "the path of a file, or rows [[t, tx, ty, tz, qx, qy, qz, qw], ...]",
+    )
+    poses_unit: Literal["m", "mm"] | None = key(
+        None, "unit of positions in the file of poses; metres unless its header has another one", "m or mm"
+    )
+    poses_time: Literal["s", "ms", "us", "ns"] | None = key(
+        None, "unit of times in the file of poses; seconds unless its header has another one", "s, ms, us or ns"
+    )
+    poses_start: Number | None = key(
+        None,
+        "where the scene begins in the file of poses [s]: a time of the file, or, before its first pose, the time "
+        "after that one; without it, the times of the file are those of the scene",
+        "a number, in seconds",
+    )
+    poses_rate: Positive | None = key(
+        None, "poses per second of a file without times, as of KITTI and COLMAP", "a number above 0"
     )
     beside: Annotated[str, Field(strict=True, min_length=1)] | None = key(
         None,
@@ -208,16 +234,11 @@ class Camera(Section):
 
     @field_validator("poses", mode="after")
     @classmethod
-    def _read_poses(cls, poses: str | PoseRows | None) -> PoseRows | None:
-        if not isinstance(poses, str):
-            for n, row in enumerate(poses or ()):
-                if fault := pose_fault(row, poses[n - 1] if n else None):  # type: ignore[index]
-                    raise scene_fault(fault, n)
-            return poses
-        try:
-            return read_poses(poses)  # type: ignore[return-value]
-        except CameraFileError as error:
-            raise scene_fault(str(error)) from None
+    def _check_poses(cls, poses: str | PoseRows | None) -> str | PoseRows | None:
+        for n, row in enumerate(poses if isinstance(poses, tuple) else ()):
+            if fault := pose_fault(row, poses[n - 1] if n else None):  # type: ignore[index, arg-type]
+                raise scene_fault(fault, n)
+        return poses
 
     @field_validator("eye", "target", "up", mode="after")
     @classmethod
@@ -240,8 +261,12 @@ class Camera(Section):
         for name in ("baseline", "rotation", "translation") if self.beside is None else ():
             if name in given:
                 raise scene_fault("goes with beside, the name of another camera; add it or remove this", name)
-        if self.scale and self.calibration is None:
-            raise scene_fault("goes with calibration; remove it", "scale")
+        for name in ("scale", "calibration_eye", "calibration_unit") if self.calibration is None else ():
+            if getattr(self, name) != type(self).model_fields[name].default:
+                raise scene_fault("goes with calibration; remove it", name)
+        for name in PoseKeys._fields if not isinstance(self.poses, str) else ():
+            if name in given:
+                raise scene_fault("goes with poses, the path of a file; remove it", name)
         if self.outside == "background" and self.distortion is None and self.calibration is None:
             raise scene_fault("goes with distortion; remove it", "outside")
         exclusive = (("calibration", "intrinsics", "fov"), ("pose", "poses", "eye"), ("calibration", "distortion"))
@@ -284,6 +309,21 @@ class Camera(Section):
         needed |= {name for name in ("distortion", "outside") if name in self.model_fields_set}
         return {name: value for name, value in dump(self).items() if name in needed}
 
+    def with_poses(self) -> Self:
+        """Return a copy with the rows of the trajectory file, if there is one.
+
+        Raises:
+            PydanticCustomError: when the file cannot be used.
+        """
+        if not isinstance(self.poses, str):
+            return self
+        try:
+            rows = read_poses(self.poses, PoseKeys(**{name: getattr(self, name) for name in PoseKeys._fields}))
+        except CameraFileError as error:
+            raise scene_fault(str(error), "poses") from None
+        kept = {name: getattr(self, name) for name in self.model_fields_set - {*PoseKeys._fields}}
+        return self.model_validate(kept | {"poses": rows})
+
     def calibrated(self, size: tuple[int, int]) -> Self:
         """Return a copy with the intrinsics and the distortion of the calibration file, if there is one.
 
@@ -296,7 +336,7 @@ class Camera(Section):
         if self.calibration is None:
             return self
         try:
-            calibration = read_calibration(self.calibration)
+            calibration = read_calibration(self.calibration, self.calibration_eye, self.calibration_unit)
         except CameraFileError as error:
             raise scene_fault(str(error), "calibration") from None
         if self.scale and calibration.size is None:
@@ -314,16 +354,12 @@ class Camera(Section):
         (fx, fy), (cx, cy) = calibration.focal, calibration.centre
         intrinsics = {"fx": fx * scale_x, "fy": fy * scale_y}
         intrinsics |= {"cx": (cx + 0.5) * scale_x - 0.5, "cy": (cy + 0.5) * scale_y - 0.5}
-        update: dict[str, Any] = {"calibration": None, "scale": False, "intrinsics": intrinsics}
-        update |= self._pair_of(calibration)
-        if any(calibration.coefficients):
-            model = "fisheye" if calibration.fisheye else "pinhole"
-            # OpenCV omits trailing coefficients of the rational model.
-            coefficients = zip(MODELS[model].coefficients, calibration.coefficients, strict=False)
-            update["distortion"] = {"model": model, **dict(coefficients)}
-        elif calibration.fisheye:
-            update["distortion"] = {"model": "fisheye"}
-        unused = {"calibration", "scale"} if "distortion" in update else {"calibration", "scale", "outside"}
+        update: dict[str, Any] = {"intrinsics": intrinsics, **self._pair_of(calibration)}
+        unused = {"calibration", "calibration_eye", "calibration_unit", "scale"}
+        if calibration.model != "pinhole" or any(calibration.coefficients.values()):
+            update["distortion"] = {"model": calibration.model, **calibration.coefficients}
+        else:
+            unused |= {"outside"}
         kept = {name: getattr(self, name) for name in self.model_fields_set - unused}
         try:
             return self.model_validate(kept | update)
@@ -338,8 +374,8 @@ class Camera(Section):
         """Return rotation and translation of a stereo calibration, for a camera with a reference camera."""
         if self.beside is None or calibration.right is None:
             if self.beside is not None and self.rotation is None:
-                remedy = "set calibration_eye: right for a stereo file with R and T, or add rotation and translation"
-                raise scene_fault(f"{self.calibration}: has no place next to {self.beside}; {remedy}", "calibration")
+                remedy = "set calibration_eye: right for a stereo file, or add rotation and translation"
+                raise scene_fault(f"{self.calibration}: has no R and T of this camera; {remedy}", "calibration")
             return {}
         if self.rotation is not None:
             raise scene_fault(f"is given together with R and T of {self.calibration}; remove one of them", "rotation")

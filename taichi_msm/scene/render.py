@@ -101,11 +101,10 @@ class Render(Section):
 
     @field_validator("camera", mode="after")
     @classmethod
-    def _read_calibration(cls, camera: AnyCamera, info: ValidationInfo) -> AnyCamera:
+    def _read_files(cls, camera: AnyCamera, info: ValidationInfo) -> AnyCamera:
         if isinstance(camera, Camera) and camera.beside is not None:
             raise scene_fault("goes with render.cameras, where the other camera has its name", "beside")
-        # An invalid size is reported separately.
-        return camera.calibrated(info.data["size"]) if isinstance(camera, Camera) and "size" in info.data else camera
+        return _read_files(camera, info)
 
     @field_validator("cameras", mode="after")
     @classmethod
@@ -123,15 +122,13 @@ class Render(Section):
                 raise scene_fault("is the name of a camera that any scene has; take another name", name)
             if isinstance(camera, Camera) and camera.beside is not None:
                 _check_beside(name, cameras)
-        if "size" not in info.data:
-            return cameras
-        calibrated = {}
+        read = {}
         for name, camera in cameras.items():
             try:
-                calibrated[name] = camera.calibrated(info.data["size"]) if isinstance(camera, Camera) else camera
+                read[name] = _read_files(camera, info)
             except PydanticCustomError as error:
                 raise scene_fault(error.message(), name, *(error.context or {}).get("below", ())) from None
-        return calibrated
+        return read
 
     @model_validator(mode="before")
     @classmethod
@@ -190,6 +187,15 @@ class Render(Section):
         """Return the name of the first camera that is `beside` a camera, or "" if there is none."""
         cameras = self.all_cameras.items()
         return next((other for other, camera in cameras if isinstance(camera, Camera) and camera.beside == name), "")
+
+
+def _read_files(camera: AnyCamera, info: ValidationInfo) -> AnyCamera:
+    """Return a camera with the contents of its files."""
+    if not isinstance(camera, Camera):
+        return camera
+    camera = camera.with_poses()
+    # An invalid size is reported separately.
+    return camera.calibrated(info.data["size"]) if "size" in info.data else camera
 
 
 def _check_beside(name: str, cameras: Mapping[str, AnyCamera]) -> None:

@@ -49,6 +49,7 @@ def crumpled(made: Scene) -> Array:
     return rest_positions(made.sheet) + np.random.default_rng(5).normal(0, 0.03, (*made.sheet.points, 3))
 
 
+@pytest.mark.default_cases("dented-oblique", "folded-near")
 @CAMERAS
 @pytest.mark.parametrize("shape", [dented, folded])
 def test_coordinates_and_depth_are_those_of_the_twin(shape: Any, camera: Any, device: Device) -> None:

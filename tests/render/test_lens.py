@@ -182,6 +182,7 @@ def test_pictures_are_like_the_twins(lens: str, render: dict[str, Any], device: 
         assert 0.2 < (drawn.max(axis=-1) > 0).mean() < 0.95
 
 
+@pytest.mark.default_cases("fisheye-3")
 @cases(("fold", 0), ("fisheye", 3), lens=LENSES, refine=(0, 3))
 def test_large_cells_are_bent(lens: str, refine: int, device: Device) -> None:
     """Sides of cells 90 pixels long bend by up to 8 px, more than a tile, outward and inward."""
@@ -193,6 +194,7 @@ def test_large_cells_are_bent(lens: str, refine: int, device: Device) -> None:
     np.testing.assert_allclose(found.coordinates, coordinates, atol=1e-5)
 
 
+@pytest.mark.slow
 @cases(("fisheye", 4), lens=LENSES, lanes=(1, 4))
 def test_the_shape_of_a_tile_does_not_change_the_bits(lens: str, lanes: int, device: Device) -> None:
     renders: list[dict[str, Any]] = [{"shading": "tissue", "size": [79, 57]}, {"wireframe": True, "supersample": 3}]
@@ -201,6 +203,7 @@ def test_the_shape_of_a_tile_does_not_change_the_bits(lens: str, lanes: int, dev
         assert_alike_in_other_tiles(made, texture, folded(made), lanes)
 
 
+@pytest.mark.default_cases("endoscope-folded", "fisheye-folded")
 @cases(*((lens, folded) for lens in LENSES), ("fold", crumpled), lens=LENSES, shape=(dented, folded, crumpled))
 def test_labels_are_on_the_ray_of_each_pixel(lens: str, shape: Any, device: Device) -> None:
     made = seen_through(lens)

@@ -62,6 +62,7 @@ def axes(made: Scene) -> Array:
     return view(made).axes.T * [1, -1, -1]
 
 
+@pytest.mark.default_cases("folded-top", "crumpled-endoscope")
 @pytest.mark.parametrize(("shape", "camera"), [(folded, "top"), (dented, "pinhole"), (crumpled, "endoscope")])
 def test_normals_are_those_of_the_twin(shape: Any, camera: str, device: Device) -> None:
     made = with_instruments(drawable(camera=CAMERAS[camera]))
@@ -80,6 +81,7 @@ def test_normals_are_those_of_the_twin(shape: Any, camera: str, device: Device) 
     assert ((sight * found).sum(axis=-1)[seen] < 1e-6).all(), "toward the camera"
 
 
+@pytest.mark.default_cases("top", "calibrated")
 @EVERY_CAMERA
 def test_a_tilted_sheet_has_one_normal(camera: str, device: Device) -> None:
     made = with_instruments(drawable(camera=CAMERAS[camera]))
@@ -136,6 +138,7 @@ def test_normals_are_across_the_gradient_of_depth(camera: str, device: Device) -
     assert apart(found.normals[middle][one], across).max() < 1e-4
 
 
+@pytest.mark.slow
 def test_other_labels_keep_their_bits(device: Device) -> None:
     made = with_instruments(drawable(camera=CAMERAS["endoscope"]))
     position = folded(made)

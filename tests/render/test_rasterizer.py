@@ -73,6 +73,7 @@ def test_nothing_is_drawn_before_every_mass_point_is_projected(device: Device) -
         assert (together.draw(position) == alone.draw(position)).all()
 
 
+@pytest.mark.default_cases("oblique", "tissue below", "inside")
 @pytest.mark.parametrize(
     "render",
     [
@@ -100,6 +101,7 @@ def test_picture_is_like_the_twin(render: dict[str, Any], device: Device) -> Non
     assert (apart == 1).mean() < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distortion", [None, {"k1": -0.1}])
 def test_what_passes_behind_the_camera_is_looked_for_only_where_it_may_be_seen(
     distortion: Any, device: Device, monkeypatch: pytest.MonkeyPatch
@@ -149,6 +151,7 @@ def test_the_shape_of_a_tile_does_not_change_the_bits(lanes: int, device: Device
         assert_alike_in_other_tiles(made, texture, dented(made), lanes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parts", [gpu.MAX_PARTS, 100])
 def test_launches_do_not_change_the_bits(parts: int, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """On a GPU, many strips, many launches for the lists of a strip, several triangles taken together, shuffled lists.
@@ -188,6 +191,7 @@ def test_launches_do_not_change_the_bits(parts: int, device: Device, monkeypatch
         np.testing.assert_array_equal(picture, expected)
 
 
+@pytest.mark.slow
 def test_the_bound_of_a_thread_is_asserted(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """The finest cells, folded, with so many that all triangles of a cell are taken together, and all instruments."""
     made = with_instruments(drawable((4, 4), size=[9, 7], refine=64, camera="oblique", supersample=4))
@@ -201,6 +205,7 @@ def test_the_bound_of_a_thread_is_asserted(device: Device, monkeypatch: pytest.M
         drawing.draw(position, rods=place_capsules(made, position, 0))
 
 
+@pytest.mark.default_cases("headlight-oblique")
 @pytest.mark.parametrize(
     ("shading", "camera"),
     [
@@ -326,6 +331,7 @@ def test_there_are_no_gaps_between_the_triangles_of_a_crumpled_sheet(device: Dev
     assert draw(made, position, np.full((4, 4, 3), 255, np.uint8)).all()
 
 
+@pytest.mark.slow
 def test_a_sheet_that_passes_through_the_eye_is_seen_in_part(device: Device) -> None:
     texture = np.full((4, 4, 3), 255, np.uint8)
     drawing = None

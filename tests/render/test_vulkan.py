@@ -83,6 +83,7 @@ def runs(root: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, li
     return here, json.loads(done.stdout)
 
 
+@pytest.mark.slow
 def test_runs_on_a_gpu_are_those_on_the_cpu(
     runs: tuple[Path, list[Any]], device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -275,6 +276,7 @@ def test_what_a_picture_takes_is_given_back(root: Path) -> None:
     assert int(done.stdout) < 3 * 24 * 199**2 / 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("output", ["png", *(pytest.param(one, marks=pytest.mark.slow) for one in ("depth", "tracks"))])
 def test_a_kernel_that_is_cut_short_is_an_error_of_one_line(
     output: str, small: Path, root: Path, message: Messages

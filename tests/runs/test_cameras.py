@@ -22,7 +22,6 @@ from taichi_msm.render.camera import View, calibration, is_moving, pair_transfor
 from taichi_msm.render.lens_table import undistortion_map
 from taichi_msm.render.rasterizer import Rasterizer
 from taichi_msm.runs.finished import read_run
-from taichi_msm.scene.calibration import Calibration, StereoPose
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from taichi_msm.view.recording import Captures
@@ -362,25 +361,24 @@ def test_what_does_not_go_together_is_refused(small: Path, message: Messages) ->
     refuse(message, beside(NEAR), "output=[stereo, disparity]")
 
 
-def test_the_pose_of_a_pair_comes_from_one_place(
-    small: Path, message: Messages, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A stereo file has R and T of the right camera; a file of one camera is completed by the scene."""
-    right = StereoPose(((1, 0, 0), (0, 1, 0), (0, 0, 1)), (-0.01, 0.002, 0))
-    mono = Calibration((40, 41), (20, 15), fisheye=False, coefficients=(), size=None)
-    monkeypatch.setattr(
-        "taichi_msm.scene.camera.read_calibration", lambda path: mono._replace(right=right if "pair" in path else None)
-    )
-    for name in ("pair.yml", "own.yml"):
-        Path(name).write_text("")
-    pair, own = ({"beside": "left", "calibration": name} for name in ("pair.yml", "own.yml"))
-    translation = {"rotation": np.eye(3).tolist(), "translation": [-0.01, 0.002, 0]}
-    views = [view_at(seen_by({"left": LEFT, "right": right}), 0, "right") for right in (pair, {**own, **translation})]
-    np.testing.assert_array_equal(views[0].matrix, views[1].matrix)
-    np.testing.assert_allclose(views[0].eye, [0.05 + 0.01, 0.002, 0.5])
-    for wrong in (own, {**pair, **translation}):
+def test_a_pair_of_a_stereo_file(small: Path, message: Messages) -> None:
+    """R and T come from the file or, for a file of one camera, from the scene."""
+    matrices = [f"[[{fx}, 0, 20], [0, 41, 15], [0, 0, 1]]" for fx in (40, 43)]
+    eyes = [f"K{n}: {matrix}\nD{n}: [-0.0{n}, 0, 0, 0]\n" for n, matrix in enumerate(matrices, 1)]
+    rotation = TURN.tolist()
+    Path("pair.yml").write_text("".join(eyes) + f"R: {rotation}\nT: [-10, 2, 0.5]\n")
+    Path("right.yml").write_text(f"camera_matrix: {matrices[1]}\ndist_coeffs: [-0.02, 0, 0, 0]\n")
+    left = {**LEFT, "calibration": "pair.yml"}
+    right = {"beside": "left", "calibration": "pair.yml", "calibration_eye": "right", "calibration_unit": "mm"}
+    single = {"beside": "left", "calibration": "right.yml"}
+    place = {"rotation": rotation, "translation": [-0.01, 0.002, 0.0005]}
+    found = [seen_by({"left": left, "right": other}) for other in (right, {**single, **place})]
+    assert found[0].render == found[1].render
+    np.testing.assert_allclose(pair_transform(found[0], "right")["translation"], place["translation"], atol=1e-12)
+    assert [view_at(found[0], 0, name).scale[0] for name in ("left", "right")] == [40, 43]
+    for wrong in (single, {**right, **place}, {**right, "calibration_eye": "left"}):
         with message.raises(SceneError):
-            seen_by({"left": LEFT, "right": wrong})
+            seen_by({"left": left, "right": wrong})
 
 
 LENS = {"k1": -0.1, "p1": 0.002}

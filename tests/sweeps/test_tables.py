@@ -162,6 +162,7 @@ def test_the_picture_shows_every_run(make: Make, ran: Path) -> None:
     assert 0.97 < (np.abs(tiles[3] - 0xE6) <= 2).all(axis=2).mean() < 1
 
 
+@pytest.mark.slow
 def test_the_same_results_give_the_same_bytes(make: Make, ran: Path) -> None:
     result = make(128)
     copy_runs(ran, result)
@@ -183,6 +184,7 @@ def test_a_damaged_picture_is_no_end(make: Make, ran: Path, message: Messages) -
     message(notes, CONTACT, "0004.png", hide=r"(?<=decoded).*")
 
 
+@pytest.mark.default_cases("frames-0")
 @pytest.mark.parametrize(("kept", "difference"), [("frames", 0), ("animation.gif", 10), ("trajectory.npz", 0)])
 def test_the_last_frame_comes_from_any_output(make: Make, ran: Path, kept: str, difference: float, pool: Pool) -> None:
     """An animation has fewer colours; what is drawn again is the same."""

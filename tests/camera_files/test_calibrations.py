@@ -1,18 +1,23 @@
-"""Calibrations and trajectories as OpenCV, ROS, STIR and TUM write them."""
+"""Calibrations as other programs write them."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
 import pytest
 
 from taichi_msm import load_scene
+from taichi_msm.camera_files.calibrations import read_calibration
+from taichi_msm.camera_files.text import CameraFileError
+from taichi_msm.cli.main import main
 from taichi_msm.errors import SceneError
 from taichi_msm.render.camera import view
-from taichi_msm.scene.calibration import read_calibration
 from taichi_msm.scene.camera import Camera
 from tests.golden import Messages
 
@@ -65,20 +70,149 @@ rectification_matrix: {rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}
 """
 
 
-def test_ros_and_stir_are_read(small: Path) -> None:
+def test_ros_is_read(small: Path) -> None:
     for model, expected in (("plumb_bob", "pinhole"), ("equidistant", "fisheye")):
         Path("ros.yaml").write_text(ROS.replace("MODEL", model))
         camera = camera_of("ros.yaml")
         assert camera.distortion is not None
         assert camera.distortion.model == expected
         assert camera.distortion.coefficients[:4] == (0.01, 0.002, 0.0003, -0.0004)
-    # STIRLoader.py of the data set reads these keys, and tells no size.
-    left = {"leftcameramat": MATRIX.tolist(), "leftdistortioncoeffs": [0, 0, 0, 0, 0]}
-    Path("calib.json").write_text(json.dumps({**left, "rightcameramat": [], "rotation": [], "translation": []}))
-    camera = camera_of("calib.json")
-    assert camera.intrinsics is not None
-    assert camera.intrinsics.fy == 60.5
-    assert camera.distortion is None
+
+
+RIGHT = np.array([[62.5, 0, 20.25], [0, 61.5, 13.75], [0, 0, 1]])
+ROTATION = np.array([[1, 0, 0], [0, 0.8, -0.6], [0, 0.6, 0.8]])
+TRANSLATION = np.array([-4.25, 0.0625, -0.125])  # [mm]
+
+
+def stereo(matrix: str, distortion: str, *marks: str) -> str:
+    """A file of OpenCV with these names of keys, each with an eye's mark."""
+    storage = cv2.FileStorage(".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    storage.write("image_size", np.array([[40, 30]]))
+    for mark, value, coefficients in zip(marks, (MATRIX, RIGHT), (COEFFICIENTS, [0.25, *4 * [0]]), strict=True):
+        storage.write(f"{matrix}{mark}", value)
+        storage.write(f"{distortion}{mark}", np.array([coefficients]))
+        storage.write(f"R{mark}", np.eye(3))  # of the rectification
+        storage.write(f"P{mark}", np.eye(3, 4))
+    storage.write("R", ROTATION)
+    storage.write("T", TRANSLATION)
+    return str(storage.releaseAndGetString())
+
+
+# STIRLoader.py of the data set reads these keys; lengths are metres, and there is no size.
+STIR = {
+    "leftcameramat": MATRIX.tolist(),
+    "rightcameramat": RIGHT.tolist(),
+    "leftdistortioncoeffs": COEFFICIENTS,
+    "rightdistortioncoeffs": [0.25, 0, 0, 0, 0],
+    "rotation": ROTATION.tolist(),
+    "translation": (TRANSLATION / 1e3).tolist(),
+}
+KALIBR = """\
+cam0:
+  cam_overlaps: [1]
+  camera_model: pinhole
+  distortion_coeffs: [-0.3, 0.1, 0.001, -0.002]
+  distortion_model: radtan
+  intrinsics: [61.5, 60.5, 19.25, 14.75]
+  resolution: [40, 30]
+  rostopic: /cam0/image_raw
+cam1:
+  T_cn_cnm1:
+  - [1.0, 0.0, 0.0, -0.00425]
+  - [0.0, 0.8, -0.6, 0.0000625]
+  - [0.0, 0.6, 0.8, -0.000125]
+  - [0.0, 0.0, 0.0, 1.0]
+  cam_overlaps: [0]
+  camera_model: pinhole
+  distortion_coeffs: [0.25, 0, 0, 0]
+  distortion_model: radtan
+  intrinsics: [62.5, 61.5, 20.25, 13.75]
+  resolution: [40, 30]
+  rostopic: /cam1/image_raw
+"""
+_SECTION = """\
+[Stereo{}]
+res_x = 40
+res_y = 30
+{}
+fc_x = {}
+fc_y = {}
+cc_x = {}
+cc_y = {}
+"""
+
+
+def stereomis() -> str:
+    """StereoCalibration.ini of the data set."""
+    text = "[Version]\nmajor = 1\n"
+    for eye, matrix, coefficients in (("Left", MATRIX, COEFFICIENTS), ("Right", RIGHT, [0.25, *4 * [0]])):
+        lines = [f"kc_{n} = {value}" for n, value in enumerate([*coefficients, 0, 0, 0])]
+        lines += [f"R_{n} = {value}" for n, value in enumerate((ROTATION if eye == "Right" else np.eye(3)).ravel())]
+        lines += [f"T_{n} = {value}" for n, value in enumerate(TRANSLATION if eye == "Right" else np.zeros(3))]
+        text += _SECTION.format(eye, "\n".join(lines), *matrix[[0, 1], [0, 1]], *matrix[:2, 2])
+    return text
+
+
+@pytest.mark.parametrize(
+    ("write", "unit"),
+    [
+        *(
+            pytest.param(partial(stereo, *names), "mm", id=names[0] + names[2])
+            for names in (
+                *(("K", "D", "1", "2"), ("M", "D", "1", "2"), ("K", "D", "0", "1"), ("mtx", "dist", "L", "R")),
+                *(("cameraMatrix", "distCoeffs", "1", "2"), ("camera_matrix", "dist_coeffs", "_left", "_right")),
+            )
+        ),
+        pytest.param(partial(json.dumps, STIR), None, id="STIR"),
+        pytest.param(lambda: KALIBR, None, id="Kalibr"),
+        pytest.param(stereomis, None, id="StereoMIS"),
+    ],
+)
+def test_both_cameras_of_a_pair_are_read(write: Callable[[], str], unit: Literal["mm"] | None, small: Path) -> None:
+    Path("pair.yml").write_text(write())
+    left, right = (read_calibration("pair.yml", eye, unit) for eye in ("left", "right"))
+    assert (left.focal, left.centre) == ((61.5, 60.5), (19.25, 14.75))
+    assert (right.focal, right.centre) == ((62.5, 61.5), (20.25, 13.75))
+    assert [*left.coefficients.values()][:4] == COEFFICIENTS[:4]
+    assert [*right.coefficients.values()][:4] == [0.25, 0, 0, 0]
+    assert left.size == right.size == (None if write.__class__ is partial and "leftcameramat" in write() else (40, 30))
+    assert right.right is not None
+    np.testing.assert_array_equal(right.right.rotation, ROTATION)
+    np.testing.assert_allclose(right.right.translation, TRANSLATION / 1e3, rtol=1e-15)
+
+
+def test_a_pair_of_unknown_unit_is_refused(small: Path, message: Messages) -> None:
+    Path("pair.yml").write_text(stereo("M", "D", "1", "2"))
+    with message.raises(CameraFileError, "pair.yml", "calibration_unit"):
+        read_calibration("pair.yml", "right")
+    Path("pair.yml").write_text(K + D)
+    with message.raises(SceneError, "render.camera.calibration: pair.yml", "calibration_eye"):
+        camera_of("pair.yml", "render.camera.calibration_eye=right")
+
+
+@pytest.mark.parametrize(
+    ("line", "model", "focal", "coefficients"),
+    [
+        ("SIMPLE_PINHOLE 40 30 60 19.75 15.25", "pinhole", (60, 60), {}),
+        ("PINHOLE 40 30 60 61 19.75 15.25", "pinhole", (60, 61), {}),
+        ("SIMPLE_RADIAL 40 30 60 19.75 15.25 0.1", "pinhole", (60, 60), {"k1": 0.1}),
+        ("RADIAL 40 30 60 19.75 15.25 0.1 0.2", "pinhole", (60, 60), {"k1": 0.1, "k2": 0.2}),
+        ("OPENCV 40 30 60 61 19.75 15.25 0.1 0 1e-3 2e-3", "pinhole", (60, 61), {"k1": 0.1, "p1": 1e-3, "p2": 2e-3}),
+        ("FULL_OPENCV 40 30 60 61 19.75 15.25 0 0 0 0 0 0 0 0.6", "pinhole", (60, 61), {"k6": 0.6}),
+        ("OPENCV_FISHEYE 40 30 60 61 19.75 15.25 0.1 0 0 0.4", "fisheye", (60, 61), {"k1": 0.1, "k4": 0.4}),
+        ("RADIAL_FISHEYE 40 30 60 19.75 15.25 0.1 0.2", "fisheye", (60, 60), {"k1": 0.1, "k2": 0.2}),
+    ],
+)
+def test_cameras_of_colmap_are_read(
+    line: str, model: str, focal: tuple[float, float], coefficients: dict[str, float], small: Path
+) -> None:
+    head = "# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
+    Path("cameras.txt").write_text(f"{head}# Number of cameras: 1\n1 {line}\n")
+    calibration = read_calibration("cameras.txt")
+    assert (calibration.model, calibration.focal, calibration.size) == (model, focal, (40, 30))
+    # COLMAP's first pixel has its centre at (0.5, 0.5).
+    assert calibration.centre == (19.25, 14.75)
+    assert {name: value for name, value in calibration.coefficients.items() if value} == coefficients
 
 
 PRINTED = """\
@@ -170,12 +304,15 @@ D = "D: [-0.3, 0.1, 0.001, -0.002, 0.03]\n"
         pytest.param(PRINTED.replace("g_x: 0", "g_x: 2"), id="binning of ROS"),
         pytest.param(PRINTED.replace("x_offset: 0", "x_offset: 4"), id="offset of ROS"),
         pytest.param(PRINTED.replace("width: 0", "width: 20"), id="width of ROS"),
-        pytest.param(
-            "M1: [1, 0, 0, 0, 1, 0, 0, 0, 1]\nD1: 3\nM2: [1, 0, 0, 0, 1, 0, 0, 0, 1]\nD2: 3", id="stereo pair"
-        ),
-        pytest.param("cam0: {camera_model: pinhole, intrinsics: [1, 1, 1, 1]}", id="Kalibr"),
-        pytest.param("; of two\n[StereoLeft]\nfc_x = 3\n", id="ini file"),
-        pytest.param("# Camera list\n1 PINHOLE 640 480 5e2 5e2 3e2 2e2\n", id="COLMAP"),
+        pytest.param(K.replace("K", "M1") + K.replace("K", "M2") + "D1: 3\nD2: [0, 0, 0, 0]", id="stereo pair"),
+        pytest.param(KALIBR.replace("distortion_coeffs: [-0.3, 0.1, 0.001, -0.002]", "x: 1"), id="Kalibr"),
+        pytest.param(KALIBR.replace("pinhole", "ds"), id="projection of Kalibr"),
+        pytest.param(KALIBR.replace("radtan", "fov"), id="distortion of Kalibr"),
+        pytest.param("; of two\n[StereoLeft]\nfc_x = 3\n", id="StereoMIS"),
+        pytest.param("[Camera]\nfc_x = 3\n", id="ini file"),
+        pytest.param("# Camera list\n1 FOV 40 30 5e2 5e2 3e2 2e2 0.1\n", id="COLMAP"),
+        pytest.param("1 PINHOLE 40 30 5e2 5e2 3e2 2e2\n2 PINHOLE 40 30 6e2 5e2 3e2 2e2\n", id="two of COLMAP"),
+        pytest.param("1 PINHOLE 40 30 5e2 5e2 3e2\n", id="parameters of COLMAP"),
     ],
 )
 def test_what_is_no_calibration_is_refused(text: str, small: Path, message: Messages) -> None:
@@ -245,9 +382,21 @@ def test_spellings_of_the_size_are_understood(text: str, small: Path) -> None:
 )
 def test_models_are_honoured(text: str, fisheye: bool, small: Path) -> None:
     Path("camera.yml").write_text(f"{K}D: [0.01, 0.002, 0.0003, -0.0004]\n{text}\n")
-    assert read_calibration("camera.yml").fisheye == fisheye
+    assert read_calibration("camera.yml").model == ("fisheye" if fisheye else "pinhole")
     Path("camera.yml").write_text(K + "distortion_model: none")
     assert camera_of("camera.yml").distortion is None
+
+
+def test_check_prints_what_was_read(small: Path, capsys: pytest.CaptureFixture[str], message: Messages) -> None:
+    Path("pair.yml").write_text(stereo("K", "D", "1", "2"))
+    cameras = "{left: {eye: [0, 0, 0.4], calibration: pair.yml}, right: {eye: [0, 0, 0.4], intrinsics: INTRINSICS}}"
+    intrinsics = "{fx: 20, fy: 15, cx: 19.5, cy: 14.5}"
+    value = cameras.replace("INTRINSICS", intrinsics)
+    assert not main(["check", "small.yaml", "--set", f"render.cameras={value}", "--set", "output=[]"])
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("render.")]
+    # 20 px on both sides of the centre are 45 degrees at a focal length of 20 px.
+    assert "fov 90.0 x 90.0 degrees" in lines[1]
+    message(lines, "render.cameras.left: pinhole, 40 x 30 px", "k1 -0.3")
 
 
 def test_files_are_in_the_folder_of_the_scene(small: Path, message: Messages) -> None:
@@ -261,89 +410,3 @@ def test_files_are_in_the_folder_of_the_scene(small: Path, message: Messages) ->
     Path("camera.yml").rename("inner/camera.yml")
     Path("inner/s.yaml").write_text(text.replace("PATH", "camera.yml"))
     assert isinstance(load_scene("inner/s.yaml", image="speckle.png").render.camera, Camera)
-
-
-TUM = """\
-# timestamp tx ty tz qx qy qz qw
-0.0 0.0 0.0 0.4 1 0 0 0
-0.2 0.1 0.0 0.4 1 0 0 0
-0.4 0.1 0.0 0.5 0.6 0.8 0 0
-"""
-
-
-def test_a_trajectory_is_read(small: Path) -> None:
-    Path("poses.txt").write_text(TUM)
-    made = load_scene("small.yaml", ["render.camera={poses: poses.txt}"])
-    # A camera that looks down: half a turn about x.
-    np.testing.assert_allclose(view(made, 0.1).eye, [0.05, 0, 0.4])
-    np.testing.assert_allclose(view(made, 0.1).axes, np.eye(3), atol=1e-12)
-    np.testing.assert_allclose(view(made, 0.3).eye, [0.1, 0, 0.45])
-    # From (1, 0, 0, 0) to (0.6, 0.8, 0, 0) is a turn about z by twice the angle whose cosine is 0.6; half of it.
-    angle = np.arccos(0.6)
-    np.testing.assert_allclose(view(made, 0.3).axes[0], [np.cos(angle), np.sin(angle), 0], atol=1e-12)
-    np.testing.assert_allclose(view(made, 0.3).axes[2], [0, 0, 1], atol=1e-12)
-
-
-EUROC = """\
-#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z [],v_RS_R_x [m s^-1]
-0,0.0,0.0,0.4,0,1,0,0,7
-200000000,0.1,0.0,0.4,0,1,0,0,7
-400000000,0.1,0.0,0.5,0,0.6,0.8,0,7
-"""
-
-
-TABLE = TUM.replace("# timestamp tx ty tz qx qy qz qw", "time,x,y,z,qx,qy,qz,qw").replace(" ", ",")
-MILLISECONDS = """\
-# format: qw qx qy qz tx ty tz timestamp(ms)
-0 1 0 0 0 0 0.4 0
-0 1 0 0 0.1 0 0.4 200
-0 0.6 0.8 0 0.1 0 0.5 400
-"""
-
-
-@pytest.mark.parametrize(
-    "text",
-    [EUROC, MILLISECONDS, TABLE, TABLE.replace(",", ";").replace(".", ",").replace("time", '"t"')],
-    ids=["EuRoC", "milliseconds", "table", "table of a spreadsheet"],
-)
-def test_a_header_decides_on_the_columns(text: str, small: Path) -> None:
-    Path("tum.txt").write_text(TUM)
-    Path("poses.txt").write_text(text)
-    expected = load_scene("small.yaml", ["render.camera={poses: tum.txt}"])
-    assert load_scene("small.yaml", ["render.camera={poses: poses.txt}"]) == expected
-
-
-HEADER = "# timestamp tx ty tz qx qy qz qw"
-
-
-@pytest.mark.parametrize(
-    ("text", "place"),
-    [
-        pytest.param(TUM.replace("0.4 0.1", "0.2 0.1"), "poses.txt:4", id="not sorted"),
-        pytest.param(TUM.replace("0.6 0.8", "0.6 0.9"), "poses.txt:4", id="no rotation"),
-        pytest.param(TUM.replace("0.6 0.8", "0.6"), "poses.txt:4", id="seven numbers"),
-        pytest.param(TUM.partition("\n")[2].replace(" ", ","), "poses.txt:1", id="commas without a header"),
-        pytest.param(TUM.replace("qx qy qz qw", "w x y z"), "poses.txt:1", id="unknown columns"),
-        pytest.param(EUROC.replace("x [m]", "x [mm]"), "poses.txt:1", id="unknown units"),
-        pytest.param("1 0 0 0 0 1 0 0 0 0 1 0\n", "poses.txt:1", id="KITTI"),
-        pytest.param("# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n", "poses.txt:1", id="COLMAP"),
-        pytest.param("# nothing\n", "poses.txt", id="no poses"),
-        pytest.param(TUM.replace("0.2 0.1", "2e8 0.1").replace("0.4 0.1", "4e8 0.1"), "", id="nanoseconds"),
-        pytest.param(TUM.replace("0.0 0.0 0.0 0.4", "0.0 0.0 0.0 0.0"), "", id="eye on the sheet"),
-        pytest.param(TUM.replace("0.0 0.0 0.0", "0.1 0.0 0.0"), "", id="late"),
-        pytest.param(TUM.replace("0.4 0.1", "0.3 0.1"), "", id="short"),
-        pytest.param(f"{TUM}# t tx ty tz qw qx qy qz\n", "poses.txt:5", id="other columns than before"),
-        *(
-            pytest.param(TUM.replace(HEADER, f"# {comment}"), "poses.txt:1", id=comment)
-            for comment in ("t, position, quaternion (w, x, y, z)", "time, pos xyz, quat wxyz", "t x y z q0 q1 q2 q3")
-        ),
-        *(
-            pytest.param(TUM.replace(HEADER, f"# {comment}"), "poses.txt:1", id=comment)
-            for comment in ("quaternion, scalar first", "world to camera", "T_cw")
-        ),
-    ],
-)
-def test_a_trajectory_that_cannot_be_used_is_refused(text: str, place: str, small: Path, message: Messages) -> None:
-    Path("poses.txt").write_text(text)
-    with message.raises(SceneError, f"render.camera.poses: {place}"):
-        load_scene("small.yaml", ["render.camera={poses: poses.txt}"])

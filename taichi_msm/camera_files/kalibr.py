@@ -1,0 +1,47 @@
+"""Kalibr's camchain: a section per camera, each but the first with the pose after the one before it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from taichi_msm.camera_files.calibration import Calibration, CalibrationReader, build, lens_model
+from taichi_msm.camera_files.keys import Keys
+from taichi_msm.camera_files.text import CameraFile
+
+
+class Kalibr(CalibrationReader):
+    """Reader of a camchain."""
+
+    name = "Kalibr's camchain"
+    recognised_by = "`cam0` with `camera_model`, `intrinsics`; `T_cn_cnm1` of `cam1`"
+
+    def recognises(self, file: CameraFile) -> bool:
+        """Return whether there are sections of cameras."""
+        return bool(self.cameras(file))
+
+    def cameras(self, file: CameraFile) -> Sequence[Keys]:
+        """Return the sections of the cameras."""
+        sections = [value for _, value in sorted(file.data.items(), key=lambda item: str(item[0]))]
+        cameras = [value for value in sections if isinstance(value, dict)]
+        return [Keys(file, camera) for camera in cameras if {"camera_model", "intrinsics"} <= {*camera}]
+
+    def read(self, keys: Keys) -> Calibration:
+        """Read a section."""
+        file, camera = keys.file, keys.data
+        if (projection := camera["camera_model"]) != "pinhole":
+            raise file.fault(f"camera_model: {projection} is not known; found {keys}; calibrate as pinhole")
+        values = keys.numbers("distortioncoeffs") or []
+        model = lens_model(file, "distortion_model", camera.get("distortion_model"), values)
+        if model is None or not (values or model == "none"):
+            remedy = "write distortion_model: radtan, equidistant or none, and distortion_coeffs"
+            raise file.fault(f"no distortion that is known; found {keys}; {remedy}")
+        intrinsics = keys.require("intrinsics", 4, "intrinsics")
+        model, values = ("pinhole", []) if model == "none" else (model, values)
+        return build(file, intrinsics, keys.require("resolution", 2, "resolution"), model, values)
+
+    def pose(self, keys: Keys) -> tuple[Sequence[float], Sequence[float]] | None:
+        """Read T_cn_cnm1, four rows [R, t]."""
+        if "T_cn_cnm1" not in keys.data:
+            return None
+        rows = keys.require("tcncnm1", 16, "T_cn_cnm1")
+        return [*rows[0:3], *rows[4:7], *rows[8:11]], rows[3:12:4]
