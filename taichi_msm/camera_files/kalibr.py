@@ -28,16 +28,21 @@ class Kalibr(CalibrationReader):
     def read(self, keys: Keys) -> Calibration:
         """Read a section."""
         file, camera = keys.file, keys.data
-        if (projection := camera["camera_model"]) != "pinhole":
-            raise file.fault(f"camera_model: {projection} is not known; found {keys}; calibrate as pinhole")
+        if (projection := camera["camera_model"]) not in ("pinhole", "omni"):
+            raise file.fault(f"camera_model: {projection} is not known; found {keys}; calibrate as pinhole or omni")
         values = keys.numbers("distortioncoeffs") or []
         model = lens_model(file, "distortion_model", camera.get("distortion_model"), values)
         if model is None or not (values or model == "none"):
             remedy = "write distortion_model: radtan, equidistant or none, and distortion_coeffs"
             raise file.fault(f"no distortion that is known; found {keys}; {remedy}")
-        intrinsics = keys.require("intrinsics", 4, "intrinsics")
-        model, values = ("pinhole", []) if model == "none" else (model, values)
-        return build(file, intrinsics, keys.require("resolution", 2, "resolution"), model, values)
+        model, values = ("pinhole", [0.0] * 4) if model == "none" else (model, values)
+        size = keys.require("resolution", 2, "resolution")
+        if projection == "pinhole":
+            return build(file, keys.require("intrinsics", 4, "intrinsics"), size, model, values)
+        if model != "pinhole":
+            raise file.fault(f"omni with {model} is not known; calibrate with distortion_model: radtan or none")
+        xi, *intrinsics = keys.require("intrinsics", 5, "intrinsics")
+        return build(file, intrinsics, size, "omnidir", [xi, *values])
 
     def pose(self, keys: Keys) -> tuple[Sequence[float], Sequence[float]] | None:
         """Read T_cn_cnm1, four rows [R, t]."""
