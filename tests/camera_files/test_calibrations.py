@@ -237,6 +237,29 @@ def test_a_calibration_of_ocamcalib_is_read(small: Path) -> None:
     assert camera.focal_lengths == (1.02 * 120, 1.02 * 120)
 
 
+# Of the data set, without comments.
+EUROC = """\
+sensor_type: camera
+T_BS:
+  cols: 4
+  rows: 4
+  data: [0, -1, 0, -0.02, 1, 0, 0, -0.06, 0, 0, 1, 0.01, 0, 0, 0, 1]
+rate_hz: 20
+resolution: [40, 30]
+camera_model: pinhole
+intrinsics: [61.5, 60.5, 19.25, 14.75] #fu, fv, cu, cv
+distortion_model: radial-tangential
+distortion_coefficients: [-0.3, 0.1, 0.001, -0.002]
+"""
+
+
+def test_a_sensor_of_euroc_is_read(small: Path) -> None:
+    Path("sensor.yaml").write_text(EUROC)
+    calibration = read_calibration("sensor.yaml")
+    assert (calibration.focal, calibration.centre, calibration.size) == ((61.5, 60.5), (19.25, 14.75), (40, 30))
+    assert calibration.coefficients == dict(zip(("k1", "k2", "p1", "p2"), COEFFICIENTS, strict=False))
+
+
 def test_an_omnidirectional_calibration_is_read(small: Path) -> None:
     storage = cv2.FileStorage("omni.yml", cv2.FILE_STORAGE_WRITE)
     storage.write("camera_matrix", MATRIX)
