@@ -23,6 +23,7 @@ REMEDY = "write camera_matrix: [fx, 0, cx, 0, fy, cy, 0, 0, 1], distortion_coeff
 LENSES = {
     **dict.fromkeys(("pinhole", "perspective", "mono", "monocular"), None),
     **dict.fromkeys(("plumbbob", "rationalpolynomial", "rational", "radtan", "radialtangential", "opencv"), "pinhole"),
+    **dict.fromkeys(("omnidir", "omnidirectional", "omni", "mei", "unified"), "omnidir"),
     **dict.fromkeys(("equidistant", "equi", "fisheye", "opencvfisheye", "kannalabrandt", "kannalabrandt4"), "fisheye"),
 }
 NO_DISTORTION = ("none", "nodistortion", "undistorted")
@@ -44,7 +45,7 @@ class Calibration(NamedTuple):
     """Calibration of a camera, in OpenCV's pixels: the centre of the first one is at (0, 0).
 
     Attributes:
-        focal: focal lengths fx, fy [px].
+        focal: focal lengths fx, fy [px]; None if the lens has its own.
         centre: principal point cx, cy [px].
         size: width and height of the pictures [px]; None if the file does not contain them.
         model: name of the lens model, one of `taichi_msm.lenses.MODELS`.
@@ -52,12 +53,25 @@ class Calibration(NamedTuple):
         right: pose of the right camera of a stereo pair, where that was asked for.
     """
 
-    focal: tuple[float, float]
+    focal: tuple[float, float] | None
     centre: tuple[float, float]
     size: tuple[int, int] | None
     model: str
     coefficients: Mapping[str, float]
     right: StereoPose | None = None
+
+    def scaled(self, scale_x: float, scale_y: float) -> Calibration:
+        """Return the calibration for pictures that are scaled by these factors, edges to edges."""
+        (cx, cy), lens = self.centre, dict(self.coefficients)
+        focal = None if self.focal is None else (self.focal[0] * scale_x, self.focal[1] * scale_y)
+        if self.model == "scaramuzza":
+            # In pixels; its matrix [[c, d], [e, 1]] has the ratio of the factors.
+            powers = {"a0": 1, "a2": -1, "a3": -2, "a4": -3}
+            lens |= {name: lens[name] * scale_y**power for name, power in powers.items()}
+            lens |= {name: lens[name] * scale_x / scale_y for name in ("c", "d")}
+        # The edges of a picture are half a pixel from the centres of the outer pixels.
+        centre = (cx + 0.5) * scale_x - 0.5, (cy + 0.5) * scale_y - 0.5
+        return self._replace(focal=focal, centre=centre, coefficients=lens)
 
 
 class CalibrationReader(ABC):
@@ -127,7 +141,7 @@ def build(
         raise file.fault(f"{fault}; write the size of those that were calibrated with")
     pixels = None if size is None else (round(size[0]), round(size[1]))
     coefficients = dict(zip(MODELS[model].coefficients, values, strict=False))
-    return Calibration((fx, fy), (cx, cy), pixels, model, coefficients)
+    return Calibration(None if MODELS[model].focal_length else (fx, fy), (cx, cy), pixels, model, coefficients)
 
 
 def lens_model(file: CameraFile, key: str, value: object, values: Sequence[float]) -> str | None:
@@ -147,6 +161,6 @@ def lens_model(file: CameraFile, key: str, value: object, values: Sequence[float
             raise file.fault(f"{key}: {value}, and coefficients that are not 0: {listed}; {remedy}")
         return "none"
     if name not in LENSES:
-        known = "plumb_bob, radtan, rational_polynomial, equidistant, fisheye, or none without coefficients"
+        known = "plumb_bob, radtan, rational_polynomial, equidistant, fisheye, omnidir, or none without coefficients"
         raise file.fault(f"{key}: {truncate(str(value))} is not known; expected one of: {known}")
     return LENSES[name]

@@ -7,13 +7,14 @@ from typing import Literal
 from taichi_msm.camera_files.calibration import Calibration, CalibrationReader, StereoPose
 from taichi_msm.camera_files.colmap import ColmapCameras
 from taichi_msm.camera_files.kalibr import Kalibr
+from taichi_msm.camera_files.ocamcalib import OCamCalib
 from taichi_msm.camera_files.opencv import OpenCV
 from taichi_msm.camera_files.stereo import Stereo
 from taichi_msm.camera_files.stereomis import StereoMIS
 from taichi_msm.camera_files.text import LENGTH_UNITS, CameraFile
 
 # The first one that recognises a file reads it.
-READERS: tuple[CalibrationReader, ...] = (ColmapCameras(), StereoMIS(), Kalibr(), Stereo(), OpenCV())
+READERS: tuple[CalibrationReader, ...] = (OCamCalib(), ColmapCameras(), StereoMIS(), Kalibr(), Stereo(), OpenCV())
 
 # Limit of the size of a file.
 MAX_BYTES = 2**22

@@ -28,7 +28,7 @@ FLAGS = {**dict.fromkeys(("1", "true", "yes", "on"), True), **dict.fromkeys(("0"
 
 # Keys that are not read but change the projection, unless they are empty or 0.
 UNSUPPORTED = (
-    r".*(distort(?!ed)|distorsion|coef|radial|tangential|prism|fisheye|omni|mirror|polynom|skew).*|kc|[kps][1-6]|xi|"
+    r".*(distort(?!ed)|distorsion|coef|radial|tangential|prism|fisheye|omni|mirror|polynom|skew).*|kc|[kps][1-6]|"
     rf"(?!new|opt).*(cameramat|intrinsic).*|{_PICTURE}?(shape|dimensions?)|"
     rf"{_PICTURE}(size|resolution|width|height).*|alpha|beta|lambda|(lens|dist).*model.*|"
     r"binning|scale(factor)?|undistort(ed)?|rectified|roi|crop(ped)?"
@@ -57,19 +57,21 @@ class OpenCV(CalibrationReader):
             raise file.fault(f"has no camera matrix that is known; found {keys}; {REMEDY}")
         if len(matrix) != 9 or [matrix[n] for n in (1, 3, 6, 7, 8)] != [0, 0, 0, 0, 1] or min(matrix[::4]) <= 0:
             raise file.fault("its camera matrix is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]; write it like that")
-        model = _model(keys, values or ())
+        xi = keys.numbers("xi") or []
+        model = _model(keys, values or (), has_xi=any(xi))
         size = _size(keys)
         if values is None and model != "none":
             fault = "has a camera matrix, and no distortion that is known"
             remedy = "write distortion_coefficients, [0, 0, 0, 0] where there is none"
             raise file.fault(f"{fault}; found {keys}; {remedy}")
-        model, values = ("pinhole", []) if model == "none" else (model, values)
-        calibration = build(file, (matrix[0], matrix[4], matrix[2], matrix[5]), size, model, values or ())
+        values = [*xi, *(values or ())] if model == "omnidir" else values or []
+        model = "pinhole" if model == "none" else model
+        calibration = build(file, (matrix[0], matrix[4], matrix[2], matrix[5]), size, model, values)
         _check_no_unread_keys(keys)
         return calibration
 
 
-def _model(keys: Keys, values: Sequence[float]) -> str:
+def _model(keys: Keys, values: Sequence[float], *, has_xi: bool) -> str:
     """Return the lens model, or "none" where the file states that; all names of models in the file must agree."""
     sources: dict[str, str] = {}  # names of keys by their models
     for name, value in keys.values(LENS).items():
@@ -81,6 +83,9 @@ def _model(keys: Keys, values: Sequence[float]) -> str:
         if (flag := fold(value)) not in FLAGS:
             raise keys.file.fault(f"{name}: {value} is neither true nor false")
         sources["fisheye" if FLAGS[flag] else "pinhole"] = name
+    if has_xi:
+        sources = {**sources, "omnidir": "xi"}
+        sources.pop("pinhole", None)  # The distortion of the omnidirectional model.
     if len(sources) > 1:
         (one, first), (other, second), *_ = sources.items()
         raise keys.file.fault(f"{first} is {one}, {second} is {other}; keep the right one")

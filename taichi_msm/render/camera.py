@@ -479,7 +479,8 @@ def _pinhole_at(camera: Camera, scene: Scene, place: Extrinsics) -> View:
     right, up, depth = axes * np.array([[1.0], [1.0], [-1.0]])
     if (intrinsics := camera.intrinsics) is not None:
         # OpenCV's first pixel has its centre at (0, 0), here at (0.5, 0.5).
-        focal_x, focal_y, x, y = intrinsics.fx, intrinsics.fy, intrinsics.cx + 0.5, intrinsics.cy + 0.5
+        focal_x, focal_y = camera.focal_lengths
+        x, y = intrinsics.cx + 0.5, intrinsics.cy + 0.5
     else:
         focal_x = focal_y = lines / 2 / np.tan(np.radians(camera.fov) / 2)
         x, y = columns / 2, lines / 2

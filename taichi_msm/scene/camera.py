@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from itertools import pairwise
 from typing import Annotated, Any, Literal
@@ -21,6 +22,7 @@ from typing_extensions import Self
 
 from taichi_msm.camera_files.calibration import Calibration
 from taichi_msm.camera_files.calibrations import read_calibration
+from taichi_msm.camera_files.keys import ROUNDING_TOLERANCE
 from taichi_msm.camera_files.text import CameraFileError
 from taichi_msm.camera_files.trajectories import PoseKeys, read_poses
 from taichi_msm.camera_files.trajectory import pose_fault
@@ -42,12 +44,15 @@ _COEFFICIENT = "a number, {:g} to {:g}"
 Coefficient = Annotated[Number, Field(ge=-MAX_COEFFICIENT, le=MAX_COEFFICIENT)]
 _ANY_COEFFICIENT = _COEFFICIENT.format(-MAX_COEFFICIENT, MAX_COEFFICIENT)
 
+_FOCAL_LENGTH = "a number above 0, in pixels"
+_FOCAL_MEANING = "focal length [px]; required unless the lens has one, as scaramuzza does"
+
 
 class Intrinsics(Section):
     """Focal lengths and principal point of a calibrated camera, in OpenCV's pixels."""
 
-    fx: Positive = key(..., "horizontal focal length [px]", "a number above 0, in pixels")
-    fy: Positive = key(..., "vertical focal length [px]", "a number above 0, in pixels")
+    fx: Positive | None = key(None, f"horizontal {_FOCAL_MEANING}", _FOCAL_LENGTH)
+    fy: Positive | None = key(None, f"vertical {_FOCAL_MEANING}", _FOCAL_LENGTH)
     cx: Coefficient = key(..., "horizontal principal point [px]; the centre of the first pixel is 0", _ANY_COEFFICIENT)
     cy: Coefficient = key(..., "vertical principal point [px]; the centre of the first pixel is 0", _ANY_COEFFICIENT)
 
@@ -70,8 +75,8 @@ def _coefficient_keys() -> dict[str, Any]:
     coefficients = {name: row for model in reversed(MODELS.values()) for name, row in model.coefficients.items()}
     return {
         name: (
-            Annotated[Number, Field(ge=row.least, le=MAX_COEFFICIENT)],
-            key(0.0, row.meaning, _COEFFICIENT.format(row.least, MAX_COEFFICIENT)),
+            Annotated[Number, Field(ge=row.least, le=row.most)] | None,
+            key(row.default, row.meaning, _COEFFICIENT.format(row.least, row.most)),
         )
         for name, row in sorted(coefficients.items())
     }
@@ -88,9 +93,23 @@ class Distortion(_Coefficients):  # type: ignore[misc]
         """Coefficients of the model, in its order."""
         return tuple(getattr(self, name) for name in MODELS[self.model].coefficients)
 
+    @property
+    def focal_length(self) -> float | None:
+        """Focal length of the lens [px]; None if `intrinsics` has it."""
+        name = MODELS[self.model].focal_length
+        return getattr(self, name) if name else None
+
+    @model_serializer(mode="wrap")
+    def _dump_own_keys(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        own = MODELS[self.model].coefficients
+        return {name: value for name, value in dump(self).items() if name == "model" or name in own}
+
     @model_validator(mode="after")
     def _check_coefficients_of_model(self) -> Self:
         own = MODELS[self.model].coefficients
+        for name, row in own.items():
+            if getattr(self, name) is None:
+                raise scene_fault(f"missing; expected {_COEFFICIENT.format(row.least, row.most)}", name)
         for name in sorted(self.model_fields_set - {"model", *own}):
             if getattr(self, name):
                 models = _alternatives(model for model, row in MODELS.items() if name in row.coefficients)
@@ -232,6 +251,16 @@ class Camera(Section):
         """Whether the pose of the camera depends on time."""
         return any(isinstance(value[0], tuple) for value in (self.poses, self.eye, self.target, self.up) if value)
 
+    @property
+    def focal_lengths(self) -> tuple[float, float]:
+        """Focal lengths along x and y, those of `intrinsics` or that of the lens [px]."""
+        assert self.intrinsics is not None
+        lens_focal = self.distortion.focal_length if self.distortion else None
+        focal_x, focal_y = lens_focal or self.intrinsics.fx, lens_focal or self.intrinsics.fy
+        assert focal_x is not None
+        assert focal_y is not None
+        return focal_x, focal_y
+
     @field_validator("poses", mode="after")
     @classmethod
     def _check_poses(cls, poses: str | PoseRows | None) -> str | PoseRows | None:
@@ -269,6 +298,7 @@ class Camera(Section):
                 raise scene_fault("goes with poses, the path of a file; remove it", name)
         if self.outside == "background" and self.distortion is None and self.calibration is None:
             raise scene_fault("goes with distortion; remove it", "outside")
+        self._check_focal_length()
         exclusive = (("calibration", "intrinsics", "fov"), ("pose", "poses", "eye"), ("calibration", "distortion"))
         for names in exclusive:
             if len(both := [name for name in names if name in given]) > 1:
@@ -297,6 +327,22 @@ class Camera(Section):
         if self.distortion is not None and not self.has_own_lens:
             message = f"goes with intrinsics or fov; without them this camera has the lens of {self.beside}"
             raise scene_fault(message, "distortion")
+
+    def _check_focal_length(self) -> None:
+        """Check that the focal length is in `intrinsics` or in the lens, or that both agree."""
+        lens_focal = self.distortion.focal_length if self.distortion else None
+        if self.intrinsics is None:
+            if lens_focal is not None:
+                fault = "missing; its lens has the focal length, and the principal point is in pixels"
+                raise scene_fault(f"{fault}; add intrinsics: {{cx: ..., cy: ...}}", "intrinsics")
+            return
+        for name in ("fx", "fy"):
+            focal = getattr(self.intrinsics, name)
+            if focal is None and lens_focal is None:
+                raise scene_fault(f"missing; expected {_FOCAL_LENGTH}", "intrinsics", name)
+            if focal and lens_focal and not math.isclose(focal, lens_focal, rel_tol=ROUNDING_TOLERANCE):
+                fault = f"{focal:g} is not the focal length of the lens, a0 = {lens_focal:g}"
+                raise scene_fault(f"{fault}; remove fx and fy", "intrinsics", name)
 
     @model_serializer(mode="wrap")
     def _dump_used_keys(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -350,10 +396,8 @@ class Camera(Section):
                 f"{size[0]} x {size[1]}; set render.size to these, or scale: true",
                 "calibration",
             )
-        # The edges of a picture are scaled to edges, half a pixel from the centres of the outer pixels.
-        (fx, fy), (cx, cy) = calibration.focal, calibration.centre
-        intrinsics = {"fx": fx * scale_x, "fy": fy * scale_y}
-        intrinsics |= {"cx": (cx + 0.5) * scale_x - 0.5, "cy": (cy + 0.5) * scale_y - 0.5}
+        calibration = calibration.scaled(scale_x, scale_y)
+        intrinsics = dict(zip(("cx", "cy", "fx", "fy"), calibration.centre + (calibration.focal or ()), strict=False))
         update: dict[str, Any] = {"intrinsics": intrinsics, **self._pair_of(calibration)}
         unused = {"calibration", "calibration_eye", "calibration_unit", "scale"}
         if calibration.model != "pinhole" or any(calibration.coefficients.values()):
@@ -363,12 +407,12 @@ class Camera(Section):
         kept = {name: getattr(self, name) for name in self.model_fields_set - unused}
         try:
             return self.model_validate(kept | update)
-        except ValidationError:
-            values = ", ".join(f"{name} = {value:g}" for name, value in intrinsics.items())
-            raise scene_fault(
-                f"{self.calibration}: {values} for pictures of this size are out of range; calibrate at a size near it",
-                "scale",
-            ) from None
+        except ValidationError as error:
+            details = error.errors()[0]
+            value = f"{'.'.join(map(str, details['loc']))} = {details['input']:g} is out of range"
+            if self.scale:
+                value += " for pictures of this size; calibrate at a size near it"
+            raise scene_fault(f"{self.calibration}: {value}", "scale" if self.scale else "calibration") from None
 
     def _pair_of(self, calibration: Calibration) -> dict[str, Any]:
         """Return rotation and translation of a stereo calibration, for a camera with a reference camera."""

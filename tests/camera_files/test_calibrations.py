@@ -17,6 +17,8 @@ from taichi_msm.camera_files.calibrations import read_calibration
 from taichi_msm.camera_files.text import CameraFileError
 from taichi_msm.cli.main import main
 from taichi_msm.errors import SceneError
+from taichi_msm.lenses import MODELS
+from taichi_msm.lenses.model import NUMPY
 from taichi_msm.render.camera import view
 from taichi_msm.scene.camera import Camera
 from tests.golden import Messages
@@ -190,6 +192,90 @@ def test_a_pair_of_unknown_unit_is_refused(small: Path, message: Messages) -> No
         camera_of("pair.yml", "render.camera.calibration_eye=right")
 
 
+# As OCamCalib writes it, with a mirror's polynomial; x is down, and the axis backward.
+OCAMCALIB = """\
+#polynomial coefficients for the DIRECT mapping function (ocam_model.ss in MATLAB). These are used by cam2world
+
+5 -1.2e+02 0.000000e+00 2.5e-03 -1.5e-05 4.0e-08
+
+#polynomial coefficients for the inverse mapping function (ocam_model.invpol in MATLAB). These are used by world2cam
+
+3 180.0 90.0 -5.0
+
+#center: "row" and "column", starting from 0 (C convention)
+
+14.75 19.25
+
+#affine parameters "c", "d", "e"
+
+1.02 0.01 -0.02
+
+#image size: "height" and "width"
+
+30 40
+"""
+
+
+def test_a_calibration_of_ocamcalib_is_read(small: Path) -> None:
+    Path("calib_results.txt").write_text(OCAMCALIB)
+    rows, columns = (axis.ravel().astype(float) for axis in np.mgrid[0:30:5, 0:40:5])
+    # cam2world: x, y and z of OCamCalib are OpenCV's y, x and -z.
+    down, across = np.linalg.solve([[1.02, 0.01], [-0.02, 1]], np.stack([rows - 14.75, columns - 19.25]))
+    radius = np.hypot(down, across)
+    forward = -np.polynomial.Polynomial([-120, 0, 2.5e-3, -1.5e-5, 4e-8])(radius)
+    calibration = read_calibration("calib_results.txt")
+    for (scale_x, scale_y), scaled in (((1, 1), calibration), ((2, 3), calibration.scaled(2, 3))):
+        lens = MODELS[scaled.model].build(NUMPY)
+        focal = scaled.coefficients["a0"]
+        x, y = lens(across / forward, down / forward, *scaled.coefficients.values())
+        assert scaled.focal is None
+        np.testing.assert_allclose(focal * x + scaled.centre[0], (columns + 0.5) * scale_x - 0.5, atol=1e-9)
+        np.testing.assert_allclose(focal * y + scaled.centre[1], (rows + 0.5) * scale_y - 0.5, atol=1e-9)
+    camera = camera_of("calib_results.txt")
+    assert camera.distortion is not None
+    assert camera.distortion.coefficients == tuple(calibration.coefficients.values())
+    assert camera.focal_lengths == (1.02 * 120, 1.02 * 120)
+
+
+# Of the data set, without comments.
+EUROC = """\
+sensor_type: camera
+T_BS:
+  cols: 4
+  rows: 4
+  data: [0, -1, 0, -0.02, 1, 0, 0, -0.06, 0, 0, 1, 0.01, 0, 0, 0, 1]
+rate_hz: 20
+resolution: [40, 30]
+camera_model: pinhole
+intrinsics: [61.5, 60.5, 19.25, 14.75] #fu, fv, cu, cv
+distortion_model: radial-tangential
+distortion_coefficients: [-0.3, 0.1, 0.001, -0.002]
+"""
+
+
+def test_a_sensor_of_euroc_is_read(small: Path) -> None:
+    Path("sensor.yaml").write_text(EUROC)
+    calibration = read_calibration("sensor.yaml")
+    assert (calibration.focal, calibration.centre, calibration.size) == ((61.5, 60.5), (19.25, 14.75), (40, 30))
+    assert calibration.coefficients == dict(zip(("k1", "k2", "p1", "p2"), COEFFICIENTS, strict=False))
+
+
+def test_an_omnidirectional_calibration_is_read(small: Path) -> None:
+    storage = cv2.FileStorage("omni.yml", cv2.FILE_STORAGE_WRITE)
+    storage.write("camera_matrix", MATRIX)
+    storage.write("distortion_coefficients", np.array([COEFFICIENTS[:4]]))
+    storage.write("xi", np.array([[1.25]]))
+    storage.write("image_size", np.array([[40, 30]]))
+    storage.release()
+    kalibr = KALIBR.replace("pinhole", "omni").replace("[61.5", "[1.25, 61.5")
+    Path("chain.yml").write_text(kalibr)
+    expected = dict(zip(("xi", "k1", "k2", "p1", "p2"), [1.25, *COEFFICIENTS], strict=False))
+    for path in ("omni.yml", "chain.yml"):
+        calibration = read_calibration(path)
+        assert (calibration.model, calibration.coefficients) == ("omnidir", expected)
+        assert (calibration.focal, calibration.centre) == ((61.5, 60.5), (19.25, 14.75))
+
+
 @pytest.mark.parametrize(
     ("line", "model", "focal", "coefficients"),
     [
@@ -295,7 +381,14 @@ D = "D: [-0.3, 0.1, 0.001, -0.002, 0.03]\n"
         pytest.param(K + D + "camera_model: ds", id="unknown model of the camera"),
         pytest.param(K + D + "distortion_model: none", id="coefficients of no model"),
         pytest.param(K + "D: [0, 0, 0, 0]\nfisheye_model: 1\ndistortion_model: plumb_bob", id="two models"),
-        pytest.param(K + D + "xi: 1.27", id="omnidirectional"),
+        pytest.param(K + D + "xi: 1.27", id="omnidirectional with k3"),
+        pytest.param(K + "D: [0, 0, 0, 0]\nxi: -1", id="coefficient out of range"),
+        pytest.param(K + "D: [0, 0, 0, 0]\nmodel: omnidir", id="omnidirectional without xi"),
+        pytest.param(K + "D: [0, 0, 0, 0]\nfisheye: 1\nxi: 1", id="omnidirectional and fisheye"),
+        pytest.param(
+            KALIBR.replace("pinhole", "omni").replace("radtan", "equidistant"), id="omnidirectional of Kalibr"
+        ),
+        pytest.param(OCAMCALIB.replace("-1.2e+02 0.0", "-1.2e+02 1.0"), id="OCamCalib"),
         pytest.param(K + D + "radial_distortion: [0.1]\nrms: 0.2", id="other distortion"),
         pytest.param(K + D + "image_shape: [30, 40]", id="size of unknown order"),
         pytest.param(K + D + "roi: [10, 10, 40, 40]", id="region"),
