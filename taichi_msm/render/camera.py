@@ -15,6 +15,7 @@ from taichi_msm.lenses.model import MAX_RADIUS
 from taichi_msm.render.lens import IDENTITY_LENS, Lens
 from taichi_msm.scene.camera import Camera
 from taichi_msm.scene.outputs import OUTPUTS
+from taichi_msm.scene.render import AnyCamera
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import FRAME_TOLERANCE, MAX_SUPERSAMPLE, MIN_MAGNITUDE
 
@@ -212,9 +213,7 @@ def _view_of(scene: Scene, time: float, name: str) -> View:
 
 def _companion(camera: Camera, scene: Scene, reference: View) -> View:
     """Resolve a camera with a rotation and a translation from its reference camera: X_this = R X_reference + T."""
-    assert camera.rotation is not None
-    assert camera.translation is not None
-    rotation, translation = nearest_rotation(np.array(camera.rotation)), np.array(camera.translation)
+    rotation, translation = (np.array(pair_transform(camera)[key]) for key in ("rotation", "translation"))
     world_to_reference = reference.axes * OPENCV_SIGNS
     axes = rotation @ world_to_reference * OPENCV_SIGNS
     eye = reference.eye - world_to_reference.T @ rotation.T @ translation
@@ -226,20 +225,19 @@ def _companion(camera: Camera, scene: Scene, reference: View) -> View:
     return reference._replace(matrix=reference.matrix @ move, axes=axes, eye=eye)
 
 
-def pair_transform(scene: Scene, name: str) -> dict[str, Any]:
+def pair_transform(camera: AnyCamera) -> dict[str, Any]:
     """Return the transform from the axes of a camera's reference camera to its own, as OpenCV's stereoCalibrate.
 
     Returns:
         "beside": name of the reference camera; "rotation", 3 x 3, and "translation" [m] with X_this = R X_reference +
         T, in OpenCV's axes. Empty without a reference camera.
     """
-    camera = scene.render.all_cameras[name]
     if not isinstance(camera, Camera) or camera.beside is None:
         return {}
-    own, other = (_view_of(scene, 0.0, each) for each in (name, camera.beside))
-    axes, eyes = own.axes * OPENCV_SIGNS, other.eye - own.eye
-    rotation = axes @ (other.axes * OPENCV_SIGNS).T
-    return {"beside": camera.beside, "rotation": rotation.tolist(), "translation": (axes @ eyes).tolist()}
+    rotation, translation = np.eye(3), [-(camera.baseline or 0.0), 0.0, 0.0]
+    if camera.rotation is not None and camera.translation is not None:
+        rotation, translation = nearest_rotation(np.array(camera.rotation)), list(camera.translation)
+    return {"beside": camera.beside, "rotation": rotation.tolist(), "translation": translation}
 
 
 def is_moving(scene: Scene, name: str = "") -> bool:

@@ -302,7 +302,7 @@ class LabelWriter:
         if self._writes_camera:
             scene, name = self._scene, self._camera
             matrices = {"size": list(scene.render.size), **calibration(view_at(scene, 0.0, name))}
-            matrices |= pair_transform(scene, name)
+            matrices |= pair_transform(scene.render.all_cameras[name])
             if is_moving(scene, name):
                 rate = scene.time.frames_per_second
                 matrices["poses"] = [pose(view_at(scene, frame / rate, name)) for frame in range(frames)]
