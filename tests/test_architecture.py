@@ -17,6 +17,7 @@ LAYERS = [
     {"arithmetic", "errors", "plot_style", "version"},
     {"system"},
     {"images", "lenses", "shapes"},
+    {"camera_files"},
     {"scene"},
     {"model"},
     {"terms"},

@@ -12,13 +12,13 @@ from itertools import chain, starmap
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from taichi_msm.errors import ArgumentError, Key, Problem, SceneError
+from taichi_msm.errors import ArgumentError, Key, Problem, SceneError, truncate
 from taichi_msm.images import PICTURE_SUFFIXES, file_sha256, irregular_kind
 from taichi_msm.load.check import validate
 from taichi_msm.load.yaml_reader import MAX_DEPTH, Document, Mark, UnreadableError, mark_at, read_yaml
 from taichi_msm.model.plan import Plan
 from taichi_msm.scene.scene import Scene
-from taichi_msm.scene.section import MAX_PATH, format_value, truncate
+from taichi_msm.scene.section import MAX_PATH, format_value
 
 # Limit of the size of a file.
 MAX_BYTES = 2**20

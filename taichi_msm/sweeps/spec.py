@@ -17,7 +17,7 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field, field_validator, model_validator
 from typing_extensions import Self
 
-from taichi_msm.errors import ArgumentError, Key, Problem, SceneError
+from taichi_msm.errors import ArgumentError, Key, Problem, SceneError, truncate
 from taichi_msm.images import PICTURE_SUFFIXES, PictureError, file_sha256
 from taichi_msm.load.check import parse_model
 from taichi_msm.load.scene_file import (
@@ -43,7 +43,6 @@ from taichi_msm.scene.section import (
     format_value,
     key,
     scene_fault,
-    truncate,
 )
 
 MAX_RUNS = 10**7
