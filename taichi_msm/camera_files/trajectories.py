@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from taichi_msm.camera_files.colmap import ColmapImages
-from taichi_msm.camera_files.columns import Columns
-from taichi_msm.camera_files.kitti import Kitti
+from taichi_msm.camera_files.colmap import COLMAP_IMAGES
+from taichi_msm.camera_files.columns import TABLES
+from taichi_msm.camera_files.kitti import KITTI
 from taichi_msm.camera_files.text import LENGTH_UNITS, CameraFile
 from taichi_msm.camera_files.trajectory import Trajectory, TrajectoryReader, pose_fault
 
 # The first one that recognises a file reads it.
-READERS: tuple[TrajectoryReader, ...] = (ColmapImages(), Kitti(), Columns())
+READERS: tuple[TrajectoryReader, ...] = (COLMAP_IMAGES, KITTI, TABLES)
 
 # Limit of the size of a file; COLMAP's contains the points of every picture.
 MAX_BYTES = 2**27
@@ -54,7 +54,7 @@ def read_poses(path: str, keys: PoseKeys = PoseKeys()) -> tuple[tuple[float, ...
         CameraFileError: when the file is invalid or not supported; the message contains the line.
     """
     file = CameraFile(path, MAX_BYTES)
-    trajectory = next(reader for reader in READERS if reader.recognises(file)).read(file)
+    trajectory = next(found for reader in READERS if (found := reader.read(file)) is not None)
     if not trajectory.rows:
         raise file.fault("no poses; expected lines t tx ty tz qx qy qz qw")
     scale = LENGTH_UNITS[_agreed(file, "poses_unit", keys.poses_unit, trajectory.length_unit) or "m"]
