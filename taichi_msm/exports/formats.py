@@ -68,6 +68,12 @@ FORMATS = {
         ),
         cameras=("left", "right"),
     ),
+    "endonerf": Format(
+        "neural reconstruction of tissue",
+        required_outputs=("depth", "instrument", "png"),
+        file_patterns=_patterns_per_run(rf"(?:images|depth|masks)/{NUMBER_PATTERN}\.png", r"poses_bounds\.npy"),
+        cameras=ANY_CAMERA,
+    ),
     "vtk": Format(
         "for ParaView",
         required_outputs=("trajectory",),
