@@ -25,7 +25,7 @@ from PIL import Image
 
 from taichi_msm.errors import ArgumentError, FilesError, ProgressCallback
 from taichi_msm.exports.formats import one_folder_per_run
-from taichi_msm.exports.inputs import Pinhole, copy_picture, read_depth, read_pinhole
+from taichi_msm.exports.inputs import Pinhole, read_depth, read_picture_file, read_pinhole
 from taichi_msm.runs.directory import create_file, write_new_file
 from taichi_msm.runs.finished import FinishedRun
 from taichi_msm.scene.outputs import zero_padded
@@ -67,7 +67,7 @@ def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[st
         background = max(background, float((depth == 0).mean()))
         # A depth below half a unit is not the background.
         values = np.where(depth > 0, np.maximum(np.rint(depth / unit), 1), 0).astype(np.uint16)
-        copy_picture(run, "png", frame, folder / "images" / name)
+        write_new_file(folder / "images" / name, read_picture_file(run, "png", frame))
         write_new_file(folder / "depth" / name, _png(values))
         mask = run.read_picture("instrument", frame)[..., 0]
         write_new_file(folder / "masks" / name, _png(np.where(mask > 127, 255, 0).astype(np.uint8)))

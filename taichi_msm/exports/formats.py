@@ -74,6 +74,12 @@ FORMATS = {
         file_patterns=_patterns_per_run(rf"(?:images|depth|masks)/{NUMBER_PATTERN}\.png", r"poses_bounds\.npy"),
         cameras=ANY_CAMERA,
     ),
+    "rerun": Format(
+        "for the viewer of rerun.io",
+        required_outputs=("trajectory",),
+        optional_outputs=("png", "depth", "flow", "tracks"),
+        file_patterns=(rf"{NUMBER_PATTERN}\.rrd",),
+    ),
     "vtk": Format(
         "for ParaView",
         required_outputs=("trajectory",),

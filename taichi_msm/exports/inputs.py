@@ -8,7 +8,6 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +18,7 @@ from taichi_msm.errors import ArgumentError
 from taichi_msm.exports.formats import ANY_CAMERA, FORMATS
 from taichi_msm.render.texture import load_texture
 from taichi_msm.runs.arrays import read_rows
-from taichi_msm.runs.directory import MAX_RECORD_BYTES, write_new_file
+from taichi_msm.runs.directory import MAX_RECORD_BYTES
 from taichi_msm.runs.finished import FinishedRun, damaged_result, reading
 from taichi_msm.scene.outputs import CAMERA_FILE
 from taichi_msm.system.files import read_regular
@@ -124,20 +123,18 @@ def read_depth(run: FinishedRun, frame: int) -> NDArray[np.float32]:
     return depth
 
 
-def copy_picture(run: FinishedRun, key: str, frame: int, path: Path) -> None:
-    """Validate a picture of a run by decoding it, and copy its file.
+def read_picture_file(run: FinishedRun, key: str, frame: int) -> bytes:
+    """Read the file of a picture of a run, and validate it by decoding it.
 
     Args:
         run: the run.
         key: entry of `output` that wrote the picture, such as "png".
         frame: index of the frame.
-        path: path of the copy.
     """
     run.read_picture(key, frame)
-    source = run.result_path(key, frame)
-    with reading(source):
-        data = read_regular(source, MAX_RECORD_BYTES)
-    write_new_file(path, data)
+    path = run.result_path(key, frame)
+    with reading(path):
+        return read_regular(path, MAX_RECORD_BYTES)
 
 
 Array = NDArray[np.float64]

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import FilesError, ProgressCallback
 from taichi_msm.exports.formats import ExportSource
-from taichi_msm.exports.inputs import copy_picture
+from taichi_msm.exports.inputs import read_picture_file
 from taichi_msm.runs.arrays import read_flo
 from taichi_msm.runs.directory import write_new_file
 from taichi_msm.runs.finished import FinishedRun, reading
@@ -71,7 +71,7 @@ def _write_run(run: FinishedRun, training: Path, first: int, progress: ProgressC
                 png16(encode_flow(flow, ~(run.read_picture("occlusion", pair)[..., 0] > 0))),
             )
         for number in (0, 1) if run.has_output("png") else ():
-            copy_picture(run, "png", pair + number, image_2 / f"{name}_1{number}.png")
+            write_new_file(image_2 / f"{name}_1{number}.png", read_picture_file(run, "png", pair + number))
     remedy = run.remedy("occlusion", "png")
     return [
         f"{name} is left out: {OUTPUTS[key].result} is not among the results; {remedy}"
