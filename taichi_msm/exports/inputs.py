@@ -18,6 +18,7 @@ from taichi_msm.errors import ArgumentError
 from taichi_msm.exports.formats import ANY_CAMERA, FORMATS
 from taichi_msm.render.texture import load_texture
 from taichi_msm.runs.arrays import read_rows
+from taichi_msm.runs.directory import MAX_RECORD_BYTES
 from taichi_msm.runs.finished import FinishedRun, damaged_result, reading
 from taichi_msm.scene.outputs import CAMERA_FILE
 from taichi_msm.system.files import read_regular
@@ -102,6 +103,40 @@ def read_track_positions(run: FinishedRun) -> tuple[NDArray[np.float32], NDArray
     return coordinates, position
 
 
+def read_depth(run: FinishedRun, frame: int) -> NDArray[np.float32]:
+    """Read the depth of a frame.
+
+    Returns:
+        Depth along the optical axis [m], shape (height, width); 0: background.
+
+    Raises:
+        FilesError: when the file is missing or damaged.
+    """
+    path = run.result_path("depth", frame)
+    with reading(path), Image.open(path, formats=["TIFF"]) as image:
+        # Before any pixel is decoded.
+        if image.mode != "F" or image.size != run.scene.render.size:
+            raise damaged_result(path)
+        depth = np.array(image)
+        if not (np.isfinite(depth) & (depth >= 0)).all():
+            raise damaged_result(path)
+    return depth
+
+
+def read_picture_file(run: FinishedRun, key: str, frame: int) -> bytes:
+    """Read the file of a picture of a run, and validate it by decoding it.
+
+    Args:
+        run: the run.
+        key: entry of `output` that wrote the picture, such as "png".
+        frame: index of the frame.
+    """
+    run.read_picture(key, frame)
+    path = run.result_path(key, frame)
+    with reading(path):
+        return read_regular(path, MAX_RECORD_BYTES)
+
+
 Array = NDArray[np.float64]
 
 # Pixel coordinates count from the picture's corner here, and from the centre of the first pixel in OpenCV [px].
@@ -131,7 +166,7 @@ def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
     another = "choose another camera by --camera, or " if FORMATS[name].cameras == ANY_CAMERA else ""
     with reading(path):
         # The limit is sufficient for 100,000 poses.
-        camera = json.loads(read_regular(run.require_own_file(path, "tracks"), 1 << 25))
+        camera = json.loads(read_regular(run.require_own_file(path, FORMATS[name].required_outputs[0]), 1 << 25))
         # Lenses other than the rational one distort even without coefficients.
         is_distorted = camera.get("model", "pinhole") != "pinhole" or bool(np.any(camera.get("distortion", ())))
         is_pinhole = "intrinsics" in camera

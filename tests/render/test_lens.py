@@ -267,7 +267,7 @@ def test_pictures_are_like_the_twins(lens: str, render: dict[str, Any], device: 
 def test_large_cells_are_bent(lens: str, refine: int, device: Device) -> None:
     """Sides of cells 90 pixels long bend by up to 8 px, more than a tile, outward and inward."""
     intrinsics = {"fx": 150, "fy": 150, "cx": 99.5, "cy": 74.5}
-    camera = {"eye": [0, 0, 0.33], "intrinsics": intrinsics, **LENSES[lens]}
+    camera = {"eye": [0, 0, 0.33], "intrinsics": intrinsics, "outside": "background", **LENSES[lens]}
     made = drawable((2, 3), camera=camera, size=[200, 150], refine=refine)
     position = rest_positions(made.sheet)
     found, (coordinates, _, _) = look(made, position), twin.labels(made, position)
