@@ -16,14 +16,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from taichi_msm.exports.glb import GL_ARRAY_BUFFER, GL_ELEMENT_ARRAY_BUFFER, BinaryChunk
-from taichi_msm.model.surface import Capsule, place_capsules, refine_surface
+from taichi_msm.exports.inputs import instrument_mesh
+from taichi_msm.model.surface import place_instruments
 from taichi_msm.render.camera import is_moving, view_at
 from taichi_msm.runs.finished import FinishedRun
 
 Array = NDArray[np.float64]
-
-# Segments of a capsule around its axis, and from the equator to the pole of an end.
-SEGMENTS, POLE_SEGMENTS = 32, 8
 
 # Near plane of a perspective camera, as a fraction of the distance of its target.
 NEAR_RATIO = 1e-3
@@ -39,14 +37,14 @@ def add_tools(document: dict[str, Any], run: FinishedRun, positions: NDArray[np.
         binary: receives the arrays.
     """
     pairs = zip(positions, run.time.tolist(), strict=True)
-    placed = [place_capsules(run.scene, position, time) for position, time in pairs]
+    placed = [place_instruments(run.scene, position, time) for position, time in pairs]
     if not placed[0]:
         return
     metal = {"baseColorFactor": [0.6, 0.6, 0.62, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.5}
     document["materials"].append({"name": "instrument", "pbrMetallicRoughness": metal})
     names = [f"probes.{index}" for index, probe in enumerate(run.scene.probes) if probe.instrument is not None]
-    for name, *capsules in zip(names, *placed, strict=True):
-        vertices, normals, triangles = capsule_mesh(capsules[0])
+    for name, *solids in zip(names, *placed, strict=True):
+        vertices, normals, triangles = instrument_mesh(solids[0])
         attributes = {
             "POSITION": binary.accessor(vertices.astype(np.float32), GL_ARRAY_BUFFER, bounds=True),
             "NORMAL": binary.accessor(normals.astype(np.float32), GL_ARRAY_BUFFER),
@@ -54,31 +52,8 @@ def add_tools(document: dict[str, Any], run: FinishedRun, positions: NDArray[np.
         indices = binary.accessor(triangles.reshape(-1).astype(np.uint32), GL_ELEMENT_ARRAY_BUFFER)
         primitive = {"attributes": attributes, "indices": indices, "material": len(document["materials"]) - 1}
         document["meshes"].append({"name": name, "primitives": [primitive]})
-        tips = np.array([capsule.tip for capsule in capsules])
+        tips = np.array([solid.tip for solid in solids])
         _add_node(document, {"name": name, "mesh": len(document["meshes"]) - 1}, {"translation": tips}, run, binary)
-
-
-def capsule_mesh(capsule: Capsule) -> tuple[Array, Array, NDArray[np.int32]]:
-    """Triangulate a capsule around the origin in place of its tip.
-
-    Returns:
-        Vertices [m] and unit normals, shape (vertices, 3); triangles, counter-clockwise from outside, shape (n, 3).
-    """
-    axis = capsule.axis
-    across = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
-    across /= np.linalg.norm(across)
-    around = np.linspace(0, 2 * np.pi, SEGMENTS + 1)
-    radial = np.cos(around)[:, None] * across + np.sin(around)[:, None] * np.cross(axis, across)
-    # From the far pole to the pole of the tip.
-    latitude = np.linspace(np.pi / 2, 0, POLE_SEGMENTS + 1)
-    latitude, offset = np.concatenate([latitude, -latitude[::-1]]), np.repeat([capsule.length, 0.0], len(latitude))
-    normals = np.cos(latitude)[:, None, None] * radial + np.sin(latitude)[:, None, None] * axis
-    surface = refine_surface(capsule.radius * normals + offset[:, None, None] * axis, 0)
-    corners = surface.vertices[surface.triangles]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
-    # At the poles, one triangle of each quad has no area.
-    triangles: NDArray[np.int32] = surface.triangles[area > 1e-9 * area.max()]
-    return surface.vertices.astype(np.float64), normals.reshape(-1, 3), triangles
 
 
 def add_cameras(document: dict[str, Any], run: FinishedRun, binary: BinaryChunk) -> list[str]:

@@ -12,8 +12,7 @@ import operator
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from taichi_msm.errors import Key, did_you_mean
-from taichi_msm.scene.section import truncate
+from taichi_msm.errors import Key, did_you_mean, truncate
 
 # Longer texts could nest deeper than Python's stack.
 MAX_LENGTH = 200

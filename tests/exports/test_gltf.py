@@ -20,7 +20,7 @@ from taichi_msm.exports import gltf
 from taichi_msm.exports.export import export
 from taichi_msm.exports.gltf import key_frames
 from taichi_msm.exports.inputs import unit_normals
-from taichi_msm.model.surface import place_capsules
+from taichi_msm.model.surface import place_instruments
 from taichi_msm.render.camera import view_at
 from taichi_msm.runs.finished import read_run
 from tests.golden import Messages
@@ -325,7 +325,7 @@ def test_tools_are_capsules_where_the_run_had_them(furnished: Glb, results: Path
         triangles = vertices[furnished.accessor(primitive["indices"]).reshape(-1, 3)]
         outward = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
         for frame in (0, 4):
-            capsule = place_capsules(run.scene, run.positions()[frame], frame / 10)[index]
+            capsule = place_instruments(run.scene, run.positions()[frame], frame / 10)[index]
             np.testing.assert_allclose(pose_at(furnished, name, frame)[0], capsule.tip, atol=1e-7)
         nearest = np.clip(vertices @ capsule.axis, 0, capsule.length)[:, None] * capsule.axis
         np.testing.assert_allclose(vertices - nearest, capsule.radius * normals, atol=1e-7)
