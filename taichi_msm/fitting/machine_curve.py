@@ -6,8 +6,9 @@ the elastic force over the travel, computed at few travels and interpolated, the
     F_n = (1 - G) f_n + sum of (s_i + share_i phi_i f_n)
 
 with shares, phi and the memory s_i of `terms/viscoelasticity.py`. Depths of contact, shares and times need no further
-curve, and log f is linear in the other parameters close to an estimate, with slopes from a curve each. This model is
-minimised within a trust region, and compared with a curve at its minimum, until it does not improve.
+curve, and log f is nearly linear in the logarithms of the other parameters, or in the reciprocal of a lock, with slopes
+from a curve each. This model is minimised within a trust region, and compared with a curve at its minimum, until it does
+not improve.
 
 It neglects the memory of mass points that leave the tool, and of those that slide along it. Therefore it is finally
 compared with runs of the tests, whose difference from the model is added to it. The Jacobian is that of the model.
@@ -39,7 +40,7 @@ TRAVELS, CONTACT_MARGIN = 24, 0.05
 NO_SHARE = 1e-12
 
 # Initial and largest trust region of the parameters of a curve, in units of x.
-FIRST_REGION, MAX_REGION = 1.0, 3.0
+FIRST_REGION, MAX_REGION = 0.5, 2.0
 
 # Largest number of steps, and changes of the cost below which they end: relative, and absolute, which is a third of a
 # standard deviation of a parameter.
@@ -109,6 +110,7 @@ class CurveRuns(Runs):
         keys = [parameter.key for parameter in self.job.parameters]
         self.of_curve = np.array([not key.startswith(("contact", "tissue.relaxation.")) for key in keys])
         self.of_contact = np.array([key.startswith("contact") for key in keys])
+        self._of_lock = np.array([key.endswith(".lock") for key in keys])
 
     def first(self, x: Array) -> Prediction:
         """Predict with the initial values; raises as `ForwardModel.predict` does."""
@@ -117,14 +119,16 @@ class CurveRuns(Runs):
         assert predicted is not None
         return predicted
 
-    def predict_one(self, x: Array, steps: int | None = None) -> Prediction | None:  # noqa: ARG002
+    def predict_one(self, x: Array, steps: int | None = None) -> Prediction | None:
         """Predict at x by the tangent; None if that fails."""
         tangent = self._tangent
         try:
             values = self._predictor.values(x)
         except SceneError:
             return None
-        return self._predict(values, tangent.reach, tangent.forces * np.exp((x - tangent.x) @ tangent.slopes))
+        steps = x - tangent.x
+        steps = np.where(self._of_lock, -np.expm1(-steps), steps)
+        return self._predict(values, tangent.reach, tangent.forces * np.exp(steps @ tangent.slopes))
 
     def predict_many(self, coordinates: Sequence[Array], steps: int | None = None) -> list[Prediction | None]:
         """Predict at several x by the tangent; None where that fails."""
@@ -289,7 +293,8 @@ def _descend(runs: CurveRuns, misfit: Misfit, start: Array, *, by_tests: bool) -
             runs.correct(trial.x, trial.predicted)
             current, region = trial, np.minimum(2 * region, np.where(runs.of_curve, MAX_REGION, np.inf))
         else:
-            region = np.minimum(region, np.abs(trial.x - current.x)) / 4
+            shrunk = np.minimum(region, np.abs(trial.x - current.x)) / 4
+            region = shrunk if by_tests else np.where(runs.of_curve, shrunk.max(where=runs.of_curve, initial=0), region)
         limits = _limits(runs, current.x, region)
         starts = [current.x] if by_tests or step else [current.x, *_relaxation_starts(runs, misfit, current, limits)]
         minimum = min((Search(runs, misfit, limits).refine(x) for x in starts), key=lambda each: each.cost)
