@@ -28,8 +28,13 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--write-messages", action="store_true", help="write tests/messages.yaml in place of comparing")
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the files that take longest, so that no worker ends long before the other."""
+    """Mark all but the default cases as slow, and begin with the files that take longest."""
+    for item in items:
+        chosen = item.get_closest_marker("default_cases")
+        if isinstance(item, pytest.Function) and chosen and item.callspec.id not in chosen.args:
+            item.add_marker(pytest.mark.slow)
     items.sort(key=lambda item: item.path.stem not in LONGEST)
 
 
@@ -106,6 +111,25 @@ def seen_by_two(device: runtime.Device, tmp_path_factory: pytest.TempPathFactory
     overrides = [cameras, "render.size=[320, 256]", "render.tracks=6", "output=[png, trajectory, forces, tracks]"]
     run(load_scene(here / "small.yaml", overrides), here / "stereo", threads=device.threads, estimate_error=False)
     return here / "stereo"
+
+
+@pytest.fixture(scope="session")
+def labelled_in_motion(device: runtime.Device, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with a drawn tool that a moving, centred camera has seen, with its labels; to be read only."""
+    here = tmp_path_factory.mktemp("labelled")
+    Image.fromarray(speckle(30, 40)).save(here / "speckle.png")
+    (here / "small.yaml").write_text(SMALL)
+    eye = "[[0, 0, -0.1, 0.5], [0.4, 0.02, -0.1, 0.45]]"
+    overrides = [
+        f"render.camera={{eye: {eye}, intrinsics: {{fx: 45, fy: 45, cx: 20, cy: 16}}}}",
+        "render.size=[40, 32]",
+        "render.tracks=6",
+        "probes.0.instrument={radius: 0.02, shaft: [0.5, -0.6, 0.9], length: 0.2}",
+        "time.duration=0.2",
+        "output=[png, trajectory, depth, flow, instrument, tracks]",
+    ]
+    run(load_scene(here / "small.yaml", overrides), here / "labelled", threads=device.threads, estimate_error=False)
+    return here / "labelled"
 
 
 @pytest.fixture

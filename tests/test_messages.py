@@ -20,6 +20,12 @@ EYE = "eye: [0, 0, 1]"
 
 OVERRIDES = {
     "fisheye coefficient": f"render.camera={{{EYE}, distortion: {{model: fisheye, p1: 0.1}}}}",
+    "lens without a required coefficient": f"render.camera={{{EYE}, distortion: {{model: omnidir, k1: 0.1}}}}",
+    "focal length nowhere": f"render.camera={{{EYE}, intrinsics: {{fx: 500, cx: 20, cy: 15}}}}",
+    "principal point nowhere": f"render.camera={{{EYE}, distortion: {{model: scaramuzza, a0: 500}}}}",
+    "two focal lengths": (
+        f"render.camera={{{EYE}, intrinsics: {{fx: 500, cx: 20, cy: 15}}, distortion: {{model: scaramuzza, a0: 501}}}}"
+    ),
     "outside alone": f"render.camera={{{EYE}, outside: background}}",
     "beside alone": "render.camera={beside: left, baseline: 0.01}",
     "no cameras": "render.cameras={}",

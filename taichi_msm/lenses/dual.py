@@ -55,8 +55,9 @@ def _arctan(number: Dual) -> Dual:
     return Dual(np.arctan(number.value), number.slope / (1 + number.value * number.value))
 
 
-def _maximum(number: Dual, least: float) -> Dual:
-    return Dual(np.maximum(number.value, least), np.where(number.value > least, number.slope, 0.0))
+def _maximum(number: Any, least: float) -> Dual:
+    value, slope = _parts(number)
+    return Dual(np.maximum(value, least), np.where(value > least, slope, 0.0))
 
 
 DUAL = Operations(_sqrt, _arctan, _maximum, lambda function: function)

@@ -37,10 +37,12 @@ NUMPY = Operations(np.sqrt, np.arctan, np.maximum, lambda function: function)
 
 
 class Coefficient(NamedTuple):
-    """A coefficient of a lens model: its meaning, for users, and its smallest value."""
+    """A coefficient of a lens model: its meaning, for users, its range, and its default; None if it is required."""
 
     meaning: str
     least: float = -MAX_COEFFICIENT
+    most: float = MAX_COEFFICIENT
+    default: float | None = 0.0
 
 
 class LensModel(ABC):
@@ -50,11 +52,13 @@ class LensModel(ABC):
         name: value of `distortion.model`, and of `model` in camera.json.
         meaning: description of the model, for users.
         coefficients: the coefficients by name, in the order of camera.json; at most 8, the place in `uniforms`.
+        focal_length: the coefficient that stands in place of fx and fy; empty if there is none.
     """
 
     name: ClassVar[str]
     meaning: ClassVar[str]
     coefficients: ClassVar[Mapping[str, Coefficient]]
+    focal_length: ClassVar[str] = ""
 
     @abstractmethod
     def build(self, operations: Operations) -> Callable[..., Any]:

@@ -1,7 +1,7 @@
-"""Position-controlled tools: capsules that touch the sheet along paths, and clamps. Scene: `probes` with `path`.
+"""Position-controlled tools: shapes that touch the sheet along paths, and clamps. Scene: `probes` with `path`.
 
-A capsule consists of all points within `radius` of its axis, c(t) + s a with 0 <= s <= length, where c is the centre of
-its round tip and a the unit vector along its shaft. It can grip the mass points at its tip.
+A shape (`taichi_msm.shapes`) has the axis c(t) + s a with 0 <= s <= length, where c is its tip and a the unit vector
+along its shaft. It can grip the mass points at its tip.
 
 A clamp holds a side of the sheet from the start. It is a tool of radius 0, which touches nothing, and c is its
 displacement.
@@ -17,6 +17,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.arithmetic import NUMPY
 from taichi_msm.errors import Problem
 from taichi_msm.model.sheet import SIDES, fixed_points, fixed_sides, rest_positions, spacing
 from taichi_msm.model.time_grid import TimeGrid
@@ -24,11 +25,10 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import FRAME_TOLERANCE, Side
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Probe
+from taichi_msm.shapes import SHAPES
+from taichi_msm.shapes.shape import Shape
 
-# Largest displacement of a tool in a step, in radii of the tool.
-MAX_STRIDE_RADII = 0.5
-
-# The same between two equilibria for a rough tool, whose force depends on where mass points first touch it.
+# Largest displacement of a rough tool between two equilibria, in radii: its force depends on where it first touches.
 ROUGH_STRIDE_RADII = 1 / 16
 
 # Largest displacement of a clamp between two equilibria, in lengths of the shortest spring at rest.
@@ -58,9 +58,10 @@ class Tool:
     axis: Array  # unit vector a from the tip along the shaft, shape (3,)
     length: float  # of the axis [m]
     radius: float  # of tip and shaft [m]
+    shape: Shape
     friction: float  # Coulomb's coefficient; infinite if rough
     grips: tuple[tuple[float, float], ...]  # start and end of every grip [s]
-    stride: float  # largest displacement between two equilibria, and of a capsule in a step [m]
+    stride: float  # largest displacement between two equilibria, and of a shape in a step [m]
 
     @property
     def rough(self) -> bool:
@@ -101,15 +102,15 @@ class Tool:
         return x, y, z
 
     def touches(self, positions: Array, t: float) -> bool:
-        """Return whether any point lies inside the capsule or, up to rounding, on its surface.
+        """Return whether any point lies inside the shape or, up to rounding, on its surface.
 
         Args:
             positions: points [m], shape (n, 3).
             t: the time [s].
         """
         r = positions - self.tip_centre(np.array([t]))[0]
-        s = np.clip(r @ self.axis, 0, self.length)
-        return bool((np.linalg.norm(r - s[:, None] * self.axis, axis=1) < self.radius * (1 + 1e-6)).any())
+        depth, *_ = self.shape.build_depth(NUMPY)(*r.T, *self.axis, self.length, self.radius)
+        return bool((depth > -1e-6 * self.radius).any())
 
     def substep_times(self, begin: float, end: float) -> Array:
         """Divide a time interval [s] so that the tool moves by at most its stride, and if rough straight, in each part.
@@ -141,8 +142,8 @@ class Clamp(Tool):
         return x, y, z
 
 
-def capsule_tools(tools: Sequence[Tool]) -> list[Tool]:
-    """Return the tools that have a capsule, in their order."""
+def touching_tools(tools: Sequence[Tool]) -> list[Tool]:
+    """Return the tools that have a shape, which touches the sheet, in their order."""
     return [tool for tool in tools if not isinstance(tool, Clamp)]
 
 
@@ -164,11 +165,13 @@ def build_tools(probes: Sequence[Probe], sheet: Sheet) -> tuple[Tool, ...]:
             continue
         assert probe.instrument is not None
         instrument, (time, across, down, heights) = probe.instrument, np.array(probe.path, dtype=float).T
-        tip_centres = np.stack([(across - 0.5) * width, (0.5 - down) * height, heights + instrument.radius], axis=1)
-        shape = unit_vector(instrument.shaft), instrument.length, instrument.radius
+        shape, axis, radius = SHAPES[instrument.shape], unit_vector(instrument.shaft), instrument.outer_radius
+        tips = heights + shape.tip_height(axis, radius)
+        tip_centres = np.stack([(across - 0.5) * width, (0.5 - down) * height, tips], axis=1)
+        solid = axis, instrument.length, radius, shape
         friction = math.inf if probe.friction == "rough" else probe.friction
-        stride = (ROUGH_STRIDE_RADII if probe.friction == "rough" else MAX_STRIDE_RADII) * instrument.radius
-        tools.append(Tool(index, time, tip_centres, heights, *shape, friction, probe.grip, stride))
+        stride = min(shape.max_stride, ROUGH_STRIDE_RADII if friction == math.inf else math.inf) * radius
+        tools.append(Tool(index, time, tip_centres, heights, *solid, friction, probe.grip, stride))
     return tuple(tools)
 
 
@@ -179,9 +182,9 @@ def _build_clamp(probe: int, side: Side, path: Array, sheet: Sheet, earlier: Seq
     for taken in (fixed_points(sheet), *(clamp.points for clamp in earlier)):
         points &= ~taken
     rest_tip = rest_positions(sheet)[points].sum(axis=0) / max(1, points.sum())
-    capsule = np.array([0.0, 0.0, 1.0]), 0.0, 0.0
+    solid = np.array([0.0, 0.0, 1.0]), 0.0, 0.0, SHAPES["capsule"]
     stride = MAX_STRIDE_SPRINGS * min(spacing(sheet))
-    return Clamp(probe, path[:, 0], path[:, 1:], path[:, 3], *capsule, 0.0, (), stride, side, points, rest_tip)
+    return Clamp(probe, path[:, 0], path[:, 1:], path[:, 3], *solid, 0.0, (), stride, side, points, rest_tip)
 
 
 def unit_vector(shaft: Sequence[float]) -> Array:
@@ -204,7 +207,7 @@ def path_problems(scene: Scene, tools: Sequence[Tool], grid: TimeGrid) -> Iterat
         if isinstance(tool, Clamp):
             yield from _clamp_problems(tool, scene)
             continue
-        depth = tool.radius - distance_to_sheet(tool, scene.sheet)
+        depth = -gap_to_sheet(tool, scene.sheet)
         if depth > 1e-9 * tool.radius:
             text = f"the instrument is {depth:.3g} m in the sheet at rest at 0 s; begin above it, at a greater height"
             yield Problem(key, text)
@@ -248,7 +251,7 @@ def too_fast(tool: Tool, grid: TimeGrid, first: int = 0) -> tuple[int, str] | No
     if isinstance(tool, Clamp) or stride <= tool.stride * (1 + 1e-9):
         return None
     return key, (
-        f"moves {stride:.3g} m in a step of {grid.step:.3g} s, over half the radius of its "
+        f"moves {stride:.3g} m in a step of {grid.step:.3g} s, over {tool.shape.max_stride:g} of the radius of its "
         f"instrument; move at most {tool.stride / grid.step:.3g} m/s, or take a smaller step"
     )
 
@@ -266,7 +269,7 @@ def min_steps_per_frame(tools: Sequence[Tool], grid: TimeGrid, least: int) -> in
         return tool.max_stride(1 / grid.frames_per_second / least)[0] / tool.stride
 
     # With n times the steps, the largest displacement in a step is at least 1 / n of the previous one.
-    while (ratio := max(map(speed_ratio, capsule_tools(tools)), default=0.0)) > 1 + 1e-9:
+    while (ratio := max(map(speed_ratio, touching_tools(tools)), default=0.0)) > 1 + 1e-9:
         least = max(least + 1, math.ceil(least * ratio * (1 - 1e-9)))
     return least
 
@@ -311,7 +314,7 @@ def path_warnings(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:
 
 
 def overlap(tools: Sequence[Tool], duration: float) -> tuple[int, int, float] | None:
-    """Find two tools that intersect, at 1025 equidistant times.
+    """Find two capsules that intersect, at 1025 equidistant times.
 
     Args:
         tools: the position-controlled tools.
@@ -321,7 +324,7 @@ def overlap(tools: Sequence[Tool], duration: float) -> tuple[int, int, float] | 
         The indices of their probes, and the first time [s]; None if no tools intersect.
     """
     times = np.linspace(0, duration, 1025)
-    for a, b in combinations(capsule_tools(tools), 2):
+    for a, b in combinations([tool for tool in touching_tools(tools) if tool.shape.name == "capsule"], 2):
         distance = _axis_distance(a, b, a.tip_centre(times) - b.tip_centre(times))
         intersecting = np.flatnonzero(distance < (1 - 1e-9) * (a.radius + b.radius))
         if intersecting.size:
@@ -350,17 +353,7 @@ def _axis_distance(a: Tool, b: Tool, offset: Array) -> Array:
     return distance
 
 
-def distance_to_sheet(tool: Tool, sheet: Sheet) -> float:
-    """Return the distance of a tool's axis at 0 s from the sheet at rest [m]."""
-    start, half = tool.tip_centre(np.zeros(1))[0], np.array([sheet.size[1] / 2, sheet.size[0] / 2, 0.0])
-
-    def distance(s: float) -> float:
-        point = start + s * tool.axis
-        return float(np.linalg.norm(point - np.clip(point, -half, half)))
-
-    # Ternary search, because the distance is a convex function of s.
-    low, high = 0.0, tool.length
-    for _ in range(200):
-        left, right = low + (high - low) / 3, high - (high - low) / 3
-        low, high = (low, right) if distance(left) <= distance(right) else (left, high)
-    return distance(low)
+def gap_to_sheet(tool: Tool, sheet: Sheet) -> float:
+    """Return the distance of a tool at 0 s from the sheet at rest [m], negative where it is in the sheet."""
+    half = np.array([sheet.size[1] / 2, sheet.size[0] / 2, 0.0])
+    return tool.shape.gap(tool.tip_centre(np.zeros(1))[0], tool.axis, tool.length, tool.radius, half)

@@ -337,8 +337,8 @@ class QuasiStatics:
         stiffest = 1.0 if material.factors is None else float(material.factors.max())
         # Rounding may shorten a spring by 1e-9.
         compressed = self.read().shortest_spring < 1 - material.tension / stiffest - 1e-9
-        capsules = [n for n, tool in enumerate(self.plan.tools) if not isinstance(tool, Clamp)]
-        return compressed or bool(self._touched()[capsules].any())
+        touching = [n for n, tool in enumerate(self.plan.tools) if not isinstance(tool, Clamp)]
+        return compressed or bool(self._touched()[touching].any())
 
     def _perturb(self, force: float) -> None:
         """Displace every mass point at random, reproducibly, by at most the displacement due to a force [N]."""

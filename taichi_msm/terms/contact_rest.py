@@ -1,7 +1,7 @@
-"""Contact in quasi-static equilibrium: contact forces of tools, and projection of mass points out of their capsules.
+"""Contact in quasi-static equilibrium: contact forces of tools, and projection of mass points out of their shapes.
 
 A tool can push a mass point that touches it but cannot pull it. Of the force F on the mass point, the tool therefore
-carries the part into the capsule, min(F . n, 0) n; the remainder, tangential or outward, must vanish in equilibrium.
+carries the part into the shape, min(F . n, 0) n; the remainder, tangential or outward, must vanish in equilibrium.
 The normals n are stored in the fields of corrections and are 0 where a mass point touches no tool. Held mass points,
 also those that stick to a rough tool, move with their tool, which carries their whole force.
 
@@ -37,7 +37,13 @@ Array = NDArray[np.float64]
 
 def build_remove_contact(config: KernelConfig, layout: ContactLayout) -> Callable[..., None]:
     """Build the Taichi function remove_contact(force, sheet, at), which removes contact forces at an entry."""
-    ti, vector, tools, grips, first_field = config.ti, config.vector, layout.tools, layout.grips, layout.first_field
+    ti, vector, tools, grips, first_field = (
+        config.ti,
+        config.vector,
+        len(layout.shapes),
+        layout.grips,
+        layout.first_field,
+    )
     holding, iterations = layout.grip_field + HOLDER, _iterations(tools)
 
     @ti.func
@@ -68,9 +74,10 @@ def build_project_out(config: KernelConfig, layout: ContactLayout) -> Callable[.
     It projects mass points out of the tools, removes their momentum into the tools, and moves held mass points with
     their tool.
     """
-    ti, vector, tools, grips = config.ti, config.vector, layout.tools, layout.grips
+    ti, vector, tools, grips = config.ti, config.vector, len(layout.shapes), layout.grips
     first_field, grip_field, base = layout.first_field, layout.grip_field, layout.bases
-    penetration, iterations = build_penetration(config), _iterations(tools)
+    penetrations = [build_penetration(config, shape) for shape in layout.shapes]
+    iterations = _iterations(tools)
     # Holders, and the columns with the shift of their mass points: of grips, and of rough tools.
     holders = [(tool + 1, base[tool] + GRIP_SHIFT) for tool in range(tools)]
     holders += [(tools + tool + 1, base[tool] + TIP_AFTER) for tool in range(tools) if layout.has_friction[tool]]
@@ -98,7 +105,7 @@ def build_project_out(config: KernelConfig, layout: ContactLayout) -> Callable[.
                 sheet.fields[(first_field + CORRECTIONS * tool + c) * field + at] = vector(0)
         for _ in range(iterations):
             for tool in ti.static(range(tools)):
-                depth, x, y, z = penetration(rest, u, now, base[tool])
+                depth, x, y, z = penetrations[tool](rest, u, now, base[tool])
                 normal = [x, y, z]
                 touches = ti.select(depth > 0, free, vector(0))
                 inward = ti.min(q[0] * x + q[1] * y + q[2] * z, 0) * touches
@@ -139,9 +146,9 @@ def touched_points(tools: int, memory: Array) -> NDArray[np.bool_]:
 
 def grips(tools: Sequence[Tool], memory: Array) -> bool:
     """Return whether the tip of any tool holds a mass point; see `touched_points`."""
-    capsules = [n + 1 for n, tool in enumerate(tools) if not isinstance(tool, Clamp)]
+    touching = [n + 1 for n, tool in enumerate(tools) if not isinstance(tool, Clamp)]
     begin = CORRECTIONS * len(tools) + HOLDER
-    return bool(np.isin(memory[begin : begin + 1], capsules).any())
+    return bool(np.isin(memory[begin : begin + 1], touching).any())
 
 
 def set_tools(plan: Plan, frame: int, time: float, columns: Array) -> None:

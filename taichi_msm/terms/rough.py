@@ -1,9 +1,9 @@
 """Rough tools in quasi-static equilibrium, to which the mass points that they touch stick. Scene: `friction: rough`.
 
 Between two shapes tools and mass points move along straight lines. A mass point with the displacement u' that the
-capsule of a tool reaches when the centre of its tip is at c' sticks to it: with the centre at c, u = u' + c - c'. It is
-held as by a grip (`contact_rest`) until the tool would pull it, that is, until the sum F of all other forces on it
-points out of the capsule, F . n > 0.
+shape of a tool reaches when its tip is at c' sticks to it: with the tip at c, u = u' + c - c'. It is held as by a grip
+(`contact_rest`) until the tool would pull it, that is, until the sum F of all other forces on it points out of the
+shape, F . n > 0.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.arithmetic import NUMPY
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.tools import Tool
@@ -18,8 +19,11 @@ from taichi_msm.terms.contact_layout import COLUMNS, CORRECTIONS, HOLD_DISPLACEM
 
 Array = NDArray[np.float64]
 
-# A mass point within this share of the radius above the surface of a capsule touches it.
+# A mass point within this share of the radius above the surface of a shape touches it.
 TOUCH_TOLERANCE = 1e-9
+
+# Number of bisections of a motion, to rounding.
+BISECTIONS = 53
 
 # Mass points are released together if the pulls on them exceed this share of the largest pull.
 RELEASE_SHARE = 0.5
@@ -40,14 +44,14 @@ def stick(plan: Plan, memory: Array, start: Array, end: Array, times: tuple[floa
     free, earliest = ~plan.fixed & (fields[HOLDER] == 0), np.full(plan.fixed.shape, np.inf)
     for n, tool in enumerate(tools):
         if tool.rough:
-            first, last = tool.tip_centre(np.array(times))
-            share = _first_touch(tool, rest + start - first, end - start - (last - first))
-            touched = free & (share <= 1) & (share < earliest)
+            before, after = (u - c for u, c in zip((start, end), tool.tip_centre(np.array(times)), strict=True))
+            share = np.full(plan.fixed.shape, np.inf)
+            share[free] = _first_touch(tool, (rest + before)[free], (rest + after)[free])
+            touched = share < earliest
             earliest[touched] = share[touched]
-            by = share[touched, None]
             fields[HOLDER, touched] = len(tools) + n + 1
-            shift = by * (end[touched] - start[touched] - (last - first))
-            fields[HOLD_DISPLACEMENT:, touched] = (start[touched] - first + shift).T
+            relative = before[touched] + share[touched, None] * (after - before)[touched]
+            fields[HOLD_DISPLACEMENT:, touched] = relative.T
     return memory
 
 
@@ -80,9 +84,7 @@ def compute_pulls(plan: Plan, memory: Array, displacement: Array, force: Array, 
     holder, pulls = memory[CORRECTIONS * len(tools) + HOLDER], np.zeros(plan.fixed.shape)
     for n, tool in enumerate(tools):
         stuck = holder == len(tools) + n + 1
-        r = position[stuck] - tool.tip_centre(np.array([time]))[0]
-        r -= np.clip(r @ tool.axis, 0, tool.length)[:, None] * tool.axis
-        normal = r / np.linalg.norm(r, axis=-1, keepdims=True)
+        _, normal = _depth_and_normal(tool, position[stuck] - tool.tip_centre(np.array([time]))[0])
         pulls[stuck] = np.maximum((force[stuck] * normal).sum(axis=-1), 0)
     return pulls
 
@@ -94,30 +96,27 @@ def release(plan: Plan, memory: Array, pulls: Array) -> Array:
     return memory
 
 
-def _first_touch(tool: Tool, r: Array, motion: Array) -> Array:
-    """Return the first share of a motion relative to a tool at which a point touches it, infinite if it does not.
+def _first_touch(tool: Tool, start: Array, end: Array) -> Array:
+    """Return the first share of a motion relative to a tool at which points touch it, infinite if they do not.
 
     Args:
         tool: the tool.
-        r: positions relative to the centre of the tip [m], shape (..., 3).
-        motion: of the points relative to the tool [m], shape (..., 3).
+        start: positions relative to its tip before the motion [m], shape (points, 3).
+        end: positions relative to its tip after the motion [m], shape (points, 3).
     """
-    along, motion_along = r @ tool.axis, motion @ tool.axis
-    r_across, motion_across = r - along[..., None] * tool.axis, motion - motion_along[..., None] * tool.axis
-    cylinder = _entry(r_across, motion_across, tool.radius)
-    with np.errstate(invalid="ignore"):
-        s = along + cylinder * motion_along
-    ends = (_entry(r - s * tool.axis, motion, tool.radius) for s in (0.0, tool.length))
-    first = np.minimum(*ends)
-    first = np.where((s >= 0) & (s <= tool.length), np.minimum(first, cylinder), first)
-    nearest = r - np.clip(along, 0, tool.length)[..., None] * tool.axis
-    touches = np.linalg.norm(nearest, axis=-1) <= (1 + TOUCH_TOLERANCE) * tool.radius
-    return np.asarray(np.where(touches, 0.0, first))
+    share = np.where(_depth_and_normal(tool, end)[0] > 0, 1.0, np.inf)
+    entering = np.isfinite(share)
+    low, high = np.zeros(entering.sum()), np.ones(entering.sum())
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        inside = _depth_and_normal(tool, start[entering] + middle[:, None] * (end - start)[entering])[0] > 0
+        low, high = np.where(inside, low, middle), np.where(inside, middle, high)
+    share[entering] = high
+    share[_depth_and_normal(tool, start)[0] >= -TOUCH_TOLERANCE * tool.radius] = 0
+    return share
 
 
-def _entry(r: Array, motion: Array, radius: float) -> Array:
-    """Return the share of a motion at which |r| falls to a radius; infinite if it does not."""
-    a, b, c = (motion**2).sum(axis=-1), (r * motion).sum(axis=-1), (r**2).sum(axis=-1) - radius**2
-    discriminant = b * b - a * c
-    enters = (b < 0) & (c >= 0) & (discriminant >= 0)
-    return np.where(enters, c / np.where(enters, np.sqrt(np.maximum(discriminant, 0)) - b, 1), np.inf)
+def _depth_and_normal(tool: Tool, r: Array) -> tuple[Array, Array]:
+    """Return the depths of points [m], shape (points,), at r from the tip of a tool, and the normals, (points, 3)."""
+    depth, *normal = tool.shape.build_depth(NUMPY)(*r.T, *tool.axis, tool.length, tool.radius)
+    return depth, np.stack(np.broadcast_arrays(*normal), axis=-1)

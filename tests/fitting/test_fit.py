@@ -128,6 +128,7 @@ def test_the_truth_comes_back_from_a_start_that_is_far_off(motion: Array) -> Non
     assert found.parameters["tissue.young"].start == 6e4
 
 
+@pytest.mark.slow
 def test_other_starts_are_tried_where_the_first_does_not_fit(motion: Array) -> None:
     # From a tool at the other end of the sheet nothing leads to the middle.
     start = changed(probes__0__at=[0.05, 0.05])
@@ -158,6 +159,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(tracks: dict[str, Array])
     assert 0.5 < float(np.std(ratios)) < 1.5
 
 
+@pytest.mark.default_cases("True")
 @pytest.mark.parametrize("bounded", [False, True])
 def test_a_profile_ends_where_the_others_can_no_longer_make_up_for_it(tracks: dict[str, Array], bounded: bool) -> None:
     # Errors so large that the motion is not linear in the damping; or a foundation that bounds keep from the truth.
@@ -177,6 +179,7 @@ def test_a_profile_ends_where_the_others_can_no_longer_make_up_for_it(tracks: di
     assert curve.max() > 1.9
 
 
+@pytest.mark.slow
 def test_what_pictures_cannot_tell_is_named_and_a_force_tells_it(
     tracks: dict[str, Array], tmp_path: Path, message: Messages
 ) -> None:
@@ -286,6 +289,7 @@ def test_depths_and_forces_of_a_tool_tell_the_foundation(device: Device, tmp_pat
     assert record["residual_force"] < 0.001
 
 
+@pytest.mark.slow
 def test_what_is_far_off_counts_less_in_a_robust_fit(tracks: dict[str, Array]) -> None:
     seen, free = noisy(tracks, 0.1), ["tissue.foundation"]
     seen["pixel"][[7, 20]] += np.linspace(0, 40, 11)[:, None]
@@ -303,6 +307,7 @@ def test_a_robust_fit_of_good_tracks_is_nearly_the_same(tracks: dict[str, Array]
     np.testing.assert_allclose(np.array(robust.interval, float), np.array(plain.interval, float), rtol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robust", [False, True])
 def test_tracks_that_are_far_apart_for_their_errors_are_independent(tracks: dict[str, Array], robust: bool) -> None:
     errors = []
@@ -313,6 +318,7 @@ def test_tracks_that_are_far_apart_for_their_errors_are_independent(tracks: dict
     np.testing.assert_allclose(errors[0], errors[1], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_errors_that_are_alike_widen_the_intervals_and_are_told(tracks: dict[str, Array]) -> None:
     # Each frame's tracks are off by one number, as when a camera shakes.
     rng, seen = np.random.default_rng(2), noisy(tracks, 0.02)
@@ -327,6 +333,7 @@ def test_errors_that_are_alike_widen_the_intervals_and_are_told(tracks: dict[str
     assert (high - low) / (2 * 1.96) == pytest.approx(alike.parameters[free[0]].standard_error, rel=0.1)
 
 
+@pytest.mark.slow
 def test_the_points_move_what_is_found_about_as_far_as_is_said(device: Device) -> None:
     position = positions_in(changed(sheet__points=[33, 33]), device)[:, ::4, ::4]
     found = fit(changed(), {"time": np.arange(11) / 25, "position": position}, ["tissue.foundation"])
@@ -360,6 +367,7 @@ def test_side_by_side_and_one_after_another_give_the_same_bits(tracks: dict[str,
     assert found[0].runs == found[1].runs
 
 
+@pytest.mark.slow
 def test_a_number_below_0_stays_there_and_one_that_starts_at_0_needs_bounds(
     tracks: dict[str, Array], message: Messages
 ) -> None:

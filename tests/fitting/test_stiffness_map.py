@@ -135,6 +135,7 @@ def test_the_files_give_what_was_fitted(result: Any, folder: Path) -> None:
     assert {"map.png", "map-error.png", "fit.png", "scene.yaml"} <= set(record["files"])
 
 
+@pytest.mark.slow
 def test_a_map_is_as_smooth_as_the_errors_allow(device: Device) -> None:
     """Of a lump and of even tissue with large errors, no more is followed than there is."""
     spreads = []
@@ -151,6 +152,7 @@ def test_a_map_is_as_smooth_as_the_errors_allow(device: Device) -> None:
     assert "the residual is only 0.25 times sigma: with a smaller sigma the map shows more" in notes
 
 
+@pytest.mark.slow
 def test_fields_that_do_not_move_are_unknown(device: Device, tmp_path: Path) -> None:
     # On so stiff a ground, exp(-distance / 5 mm) of a pull is felt: nothing on the other side.
     data = scene().model_dump(mode="json", exclude_none=True)
@@ -163,6 +165,7 @@ def test_fields_that_do_not_move_are_unknown(device: Device, tmp_path: Path) -> 
     assert (np.asarray(Image.open(tmp_path / "map-error.png"))[:, 3] == 65535).all()
 
 
+@pytest.mark.slow
 def test_pictures_that_have_the_name_of_the_map_are_kept(
     device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -197,6 +200,7 @@ def test_bounds_must_leave_springs_a_length(device: Device, message: Messages) -
     assert np.abs(np.log(found.factors)).max() < 4 * found.errors.max()
 
 
+@pytest.mark.slow
 def test_the_mesh_error_is_that_of_the_map_that_was_found(result: Any, folder: Path, device: Device) -> None:
     # The lump of the truth, where the search begins with none, changes it by more than the last digit.
     found, even = (
@@ -288,6 +292,7 @@ def test_a_map_that_takes_too_much_memory_is_refused(monkeypatch: pytest.MonkeyP
         fit(scene(), seen, ["tissue.map"], resolution=4)
 
 
+@pytest.mark.slow
 def test_ctrl_c_stops_a_map_in_the_middle_of_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of which one takes minutes."""
     monkeypatch.chdir(tmp_path)

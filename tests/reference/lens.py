@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +21,14 @@ def distort(camera: View, x: Array, y: Array) -> tuple[Array, Array]:
         t = np.arctan(r)
         ratio = t * (1 + k[0] * t**2 + k[1] * t**4 + k[2] * t**6 + k[3] * t**8) / np.maximum(r, 1e-9)
         return x * ratio, y * ratio
+    if camera.lens.model == "scaramuzza":
+        x, y = scaramuzza_pixel(k, x, y)
+        return x / camera.scale[0], y / camera.scale[1]
+    if camera.lens.model == "omnidir":
+        # The ray's point on the unit sphere, projected from xi behind the centre.
+        x, y, z = np.stack([x, y, np.ones_like(x)]) / np.sqrt(x**2 + y**2 + 1)
+        x, y, k = x / (z + k[0]), y / (z + k[0]), (*k[1:], 0, 0, 0, 0)
+        r = np.hypot(x, y)
     k1, k2, p1, p2, k3, k4, k5, k6 = k
     ratio = (1 + k1 * r**2 + k2 * r**4 + k3 * r**6) / (1 + k4 * r**2 + k5 * r**4 + k6 * r**6)
     return (
@@ -31,6 +41,14 @@ def undistorted(camera: View, x: Array, y: Array) -> tuple[Array, Array]:
     """Find where what is seen at pixels (x, y) [px] would be seen without distortion [px]; NaN beyond the limit."""
     if camera.lens is None:
         return x, y
+    if camera.lens.model == "scaramuzza":
+        # Its own direction: from the sensor to the ray, in closed form.
+        a, b = scaramuzza_ray(camera.lens.coefficients, x - camera.centre[0], y - camera.centre[1])
+        good = np.hypot(a, b) < camera.lens.limit
+        return (
+            np.where(good, camera.centre[0] + camera.scale[0] * a, np.nan),
+            np.where(good, camera.centre[1] + camera.scale[1] * b, np.nan),
+        )
     seen_x, seen_y = (x - camera.centre[0]) / camera.scale[0], (y - camera.centre[1]) / camera.scale[1]
     # From the axis outward, in steps small enough for Newton's method.
     a, b = np.zeros_like(seen_x), np.zeros_like(seen_y)
@@ -51,3 +69,28 @@ def undistorted(camera: View, x: Array, y: Array) -> tuple[Array, Array]:
         np.where(good, camera.centre[0] + camera.scale[0] * a, np.nan),
         np.where(good, camera.centre[1] + camera.scale[1] * b, np.nan),
     )
+
+
+def scaramuzza_ray(coefficients: Sequence[float], x: Array, y: Array) -> tuple[Array, Array]:
+    """Find where the ray of a pixel (x, y) [px] from the principal point meets depth 1; NaN if it points backward."""
+    a0, a2, a3, a4, c, d, e = coefficients
+    u, v = np.linalg.solve(np.array([[c, d], [e, 1]]), np.stack([x, y]).reshape(2, -1)).reshape(2, *x.shape)
+    p = np.hypot(u, v)
+    f = a0 + a2 * p**2 + a3 * p**3 + a4 * p**4
+    return u / np.where(f > 0, f, np.nan), v / np.where(f > 0, f, np.nan)
+
+
+def scaramuzza_pixel(coefficients: Sequence[float], x: Array, y: Array) -> tuple[Array, Array]:
+    """Find the pixel [px], from the principal point, of a point at depth 1, as world2cam of OCamCalib: by bisection."""
+    a0, a2, a3, a4, c, d, e = coefficients
+    r = np.hypot(x, y)
+    # The first root, from the axis.
+    grid = np.linspace(0, 3 * a0, 300).reshape(-1, *(1,) * r.ndim)
+    first = np.argmax(grid > r * (a0 + a2 * grid**2 + a3 * grid**3 + a4 * grid**4), axis=0)
+    low, high = grid.ravel()[first - 1], grid.ravel()[first]
+    for _ in range(60):
+        p = (low + high) / 2
+        is_beyond = p > r * (a0 + a2 * p**2 + a3 * p**3 + a4 * p**4)
+        low, high = np.where(is_beyond, low, p), np.where(is_beyond, p, high)
+    u, v = x * low / np.maximum(r, 1e-300), y * low / np.maximum(r, 1e-300)
+    return c * u + d * v, e * u + v

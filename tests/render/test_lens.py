@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import SceneError
 from taichi_msm.lenses import MODELS
+from taichi_msm.lenses.model import MAX_RADIUS
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.model.surface import place_capsules
+from taichi_msm.model.surface import place_instruments
 from taichi_msm.render import tracking, uniforms
 from taichi_msm.render.camera import calibration, view
 from taichi_msm.render.labels import track_grid
@@ -26,6 +27,7 @@ from taichi_msm.system.runtime import Device
 from tests import reference
 from tests.golden import Messages
 from tests.reference import labels as twin
+from tests.reference.lens import scaramuzza_pixel, scaramuzza_ray
 from tests.render.test_labels import crumpled, folded, look
 from tests.render.test_rasterizer import assert_alike_in_other_tiles, dented, difference, drawable, with_instruments
 from tests.scenes import speckle
@@ -41,8 +43,17 @@ LENSES: dict[str, dict[str, Any]] = {
     "rational": {"distortion": {"k1": 0.3, "k2": 0.1, "k4": 0.8, "k6": 0.02, "p1": -0.004}},
     "fisheye": {"distortion": {"model": "fisheye", "k1": -0.05, "k2": 0.01}},
     "pincushion": {"distortion": {"k1": 0.4}},
+    "omnidir": {
+        "distortion": {"model": "omnidir", "xi": 0.5, "k1": -0.2, "k2": 0.05, "p1": 0.002, "p2": -0.001},
+        "intrinsics": {"fx": 90, "fy": 93, "cx": 37, "cy": 31},
+    },
+    "scaramuzza": {
+        "distortion": {"model": "scaramuzza", "a0": 61, "a2": -4e-3, "a3": 3e-5, "a4": -1e-6, "c": 1.01, "d": 0.02},
+        "intrinsics": {"cx": 37, "cy": 31},
+    },
 }
-EVERY_LENS = pytest.mark.parametrize("lens", LENSES)
+# Kernels take long to compile, so some lenses are quick.
+QUICK = tuple(lens for lens in LENSES if lens != "omnidir")
 
 
 def cases(*quick: tuple[Any, ...], **values: Any) -> pytest.MarkDecorator:
@@ -56,10 +67,32 @@ def seen_through(lens: str, points: tuple[int, int] = (9, 11), **render: Any) ->
     return with_instruments(drawable(points, camera=camera, **render))
 
 
+def omnidir_points(points: Array, axis: Array, shift: Array, matrix: Array, distortion: Array) -> tuple[Array]:
+    """As cv2.omnidir.projectPoints, which only OpenCV's contributed modules have, from its documentation."""
+    xi, k1, k2, p1, p2 = distortion
+    sphere = points[:, 0] @ cv2.Rodrigues(axis)[0].T + shift
+    sphere = sphere / np.linalg.norm(sphere, axis=-1, keepdims=True)
+    u, v = sphere[:, :2].T / (sphere[:, 2] + xi)
+    q = u**2 + v**2
+    radial = 1 + k1 * q + k2 * q**2
+    bent = u * radial + 2 * p1 * u * v + p2 * (q + 2 * u**2), v * radial + p1 * (q + 2 * v**2) + 2 * p2 * u * v
+    return ((np.stack([*bent, np.ones_like(u)], axis=-1) @ matrix.T)[:, None, :2],)
+
+
+def scaramuzza_points(points: Array, axis: Array, shift: Array, matrix: Array, distortion: Array) -> tuple[Array]:
+    x, y, z = (points[:, 0] @ cv2.Rodrigues(axis)[0].T + shift).T
+    return ((np.stack(scaramuzza_pixel(distortion.tolist(), x / z, y / z), axis=-1) + matrix[:2, 2])[:, None],)
+
+
 PROJECT: dict[str, Any] = {
     "pinhole": cv2.projectPoints,
     "fisheye": cv2.fisheye.projectPoints,
+    "omnidir": omnidir_points,
+    "scaramuzza": scaramuzza_points,
 }
+
+# The calibration of C3VD's colonoscope (Bobrow et al. 2023), in pixels of 1350 x 1080.
+C3VD = (769.2436, -8.127706e-4, 6.256742e-7, -1.196622e-9, 0.99998688, 0.00288274, -0.00296316)
 
 
 def opencv(made: Scene, points: Array) -> Array:
@@ -90,6 +123,13 @@ def surface_positions(made: Scene, coordinates: Array, position: Array) -> Array
         Lens("pinhole", (0.3, 0.1, 1e-3, 1e-3, 0.05, 0.4, 0.1, 0.01)),
         Lens("fisheye", (-0.05, 0.01, -0.003, 0.001)),
         Lens("fisheye", (-0.5, 0, 0, 0)),
+        Lens("omnidir", (0.0, -0.1, 0.02, 1e-3, -2e-3)),
+        Lens("omnidir", (0.9, -0.3, 0.05, 1e-3, -2e-3)),
+        Lens("omnidir", (2.5, 0.4, -0.1, 0, 1e-3)),
+        Lens("scaramuzza", C3VD),
+        # Without polynomial, and one that folds back at 44 degrees.
+        Lens("scaramuzza", (300, 0, 0, 0, 1, 0, 0)),
+        Lens("scaramuzza", (400, -5e-4, 2e-6, 0, 1, 0.1, 0.02)),
     ],
     ids=str,
 )
@@ -99,6 +139,7 @@ def test_places_are_those_of_opencv_and_back(lens: Lens) -> None:
     place = np.stack([away * np.cos(turn), away * np.sin(turn)], axis=-1)
     points, none = np.concatenate([place, np.ones((5000, 1))], axis=1)[:, None], np.zeros(3)
     expected = PROJECT[lens.model](points, none, none, np.eye(3), np.array(lens.coefficients))[0][:, 0]
+    expected /= lens.coefficients[0] if lens.model == "scaramuzza" else 1
     seen = lens.distort(place)
     np.testing.assert_allclose(seen, expected, atol=1e-13)
     # 1e-6 px where the focal length is 1000 px; nothing is nearer to the axis and seen there too.
@@ -122,6 +163,45 @@ def test_beyond_the_fold_there_is_nothing() -> None:
     np.testing.assert_allclose(lens.undistort(lens.distort(place)), place, atol=1e-9)
     # t - t^3 / 2 is largest at t = sqrt(2 / 3).
     assert Lens("fisheye", (-0.5, 0, 0, 0)).limit == pytest.approx(np.tan(np.sqrt(2 / 3)))
+
+
+def test_wide_lenses_end_where_they_fold() -> None:
+    # The plane's u - u^3 / 2 is largest at u = sqrt(2 / 3), and with xi = 1, u = tan(t / 2).
+    assert Lens("omnidir", (1.0, -0.5, 0, 0, 0)).limit == pytest.approx(np.tan(2 * np.arctan(np.sqrt(2 / 3))))
+    # Without xi it is the rational lens.
+    flat = Lens("pinhole", (-0.5, 0.02, 1e-3, 2e-3, 0, 0, 0, 0))
+    assert Lens("omnidir", (0.0, *flat.coefficients[:4])).limit == pytest.approx(flat.limit)
+    # A plane that the sphere does not reach folds nothing, nor does C3VD's polynomial within 88 degrees.
+    assert Lens("omnidir", (3.0, -0.5, 0, 0, 0)).limit == Lens("scaramuzza", C3VD).limit == MAX_RADIUS
+    # p / (a0 + a2 p^2) is largest at p = sqrt(a0 / a2), sqrt(1 / (4 a0 a2)).
+    assert Lens("scaramuzza", (400, 1e-4, 0, 0, 1, 0, 0)).limit == pytest.approx(2.5, rel=1e-5)
+
+
+def test_rays_of_c3vd_are_those_of_its_polynomial() -> None:
+    """A pixel's ray in closed form, within 1e-6 px of a picture of 1350 x 1080 that it does not fill."""
+    x, y = np.meshgrid(np.linspace(-680, 670, 90), np.linspace(-544, 536, 72))
+    found = Lens("scaramuzza", C3VD).undistort(np.stack([x, y], axis=-1) / C3VD[0])
+    a, b = scaramuzza_ray(C3VD, x, y)
+    angle = np.degrees(np.arctan(np.hypot(a, b)))
+    np.testing.assert_array_equal(np.isnan(found[..., 0]), ~(angle < 88))
+    assert 0.9 < (angle < 88).mean() < 1
+    # As a pixel moves by dp, the tangent moves by at most dp / a0 / cos^2 of the angle, times 2 for this lens.
+    error = np.hypot(found[..., 0] - a, found[..., 1] - b) * np.cos(np.radians(angle)) ** 2 * C3VD[0] / 2
+    assert np.nanmax(error) < 1e-6
+
+
+@pytest.mark.parametrize("lens", ["fisheye", "omnidir", "scaramuzza"])
+def test_a_lens_is_recorded_as_it_was_given(lens: str) -> None:
+    made = seen_through(lens)
+    recorded = made.model_dump(mode="json")
+    assert recorded["render"]["camera"]["distortion"].keys() == {"model", *MODELS[lens].coefficients}
+    assert Scene.model_validate(recorded) == made
+    written, given = calibration(view(made)), LENSES[lens]["distortion"]
+    assert written["model"] == lens
+    default = {name: row.default for name, row in MODELS[lens].coefficients.items()}
+    assert written["distortion"] == [{**default, **given}[name] for name in default]
+    if lens == "scaramuzza":
+        assert np.diag(written["calibration"]).tolist() == [61, 61, 1]
 
 
 def test_every_lens_fits_into_the_uniforms() -> None:
@@ -173,7 +253,7 @@ def test_pictures_are_like_the_twins(lens: str, render: dict[str, Any], device: 
     made, texture = seen_through(lens, **render), speckle(13, 17)
     for shape in (dented, folded):
         position = shape(made)
-        placed = place_capsules(made, position, 0)
+        placed = place_instruments(made, position, 0)
         drawn = Rasterizer(made, texture).draw(position, rods=placed)
         apart = difference(drawn, reference.draw(made, position, texture, placed))
         # As without a lens (test_drawing.py).
@@ -182,17 +262,19 @@ def test_pictures_are_like_the_twins(lens: str, render: dict[str, Any], device: 
         assert 0.2 < (drawn.max(axis=-1) > 0).mean() < 0.95
 
 
+@pytest.mark.default_cases("fisheye-3")
 @cases(("fold", 0), ("fisheye", 3), lens=LENSES, refine=(0, 3))
 def test_large_cells_are_bent(lens: str, refine: int, device: Device) -> None:
     """Sides of cells 90 pixels long bend by up to 8 px, more than a tile, outward and inward."""
     intrinsics = {"fx": 150, "fy": 150, "cx": 99.5, "cy": 74.5}
-    camera = {"eye": [0, 0, 0.33], "intrinsics": intrinsics, **LENSES[lens]}
+    camera = {"eye": [0, 0, 0.33], "intrinsics": intrinsics, "outside": "background", **LENSES[lens]}
     made = drawable((2, 3), camera=camera, size=[200, 150], refine=refine)
     position = rest_positions(made.sheet)
     found, (coordinates, _, _) = look(made, position), twin.labels(made, position)
     np.testing.assert_allclose(found.coordinates, coordinates, atol=1e-5)
 
 
+@pytest.mark.slow
 @cases(("fisheye", 4), lens=LENSES, lanes=(1, 4))
 def test_the_shape_of_a_tile_does_not_change_the_bits(lens: str, lanes: int, device: Device) -> None:
     renders: list[dict[str, Any]] = [{"shading": "tissue", "size": [79, 57]}, {"wireframe": True, "supersample": 3}]
@@ -201,11 +283,12 @@ def test_the_shape_of_a_tile_does_not_change_the_bits(lens: str, lanes: int, dev
         assert_alike_in_other_tiles(made, texture, folded(made), lanes)
 
 
-@cases(*((lens, folded) for lens in LENSES), ("fold", crumpled), lens=LENSES, shape=(dented, folded, crumpled))
+@pytest.mark.default_cases("endoscope-folded", "fisheye-folded")
+@cases(*((lens, folded) for lens in QUICK), ("fold", crumpled), lens=LENSES, shape=(dented, folded, crumpled))
 def test_labels_are_on_the_ray_of_each_pixel(lens: str, shape: Any, device: Device) -> None:
     made = seen_through(lens)
     position = shape(made)
-    placed = place_capsules(made, position, 0)
+    placed = place_instruments(made, position, 0)
     found, (coordinates, depth, instrument) = look(made, position), twin.labels(made, position, placed)
     alike = (np.isnan(found.coordinates[..., 0]) == np.isnan(coordinates[..., 0])) & (
         np.abs(found.depth - depth) < 1e-4 * depth.max()
@@ -226,7 +309,7 @@ def test_labels_are_on_the_ray_of_each_pixel(lens: str, shape: Any, device: Devi
 
 
 @cases(
-    *((lens, folded, None) for lens in LENSES),
+    *((lens, folded, None) for lens in QUICK),
     *((lens, crumpled, 1) for lens in ("fold", "fisheye")),
     lens=LENSES,
     shape=(dented, folded, crumpled),
@@ -282,7 +365,7 @@ def test_what_tangential_distortion_folds_back_is_outside_the_picture(device: De
     assert 0.1 < np.isnan(found.pixels).mean() < 0.9
 
 
-@EVERY_LENS
+@cases(*((lens,) for lens in QUICK), lens=LENSES)
 def test_what_is_picked_is_what_is_labelled(lens: str, device: Device) -> None:
     made = seen_through(lens).model_copy(update={"probes": ()})
     position = folded(made)

@@ -143,6 +143,7 @@ def test_a_drag_moves_the_control_point_with_the_pointer(begin: Begin) -> None:
     assert np.array(session.tool.position) * 24 == pytest.approx([16, 10], abs=0.4), "the tool is not there any more"
 
 
+@pytest.mark.default_cases("f64 with the scene's probes")
 @pytest.mark.parametrize(
     ("overrides", "play"),
     [
@@ -371,6 +372,7 @@ def test_a_film_shows_the_tissue_alone(begin: Begin) -> None:
     assert np.abs(shown.astype(int) - alone).mean() > 15
 
 
+@pytest.mark.slow
 def test_a_session_too_long_for_a_file_says_so_before(
     begin: Begin, monkeypatch: pytest.MonkeyPatch, message: Messages
 ) -> None:
@@ -417,6 +419,7 @@ def test_a_name_of_two_lines_is_one_in_the_comment(small: Path) -> None:
     assert load_scene(keeper.save_scene(load_scene("small.yaml"))).sheet == load_scene("small.yaml").sheet
 
 
+@pytest.mark.slow
 def test_a_sheet_that_nothing_holds_may_fly_after_a_press(begin: Begin) -> None:
     # It flies on when the force is gone, farther than a sheet that was never pressed could.
     session = begin({**TILTED, "sheet.fixed": "none", "springs.virtual": 0.0, "probes.0.falloff": 0.0, "damping": 0.0})
@@ -546,6 +549,7 @@ def moved(session: Session) -> PositionControlledTool:
     return session.tool
 
 
+@pytest.mark.default_cases("f32")
 @pytest.mark.parametrize(
     ("overrides", "play"),
     [

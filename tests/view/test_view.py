@@ -505,6 +505,7 @@ def test_the_window(small: Path, screen: Screen) -> None:
     assert np.abs(after - before).max() > 50
 
 
+@pytest.mark.slow
 def test_the_window_by_position_until_a_signal(small: Path, screen: Screen, message: Messages) -> None:
     live = Live(screen, "probes.0.instrument={radius: 0.04, shaft: [0.3, -0.2, 1], length: 0.3}")
     live.kept("picture", "p")

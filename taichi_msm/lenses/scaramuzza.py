@@ -1,0 +1,79 @@
+"""Scaramuzza's polynomial model of wide lenses, as OCamCalib, MATLAB's fisheyeIntrinsics and C3VD calibrate it.
+
+A point (u, v) of the sensor [px], at the distance p from the axis, sees along (u, v, f), and its pixel is
+
+    (c u + d v, e u + v) from the principal point,    f(p) = a0 + a2 p^2 + a3 p^3 + a4 p^4.
+
+So p solves p = r f(p), r = |(x, y)|. Here in units of the focal length a0: t = p / a0, g(t) = f(p) / a0.
+
+Source: Scaramuzza, Martinelli and Siegwart 2006; MATLAB's documentation of fisheyeIntrinsics.
+"""
+
+# No `from __future__ import annotations` here: Taichi reads the function of a lens.
+
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.polynomial import Polynomial
+
+from taichi_msm.lenses.fisheye import MIN_SQUARED_RADIUS
+from taichi_msm.lenses.model import MAX_RADIUS, NUMPY, Coefficient, LensModel, Operations, positive_roots
+
+# Steps of Newton's method; lenses of endoscopes need 6.
+NEWTON_STEPS = 12
+
+# Maximum error of t, 1e-6 px at a focal length of 1000 px, and the number of radii at which it is verified.
+ROOT_TOLERANCE, ROOT_CHECKS = 1e-9, 2048
+
+
+class Scaramuzza(LensModel):
+    """Scaramuzza's polynomial model."""
+
+    name = "scaramuzza"
+    meaning = "Scaramuzza's polynomial, with a0, a2, a3, a4 and the matrix c, d, e"
+    focal_length = "a0"
+    coefficients: ClassVar = {
+        "a0": Coefficient("focal length [px], in place of fx and fy", least=1e-3, default=None),
+        "a2": Coefficient("coefficient of the squared radius [1/px]"),
+        "a3": Coefficient("coefficient of the cubed radius [1/px^2]"),
+        "a4": Coefficient("coefficient of the fourth power of the radius [1/px^3]"),
+        "c": Coefficient("horizontal stretch", least=0.5, most=2.0, default=1.0),
+        "d": Coefficient("horizontal shear", least=-0.5, most=0.5),
+        "e": Coefficient("vertical shear", least=-0.5, most=0.5),
+    }
+
+    def build(self, operations: Operations) -> Callable[..., Any]:
+        """Build the formula."""
+        sqrt, maximum = operations.sqrt, operations.maximum
+
+        def distort(x, y, a0, a2, a3, a4, c, d, e):
+            b2, b3, b4 = a0 * a2, a0 * a0 * a3, a0 * a0 * a0 * a4
+            r = sqrt(maximum(x * x + y * y, MIN_SQUARED_RADIUS))
+            # The solution with a3 = a4 = 0, at most the stereographic one.
+            t = 2.0 * r / (1.0 + sqrt(1.0 + maximum(b2 * (-4.0), 1.0) * r * r))
+            for _ in range(NEWTON_STEPS):
+                g = 1.0 + t * t * (b2 + t * (b3 + t * b4))
+                slope = t * (2.0 * b2 + t * (3.0 * b3 + t * (4.0 * b4)))
+                t = t + (t - r * g) / (r * slope - 1.0)
+            ratio = t / r
+            u, v = x * ratio, y * ratio
+            return c * u + d * v, e * u + v
+
+        return distort
+
+    def limit(self, coefficients: Sequence[float]) -> float:
+        """Return the radius up to which r = t / g(t) increases and Newton's method finds t."""
+        a0, a2, a3, a4, *_ = coefficients
+        t = Polynomial([0, 1])
+        g = Polynomial([1, 0, a2 * a0, a3 * a0**2, a4 * a0**3])
+        fold = min(positive_roots(g - t * g.deriv()), default=np.inf)
+        end = min([fold, *positive_roots(g - t / MAX_RADIUS)])
+        radial_positions = end * np.sin(np.linspace(0, np.pi / 2, ROOT_CHECKS))
+        radii = radial_positions / g(radial_positions)
+        with np.errstate(all="ignore"):
+            roots, _ = self.build(NUMPY)(radii, 0.0, a0, a2, a3, a4, 1.0, 0.0, 0.0)
+        is_wrong = ~(np.abs(roots - radial_positions) <= ROOT_TOLERANCE)
+        if is_wrong.any():
+            return float(radii[max(0, np.argmax(is_wrong) - 1)])
+        return MAX_RADIUS
