@@ -7,8 +7,8 @@ the elastic force over the travel, computed at few travels and interpolated, the
 
 with shares, phi and the memory s_i of `terms/viscoelasticity.py`. Depths of contact, shares and times need no further
 curve, and log f is nearly linear in the logarithms of the other parameters, or in the reciprocal of a lock, with slopes
-from a curve each. This model is minimised within a trust region, and compared with a curve at its minimum, until it does
-not improve.
+from a curve each. This model is minimised within a trust region, and compared with a curve at its minimum, until it
+does not improve.
 
 It neglects the memory of mass points that leave the tool, and of those that slide along it. Therefore it is finally
 compared with runs of the tests, whose difference from the model is added to it. The Jacobian is that of the model.
