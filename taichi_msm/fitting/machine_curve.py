@@ -126,9 +126,9 @@ class CurveRuns(Runs):
             values = self._predictor.values(x)
         except SceneError:
             return None
-        steps = x - tangent.x
-        steps = np.where(self._of_lock, -np.expm1(-steps), steps)
-        return self._predict(values, tangent.reach, tangent.forces * np.exp(steps @ tangent.slopes))
+        distance = x - tangent.x
+        distance = np.where(self._of_lock, -np.expm1(-distance), distance)
+        return self._predict(values, tangent.reach, tangent.forces * np.exp(distance @ tangent.slopes))
 
     def predict_many(self, coordinates: Sequence[Array], steps: int | None = None) -> list[Prediction | None]:
         """Predict at several x by the tangent; None where that fails."""
