@@ -302,8 +302,8 @@ class Simulation:
         """Draw the sheet and the instruments of the probes.
 
         Args:
-            camera: name of a camera of the scene, "top", "oblique", a `Camera` or a mapping of its keys; None for the
-                scene's main camera.
+            camera: name of a camera of the scene, "top", "oblique", "fit", a `Camera` or a mapping of its keys; None
+                for the scene's main camera.
             positions: positions of the mass points [m], shape (rows, cols, 3); None for the current ones.
             time: time of these positions [s], which moves instruments and cameras; None for the current time.
 

@@ -10,6 +10,9 @@ import numpy as np
 from taichi_msm.arithmetic import Operations
 from taichi_msm.shapes.shape import MIN_DISTANCE_M, Array, Shape
 
+# Segments of a mesh between the side and a pole.
+POLE_SEGMENTS = 8
+
 
 class Capsule(Shape):
     """A capsule."""
@@ -60,6 +63,13 @@ class Capsule(Shape):
             return t, is_hit, o_x + d_x * t - a_x * foot, o_y + d_y * t - a_y * foot, t * (-1.0) - a_z * foot
 
         return intersect
+
+    def profile(self, length: float, radius: float) -> Array:
+        """Return two quarters of a circle; see `Shape.profile`."""
+        latitude = np.linspace(np.pi / 2, 0, POLE_SEGMENTS + 1)
+        latitude, offset = np.concatenate([latitude, -latitude[::-1]]), np.repeat([length, 0.0], len(latitude))
+        normals = np.stack([np.sin(latitude), np.cos(latitude)])
+        return np.stack([offset + radius * normals[0], radius * normals[1], *normals], axis=1)
 
     def tip_height(self, axis: Array, radius: float) -> float:
         """Return the radius."""

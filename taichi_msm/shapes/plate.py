@@ -79,6 +79,11 @@ class Plate(Shape):
 
         return intersect
 
+    def profile(self, length: float, radius: float) -> Array:
+        """Return the end, the side and the end at the tip; see `Shape.profile`."""
+        ends = [[length, 0, 1, 0], [length, radius, 1, 0], [length, radius, 0, 1]]
+        return np.array([*ends, [0, radius, 0, 1], [0, radius, -1, 0], [0, 0, -1, 0]], float)
+
     def tip_height(self, axis: Array, radius: float) -> float:
         """Return the height of the centre of the end above its rim's lowest point; 0 where the axis is vertical."""
         return radius * math.hypot(*axis[:2])

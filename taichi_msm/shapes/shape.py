@@ -50,6 +50,13 @@ class Shape(ABC):
         """
 
     @abstractmethod
+    def profile(self, length: float, radius: float) -> Array:
+        """Return the outline that meshes revolve about the axis, from its end to the tip, shape (points, 4).
+
+        Of each point, its place along the axis and its distance from it [m], and the same components of its normal.
+        """
+
+    @abstractmethod
     def tip_height(self, axis: Array, radius: float) -> float:
         """Return the height of the tip above the lowest point of the end of the shape [m]."""
 
