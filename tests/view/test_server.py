@@ -171,11 +171,15 @@ def test_the_first_page_steers_and_the_next_one_when_it_leaves(
             state = await second.until(lambda state: state["time"] > 0.1)
             assert (state["steers"], state["watching"], session.tool.engaged) == (False, 1, False)
             await first.say("press", 60, 50)
-            state = await first.until(lambda state: any(depth > 2e-3 for _, _, depth in state["readings"]))
+            await first.until(lambda state: any(depth > 2e-3 for _, _, depth in state["readings"]))
+            # The whole force acts after a fifth of a second.
+            pressed = session.frame / session.frame_rate
+            state = await first.until(lambda state: state["time"] > pressed + 0.3)
             assert state["steers"]
-            times, forces, _ = np.array(state["readings"]).T
-            assert times[-1] == pytest.approx(state["time"])
-            assert forces[-1] == pytest.approx(session.tool_force(), rel=0.5)
+            time, force, _ = state["readings"][-1]
+            assert time == pytest.approx(state["time"], rel=1e-4)
+            assert force == pytest.approx(session.tool_force(), rel=1e-4)
+            assert force > 0
             await second.until(lambda state: any(depth > 2e-3 for _, _, depth in state["readings"]))
             first.connection.close()
             await second.until(lambda state: state["steers"])
