@@ -297,7 +297,10 @@ class _Page(_Guarded):
     """The files of the page."""
 
     def get(self) -> None:
-        name = self.request.path.lstrip("/").partition("/")[2]
+        token, slash, name = self.request.path.lstrip("/").partition("/")
+        if not slash:
+            self.redirect(f"{token}/")
+            return
         if name not in PAGE:
             raise HTTPError(404)
         file, kind = PAGE[name]

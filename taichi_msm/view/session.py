@@ -247,6 +247,9 @@ class Session:
         rate = self.frame_rate / self.subframes
         self._film = Film(folder, self.scene.render, rate, self.subframes, self._elapsed, option, suffix)
         self._film_path = path
+        if path is not None:
+            # A session that ends at once has a film, too.
+            self._film.add_frame(self._draw(), self._elapsed)
 
     def picture(self, pacing: str = "") -> Picture:
         """Draw the tissue and the overlay; append the picture without text to a running film.

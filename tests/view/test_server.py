@@ -126,6 +126,7 @@ def test_every_request_needs_the_token_and_a_known_origin(session: Session, capl
             port = root.rpartition(":")[2]
             for name in PAGE:
                 assert await status(f"{server.url}{name}") == 200
+            assert await status(server.url.rstrip("/")) == 200, "it leads to the page"
             for path in ("x", "socket/", "../view.js", "%2e%2e/server.py", "index.html", "page/index.html"):
                 assert await status(server.url + path) in (403, 404), path
             for path in ("/", "/favicon.ico", f"/{token[:-1]}/", f"/{token}0/", "/socket", "/%ff/", f"/x/{token}/"):
