@@ -6,6 +6,7 @@ import asyncio
 import json
 import logging
 import re
+import signal
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from contextlib import ExitStack, asynccontextmanager, suppress
 from io import BytesIO
@@ -20,12 +21,14 @@ from tornado.websocket import WebSocketClientConnection, WebSocketClosedError, w
 
 from taichi_msm import load_scene
 from taichi_msm.cli.main import main
+from taichi_msm.errors import Pause
 from taichi_msm.system.runtime import Device
 from taichi_msm.view import server as server_module
 from taichi_msm.view.messages import MAX_BYTES, parse_message
 from taichi_msm.view.recording import Captures
 from taichi_msm.view.server import MAX_PAGES, MAX_UNREAD_PICTURES, PAGE, Server, listen
 from taichi_msm.view.session import Session
+from tests.conftest import Program
 from tests.golden import Messages
 from tests.view.chromium import PROGRAM, chromium
 from tests.view.test_session import TILTED
@@ -331,6 +334,22 @@ def test_a_port_in_use_is_one_error(small: Path, capsys: pytest.CaptureFixture[s
     with listen(0) as taken:
         assert main(["view", "small.yaml", "--browser", "--port", str(taken.getsockname()[1])]) == 2
     message(capsys.readouterr().err, hide=r"\d{4,}")
+
+
+def test_ctrl_c_ends_the_command(small: Path, program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
+    serve = Server.run
+
+    async def interrupt(server: Server, pause: Pause) -> None:
+        signal.raise_signal(signal.SIGINT)
+        await serve(server, pause)
+
+    monkeypatch.setattr(Server, "run", interrupt)
+    done = program("view", "small.yaml", "--browser", "--record", "live.gif")
+    url, film = done.stdout.splitlines()
+    assert (done.returncode, film) == (130, "live.gif")
+    assert re.fullmatch(r"http://127\.0\.0\.1:\d+/[\w-]{32}/", url)
+    assert done.stderr.splitlines()[-1] == "interrupted"
+    assert Path("live.gif").exists()
 
 
 @pytest.mark.skipif(PROGRAM is None, reason="needs Chromium")
