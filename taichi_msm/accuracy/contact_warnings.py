@@ -20,14 +20,15 @@ MAX_INDENTATION_RATIO = 1 / 5
 def tool_contact_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
     """Warn about tools that slide through a soft sheet, and about the first tool that pierced the sheet."""
     membrane, foundation = _stiffnesses(plan)
-    for tool in touching_tools(plan.tools):
+    remedy = "take friction: rough, " if plan.scene.time.at_rest else ""
+    for tool in (tool for tool in touching_tools(plan.tools) if not tool.rough):
         depth, limit = _max_depth(tool, plan.scene.time.duration), MAX_INDENTATION_RATIO * tool.radius
         if membrane < (support := foundation * tool.radius**2) and depth > limit * (1 + 1e-9):
             yield (
                 f"probes.{tool.probe}: the sheet slides off the tip sideways, and its force is too small: the sheet "
                 f"resists stretching by {membrane:.3g} N/m (young x thickness), less than the foundation under the "
                 f"tip, {support:.3g} N/m (foundation x radius^2), and the tip goes {1000 * depth:.3g} mm deep, more "
-                f"than a fifth of its radius, {1000 * limit:.3g} mm; press less deep, or with a wider tip"
+                f"than a fifth of its radius, {1000 * limit:.3g} mm; {remedy}press less deep, or with a wider tip"
             )
     for tool in plan.tools:
         if tool.probe == progress.pierced_by - 1:

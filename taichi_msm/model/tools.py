@@ -28,6 +28,9 @@ from taichi_msm.scene.tools import Probe
 from taichi_msm.shapes import SHAPES
 from taichi_msm.shapes.shape import Shape
 
+# The same between two equilibria for a rough tool, whose force depends on where mass points first touch it.
+ROUGH_STRIDE_RADII = 1 / 16
+
 # Largest displacement of a clamp between two equilibria, in lengths of the shortest spring at rest.
 MAX_STRIDE_SPRINGS = 0.5
 
@@ -56,9 +59,14 @@ class Tool:
     length: float  # of the axis [m]
     radius: float  # of tip and shaft [m]
     shape: Shape
-    friction: float  # Coulomb's coefficient
+    friction: float  # Coulomb's coefficient; infinite if rough
     grips: tuple[tuple[float, float], ...]  # start and end of every grip [s]
     stride: float  # largest displacement between two equilibria, and of a shape in a step [m]
+
+    @property
+    def rough(self) -> bool:
+        """Whether the mass points that it touches stick to it."""
+        return self.friction == math.inf
 
     @property
     def path_length(self) -> float:
@@ -105,7 +113,7 @@ class Tool:
         return bool((depth > -1e-6 * self.radius).any())
 
     def substep_times(self, begin: float, end: float) -> Array:
-        """Divide a time interval [s] so that the tool moves by at most its stride in each subinterval.
+        """Divide a time interval [s] so that the tool moves by at most its stride, and if rough straight, in each part.
 
         Returns:
             Ends of the subintervals [s].
@@ -115,7 +123,8 @@ class Tool:
             times = np.linspace(begin, end, count + 1)
             longest = float(np.linalg.norm(np.diff(self.tip_centre(times), axis=0), axis=1).max())
             if longest <= max_stride:
-                return times[1:]
+                bends = self.times[self.rough & (self.times > begin) & (self.times < end)]
+                return np.union1d(times[1:], bends)
             count = max(count + 1, int(count * longest / max_stride))
 
 
@@ -160,9 +169,9 @@ def build_tools(probes: Sequence[Probe], sheet: Sheet) -> tuple[Tool, ...]:
         tips = heights + shape.tip_height(axis, radius)
         tip_centres = np.stack([(across - 0.5) * width, (0.5 - down) * height, tips], axis=1)
         solid = axis, instrument.length, radius, shape
-        tools.append(
-            Tool(index, time, tip_centres, heights, *solid, probe.friction, probe.grip, shape.max_stride * radius)
-        )
+        friction = math.inf if probe.friction == "rough" else probe.friction
+        stride = min(shape.max_stride, ROUGH_STRIDE_RADII if friction == math.inf else 1) * radius
+        tools.append(Tool(index, time, tip_centres, heights, *solid, friction, probe.grip, stride))
     return tuple(tools)
 
 
@@ -202,9 +211,12 @@ def path_problems(scene: Scene, tools: Sequence[Tool], grid: TimeGrid) -> Iterat
         if depth > 1e-9 * tool.radius:
             text = f"the instrument is {depth:.3g} m in the sheet at rest at 0 s; begin above it, at a greater height"
             yield Problem(key, text)
+        if tool.rough and not scene.time.at_rest:
+            text = "rough needs time.motion: quasistatic; give Coulomb's coefficient, such as 0.3"
+            yield Problem(("probes", tool.probe, "friction"), text)
         if scene.time.at_rest:
-            if tool.friction > 0:
-                text = f"{tool.friction:g} needs time.motion: dynamic, as at rest nothing slides; remove friction"
+            if 0 < tool.friction < math.inf:
+                text = f"{tool.friction:g} needs time.motion: dynamic, as at rest nothing slides; take rough or 0"
                 yield Problem(("probes", tool.probe, "friction"), text)
         elif fault := too_fast(tool, grid):
             yield Problem((*key, fault[0]), fault[1])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     ConfigDict,
@@ -155,8 +155,11 @@ class Probe(Section):
         "solid that is drawn for the tool; with path it touches the sheet, and is required",
         "a mapping with radius or plate, shaft and length",
     )
-    friction: NotNegative = key(
-        0.0, "with path: Coulomb's coefficient between the instrument and the sheet", "a number, 0 or more"
+    friction: Literal["rough"] | NotNegative = key(
+        0.0,
+        "with path: Coulomb's coefficient between the instrument and the sheet; in quasi-static scenes rough: points "
+        "that the instrument touches stick to it",
+        "a number, 0 or more, or rough",
     )
     grip: tuple[tuple[Number, Number], ...] = key(
         (),

@@ -72,18 +72,15 @@ class ContactTerm(Term):
 
     shapes: tuple[str, ...]  # name of the shape of every tool
     has_friction: tuple[bool, ...]  # whether each tool has friction
-    grips: bool  # whether any tool can hold tissue
+    grips: bool  # whether any tool can hold tissue, as grips, clamps and rough tools do
 
     @classmethod
     def from_plan(cls, plan: Plan) -> Self | None:
         """Return the term's configuration; None without position-controlled tools."""
         tools = plan.tools
-        grips = any(tool.grips or isinstance(tool, Clamp) for tool in tools)
-        return (
-            cls(tuple(tool.shape.name for tool in tools), tuple(tool.friction > 0 for tool in tools), grips)
-            if tools
-            else None
-        )
+        grips = any(tool.grips or tool.rough or isinstance(tool, Clamp) for tool in tools)
+        shapes = tuple(tool.shape.name for tool in tools)
+        return cls(shapes, tuple(tool.friction > 0 for tool in tools), grips) if tools else None
 
     @property
     def memory(self) -> tuple[str, ...]:
@@ -155,7 +152,8 @@ class ContactTerm(Term):
 
     def layout(self, config: KernelConfig) -> ContactLayout:
         """Return the columns and fields of the term."""
-        return ContactLayout(self.shapes, self.grips, config.first_field(ContactTerm), config.first_column(ContactTerm))
+        first_field, first_column = config.first_field(ContactTerm), config.first_column(ContactTerm)
+        return ContactLayout(self.shapes, self.has_friction, self.grips, first_field, first_column)
 
     def _build_reaches(self, config: KernelConfig) -> Callable[..., Any]:
         """Build the Taichi function reaches(sheet, i, low, high, now).

@@ -19,7 +19,8 @@ LENGTH, RADIUS, FRICTION, INVERSE_AXIS, TOOL_COLUMNS = 13, 14, 15, 16, 18
 GRIP_IDLE, GRIP_BEGINS, GRIP_CONTINUES = 0.0, 1.0, 2.0
 
 # Fields: for every tool the three components of the summed corrections; with grips, the index of the tool that holds a
-# mass point plus 1, and the displacement of the mass point when the grip began.
+# mass point plus 1, and the displacement of the mass point when the grip began. Of mass points that stick to a rough
+# tool (`rough`) the index is larger by the number of tools, and the displacement is that relative to the tool.
 CORRECTIONS, HOLDER, HOLD_DISPLACEMENT = 3, 0, 1
 
 
@@ -27,6 +28,7 @@ class ContactLayout(NamedTuple):
     """The columns and fields of contact in a load table and in the fields of a sheet."""
 
     shapes: tuple[str, ...]  # name of the shape of every tool
+    has_friction: tuple[bool, ...]  # whether each tool has friction, and at rest is rough
     grips: bool  # whether any tool can hold tissue
     first_field: int
     first_column: int

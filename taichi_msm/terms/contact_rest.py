@@ -2,8 +2,8 @@
 
 A tool can push a mass point that touches it but cannot pull it. Of the force F on the mass point, the tool therefore
 carries the part into the shape, min(F . n, 0) n; the remainder, tangential or outward, must vanish in equilibrium.
-The normals n are stored in the fields of corrections and are 0 where a mass point touches no tool. Held mass points
-move with their tool, which carries their whole force.
+The normals n are stored in the fields of corrections and are 0 where a mass point touches no tool. Held mass points,
+also those that stick to a rough tool, move with their tool, which carries their whole force.
 
 A mass point may touch several tools. Their contact forces and corrections are then found by projected Gauss-Seidel
 iteration.
@@ -78,6 +78,9 @@ def build_project_out(config: KernelConfig, layout: ContactLayout) -> Callable[.
     first_field, grip_field, base = layout.first_field, layout.grip_field, layout.bases
     penetrations = [build_penetration(config, shape) for shape in layout.shapes]
     iterations = _iterations(tools)
+    # Holders, and the columns with the shift of their mass points: of grips, and of rough tools.
+    holders = [(tool + 1, base[tool] + GRIP_SHIFT) for tool in range(tools)]
+    holders += [(tools + tool + 1, base[tool] + TIP_AFTER) for tool in range(tools) if layout.has_friction[tool]]
 
     @ti.func
     def project_out(sheet: ti.template(), i, kind, b, now: ti.template()):
@@ -91,14 +94,11 @@ def build_project_out(config: KernelConfig, layout: ContactLayout) -> Callable[.
         free = ti.select(sheet.by_column[(MOBILITY + kind) * sheet.width + b] > 0, vector(1), vector(0))
         if ti.static(grips):
             held = sheet.fields[(grip_field + HOLDER) * field + at]
-            for tool in ti.static(range(tools)):
+            for holder, shift in ti.static(holders):
                 for c in ti.static(range(3)):
-                    target = (
-                        sheet.fields[(grip_field + HOLD_DISPLACEMENT + c) * field + at]
-                        + now[base[tool] + GRIP_SHIFT + c]
-                    )
-                    u[c] = ti.select(held == tool + 1, target, u[c])
-                    q[c] = ti.select(held == tool + 1, vector(0), q[c])
+                    target = sheet.fields[(grip_field + HOLD_DISPLACEMENT + c) * field + at] + now[shift + c]
+                    u[c] = ti.select(held == holder, target, u[c])
+                    q[c] = ti.select(held == holder, vector(0), q[c])
             free = ti.select(held > 0, vector(0), free)
         for tool in ti.static(range(tools)):
             for c in ti.static(range(3)):
@@ -139,7 +139,8 @@ def touched_points(tools: int, memory: Array) -> NDArray[np.bool_]:
     normals = memory[: CORRECTIONS * tools].reshape(tools, CORRECTIONS, *memory.shape[1:])
     touched = (normals != 0).any(axis=1)
     if len(memory) > CORRECTIONS * tools:
-        touched |= memory[CORRECTIONS * tools + HOLDER] == np.arange(1, tools + 1)[:, None, None]
+        holder = memory[CORRECTIONS * tools + HOLDER]
+        touched |= (holder > 0) & ((holder - 1) % tools == np.arange(tools)[:, None, None])
     return np.asarray(touched)
 
 
@@ -183,10 +184,12 @@ def memory_after_grips(plan: Plan, frame: int, displacement: Array, before: Arra
             holder[holder == n + 1] = 0
         if isinstance(tool, Clamp):
             holder[tool.points] = n + 1
+        if not tool.rough:
+            holder[holder == len(tools) + n + 1] = 0
     for n, (tool, start) in enumerate(zip(tools, starts, strict=True)):
         if start == frame:
             distance = np.linalg.norm(position - _centre_at_grip(plan, tool, frame), axis=-1)
-            gripped = (distance <= GRIP_RADII * tool.radius) & ~plan.fixed & (holder == 0)
+            gripped = (distance <= GRIP_RADII * tool.radius) & ~plan.fixed & ((holder == 0) | (holder > len(tools)))
             holder[gripped] = n + 1
             held_displacement[:, gripped] = displacement[gripped].T
     return memory

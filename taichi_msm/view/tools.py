@@ -185,7 +185,7 @@ class PositionControlledTool:
     that a run allows. A grip begins when the tip has reached its depth, and ends with the release.
 
     Args:
-        probe: has the instrument, and the friction if it is set; quasi-static sessions have no friction.
+        probe: has the instrument, and the friction if it is set; in quasi-static sessions rough or none.
         plan: of the session.
 
     Attributes:
@@ -203,7 +203,7 @@ class PositionControlledTool:
         self._max_depth = min(MAX_DEPTH_RADII * self._radius, 0.25 * min(self._sheet.size))
         self._hover_height = _rounded(HOVER_HEIGHT_RADII * self._radius)
         friction = probe.friction if "friction" in probe.model_fields_set else DEFAULT_FRICTION
-        if plan.scene.time.at_rest:
+        if plan.scene.time.at_rest and friction != "rough":
             friction = 0.0
         self._probe = Probe(path=((0.0, 0.5, 0.5, self._hover_height),), friction=friction, instrument=probe.instrument)
         # The default depth is the radius of the tip.
