@@ -113,6 +113,25 @@ def seen_by_two(device: runtime.Device, tmp_path_factory: pytest.TempPathFactory
     return here / "stereo"
 
 
+@pytest.fixture(scope="session")
+def labelled_in_motion(device: runtime.Device, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with a drawn tool that a moving, centred camera has seen, with its labels; to be read only."""
+    here = tmp_path_factory.mktemp("labelled")
+    Image.fromarray(speckle(30, 40)).save(here / "speckle.png")
+    (here / "small.yaml").write_text(SMALL)
+    eye = "[[0, 0, -0.1, 0.5], [0.4, 0.02, -0.1, 0.45]]"
+    overrides = [
+        f"render.camera={{eye: {eye}, intrinsics: {{fx: 45, fy: 45, cx: 20, cy: 16}}}}",
+        "render.size=[40, 32]",
+        "render.tracks=6",
+        "probes.0.instrument={radius: 0.02, shaft: [0.5, -0.6, 0.9], length: 0.2}",
+        "time.duration=0.2",
+        "output=[png, trajectory, depth, flow, instrument, tracks]",
+    ]
+    run(load_scene(here / "small.yaml", overrides), here / "labelled", threads=device.threads, estimate_error=False)
+    return here / "labelled"
+
+
 @pytest.fixture
 def stereo(seen_by_two: Path, tmp_path: Path) -> Path:
     """A copy of these results, to be changed."""

@@ -14,9 +14,9 @@ PACKAGE = Path(__file__).parent.parent / "taichi_msm"
 
 # A module or a package imports from earlier lines, and a package from itself.
 LAYERS = [
-    {"errors", "plot_style", "version"},
+    {"arithmetic", "errors", "plot_style", "version"},
     {"system"},
-    {"images", "lenses"},
+    {"images", "lenses", "shapes"},
     {"camera_files"},
     {"scene"},
     {"model"},
@@ -27,7 +27,7 @@ LAYERS = [
     {"load"},
     {"gradients"},
     {"runs"},
-    {"exports", "study", "sweeps", "view"},
+    {"datasets", "exports", "study", "sweeps", "view"},
     {"fitting"},
     {"cli"},
     {"__main__", "__init__"},

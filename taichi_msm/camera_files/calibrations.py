@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from taichi_msm.camera_files.calibration import Calibration, CalibrationReader, StereoPose
+from taichi_msm.camera_files.calibration import Calibration, CalibrationReader
 from taichi_msm.camera_files.colmap import ColmapCameras
 from taichi_msm.camera_files.kalibr import Kalibr
 from taichi_msm.camera_files.ocamcalib import OCamCalib
@@ -40,8 +40,7 @@ def read_calibration(
         CameraFileError: when the file is invalid or not supported; the message lists what was found.
     """
     file = CameraFile(path, MAX_BYTES)
-    reader = next((reader for reader in READERS if reader.recognises(file)), READERS[-1])
-    cameras = reader.cameras(file)
+    reader, cameras = next((reader, cameras) for reader in READERS if (cameras := reader.cameras(file)))
     if eye == EYES[0]:
         return reader.read(cameras[0])
     if len(cameras) < len(EYES):
@@ -49,10 +48,9 @@ def read_calibration(
     calibration, pose = reader.read(cameras[1]), reader.pose(cameras[1])
     if pose is None:
         return calibration
-    rotation, translation = pose
-    scale = LENGTH_UNITS[unit] if unit is not None else reader.unit or 1.0
-    if unit is None and reader.unit is None and max(map(abs, translation)) > MAX_BASELINE_M:
-        listed = ", ".join(f"{number:g}" for number in translation)
+    if unit is None and reader.unit is None and max(map(abs, pose.translation)) > MAX_BASELINE_M:
+        listed = ", ".join(f"{number:g}" for number in pose.translation)
         raise file.fault(f"the cameras are [{listed}] m apart; set calibration_unit: mm, or m if that is right")
-    rows = tuple(tuple(rotation[n : n + 3]) for n in (0, 3, 6))
-    return calibration._replace(right=StereoPose(rows, tuple(scale * number for number in translation)))
+    scale = LENGTH_UNITS[unit] if unit is not None else reader.unit or 1.0
+    translation = tuple(scale * number for number in pose.translation)
+    return calibration._replace(right=pose._replace(translation=translation))

@@ -58,38 +58,28 @@ class _Columns(NamedTuple):
 TUM = _Columns(tuple(range(8)), 8)
 
 
-class Columns(TrajectoryReader):
-    """Reader of a row per pose."""
-
-    name = "TUM, EuRoC, TUM-VI"
-    recognised_by = "lines `t tx ty tz qx qy qz qw`, or a header with names of columns, such as `#timestamp [ns],...`"
-
-    def recognises(self, file: CameraFile) -> bool:  # noqa: ARG002
-        """Return True: any file may have columns."""
-        return True
-
-    def read(self, file: CameraFile) -> Trajectory:
-        """Read the rows; without a header, the columns are TUM's."""
-        rows: list[list[float]] = []
-        lines = []
-        columns = None
-        for n, line in enumerate(file.text.splitlines(), 1):
-            text, _, comment = line.strip().replace('"', "").partition("#")
-            if ";" in text:
-                text = text.replace(",", ".").replace(";", ",")  # Spreadsheets write this where decimals have commas.
-            words = text.replace(",", " ").split()
-            if (header := _header(text or comment, is_comment=not words)) and not rows:
-                columns = _columns(file, n, header)
-            elif header and _columns(file, n, header) != (columns or TUM):
-                raise file.fault("other columns than before; write a file of one order", n)
-            elif not words and not header and (match := OTHER_CONVENTION.search(comment)):
-                fault = f"a comment has {truncate(match[0])}, which is not understood"
-                raise file.fault(f"{fault}; name the columns in the first line: # {', '.join(COLUMNS)}", n)
-            elif words:
-                rows.append(_row(file, n, words, columns, separated="," in text))
-                lines.append(n)
-        columns = columns or TUM
-        return Trajectory(rows, lines, True, columns.time_unit, columns.length_unit)
+def _read(file: CameraFile) -> Trajectory:
+    """Read the rows; without a header, the columns are TUM's."""
+    rows: list[list[float]] = []
+    lines = []
+    columns = None
+    for n, line in enumerate(file.text.splitlines(), 1):
+        text, _, comment = line.strip().replace('"', "").partition("#")
+        if ";" in text:
+            text = text.replace(",", ".").replace(";", ",")  # Spreadsheets write this where decimals have commas.
+        words = text.replace(",", " ").split()
+        if (header := _header(text or comment, is_comment=not words)) and not rows:
+            columns = _columns(file, n, header)
+        elif header and _columns(file, n, header) != (columns or TUM):
+            raise file.fault("other columns than before; write a file of one order", n)
+        elif not words and not header and (match := OTHER_CONVENTION.search(comment)):
+            fault = f"a comment has {truncate(match[0])}, which is not understood"
+            raise file.fault(f"{fault}; name the columns in the first line: # {', '.join(COLUMNS)}", n)
+        elif words:
+            rows.append(_row(file, n, words, columns, separated="," in text))
+            lines.append(n)
+    columns = columns or TUM
+    return Trajectory(rows, lines, True, columns.time_unit, columns.length_unit)
 
 
 def _header(text: str, *, is_comment: bool) -> list[str]:
@@ -140,3 +130,10 @@ def _row(
         fault = "commas without a header, and w comes first in EuRoC's rows, last in TUM's"
         raise file.fault(f"{fault}; name the columns in a first line: # {', '.join(COLUMNS)}", line)
     return [numbers[n] for n in expected.indices]
+
+
+TABLES = TrajectoryReader(
+    "TUM, EuRoC, TUM-VI",
+    "lines `t tx ty tz qx qy qz qw`, or a header with names of columns, such as `#timestamp [ns],...`",
+    _read,
+)

@@ -8,31 +8,25 @@ from taichi_msm.camera_files.trajectory import NORM_TOLERANCE, Trajectory, Traje
 COUNT = 12
 
 
-class Kitti(TrajectoryReader):
-    """Reader of twelve numbers per line."""
+def _read(file: CameraFile) -> Trajectory | None:
+    """Read the matrices, if the first line has twelve numbers."""
+    lines = [(n, line.split()) for n, line in enumerate(file.text.splitlines(), 1) if line.strip()]
+    if not lines or len(lines[0][1]) != COUNT or parse_numbers(lines[0][1]) is None:
+        return None
+    import numpy as np
+    from scipy.spatial.transform import Rotation
 
-    name = "KITTI"
-    recognised_by = "lines of twelve numbers, without a header; needs `poses_rate`"
+    rows: list[list[float]] = []
+    for n, words in lines:
+        numbers = parse_numbers(words)
+        if numbers is None or len(numbers) != COUNT:
+            raise file.fault("not twelve numbers as before; write a file of one format", n)
+        matrix = np.array(numbers).reshape(3, 4)
+        rotation = matrix[:, :3]
+        if abs(rotation @ rotation.T - np.eye(3)).max() > NORM_TOLERANCE or np.linalg.det(rotation) < 0:
+            raise file.fault("its first three columns are no rotation; write an orthonormal matrix", n)
+        rows.append([len(rows), *matrix[:, 3].tolist(), *Rotation.from_matrix(rotation).as_quat().tolist()])
+    return Trajectory(rows, [n for n, _ in lines], has_times=False)
 
-    def recognises(self, file: CameraFile) -> bool:
-        """Return whether the first line has twelve numbers."""
-        words = next((line.split() for line in file.text.splitlines() if line.strip()), [])
-        return len(words) == COUNT and parse_numbers(words) is not None
 
-    def read(self, file: CameraFile) -> Trajectory:
-        """Read the matrices."""
-        import numpy as np
-        from scipy.spatial.transform import Rotation
-
-        lines = [(n, line.split()) for n, line in enumerate(file.text.splitlines(), 1) if line.strip()]
-        rows: list[list[float]] = []
-        for n, words in lines:
-            numbers = parse_numbers(words)
-            if numbers is None or len(numbers) != COUNT:
-                raise file.fault("not twelve numbers as before; write a file of one format", n)
-            matrix = np.array(numbers).reshape(3, 4)
-            rotation = matrix[:, :3]
-            if abs(rotation @ rotation.T - np.eye(3)).max() > NORM_TOLERANCE or np.linalg.det(rotation) < 0:
-                raise file.fault("its first three columns are no rotation; write an orthonormal matrix", n)
-            rows.append([len(rows), *matrix[:, 3].tolist(), *Rotation.from_matrix(rotation).as_quat().tolist()])
-        return Trajectory(rows, [n for n, _ in lines], has_times=False)
+KITTI = TrajectoryReader("KITTI", "lines of twelve numbers, without a header; needs `poses_rate`", _read)

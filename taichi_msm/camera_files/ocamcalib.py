@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from taichi_msm.camera_files.calibration import Calibration, CalibrationReader, build
+from taichi_msm.camera_files.calibration import Calibration, CalibrationReader
 from taichi_msm.camera_files.keys import Keys
 from taichi_msm.camera_files.text import CameraFile
+from taichi_msm.lenses import MODELS
 
 # Lines that are neither empty nor comments, in their order, each with its number of values.
 LINES = {"polynomial": None, "inverse": None, "centre": 2, "affine": 3, "size": 2}
@@ -19,12 +20,10 @@ class OCamCalib(CalibrationReader):
     name = "OCamCalib"
     recognised_by = "calib_results.txt: `#polynomial coefficients for the DIRECT mapping function`"
 
-    def recognises(self, file: CameraFile) -> bool:
-        """Return whether the first line is that comment."""
-        return file.text.lstrip().startswith("#polynomial coefficients")
-
     def cameras(self, file: CameraFile) -> Sequence[Keys]:
-        """Return the only camera."""
+        """Return the only camera, if the file begins with that comment."""
+        if not file.text.lstrip().startswith("#polynomial coefficients"):
+            return ()
         lines = [line.strip() for line in file.text.splitlines()]
         return [Keys(file, dict(zip(LINES, (line for line in lines if line and line[0] != "#"), strict=False)))]
 
@@ -43,4 +42,8 @@ class OCamCalib(CalibrationReader):
                 f"{fault}; expected its length, up to {DEGREE + 1}, a0 below 0, a1 = 0, a2, a3, a4, and c above 0"
             )
         values = [-c * a0, *(-a / c**n for n, a in enumerate(powers, 1)), 1 / c, e / c, d / c]
-        return build(keys.file, (values[0], values[0], column, row), (width, height), "scaramuzza", values)
+        lens = dict(zip(MODELS["scaramuzza"].coefficients, values, strict=True))
+        return Calibration(None, (column, row), (round(width), round(height)), "scaramuzza", lens)
+
+    def pose(self, keys: Keys) -> None:
+        """Return None, as there is one camera."""

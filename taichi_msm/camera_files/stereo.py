@@ -17,9 +17,6 @@ MARKS = (
     (r"(.+?)_?0", r"(.+?)_?1"),
 )
 
-ROTATION = r"r|rot|rotation|rmat|(rot|rotation)(mat|matrix)"
-TRANSLATION = r"t|tvec|trans|translation|(trans|translation)(vec|vector)"
-
 
 class Stereo(OpenCV):
     """Reader of marked keys, as K1, D1, K2, D2, and of the pose R, T of the right camera."""
@@ -28,12 +25,8 @@ class Stereo(OpenCV):
     recognised_by = "`K1`, `D1`, `K2`, `D2` (or `M1`, `cameraMatrix1`, `leftcameramat`, `K_l`, ...), with `R`, `T`"
     unit = None
 
-    def recognises(self, file: CameraFile) -> bool:
-        """Return whether both cameras have a matrix."""
-        return bool(self.cameras(file))
-
     def cameras(self, file: CameraFile) -> Sequence[Keys]:
-        """Return the keys of each camera, with those that have no mark."""
+        """Return the keys of each camera, if both have a matrix, with those that have no mark."""
         for marks in MARKS:
             eyes = [_marked(file, mark) for mark in marks]
             if all(any(_is_matrix(file, *item) for item in eye.items()) for eye in eyes):
@@ -41,13 +34,6 @@ class Stereo(OpenCV):
                 folded = [{**shared, **eye} for eye in eyes]
                 return [Keys(file, {key: file.data[key] for key in names}, names) for names in folded]
         return ()
-
-    def pose(self, keys: Keys) -> tuple[Sequence[float], Sequence[float]] | None:
-        """Read R and T, which have no mark; R1 and R2 would be rotations of the rectification."""
-        shared = Keys(keys.file, {key: value for key, value in keys.data.items() if keys.folded[key] == fold(key)})
-        if not shared.values(ROTATION) and not shared.values(TRANSLATION):
-            return None
-        return shared.require(ROTATION, 9, "rotation R"), shared.require(TRANSLATION, 3, "translation T")
 
 
 def _marked(file: CameraFile, mark: str) -> dict[str, str]:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from taichi_msm.camera_files.colmap import ColmapImages
-from taichi_msm.camera_files.columns import Columns
-from taichi_msm.camera_files.kitti import Kitti
+from taichi_msm.camera_files.colmap import COLMAP_IMAGES
+from taichi_msm.camera_files.columns import TABLES
+from taichi_msm.camera_files.kitti import KITTI
 from taichi_msm.camera_files.text import LENGTH_UNITS, CameraFile
 from taichi_msm.camera_files.trajectory import Trajectory, TrajectoryReader, pose_fault
 
 # The first one that recognises a file reads it.
-READERS: tuple[TrajectoryReader, ...] = (ColmapImages(), Kitti(), Columns())
+READERS: tuple[TrajectoryReader, ...] = (COLMAP_IMAGES, KITTI, TABLES)
 
 # Limit of the size of a file; COLMAP's contains the points of every picture.
 MAX_BYTES = 2**27
@@ -54,7 +54,7 @@ def read_poses(path: str, keys: PoseKeys = PoseKeys()) -> tuple[tuple[float, ...
         CameraFileError: when the file is invalid or not supported; the message contains the line.
     """
     file = CameraFile(path, MAX_BYTES)
-    trajectory = next(reader for reader in READERS if reader.recognises(file)).read(file)
+    trajectory = next(found for reader in READERS if (found := reader.read(file)) is not None)
     if not trajectory.rows:
         raise file.fault("no poses; expected lines t tx ty tz qx qy qz qw")
     scale = LENGTH_UNITS[_agreed(file, "poses_unit", keys.poses_unit, trajectory.length_unit) or "m"]
@@ -90,9 +90,10 @@ def _times(file: CameraFile, trajectory: Trajectory, keys: PoseKeys) -> list[flo
     if start > times[-1]:
         times_text = f"{times[0]:.15g} s to {times[-1]:.15g} s"
         raise file.fault(f"poses_start: {start:.15g} s is after its poses, at {times_text}; take a time of these")
-    # A time before the first pose counts from it.
-    origin = start if start >= times[0] else times[0] + start
-    return [time - origin for time in times]
+    # A time before the first pose counts from it. Differences of large times are rounded to their resolution.
+    is_after_first = start >= times[0] or math.isclose(start, times[0], abs_tol=1e-9)
+    origin, digits = start if is_after_first else times[0] + start, int(-math.log10(math.ulp(times[-1])))
+    return [round(time - origin, digits) for time in times]
 
 
 def _agreed(file: CameraFile, key: str, value: str | None, found: str | None) -> str | None:

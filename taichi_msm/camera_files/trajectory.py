@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from typing import ClassVar, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 from taichi_msm.camera_files.text import CameraFile
 
@@ -37,24 +36,19 @@ class Trajectory(NamedTuple):
     length_unit: str | None = None
 
 
-class TrajectoryReader(ABC):
+class TrajectoryReader(NamedTuple):
     """Reader of a format of trajectories.
 
     Attributes:
         name: name of the format, for users.
         recognised_by: content by which a file is recognised, for users.
+        read: function that returns the trajectory, or None if the file has another format; it raises a CameraFileError
+            with the line of a fault.
     """
 
-    name: ClassVar[str]
-    recognised_by: ClassVar[str]
-
-    @abstractmethod
-    def recognises(self, file: CameraFile) -> bool:
-        """Return whether a file has this format."""
-
-    @abstractmethod
-    def read(self, file: CameraFile) -> Trajectory:
-        """Read the rows; raise a CameraFileError with the line of a fault."""
+    name: str
+    recognised_by: str
+    read: Callable[[CameraFile], Trajectory | None]
 
 
 def parse_numbers(words: Sequence[str]) -> list[float] | None:

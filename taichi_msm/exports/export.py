@@ -74,7 +74,7 @@ def export(
 
     Args:
         runs: folder of a run, or of a sweep, whose complete runs are exported; or a sequence of folders.
-        format: kitti, tapvid, tapvid3d, stir, vtk, gltf, obj or csv.
+        format: kitti, tapvid, tapvid3d, stir, endonerf, rerun, vtk, gltf, obj or csv.
         out: destination; None for export-FORMAT in the folder of a single run or sweep, or in output for several.
         progress: called often with the finished frames and the total number of frames; an exception from it cancels the
             export without changing any file.

@@ -68,6 +68,18 @@ FORMATS = {
         ),
         cameras=("left", "right"),
     ),
+    "endonerf": Format(
+        "neural reconstruction of tissue",
+        required_outputs=("depth", "instrument", "png"),
+        file_patterns=_patterns_per_run(rf"(?:images|depth|masks)/{NUMBER_PATTERN}\.png", r"poses_bounds\.npy"),
+        cameras=ANY_CAMERA,
+    ),
+    "rerun": Format(
+        "for the viewer of rerun.io",
+        required_outputs=("trajectory",),
+        optional_outputs=("png", "depth", "flow", "tracks"),
+        file_patterns=(rf"{NUMBER_PATTERN}\.rrd",),
+    ),
     "vtk": Format(
         "for ParaView",
         required_outputs=("trajectory",),

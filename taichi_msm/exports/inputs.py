@@ -16,8 +16,10 @@ from PIL import Image
 
 from taichi_msm.errors import ArgumentError
 from taichi_msm.exports.formats import ANY_CAMERA, FORMATS
+from taichi_msm.model.surface import Solid, refine_surface
 from taichi_msm.render.texture import load_texture
 from taichi_msm.runs.arrays import read_rows
+from taichi_msm.runs.directory import MAX_RECORD_BYTES
 from taichi_msm.runs.finished import FinishedRun, damaged_result, reading
 from taichi_msm.scene.outputs import CAMERA_FILE
 from taichi_msm.system.files import read_regular
@@ -102,6 +104,40 @@ def read_track_positions(run: FinishedRun) -> tuple[NDArray[np.float32], NDArray
     return coordinates, position
 
 
+def read_depth(run: FinishedRun, frame: int) -> NDArray[np.float32]:
+    """Read the depth of a frame.
+
+    Returns:
+        Depth along the optical axis [m], shape (height, width); 0: background.
+
+    Raises:
+        FilesError: when the file is missing or damaged.
+    """
+    path = run.result_path("depth", frame)
+    with reading(path), Image.open(path, formats=["TIFF"]) as image:
+        # Before any pixel is decoded.
+        if image.mode != "F" or image.size != run.scene.render.size:
+            raise damaged_result(path)
+        depth = np.array(image)
+        if not (np.isfinite(depth) & (depth >= 0)).all():
+            raise damaged_result(path)
+    return depth
+
+
+def read_picture_file(run: FinishedRun, key: str, frame: int) -> bytes:
+    """Read the file of a picture of a run, and validate it by decoding it.
+
+    Args:
+        run: the run.
+        key: entry of `output` that wrote the picture, such as "png".
+        frame: index of the frame.
+    """
+    run.read_picture(key, frame)
+    path = run.result_path(key, frame)
+    with reading(path):
+        return read_regular(path, MAX_RECORD_BYTES)
+
+
 Array = NDArray[np.float64]
 
 # Pixel coordinates count from the picture's corner here, and from the centre of the first pixel in OpenCV [px].
@@ -131,7 +167,7 @@ def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
     another = "choose another camera by --camera, or " if FORMATS[name].cameras == ANY_CAMERA else ""
     with reading(path):
         # The limit is sufficient for 100,000 poses.
-        camera = json.loads(read_regular(run.require_own_file(path, "tracks"), 1 << 25))
+        camera = json.loads(read_regular(run.require_own_file(path, FORMATS[name].required_outputs[0]), 1 << 25))
         # Lenses other than the rational one distort even without coefficients.
         is_distorted = camera.get("model", "pinhole") != "pinhole" or bool(np.any(camera.get("distortion", ())))
         is_pinhole = "intrinsics" in camera
@@ -150,3 +186,29 @@ def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
         if not (np.isfinite(matrix).all() and (focal > 0).all()):
             raise damaged_result(path)
     return Pinhole(focal, centre, poses)
+
+
+# Segments of the mesh of an instrument around its axis.
+SEGMENTS = 32
+
+
+def instrument_mesh(
+    solid: Solid,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int32]]:
+    """Triangulate an instrument around the origin in place of its tip.
+
+    Returns:
+        Vertices [m] and unit normals, shape (vertices, 3); triangles, counter-clockwise from outside, shape (n, 3).
+    """
+    axis = solid.axis
+    across = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    across /= np.linalg.norm(across)
+    around = np.linspace(0, 2 * np.pi, SEGMENTS + 1)
+    radial = np.cos(around)[:, None] * across + np.sin(around)[:, None] * np.cross(axis, across)
+    along, outward, *normal = solid.shape.profile(solid.length, solid.radius).T[..., None, None]
+    surface = refine_surface(outward * radial + along * axis, 0)
+    corners = surface.vertices[surface.triangles]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
+    # On the axis, one triangle of each quad has no area.
+    triangles: NDArray[np.int32] = surface.triangles[area > 1e-9 * area.max()]
+    return surface.vertices.astype(np.float64), (normal[1] * radial + normal[0] * axis).reshape(-1, 3), triangles

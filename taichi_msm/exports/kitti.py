@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import FilesError, ProgressCallback
 from taichi_msm.exports.formats import ExportSource
+from taichi_msm.exports.inputs import read_picture_file
 from taichi_msm.runs.arrays import read_flo
-from taichi_msm.runs.directory import MAX_RECORD_BYTES, write_new_file
+from taichi_msm.runs.directory import write_new_file
 from taichi_msm.runs.finished import FinishedRun, reading
 from taichi_msm.scene.outputs import OUTPUTS, zero_padded
-from taichi_msm.system.files import read_regular
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_BIT_DEPTH, PNG_RGB = 16, 2
@@ -71,7 +71,7 @@ def _write_run(run: FinishedRun, training: Path, first: int, progress: ProgressC
                 png16(encode_flow(flow, ~(run.read_picture("occlusion", pair)[..., 0] > 0))),
             )
         for number in (0, 1) if run.has_output("png") else ():
-            _copy_frame(run, pair + number, image_2 / f"{name}_1{number}.png")
+            write_new_file(image_2 / f"{name}_1{number}.png", read_picture_file(run, "png", pair + number))
     remedy = run.remedy("occlusion", "png")
     return [
         f"{name} is left out: {OUTPUTS[key].result} is not among the results; {remedy}"
@@ -126,12 +126,3 @@ def _chunk(kind: bytes, data: bytes) -> Iterator[bytes]:
     yield kind
     yield data
     yield struct.pack(">I", zlib.crc32(data, zlib.crc32(kind)))
-
-
-def _copy_frame(run: FinishedRun, number: int, path: Path) -> None:
-    """Validate a frame by decoding it, and copy its file."""
-    run.read_picture("png", number)
-    source = run.result_path("png", number)
-    with reading(source):
-        data = read_regular(source, MAX_RECORD_BYTES)
-    write_new_file(path, data)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import SceneError
 from taichi_msm.fitting.machine_tables import MachineTest
-from taichi_msm.model.tools import Clamp, Tool, build_tools, distance_to_sheet
+from taichi_msm.model.tools import Clamp, Tool, build_tools, gap_to_sheet
 from taichi_msm.scene.scene import Scene
 
 Array = NDArray[np.float64]
@@ -98,7 +98,7 @@ def _first_contact(tool: Tool, direction: Array, scene: Scene) -> Array | None:
     for _ in range(1000):
         centre = start + travel * direction
         placed = replace(tool, times=np.zeros(1), tip_centres=centre[None], heights=centre[2:] - tool.radius)
-        gap = distance_to_sheet(placed, scene.sheet) - tool.radius
+        gap = gap_to_sheet(placed, scene.sheet)
         if gap <= tolerance:
             return np.asarray(centre)
         travel += gap

@@ -21,9 +21,12 @@ from taichi_msm.scene.section import FRAME_TOLERANCE, MAX_SUPERSAMPLE, MIN_MAGNI
 
 Array = NDArray[np.float64]
 
-# The oblique preset: direction of the eye, 50 degrees above the sheet at its lower edge; field of view [degrees].
+# Presets oblique and fit: direction of the eye, 50 degrees above the sheet at its lower edge; field of view [degrees].
 OBLIQUE_DIRECTION = np.array([0.0, -0.64, 0.77])
 OBLIQUE_FOV = 32.0
+
+# Margin of the preset fit on every side, as a fraction of the picture's width or height.
+FIT_MARGIN = 0.02
 
 # Kernels multiply the matrix by the samples along a side of a pixel, in f32.
 MAX_MATRIX_ENTRY = float(np.finfo(np.float32).max) / MAX_SUPERSAMPLE
@@ -203,7 +206,7 @@ def _view_of(scene: Scene, time: float, name: str) -> View:
     elif isinstance(camera, Camera) and camera.beside is not None:
         result = _companion(camera, scene, _view_of(scene, time, camera.beside))
     else:
-        result = _pinhole(camera if isinstance(camera, Camera) else _oblique(scene), scene, time)
+        result = _pinhole(camera if isinstance(camera, Camera) else _preset(camera, scene), scene, time)
     if baseline:
         shift, matrix = baseline * result.axes[0], result.matrix.copy()
         matrix[:, 3] -= matrix[:, :3] @ shift
@@ -407,8 +410,8 @@ def pinhole(scene: Scene, time: float = 0.0) -> Camera:
     camera = scene.render.main_camera
     if isinstance(camera, Camera):
         return frozen_camera(camera, time)
-    if camera == "oblique":
-        return _oblique(scene)
+    if camera != "top":
+        return _preset(camera, scene)
     half_height = scene.render.size[1] / 2 / _top_scale(scene)
     return Camera(eye=(0.0, 0.0, half_height / math.tan(math.radians(OBLIQUE_FOV) / 2)), fov=OBLIQUE_FOV)
 
@@ -490,6 +493,27 @@ def _pinhole_at(camera: Camera, scene: Scene, place: Extrinsics) -> View:
     scale, centre = np.array([focal_x, focal_y]), np.array([x, y])
     lens = None if lens == IDENTITY_LENS else lens
     return View(matrix, near, axes, eye, scale, centre, size, distance, pinhole=True, lens=lens)
+
+
+def _preset(name: str, scene: Scene) -> Camera:
+    return {"oblique": _oblique, "fit": _fit}[name](scene)
+
+
+def _fit(scene: Scene) -> Camera:
+    """Return the fit preset, for which the sheet at rest fills the picture up to a margin.
+
+    The eye is d from the plane across the line of sight through the sheet's centre. The corners are a above and below
+    that line, and b behind and before the plane. With the eye a b / d below the line, they are projected to a / d above
+    and below the middle of the picture. Before the plane, half the sheet's width has the angle width / 2 / (d - b).
+    """
+    (height, width), (columns, lines) = scene.sheet.size, scene.render.size
+    axes = look_at_axes(OBLIQUE_DIRECTION.tolist(), (0, 0, 0), (0, 1, 0))
+    a, b = height / 2 * axes[1, 1], -height / 2 * axes[2, 1]
+    half_height = (1 - 2 * FIT_MARGIN) * math.tan(math.radians(OBLIQUE_FOV) / 2)
+    distance = max(a / half_height, width / 2 / (half_height * columns / lines) + b)
+    eye = distance * axes[2] - a * b / distance * axes[1]
+    target = eye - eye[2] / axes[2, 2] * axes[2]
+    return Camera(eye=tuple(eye.tolist()), target=tuple(target.tolist()), fov=OBLIQUE_FOV)
 
 
 def _oblique(scene: Scene) -> Camera:

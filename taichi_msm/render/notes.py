@@ -42,9 +42,9 @@ def drawing_warnings(scene: Scene) -> Iterator[str]:
                 f"probes.{index}.instrument: its shaft points down, through the sheet at rest; it goes from the tip "
                 "to the hand, upward for z above 0"
             )
-        if instrument.radius > 0.25 * max(scene.sheet.size):
+        if instrument.outer_radius > 0.25 * max(scene.sheet.size):
             yield (
-                f"probes.{index}.instrument: {instrument.radius:g} m is a wide capsule for a sheet of "
+                f"probes.{index}.instrument: {instrument.outer_radius:g} m is a wide instrument for a sheet of "
                 f"{max(scene.sheet.size):g} m; the radius is in metres"
             )
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError, as_array, did_you_mean, is_real_array
-from taichi_msm.model.surface import Capsule
+from taichi_msm.model.surface import Solid
 from taichi_msm.render.camera import View, is_moving, view, view_at
 from taichi_msm.render.labels import LABELS, Flow, FrameOutputs, Labels, Sight, Stereo, requested_labels, track_grid
 from taichi_msm.render.texture import load_texture
@@ -39,7 +39,7 @@ class Shot(NamedTuple):
 
     positions: Array
     view: View
-    rods: Sequence[Capsule] = ()
+    rods: Sequence[Solid] = ()
 
 
 class Renderer:
@@ -218,7 +218,7 @@ class Renderer:
 
     def _key(self, style: Render, *, picture: bool, labels: Collection[str] = (), camera: View) -> tuple[object, ...]:
         """Return all settings in which the rasterisers of this scene differ."""
-        return picture, frozenset(labels), camera.optics, style.shading, style.wireframe, self.scene.has_instruments
+        return picture, frozenset(labels), camera.optics, style.shading, style.wireframe, self.scene.shapes
 
     def _texture(self) -> NDArray[np.uint8]:
         """Return the texture, loaded again only if the scene names another picture."""

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.model.surface import Capsule
+from taichi_msm.model.surface import Solid
 from taichi_msm.render import geometry, lens_kernels
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.bins import BOUNDS_STRIDE, build_bins, store_bounds
 from taichi_msm.render.camera import View
 from taichi_msm.render.config import INFINITY, Bytes, Doubles, Floats, Integers
-from taichi_msm.render.coverage import intersect_capsule
+from taichi_msm.render.coverage import intersect_instrument
 from taichi_msm.render.geometry import NODE_STRIDE
 from taichi_msm.render.labels import NO_FLOW, Flow, Labels, Sight
 from taichi_msm.render.lens_table import undistorted_view
@@ -42,7 +42,7 @@ CELLS_AROUND_NODE = 4
 NOT_VISIBLE = math.nan
 
 
-def locate_points(scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Capsule] = ()) -> Sight:
+def locate_points(scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Solid] = ()) -> Sight:
     """Project material points into the picture, and determine their occlusion.
 
     Args:
@@ -59,7 +59,7 @@ def locate_points(scene: Scene, coordinates: Array, position: Array, view: View,
     return Sight(pixels, hidden.view(np.bool_))
 
 
-def compute_flow(scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Capsule] = ()) -> Flow:
+def compute_flow(scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Solid] = ()) -> Flow:
     """Compute the optical flow and the occlusion of another frame's pixels.
 
     Args:
@@ -77,7 +77,7 @@ def compute_flow(scene: Scene, coordinates: Array, position: Array, view: View, 
     return Flow(moved.reshape(*shape, 2), hidden.reshape(shape) * np.uint8(255))
 
 
-def compute_stereo(scene: Scene, labels: Labels, position: Array, view: View, rods: Sequence[Capsule] = ()) -> Flow:
+def compute_stereo(scene: Scene, labels: Labels, position: Array, view: View, rods: Sequence[Solid] = ()) -> Flow:
     """Compute the flow from a camera's picture to that of its companion at the same time, also of instruments.
 
     Args:
@@ -107,13 +107,13 @@ def compute_stereo(scene: Scene, labels: Labels, position: Array, view: View, ro
     return Flow(flow, occlusion)
 
 
-def _instrument_depth(scene: Scene, pixels: Array, view: View, rods: Sequence[Capsule]) -> Array:
+def _instrument_depth(scene: Scene, pixels: Array, view: View, rods: Sequence[Solid]) -> Array:
     """Return the depth of the instruments at undistorted pixels, shape (n, 2) [m]; INFINITY next to them."""
     launches = Launches(bounded=lanes("f64") == 1)
     uniforms = uni.view_uniforms(view._replace(lens=None), scene.render, 1, scene.sheet.size, (1, 1), rods)
     depth = launches.array(np.float64, len(pixels))
     launches.launch(
-        _meet_instruments, len(pixels), launches.upload(np.ascontiguousarray(pixels).ravel()),
+        _ray_kernel(scene.shapes), len(pixels), launches.upload(np.ascontiguousarray(pixels).ravel()),
         launches.upload(uniforms), len(rods), depth, rounds=len(rods),
     )  # fmt: skip
     launches.require_completion()
@@ -121,7 +121,7 @@ def _instrument_depth(scene: Scene, pixels: Array, view: View, rods: Sequence[Ca
 
 
 def _track(
-    scene: Scene, points: Array, position: Array, view: View, rods: Sequence[Capsule], *, as_flow: bool
+    scene: Scene, points: Array, position: Array, view: View, rods: Sequence[Solid], *, as_flow: bool
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Return the pixels of points, `as_flow` relative to another frame's pixels, and their occlusion.
 
@@ -150,7 +150,7 @@ def _track(
         uni.set_lens(uniform_values, view, 1, view.lens.limit)
     uniforms = launches.upload(uniform_values)
     sizes = uni.sizes_of(scene, np.empty((0, 3), np.int32))
-    sizes[[uni.CAPSULE_COUNT, uni.WIDTH, uni.HEIGHT]] = len(rods), width, height
+    sizes[[uni.INSTRUMENT_COUNT, uni.WIDTH, uni.HEIGHT]] = len(rods), width, height
     nodes, cell = (launches.array(np.float64, n) for n in (rows * cols * NODE_STRIDE, cells * CELL_STRIDE))
     bounds = launches.array(np.int32, cells * BOUNDS_STRIDE)
     with compilation_options(optimised=False):
@@ -173,7 +173,7 @@ def _track(
     # Iterations per point: one per cell, and one per triangle.
     rounds = 1 + 2 * (scene.render.refine + 1) ** 2
     for listed, count in launches.chunks(int(bins.lengths.max()), rounds):
-        kernel = _kernel(view.lens_model, is_material)
+        kernel = _kernel(view.lens_model, scene.shapes, is_material)
         launches.launch(kernel, total, listed, count, *arguments, rounds=count * rounds + len(rods))
     launches.require_completion()
     return launches.download(pixels).reshape(-1, 2), launches.download(hidden)
@@ -294,30 +294,36 @@ def _cell_occludes(
     return occluded
 
 
-@ti.kernel
-def _meet_instruments(
-    first: ti.i32, end: ti.i32, ended: Integers, pixels: Doubles, uniforms: Doubles, count: ti.i32, depth: Doubles
-):
-    """Compute the depth of the nearest of `count` instruments at undistorted pixels."""
-    for k in range(first, end):
-        nearest = ti.cast(INFINITY, ti.f64)
-        for index in range(count):
-            hit_depth, _, _, _ = intersect_capsule(pixels[2 * k], pixels[2 * k + 1], index, uniforms)
-            if geometry.w_at(hit_depth, uniforms) > uniforms[uni.NEAR]:
-                nearest = ti.min(nearest, hit_depth)
-        depth[k] = nearest
-        end_thread(ended)
+@cache
+def _ray_kernel(shapes: tuple[str, ...]) -> Callable[..., None]:
+    """Return the kernel that intersects lines of sight with instruments of these shapes."""
+
+    @ti.kernel
+    def meet_instruments(
+        first: ti.i32, end: ti.i32, ended: Integers, pixels: Doubles, uniforms: Doubles, count: ti.i32, depth: Doubles
+    ):
+        """Compute the depth of the nearest of `count` instruments at undistorted pixels."""
+        for k in range(first, end):
+            nearest = ti.cast(INFINITY, ti.f64)
+            for index in range(count):
+                hit_depth, _, _, _ = intersect_instrument(pixels[2 * k], pixels[2 * k + 1], index, uniforms, shapes)
+                if geometry.w_at(hit_depth, uniforms) > uniforms[uni.NEAR]:
+                    nearest = ti.min(nearest, hit_depth)
+            depth[k] = nearest
+            end_thread(ended)
+
+    return meet_instruments
 
 
 @ti.func
-def _capsule_occludes(x, y, depth, uniforms: ti.template(), sizes: ti.template()):
+def _instrument_occludes(x, y, depth, uniforms: ti.template(), sizes: ti.template(), shapes: ti.template()):
     """Return whether an instrument occludes a point at (x, y) and `depth`."""
     occluded = False
-    for index in range(sizes[uni.CAPSULE_COUNT]):
-        capsule = uni.CAPSULES + index * uni.CAPSULE_STRIDE
-        is_between = x >= uniforms[capsule + uni.LEFT] and x <= uniforms[capsule + uni.RIGHT]
-        if is_between and y >= uniforms[capsule + uni.TOP] and y <= uniforms[capsule + uni.BOTTOM]:
-            hit_depth, _, _, _ = intersect_capsule(x, y, index, uniforms)
+    for index in range(sizes[uni.INSTRUMENT_COUNT]):
+        base = uni.INSTRUMENTS + index * uni.INSTRUMENT_STRIDE
+        is_between = x >= uniforms[base + uni.LEFT] and x <= uniforms[base + uni.RIGHT]
+        if is_between and y >= uniforms[base + uni.TOP] and y <= uniforms[base + uni.BOTTOM]:
+            hit_depth, _, _, _ = intersect_instrument(x, y, index, uniforms, shapes)
             if hit_depth < depth and geometry.w_at(hit_depth, uniforms) > uniforms[uni.NEAR]:
                 occluded = True
     return occluded
@@ -351,8 +357,14 @@ def _other_point(entry, points: ti.template(), _sizes: ti.template(), _subdivisi
 
 
 @cache
-def _kernel(lens: str, is_material: bool) -> Callable[..., None]:
-    """Return the kernel that locates points, for a lens model; empty without lens distortion."""
+def _kernel(lens: str, shapes: tuple[str, ...], is_material: bool) -> Callable[..., None]:
+    """Return the kernel that locates points.
+
+    Args:
+        lens: name of the lens model; empty without lens distortion.
+        shapes: names of the shapes of the instruments.
+        is_material: whether the points are material points of the sheet, otherwise points of instruments.
+    """
     Points: Any = Floats if is_material else Doubles
     locate, stride, limit = (_material_point, 2, 2.0) if is_material else (_other_point, 4, INFINITY)
 
@@ -401,7 +413,10 @@ def _kernel(lens: str, is_material: bool) -> Callable[..., None]:
                                         undistorted_x, undistorted_y, depth, entries[n], own_cell, own_triangle,
                                         cols, subdivisions, near, nodes, cell,
                                     )  # fmt: skip
-                        is_hidden = is_hidden or _capsule_occludes(undistorted_x, undistorted_y, depth, uniforms, sizes)
+                        if ti.static(len(shapes) > 0):
+                            is_hidden = is_hidden or _instrument_occludes(
+                                undistorted_x, undistorted_y, depth, uniforms, sizes, shapes
+                            )
                     if not is_valid:
                         x, y = ti.cast(NOT_VISIBLE, ti.f64), ti.cast(NOT_VISIBLE, ti.f64)
             if as_flow > 0:

@@ -30,7 +30,7 @@ from taichi_msm.errors import (
 from taichi_msm.load.check import check_scene
 from taichi_msm.load.resolve import resolve
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.surface import Surface, place_capsules, refine_surface, to_positions
+from taichi_msm.model.surface import Surface, place_instruments, refine_surface, to_positions
 from taichi_msm.render.labels import Flow, FrameOutputs, Labels, Sight
 from taichi_msm.render.picking import pick
 from taichi_msm.render.renderer import Array, CameraLike, Renderer, Shot
@@ -302,8 +302,8 @@ class Simulation:
         """Draw the sheet and the instruments of the probes.
 
         Args:
-            camera: name of a camera of the scene, "top", "oblique", a `Camera` or a mapping of its keys; None for the
-                scene's main camera.
+            camera: name of a camera of the scene, "top", "oblique", "fit", a `Camera` or a mapping of its keys; None
+                for the scene's main camera.
             positions: positions of the mass points [m], shape (rows, cols, 3); None for the current ones.
             time: time of these positions [s], which moves instruments and cameras; None for the current time.
 
@@ -495,7 +495,9 @@ class Simulation:
             time = self.time
         elif not (is_real_array(as_array(time, "time"), ()) and math.isfinite(time)):
             raise ArgumentError(f"time: {time!r}; take a number, in seconds, or None for now")
-        return Shot(positions, self.renderer.resolve_camera(camera, time), place_capsules(self.scene, positions, time))
+        return Shot(
+            positions, self.renderer.resolve_camera(camera, time), place_instruments(self.scene, positions, time)
+        )
 
     def _require_no_fault(self, reading: Reading, fault: str) -> None:
         """Raise a DivergedError if there is a fault."""

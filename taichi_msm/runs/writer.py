@@ -360,6 +360,7 @@ class RunRecord(TypedDict, total=False):
     residual: float  # quasi-static: largest net force on a mass point in any frame, relative to the largest force
     evaluations: int  # quasi-static: number of force evaluations so far
     max_displacement: float  # [m]
+    max_displacement_frame: int  # frame with this displacement
     shortest_spring: float  # smallest ratio of a spring's length to its rest length
     longest_spring: float  # largest such ratio
     probes: list[ProbeRecord]
@@ -374,5 +375,6 @@ class RunRecord(TypedDict, total=False):
     lanes: int
     workers: int
     versions: dict[str, str]  # of all software that affects the results
+    commit: str | None  # of the program, by git; None if it does not run from a clone
     frames: int
     outputs: list[str]  # names of files, and of folders with a file per frame

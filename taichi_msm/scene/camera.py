@@ -381,8 +381,10 @@ class Camera(Section):
         """
         if self.calibration is None:
             return self
+        # Only a stereo pair uses the distance of the cameras.
+        unit = self.calibration_unit if self.beside else "m"
         try:
-            calibration = read_calibration(self.calibration, self.calibration_eye, self.calibration_unit)
+            calibration = read_calibration(self.calibration, self.calibration_eye, unit)
         except CameraFileError as error:
             raise scene_fault(str(error), "calibration") from None
         if self.scale and calibration.size is None:

@@ -38,8 +38,8 @@ from taichi_msm.scene.section import (
 )
 
 # A preset, by its name, or a pinhole camera.
-AnyCamera = Literal["top", "oblique"] | Camera
-PRESETS = ("top", "oblique")
+AnyCamera = Literal["top", "oblique", "fit"] | Camera
+PRESETS = ("top", "oblique", "fit")
 
 
 class Light(Section):
@@ -66,16 +66,17 @@ class Render(Section):
     )
     camera: AnyCamera = key(
         "top",
-        "top: orthographic, from above; oblique: tilted, shows depth; or a pinhole camera",
-        "top, oblique, or a mapping: {eye: [x, y, z], target: [x, y, z], up: [x, y, z], fov: degrees}, with pose or "
-        "poses in place of eye, and intrinsics or calibration in place of fov",
+        "top: orthographic, from above; oblique: tilted, shows depth; fit: as tilted, and the sheet at rest fills the "
+        "picture up to a margin of 2 %; or a pinhole camera",
+        "top, oblique, fit, or a mapping: {eye: [x, y, z], target: [x, y, z], up: [x, y, z], fov: degrees}, with pose "
+        "or poses in place of eye, and intrinsics or calibration in place of fov",
     )
     cameras: dict[str, AnyCamera] | None = key(
         None,
         "in place of camera: several cameras by name, each with its own folder of files; the first is the main camera, "
         "whose light is in all pictures",
-        "names of a-z, 0-9, _ and -, each with top, oblique, {eye: [x, y, z], ...}, {beside: NAME, baseline: metres} "
-        "or {beside: NAME, rotation: 3 x 3, translation: [x, y, z], ...}",
+        "names of a-z, 0-9, _ and -, each with top, oblique, fit, {eye: [x, y, z], ...}, {beside: NAME, baseline: "
+        "metres} or {beside: NAME, rotation: 3 x 3, translation: [x, y, z], ...}",
     )
     shading: Literal["none", "headlight", "tissue"] = key(
         "headlight",

@@ -182,9 +182,9 @@ class Scene(Section):
         return any(OUTPUTS[name].is_camera_output for name in self.output)
 
     @property
-    def has_instruments(self) -> bool:
-        """Whether any probe has an instrument."""
-        return any(probe.instrument is not None for probe in self.probes)
+    def shapes(self) -> tuple[str, ...]:
+        """Names of the shapes of all instruments, sorted."""
+        return tuple(sorted({probe.instrument.shape for probe in self.probes if probe.instrument is not None}))
 
     @property
     def kind(self) -> Literal["tissue", "springs"]:

@@ -14,7 +14,7 @@ from taichi_msm.load.check import check_scene
 from taichi_msm.load.resolve import resolve
 from taichi_msm.load.yaml_reader import MAX_NODES
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.surface import place_capsule, place_capsules, surface_point
+from taichi_msm.model.surface import place_instrument, place_instruments, surface_point
 from taichi_msm.model.tool_force import probe_force
 from taichi_msm.model.tools import path_problems, path_warnings
 from taichi_msm.render.texture import load_texture
@@ -263,10 +263,10 @@ class Session:
     def _draw(self) -> Picture:
         """Draw the tissue and the instruments, with that of the tool where it acts or would act."""
         positions, scene = self.positions(), self._simulation.scene
-        instruments = place_capsules(scene, positions, self._simulation.time)
+        instruments = place_instruments(scene, positions, self._simulation.time)
         instrument = scene.probes[-1].instrument
         if instrument is not None and (position := self._controller.hover_position()):
-            instruments[-1] = place_capsule(instrument, scene, positions, self._rest_point(position))
+            instruments[-1] = place_instrument(instrument, scene, positions, self._rest_point(position))
         return self.viewport.draw(positions, instruments)
 
     def _rest_point(self, position: SheetPosition) -> NDArray[np.float64]:

@@ -14,7 +14,7 @@ from taichi_msm.errors import SceneError
 from taichi_msm.lenses import MODELS
 from taichi_msm.lenses.model import MAX_RADIUS
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.model.surface import place_capsules
+from taichi_msm.model.surface import place_instruments
 from taichi_msm.render import tracking, uniforms
 from taichi_msm.render.camera import calibration, view
 from taichi_msm.render.labels import track_grid
@@ -253,7 +253,7 @@ def test_pictures_are_like_the_twins(lens: str, render: dict[str, Any], device: 
     made, texture = seen_through(lens, **render), speckle(13, 17)
     for shape in (dented, folded):
         position = shape(made)
-        placed = place_capsules(made, position, 0)
+        placed = place_instruments(made, position, 0)
         drawn = Rasterizer(made, texture).draw(position, rods=placed)
         apart = difference(drawn, reference.draw(made, position, texture, placed))
         # As without a lens (test_drawing.py).
@@ -267,7 +267,7 @@ def test_pictures_are_like_the_twins(lens: str, render: dict[str, Any], device: 
 def test_large_cells_are_bent(lens: str, refine: int, device: Device) -> None:
     """Sides of cells 90 pixels long bend by up to 8 px, more than a tile, outward and inward."""
     intrinsics = {"fx": 150, "fy": 150, "cx": 99.5, "cy": 74.5}
-    camera = {"eye": [0, 0, 0.33], "intrinsics": intrinsics, **LENSES[lens]}
+    camera = {"eye": [0, 0, 0.33], "intrinsics": intrinsics, "outside": "background", **LENSES[lens]}
     made = drawable((2, 3), camera=camera, size=[200, 150], refine=refine)
     position = rest_positions(made.sheet)
     found, (coordinates, _, _) = look(made, position), twin.labels(made, position)
@@ -288,7 +288,7 @@ def test_the_shape_of_a_tile_does_not_change_the_bits(lens: str, lanes: int, dev
 def test_labels_are_on_the_ray_of_each_pixel(lens: str, shape: Any, device: Device) -> None:
     made = seen_through(lens)
     position = shape(made)
-    placed = place_capsules(made, position, 0)
+    placed = place_instruments(made, position, 0)
     found, (coordinates, depth, instrument) = look(made, position), twin.labels(made, position, placed)
     alike = (np.isnan(found.coordinates[..., 0]) == np.isnan(coordinates[..., 0])) & (
         np.abs(found.depth - depth) < 1e-4 * depth.max()

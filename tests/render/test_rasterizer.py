@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.model.surface import place_capsules
+from taichi_msm.model.surface import place_instruments
 from taichi_msm.render import bins, gpu, tracking
 from taichi_msm.render.camera import view
 from taichi_msm.render.cpu import Bands
@@ -130,7 +130,7 @@ def test_what_passes_behind_the_camera_is_looked_for_only_where_it_may_be_seen(
 def assert_alike_in_other_tiles(made: Scene, texture: NDArray[np.uint8], position: NDArray[Any], lanes: int) -> None:
     """Pictures and labels have the same bits if so many pixels are drawn at a time; labels have one sample a pixel."""
     config = drawing_config(made, labels=LABELS if made.render.supersample == 1 else ())
-    placed = place_capsules(made, position, 0)
+    placed = place_instruments(made, position, 0)
     expected = Rasterizer(made, texture, config).look(position, rods=placed)
     other = Rasterizer(made, texture, config._replace(lanes=lanes)).look(position, rods=placed)
     np.testing.assert_array_equal(other.picture, expected.picture)
@@ -161,7 +161,11 @@ def test_launches_do_not_change_the_bits(parts: int, device: Device, monkeypatch
     made = with_instruments(drawable((9, 11), size=[60, 50], refine=2, camera="top", supersample=2))
     rng = np.random.default_rng(6)
     position = rest_positions(made.sheet) + rng.normal(0, 0.03, (9, 11, 3)) * [1, 1, 0]
-    placed, texture, config = place_capsules(made, position, 0), speckle(30, 20), drawing_config(made)._replace(lanes=1)
+    placed, texture, config = (
+        place_instruments(made, position, 0),
+        speckle(30, 20),
+        drawing_config(made)._replace(lanes=1),
+    )
     begun: list[int] = []
     launch = launches.Launches.launch
 
@@ -199,10 +203,10 @@ def test_the_bound_of_a_thread_is_asserted(device: Device, monkeypatch: pytest.M
     position = np.random.default_rng(4).normal(0, 0.2, (4, 4, 3))
     drawing = Rasterizer(made, speckle(8, 8), drawing_config(made)._replace(lanes=1))
     monkeypatch.setattr(gpu, "MAX_PARTS", 1)
-    drawing.draw(position, rods=place_capsules(made, position, 0))
+    drawing.draw(position, rods=place_instruments(made, position, 0))
     monkeypatch.setattr(launches, "MAX_ROUNDS", launches.RESERVED_ROUNDS + 3 * 2 * 65**2)
     with pytest.raises(AssertionError):
-        drawing.draw(position, rods=place_capsules(made, position, 0))
+        drawing.draw(position, rods=place_instruments(made, position, 0))
 
 
 @pytest.mark.default_cases("headlight-oblique")
@@ -217,7 +221,7 @@ def test_the_bound_of_a_thread_is_asserted(device: Device, monkeypatch: pytest.M
 def test_instruments_are_like_the_twin(shading: str, camera: Any, device: Device) -> None:
     made = with_instruments(drawable(camera=camera, shading=shading))
     position, texture = dented(made), np.full((9, 9, 3), 120, np.uint8)
-    placed = place_capsules(made, position, 0)
+    placed = place_instruments(made, position, 0)
     drawn = Rasterizer(made, texture).draw(position, rods=placed)
     apart = difference(drawn, reference.draw(made, position, texture, placed))
     assert (apart > 1).mean() < 0.005, "but for outlines"
@@ -228,7 +232,7 @@ def test_instruments_are_like_the_twin(shading: str, camera: Any, device: Device
 def test_an_instrument_touches_the_sheet_at_the_control_point(device: Device) -> None:
     made = with_instruments(drawable(refine=4))
     position = dented(made)
-    for placed, (across, down) in zip(place_capsules(made, position, 0), ((0.4, 0.4), (0.7, 0.8)), strict=True):
+    for placed, (across, down) in zip(place_instruments(made, position, 0), ((0.4, 0.4), (0.7, 0.8)), strict=True):
         rows, cols = made.sheet.points
         patch = reference.refine(position, 4)
         near = patch[round(down * (rows - 1) * 5), round(across * (cols - 1) * 5)]

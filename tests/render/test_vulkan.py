@@ -19,7 +19,7 @@ from PIL import Image
 from taichi_msm import run
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.model.surface import place_capsules
+from taichi_msm.model.surface import place_instruments
 from taichi_msm.render.camera import view
 from taichi_msm.render.labels import requested_labels, track_grid
 from taichi_msm.render.rasterizer import Rasterizer, drawing_config
@@ -185,7 +185,7 @@ TINY = {"eye": [0, 0, 4], "fov": 10}
 def looks(made: Scene, texture: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
     """Draw and find, on the device that was started."""
     position, view_now = draped(made), view(made)
-    placed = place_capsules(made, position, 0)
+    placed = place_instruments(made, position, 0)
     found = Rasterizer(
         made, texture, drawing_config(made, labels=requested_labels(()) if made.render.supersample == 1 else ())
     ).look(position, rods=placed)
@@ -197,7 +197,7 @@ def looks(made: Scene, texture: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
     assert labels is not None
     seen |= {name: value for name, value in labels._asdict().items() if value.size}
     moved = position + np.array([0.002, 0.001, 0])
-    placed_then = place_capsules(made, moved, 0)
+    placed_then = place_instruments(made, moved, 0)
     seen["flow"], seen["occlusion"] = compute_flow(made, labels.coordinates, moved, view_now, placed_then)
     rough = position + np.random.default_rng(5).normal(0, 0.004, position.shape)
     seen["pixels"], seen["hidden"] = locate_points(made, track_grid(60), rough, view_now, placed)

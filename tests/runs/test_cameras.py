@@ -16,7 +16,7 @@ from taichi_msm import ArgumentError, Playback, Simulation, resume, run
 from taichi_msm.errors import ForeignError, SceneError
 from taichi_msm.load import cost
 from taichi_msm.load.scene_file import load_plan, load_scene
-from taichi_msm.model.surface import place_capsules
+from taichi_msm.model.surface import place_instruments
 from taichi_msm.render import rasterizer
 from taichi_msm.render.camera import View, calibration, is_moving, pair_transform, view, view_at
 from taichi_msm.render.lens_table import undistortion_map
@@ -164,7 +164,7 @@ def test_the_light_is_that_of_the_main_camera(shading: str, device: Device) -> N
     del render["camera"]
     made = made.model_copy(update={"render": render})
     position, texture = dented(made), np.full((9, 9, 3), 120, np.uint8)
-    placed, config = place_capsules(made, position, 0), rasterizer.drawing_config(made)
+    placed, config = place_instruments(made, position, 0), rasterizer.drawing_config(made)
     on_cpu = Rasterizer(made, texture, config)
     of_gpu = Rasterizer(made, texture, config._replace(lanes=1)) if shading == "tissue" else on_cpu
     for name in made.render.all_cameras:

@@ -1,0 +1,129 @@
+"""EndoNeRF export: pictures, depth, masks and poses for neural reconstruction of deforming tissue.
+
+    images/000000.png   frames, RGB
+    depth/000000.png    depth along the optical axis, 16 bits; 0: background
+    masks/000000.png    255 where an instrument is visible, else 0
+    poses_bounds.npy    a row per frame, float64: the matrix [right, up, backward, eye, (height, width, focal length)],
+                        shape (3, 5), row by row, from the camera to the world; least and largest depth of the frame
+
+The loaders read integers, and take depths, eyes and bounds in one unit: 0.01 mm, or the next power of ten in which the
+depths fit 16 bits. Their world is the camera of the first frame: EndoNeRF draws its films from there, and with
+normalised device coordinates rays start there. They take a single focal length and the axis through the middle.
+
+Source: med-air/EndoNeRF, load_llff.py (`_load_data`, `load_llff_data`) and run_endonerf_helpers.py (`get_rays`) at
+5201b1e; yifliu3/EndoGaussian, scene/endo_loader.py (`load_meta`, `format_infos`, `get_pts_cam`) at d7aad82.
+"""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from taichi_msm.errors import ArgumentError, FilesError, ProgressCallback
+from taichi_msm.exports.formats import one_folder_per_run
+from taichi_msm.exports.inputs import Pinhole, read_depth, read_picture_file, read_pinhole
+from taichi_msm.runs.directory import create_file, write_new_file
+from taichi_msm.runs.finished import FinishedRun
+from taichi_msm.scene.outputs import zero_padded
+
+FORMAT_NAME = "endonerf"
+
+# Smallest unit of length [m], and the largest value of a pixel.
+MIN_UNIT_M, MAX_VALUE = 1e-5, 65535
+
+# Size of the pictures that EndoGaussian's loader takes for granted [px].
+LOADER_SIZE = (640, 512)
+
+# Largest relative difference of the focal lengths; and distance of the axis from the middle [px]: the loaders take it
+# through the middle of the pixel right and below of the picture's middle.
+FOCAL_TOLERANCE, CENTRE_TOLERANCE_PX = 1e-6, 0.5 + 1e-6
+
+# Signs that convert OpenCV's axes, right, down and forward, to right, up and backward.
+AXIS_SIGNS = np.array([1.0, -1.0, -1.0])
+
+
+@one_folder_per_run
+def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
+    """Write the frames, depths, masks and poses of a run; arguments as for `one_folder_per_run`.
+
+    Raises:
+        FilesError: as for `read_pinhole` and `read_depth`, and when a frame shows nothing.
+        ArgumentError: as for `read_pinhole`, and when the loaders cannot describe the camera.
+    """
+    camera, size = read_pinhole(run, FORMAT_NAME), run.scene.render.size
+    _require_central(camera, size, run)
+    for name in ("images", "depth", "masks"):
+        (folder / name).mkdir()
+    bounds = np.array([_depth_bounds(run, frame) for frame in range(run.frames)])
+    unit = MIN_UNIT_M * 10.0 ** max(0, np.ceil(np.log10(bounds.max() / MAX_VALUE / MIN_UNIT_M)))
+    background = 0.0
+    for frame in range(run.frames):
+        progress(frame, run.frames)
+        name, depth = f"{zero_padded(frame)}.png", read_depth(run, frame)
+        background = max(background, float((depth == 0).mean()))
+        # A depth below half a unit is not the background.
+        values = np.where(depth > 0, np.maximum(np.rint(depth / unit), 1), 0).astype(np.uint16)
+        write_new_file(folder / "images" / name, read_picture_file(run, "png", frame))
+        write_new_file(folder / "depth" / name, _png(values))
+        mask = run.read_picture("instrument", frame)[..., 0]
+        write_new_file(folder / "masks" / name, _png(np.where(mask > 127, 255, 0).astype(np.uint8)))
+    with create_file(folder / "poses_bounds.npy") as file:
+        np.save(file, np.concatenate([_poses(camera, size, unit).reshape(run.frames, 15), bounds / unit], axis=1))
+    notes = [f"depths, eyes and bounds are in units of {1000 * unit:g} mm"]
+    if size != LOADER_SIZE:
+        expected = f"{LOADER_SIZE[0]} x {LOADER_SIZE[1]}"
+        notes.append(
+            f"EndoGaussian's loader reads pictures of {expected} pixels only; these have {size[0]} x {size[1]}"
+        )
+    if background:
+        share = f"up to {100 * background:.2g} % of the pixels of a frame are background, depth 0"
+        notes.append(f"{share}: EndoGaussian leaves them out, EndoNeRF does not; fill the picture with the sheet")
+    return notes
+
+
+def _require_central(camera: Pinhole, size: tuple[int, int], run: FinishedRun) -> None:
+    """Raise an ArgumentError for a camera with two focal lengths or with its axis off the middle."""
+    across, down = camera.focal.tolist()
+    x, y = (camera.centre - np.array(size) / 2).tolist()
+    faults = []
+    if abs(across / down - 1) > FOCAL_TOLERANCE:
+        faults.append(f"its focal lengths are {across:g} and {down:g} px")
+    if max(abs(x), abs(y)) > CENTRE_TOLERANCE_PX:
+        faults.append(f"its axis is {x:g} px to the right and {y:g} px below the middle")
+    if faults:
+        fault = f"{FORMAT_NAME} has one focal length and an axis through the middle, but {' and '.join(faults)}"
+        width, height = size[0] / 2, size[1] / 2
+        remedy = f"run the scene with fx = fy, cx: {width:g} and cy: {height:g}, or with fov"
+        raise ArgumentError(f"{run.directory / run.camera}: {fault}; {remedy}")
+
+
+def _depth_bounds(run: FinishedRun, frame: int) -> tuple[float, float]:
+    """Return the least and the largest depth in a frame [m]."""
+    depth = read_depth(run, frame)
+    visible = depth[depth > 0]
+    if not len(visible):
+        fault = f"frame {frame} shows background only, and {FORMAT_NAME} needs the range of depths"
+        raise FilesError(f"{run.directory / run.camera}: {fault}; run the scene with a camera that shows the sheet")
+    return float(visible.min()), float(visible.max())
+
+
+def _poses(camera: Pinhole, size: tuple[int, int], unit: float) -> NDArray[np.float64]:
+    """Return the matrices of poses_bounds.npy, shape (frames, 3, 5)."""
+    poses = np.concatenate([camera.poses, np.tile([[[0.0, 0.0, 0.0, 1.0]]], (len(camera.poses), 1, 1))], axis=1)
+    signs = np.append(AXIS_SIGNS, 1.0)
+    # From each camera to the first one, exactly the identity for a camera that does not move.
+    to_first = signs[:, None] * (poses[0] @ np.linalg.inv(poses)) * signs
+    to_first[(poses == poses[0]).all(axis=(1, 2))] = np.eye(4)
+    to_first[:, :3, 3] /= unit
+    optics = np.tile(np.array([[size[1]], [size[0]], [camera.focal[0]]]), (len(poses), 1, 1))
+    return np.concatenate([to_first[:, :3], optics], axis=2)
+
+
+def _png(picture: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, "PNG", compress_level=1)
+    return file.getvalue()

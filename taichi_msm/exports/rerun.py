@@ -1,0 +1,164 @@
+"""Rerun export: a recording per run, for the viewer of rerun.io.
+
+    world/sheet             mesh of the mass points with the picture of the scene
+    world/tools/0           capsule of the instrument of a probe, by the number of the probe
+    world/tracks            positions of the tracked points
+    world/camera            pose and pinhole of the camera; world/cameras/NAME for each of several
+    world/camera/picture    frames; depth next to it [m], and flow as a tensor, shape (height, width, 2) [px]
+
+Lengths are in metres, in the world of the scene, with y up. The timelines are `frame` and `time` [s]. Pixels count from
+the picture's upper left corner, as Rerun's do. Rerun has no lens distortion: pictures are exported as drawn.
+
+Source: Rerun's documentation of archetypes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from uuid import NAMESPACE_URL, uuid5
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.errors import NotInstalledError, ProgressCallback
+from taichi_msm.exports.formats import FORMATS, ExportSource
+from taichi_msm.exports.inputs import (
+    EXPORT_REFINE,
+    instrument_mesh,
+    read_depth,
+    read_picture_file,
+    read_track_positions,
+    unit_normals,
+)
+from taichi_msm.model.surface import place_instruments, refine_surface
+from taichi_msm.render.camera import OPENCV_SIGNS, View, calibration, is_moving, view_at
+from taichi_msm.render.texture import load_texture
+from taichi_msm.runs.arrays import read_flo
+from taichi_msm.runs.finished import FinishedRun, reading
+from taichi_msm.scene.outputs import OUTPUTS, zero_padded
+
+# Fraction of a turn between the hues of successive points.
+GOLDEN_RATIO = 0.618
+
+
+def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
+    """Write a recording per run; arguments as for `FormatWriter`.
+
+    Raises:
+        FilesError: as for `FinishedRun.positions` and the readers of `inputs`.
+        SceneError: as for `load_texture`.
+        NotInstalledError: when rerun-sdk is not installed.
+    """
+    try:
+        import rerun
+    except ImportError:
+        raise NotInstalledError(
+            "--format rerun: needs rerun-sdk, which is not installed; pip install rerun-sdk"
+        ) from None
+    for run, name, progress in sources:
+        # The viewer merges recordings with the same identity.
+        identity = uuid5(NAMESPACE_URL, run.directory.resolve().as_uri())
+        with rerun.RecordingStream("taichi_msm", recording_id=identity) as recording:
+            recording.save(folder / f"{name or zero_padded(0)}.rrd")
+            recording.send_recording_name(run.directory.name)
+            # Without the timelines of the export itself.
+            recording.set_log_time_enabled(False)
+            recording.set_log_tick_enabled(False)
+            _log_run(run, recording, progress)
+            recording.flush()
+            recording.disconnect()
+        yield _notes(run)
+
+
+def _views(run: FinishedRun) -> dict[str, FinishedRun]:
+    """Return the run with each of its cameras selected, by the camera's entity."""
+    names = run.camera_names()
+    entities = {f"world/cameras/{name}": name for name in names} if names else {"world/camera": ""}
+    return {entity: replace(run, camera=name) for entity, name in entities.items()}
+
+
+def _notes(run: FinishedRun) -> list[str]:
+    views = _views(run).values()
+    missing = [key for key in FORMATS["rerun"].optional_outputs if not any(each.has_output(key) for each in views)]
+    notes = [f"without {key}, which is not among the results; {run.remedy(key)}" for key in missing]
+    if any(view_at(run.scene, 0.0, each.camera).lens is not None for each in views):
+        notes.append("Rerun has no lens distortion, so that points in space are off in the pictures of a lens")
+    return notes
+
+
+def _log_run(run: FinishedRun, recording: Any, progress: ProgressCallback) -> None:
+    """Log all frames."""
+    import rerun
+
+    positions, views = run.positions(), _views(run)
+    tracks = next((read_track_positions(each)[1] for each in views.values() if each.has_output("tracks")), None)
+    instruments = [number for number, probe in enumerate(run.scene.probes) if probe.instrument is not None]
+    recording.log("world", rerun.ViewCoordinates.RIGHT_HAND_Y_UP, static=True)
+    for frame, position in enumerate(positions):
+        progress(frame, run.frames)
+        time = float(run.time[frame])
+        recording.set_time("frame", sequence=frame)
+        recording.set_time("time", duration=time)
+        recording.log("world/sheet", _mesh(run, position, is_first=frame == 0))
+        for number, solid in zip(instruments, place_instruments(run.scene, position, time), strict=True):
+            if frame == 0:
+                vertices, normals, triangles = instrument_mesh(solid)
+                mesh = rerun.Mesh3D(vertex_positions=vertices, vertex_normals=normals, triangle_indices=triangles)
+                recording.log(f"world/tools/{number}", mesh, static=True)
+            recording.log(f"world/tools/{number}", rerun.Transform3D(translation=solid.tip))
+        if tracks is not None:
+            recording.log("world/tracks", rerun.Points3D(tracks[:, frame], colors=_colours(len(tracks))))
+        for entity, each in views.items():
+            view = view_at(run.scene, time, each.camera)
+            if view.pinhole and (frame == 0 or is_moving(run.scene, each.camera)):
+                recording.log(entity, *_pinhole(view))
+            _log_pictures(each, frame, entity, recording)
+
+
+def _mesh(run: FinishedRun, position: NDArray[np.floating], *, is_first: bool) -> Any:
+    """Build the mesh of the first frame, or the vertices of a later one, for which the viewer keeps the rest."""
+    import rerun
+
+    vertices: dict[str, Any] = {"vertex_positions": position.reshape(-1, 3), "vertex_normals": unit_normals(position)}
+    if not is_first:
+        return rerun.Mesh3D.from_fields(**vertices)
+    surface = refine_surface(position, EXPORT_REFINE)
+    vertices["triangle_indices"] = surface.triangles
+    if run.scene.image is None:
+        return rerun.Mesh3D(**vertices)
+    picture = load_texture(run.scene, run.sha256.get("image", ""))
+    return rerun.Mesh3D(**vertices, vertex_texcoords=surface.texture_coordinates, albedo_texture=picture)
+
+
+def _colours(count: int) -> NDArray[np.uint8]:
+    """Return distinct colours, shape (count, 3)."""
+    phase = np.arange(count)[:, None] * GOLDEN_RATIO + np.array([0, 1 / 3, 2 / 3])
+    return (127.5 + 127.5 * np.cos(2 * np.pi * phase)).astype(np.uint8)
+
+
+def _pinhole(view: View) -> tuple[Any, Any]:
+    """Build pose and projection of a camera, in OpenCV's axes."""
+    import rerun
+
+    pose = rerun.Transform3D(translation=view.eye, mat3x3=(view.axes * OPENCV_SIGNS).T)
+    matrix, size = calibration(view)["intrinsics"], view.size.tolist()
+    return pose, rerun.Pinhole(image_from_camera=matrix, resolution=size, camera_xyz=rerun.ViewCoordinates.RDF)
+
+
+def _log_pictures(run: FinishedRun, frame: int, entity: str, recording: Any) -> None:
+    """Log the outputs of a camera that the run has."""
+    import rerun
+
+    if run.has_output("png"):
+        picture = rerun.EncodedImage(contents=read_picture_file(run, "png", frame), media_type="image/png")
+        recording.log(f"{entity}/picture", picture)
+    if run.has_output("depth"):
+        recording.log(f"{entity}/depth", rerun.DepthImage(read_depth(run, frame), meter=1.0))
+    if run.has_output("flow") and frame < OUTPUTS["flow"].count(run.frames):
+        path = run.result_path("flow", frame)
+        with reading(path):
+            flow = read_flo(path, run.scene.render.size)
+        recording.log(f"{entity}/flow", rerun.Tensor(flow, dim_names=("height", "width", "right and down")))
