@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import DivergedError, SceneError
-from taichi_msm.fitting.least_squares import Misfit, Scales, Search, Solution
+from taichi_msm.fitting.least_squares import Misfit, Search, Solution
 from taichi_msm.fitting.machine_model import MachineModel, MachineProblem, contact_keys
 from taichi_msm.fitting.predict import Prediction, Runs, difference_step, mesh_error
 from taichi_msm.load.check import check_scene
@@ -165,7 +165,7 @@ class CurveRuns(Runs):
     def correct(self, x: Array, predicted: Prediction) -> None:
         """Correct further predictions, so that the one at x is `predicted`."""
         if (by_tangent := self.predict_one(x)) is not None:
-            self._correction = self._correction + predicted.forces - by_tangent.forces
+            self._correction = self._correction + predicted.values[0] - by_tangent.values[0]
 
     def set_tangent(self, x: Array) -> None:
         """Set the tangent to the curve at x; raises as `ForwardModel.predict` does."""
@@ -204,7 +204,7 @@ class CurveRuns(Runs):
             relax(curve(loading.travel(values.get(key))), branches, 1 / loading.rate)
             for loading, key in zip(self.job.tests, contact_keys(len(self.job.tests)), strict=True)
         ]
-        return Prediction(np.empty((0, 0, 3)), np.concatenate(of_tests)[:, None] + self._correction, 1, np.zeros(1))
+        return Prediction((np.concatenate(of_tests)[:, None] + self._correction,), 1, np.zeros(1))
 
     def _forces(self, values: dict[str, float], reach: float, halvings: int = 0) -> Array:
         """Run a curve; return its forces at equidistant travels [N], shape (TRAVELS + 1,)."""
@@ -213,7 +213,7 @@ class CurveRuns(Runs):
         if key not in self._curves:
             self._report_progress()
             simulation, plan = self._predictor.start(self._plan_curve(values, reach), None, halvings)
-            self._curves[key] = self._predictor.forces(simulation, plan.grid.frames, self._report_progress)
+            self._curves[key] = self._predictor.forces(simulation, plan.grid.frames, self._report_progress)[:, 0]
             self.count += 1
         return self._curves[key]
 
@@ -270,9 +270,7 @@ def _scaled(runs: CurveRuns, misfit: Misfit, x: Array, initial: Prediction) -> A
 
 def _descend(runs: CurveRuns, misfit: Misfit, start: Array, *, by_tests: bool) -> Solution:
     """Minimise the tangent within a trust region, and evaluate its minimum by a curve or the tests, repeatedly."""
-    forces = misfit.observations.forces
-    assert forces is not None
-    scales = Scales(1.0, forces.sigma)
+    scales = misfit.scales(misfit.signals)
 
     def evaluate(x: Array) -> Solution:
         predicted = runs.run_tests(x) if by_tests else runs.run_curve(x)

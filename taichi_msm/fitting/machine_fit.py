@@ -129,11 +129,11 @@ def read_machine_problem(
         tests.append(loading)
     parameters = machine_parameters(scene, tests, free, bounds, approach.probe)
     placed = Scene(**tests[0].place(as_data(without_outputs(scene)), approach))
-    observations = observe_tests(tests)
+    observations = observe_tests(tests, approach)
     if (count := sum(len(loading.force) for loading in tests)) <= len(parameters):
         fault = f"{count} frames, too few for {len(parameters)} parameters; raise --rate"
         raise SceneError([f"{observations.name}: {fault}"])
-    return MachineProblem(secrets.token_hex(8), placed, parameters, observations, tuple(tests), approach)
+    return MachineProblem(secrets.token_hex(8), placed, parameters, (observations,), tuple(tests), approach)
 
 
 def fitted_tests(job: MachineProblem, values: Mapping[str, float], forces: Array) -> tuple[FittedTest, ...]:

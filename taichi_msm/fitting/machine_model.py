@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import Pause, SceneError
+from taichi_msm.fitting.forces import Forces
 from taichi_msm.fitting.machine_test import Approach, Loading
-from taichi_msm.fitting.observations import Forces, Observations
+from taichi_msm.fitting.observation import ObservationModel
 from taichi_msm.fitting.parameters import Bounds, Parameter, make_parameters, with_values
 from taichi_msm.fitting.predict import FitProblem, ForwardModel, Prediction
 from taichi_msm.load.check import check_scene
@@ -30,6 +31,9 @@ def contact_keys(count: int) -> list[str]:
 @dataclass(frozen=True, eq=False)
 class MachineProblem(FitProblem):
     """Scene, parameters and machine tests of a fit."""
+
+    # Tests have many frames, and smooth forces.
+    signs: ClassVar[tuple[int, ...]] = (1,)
 
     tests: tuple[Loading, ...]
     approach: Approach
@@ -59,7 +63,7 @@ class MachineProblem(FitProblem):
 
 
 class MachineModel(ForwardModel):
-    """Forward model of machine tests; its values are empty, its forces of shape (frames of all tests, 1)."""
+    """Forward model of machine tests; predicts `MachineForces`, of shape (frames of all tests, 1)."""
 
     job: MachineProblem
 
@@ -69,7 +73,7 @@ class MachineModel(ForwardModel):
         steps: int | None = None,
         *,
         coarse: int = 0,
-        to_end: bool = False,  # noqa: ARG002  # The runs end with their tests.
+        to_end: bool = False,  # The runs end with their tests.
         pause: Pause = lambda: None,
     ) -> Prediction:
         """Simulate all tests with the parameters at x; arguments and errors as of `ForwardModel.predict`."""
@@ -78,7 +82,14 @@ class MachineModel(ForwardModel):
             simulation, plan = self.start(self.plan(x, n), steps, coarse)
             forces.append(self.forces(simulation, plan.grid.frames, pause))
             most_steps = max(most_steps, plan.grid.steps_per_frame)
-        return Prediction(np.empty((0, 0, 3)), np.concatenate(forces)[:, None], most_steps, np.zeros(1))
+        return Prediction((np.concatenate(forces),), most_steps, np.zeros(1))
+
+    def forces(self, simulation: Simulation, frames: int, pause: Pause) -> Array:
+        """Return the forces along the tool's direction in a run of a number of frames [N], shape (frames + 1, 1)."""
+        (observed,) = self.job.observations
+        model = observed.build_model(self.job.scene, frames + 1)
+        (recorded,) = self.record([model], simulation, frames + 1, pause)
+        return model.predict(recorded)
 
     def plan(self, x: Array, n: int = 0) -> Plan:
         """Plan the scene of test n with the parameters at x; SceneError: it is not valid."""
@@ -93,14 +104,6 @@ class MachineModel(ForwardModel):
         if not np.isfinite(list(values.values())).all():
             raise SceneError(["the values are out of range"])
         return values
-
-    def forces(self, simulation: Simulation, frames: int, pause: Pause) -> Array:
-        """Return the forces along the tool's direction at the frames of a run [N], shape (frames + 1,)."""
-        forces = []
-        for frame in range(frames + 1):
-            simulation.advance(min(frame, 1), pause)
-            forces.append(simulation.forces()[self.job.approach.probe].force)
-        return np.array(forces) @ self.job.approach.direction
 
 
 def machine_parameters(
@@ -147,17 +150,39 @@ def _contact_parameter(key: str, test: Loading, bounds: Bounds | None) -> Parame
     return Parameter(key, test.contact, low, high, high - low)
 
 
-def observe_tests(tests: Sequence[Loading]) -> Observations:
-    """Return the forces of machine tests as observations without points."""
-    name = ", ".join(loading.test.name for loading in tests)
+class MachineForceModel(ObservationModel):
+    """Map from the run of a machine test to the forces at its frames."""
+
+    def __init__(self, approach: Approach) -> None:
+        self._approach = approach
+
+    def record(self, simulation: Simulation) -> Array:
+        """Return the force of the tool in the current frame [N], shape (3,)."""
+        return np.array(simulation.forces()[self._approach.probe].force)
+
+    def predict(self, recorded: Array) -> Array:
+        """Return the forces along the direction of the tool at all frames [N], shape (frames, 1)."""
+        return np.asarray(recorded @ self._approach.direction[:, None])
+
+
+@dataclass(frozen=True, eq=False)
+class MachineForces(Forces):
+    """Forces at the frames of all tests along the direction of the tool, of shape (frames, 1)."""
+
+    approach: Approach
+
+    def build_model(self, scene: Scene, frames: int) -> MachineForceModel:
+        """Build the map from the run of a test."""
+        return MachineForceModel(self.approach)
+
+
+def observe_tests(tests: Sequence[Loading], approach: Approach) -> MachineForces:
+    """Return the forces of machine tests."""
     lengths = [len(loading.force) for loading in tests]
-    forces = Forces(
-        name,
+    return MachineForces(
+        ", ".join(loading.test.name for loading in tests),
         np.concatenate([loading.scene_time for loading in tests]),
-        np.repeat(np.arange(len(tests)), lengths),
         np.concatenate([loading.force for loading in tests])[:, None],
         np.repeat([loading.sigma for loading in tests], lengths),
+        approach,
     )
-    empty = np.empty((0, 0, 3))
-    # The unit of no value; with a sigma, none is estimated.
-    return Observations(name, "position", np.empty(0), np.empty((0, 2)), empty, 1.0, forces)

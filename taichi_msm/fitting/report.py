@@ -94,4 +94,4 @@ def _scene_text(result: FitResult, scene: Scene, folder: Path, names: dict[str, 
     summary = (
         ", ".join(f"{key} {estimate.value:.6g}" for key, estimate in result.parameters.items()) or f"tissue.map, {MAP}"
     )
-    return f"# Fitted to {printable(result.observations.name)}: {printable(summary)}; more in {RECORD}.\n{text}"
+    return f"# Fitted to {printable(result.observations[0].name)}: {printable(summary)}; more in {RECORD}.\n{text}"

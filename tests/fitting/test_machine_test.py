@@ -255,7 +255,7 @@ def test_the_parameters_of_a_tissue_that_relaxes_come_back_and_its_scene_runs_al
     assert (tmp_path / "out/fit.png").stat().st_size > 10000
     np.testing.assert_allclose(
         forces_of(json.loads(load_scene(tmp_path / "out/scene.yaml").model_dump_json(exclude_none=True))),
-        result.fitted_forces[:, 0],
+        result.fitted[0][:, 0],
         atol=1e-6,
     )
 
