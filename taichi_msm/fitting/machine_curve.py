@@ -101,7 +101,13 @@ class _Tangent:
 
 
 class CurveRuns(Runs):
-    """Predictions of machine tests by a tangent, with a correction of every frame; see `Runs`."""
+    """Predictions of machine tests by a tangent, or curves, with a correction of every frame; see `Runs`.
+
+    Attributes:
+        by_tangent: whether predictions are by the tangent.
+        of_curve: mask of the parameters on which a curve depends, shape (n,).
+        of_contact: mask of the depths of contact, shape (n,).
+    """
 
     job: MachineProblem
     _predictor: MachineModel
@@ -111,6 +117,7 @@ class CurveRuns(Runs):
         super().__init__(*arguments)
         self._curves: dict[tuple[object, ...], Array] = {}
         self._correction: Array | float = 0.0
+        self.by_tangent = True
         keys = [parameter.key for parameter in self.job.parameters]
         self.of_curve = np.array([not key.startswith(("contact", "tissue.relaxation.")) for key in keys])
         self.of_contact = np.array([key.startswith("contact") for key in keys])
@@ -124,7 +131,9 @@ class CurveRuns(Runs):
         return predicted
 
     def predict_one(self, x: Array, steps: int | None = None) -> Prediction | None:
-        """Predict at x by the tangent; None if that fails."""
+        """Predict at x by the tangent, or a curve; None if that fails."""
+        if not self.by_tangent:
+            return self.predict_coarse(x, 0)
         tangent = self._tangent
         try:
             values = self._predictor.values(x)
@@ -135,7 +144,7 @@ class CurveRuns(Runs):
         return self._predict(values, tangent.reach, tangent.forces * np.exp(distance @ tangent.slopes))
 
     def predict_many(self, coordinates: Sequence[Array], steps: int | None = None) -> list[Prediction | None]:
-        """Predict at several x by the tangent; None where that fails."""
+        """Predict at several x as `predict_one` does."""
         return [self.predict_one(x, steps) for x in coordinates]
 
     def predict_coarse(self, x: Array, halvings: int) -> Prediction | None:
