@@ -1,10 +1,11 @@
 """Fit published tests of testing machines, and write docs/machine-fits.md.
 
     python docs/make_machine.py WORKBOOK STRIP ... [--only SHEET ...]
+    python docs/make_machine.py WORKBOOK STRIP --draw SHEET
 
 The files are those named on the page; strips are skin or mucosa by their names. A fit that is already in
 docs/machine-fits.json is kept, so that the script continues where it was interrupted: delete the file to repeat all.
-Takes about half a minute of a core per test.
+With --draw it fits a strip and a sheet again, and draws them. Takes about half a minute of a core per test.
 """
 
 from __future__ import annotations
@@ -14,11 +15,13 @@ import json
 from pathlib import Path
 from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
 
 from taichi_msm import FitResult, SceneError, fit
 from taichi_msm.fitting.machine_tables import read_machine_test
 from taichi_msm.fitting.table_grids import read_workbook
+from taichi_msm.plot_style import BLUE, DPI, STYLE, VERMILION
 
 DOCS = Path(__file__).parent
 RECORD, PAGE, TEMPLATE = DOCS / "machine-fits.json", DOCS / "machine-fits.md", DOCS / "machine-fits.template"
@@ -158,13 +161,36 @@ def write_page(record: dict[str, Any]) -> None:
     PAGE.write_text(text, encoding="utf-8")
 
 
+def draw(pressed: FitResult, pulled: FitResult) -> None:
+    """Draw measured and fitted forces over time and over depth."""
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(1, 3, figsize=(12, 3.6), layout="constrained")
+        titles = "Beef, pressed and held", "Beef", "Pig skin, pulled"
+        for panel, title, result in zip(axes, titles, (pressed, pressed, pulled), strict=True):
+            (test,) = result.tests
+            loading = test.loading
+            over_time = panel is axes[0]
+            at = loading.time if over_time else 1000 * (loading.depth - loading.depth[0])
+            panel.plot(at, loading.force, ".", color=VERMILION, markersize=4, label="measured")
+            panel.plot(at, test.force, color=BLUE, label="fitted")
+            panel.set(xlabel="time [s]" if over_time else "depth [mm]", ylabel="force [N]", title=title)
+        axes[2].set_xlabel("pull [mm]")
+        axes[0].legend()
+        figure.savefig(DOCS / "images" / "machine-fits.png", dpi=DPI)
+        plt.close(figure)
+
+
 def main() -> None:
     """Fit the tests that are not in the record, and write the page."""
     parser = argparse.ArgumentParser()
     parser.add_argument("workbook")
     parser.add_argument("strips", nargs="*")
     parser.add_argument("--only", nargs="*", help="sheets of the workbook")
+    parser.add_argument("--draw", help="sheet of the workbook")
     options = parser.parse_args()
+    if options.draw:
+        draw(fit_sheet(options.workbook, options.draw), fit_strip(options.strips[0]))
+        return
     record = json.loads(RECORD.read_text(encoding="utf-8")) if RECORD.exists() else {}
     sheets = options.only or [name for name in read_workbook(options.workbook) if name.startswith("230403-")]
     tests = {Path(path).stem: (fit_strip, (path,)) for path in options.strips}
