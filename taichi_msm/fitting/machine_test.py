@@ -55,7 +55,7 @@ class Approach:
     probe: int  # index of the tool in the scene
     start: Array  # centre of the tip at first contact, or 0, the displacement of a clamp at rest [m], shape (3,)
     direction: Array  # unit vector, shape (3,)
-    radius: float  # of the tip [m]
+    tip_height: float  # of the centre above the lowest point of the tip [m]
     size: tuple[float, float]  # height and width of the sheet [m]
     is_clamp: bool
 
@@ -73,7 +73,7 @@ class Approach:
         x, y, z = (self.start + travel[:, None] * self.direction).T
         if self.is_clamp:
             return np.stack([times, x, y, z], axis=1).tolist()
-        return np.stack([times, x / width + 0.5, 0.5 - y / height, z - self.radius], axis=1).tolist()
+        return np.stack([times, x / width + 0.5, 0.5 - y / height, z - self.tip_height], axis=1).tolist()
 
     def place(self, data: dict[str, Any], times: Array, travel: Array, rate: float) -> dict[str, Any]:
         """Return a scene's data with the path of the tool, and the times, of a test.
@@ -106,7 +106,12 @@ def find_approach(scene: Scene) -> Approach:
     start = np.zeros(3) if is_clamp else _first_contact(tool, direction, scene)
     if start is None:
         raise SceneError([f"{key}: the line from its first key to the farthest misses the sheet; direct it there"])
-    return Approach(tool.probe, start, direction, tool.radius, scene.sheet.size, is_clamp)
+    return Approach(tool.probe, start, direction, _tip_height(tool), scene.sheet.size, is_clamp)
+
+
+def _tip_height(tool: Tool) -> float:
+    """Return the height of the tip's centre above its lowest point [m]."""
+    return float(tool.tip_centres[0, 2] - tool.heights[0])
 
 
 def _first_contact(tool: Tool, direction: Array, scene: Scene) -> Array | None:
@@ -114,12 +119,15 @@ def _first_contact(tool: Tool, direction: Array, scene: Scene) -> Array | None:
     start, tolerance = tool.tip_centres[0], 1e-9 * tool.radius
     travel, reach = 0.0, float(np.linalg.norm(start)) + tool.length + math.hypot(*scene.sheet.size)
     # The distance from the sheet changes by at most the travel, so that the tool may advance by it (sphere tracing).
+    # That of a tilted plate is approximate, so that it may have to go back.
+    goes_back = False
     for _ in range(1000):
         centre = start + travel * direction
-        placed = replace(tool, times=np.zeros(1), tip_centres=centre[None], heights=centre[2:] - tool.radius)
+        placed = replace(tool, times=np.zeros(1), tip_centres=centre[None], heights=centre[2:] - _tip_height(tool))
         gap = gap_to_sheet(placed, scene.sheet)
-        if gap <= tolerance:
+        if abs(gap) <= tolerance or (goes_back and gap > 0):
             return np.asarray(centre)
+        goes_back = goes_back or gap < 0
         travel += gap
         if travel > reach:
             break

@@ -24,6 +24,7 @@ from taichi_msm.fitting.machine_test import (
     find_approach,
     late_contact_note,
 )
+from taichi_msm.load.check import check_scene
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
@@ -202,15 +203,21 @@ def test_the_tool_waits_until_contact() -> None:
     np.testing.assert_allclose(travel[loading.depth > 4], loading.depth[loading.depth > 4] - 4)
 
 
-@pytest.mark.parametrize("shaft", [[0, 0, 1], [0.5, -0.6, 0.9]])
-def test_a_tool_starts_where_it_touches_the_sheet(shaft: list[float]) -> None:
-    data = changed(scene(), probes__0__instrument={"radius": RADIUS, "shaft": shaft, "length": 0.05})
+@pytest.mark.parametrize(
+    ("tip", "shaft"), [("radius", [0, 0, 1]), ("radius", [0.5, -0.6, 0.9]), ("plate", [0.5, -0.6, 0.9])]
+)
+def test_a_tool_starts_where_it_touches_the_sheet(shaft: list[float], tip: str) -> None:
+    data = changed(scene(), probes__0__instrument={tip: RADIUS, "shaft": shaft, "length": 0.05})
     data["probes"][0]["path"] = [[0, 0.3, 0.5, 0.004], [1, 0.5, 0.4, -0.002], [2, 0.4, 0.4, 0]]
     approach = find_approach(Scene.model_validate(data))
-    assert approach.start[2] == pytest.approx(RADIUS, rel=1e-8)
+    if tip == "radius":
+        assert approach.start[2] == pytest.approx(RADIUS, rel=1e-8)
     np.testing.assert_allclose(approach.direction, np.array([0.004, 0.002, -0.006]) / np.sqrt(56e-6), rtol=1e-9)
     path = approach.keyframes(np.array([0.0, 1.0]), np.array([0.0, 1e-3]))
-    assert path[0][3] == pytest.approx(0, abs=1e-8)
+    # The gap of a tilted plate is approximate, but the scene is not refused.
+    assert path[0][3] == pytest.approx(0, abs=1e-8 if tip == "radius" else 5e-6)
+    data["probes"][0]["path"] = path
+    check_scene(data)
     lengths = (np.array(path[1][1:]) - path[0][1:]) * [0.02, 0.02, 1]
     assert np.linalg.norm(lengths) == pytest.approx(1e-3)
 
