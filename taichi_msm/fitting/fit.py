@@ -34,12 +34,14 @@ from taichi_msm.fitting.least_squares import (
     uncertainty,
     unseen,
 )
+from taichi_msm.fitting.machine_curve import CurveRuns, has_curve, search_by_curve
 from taichi_msm.fitting.machine_fit import (
     TABLE_OPTIONS,
     explanations,
     fitted_tests,
     read_machine_problem,
     table_paths,
+    unknown_notes,
 )
 from taichi_msm.fitting.machine_model import MachineProblem
 from taichi_msm.fitting.observation import ErrorCorrelation, Observation
@@ -139,7 +141,8 @@ def fit(
             assert isinstance(points, PointObservation)
             result = fit_map(initial, points, settings, name, progress)
         else:
-            runs = stack.enter_context(Runs(problem, workers, progress))
+            kind = CurveRuns if has_curve(problem) else Runs
+            runs = stack.enter_context(kind(problem, workers, progress))
             result = _fit(runs, initial, method)
         result = replace(result, seconds=time.perf_counter() - start)
         if directory is not None:
@@ -205,10 +208,13 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
         raise SceneError(found)
     signals = [observed.signal(scene) or 1.0 for observed in observations]
     misfit = Misfit(observations, signals, robust=method.get("robust", False))
-    search = Search(runs, misfit)
-    if machine:
-        search.remember(start, first)
-    solution = search.best(start)
+    if isinstance(runs, CurveRuns):
+        search, solution = search_by_curve(runs, misfit, start, first)
+    else:
+        search = Search(runs, misfit)
+        if machine:
+            search.remember(start, first)
+        solution = search.best(start)
     if found := list(faults_at_solution(observations, scene, first, solution.predicted)):
         raise SceneError(found)
     uncertainties = uncertainty(misfit, solution, search.jacobian(solution), error_correlation)
@@ -246,6 +252,14 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
             *result_module.search_notes(solution, parameters, fits_well=search.fits_well(solution)),
             *result_module.mesh_notes(parameters, solution.x, uncertainties, shifts),
             *result_module.correlation_notes(parameters, uncertainties, unidentified),
+            *unknown_notes(
+                tests,
+                {
+                    key: value
+                    for (key, value), each in zip(fitted_values.items(), estimates, strict=True)
+                    if not each.identifiable
+                },
+            ),
             *(
                 explanations(tests, fits_contact=any(parameter.key.startswith("contact") for parameter in parameters))
                 if rejection_reason
@@ -254,6 +268,11 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
             *result_module.residual_notes(misfit, solution, uncertainties, error_correlation),
         ],
         scene=Scene(**runs.job.fitted_data(as_data(scene), fitted_values)),
+        other_scenes=[
+            Scene(**machine.place(as_data(scene), fitted_values, n))
+            for n in range(1, len(tests))
+            if machine is not None
+        ],
         observations=observations,
         fitted=solution.predicted.values,
         tests=tests,

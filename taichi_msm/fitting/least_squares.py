@@ -139,22 +139,23 @@ class Search:
     Args:
         runs: computes predictions.
         misfit: the residuals; the initial value of an unknown sigma is the observed motion.
+        limits: smallest and largest coordinates, each of shape (n,); by default those of the parameters.
     """
 
-    def __init__(self, runs: Runs, misfit: Misfit) -> None:
+    def __init__(self, runs: Runs, misfit: Misfit, limits: tuple[Array, Array] | None = None) -> None:
         self._runs, self._misfit = runs, misfit
         self._delta = difference_step(runs.job.scene)
-        limits = np.array([parameter.limits for parameter in runs.job.parameters])
-        self._limits = limits[:, 0], limits[:, 1]
+        low, high = np.array([parameter.limits for parameter in runs.job.parameters]).T
+        self._limits = limits or (low, high)
         self._known: dict[bytes, Prediction | None] = {}
         self._neighbours: dict[bytes, Prediction | None] = {}
 
     def best(self, start: Array) -> Solution:
         """Minimise from a start, and from two alternative starts if the fit is poor."""
-        solution = self._solve(start)
+        solution = self.refine(start)
         if self.fits_well(solution):
             return solution
-        starts = self._alternative_starts()
+        starts = self.alternative_starts()
         self._runs.expected += len(starts)
         costs = [
             (self._cost(predicted, solution.scales), n)
@@ -162,7 +163,7 @@ class Search:
             if predicted is not None
         ]
         for _, n in sorted(costs)[:2]:
-            candidate = self._solve(starts[n])
+            candidate = self.refine(starts[n])
             # Costs are comparable only with the same sigma.
             if self._cost(candidate.predicted, solution.scales) < self._cost(solution.predicted, solution.scales):
                 solution = candidate
@@ -193,7 +194,7 @@ class Search:
             self._known[key] = self._runs.predict_one(x)
         return self._known[key]
 
-    def _solve(self, start: Array) -> Solution:
+    def refine(self, start: Array) -> Solution:
         """Minimise from a start, alternating with an unknown sigma."""
         misfit = self._misfit
         is_unknown = any(observed.sigma is None for observed in misfit.observations)
@@ -291,7 +292,7 @@ class Search:
     def _cost(self, predicted: Prediction, scales: Scales) -> float:
         return self._misfit.cost(self._misfit.residuals(predicted, scales))
 
-    def _alternative_starts(self) -> list[Array]:
+    def alternative_starts(self) -> list[Array]:
         """Return a Sobol sequence of starts within the bounds, at least 8 per parameter, or 8 for machine tests."""
         from scipy.stats import qmc
 

@@ -48,9 +48,18 @@ class MachineProblem(FitProblem):
 
     def place(self, data: dict[str, Any], values: Mapping[str, float], n: int) -> dict[str, Any]:
         """Return a scene's data with parameter values, by key, and with the path and the times of test n."""
+        contact = values.get(contact_keys(len(self.tests))[n])
+        return self.tests[n].place(self.with_scene_values(data, values), self.approach, contact)
+
+    def with_scene_values(self, data: dict[str, Any], values: Mapping[str, float]) -> dict[str, Any]:
+        """Return a scene's data with parameter values by key, except depths of contact."""
         of_scene = [parameter for parameter in self.parameters if parameter.key not in contact_keys(len(self.tests))]
-        data = with_values(data, of_scene, [values[parameter.key] for parameter in of_scene])
-        return self.tests[n].place(data, self.approach, values.get(contact_keys(len(self.tests))[n]))
+        return with_values(data, of_scene, [values[parameter.key] for parameter in of_scene])
+
+    def reach(self, values: Mapping[str, float]) -> float:
+        """Return the greatest travel of all tests [m] with parameter values by key."""
+        keys = contact_keys(len(self.tests))
+        return max(float(test.travel(values.get(key)).max()) for test, key in zip(self.tests, keys, strict=True))
 
 
 class MachineModel(ForwardModel):
@@ -68,23 +77,33 @@ class MachineModel(ForwardModel):
         pause: Pause = lambda: None,
     ) -> Prediction:
         """Simulate all tests with the parameters at x; arguments and errors as of `ForwardModel.predict`."""
-        (observed,), forces, most_steps = self.job.observations, [], 0
+        forces, most_steps = [], 0
         for n in range(len(self.job.tests)):
             simulation, plan = self.start(self.plan(x, n), steps, coarse)
-            model, frames = observed.build_model(plan.scene, plan.grid.frames + 1), plan.grid.frames + 1
-            forces += [model.predict(recorded) for recorded in self.record([model], simulation, frames, pause)]
+            forces.append(self.forces(simulation, plan.grid.frames, pause))
             most_steps = max(most_steps, plan.grid.steps_per_frame)
         return Prediction((np.concatenate(forces),), most_steps, np.zeros(1))
 
+    def forces(self, simulation: Simulation, frames: int, pause: Pause) -> Array:
+        """Return the forces along the tool's direction in a run of a number of frames [N], shape (frames + 1, 1)."""
+        (observed,) = self.job.observations
+        model = observed.build_model(self.job.scene, frames + 1)
+        (recorded,) = self.record([model], simulation, frames + 1, pause)
+        return model.predict(recorded)
+
     def plan(self, x: Array, n: int = 0) -> Plan:
         """Plan the scene of test n with the parameters at x; SceneError: it is not valid."""
+        return check_scene(Scene(**self.job.place(self.data, self.values(x), n)), self.maps)
+
+    def values(self, x: Array) -> dict[str, float]:
+        """Return the parameter values by key at x; SceneError: they are out of range."""
         values = {
             parameter.key: parameter.value(coordinate)
             for parameter, coordinate in zip(self.job.parameters, x.tolist(), strict=True)
         }
         if not np.isfinite(list(values.values())).all():
             raise SceneError(["the values are out of range"])
-        return check_scene(Scene(**self.job.place(self.data, values, n)), self.maps)
+        return values
 
 
 def machine_parameters(
@@ -164,6 +183,6 @@ def observe_tests(tests: Sequence[Loading], approach: Approach) -> MachineForces
         ", ".join(loading.test.name for loading in tests),
         np.concatenate([loading.scene_time for loading in tests]),
         np.concatenate([loading.force for loading in tests])[:, None],
-        np.repeat([loading.noise for loading in tests], lengths),
+        np.repeat([loading.sigma for loading in tests], lengths),
         approach,
     )

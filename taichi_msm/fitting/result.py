@@ -127,6 +127,7 @@ class FitResult:
         curves: profiles of the parameters by key, or their quadratic approximations.
         map: estimated map; None for a fit of numbers.
         tests: the machine tests with their fitted forces.
+        other_scenes: fitted scenes of the machine tests after the first one.
     """
 
     parameters: dict[str, Estimate] = field(default_factory=dict)
@@ -151,6 +152,7 @@ class FitResult:
     curves: dict[str, list[ProfilePoint]] = field(repr=False, default_factory=dict)
     map: FittedMap | None = None
     tests: tuple[FittedTest, ...] = ()
+    other_scenes: Sequence[Scene] = field(repr=False, default_factory=list)
 
     @property
     def model_rejected(self) -> bool:
