@@ -119,7 +119,7 @@ class CurveRuns(Runs):
         assert predicted is not None
         return predicted
 
-    def predict_one(self, x: Array, steps: int | None = None) -> Prediction | None:  # noqa: ARG002
+    def predict_one(self, x: Array, steps: int | None = None) -> Prediction | None:
         """Predict at x by the tangent; None if that fails."""
         tangent = self._tangent
         try:
