@@ -218,6 +218,8 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
     if found := list(faults_at_solution(observations, scene, first, solution.predicted)):
         raise SceneError(found)
     uncertainties = uncertainty(misfit, solution, search.jacobian(solution), error_correlation)
+    if isinstance(runs, CurveRuns):
+        runs.by_tangent = False
     profiles = Profiler(parameters, misfit, solution, uncertainties).profiles(runs) if method.get("profile") else None
     mesh, shifts = _mesh(runs, misfit, solution, uncertainties)
     estimates = [

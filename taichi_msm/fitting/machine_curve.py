@@ -17,6 +17,7 @@ compared with runs of the tests, whose difference from the model is added to it.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -45,6 +46,9 @@ FIRST_REGION, MAX_REGION = 0.5, 2.0
 # Largest number of steps, and changes of the cost below which they end: relative, and absolute, which is a third of a
 # standard deviation of a parameter.
 MAX_STEPS, MIN_RELATIVE_CHANGE, MIN_CHANGE = 20, 1e-3, 0.05
+
+# Change of the forces by a change of x of 1 [sigma], below which a parameter is also searched from a smaller value.
+MIN_INFORMATION = 3.0
 
 # Number of starts of the parameters that need no curve.
 RELAXATION_STARTS = 64
@@ -97,7 +101,13 @@ class _Tangent:
 
 
 class CurveRuns(Runs):
-    """Predictions of machine tests by a tangent, with a correction of every frame; see `Runs`."""
+    """Predictions of machine tests by a tangent, or curves, with a correction of every frame; see `Runs`.
+
+    Attributes:
+        by_tangent: whether predictions are by the tangent.
+        of_curve: mask of the parameters on which a curve depends, shape (n,).
+        of_contact: mask of the depths of contact, shape (n,).
+    """
 
     job: MachineProblem
     _predictor: MachineModel
@@ -107,6 +117,7 @@ class CurveRuns(Runs):
         super().__init__(*arguments)
         self._curves: dict[tuple[object, ...], Array] = {}
         self._correction: Array | float = 0.0
+        self.by_tangent = True
         keys = [parameter.key for parameter in self.job.parameters]
         self.of_curve = np.array([not key.startswith(("contact", "tissue.relaxation.")) for key in keys])
         self.of_contact = np.array([key.startswith("contact") for key in keys])
@@ -120,7 +131,9 @@ class CurveRuns(Runs):
         return predicted
 
     def predict_one(self, x: Array, steps: int | None = None) -> Prediction | None:
-        """Predict at x by the tangent; None if that fails."""
+        """Predict at x by the tangent, or a curve; None if that fails."""
+        if not self.by_tangent:
+            return self.predict_coarse(x, 0)
         tangent = self._tangent
         try:
             values = self._predictor.values(x)
@@ -131,7 +144,7 @@ class CurveRuns(Runs):
         return self._predict(values, tangent.reach, tangent.forces * np.exp(distance @ tangent.slopes))
 
     def predict_many(self, coordinates: Sequence[Array], steps: int | None = None) -> list[Prediction | None]:
-        """Predict at several x by the tangent; None where that fails."""
+        """Predict at several x as `predict_one` does."""
         return [self.predict_one(x, steps) for x in coordinates]
 
     def predict_coarse(self, x: Array, halvings: int) -> Prediction | None:
@@ -245,14 +258,22 @@ def search_by_curve(runs: CurveRuns, misfit: Misfit, start: Array, first: Predic
     """
     search = Search(runs, misfit)
     solution = _descend(runs, misfit, _scaled(runs, misfit, start, first), by_tests=False)
+    starts = []
     if not search.fits_well(solution):
-        candidates = []
+        costs = []
         for x in search.alternative_starts():
             if (predicted := runs.predict_coarse(x, 0)) is not None:
-                candidates.append((misfit.cost(misfit.residuals(predicted, solution.scales)), x.tolist()))
-        for _, x in sorted(candidates)[:2]:
-            solution = min(solution, _descend(runs, misfit, np.array(x), by_tests=False), key=lambda each: each.cost)
-        runs.set_tangent(solution.x)
+                costs.append((misfit.cost(misfit.residuals(predicted, solution.scales)), x.tolist()))
+        starts = [np.array(x) for _, x in sorted(costs)[:2]]
+    # Beyond the forces measured, a lock or factor has no effect, but may have a better value where it has.
+    information = np.linalg.norm(misfit.scaled(search.jacobian(solution), solution.scales), axis=0)
+    for n in np.flatnonzero(runs.of_curve & (information < MIN_INFORMATION)):
+        starts.append(solution.x.copy())
+        starts[-1][n] = max(start[n] - 1, runs.job.parameters[n].limits[0])
+    for x in starts:
+        with suppress(SceneError, DivergedError):
+            solution = min(solution, _descend(runs, misfit, x, by_tests=False), key=lambda each: each.cost)
+    runs.set_tangent(solution.x)
     solution = _descend(runs, misfit, solution.x, by_tests=True)
     runs.correct(solution.x, solution.predicted)
     return Search(runs, misfit), solution

@@ -44,8 +44,8 @@ CONTACT_NOISES = 5.0
 FORCE_ACCURACY = 1e-5
 
 # A contact is late if 5 noises are more than this share of the peak, and force and depth of the rows of the noise have
-# a larger rank correlation: of 10 independent ones, it has a probability of 0.002.
-MIN_LATE_SHARE, MIN_LATE_CORRELATION = 0.01, 0.7
+# a larger rank correlation: of 10 independent ones, it has a probability of 0.015.
+MIN_LATE_SHARE, MIN_LATE_CORRELATION = 0.01, 0.55
 
 
 @dataclass(frozen=True, eq=False)
