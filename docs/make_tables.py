@@ -1,4 +1,4 @@
-"""Write the tables that come from the program's own words into the pages: keys and outputs.
+"""Write the tables that come from the program's own words into the pages: keys, outputs, camera files.
 
 python docs/make_tables.py
 """
@@ -6,11 +6,14 @@ python docs/make_tables.py
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from taichi_msm.camera_files import calibrations, trajectories
+from taichi_msm.camera_files.calibration import CalibrationReader
+from taichi_msm.camera_files.trajectory import TrajectoryReader
 from taichi_msm.load.scene_file import schema
 from taichi_msm.scene.outputs import OUTPUTS
 from taichi_msm.scene.section import Section
@@ -57,7 +60,7 @@ def window_keys() -> str:
 def outputs(*sources: str) -> str:
     """Give the table of the outputs with these sources."""
     chosen = [output for output in OUTPUTS.values() if output.source in sources]
-    lines = [f"| `{output.name}` | `{output.file}` | {output.description} |" for output in chosen]
+    lines = [f"| `{output.entry}` | `{output.file}` | {output.description} |" for output in chosen]
     return "| `output` | file (that of frame 0) | what it holds |\n|---|---|---|\n" + "\n".join(lines) + "\n"
 
 
@@ -72,12 +75,20 @@ def model_keys(model: type[Section], *titles: str) -> str:
     return f"| {' | '.join(titles)} |\n|{'---|' * len(titles)}\n" + "\n".join(lines) + "\n"
 
 
+def readers(table: Sequence[CalibrationReader] | Sequence[TrajectoryReader]) -> str:
+    """Give the table of readers of camera files."""
+    lines = [f"| {reader.name} | {reader.recognised_by} |" for reader in table]
+    return "| format | recognised by |\n|---|---|\n" + "\n".join(lines) + "\n"
+
+
 # What makes each table, by its page and its name there.
 TABLES: dict[tuple[str, str], Callable[[], str]] = {
     ("keys", "keys"): scene_keys,
     ("view", "hands"): window_keys,
     ("sweep", "sweep keys"): partial(model_keys, SweepSettings, "key", "meaning", "value", "default"),
     ("sweep", "distributions"): partial(model_keys, Distribution, "way", "how the key varies", "value"),
+    ("cameras", "calibrations"): partial(readers, calibrations.READERS),
+    ("cameras", "trajectories"): partial(readers, trajectories.READERS),
     ("files", "outputs"): partial(outputs, "picture", "positions", "forces"),
     ("labels", "labels"): partial(outputs, "labels", "flow", "stereo", "tracks"),
 }

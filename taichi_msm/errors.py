@@ -120,6 +120,15 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
+# Limit of the length of a value in a message.
+MAX_VALUE_LENGTH = 60
+
+
+def truncate(text: str) -> str:
+    """Truncate a text to the length of a value in a message."""
+    return text if len(text) <= MAX_VALUE_LENGTH else text[:MAX_VALUE_LENGTH] + "..."
+
+
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """Return a hint for a message about an unknown name: the most similar of the known names, or an empty text."""
     # Imported here, as it is needed only for a message.

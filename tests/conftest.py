@@ -28,8 +28,13 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--write-messages", action="store_true", help="write tests/messages.yaml in place of comparing")
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the files that take longest, so that no worker ends long before the other."""
+    """Mark all but the default cases as slow, and begin with the files that take longest."""
+    for item in items:
+        chosen = item.get_closest_marker("default_cases")
+        if isinstance(item, pytest.Function) and chosen and item.callspec.id not in chosen.args:
+            item.add_marker(pytest.mark.slow)
     items.sort(key=lambda item: item.path.stem not in LONGEST)
 
 

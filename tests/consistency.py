@@ -45,14 +45,13 @@ AGREEMENTS = {
     "occluded": Agreement("`tracks`: `occluded` and the line of sight", "share of tracks", 0.0),
     "position": Agreement("`tracks`: `position` and depth, back through the lens", "m", 1e-6),
     "chain": Agreement("`tracks`: `points` and ten flows in turn", "px", 0.1),
-    "stereo": Agreement("flow to a second camera and the point, projected there", "px", 1e-5),
-    "disparity": Agreement("flow to a second camera and -fx baseline / depth, without distortion", "px", 1e-4),
-    "stereo occlusion": Agreement("occlusion in a second camera and the line of sight", "share of pixels", 0.0),
+    "stereo": Agreement("`stereo` and the point, projected in the other picture", "px", 1e-5),
+    "disparity": Agreement("`stereo` and `disparity`, without distortion", "px", 1e-4),
+    "stereo occlusion": Agreement("`stereo-occlusion` and the line of sight", "share of pixels", 0.0),
 }
 
 WIDTH, HEIGHT, POINTS, REFINE, SIDE = 120, 90, 13, 1, 0.1
 RADIUS, LENGTH, SHAFT = 0.007, 0.08, np.array([0.3, 0.5, 0.9])
-BASELINE = 0.005
 
 PLACE = {"eye": [0.03, -0.06, 0.1], "target": [0, 0, 0.01]}
 INTRINSICS = {"fx": 97.0, "fy": 96.0, "cx": 58.2, "cy": 45.6}
@@ -67,8 +66,18 @@ CAMERAS: dict[str, Any] = {
     "moving": {**PLACE, "eye": SWAY, "intrinsics": INTRINSICS, "distortion": RATIONAL},
 }
 
-# Those whose flow to the same camera beside it is compared.
-STEREO = ("intrinsics", "rational")
+# The cameras that are beside some of them, as OpenCV's stereoCalibrate finds them or parallel.
+STEREO: dict[str, dict[str, Any]] = {
+    "intrinsics": {"beside": "left", "baseline": 0.005},
+    "rational": {
+        "beside": "left",
+        # From the other side, where the tool hides itself and the fold hides its tip.
+        "rotation": cv2.Rodrigues(np.array([-0.24, 1.26, 1.24]))[0].tolist(),
+        "translation": [-0.065, -0.081, 0.064],
+        "intrinsics": {"fx": 101.0, "fy": 102.0, "cx": 57.0, "cy": 43.0},
+        "distortion": {"k1": -0.3, "k2": 0.09, "p1": -0.001},
+    },
+}
 
 # The frames that are compared, while the sheet is pulled over itself; there is one after each.
 FRAMES = (5, 9)
@@ -127,10 +136,6 @@ class Camera(NamedTuple):
         place = self.unproject(pixels)
         there = np.concatenate([place * depth[:, None] if self.pinhole else place, depth[:, None]], axis=1)
         return np.asarray((there - self.shift) @ self.turn)
-
-    def beside(self, baseline: float) -> Camera:
-        """The same camera, moved along its x axis [m]."""
-        return self._replace(shift=self.shift - [baseline, 0, 0])
 
 
 def read_camera(written: dict[str, Any], frame: int) -> Camera:
@@ -367,27 +372,62 @@ def fetched(values: Array, pixels: Array) -> tuple[Array, Array]:
 
 
 def of_stereo(files: Files, name: str, threads: int) -> Found:
-    """Flow from one camera of CAMERAS to the same one beside it, within one frame."""
-    optics = {key: value for key, value in CAMERAS[name].items() if key not in PLACE}
-    pose = np.array(files.written["pose"])
-    both = [
-        {**optics, "pose": {"rotation": pose[:, :3].tolist(), "translation": (pose[:, 3] - [away, 0, 0]).tolist()}}
-        for away in (0, BASELINE)
-    ]
-    with Simulation(scene(CAMERAS[name]), threads=threads) as simulation:
+    """The labels of a pair: one of CAMERAS, and the one of STEREO that is beside it."""
+    beside = STEREO[name]
+    render = {"size": [WIDTH, HEIGHT], "refine": REFINE, "cameras": {"left": CAMERAS[name], "right": beside}}
+    output = ["stereo", *(["disparity"] if "baseline" in beside else [])]
+    pair = Scene.model_validate({**scene(CAMERAS[name]).model_dump(exclude={"render"}), "render": render})
+    with Simulation(pair.model_copy(update={"output": output}), threads=threads) as simulation:
         for frame in FRAMES:
-            at = {"positions": files.positions[frame], "time": float(files.time[frame])}
-            left = simulation.labels(both[0], **at)
-            flow, occlusion = simulation.flow(left, both[1], **at)
-            sheet, right = np.isfinite(left.coordinates[..., 0]), files.camera(frame).beside(BASELINE)
-            shown = material(files.vertices[frame], left.coordinates[sheet].astype(float))
-            yield "stereo", far(centres()[sheet] + flow[sheet], right.pixels(shown))
-            hidden = files.hidden(shown, frame, right)
-            assert hidden.any()
-            yield "stereo occlusion", float(np.mean((occlusion[sheet] == 255) != hidden))
-            if "distortion" not in optics:
-                across = files.written["calibration"][0][0] * BASELINE / left.depth[sheet].astype(float)
-                yield "disparity", far(flow[sheet], np.stack([-across, 0 * across], axis=1))
+            seen = simulation.observe(None, "left", files.positions[frame], float(files.time[frame]))
+            assert seen.labels is not None
+            assert seen.stereo is not None
+            stereo, covered = seen.stereo.stereo, seen.stereo.stereo_occlusion
+            assert stereo is not None
+            assert covered is not None
+            left, depth = files.camera(frame), seen.labels.depth.astype(float)
+            right = read_camera(right_of(files.written, beside), frame)
+            sheet, tool = np.isfinite(seen.labels.coordinates[..., 0]), seen.labels.instrument > 0
+            shown = material(files.vertices[frame], seen.labels.coordinates[sheet].astype(float))
+            metal, outside = on_rod(left, centres()[tool], depth[tool], files.middles[frame])
+            for part, points, bare in ((sheet, shown, shown), (tool, metal, outside)):
+                known = stereo[part][:, 0] < 1e9  # within the limit of the lens
+                yield "stereo", far(centres()[part][known] + stereo[part][known], right.pixels(points[known]))
+                hidden = ~known
+                hidden[known] = files.hidden(bare[known], frame, right)
+                assert hidden.any() or "baseline" in beside
+                yield "stereo occlusion", float(np.mean((covered[part] == 255) != hidden))
+            assert (stereo[~sheet & ~tool] == 1e10).all()
+            assert not covered[~sheet & ~tool].any()
+            if seen.stereo.disparity is not None:
+                across = seen.stereo.disparity[depth > 0]
+                yield "disparity", far(stereo[depth > 0], np.stack([-across, 0 * across], axis=1))
+
+
+def on_rod(camera: Camera, pixels: Array, depth: Array, middle: Array) -> tuple[Array, Array]:
+    """The points of the rod at pixels, from their depths in f32 by Newton's method; and points just outside it."""
+    axis = SHAFT / np.linalg.norm(SHAFT)
+    eye, beyond = (camera.points(pixels, np.full(len(depth), far)) for far in (0.0, 1.0))
+    for _ in range(4):
+        away = eye + depth[:, None] * (beyond - eye) - middle
+        foot = np.clip(away @ axis, 0, LENGTH)[:, None] * axis
+        distance = np.linalg.norm(away - foot, axis=1)
+        depth = depth - (distance - RADIUS) * distance / ((away - foot) * (beyond - eye)).sum(axis=1)
+    return middle + away, middle + foot + (away - foot) * (1 + 1e-7)
+
+
+def right_of(left: dict[str, Any], beside: dict[str, Any]) -> dict[str, Any]:
+    """What camera.json of the camera beside another one must say: X_right = R X_left + T."""
+    if "baseline" in beside:
+        rotation, translation, lens = np.eye(3), np.array([-beside["baseline"], 0, 0]), {}
+    else:
+        rotation, translation = np.array(beside["rotation"]), np.array(beside["translation"])
+        fx, fy, cx, cy = beside["intrinsics"].values()
+        distortion = [beside["distortion"].get(key, 0.0) for key in ("k1", "k2", "p1", "p2")]
+        lens = {"calibration": [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], "model": "pinhole", "distortion": distortion}
+    pose = rotation @ np.array(left["pose"])
+    pose[:, 3] += translation
+    return {**left, **lens, "pose": pose.tolist()}
 
 
 def measured(folder: Path, name: str, threads: int) -> dict[str, float]:

@@ -85,6 +85,7 @@ def test_a_peer_that_is_not_installed_is_skipped_with_its_word(message: Messages
     assert there.samples
 
 
+@pytest.mark.slow
 def test_a_measurement_is_a_process_of_its_own(monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
     with pytest.raises(process.FailedError, match="TypeError"):
         process.call("json:dumps", nothing=1)

@@ -195,7 +195,7 @@ def test_all_parts_of_a_scene_are_exported() -> None:
 
 def test_everything_has_its_row() -> None:
     results, labels = table(DOCS / "files.md", "outputs"), table(DOCS / "labels.md", "labels")
-    assert words(results) + words(labels) == list(OUTPUTS)
+    assert words(results) + words(labels) == [output.entry for output in OUTPUTS.values()]
     assert sorted(words(table(DOCS / "files.md", "record"))) == sorted(get_type_hints(RunRecord))
     assert words(table(DOCS / "error.md", "estimate")) == list(get_type_hints(ErrorRecord))
     assert sorted(words(table(DOCS / "export.md", "formats"))) == sorted(FORMATS)
@@ -220,9 +220,10 @@ def test_every_command_is_understood() -> None:
             cli_options.program.commands[name].make_context(name, arguments)
 
 
-def test_the_commands_work(small_scenes: Path, program: Program) -> None:
+@pytest.mark.parametrize("pages", [WITH_COMMANDS[:3], pytest.param(WITH_COMMANDS, marks=pytest.mark.slow)])
+def test_the_commands_work(pages: list[Path], small_scenes: Path, program: Program) -> None:
     seen = set()
-    for page in WITH_COMMANDS:
+    for page in pages:
         for arguments in commands(page):
             opens_a_window = arguments[0] == "view" and "--record" not in arguments
             needs_a_session = any("session-1" in word for word in arguments)
@@ -235,9 +236,11 @@ def test_the_commands_work(small_scenes: Path, program: Program) -> None:
             fast = arguments[0] == "run" and page.stem != "error" and len(seen) > 1
             done = program(*arguments, *(["--no-estimate"] if fast else []))
             assert done.returncode == 0, (arguments, done.stderr)
-    exec(blocks(DOCS / "sweep.md", "python")[0], {})
+    if DOCS / "sweep.md" in pages:
+        exec(blocks(DOCS / "sweep.md", "python")[0], {})
 
 
+@pytest.mark.slow
 def test_the_python_shown_runs(
     examples_folder: Path, program: Program, capfd: pytest.CaptureFixture[str], message: Messages
 ) -> None:
@@ -255,13 +258,22 @@ def test_the_python_shown_runs(
     assert Path("output/from-python/animation.gif").exists()
 
 
-def test_the_way_from_pixels_to_points_is_exact(small: Path) -> None:
-    lens = "intrinsics: {fx: 40, fy: 40, cx: 20, cy: 15}, distortion: {k1: -0.3, k2: 0.1, p1: 0.001}"
-    settings = [f"render.camera={{eye: [0, 0, 0.25], {lens}}}", "output=[depth]", "render.supersample=1"]
+def test_the_ways_from_pixels_to_points_are_exact(small: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    left = "intrinsics: {fx: 40, fy: 40, cx: 20, cy: 15}, distortion: {k1: -0.3, k2: 0.1, p1: 0.001}"
+    right = "intrinsics: {fx: 42, fy: 41, cx: 19, cy: 14}, distortion: {k1: -0.2, p2: 0.001}"
+    place = "beside: left, rotation: [[0.9992, 0, 0.04], [0, 1, 0], [-0.04, 0, 0.9992]], translation: [-0.02, 0.002, 0]"
+    cameras = f"render.cameras={{left: {{eye: [0, 0, 0.25], {left}}}, right: {{{place}, {right}}}}}"
+    settings = [cameras, "output=[depth, stereo]", "render.supersample=1"]
     run(load_scene("small.yaml", settings), "out")
+    (pair,) = [block for block in blocks(DOCS / "labels.md", "py") if "stereoRectify" in block]
+    exec(pair.replace("output/pair", "out"), {})
+    row, depth = map(float, capfd.readouterr().out.split())
+    # Coordinates in f32 are good to 3e-5 px, and that of 0.25 m, of which 3 px of disparity tell.
+    assert row < 1e-4
+    assert depth < 1e-5
     (shown,) = [block for block in blocks(DOCS / "labels.md", "py") if "projectPoints" in block]
     found: dict[str, Any] = {}
-    exec(shown.replace("output/grasp", "out"), found)
+    exec(shown.replace("output/grasp", "out/left"), found)
     pixels = np.stack([found["columns"], found["rows"]], axis=-1)
     assert len(pixels) > 500, "the sheet fills the picture"
     # 2e-3 with OpenCV's five iterations.

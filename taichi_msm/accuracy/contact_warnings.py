@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions, spacing
-from taichi_msm.model.tools import Tool, capsule_tools
+from taichi_msm.model.tools import Tool, touching_tools
 from taichi_msm.solver.state import RunProgress
 
 # At a larger depth of a tip, in radii of the tip, the mass points of a soft sheet slide off sideways.
@@ -20,14 +20,15 @@ MAX_INDENTATION_RATIO = 1 / 5
 def tool_contact_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
     """Warn about tools that slide through a soft sheet, and about the first tool that pierced the sheet."""
     membrane, foundation = _stiffnesses(plan)
-    for tool in capsule_tools(plan.tools):
+    remedy = "take friction: rough, " if plan.scene.time.at_rest else ""
+    for tool in (tool for tool in touching_tools(plan.tools) if not tool.rough):
         depth, limit = _max_depth(tool, plan.scene.time.duration), MAX_INDENTATION_RATIO * tool.radius
         if membrane < (support := foundation * tool.radius**2) and depth > limit * (1 + 1e-9):
             yield (
                 f"probes.{tool.probe}: the sheet slides off the tip sideways, and its force is too small: the sheet "
                 f"resists stretching by {membrane:.3g} N/m (young x thickness), less than the foundation under the "
                 f"tip, {support:.3g} N/m (foundation x radius^2), and the tip goes {1000 * depth:.3g} mm deep, more "
-                f"than a fifth of its radius, {1000 * limit:.3g} mm; press less deep, or with a wider tip"
+                f"than a fifth of its radius, {1000 * limit:.3g} mm; {remedy}press less deep, or with a wider tip"
             )
     for tool in plan.tools:
         if tool.probe == progress.pierced_by - 1:
@@ -54,7 +55,7 @@ def first_piercing_probe(plan: Plan, displacement: NDArray[np.floating], frame: 
     if not plan.has_contact:
         return 0
     position, time = rest_positions(plan.scene.sheet) + displacement, frame / plan.grid.frames_per_second
-    return next((tool.probe + 1 for tool in capsule_tools(plan.tools) if _pierces(tool, position, time)), 0)
+    return next((tool.probe + 1 for tool in touching_tools(plan.tools) if _pierces(tool, position, time)), 0)
 
 
 def _pierces(tool: Tool, position: NDArray[np.floating], time: float) -> bool:

@@ -103,6 +103,9 @@ class DivergenceMonitor:
             self.progress = RunProgress(
                 frame=frame,
                 max_displacement=max(progress.max_displacement, extreme.distance),
+                max_displacement_frame=(
+                    frame if extreme.distance > progress.max_displacement else progress.max_displacement_frame
+                ),
                 shortest_spring=min(progress.shortest_spring, reading.shortest_spring),
                 longest_spring=max(progress.longest_spring, reading.longest_spring),
                 energy=reading.energy,

@@ -59,10 +59,10 @@ class PathDependence:
         self._jumps: dict[int, float] = {}
         self._equal_load_distances: dict[int, float] = {}
         self._second_distances: dict[int, float] = {}
-        # Tissue that relaxes creeps under equal loads, and depends on their history in any case.
-        self._relaxes = bool(plan.material.relaxation)
+        # Tissue that relaxes, and mass points that stick to tools, depend on the history of the loads in any case.
+        self._has_history = bool(plan.material.relaxation) or any(tool.rough for tool in plan.tools)
         nodes = (plan.grid.frames + 1) * math.prod(plan.scene.sheet.points)
-        compares = nodes <= MAX_COMPARED_NODES and not self._relaxes
+        compares = nodes <= MAX_COMPARED_NODES and not self._has_history
         self._by_load: dict[tuple[int, ...], Array] | None = {} if compares else None
 
     def check_frame(self, frame: int, displacement: Array) -> None:
@@ -90,7 +90,7 @@ class PathDependence:
 
     def finish(self, device: Device, cores: int | None, pause: Pause) -> None:
         """Solve the most displaced frame, one after it and the last frame a second time, see `second_solution`."""
-        if self._largest == 0 or self._relaxes:
+        if self._largest == 0 or self._has_history:
             return
         for frame, displacement in dict(filter(None, (self._most_displaced, self._unloaded, self._previous))).items():
             second = second_solution(self._plan, frame, device, cores, pause)

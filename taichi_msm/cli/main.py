@@ -9,7 +9,7 @@ from pathlib import Path
 
 import click
 
-from taichi_msm.cli import export, fit, run, study, sweep  # noqa: F401  # each registers its commands
+from taichi_msm.cli import example, export, fit, run, study, sweep  # noqa: F401  # each registers its commands
 from taichi_msm.cli.options import program
 from taichi_msm.cli.session import BUG, DONE, FILES, INVALID_INPUT, report_failure
 from taichi_msm.errors import (

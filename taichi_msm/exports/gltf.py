@@ -1,4 +1,4 @@
-"""glTF 2.0 export: the animated surface and its picture in a single file.
+"""glTF 2.0 export: the animated surface with its picture, the tools and the cameras in a single file.
 
 The mesh is the surface in the first frame. Every other frame is a morph target: the differences of vertices and normals
 from the mesh. In the animation, the weight of a target is 1 at its frame and 0 at the adjacent ones, with linear
@@ -7,16 +7,12 @@ interpolation. Like this package, glTF uses metres, y up, and texture coordinate
 Browsers store each target in a layer of a texture, and WebGL 2 guarantees 256 layers. Runs that exceed this, or the
 size limit, are reduced to keyframes, and the largest interpolation error is reported.
 
-Source: the glTF 2.0 specification of Khronos, sections 3.6 (accessors), 3.7.2.2 (morph targets), 3.11 (animations) and
-4.4 (GLB).
+Source: the glTF 2.0 specification of Khronos, sections 3.7.2.2 (morph targets) and 3.11 (animations).
 """
 
 from __future__ import annotations
 
 import heapq
-import json
-import struct
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,6 +21,8 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import ProgressCallback
 from taichi_msm.exports.formats import one_folder_per_run
+from taichi_msm.exports.glb import GL_ARRAY_BUFFER, GL_ELEMENT_ARRAY_BUFFER, BinaryChunk
+from taichi_msm.exports.gltf_nodes import add_cameras, add_tools
 from taichi_msm.exports.inputs import EXPORT_REFINE, picture_png, unit_normals
 from taichi_msm.model.surface import refine_surface
 from taichi_msm.runs.directory import create_file
@@ -39,19 +37,10 @@ TARGET_VERTEX_BYTES = 2 * 3 * 4  # differences of position and normal, float32
 # Constants of OpenGL for texture filtering and wrapping.
 GL_LINEAR, GL_LINEAR_MIPMAP_LINEAR, GL_CLAMP_TO_EDGE = 9729, 9987, 33071
 
-COMPONENT_TYPES = {"f": 5126, "u": 5125}  # float32, uint32
-ACCESSOR_TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3"}
-
-# Constants of OpenGL for buffers of vertices and of vertex indices.
-GL_ARRAY_BUFFER, GL_ELEMENT_ARRAY_BUFFER = 34962, 34963
-
-# Alignment of chunks and buffer views.
-ALIGNMENT_BYTES = 4
-
 
 @one_folder_per_run
 def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    """Write the animated surface of a run with its picture; arguments as for `one_folder_per_run`.
+    """Write the animated surface of a run with its picture, tools and cameras; arguments as for `one_folder_per_run`.
 
     Raises:
         FilesError: as for `FinishedRun.positions`.
@@ -80,13 +69,17 @@ def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[st
         mesh["weights"] = [0.0] * len(targets)
         mesh["extras"] = {"targetNames": [f"{time:g} s" for time in times[1:]], "error": keys.error}
         document["animations"] = [_animation(times.astype(np.float32), binary)]
+    document["meshes"] = [mesh]
+    add_tools(document, run, positions, binary)
+    notes = add_cameras(document, run, binary)
     with create_file(folder / "surface.glb") as file:
-        file.writelines(binary.container({**document, "meshes": [mesh]}))
+        file.writelines(binary.container(document))
     if len(keys.frames) == run.frames:
-        return []
+        return notes
     return [
+        *notes,
         f"{len(keys.frames)} of {run.frames} frames are key frames; between them no point is farther than "
-        f"{keys.error:.2g} m from where it was"
+        f"{keys.error:.2g} m from where it was",
     ]
 
 
@@ -203,74 +196,3 @@ def _worst_frame(position: NDArray[np.floating], first: int, last: int) -> _Span
         error = position[frame] - (start + fraction * (end - start))
         worst = min(worst, _Span(-float(np.linalg.norm(error, axis=-1).max()), frame, first, last))
     return worst
-
-
-class BinaryChunk:
-    """Binary chunk of a .glb file.
-
-    The container, a header of 12 bytes and two chunks, is too simple to justify a dependency on pygltflib.
-    """
-
-    def __init__(self) -> None:
-        self._views: list[dict[str, Any]] = []
-        self._accessors: list[dict[str, Any]] = []
-        self._parts: list[bytes | memoryview] = []
-        self._length = 0
-
-    def view(self, data: bytes | memoryview, target: int | None = None) -> int:
-        """Append bytes.
-
-        Args:
-            data: content of the view.
-            target: GL_ARRAY_BUFFER or GL_ELEMENT_ARRAY_BUFFER; None for other data.
-
-        Returns:
-            Index of the buffer view.
-        """
-        view = {"buffer": 0, "byteOffset": self._length, "byteLength": len(data)}
-        self._views.append(view if target is None else {**view, "target": target})
-        self._parts += [data, _padding(len(data), b"\0")]
-        self._length += _aligned_length(len(data))
-        return len(self._views) - 1
-
-    def accessor(self, values: NDArray[Any], target: int | None = None, *, bounds: bool = False) -> int:
-        """Append numbers.
-
-        Args:
-            values: float32 or uint32, shape (n,) or (n, k), k = 1 to 3.
-            target: as for `view`.
-            bounds: whether to store the minimum and maximum.
-
-        Returns:
-            Index of the accessor.
-        """
-        rows = np.ascontiguousarray(values).reshape(len(values), -1)
-        accessor = {
-            "bufferView": self.view(rows.data.cast("B"), target),
-            "componentType": COMPONENT_TYPES[rows.dtype.kind],
-            "count": len(rows),
-            "type": ACCESSOR_TYPES[rows.shape[1]],
-        }
-        if bounds:
-            accessor |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
-        self._accessors.append(accessor)
-        return len(self._accessors) - 1
-
-    def container(self, document: dict[str, Any]) -> Iterator[bytes | memoryview]:
-        """Yield the content of a .glb file with this chunk and a JSON document that refers to it."""
-        buffers = {"accessors": self._accessors, "bufferViews": self._views, "buffers": [{"byteLength": self._length}]}
-        text = json.dumps({**document, **buffers}, separators=(",", ":"), allow_nan=False).encode()
-        text += _padding(len(text), b" ")
-        yield struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + self._length)
-        yield struct.pack("<I4s", len(text), b"JSON")
-        yield text
-        yield struct.pack("<I4s", self._length, b"BIN\0")
-        yield from self._parts
-
-
-def _aligned_length(length: int) -> int:
-    return -(-length // ALIGNMENT_BYTES) * ALIGNMENT_BYTES
-
-
-def _padding(length: int, filler: bytes) -> bytes:
-    return filler * (_aligned_length(length) - length)

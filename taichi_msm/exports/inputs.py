@@ -16,6 +16,7 @@ from PIL import Image
 
 from taichi_msm.errors import ArgumentError
 from taichi_msm.exports.formats import ANY_CAMERA, FORMATS
+from taichi_msm.model.surface import Solid, refine_surface
 from taichi_msm.render.texture import load_texture
 from taichi_msm.runs.arrays import read_rows
 from taichi_msm.runs.directory import MAX_RECORD_BYTES
@@ -185,3 +186,29 @@ def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
         if not (np.isfinite(matrix).all() and (focal > 0).all()):
             raise damaged_result(path)
     return Pinhole(focal, centre, poses)
+
+
+# Segments of the mesh of an instrument around its axis.
+SEGMENTS = 32
+
+
+def instrument_mesh(
+    solid: Solid,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int32]]:
+    """Triangulate an instrument around the origin in place of its tip.
+
+    Returns:
+        Vertices [m] and unit normals, shape (vertices, 3); triangles, counter-clockwise from outside, shape (n, 3).
+    """
+    axis = solid.axis
+    across = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    across /= np.linalg.norm(across)
+    around = np.linspace(0, 2 * np.pi, SEGMENTS + 1)
+    radial = np.cos(around)[:, None] * across + np.sin(around)[:, None] * np.cross(axis, across)
+    along, outward, *normal = solid.shape.profile(solid.length, solid.radius).T[..., None, None]
+    surface = refine_surface(outward * radial + along * axis, 0)
+    corners = surface.vertices[surface.triangles]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
+    # On the axis, one triangle of each quad has no area.
+    triangles: NDArray[np.int32] = surface.triangles[area > 1e-9 * area.max()]
+    return surface.vertices.astype(np.float64), (normal[1] * radial + normal[0] * axis).reshape(-1, 3), triangles

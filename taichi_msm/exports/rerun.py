@@ -25,8 +25,15 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import NotInstalledError, ProgressCallback
 from taichi_msm.exports.formats import FORMATS, ExportSource
-from taichi_msm.exports.inputs import EXPORT_REFINE, read_depth, read_picture_file, read_track_positions, unit_normals
-from taichi_msm.model.surface import Capsule, place_capsules, refine_surface
+from taichi_msm.exports.inputs import (
+    EXPORT_REFINE,
+    instrument_mesh,
+    read_depth,
+    read_picture_file,
+    read_track_positions,
+    unit_normals,
+)
+from taichi_msm.model.surface import place_instruments, refine_surface
 from taichi_msm.render.camera import OPENCV_SIGNS, View, calibration, is_moving, view_at
 from taichi_msm.render.labels import NO_FLOW
 from taichi_msm.render.texture import load_texture
@@ -97,8 +104,12 @@ def _log_run(run: FinishedRun, recording: Any, progress: ProgressCallback) -> No
         recording.set_time("frame", sequence=frame)
         recording.set_time("time", duration=time)
         recording.log("world/sheet", _mesh(run, position, is_first=frame == 0))
-        for number, capsule in zip(instruments, place_capsules(run.scene, position, time), strict=True):
-            recording.log(f"world/tools/{number}", _capsule(capsule))
+        for number, solid in zip(instruments, place_instruments(run.scene, position, time), strict=True):
+            if frame == 0:
+                vertices, normals, triangles = instrument_mesh(solid)
+                mesh = rerun.Mesh3D(vertex_positions=vertices, vertex_normals=normals, triangle_indices=triangles)
+                recording.log(f"world/tools/{number}", mesh, static=True)
+            recording.log(f"world/tools/{number}", rerun.Transform3D(translation=solid.tip))
         if tracks is not None:
             recording.log("world/tracks", rerun.Points3D(tracks[:, frame], colors=_colours(len(tracks))))
         for entity, each in views.items():
@@ -121,17 +132,6 @@ def _mesh(run: FinishedRun, position: NDArray[np.floating], *, is_first: bool) -
         return rerun.Mesh3D(**vertices)
     picture = load_texture(run.scene, run.sha256.get("image", ""))
     return rerun.Mesh3D(**vertices, vertex_texcoords=surface.texture_coordinates, albedo_texture=picture)
-
-
-def _capsule(capsule: Capsule) -> Any:
-    """Build a capsule; Rerun's begin at the origin, along z."""
-    import rerun
-    from scipy.spatial.transform import Rotation
-
-    rotation, _ = Rotation.align_vectors([capsule.axis], [[0, 0, 1]])
-    return rerun.Capsules3D(
-        lengths=[capsule.length], radii=[capsule.radius], translations=[capsule.tip], quaternions=[rotation.as_quat()]
-    )
 
 
 def _colours(count: int) -> NDArray[np.uint8]:

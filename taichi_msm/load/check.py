@@ -105,7 +105,7 @@ def _replace_faulty(data: dict[str, Any], problems: list[Problem]) -> dict[str, 
     output = data.get("output")
     if "render" in faulty and isinstance(output, list):
         # Without the cameras, an output of a stereo pair cannot be checked.
-        stereo = {name for name, row in OUTPUTS.items() if row.needs_stereo_pair}
+        stereo = {row.entry for row in OUTPUTS.values() if row.needs_stereo_pair}
         data = {**data, "output": [name for name in output if name not in stereo]}
     valid = {name: value for name, value in data.items() if name not in faulty} | {
         name: value for name, value in _REPLACEMENTS.items() if name in faulty

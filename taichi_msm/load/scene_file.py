@@ -12,13 +12,13 @@ from itertools import chain, starmap
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from taichi_msm.errors import ArgumentError, Key, Problem, SceneError
+from taichi_msm.errors import ArgumentError, Key, Problem, SceneError, truncate
 from taichi_msm.images import PICTURE_SUFFIXES, file_sha256, irregular_kind
 from taichi_msm.load.check import validate
 from taichi_msm.load.yaml_reader import MAX_DEPTH, Document, Mark, UnreadableError, mark_at, read_yaml
 from taichi_msm.model.plan import Plan
 from taichi_msm.scene.scene import Scene
-from taichi_msm.scene.section import MAX_PATH, format_value, truncate
+from taichi_msm.scene.section import MAX_PATH, format_value
 
 # Limit of the size of a file.
 MAX_BYTES = 2**20
@@ -129,7 +129,7 @@ def plan_file(
     ):
         raise ArgumentError(f'overrides: {overrides!r}; take ["sheet.points=[61,61]"] or {{"sheet.points": [61, 61]}}')
     draft = Draft(file)
-    if {"scene", "vary"} <= draft.data.keys():
+    if "scene" in draft.data and {"vary", "variables"} & draft.data.keys():
         raise SceneError([f"{file.name}:1:1: a sweep; use `taichi-msm sweep`"])
     parsed = (
         starmap(_parse_value, overrides.items()) if isinstance(overrides, Mapping) else map(parse_override, overrides)

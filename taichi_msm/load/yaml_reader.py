@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from taichi_msm.errors import Key, Problem
-from taichi_msm.scene.section import truncate
+from taichi_msm.errors import Key, Problem, truncate
 
 MAX_DEPTH = 20
 MAX_NODES = 100_000

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from taichi_msm.model.sheet import Maps, Material, has_fixed_border
 from taichi_msm.model.time_grid import TimeGrid
 from taichi_msm.model.tool_force import control_points
-from taichi_msm.model.tools import Clamp, Tool, build_tools, capsule_tools
+from taichi_msm.model.tools import Clamp, Tool, build_tools, touching_tools
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Probe
@@ -111,7 +111,7 @@ class Plan:
     @property
     def has_contact(self) -> bool:
         """Whether mass points can meet and leave a tool."""
-        return bool(capsule_tools(self.tools))
+        return bool(touching_tools(self.tools))
 
     def with_grid(self, **changes: Any) -> Plan:
         """Return a copy with other attributes of the time grid, such as `steps_per_frame` or `precision`."""

@@ -13,6 +13,8 @@ from taichi_msm.model.tools import build_tools, unit_vector
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Instrument
+from taichi_msm.shapes import SHAPES
+from taichi_msm.shapes.shape import Shape
 
 Array = NDArray[np.float64]
 
@@ -128,13 +130,14 @@ class Surface(NamedTuple):
     texture_coordinates: NDArray[np.float64]
 
 
-class Capsule(NamedTuple):
-    """The shape and position of an instrument at a time: a cylinder with hemispherical ends."""
+class Solid(NamedTuple):
+    """The shape and position of an instrument at a time."""
 
-    tip: Array  # centre of the hemisphere that touches the sheet [m], shape (3,)
-    axis: Array  # unit vector from the tip along the cylinder, shape (3,)
-    length: float  # of the cylinder [m]
-    radius: float  # of cylinder and ends [m]
+    tip: Array  # end of the axis at the sheet [m], shape (3,)
+    axis: Array  # unit vector from the tip along the shaft, shape (3,)
+    length: float  # of the axis [m]
+    radius: float  # of the shape [m]
+    shape: Shape = SHAPES["capsule"]
 
 
 def refine_surface(position: NDArray[np.floating], refine: int) -> Surface:
@@ -162,8 +165,8 @@ def refine_surface(position: NDArray[np.floating], refine: int) -> Surface:
     )
 
 
-def place_capsules(scene: Scene, position: NDArray[np.floating], time: float) -> list[Capsule]:
-    """Return a capsule for every probe with an instrument, in the order of the probes.
+def place_instruments(scene: Scene, position: NDArray[np.floating], time: float) -> list[Solid]:
+    """Return a solid for every probe with an instrument, in the order of the probes.
 
     Args:
         scene: the scene.
@@ -177,13 +180,14 @@ def place_capsules(scene: Scene, position: NDArray[np.floating], time: float) ->
             continue
         if index in moved:
             tool = moved[index]
-            placed.append(Capsule(tool.tip_centre(np.array([time]))[0], tool.axis, tool.length, tool.radius))
+            tip = tool.tip_centre(np.array([time]))[0]
+            placed.append(Solid(tip, tool.axis, tool.length, tool.radius, tool.shape))
         else:
-            placed.append(place_capsule(probe.instrument, scene, position, control_point(probe, scene.sheet, time)))
+            placed.append(place_instrument(probe.instrument, scene, position, control_point(probe, scene.sheet, time)))
     return placed
 
 
-def place_capsule(instrument: Instrument, scene: Scene, position: NDArray[np.floating], rest: Array) -> Capsule:
+def place_instrument(instrument: Instrument, scene: Scene, position: NDArray[np.floating], rest: Array) -> Solid:
     """Place the instrument of a force-controlled probe on the surface.
 
     Args:
@@ -195,7 +199,8 @@ def place_capsule(instrument: Instrument, scene: Scene, position: NDArray[np.flo
     axis = unit_vector(instrument.shaft)
     point, normal = surface_point(position, scene.render.refine, scene.sheet, rest)
     outward = normal if normal @ axis >= 0 else -normal
-    return Capsule(point + instrument.radius * outward, axis, instrument.length, instrument.radius)
+    shape, radius = SHAPES[instrument.shape], instrument.outer_radius
+    return Solid(point + shape.tip_height(axis, radius) * outward, axis, instrument.length, radius, shape)
 
 
 def _insert(values: NDArray[np.floating], refine: int, axis: int) -> NDArray[np.floating]:

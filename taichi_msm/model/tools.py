@@ -1,7 +1,7 @@
-"""Position-controlled tools: capsules that touch the sheet along paths, and clamps. Scene: `probes` with `path`.
+"""Position-controlled tools: shapes that touch the sheet along paths, and clamps. Scene: `probes` with `path`.
 
-A capsule consists of all points within `radius` of its axis, c(t) + s a with 0 <= s <= length, where c is the centre of
-its round tip and a the unit vector along its shaft. It can grip the mass points at its tip.
+A shape (`taichi_msm.shapes`) has the axis c(t) + s a with 0 <= s <= length, where c is its tip and a the unit vector
+along its shaft. It can grip the mass points at its tip.
 
 A clamp holds a side of the sheet from the start. It is a tool of radius 0, which touches nothing, and c is its
 displacement.
@@ -17,6 +17,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.arithmetic import NUMPY
 from taichi_msm.errors import Problem
 from taichi_msm.model.sheet import SIDES, fixed_points, fixed_sides, rest_positions, spacing
 from taichi_msm.model.time_grid import TimeGrid
@@ -24,9 +25,11 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import FRAME_TOLERANCE, Side
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.scene.tools import Probe
+from taichi_msm.shapes import SHAPES
+from taichi_msm.shapes.shape import Shape
 
-# Largest displacement of a tool in a step, in radii of the tool.
-MAX_STRIDE_RADII = 0.5
+# The same between two equilibria for a rough tool, whose force depends on where mass points first touch it.
+ROUGH_STRIDE_RADII = 1 / 16
 
 # Largest displacement of a clamp between two equilibria, in lengths of the shortest spring at rest.
 MAX_STRIDE_SPRINGS = 0.5
@@ -55,9 +58,15 @@ class Tool:
     axis: Array  # unit vector a from the tip along the shaft, shape (3,)
     length: float  # of the axis [m]
     radius: float  # of tip and shaft [m]
-    friction: float  # Coulomb's coefficient
+    shape: Shape
+    friction: float  # Coulomb's coefficient; infinite if rough
     grips: tuple[tuple[float, float], ...]  # start and end of every grip [s]
-    stride: float  # largest displacement between two equilibria, and of a capsule in a step [m]
+    stride: float  # largest displacement between two equilibria, and of a shape in a step [m]
+
+    @property
+    def rough(self) -> bool:
+        """Whether the mass points that it touches stick to it."""
+        return self.friction == math.inf
 
     @property
     def path_length(self) -> float:
@@ -93,18 +102,18 @@ class Tool:
         return x, y, z
 
     def touches(self, positions: Array, t: float) -> bool:
-        """Return whether any point lies inside the capsule or, up to rounding, on its surface.
+        """Return whether any point lies inside the shape or, up to rounding, on its surface.
 
         Args:
             positions: points [m], shape (n, 3).
             t: the time [s].
         """
         r = positions - self.tip_centre(np.array([t]))[0]
-        s = np.clip(r @ self.axis, 0, self.length)
-        return bool((np.linalg.norm(r - s[:, None] * self.axis, axis=1) < self.radius * (1 + 1e-6)).any())
+        depth, *_ = self.shape.build_depth(NUMPY)(*r.T, *self.axis, self.length, self.radius)
+        return bool((depth > -1e-6 * self.radius).any())
 
     def substep_times(self, begin: float, end: float) -> Array:
-        """Divide a time interval [s] so that the tool moves by at most its stride in each subinterval.
+        """Divide a time interval [s] so that the tool moves by at most its stride, and if rough straight, in each part.
 
         Returns:
             Ends of the subintervals [s].
@@ -114,7 +123,8 @@ class Tool:
             times = np.linspace(begin, end, count + 1)
             longest = float(np.linalg.norm(np.diff(self.tip_centre(times), axis=0), axis=1).max())
             if longest <= max_stride:
-                return times[1:]
+                bends = self.times[self.rough & (self.times > begin) & (self.times < end)]
+                return np.union1d(times[1:], bends)
             count = max(count + 1, int(count * longest / max_stride))
 
 
@@ -132,8 +142,8 @@ class Clamp(Tool):
         return x, y, z
 
 
-def capsule_tools(tools: Sequence[Tool]) -> list[Tool]:
-    """Return the tools that have a capsule, in their order."""
+def touching_tools(tools: Sequence[Tool]) -> list[Tool]:
+    """Return the tools that have a shape, which touches the sheet, in their order."""
     return [tool for tool in tools if not isinstance(tool, Clamp)]
 
 
@@ -155,10 +165,13 @@ def build_tools(probes: Sequence[Probe], sheet: Sheet) -> tuple[Tool, ...]:
             continue
         assert probe.instrument is not None
         instrument, (time, across, down, heights) = probe.instrument, np.array(probe.path, dtype=float).T
-        tip_centres = np.stack([(across - 0.5) * width, (0.5 - down) * height, heights + instrument.radius], axis=1)
-        shape = unit_vector(instrument.shaft), instrument.length, instrument.radius
-        stride = MAX_STRIDE_RADII * instrument.radius
-        tools.append(Tool(index, time, tip_centres, heights, *shape, probe.friction, probe.grip, stride))
+        shape, axis, radius = SHAPES[instrument.shape], unit_vector(instrument.shaft), instrument.outer_radius
+        tips = heights + shape.tip_height(axis, radius)
+        tip_centres = np.stack([(across - 0.5) * width, (0.5 - down) * height, tips], axis=1)
+        solid = axis, instrument.length, radius, shape
+        friction = math.inf if probe.friction == "rough" else probe.friction
+        stride = min(shape.max_stride, ROUGH_STRIDE_RADII if friction == math.inf else 1) * radius
+        tools.append(Tool(index, time, tip_centres, heights, *solid, friction, probe.grip, stride))
     return tuple(tools)
 
 
@@ -169,9 +182,9 @@ def _build_clamp(probe: int, side: Side, path: Array, sheet: Sheet, earlier: Seq
     for taken in (fixed_points(sheet), *(clamp.points for clamp in earlier)):
         points &= ~taken
     rest_tip = rest_positions(sheet)[points].sum(axis=0) / max(1, points.sum())
-    capsule = np.array([0.0, 0.0, 1.0]), 0.0, 0.0
+    solid = np.array([0.0, 0.0, 1.0]), 0.0, 0.0, SHAPES["capsule"]
     stride = MAX_STRIDE_SPRINGS * min(spacing(sheet))
-    return Clamp(probe, path[:, 0], path[:, 1:], path[:, 3], *capsule, 0.0, (), stride, side, points, rest_tip)
+    return Clamp(probe, path[:, 0], path[:, 1:], path[:, 3], *solid, 0.0, (), stride, side, points, rest_tip)
 
 
 def unit_vector(shaft: Sequence[float]) -> Array:
@@ -194,13 +207,16 @@ def path_problems(scene: Scene, tools: Sequence[Tool], grid: TimeGrid) -> Iterat
         if isinstance(tool, Clamp):
             yield from _clamp_problems(tool, scene)
             continue
-        depth = tool.radius - distance_to_sheet(tool, scene.sheet)
+        depth = -gap_to_sheet(tool, scene.sheet)
         if depth > 1e-9 * tool.radius:
             text = f"the instrument is {depth:.3g} m in the sheet at rest at 0 s; begin above it, at a greater height"
             yield Problem(key, text)
+        if tool.rough and not scene.time.at_rest:
+            text = "rough needs time.motion: quasistatic; give Coulomb's coefficient, such as 0.3"
+            yield Problem(("probes", tool.probe, "friction"), text)
         if scene.time.at_rest:
-            if tool.friction > 0:
-                text = f"{tool.friction:g} needs time.motion: dynamic, as at rest nothing slides; remove friction"
+            if 0 < tool.friction < math.inf:
+                text = f"{tool.friction:g} needs time.motion: dynamic, as at rest nothing slides; take rough or 0"
                 yield Problem(("probes", tool.probe, "friction"), text)
         elif fault := too_fast(tool, grid):
             yield Problem((*key, fault[0]), fault[1])
@@ -235,7 +251,7 @@ def too_fast(tool: Tool, grid: TimeGrid, first: int = 0) -> tuple[int, str] | No
     if isinstance(tool, Clamp) or stride <= tool.stride * (1 + 1e-9):
         return None
     return key, (
-        f"moves {stride:.3g} m in a step of {grid.step:.3g} s, over half the radius of its "
+        f"moves {stride:.3g} m in a step of {grid.step:.3g} s, over {tool.shape.max_stride:g} of the radius of its "
         f"instrument; move at most {tool.stride / grid.step:.3g} m/s, or take a smaller step"
     )
 
@@ -253,7 +269,7 @@ def min_steps_per_frame(tools: Sequence[Tool], grid: TimeGrid, least: int) -> in
         return tool.max_stride(1 / grid.frames_per_second / least)[0] / tool.stride
 
     # With n times the steps, the largest displacement in a step is at least 1 / n of the previous one.
-    while (ratio := max(map(speed_ratio, capsule_tools(tools)), default=0.0)) > 1 + 1e-9:
+    while (ratio := max(map(speed_ratio, touching_tools(tools)), default=0.0)) > 1 + 1e-9:
         least = max(least + 1, math.ceil(least * ratio * (1 - 1e-9)))
     return least
 
@@ -298,7 +314,7 @@ def path_warnings(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:
 
 
 def overlap(tools: Sequence[Tool], duration: float) -> tuple[int, int, float] | None:
-    """Find two tools that intersect, at 1025 equidistant times.
+    """Find two capsules that intersect, at 1025 equidistant times.
 
     Args:
         tools: the position-controlled tools.
@@ -308,7 +324,7 @@ def overlap(tools: Sequence[Tool], duration: float) -> tuple[int, int, float] | 
         The indices of their probes, and the first time [s]; None if no tools intersect.
     """
     times = np.linspace(0, duration, 1025)
-    for a, b in combinations(capsule_tools(tools), 2):
+    for a, b in combinations([tool for tool in touching_tools(tools) if tool.shape.name == "capsule"], 2):
         distance = _axis_distance(a, b, a.tip_centre(times) - b.tip_centre(times))
         intersecting = np.flatnonzero(distance < (1 - 1e-9) * (a.radius + b.radius))
         if intersecting.size:
@@ -337,17 +353,7 @@ def _axis_distance(a: Tool, b: Tool, offset: Array) -> Array:
     return distance
 
 
-def distance_to_sheet(tool: Tool, sheet: Sheet) -> float:
-    """Return the distance of a tool's axis at 0 s from the sheet at rest [m]."""
-    start, half = tool.tip_centre(np.zeros(1))[0], np.array([sheet.size[1] / 2, sheet.size[0] / 2, 0.0])
-
-    def distance(s: float) -> float:
-        point = start + s * tool.axis
-        return float(np.linalg.norm(point - np.clip(point, -half, half)))
-
-    # Ternary search, because the distance is a convex function of s.
-    low, high = 0.0, tool.length
-    for _ in range(200):
-        left, right = low + (high - low) / 3, high - (high - low) / 3
-        low, high = (low, right) if distance(left) <= distance(right) else (left, high)
-    return distance(low)
+def gap_to_sheet(tool: Tool, sheet: Sheet) -> float:
+    """Return the distance of a tool at 0 s from the sheet at rest [m], negative where it is in the sheet."""
+    half = np.array([sheet.size[1] / 2, sheet.size[0] / 2, 0.0])
+    return tool.shape.gap(tool.tip_centre(np.zeros(1))[0], tool.axis, tool.length, tool.radius, half)

@@ -14,14 +14,19 @@ from taichi_msm.errors import Key, Problem, SceneError
 from taichi_msm.lenses.model import MAX_RADIUS
 from taichi_msm.render.lens import IDENTITY_LENS, Lens
 from taichi_msm.scene.camera import Camera
+from taichi_msm.scene.outputs import OUTPUTS
+from taichi_msm.scene.render import AnyCamera
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import FRAME_TOLERANCE, MAX_SUPERSAMPLE, MIN_MAGNITUDE
 
 Array = NDArray[np.float64]
 
-# The oblique preset: direction of the eye, 50 degrees above the sheet at its lower edge; field of view [degrees].
+# Presets oblique and fit: direction of the eye, 50 degrees above the sheet at its lower edge; field of view [degrees].
 OBLIQUE_DIRECTION = np.array([0.0, -0.64, 0.77])
 OBLIQUE_FOV = 32.0
+
+# Margin of the preset fit on every side, as a fraction of the picture's width or height.
+FIT_MARGIN = 0.02
 
 # Kernels multiply the matrix by the samples along a side of a pixel, in f32.
 MAX_MATRIX_ENTRY = float(np.finfo(np.float32).max) / MAX_SUPERSAMPLE
@@ -57,7 +62,8 @@ class View(NamedTuple):
         distance: distance of the eye from the target [m]; for a moving camera that at the start.
         pinhole: whether the projection is perspective.
         lens: lens distortion; None if there is none.
-        baseline: distance to the companion camera of a stereo pair, along the x axis [m]; 0 without one.
+        baseline: distance to the companion camera of a parallel stereo pair, along the x axis [m]; 0 without one.
+        companion: view of the first camera that is `beside` this one; None without one.
         light_view: view of the camera at the light; None if it is this one.
     """
 
@@ -72,6 +78,7 @@ class View(NamedTuple):
     pinhole: bool
     lens: Lens | None = None
     baseline: float = 0.0
+    companion: View | None = None
     light_view: View | None = None
 
     @property
@@ -100,6 +107,11 @@ class View(NamedTuple):
         x, y, w, _ = np.moveaxis(self.project(points), -1, 0)
         w = np.where(w > self.near, w, np.nan)
         return self.distort(np.stack([x / w, y / w], axis=-1))
+
+    def points(self, pixels: Array, depth: Array) -> Array:
+        """Return the points [m], shape (n, 3), at undistorted pixels [px], shape (n, 2), and depths [m], shape (n,)."""
+        right, down = ((pixels - self.centre) / self.scale * (depth[:, None] if self.pinhole else 1.0)).T
+        return self.eye + np.stack([right, -down, -depth], axis=-1) @ self.axes
 
     def distort(self, pixels: Array) -> Array:
         """Return distorted pixels [px], shape (..., 2); NaN beyond the limit of the lens."""
@@ -179,27 +191,68 @@ def view_at(scene: Scene, time: float, name: str = "") -> View:
     """Resolve a valid camera of a scene at a time [s]; without a name, the main camera."""
     render = scene.render
     name = name or render.main
-    camera, baseline = render.origin(name)
+    result = _view_of(scene, time, name)
+    if other := render.companion(name):
+        baseline = render.all_cameras[other].baseline or 0.0  # type: ignore[union-attr]
+        result = result._replace(companion=_view_of(scene, time, other), baseline=baseline)
+    return result if name == render.main else result._replace(light_view=_view_of(scene, time, render.main))
+
+
+def _view_of(scene: Scene, time: float, name: str) -> View:
+    """Resolve a camera without its companion and its light."""
+    camera, baseline = scene.render.origin(name)
     if camera == "top":
         result = _top(scene)
+    elif isinstance(camera, Camera) and camera.beside is not None:
+        result = _companion(camera, scene, _view_of(scene, time, camera.beside))
     else:
-        result = _pinhole(camera if isinstance(camera, Camera) else _oblique(scene), scene, time)
+        result = _pinhole(camera if isinstance(camera, Camera) else _preset(camera, scene), scene, time)
     if baseline:
         shift, matrix = baseline * result.axes[0], result.matrix.copy()
         matrix[:, 3] -= matrix[:, :3] @ shift
         result = result._replace(matrix=matrix, eye=result.eye + shift)
-    light_view = None if name == render.main else view_at(scene, time)
-    return result._replace(baseline=render.baseline(name), light_view=light_view)
+    return result
+
+
+def _companion(camera: Camera, scene: Scene, reference: View) -> View:
+    """Resolve a camera with a rotation and a translation from its reference camera: X_this = R X_reference + T."""
+    rotation, translation = (np.array(pair_transform(camera)[key]) for key in ("rotation", "translation"))
+    world_to_reference = reference.axes * OPENCV_SIGNS
+    axes = rotation @ world_to_reference * OPENCV_SIGNS
+    eye = reference.eye - world_to_reference.T @ rotation.T @ translation
+    if camera.has_own_lens:
+        return _pinhole_at(camera, scene, Extrinsics(eye, axes, reference.distance))
+    # The reference camera, with the world moved instead: a point that is Y here is seen as one that is X = Y there.
+    turn, move = reference.axes.T @ axes, np.eye(4)
+    move[:3, :3], move[:3, 3] = turn, reference.eye - turn @ eye
+    return reference._replace(matrix=reference.matrix @ move, axes=axes, eye=eye)
+
+
+def pair_transform(camera: AnyCamera) -> dict[str, Any]:
+    """Return the transform from the axes of a camera's reference camera to its own, as OpenCV's stereoCalibrate.
+
+    Returns:
+        "beside": name of the reference camera; "rotation", 3 x 3, and "translation" [m] with X_this = R X_reference +
+        T, in OpenCV's axes. Empty without a reference camera.
+    """
+    if not isinstance(camera, Camera) or camera.beside is None:
+        return {}
+    rotation, translation = np.eye(3), [-(camera.baseline or 0.0), 0.0, 0.0]
+    if camera.rotation is not None and camera.translation is not None:
+        rotation, translation = nearest_rotation(np.array(camera.rotation)), list(camera.translation)
+    return {"beside": camera.beside, "rotation": rotation.tolist(), "translation": translation}
 
 
 def is_moving(scene: Scene, name: str = "") -> bool:
     """Return whether a camera moves; without a name, the main camera."""
     camera, _ = scene.render.origin(name or scene.render.main)
+    if isinstance(camera, Camera) and camera.beside is not None:
+        return is_moving(scene, camera.beside)
     return isinstance(camera, Camera) and camera.moves
 
 
 def camera_problems(scene: Scene) -> Iterator[Problem]:
-    """List the problems of the cameras of a scene and of a requested disparity."""
+    """List the problems of the cameras of a scene and of requested labels of stereo pairs."""
     is_valid = True
     for name, camera in scene.render.all_cameras.items():
         problem = next(_single_camera_problems(camera, scene, name), None) if isinstance(camera, Camera) else None
@@ -208,64 +261,83 @@ def camera_problems(scene: Scene) -> Iterator[Problem]:
             yield Problem(key + problem.path, problem.message)
             is_valid = False
     if is_valid and scene.asks_for("stereo"):
-        yield from _disparity_problems(scene)
+        yield from _pair_problems(scene)
 
 
 def _single_camera_problems(camera: Camera, scene: Scene, name: str) -> Iterator[Problem]:
     """List the problems of a camera; keys are relative to its section."""
     if camera.beside is None:
         yield from _extrinsics_problems(camera, scene)
-        if camera.distortion is not None and camera.outside == "refuse":
-            yield from _lens_problems(view_at(scene, 0.0, name))
-    elif abs(scene.render.origin(name)[1]) > MAX_BASELINE_RATIO * max(scene.sheet.size):
+    else:
+        yield from _placement_problems(camera, scene, name)
+    if camera.distortion is not None and camera.outside == "refuse":
+        yield from _lens_problems(view_at(scene, 0.0, name))
+
+
+def _placement_problems(camera: Camera, scene: Scene, name: str) -> Iterator[Problem]:
+    """List the problems of the place of a camera with a reference camera; keys are relative to its section."""
+    key, distance = "baseline", abs(scene.render.origin(name)[1])
+    if camera.rotation is not None and camera.translation is not None:
+        if fault := _rotation_fault(np.array(camera.rotation)):
+            yield Problem(("rotation",), fault)
+            return
+        key, distance = "translation", math.hypot(*camera.translation)
+    if distance > MAX_BASELINE_RATIO * max(scene.sheet.size):
         message = (
             f"puts it more than {MAX_BASELINE_RATIO:g} times the size of the sheet away; take a smaller number, "
             "in metres"
         )
-        yield Problem(("baseline",), message)
+        yield Problem((key,), message)
 
 
-def _disparity_problems(scene: Scene) -> Iterator[Problem]:
-    pairs = [name for name in scene.render.all_cameras if scene.render.baseline(name)]
+def _rotation_fault(rotation: Array) -> str:
+    """Describe the fault of a matrix that is not a rotation; empty for one within 1e-3 of a rotation."""
+    deviation = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if deviation <= 1e-3 and np.linalg.det(rotation) > 0:
+        return ""
+    fault = f"no rotation: products of its rows are off by {deviation:.2g}"
+    if np.linalg.det(rotation) < 0:
+        fault = "a mirror, no rotation"
+    return f"is {fault}; its rows are the directions to the right, down and forward, of length 1 and across each other"
+
+
+def _pair_problems(scene: Scene) -> Iterator[Problem]:
+    """List the problems of requested labels of stereo pairs."""
+    cameras = scene.render.all_cameras
+    pairs = {name: companion for name in cameras if (companion := scene.render.companion(name))}
     if not pairs:
+        asked = next(name for name in scene.output if OUTPUTS[name].needs_stereo_pair)
         message = (
-            "disparity needs a camera beside another one; take render.cameras with {beside: NAME, baseline: metres}"
+            f"{asked} needs a camera beside another one; take render.cameras with {{beside: NAME, baseline: metres}}"
         )
         yield Problem(("output",), f"{message}, or leave it out")
-    for name in pairs:
+    for name, companion in pairs.items() if "disparity" in scene.output else ():
+        message = ""
         if view_at(scene, 0.0, name).lens is not None:
             message = f"disparity is along rows only without distortion, and {name} has one; leave out one of them"
+        elif cameras[companion].baseline is None:  # type: ignore[union-attr]
+            message = f"disparity is along rows only at a baseline, and {companion} has a rotation; take stereo instead"
+        if message:
             yield Problem(("output",), message)
             return
 
 
 def _extrinsics_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
     """List the problems of a camera's extrinsics at any frame; keys are relative to its section."""
-    if camera.pose is not None:
-        rotation = np.array(camera.pose.rotation)
-        if not (np.abs(rotation @ rotation.T - np.eye(3)).max() <= 1e-3 and np.linalg.det(rotation) > 0):
-            deviation = np.abs(rotation @ rotation.T - np.eye(3)).max()
-            fault = f"no rotation: products of its rows are off by {deviation:.2g}"
-            if np.linalg.det(rotation) < 0:
-                fault = "a mirror, no rotation"
-            message = "its rows are the directions to the right, down and forward, of length 1 and across each other"
-            yield Problem(("pose", "rotation"), f"is {fault}; {message}")
-            return
+    if camera.pose is not None and (fault := _rotation_fault(np.array(camera.pose.rotation))):
+        yield Problem(("pose", "rotation"), fault)
+        return
     if camera.poses is not None:
         begin, end, duration = camera.poses[0][0], camera.poses[-1][0], scene.time.duration
         tolerance = FRAME_TOLERANCE / scene.time.frames_per_second
         gap = camera.poses[min(1, len(camera.poses) - 1)][0] - max(begin, 0.0)  # type: ignore[operator]
         if gap > MAX_GAP_S or (len(camera.poses) > 2 and gap > MAX_GAP_RATIO * duration):
-            message = (
-                f"its first poses are {gap:.6g} s apart, and the scene lasts {duration:g} s; write times in seconds"
-            )
-            yield Problem(
-                ("poses",), f"{message}, nanoseconds divided by 1e9, or name the columns in a header, with t [ns]"
-            )
+            message = f"its first poses are {gap:.6g} s apart, and the scene lasts {duration:g} s"
+            yield Problem(("poses",), f"{message}; set poses_time, the unit of its times: ms, us or ns")
             return
         if begin > tolerance or end < duration - tolerance:  # type: ignore[operator]
             message = f"covers {begin:.12g} s to {end:.12g} s, but the scene goes from 0 s to {duration:g} s"
-            remedy = "its times are those of the scene: subtract the first one from all"
+            remedy = "set poses_start: 0 to begin at the first pose, or another time of the file"
             if begin <= tolerance:  # type: ignore[operator]
                 remedy = "shorten time.duration or give the poses of all of it"
             yield Problem(("poses",), f"{message}; {remedy}")
@@ -338,8 +410,8 @@ def pinhole(scene: Scene, time: float = 0.0) -> Camera:
     camera = scene.render.main_camera
     if isinstance(camera, Camera):
         return frozen_camera(camera, time)
-    if camera == "oblique":
-        return _oblique(scene)
+    if camera != "top":
+        return _preset(camera, scene)
     half_height = scene.render.size[1] / 2 / _top_scale(scene)
     return Camera(eye=(0.0, 0.0, half_height / math.tan(math.radians(OBLIQUE_FOV) / 2)), fov=OBLIQUE_FOV)
 
@@ -396,10 +468,15 @@ def _top(scene: Scene) -> View:
 
 
 def _pinhole(camera: Camera, scene: Scene, time: float) -> View:
-    columns, lines = scene.render.size
-    eye, axes, distance = extrinsics(camera, time)
+    place = extrinsics(camera, time)
     # The intensity of the light does not change while the camera moves.
-    distance = extrinsics(camera, 0.0).distance if camera.moves else distance
+    return _pinhole_at(camera, scene, place._replace(distance=extrinsics(camera, 0.0).distance))
+
+
+def _pinhole_at(camera: Camera, scene: Scene, place: Extrinsics) -> View:
+    """Return the view of a pinhole camera with some extrinsics."""
+    columns, lines = scene.render.size
+    eye, axes, distance = place
     right, up, depth = axes * np.array([[1.0], [1.0], [-1.0]])
     if (intrinsics := camera.intrinsics) is not None:
         # OpenCV's first pixel has its centre at (0, 0), here at (0.5, 0.5).
@@ -416,6 +493,27 @@ def _pinhole(camera: Camera, scene: Scene, time: float) -> View:
     scale, centre = np.array([focal_x, focal_y]), np.array([x, y])
     lens = None if lens == IDENTITY_LENS else lens
     return View(matrix, near, axes, eye, scale, centre, size, distance, pinhole=True, lens=lens)
+
+
+def _preset(name: str, scene: Scene) -> Camera:
+    return {"oblique": _oblique, "fit": _fit}[name](scene)
+
+
+def _fit(scene: Scene) -> Camera:
+    """Return the fit preset, for which the sheet at rest fills the picture up to a margin.
+
+    The eye is d from the plane across the line of sight through the sheet's centre. The corners are a above and below
+    that line, and b behind and before the plane. With the eye a b / d below the line, they are projected to a / d above
+    and below the middle of the picture. Before the plane, half the sheet's width has the angle width / 2 / (d - b).
+    """
+    (height, width), (columns, lines) = scene.sheet.size, scene.render.size
+    axes = look_at_axes(OBLIQUE_DIRECTION.tolist(), (0, 0, 0), (0, 1, 0))
+    a, b = height / 2 * axes[1, 1], -height / 2 * axes[2, 1]
+    half_height = (1 - 2 * FIT_MARGIN) * math.tan(math.radians(OBLIQUE_FOV) / 2)
+    distance = max(a / half_height, width / 2 / (half_height * columns / lines) + b)
+    eye = distance * axes[2] - a * b / distance * axes[1]
+    target = eye - eye[2] / axes[2, 2] * axes[2]
+    return Camera(eye=tuple(eye.tolist()), target=tuple(target.tolist()), fov=OBLIQUE_FOV)
 
 
 def _oblique(scene: Scene) -> Camera:

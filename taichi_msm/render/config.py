@@ -62,7 +62,7 @@ class DrawingConfig(NamedTuple):
         relief: whether tissue is shaded with a relief.
         vignette: whether tissue is shaded with a vignette.
         wireframe: whether the mass-point mesh is drawn.
-        instruments: whether the scene has instruments.
+        shapes: names of the shapes of the instruments.
         metal: whether instruments are shaded.
         picture: whether colours are written.
         labels: names of the labels that are written; they require one sample per pixel.
@@ -77,7 +77,7 @@ class DrawingConfig(NamedTuple):
     relief: bool
     vignette: bool
     wireframe: bool
-    instruments: bool
+    shapes: tuple[str, ...]
     metal: bool
     picture: bool
     labels: frozenset[str]
@@ -170,7 +170,7 @@ def _planes(config: DrawingConfig) -> Any:
         **dict.fromkeys(("depth", "texel_x", "texel_y"), True),  # of the visible surface; texture coordinates [texels]
         "light": config.headlit,  # reflected share of the headlight
         "wire": config.wireframe,  # opacity of the mesh's lines
-        "instrument": config.instruments,  # 255 for a visible instrument, else 0
+        "instrument": len(config.shapes) > 0,  # 255 for a visible instrument, else 0
         **dict.fromkeys(("normal_x", "normal_y", "normal_z"), config.tissue or config.metal),  # in the camera's frame
         **dict.fromkeys(("cell", "triangle"), config.unordered),  # indices of the visible cell and triangle
         "footprint": config.tissue,  # squared size of a sample on the texture
@@ -309,7 +309,7 @@ def map_steps(entry, band: ti.template()):
 def clear_tile(entry, band: ti.template()):
     """Mark the samples of a tile as empty."""
     band.samples[entry + band.config.plane.depth] = band.config.float_vector(INFINITY)
-    if ti.static(band.config.instruments):
+    if ti.static(len(band.config.shapes) > 0):
         band.samples[entry + band.config.plane.instrument] = band.config.float_vector(0)
 
 

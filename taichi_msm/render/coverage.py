@@ -4,16 +4,17 @@ Vertices are not stored. For a sample inside the outline of a cell, the two equa
 the side of the sub-quad's diagonal the triangle, and the two linear equations of the triangle the point on it. A cell
 that is folded or extends behind the camera is drawn triangle by triangle instead.
 
-An instrument is a capsule: all points within a radius of the line segment from the centre A of its tip to A + length U.
-The line of sight through a sample is P = O + D t, where t is the depth. On the cylinder the component of P - A
-perpendicular to U is as long as the radius, a quadratic equation for t. Where its solution is beyond an end of the
-segment, the line of sight is intersected with the sphere around that end.
+The line of sight through a sample is P = O + D t, where t is the depth. `taichi_msm.shapes` intersects it with the
+instruments.
 
 To add an output per pixel, add its planes in labels.py or config.py and its values in `store_surface`.
 """
 
+from collections.abc import Callable
+from functools import cache
 from typing import Any, NamedTuple
 
+from taichi_msm.arithmetic import Operations
 from taichi_msm.render import geometry
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.config import (
@@ -31,6 +32,7 @@ from taichi_msm.render.config import (
 from taichi_msm.render.geometry import NODE_STRIDE, facet, line_of_sight, on_triangle, w_at
 from taichi_msm.render.lens_kernels import DISTORTED_STRIDE
 from taichi_msm.render.lens_table import INVALID_COORDINATE
+from taichi_msm.shapes import SHAPES
 from taichi_msm.system.runtime import ti
 
 # Numbers per unit normal; in `nodes` the normals follow the projected mass points.
@@ -259,63 +261,55 @@ def cover_cell(i, j, part: ti.template(), sheet: ti.template(), band: ti.templat
                 tile_row += 1
 
 
-@ti.func
-def _dot(a_x, a_y, a_z, b_x, b_y, b_z):
-    return a_x * b_x + a_y * b_y + a_z * b_z
+@cache
+def compile_ray(shape: str) -> Callable[..., Any]:
+    """Return the Taichi function of `Shape.build_ray`."""
+    return ti.func(SHAPES[shape].build_ray(Operations(ti.sqrt, ti.log, ti.max, ti.min, ti.select, ti.func)))
 
 
 @ti.func
-def intersect_capsule(x, y, index, uniforms: ti.template()):
+def intersect_instrument(x, y, index, uniforms: ti.template(), shapes: ti.template()):
     """Intersect lines of sight with an instrument.
 
+    Args:
+        index: of the instrument.
+        shapes: names of the shapes of all instruments.
+
     Returns:
-        Depth of the first intersection [m], INFINITY without one; three components of the normal times the radius.
+        Depth of the first intersection [m], INFINITY without one; three components of a normal of any length.
     """
-    capsule = uni.CAPSULES + index * uni.CAPSULE_STRIDE
-    tip, axis = capsule + uni.TIP, capsule + uni.AXIS
-    u_x, u_y, u_z = uniforms[axis], uniforms[axis + 1], uniforms[axis + 2]
-    length, radius = uniforms[capsule + uni.LENGTH], uniforms[capsule + uni.RADIUS]
+    base = uni.INSTRUMENTS + index * uni.INSTRUMENT_STRIDE
+    tip, axis = base + uni.TIP, base + uni.AXIS
     # The line of sight is P = O + D t, with t relative to the depth of the tip and the origin at the tip.
     start = uniforms[tip + 2] * (-1.0)
     across, up = line_of_sight(x, y, uniforms)
-    d_x, d_y, d_z = across * uniforms[uni.PINHOLE], up * uniforms[uni.PINHOLE], -1.0
     w = w_at(start, uniforms)
-    o_x, o_y, o_z = across * w - uniforms[tip], up * w - uniforms[tip + 1], 0.0
-    # The cylinder: a t^2 + 2 b t + c = 0.
-    d_d = _dot(d_x, d_y, d_z, d_x, d_y, d_z)
-    d_u = _dot(d_x, d_y, d_z, u_x, u_y, u_z)
-    o_u = _dot(o_x, o_y, o_z, u_x, u_y, u_z)
-    o_d = _dot(o_x, o_y, o_z, d_x, d_y, d_z)
-    o_o = _dot(o_x, o_y, o_z, o_x, o_y, o_z)
-    a = ti.max(d_d - d_u * d_u, 1e-12)
-    b = o_d - o_u * d_u
-    c = o_o - o_u * o_u - radius * radius
-    discriminant = b * b - a * c
-    t_side = (ti.sqrt(ti.max(discriminant, 0.0)) + b) * (-1.0) / a
-    along = o_u + t_side * d_u
-    # The sphere around the nearer end of the segment.
-    end = ti.select(along < length * 0.5, 0.0, length)
-    b_end = o_d - end * d_u
-    c_end = o_o - 2.0 * end * o_u + end * end - radius * radius
-    discriminant_end = b_end * b_end - d_d * c_end
-    t_end = (ti.sqrt(ti.max(discriminant_end, 0.0)) + b_end) * (-1.0) / d_d
-    on_side = (along >= 0.0) & (along <= length)
-    t = ti.select(on_side, t_side, t_end)
-    is_hit = (discriminant >= 0.0) & (on_side | (discriminant_end >= 0.0))
-    foot = ti.max(ti.min(o_u + t * d_u, length), 0.0)
+    o_x, o_y = across * w - uniforms[tip], up * w - uniforms[tip + 1]
+    d_x, d_y = across * uniforms[uni.PINHOLE], up * uniforms[uni.PINHOLE]
+    a_x, a_y, a_z = uniforms[axis], uniforms[axis + 1], uniforms[axis + 2]
+    length, radius = uniforms[base + uni.LENGTH], uniforms[base + uni.RADIUS]
+    d_d, d_a = d_x * d_x + d_y * d_y + 1.0, d_x * a_x + d_y * a_y - a_z
+    o_a, o_d, o_o = o_x * a_x + o_y * a_y, o_x * d_x + o_y * d_y, o_x * o_x + o_y * o_y
+    first = ti.static(compile_ray(shapes[0]))
+    t, is_hit, foot, end = first(d_d, d_a, o_a, o_d, o_o, length, radius)
+    for shape in ti.static(shapes[1:]):
+        if uniforms[base + uni.KIND] == ti.static(uni.KINDS[shape]):
+            other = ti.static(compile_ray(shape))
+            t, is_hit, foot, end = other(d_d, d_a, o_a, o_d, o_o, length, radius)
+    is_side = end == 0.0
     return (
         ti.select(is_hit, start + t, INFINITY),
-        o_x + d_x * t - u_x * foot,
-        o_y + d_y * t - u_y * foot,
-        d_z * t - u_z * foot,
+        ti.select(is_side, o_x + d_x * t - a_x * foot, end * a_x * radius),
+        ti.select(is_side, o_y + d_y * t - a_y * foot, end * a_y * radius),
+        ti.select(is_side, t * (-1.0) - a_z * foot, end * a_z * radius),
     )
 
 
 @ti.func
-def cover_tile_with_capsule(entry, x, y, index, band: ti.template()):
+def cover_tile_with_instrument(entry, x, y, index, band: ti.template()):
     """Cover a tile of samples with an instrument."""
     plane, samples = ti.static((band.config.plane, band.samples))
-    depth, n_x, n_y, n_z = intersect_capsule(x, y, index, band.uniforms)
+    depth, n_x, n_y, n_z = intersect_instrument(x, y, index, band.uniforms, band.config.shapes)
     visible = (w_at(depth, band.uniforms) > band.near) & (depth < samples[entry + plane.depth])
     if ti.static(band.config.has_distortion):
         visible = visible & (x < INVALID_COORDINATE)
@@ -331,13 +325,13 @@ def cover_tile_with_capsule(entry, x, y, index, band: ti.template()):
 
 
 @ti.func
-def cover_capsules(count, band: ti.template()):
+def cover_instruments(count, band: ti.template()):
     """Cover a band with the instruments."""
     config, uniforms = ti.static((band.config, band.uniforms))
     for index in range(count):
-        capsule = uni.CAPSULES + index * uni.CAPSULE_STRIDE
-        left, right = uniforms[capsule + uni.LEFT], uniforms[capsule + uni.RIGHT]
-        top, bottom = uniforms[capsule + uni.TOP], uniforms[capsule + uni.BOTTOM]
+        base = uni.INSTRUMENTS + index * uni.INSTRUMENT_STRIDE
+        left, right = uniforms[base + uni.LEFT], uniforms[base + uni.RIGHT]
+        top, bottom = uniforms[base + uni.TOP], uniforms[base + uni.BOTTOM]
         low_x, high_x, low_y, high_y = left, right, top, bottom
         if ti.static(config.has_distortion):
             # With lens distortion each tile has its own undistorted box.
@@ -357,7 +351,7 @@ def cover_capsules(count, band: ti.template()):
                         overlaps = box[0] <= right and box[1] >= left and box[2] <= bottom and box[3] >= top
                     if overlaps:
                         x, y = undistorted_centres(tile_x, tile_y, map_entry(entry, band), band.samples, config)
-                        cover_tile_with_capsule(entry, x, y, index, band)
+                        cover_tile_with_instrument(entry, x, y, index, band)
 
 
 @ti.func

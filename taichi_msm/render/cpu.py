@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.config import INFINITY, Band, Bytes, DrawingConfig, Floats, Integers, clear_tile
-from taichi_msm.render.coverage import NORMAL_STRIDE, DrawnSheet, cover_capsules, cover_cell, store_normal
+from taichi_msm.render.coverage import NORMAL_STRIDE, DrawnSheet, cover_cell, cover_instruments, store_normal
 from taichi_msm.render.geometry import NODE_STRIDE, SCREEN, may_cover_rows, project
 from taichi_msm.render.labels import label_offsets
 from taichi_msm.render.lens_kernels import DISTORTED_STRIDE, store_distorted
@@ -193,8 +193,8 @@ def _kernel(config: DrawingConfig) -> Callable[..., None]:
                 # Starting a separate parallel loop takes longer than projecting a sheet of usual size.
                 project_all(position, rows, cols, config, uniforms, sizes, nodes)
                 texture_width, texture_height = sizes[uni.LEVELS + 1], sizes[uni.LEVELS + 2]
-                capsule_count, subdivisions, near = (
-                    sizes[uni.CAPSULE_COUNT],
+                instrument_count, subdivisions, near = (
+                    sizes[uni.INSTRUMENT_COUNT],
                     uniforms[uni.SUBDIVISIONS],
                     uniforms[uni.NEAR],
                 )
@@ -209,7 +209,7 @@ def _kernel(config: DrawingConfig) -> Callable[..., None]:
                     DrawnSheet(nodes, rows, cols, subdivisions, texture_width, texture_height, distorted_start)
                 )
                 appearance = ti.static(
-                    Appearance(config, texels, sizes, texture_width, texture_height, uniforms, capsule_count)
+                    Appearance(config, texels, sizes, texture_width, texture_height, uniforms, instrument_count)
                 )
                 pixels = width * height
                 output = ti.static(PixelArrays(colours, labels, pixels))
@@ -230,8 +230,8 @@ def _kernel(config: DrawingConfig) -> Callable[..., None]:
                             )
                         )  # fmt: skip
                         cover_band(sheet, band)
-                        if ti.static(config.instruments):
-                            cover_capsules(capsule_count, band)
+                        if ti.static(len(config.shapes) > 0):
+                            cover_instruments(instrument_count, band)
                         resolve(
                             first, row, end_row, 0, width, tiles_across, width, map_start, samples, appearance, output
                         )

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.bins import BOUNDS_STRIDE, SEARCH_ROUNDS, build_bins, is_in_bounds, owner_of, store_bounds
 from taichi_msm.render.config import INFINITY, Band, Bytes, DrawingConfig, Floats, Integers, clear_tile
-from taichi_msm.render.coverage import NORMAL_STRIDE, DrawnSheet, Part, cover_capsules, cover_cell, store_normal
+from taichi_msm.render.coverage import NORMAL_STRIDE, DrawnSheet, Part, cover_cell, cover_instruments, store_normal
 from taichi_msm.render.geometry import (
     NODE_STRIDE,
     cell_outline,
@@ -82,7 +82,7 @@ class Threads:
             DeviceError: when the device ended a thread early.
         """
         launches, factor = Launches(bounded=True), self._config.supersample
-        (width, height), capsules = self._size, int(sizes[uni.CAPSULE_COUNT])
+        (width, height), instruments = self._size, int(sizes[uni.INSTRUMENT_COUNT])
         samples_across, samples_down = width * factor, height * factor
         view = launches.upload(uniforms), launches.upload(sizes)
         with compilation_options(optimised=False):
@@ -104,8 +104,8 @@ class Threads:
         view = view[0], launches.upload(sizes)
         # Iterations per sample: one per part, and three per triangle, for the triangle and its tiles.
         rounds_of_part = 1 + 3 * pieces_per_part
-        rounds_of_capsules = capsules * (1 + factor * (1 + factor))
-        rounds_of_shading = factor * (1 + factor * (1 + int(sizes[uni.LEVEL_COUNT]) + capsules)) + 2
+        rounds_of_instruments = instruments * (1 + factor * (1 + factor))
+        rounds_of_shading = factor * (1 + factor * (1 + int(sizes[uni.LEVEL_COUNT]) + instruments)) + 2
         for row in range(0, height, self._rows):
             rows = min(self._rows, height - row)
             top, bottom = row * factor, (row + rows) * factor
@@ -120,7 +120,7 @@ class Threads:
             launches.launch(
                 self._resolve, rows * width,
                 row, *view, self._texels, self._samples, self._colours, self._labels,
-                rounds=rounds_of_capsules + rounds_of_shading,
+                rounds=rounds_of_instruments + rounds_of_shading,
             )  # fmt: skip
         launches.require_completion()
         colours = launches.download(self._colours) if self._config.picture else np.empty(0, np.uint8)
@@ -264,22 +264,24 @@ def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callab
     ):  # fmt: skip
         """Cover the pixels of a strip, which begins at `row`, with the instruments; write their colours and labels."""
         for index in range(first, end):
-            width, height, capsule_count = sizes[uni.WIDTH], sizes[uni.HEIGHT], sizes[uni.CAPSULE_COUNT]
+            width, height, instrument_count = sizes[uni.WIDTH], sizes[uni.HEIGHT], sizes[uni.INSTRUMENT_COUNT]
             x, y = index % width, row + index // width
             left, top, samples_across = x * factor, y * factor, width * factor
             table = samples_across * height * factor * config.map_planes
             line = table + (y - row) * factor * samples_across * planes
             map_start = top * samples_across * config.map_planes
-            if ti.static(config.instruments):
+            if ti.static(len(config.shapes) > 0):
                 band = ti.static(
                     Band(
                         config, samples, line, samples_across, left, left + factor, top, top + factor,
                         samples_across, height * factor, uniforms[uni.NEAR], uniforms, map_start,
                     )
                 )  # fmt: skip
-                cover_capsules(capsule_count, band)
+                cover_instruments(instrument_count, band)
             appearance = ti.static(
-                Appearance(config, texels, sizes, sizes[uni.LEVELS + 1], sizes[uni.LEVELS + 2], uniforms, capsule_count)
+                Appearance(
+                    config, texels, sizes, sizes[uni.LEVELS + 1], sizes[uni.LEVELS + 2], uniforms, instrument_count
+                )
             )
             pixels = width * height
             output = ti.static(PixelArrays(colours, labels, pixels))

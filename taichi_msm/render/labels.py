@@ -128,14 +128,20 @@ class Flow(NamedTuple):
 
 
 class Stereo(NamedTuple):
-    """Labels of a stereo pair of cameras, in the first one's picture.
+    """Labels of a stereo pair of cameras, in the first one's picture; None for those that were not requested.
 
     Attributes:
         disparity: displacement to the left in the second one's picture [px], shape (height, width); 0 where
             nothing is visible.
+        stereo: displacement to the right and down in the second one's picture [px], shape (height, width, 2); NO_FLOW
+            where nothing is visible, and where the visible point is behind the second eye.
+        stereo_occlusion: 255 where the visible point is occluded in the second picture or outside it, else 0, shape
+            (height, width).
     """
 
-    disparity: NDArray[np.float32]
+    disparity: NDArray[np.float32] | None = None
+    stereo: NDArray[np.float32] | None = None
+    stereo_occlusion: NDArray[np.uint8] | None = None
 
 
 class Sight(NamedTuple):

@@ -7,8 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.lenses import MODELS
 from taichi_msm.render import texture
 from taichi_msm.render.camera import View, is_moving, view_at
+from taichi_msm.scene.camera import Camera, Distortion
 from taichi_msm.scene.render import Light
 from taichi_msm.scene.scene import Scene
 
@@ -40,11 +42,34 @@ def drawing_warnings(scene: Scene) -> Iterator[str]:
                 f"probes.{index}.instrument: its shaft points down, through the sheet at rest; it goes from the tip "
                 "to the hand, upward for z above 0"
             )
-        if instrument.radius > 0.25 * max(scene.sheet.size):
+        if instrument.outer_radius > 0.25 * max(scene.sheet.size):
             yield (
-                f"probes.{index}.instrument: {instrument.radius:g} m is a wide capsule for a sheet of "
+                f"probes.{index}.instrument: {instrument.outer_radius:g} m is a wide instrument for a sheet of "
                 f"{max(scene.sheet.size):g} m; the radius is in metres"
             )
+
+
+def describe_calibrations(scene: Scene) -> Iterator[str]:
+    """Describe each camera with intrinsics: lens model, size, fields of view with its distortion, coefficients."""
+    for name, camera in scene.render.all_cameras.items():
+        if not isinstance(camera, Camera) or camera.intrinsics is None:
+            continue
+        view, distortion = view_at(scene, 0.0, name), camera.distortion or Distortion()
+        (x, y), (width, height) = view.centre, view.size
+        edges = (view.undistort(np.array([[0, y], [width, y], [x, 0], [x, height]])) - view.centre) / view.scale
+        left, right, top, bottom = np.degrees(np.arctan(edges[[0, 1, 2, 3], [0, 0, 1, 1]]))
+        fov = " x ".join(
+            "(the lens's)" if np.isnan(angle) else f"{angle:.1f}" for angle in (right - left, bottom - top)
+        )
+        pairs = zip(MODELS[distortion.model].coefficients, distortion.coefficients, strict=True)
+        values = "".join(f", {coefficient} {value:g}" for coefficient, value in pairs if value)
+        facts = f"{distortion.model}, {width:g} x {height:g} px, fov {fov} degrees"
+        yield f"{camera_key(name)}: {facts}{values or ', no distortion'}"
+
+
+def camera_key(name: str) -> str:
+    """Return the key of a camera by its name."""
+    return f"render.cameras.{name}" if name else "render.camera"
 
 
 def _invisible_sheet(scene: Scene) -> Iterator[str]:
@@ -57,7 +82,7 @@ def _invisible_sheet(scene: Scene) -> Iterator[str]:
         pixels = camera.undistort(np.stack(np.meshgrid(*(centres * side for side in camera.size)), axis=-1))
         frames = range(scene.time.frames + 1 if is_moving(scene, name) else 1)
         if not any(_is_visible(view_at(scene, frame / rate, name), pixels, scene.sheet.size) for frame in frames):
-            key = f"render.cameras.{name}" if name else "render.camera"
+            key = camera_key(name)
             yield f"{key} shows nothing of the sheet at rest, or only a dot, in all frames; lengths are in metres"
 
 

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.model.surface import Capsule
+from taichi_msm.model.surface import Solid
 from taichi_msm.render import uniforms as uni
-from taichi_msm.render.camera import View, view, view_at
+from taichi_msm.render.camera import View, view_at
 from taichi_msm.render.config import DrawingConfig
 from taichi_msm.render.cpu import Bands
 from taichi_msm.render.gpu import Threads
@@ -48,8 +48,8 @@ def drawing_config(
         relief=tissue and render.light.relief != 0,
         vignette=tissue and render.light.vignette != 0,
         wireframe=render.wireframe and picture,
-        instruments=scene.has_instruments,
-        metal=picture and scene.has_instruments,
+        shapes=scene.shapes,
+        metal=picture and bool(scene.shapes),
         picture=picture,
         labels=frozenset(labels),
         lens=view_at(scene, 0.0).lens_model if lens is None else lens,
@@ -69,7 +69,7 @@ class Rasterizer:
     def __init__(self, scene: Scene, texture: NDArray[np.uint8], config: DrawingConfig | None = None) -> None:
         self.scene = scene
         self.config = config or drawing_config(scene)
-        self._view = view(scene)
+        self._view = view_at(scene, 0.0)
         self._cached: tuple[View, NDArray[np.float32]] | None = None
         self._optics: tuple[object, ...] = ()
         self._texture_size = texture.shape[1], texture.shape[0]
@@ -78,9 +78,7 @@ class Rasterizer:
         backend = Threads if self.config.lanes == 1 else Bands
         self._backend: Bands | Threads = backend(self.config, scene.sheet.points, scene.render.size, texels)
 
-    def draw(
-        self, position: NDArray[Any], camera: View | None = None, rods: Sequence[Capsule] = ()
-    ) -> NDArray[np.uint8]:
+    def draw(self, position: NDArray[Any], camera: View | None = None, rods: Sequence[Solid] = ()) -> NDArray[np.uint8]:
         """Draw the picture.
 
         Args:
@@ -95,7 +93,7 @@ class Rasterizer:
         assert picture is not None
         return picture
 
-    def look(self, position: NDArray[Any], camera: View | None = None, rods: Sequence[Capsule] = ()) -> FrameOutputs:
+    def look(self, position: NDArray[Any], camera: View | None = None, rods: Sequence[Solid] = ()) -> FrameOutputs:
         """Draw the picture, the labels or both, as configured.
 
         Args:
@@ -103,7 +101,7 @@ class Rasterizer:
             camera: the camera; by default the scene's main camera at the start.
             rods: the instruments.
         """
-        self._sizes[uni.CAPSULE_COUNT] = len(rods)
+        self._sizes[uni.INSTRUMENT_COUNT] = len(rods)
         camera = camera or self._view
         uniforms = self._uniforms(camera, rods)
         self._update_undistortion_map(camera)
@@ -123,7 +121,7 @@ class Rasterizer:
                 undistortion_map(camera, self.config.supersample, with_steps=self.config.map_has_steps)
             )
 
-    def _uniforms(self, camera: View, rods: Sequence[Capsule]) -> NDArray[np.float32]:
+    def _uniforms(self, camera: View, rods: Sequence[Solid]) -> NDArray[np.float32]:
         """Return the uniforms of a view; without instruments they are cached until the camera changes."""
         if rods or self._cached is None or self._cached[0] is not camera:
             render, size = self.scene.render, self.scene.sheet.size

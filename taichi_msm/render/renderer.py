@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError, as_array, did_you_mean, is_real_array
-from taichi_msm.model.surface import Capsule
+from taichi_msm.model.surface import Solid
 from taichi_msm.render.camera import View, is_moving, view, view_at
 from taichi_msm.render.labels import LABELS, Flow, FrameOutputs, Labels, Sight, Stereo, requested_labels, track_grid
 from taichi_msm.render.texture import load_texture
@@ -39,7 +39,7 @@ class Shot(NamedTuple):
 
     positions: Array
     view: View
-    rods: Sequence[Capsule] = ()
+    rods: Sequence[Solid] = ()
 
 
 class Renderer:
@@ -63,7 +63,7 @@ class Renderer:
     def restart(self, scene: Scene) -> None:
         """Replace the scene, and discard its rasterisers."""
         self._rasterizers.clear()
-        self.scene, self.view = scene, view(scene)
+        self.scene, self.view = scene, view_at(scene, 0.0)
         names = scene.render.all_cameras
         self._has_moving_camera = any(is_moving(scene, name) for name in names)
         self._views = {name: self.view if name == scene.render.main else view_at(scene, 0.0, name) for name in names}
@@ -174,8 +174,8 @@ class Renderer:
             observed = self._rasterizer(picture=True, labels=labels, camera=shot.view).look(*shot)
         if scene.labels_pixels and observed.labels is None:
             observed = observed._replace(labels=self._labels(shot, requested))
-        if observed.labels is not None and scene.asks_for("stereo") and shot.view.baseline:
-            observed = observed._replace(stereo=Stereo(shot.view.disparity(observed.labels.depth)))
+        if observed.labels is not None and scene.asks_for("stereo") and shot.view.companion is not None:
+            observed = observed._replace(stereo=self._stereo(observed.labels, shot))
         if before is not None and scene.asks_for("flow"):
             observed = observed._replace(flow=self.flow(before, shot))
         if scene.asks_for("tracks"):
@@ -185,6 +185,18 @@ class Renderer:
     def close(self) -> None:
         """Free the memory."""
         self._rasterizers.clear()
+
+    def _stereo(self, labels: Labels, shot: Shot) -> Stereo:
+        """Return the requested labels of a stereo pair."""
+        stereo = Stereo()
+        if "disparity" in self.scene.output:
+            stereo = stereo._replace(disparity=shot.view.disparity(labels.depth))
+        if "stereo" in self.scene.output:
+            from taichi_msm.render.tracking import compute_stereo
+
+            flow, occlusion = compute_stereo(self.scene, labels, *shot)
+            stereo = stereo._replace(stereo=flow, stereo_occlusion=occlusion)
+        return stereo
 
     def _labels(self, shot: Shot, names: Collection[str]) -> Labels:
         labels = self._rasterizer(picture=False, labels=names, camera=shot.view).look(*shot).labels
@@ -206,7 +218,7 @@ class Renderer:
 
     def _key(self, style: Render, *, picture: bool, labels: Collection[str] = (), camera: View) -> tuple[object, ...]:
         """Return all settings in which the rasterisers of this scene differ."""
-        return picture, frozenset(labels), camera.optics, style.shading, style.wireframe, self.scene.has_instruments
+        return picture, frozenset(labels), camera.optics, style.shading, style.wireframe, self.scene.shapes
 
     def _texture(self) -> NDArray[np.uint8]:
         """Return the texture, loaded again only if the scene names another picture."""

@@ -38,7 +38,7 @@ class Appearance(NamedTuple):
         sizes: sizes and counters.
         width, height: size of the first level [texels].
         uniforms: constants of the view.
-        capsule_count: number of instruments.
+        instrument_count: number of instruments.
     """
 
     config: DrawingConfig
@@ -47,7 +47,7 @@ class Appearance(NamedTuple):
     width: Any
     height: Any
     uniforms: Any
-    capsule_count: Any
+    instrument_count: Any
 
 
 class PixelArrays(NamedTuple):
@@ -174,7 +174,7 @@ def write_labels(
     plane, channels = ti.static((config.plane, label_channels(config.plane, config.labels)))
     is_covered = samples[entry + plane.depth] < INFINITY
     is_sheet = is_covered
-    if ti.static(config.instruments):
+    if ti.static(len(config.shapes) > 0):
         is_sheet = is_sheet & (samples[entry + plane.instrument] <= 0.0)
     values = [
         ti.select(is_sheet if ti.static(label.sheet_only) else is_covered, samples[entry + vector], label.missing_value)
@@ -269,20 +269,20 @@ def specular(mirror):
 
 
 @ti.func
-def light_transmission(x, y, depth, capsule_count, uniforms: ti.template(), config: ti.template()):
+def light_transmission(x, y, depth, instrument_count, uniforms: ti.template(), config: ti.template()):
     """Return the share of the light that is not shaded by the instruments."""
     offset_x, offset_y = line_of_sight(x, y, uniforms)
     w = w_at(depth, uniforms)
     right, up = offset_x * w, offset_y * w
     transmission = config.float_vector(1)
-    for index in range(capsule_count):
-        capsule = uni.CAPSULES + index * uni.CAPSULE_STRIDE
-        tip, axis = capsule + uni.TIP, capsule + uni.AXIS
+    for index in range(instrument_count):
+        base = uni.INSTRUMENTS + index * uni.INSTRUMENT_STRIDE
+        tip, axis = base + uni.TIP, base + uni.AXIS
         p_x, p_y, p_z = right - uniforms[tip], up - uniforms[tip + 1], depth * (-1.0) - uniforms[tip + 2]
         u_x, u_y, u_z = uniforms[axis], uniforms[axis + 1], uniforms[axis + 2]
-        foot = ti.max(ti.min(p_x * u_x + p_y * u_y + p_z * u_z, uniforms[capsule + uni.LENGTH]), 0.0)
+        foot = ti.max(ti.min(p_x * u_x + p_y * u_y + p_z * u_z, uniforms[base + uni.LENGTH]), 0.0)
         f_x, f_y, f_z = p_x - u_x * foot, p_y - u_y * foot, p_z - u_z * foot
-        square = uniforms[capsule + uni.RADIUS] * uniforms[capsule + uni.RADIUS]
+        square = uniforms[base + uni.RADIUS] * uniforms[base + uni.RADIUS]
         transmission *= 1.0 - uni.SHADE * square / ti.max(f_x * f_x + f_y * f_y + f_z * f_z, square)
     return transmission
 
@@ -326,8 +326,8 @@ def light_tissue(x, y, depth, normal: ti.template(), slope_x, slope_y, column, r
     diffuse = ti.max(cosine + uni.WRAP, 0.0) * (1.0 / (1.0 + uni.WRAP)) * nearness * uniforms[uni.LIGHT_NORMALISATION]
     factor = uniforms[uni.AMBIENT] + (1.0 - uniforms[uni.AMBIENT]) * diffuse
     gloss = specular(mirror) * nearness * (255.0 * uniforms[uni.GLOSS])
-    if ti.static(config.instruments):
-        transmission = light_transmission(x, y, depth, appearance.capsule_count, uniforms, config)
+    if ti.static(len(config.shapes) > 0):
+        transmission = light_transmission(x, y, depth, appearance.instrument_count, uniforms, config)
         factor, gloss = factor * transmission, gloss * transmission
     if ti.static(config.vignette):
         # The distance from the centre of the picture is in units of half its diagonal.

@@ -7,25 +7,26 @@ instrument is nearer on the same line of sight. Bins list the cells that may be 
 import math
 from collections.abc import Callable, Sequence
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.model.surface import Capsule
+from taichi_msm.model.surface import Solid
 from taichi_msm.render import geometry, lens_kernels
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.bins import BOUNDS_STRIDE, build_bins, store_bounds
 from taichi_msm.render.camera import View
 from taichi_msm.render.config import INFINITY, Bytes, Doubles, Floats, Integers
-from taichi_msm.render.coverage import intersect_capsule
+from taichi_msm.render.coverage import intersect_instrument
 from taichi_msm.render.geometry import NODE_STRIDE
-from taichi_msm.render.labels import NO_FLOW, Flow, Sight
+from taichi_msm.render.labels import NO_FLOW, Flow, Labels, Sight
 from taichi_msm.render.lens_table import undistorted_view
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.launches import Launches, end_thread
 from taichi_msm.system.runtime import compilation_options, lanes, ti
 
-Array = NDArray[np.floating]
+Array = NDArray[Any]
 
 # Offsets in the numbers of a cell: its bounds in the picture [px]; its least depth [m]; and `facing`, 0 if it is drawn
 # triangle by triangle.
@@ -41,7 +42,7 @@ CELLS_AROUND_NODE = 4
 NOT_VISIBLE = math.nan
 
 
-def locate_points(scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Capsule] = ()) -> Sight:
+def locate_points(scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Solid] = ()) -> Sight:
     """Project material points into the picture, and determine their occlusion.
 
     Args:
@@ -58,7 +59,7 @@ def locate_points(scene: Scene, coordinates: Array, position: Array, view: View,
     return Sight(pixels, hidden.view(np.bool_))
 
 
-def compute_flow(scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Capsule] = ()) -> Flow:
+def compute_flow(scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Solid] = ()) -> Flow:
     """Compute the optical flow and the occlusion of another frame's pixels.
 
     Args:
@@ -76,17 +77,70 @@ def compute_flow(scene: Scene, coordinates: Array, position: Array, view: View, 
     return Flow(moved.reshape(*shape, 2), hidden.reshape(shape) * np.uint8(255))
 
 
+def compute_stereo(scene: Scene, labels: Labels, position: Array, view: View, rods: Sequence[Solid] = ()) -> Flow:
+    """Compute the flow from a camera's picture to that of its companion at the same time, also of instruments.
+
+    Args:
+        scene: the scene.
+        labels: labels of the camera's picture.
+        position: positions of the mass points [m], shape (rows, cols, 3).
+        view: the camera, with its companion.
+        rods: the instruments.
+
+    Raises:
+        DeviceError: when the device ended a thread early.
+    """
+    companion = view.companion
+    assert companion is not None
+    flow, occlusion = compute_flow(scene, labels.coordinates, position, companion, rods)
+    shown = np.argwhere(labels.instrument)
+    if len(shown):
+        y, x = shown.T
+        centres = shown[:, ::-1].astype(np.float64) + 0.5
+        pixels = view.undistort(centres)
+        depth = _instrument_depth(scene, pixels, view, rods)
+        # Rounding to f32 may have drawn a pixel that is just outside the outline.
+        depth = np.where(depth < INFINITY, depth, labels.depth[y, x])
+        there, hidden = _track(scene, view.points(pixels, depth), position, companion, rods, as_flow=False)
+        flow[y, x] = np.where(np.isnan(there), NO_FLOW, there - centres)
+        occlusion[y, x] = hidden * np.uint8(255)
+    return Flow(flow, occlusion)
+
+
+def _instrument_depth(scene: Scene, pixels: Array, view: View, rods: Sequence[Solid]) -> Array:
+    """Return the depth of the instruments at undistorted pixels, shape (n, 2) [m]; INFINITY next to them."""
+    launches = Launches(bounded=lanes("f64") == 1)
+    uniforms = uni.view_uniforms(view._replace(lens=None), scene.render, 1, scene.sheet.size, (1, 1), rods)
+    depth = launches.array(np.float64, len(pixels))
+    launches.launch(
+        _ray_kernel(scene.shapes), len(pixels), launches.upload(np.ascontiguousarray(pixels).ravel()),
+        launches.upload(uniforms), len(rods), depth, rounds=len(rods),
+    )  # fmt: skip
+    launches.require_completion()
+    return launches.download(depth)
+
+
 def _track(
-    scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Capsule], *, as_flow: bool
+    scene: Scene, points: Array, position: Array, view: View, rods: Sequence[Solid], *, as_flow: bool
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Return the pixels of material points, `as_flow` relative to another frame's pixels, and their occlusion."""
-    total = len(coordinates)
+    """Return the pixels of points, `as_flow` relative to another frame's pixels, and their occlusion.
+
+    Args:
+        scene: the scene.
+        points: coordinates of material points, shape (n, 2); or points of instruments [m], shape (n, 3).
+        position: positions of the mass points [m], shape (rows, cols, 3).
+        view: the camera.
+        rods: the instruments.
+        as_flow: whether the pixels are relative to those of another frame.
+    """
+    total, is_material = len(points), points.shape[-1] == 2
     if total == 0:
         return np.empty((0, 2), np.float32), np.empty(0, np.uint8)
     rows, cols = scene.sheet.points
     cells = (rows - 1) * (cols - 1)
     # Occlusion is computed without lens distortion.
     undistorted = view if view.lens is None else undistorted_view(view)
+    points = np.asarray(points, np.float32) if is_material else undistorted.project(points)
     width, height = (int(side) for side in undistorted.size)
     # With bins half as wide as cells, most bins only overlap the cells around one mass point.
     bin_size = max(4, round((width * height / cells) ** 0.5 / 2))
@@ -96,7 +150,7 @@ def _track(
         uni.set_lens(uniform_values, view, 1, view.lens.limit)
     uniforms = launches.upload(uniform_values)
     sizes = uni.sizes_of(scene, np.empty((0, 3), np.int32))
-    sizes[[uni.CAPSULE_COUNT, uni.WIDTH, uni.HEIGHT]] = len(rods), width, height
+    sizes[[uni.INSTRUMENT_COUNT, uni.WIDTH, uni.HEIGHT]] = len(rods), width, height
     nodes, cell = (launches.array(np.float64, n) for n in (rows * cols * NODE_STRIDE, cells * CELL_STRIDE))
     bounds = launches.array(np.int32, cells * BOUNDS_STRIDE)
     with compilation_options(optimised=False):
@@ -112,14 +166,15 @@ def _track(
     )  # fmt: skip
     pixels, hidden = launches.array(np.float32, 2 * total), launches.array(np.uint8, total)
     arguments = (
-        launches.upload(np.ascontiguousarray(coordinates, np.float32).ravel()),
+        launches.upload(np.ascontiguousarray(points).ravel()),
         int(as_flow), uniforms, launches.upload(sizes), nodes, cell, bins.starts, bins.entries, is_simple,
         pixels, hidden,
     )  # fmt: skip
     # Iterations per point: one per cell, and one per triangle.
     rounds = 1 + 2 * (scene.render.refine + 1) ** 2
     for listed, count in launches.chunks(int(bins.lengths.max()), rounds):
-        launches.launch(_kernel(view.lens_model), total, listed, count, *arguments, rounds=count * rounds + len(rods))
+        kernel = _kernel(view.lens_model, scene.shapes, is_material)
+        launches.launch(kernel, total, listed, count, *arguments, rounds=count * rounds + len(rods))
     launches.require_completion()
     return launches.download(pixels).reshape(-1, 2), launches.download(hidden)
 
@@ -239,36 +294,92 @@ def _cell_occludes(
     return occluded
 
 
+@cache
+def _ray_kernel(shapes: tuple[str, ...]) -> Callable[..., None]:
+    """Return the kernel that intersects lines of sight with instruments of these shapes."""
+
+    @ti.kernel
+    def meet_instruments(
+        first: ti.i32, end: ti.i32, ended: Integers, pixels: Doubles, uniforms: Doubles, count: ti.i32, depth: Doubles
+    ):
+        """Compute the depth of the nearest of `count` instruments at undistorted pixels."""
+        for k in range(first, end):
+            nearest = ti.cast(INFINITY, ti.f64)
+            for index in range(count):
+                hit_depth, _, _, _ = intersect_instrument(pixels[2 * k], pixels[2 * k + 1], index, uniforms, shapes)
+                if geometry.w_at(hit_depth, uniforms) > uniforms[uni.NEAR]:
+                    nearest = ti.min(nearest, hit_depth)
+            depth[k] = nearest
+            end_thread(ended)
+
+    return meet_instruments
+
+
 @ti.func
-def _capsule_occludes(x, y, depth, uniforms: ti.template(), sizes: ti.template()):
+def _instrument_occludes(x, y, depth, uniforms: ti.template(), sizes: ti.template(), shapes: ti.template()):
     """Return whether an instrument occludes a point at (x, y) and `depth`."""
     occluded = False
-    for index in range(sizes[uni.CAPSULE_COUNT]):
-        capsule = uni.CAPSULES + index * uni.CAPSULE_STRIDE
-        is_between = x >= uniforms[capsule + uni.LEFT] and x <= uniforms[capsule + uni.RIGHT]
-        if is_between and y >= uniforms[capsule + uni.TOP] and y <= uniforms[capsule + uni.BOTTOM]:
-            hit_depth, _, _, _ = intersect_capsule(x, y, index, uniforms)
+    for index in range(sizes[uni.INSTRUMENT_COUNT]):
+        base = uni.INSTRUMENTS + index * uni.INSTRUMENT_STRIDE
+        is_between = x >= uniforms[base + uni.LEFT] and x <= uniforms[base + uni.RIGHT]
+        if is_between and y >= uniforms[base + uni.TOP] and y <= uniforms[base + uni.BOTTOM]:
+            hit_depth, _, _, _ = intersect_instrument(x, y, index, uniforms, shapes)
             if hit_depth < depth and geometry.w_at(hit_depth, uniforms) > uniforms[uni.NEAR]:
                 occluded = True
     return occluded
 
 
+@ti.func
+def _material_point(entry, points: ti.template(), sizes: ti.template(), subdivisions, nodes: ti.template()):
+    """Return X, Y, w and depth of a material point on the drawn triangles, its cell and its triangle in the cell."""
+    rows, cols = sizes[uni.ROWS], sizes[uni.COLS]
+    s = ti.math.clamp(ti.cast(points[entry], ti.f64), 0.0, 1.0) * (cols - 1)
+    t = ti.math.clamp(ti.cast(points[entry + 1], ti.f64), 0.0, 1.0) * (rows - 1)
+    j, i = ti.min(ti.cast(s, ti.i32), cols - 2), ti.min(ti.cast(t, ti.i32), rows - 2)
+    s, t = s - j, t - i
+    cell, quad_side = i * (cols - 1) + j, 1.0 / subdivisions
+    quad_column = ti.min(ti.floor(s * subdivisions), subdivisions - 1.0)
+    quad_row = ti.min(ti.floor(t * subdivisions), subdivisions - 1.0)
+    s0, t0 = quad_column * quad_side, quad_row * quad_side
+    s1, t1 = s - s0, t - t0
+    triangle = 2 * ti.cast(quad_row * subdivisions + quad_column, ti.i32) + ti.cast(t1 > s1, ti.i32)
+    patch = ti.static(geometry.cell_patch(geometry.corner_entry(cell, cols), cols, 0.0, True, nodes, True))
+    # In the sub-quad, D s t is replaced by a function that is linear on each side of the diagonal.
+    twist = s0 * t0 + s1 * t0 + s0 * t1 + ti.min(s1, t1) * quad_side
+    p = patch.a + patch.b * s + patch.c * t + patch.d * twist
+    return p[0], p[1], p[2], p[3], cell, triangle
+
+
+@ti.func
+def _other_point(entry, points: ti.template(), _sizes: ti.template(), _subdivisions, _nodes: ti.template()):
+    """Return X, Y, w and depth of a point that is not on the sheet; no cell is its own."""
+    return points[entry], points[entry + 1], points[entry + 2], points[entry + 3], -1, -1
+
+
 @cache
-def _kernel(lens: str) -> Callable[..., None]:
-    """Return the kernel that locates points, for a lens model; empty without lens distortion."""
+def _kernel(lens: str, shapes: tuple[str, ...], is_material: bool) -> Callable[..., None]:
+    """Return the kernel that locates points.
+
+    Args:
+        lens: name of the lens model; empty without lens distortion.
+        shapes: names of the shapes of the instruments.
+        is_material: whether the points are material points of the sheet, otherwise points of instruments.
+    """
+    Points: Any = Floats if is_material else Doubles
+    locate, stride, limit = (_material_point, 2, 2.0) if is_material else (_other_point, 4, INFINITY)
 
     @ti.kernel
     def locate_kernel(
-        first: ti.i32, end: ti.i32, ended: Integers, listed: ti.i32, count: ti.i32, coordinates: Floats,
+        first: ti.i32, end: ti.i32, ended: Integers, listed: ti.i32, count: ti.i32, points: Points,
         as_flow: ti.i32, uniforms: Doubles, sizes: Integers, nodes: Doubles, cell: Doubles,
         starts: Integers, entries: Integers, is_simple: Bytes, pixels: Floats, hidden: Bytes,
     ):  # fmt: skip
-        """Project material points, and test their occlusion by a chunk of the cells in their bins.
+        """Project points, and test their occlusion by a chunk of the cells in their bins.
 
         Args:
             listed: position of the first cell in its list.
             count: number of cells.
-            coordinates: coordinates of the points on the sheet.
+            points: coordinates of material points on the sheet, or X, Y, w and depth of other points.
             as_flow: 0 for pixels; 1 for displacements from the pixel centres of another frame, whose points these are.
             cell: outlines of the cells.
             starts: start of the list of each bin.
@@ -278,36 +389,20 @@ def _kernel(lens: str) -> Callable[..., None]:
             hidden: whether the points are hidden, updated.
         """
         for k in range(first, end):
-            rows, cols, width, height = sizes[uni.ROWS], sizes[uni.COLS], sizes[uni.WIDTH], sizes[uni.HEIGHT]
+            cols, width, height = sizes[uni.COLS], sizes[uni.WIDTH], sizes[uni.HEIGHT]
             near, subdivisions = uniforms[uni.NEAR], uniforms[uni.SUBDIVISIONS]
-            u, v = coordinates[2 * k], coordinates[2 * k + 1]
             x, y, is_hidden = ti.cast(NOT_VISIBLE, ti.f64), ti.cast(NOT_VISIBLE, ti.f64), False
-            if abs(u) < 2.0:  # False for NaN
-                s = ti.math.clamp(ti.cast(u, ti.f64), 0.0, 1.0) * (cols - 1)
-                t = ti.math.clamp(ti.cast(v, ti.f64), 0.0, 1.0) * (rows - 1)
-                j, i = ti.min(ti.cast(s, ti.i32), cols - 2), ti.min(ti.cast(t, ti.i32), rows - 2)
-                s, t = s - j, t - i
-                own_cell, quad_side = i * (cols - 1) + j, 1.0 / subdivisions
-                quad_column = ti.min(ti.floor(s * subdivisions), subdivisions - 1.0)
-                quad_row = ti.min(ti.floor(t * subdivisions), subdivisions - 1.0)
-                s0, t0 = quad_column * quad_side, quad_row * quad_side
-                s1, t1 = s - s0, t - t0
-                own_triangle = 2 * ti.cast(quad_row * subdivisions + quad_column, ti.i32) + ti.cast(t1 > s1, ti.i32)
-                patch = ti.static(
-                    geometry.cell_patch(geometry.corner_entry(own_cell, cols), cols, 0.0, True, nodes, True)
-                )
-                # In the sub-quad, D s t is replaced by a function that is linear on each side of the diagonal.
-                twist = s0 * t0 + s1 * t0 + s0 * t1 + ti.min(s1, t1) * quad_side
-                p = patch.a + patch.b * s + patch.c * t + patch.d * twist
+            if abs(points[stride * k]) < limit:  # False for NaN
+                p_x, p_y, w, p_depth, own_cell, own_triangle = locate(stride * k, points, sizes, subdivisions, nodes)
                 is_hidden = True
-                if p[2] > near:
-                    x, y = p[0] / p[2], p[1] / p[2]
+                if w > near:
+                    x, y = p_x / w, p_y / w
                     undistorted_x, undistorted_y, is_valid = x, y, True
                     if ti.static(lens != ""):
                         x, y, is_valid = lens_kernels.distorted_point(undistorted_x, undistorted_y, uniforms, lens)
                     if is_valid and x >= 0.0 and y >= 0.0 and x < width and y < height:
                         is_hidden = False
-                        depth = p[3] - uniforms[uni.DEPTH_TOLERANCE]
+                        depth = p_depth - uniforms[uni.DEPTH_TOLERANCE]
                         bin_index = ti.cast(undistorted_y, ti.i32) // sizes[uni.BIN_SIZE] * sizes[uni.BINS_ACROSS]
                         bin_index += ti.cast(undistorted_x, ti.i32) // sizes[uni.BIN_SIZE]
                         if is_simple[bin_index] == 0:
@@ -318,7 +413,10 @@ def _kernel(lens: str) -> Callable[..., None]:
                                         undistorted_x, undistorted_y, depth, entries[n], own_cell, own_triangle,
                                         cols, subdivisions, near, nodes, cell,
                                     )  # fmt: skip
-                        is_hidden = is_hidden or _capsule_occludes(undistorted_x, undistorted_y, depth, uniforms, sizes)
+                        if ti.static(len(shapes) > 0):
+                            is_hidden = is_hidden or _instrument_occludes(
+                                undistorted_x, undistorted_y, depth, uniforms, sizes, shapes
+                            )
                     if not is_valid:
                         x, y = ti.cast(NOT_VISIBLE, ti.f64), ti.cast(NOT_VISIBLE, ti.f64)
             if as_flow > 0:

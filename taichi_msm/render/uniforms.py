@@ -12,11 +12,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.model.surface import Capsule
+from taichi_msm.model.surface import Solid
 from taichi_msm.render.camera import View
 from taichi_msm.render.lens_table import visible_region
 from taichi_msm.scene.render import Render
 from taichi_msm.scene.scene import Scene
+from taichi_msm.shapes import SHAPES
 
 # The wireframe: colour, width [px] and opacity of its lines.
 WIRE_COLOUR = (235, 245, 255)
@@ -48,7 +49,7 @@ Array = NDArray[np.float64]
 # Indices into the array of sizes: sizes of the sheet, the picture and its bins; three counters, of rows of mass points
 # that workers have taken, of rows that they have projected, and of bands that they have taken; and the levels of the
 # texture, each with its first texel, its width and its height.
-ROWS, COLS, WIDTH, HEIGHT, CAPSULE_COUNT, BIN_SIZE, BINS_ACROSS = range(7)
+ROWS, COLS, WIDTH, HEIGHT, INSTRUMENT_COUNT, BIN_SIZE, BINS_ACROSS = range(7)
 ROWS_TAKEN, ROWS_PROJECTED, BANDS_TAKEN, LEVEL_COUNT, LEVELS = range(7, 12)
 LEVEL_STRIDE = 3
 
@@ -82,10 +83,11 @@ SAGITTA_FACTOR, STRETCH_FACTOR = 70, 71
 # The light's position toward the camera, in its frame [m]; the direction to the headlight, in the world.
 LIGHT_Z, HEADLIGHT = 72, 73
 
-# The instruments, each with the centre of its tip and its axis in the camera's frame; its length and radius; and its
-# bounding box in the picture without distortion [samples].
-CAPSULES, CAPSULE_STRIDE = 76, 12
-TIP, AXIS, LENGTH, RADIUS, LEFT, TOP, RIGHT, BOTTOM = 0, 3, 6, 7, 8, 9, 10, 11
+# The instruments, each with the centre of its tip and its axis in the camera's frame; its length and radius; its
+# bounding box in the picture without distortion [samples]; and the number of its shape.
+INSTRUMENTS, INSTRUMENT_STRIDE = 76, 13
+TIP, AXIS, LENGTH, RADIUS, LEFT, TOP, RIGHT, BOTTOM, KIND = 0, 3, 6, 7, 8, 9, 10, 11, 12
+KINDS = {name: float(number) for number, name in enumerate(SHAPES)}
 
 
 def sizes_of(scene: Scene, levels: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -107,7 +109,7 @@ def view_uniforms(
     factor: int,
     sheet: tuple[float, float],
     texture: tuple[int, int],
-    rods: Sequence[Capsule],
+    rods: Sequence[Solid],
 ) -> Array:
     """Build the array of uniforms of a view.
 
@@ -119,7 +121,7 @@ def view_uniforms(
         texture: width and height of the texture [texels].
         rods: the instruments.
     """
-    uniforms = np.zeros(CAPSULES + len(rods) * CAPSULE_STRIDE)
+    uniforms = np.zeros(INSTRUMENTS + len(rods) * INSTRUMENT_STRIDE)
     uniforms[MATRIX:AXES] = (view.matrix * np.array([[factor], [factor], [1], [1]])).ravel()
     uniforms[AXES:NEAR] = view.axes.ravel()
     uniforms[NEAR:BACKGROUND] = view.near, render.refine + 1
@@ -132,7 +134,7 @@ def view_uniforms(
     normalisation = (1 + WRAP) / (light_view.distance / light_distance + WRAP)
     if light_view is not view:
         light_position = view.axes @ (light_view.eye + light_position @ light_view.axes - view.eye)
-    uniforms[[LIGHT_X, LIGHT_Y, LIGHT_Z]], uniforms[HEADLIGHT:CAPSULES] = light_position, light_view.axes[2]
+    uniforms[[LIGHT_X, LIGHT_Y, LIGHT_Z]], uniforms[HEADLIGHT:INSTRUMENTS] = light_position, light_view.axes[2]
     uniforms[LIGHT_DISTANCE:ACROSS] = light_distance, normalisation, light.ambient, light.gloss, light.vignette
     uniforms[ACROSS:UP], uniforms[UP:SLOPE_X] = view.axes[:, 0], view.axes[:, 1]
     height = light.relief / 100 / 255 * max(sheet)
@@ -144,8 +146,8 @@ def view_uniforms(
         uniforms[VISIBLE:SAGITTA_FACTOR] = np.array(region.box) * factor
         uniforms[SAGITTA_FACTOR], uniforms[STRETCH_FACTOR] = region.sagitta_factor / factor, region.stretch_factor
     for n, rod in enumerate(rods):
-        uniforms[CAPSULES + n * CAPSULE_STRIDE : CAPSULES + (n + 1) * CAPSULE_STRIDE] = _capsule_uniforms(
-            rod, view, factor
+        uniforms[INSTRUMENTS + n * INSTRUMENT_STRIDE : INSTRUMENTS + (n + 1) * INSTRUMENT_STRIDE] = (
+            _instrument_uniforms(rod, view, factor)
         )
     return uniforms
 
@@ -165,14 +167,14 @@ def set_lens(uniforms: Array, view: View, factor: int, radius: float) -> None:
     uniforms[PICTURE_X:FOCAL_X], uniforms[FOCAL_X:VISIBLE] = view.centre * factor, view.scale * factor
 
 
-def _capsule_uniforms(capsule: Capsule, view: View, factor: int) -> Array:
-    uniforms = np.empty(CAPSULE_STRIDE)
-    uniforms[TIP:AXIS] = view.axes @ (capsule.tip - view.eye)
-    uniforms[AXIS:LENGTH] = view.axes @ capsule.axis
-    uniforms[[LENGTH, RADIUS]] = capsule.length, capsule.radius
-    # The capsule is within the convex hull of a cube around each end.
-    ends = np.stack([capsule.tip, capsule.tip + capsule.axis * capsule.length])
-    corner = np.array(np.meshgrid(*[(-capsule.radius, capsule.radius)] * 3)).reshape(3, -1).T @ view.axes
+def _instrument_uniforms(solid: Solid, view: View, factor: int) -> Array:
+    uniforms = np.empty(INSTRUMENT_STRIDE)
+    uniforms[TIP:AXIS] = view.axes @ (solid.tip - view.eye)
+    uniforms[AXIS:LENGTH] = view.axes @ solid.axis
+    uniforms[[LENGTH, RADIUS]] = solid.length, solid.radius
+    # The shape is within the convex hull of a cube around each end.
+    ends = np.stack([solid.tip, solid.tip + solid.axis * solid.length])
+    corner = np.array(np.meshgrid(*[(-solid.radius, solid.radius)] * 3)).reshape(3, -1).T @ view.axes
     boxes = (ends[:, None] + corner).reshape(-1, 3)
     x, y, w, _ = view.project(boxes).T
     # Without distortion, as all coordinates in kernels.
@@ -181,5 +183,5 @@ def _capsule_uniforms(capsule: Capsule, view: View, factor: int) -> Array:
     if (w > view.near).all():
         projected = np.stack([x / w, y / w], axis=-1)
         low, high = np.clip([projected.min(axis=0), projected.max(axis=0)], low, high)
-    uniforms[LEFT:] = np.concatenate([low, high]) * factor
+    uniforms[LEFT:KIND], uniforms[KIND] = np.concatenate([low, high]) * factor, KINDS[solid.shape.name]
     return uniforms

@@ -38,6 +38,7 @@ class FinishedRun:
     status: str  # as in `RunRecord`
     scene: Scene  # as simulated: with resolved mesh, step and precision, and picture paths from the current directory
     frames: int  # number of simulated frames
+    largest_frame: int  # with the largest displacement; the last one of runs that do not record it
     sha256: Mapping[str, str]  # of the scene's picture files, by their keys in the scene
     overrides: list[str]  # of the scene file
     _record: bytes = field(repr=False)  # content of run.json
@@ -204,7 +205,10 @@ def read_run(directory: str | Path) -> FinishedRun:
         is_resolved = scene.time.precision != "auto" and scene.sheet.tolerance is scene.time.tolerance is None
         if not isinstance(frames, int) or not 1 <= frames <= scene.time.frames + 1 or not is_resolved:
             raise damaged_result(path)
-    return FinishedRun(path.parent, record["status"], scene, frames, sha256, overrides, data, scene.render.main)
+        largest_frame = min(record.get("max_displacement_frame", frames), frames - 1)
+    return FinishedRun(
+        path.parent, record["status"], scene, frames, largest_frame, sha256, overrides, data, scene.render.main
+    )
 
 
 @contextmanager

@@ -47,6 +47,7 @@ from taichi_msm.solver.state import ProbeForces, RunProgress
 from taichi_msm.system import process, runtime
 from taichi_msm.system.compiler import versions
 from taichi_msm.system.runtime import Device
+from taichi_msm.version import commit
 
 
 class Stopwatch:
@@ -412,6 +413,7 @@ class _Run:
             "lanes": simulation.lanes,
             "workers": simulation.workers,
             "versions": self._context.manifest.versions,
+            "commit": commit(),
         }
         return cast(RunRecord, writer.publish(record))
 
@@ -465,6 +467,7 @@ def _run_entries(
         "points": list(scene.sheet.points),
         **_step_entries(plan, progress),
         "max_displacement": progress.max_displacement,
+        "max_displacement_frame": progress.max_displacement_frame,
         "shortest_spring": progress.shortest_spring,
         "longest_spring": progress.longest_spring,
         "probes": probes,

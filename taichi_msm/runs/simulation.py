@@ -6,6 +6,7 @@ import io
 import math
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from html import escape
 from itertools import count
 from string import Template
@@ -30,7 +31,7 @@ from taichi_msm.errors import (
 from taichi_msm.load.check import check_scene
 from taichi_msm.load.resolve import resolve
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.surface import Surface, place_capsules, refine_surface, to_positions
+from taichi_msm.model.surface import Surface, place_instruments, refine_surface, to_positions
 from taichi_msm.render.labels import Flow, FrameOutputs, Labels, Sight
 from taichi_msm.render.picking import pick
 from taichi_msm.render.renderer import Array, CameraLike, Renderer, Shot
@@ -210,6 +211,26 @@ class Simulation:
             self._dynamics = build_dynamics(self._plan, self.device, cores=self._cores)
         self._reset()
 
+    def change_material(self, scene: Plan | Scene | Mapping[str, Any]) -> None:
+        """Continue from the last frame with another material; shape, velocities, time and probes stay.
+
+        Args:
+            scene: differs from the current scene in the values of `tissue`, `springs` and `damping` only.
+
+        Raises:
+            SceneError: as for `Simulation`.
+        """
+        self._require_open()
+        before, state = self._plan, self.save().state
+        plan = resolve(check_scene(scene), self.device).plan.with_probes(self.scene.probes)
+        steps = self.frame * plan.grid.steps_per_frame
+        # Differences are those of a step, which the stability limit may have changed.
+        difference = state.difference * state.difference.dtype.type(plan.grid.step / before.grid.step)
+        self._dynamics.restart(plan, state._replace(steps=steps, difference=difference))
+        self._plan, self.renderer.scene = plan, plan.scene
+        progress = replace(self.progress, energy=self._dynamics.read().energy)
+        self._monitor, self._force_recorder = DivergenceMonitor(plan, progress), ForceRecorder(plan)
+
     def save(self) -> Snapshot:
         """Return the state from which another simulation of the scene can continue.
 
@@ -302,8 +323,8 @@ class Simulation:
         """Draw the sheet and the instruments of the probes.
 
         Args:
-            camera: name of a camera of the scene, "top", "oblique", a `Camera` or a mapping of its keys; None for the
-                scene's main camera.
+            camera: name of a camera of the scene, "top", "oblique", "fit", a `Camera` or a mapping of its keys; None
+                for the scene's main camera.
             positions: positions of the mass points [m], shape (rows, cols, 3); None for the current ones.
             time: time of these positions [s], which moves instruments and cameras; None for the current time.
 
@@ -495,7 +516,9 @@ class Simulation:
             time = self.time
         elif not (is_real_array(as_array(time, "time"), ()) and math.isfinite(time)):
             raise ArgumentError(f"time: {time!r}; take a number, in seconds, or None for now")
-        return Shot(positions, self.renderer.resolve_camera(camera, time), place_capsules(self.scene, positions, time))
+        return Shot(
+            positions, self.renderer.resolve_camera(camera, time), place_instruments(self.scene, positions, time)
+        )
 
     def _require_no_fault(self, reading: Reading, fault: str) -> None:
         """Raise a DivergedError if there is a fault."""

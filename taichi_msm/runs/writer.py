@@ -20,7 +20,7 @@ from taichi_msm.errors import Pause, writing
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.surface import surface_positions
 from taichi_msm.model.tool_force import ProbeRecord
-from taichi_msm.render.camera import calibration, is_moving, pose, view_at
+from taichi_msm.render.camera import calibration, is_moving, pair_transform, pose, view_at
 from taichi_msm.render.labels import FrameOutputs, track_grid
 from taichi_msm.runs.arrays import ChunkedArray, write_arrays, write_flo
 from taichi_msm.runs.checkpoint import CHECKPOINT_FOLDER, CHECKPOINT_PATTERNS, Checkpoint
@@ -264,7 +264,7 @@ class LabelWriter:
         self._folder, self._scene, self._camera = folder, scene, camera
         selected = [output for name, output in OUTPUTS.items() if name in scene.folders[camera]]
         self._frame_outputs = [output for output in selected if output.source in ("labels", "flow", "stereo")]
-        self._writes_camera = any(output.needs_camera for output in selected)
+        self._writes_camera = any(OUTPUTS[name].needs_camera for names in scene.folders.values() for name in names)
         # Tracks stay in memory until `finish`, because their file is ordered by track.
         shape = scene.render.tracks**2 if scene.asks_for("tracks") else 0, scene.time.frames + 1
         self._pixels, self._occluded = np.empty((*shape, 2), np.float32), np.empty(shape, np.bool_)
@@ -302,6 +302,7 @@ class LabelWriter:
         if self._writes_camera:
             scene, name = self._scene, self._camera
             matrices = {"size": list(scene.render.size), **calibration(view_at(scene, 0.0, name))}
+            matrices |= pair_transform(scene.render.all_cameras[name])
             if is_moving(scene, name):
                 rate = scene.time.frames_per_second
                 matrices["poses"] = [pose(view_at(scene, frame / rate, name)) for frame in range(frames)]
@@ -359,6 +360,7 @@ class RunRecord(TypedDict, total=False):
     residual: float  # quasi-static: largest net force on a mass point in any frame, relative to the largest force
     evaluations: int  # quasi-static: number of force evaluations so far
     max_displacement: float  # [m]
+    max_displacement_frame: int  # frame with this displacement
     shortest_spring: float  # smallest ratio of a spring's length to its rest length
     longest_spring: float  # largest such ratio
     probes: list[ProbeRecord]
@@ -373,5 +375,6 @@ class RunRecord(TypedDict, total=False):
     lanes: int
     workers: int
     versions: dict[str, str]  # of all software that affects the results
+    commit: str | None  # of the program, by git; None if it does not run from a clone
     frames: int
     outputs: list[str]  # names of files, and of folders with a file per frame

@@ -20,9 +20,14 @@ from pydantic import (
 )
 from typing_extensions import Self
 
+from taichi_msm.camera_files.calibration import Calibration
+from taichi_msm.camera_files.calibrations import read_calibration
+from taichi_msm.camera_files.keys import ROUNDING_TOLERANCE
+from taichi_msm.camera_files.text import CameraFileError
+from taichi_msm.camera_files.trajectories import PoseKeys, read_poses
+from taichi_msm.camera_files.trajectory import pose_fault
 from taichi_msm.lenses import MODELS
 from taichi_msm.lenses.model import MAX_COEFFICIENT
-from taichi_msm.scene.calibration import ROUNDING_TOLERANCE, CameraFileError, pose_fault, read_calibration, read_poses
 from taichi_msm.scene.section import (
     MIN_FOV,
     MIN_MAGNITUDE,
@@ -113,12 +118,14 @@ class Distortion(_Coefficients):  # type: ignore[misc]
         return self
 
 
+Rotation = tuple[Vector, Vector, Vector]
+_ROTATION = "three rows of three numbers: an orthonormal matrix"
+
+
 class Pose(Section):
     """Extrinsics of a camera, in OpenCV's axes: x right, y down, z forward."""
 
-    rotation: tuple[Vector, Vector, Vector] = key(
-        ..., "rotation from the world's axes to the camera's", "three rows of three numbers: an orthonormal matrix"
-    )
+    rotation: Rotation = key(..., "rotation from the world's axes to the camera's", _ROTATION)
     translation: Vector = key(..., "world's origin in the camera's axes [m]", "three numbers: [x, y, z] in metres")
 
 
@@ -136,8 +143,15 @@ class Camera(Section):
 
     calibration: FilePath | None = key(
         None,
-        "in place of fov and distortion: calibration file of OpenCV, ROS or STIR, relative to the scene file",
+        "in place of fov and distortion: calibration file of OpenCV, ROS, SCARED, STIR, StereoMIS, Kalibr or COLMAP, "
+        "relative to the scene file",
         "the path of a file",
+    )
+    calibration_eye: Literal["left", "right"] = key(
+        "left", "camera of the calibration of a stereo pair", "left or right"
+    )
+    calibration_unit: Literal["m", "mm"] | None = key(
+        None, "unit of lengths in the calibration, the distance of the cameras of a stereo pair", "m or mm"
     )
     scale: StrictBool = key(
         False, "whether a calibration for another picture size is scaled to this one", "true or false"
@@ -164,20 +178,46 @@ class Camera(Section):
     )
     poses: FilePath | PoseRows | None = key(
         None,
-        "in place of eye, target and up: trajectory of the camera, a file in TUM's format, relative to the scene file, "
-        "or its rows [t, tx, ty, tz, qx, qy, qz, qw], from the camera to the world",
+        "in place of eye, target and up: trajectory of the camera, a file of TUM, EuRoC, KITTI or COLMAP, relative to "
+        "the scene file, or its rows [t, tx, ty, tz, qx, qy, qz, qw], from the camera to the world",
         "the path of a file, or rows [[t, tx, ty, tz, qx, qy, qz, qw], ...]",
+    )
+    poses_unit: Literal["m", "mm"] | None = key(
+        None, "unit of positions in the file of poses; metres unless its header has another one", "m or mm"
+    )
+    poses_time: Literal["s", "ms", "us", "ns"] | None = key(
+        None, "unit of times in the file of poses; seconds unless its header has another one", "s, ms, us or ns"
+    )
+    poses_start: Number | None = key(
+        None,
+        "where the scene begins in the file of poses [s]: a time of the file, or, before its first pose, the time "
+        "after that one; without it, the times of the file are those of the scene",
+        "a number, in seconds",
+    )
+    poses_rate: Positive | None = key(
+        None, "poses per second of a file without times, as of KITTI and COLMAP", "a number above 0"
     )
     beside: Annotated[str, Field(strict=True, min_length=1)] | None = key(
         None,
-        "in `cameras`, in place of all other keys except baseline: name of the reference camera of a stereo pair, of "
-        "which this camera is a translated copy",
+        "in `cameras`, in place of eye, pose and poses: name of the reference camera of a stereo pair, with which this "
+        "camera moves",
         "the name of another camera",
     )
     baseline: Number | None = key(
         None,
-        "distance from the camera named by beside, along the x axis of that camera [m]",
+        "with beside: this camera is a copy of the reference camera, at this distance along its x axis [m]",
         "a number but 0, in metres",
+    )
+    rotation: Rotation | None = key(
+        None,
+        "with beside, in place of baseline: R of OpenCV's stereoCalibrate, from the axes of the reference camera to "
+        "those of this one; without intrinsics, calibration and fov, this camera has the lens of the reference camera",
+        _ROTATION,
+    )
+    translation: Vector | None = key(
+        None,
+        "with rotation: T of OpenCV's stereoCalibrate in metres, X_this = R X_reference + T",
+        "three numbers: [x, y, z] in metres",
     )
     eye: Vector | VectorKeyframes | None = key(
         None,
@@ -202,6 +242,11 @@ class Camera(Section):
     )
 
     @property
+    def has_own_lens(self) -> bool:
+        """Whether a camera with a reference camera has intrinsics of its own."""
+        return self.intrinsics is not None or "fov" in self.model_fields_set
+
+    @property
     def moves(self) -> bool:
         """Whether the pose of the camera depends on time."""
         return any(isinstance(value[0], tuple) for value in (self.poses, self.eye, self.target, self.up) if value)
@@ -218,16 +263,11 @@ class Camera(Section):
 
     @field_validator("poses", mode="after")
     @classmethod
-    def _read_poses(cls, poses: str | PoseRows | None) -> PoseRows | None:
-        if not isinstance(poses, str):
-            for n, row in enumerate(poses or ()):
-                if fault := pose_fault(row, poses[n - 1] if n else None):  # type: ignore[index]
-                    raise scene_fault(fault, n)
-            return poses
-        try:
-            return read_poses(poses)  # type: ignore[return-value]
-        except CameraFileError as error:
-            raise scene_fault(str(error)) from None
+    def _check_poses(cls, poses: str | PoseRows | None) -> str | PoseRows | None:
+        for n, row in enumerate(poses if isinstance(poses, tuple) else ()):
+            if fault := pose_fault(row, poses[n - 1] if n else None):  # type: ignore[index, arg-type]
+                raise scene_fault(fault, n)
+        return poses
 
     @field_validator("eye", "target", "up", mode="after")
     @classmethod
@@ -246,17 +286,16 @@ class Camera(Section):
     def _check_combination(self) -> Self:
         given = {name for name in self.model_fields_set if getattr(self, name) is not None}
         if self.beside is not None:
-            for name in sorted(given - {"beside", "baseline"}):
-                raise scene_fault(
-                    "is given together with beside, and a camera beside another is like that; remove it", name
-                )
-            if self.baseline is None or abs(self.baseline) < MIN_MAGNITUDE:
-                fault = "missing" if self.baseline is None else f"{self.baseline:g} puts it where {self.beside} is"
-                raise scene_fault(f"{fault}; expected a number but 0, in metres", "baseline")
-        elif self.baseline is not None:
-            raise scene_fault("goes with beside, the name of another camera; add it or remove this", "baseline")
-        if self.scale and self.calibration is None:
-            raise scene_fault("goes with calibration; remove it", "scale")
+            self._check_pair(given)
+        for name in ("baseline", "rotation", "translation") if self.beside is None else ():
+            if name in given:
+                raise scene_fault("goes with beside, the name of another camera; add it or remove this", name)
+        for name in ("scale", "calibration_eye", "calibration_unit") if self.calibration is None else ():
+            if getattr(self, name) != type(self).model_fields[name].default:
+                raise scene_fault("goes with calibration; remove it", name)
+        for name in PoseKeys._fields if not isinstance(self.poses, str) else ():
+            if name in given:
+                raise scene_fault("goes with poses, the path of a file; remove it", name)
         if self.outside == "background" and self.distortion is None and self.calibration is None:
             raise scene_fault("goes with distortion; remove it", "outside")
         self._check_focal_length()
@@ -267,6 +306,27 @@ class Camera(Section):
         for name in {"target", "up"} & given if {"pose", "poses"} & given else ():
             raise scene_fault("goes with eye; a pose has a direction of its own", name)
         return self
+
+    def _check_pair(self, given: set[str]) -> None:
+        """Check the keys of a camera with a reference camera."""
+        for name in sorted({"eye", "pose", "poses", "target", "up"} & given):
+            raise scene_fault("is given together with beside, which places the camera; remove it", name)
+        if self.baseline is not None:
+            for name in sorted(given - {"beside", "baseline"}):
+                message = f"is given together with baseline, and this camera is then a copy of {self.beside}"
+                raise scene_fault(f"{message}; remove it, or take rotation and translation in place of baseline", name)
+            if abs(self.baseline) < MIN_MAGNITUDE:
+                fault = f"{self.baseline:g} puts it where {self.beside} is"
+                raise scene_fault(f"{fault}; expected a number but 0, in metres", "baseline")
+        elif missing := {"rotation", "translation"} - given:
+            for name in {"rotation", "translation"} & given:
+                raise scene_fault(f"goes with {missing.pop()}; add it", name)
+            if self.calibration is None:
+                message = "missing; expected a number but 0, in metres, or rotation and translation in its place"
+                raise scene_fault(message, "baseline")
+        if self.distortion is not None and not self.has_own_lens:
+            message = f"goes with intrinsics or fov; without them this camera has the lens of {self.beside}"
+            raise scene_fault(message, "distortion")
 
     def _check_focal_length(self) -> None:
         """Check that the focal length is in `intrinsics` or in the lens, or that both agree."""
@@ -287,12 +347,28 @@ class Camera(Section):
     @model_serializer(mode="wrap")
     def _dump_used_keys(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Omit keys that others replace, because their defaults would be invalid when the scene is read again."""
-        if self.beside is not None:
-            return {name: value for name, value in dump(self).items() if name in ("beside", "baseline")}
         needed = {"eye", "target", "up"} if self.eye is not None else {"pose", "poses"} & self.model_fields_set
-        needed |= {"intrinsics"} if self.intrinsics is not None else {"fov"}
+        if self.beside is not None:
+            needed = {"beside", "baseline"} if self.baseline is not None else {"beside", "rotation", "translation"}
+        if self.beside is None or self.has_own_lens:
+            needed |= {"intrinsics"} if self.intrinsics is not None else {"fov"}
         needed |= {name for name in ("distortion", "outside") if name in self.model_fields_set}
         return {name: value for name, value in dump(self).items() if name in needed}
+
+    def with_poses(self) -> Self:
+        """Return a copy with the rows of the trajectory file, if there is one.
+
+        Raises:
+            PydanticCustomError: when the file cannot be used.
+        """
+        if not isinstance(self.poses, str):
+            return self
+        try:
+            rows = read_poses(self.poses, PoseKeys(**{name: getattr(self, name) for name in PoseKeys._fields}))
+        except CameraFileError as error:
+            raise scene_fault(str(error), "poses") from None
+        kept = {name: getattr(self, name) for name in self.model_fields_set - {*PoseKeys._fields}}
+        return self.model_validate(kept | {"poses": rows})
 
     def calibrated(self, size: tuple[int, int]) -> Self:
         """Return a copy with the intrinsics and the distortion of the calibration file, if there is one.
@@ -305,8 +381,10 @@ class Camera(Section):
         """
         if self.calibration is None:
             return self
+        # Only a stereo pair uses the distance of the cameras.
+        unit = self.calibration_unit if self.beside else "m"
         try:
-            calibration = read_calibration(self.calibration)
+            calibration = read_calibration(self.calibration, self.calibration_eye, unit)
         except CameraFileError as error:
             raise scene_fault(str(error), "calibration") from None
         if self.scale and calibration.size is None:
@@ -320,28 +398,34 @@ class Camera(Section):
                 f"{size[0]} x {size[1]}; set render.size to these, or scale: true",
                 "calibration",
             )
-        # The edges of a picture are scaled to edges, half a pixel from the centres of the outer pixels.
-        (fx, fy), (cx, cy) = calibration.focal, calibration.centre
-        intrinsics = {"fx": fx * scale_x, "fy": fy * scale_y}
-        intrinsics |= {"cx": (cx + 0.5) * scale_x - 0.5, "cy": (cy + 0.5) * scale_y - 0.5}
-        update: dict[str, Any] = {"calibration": None, "scale": False, "intrinsics": intrinsics}
-        if any(calibration.coefficients):
-            model = "fisheye" if calibration.fisheye else "pinhole"
-            # OpenCV omits trailing coefficients of the rational model.
-            coefficients = zip(MODELS[model].coefficients, calibration.coefficients, strict=False)
-            update["distortion"] = {"model": model, **dict(coefficients)}
-        elif calibration.fisheye:
-            update["distortion"] = {"model": "fisheye"}
-        unused = {"calibration", "scale"} if "distortion" in update else {"calibration", "scale", "outside"}
+        calibration = calibration.scaled(scale_x, scale_y)
+        intrinsics = dict(zip(("cx", "cy", "fx", "fy"), calibration.centre + (calibration.focal or ()), strict=False))
+        update: dict[str, Any] = {"intrinsics": intrinsics, **self._pair_of(calibration)}
+        unused = {"calibration", "calibration_eye", "calibration_unit", "scale"}
+        if calibration.model != "pinhole" or any(calibration.coefficients.values()):
+            update["distortion"] = {"model": calibration.model, **calibration.coefficients}
+        else:
+            unused |= {"outside"}
         kept = {name: getattr(self, name) for name in self.model_fields_set - unused}
         try:
             return self.model_validate(kept | update)
-        except ValidationError:
-            values = ", ".join(f"{name} = {value:g}" for name, value in intrinsics.items())
-            raise scene_fault(
-                f"{self.calibration}: {values} for pictures of this size are out of range; calibrate at a size near it",
-                "scale",
-            ) from None
+        except ValidationError as error:
+            details = error.errors()[0]
+            value = f"{'.'.join(map(str, details['loc']))} = {details['input']:g} is out of range"
+            if self.scale:
+                value += " for pictures of this size; calibrate at a size near it"
+            raise scene_fault(f"{self.calibration}: {value}", "scale" if self.scale else "calibration") from None
+
+    def _pair_of(self, calibration: Calibration) -> dict[str, Any]:
+        """Return rotation and translation of a stereo calibration, for a camera with a reference camera."""
+        if self.beside is None or calibration.right is None:
+            if self.beside is not None and self.rotation is None:
+                remedy = "set calibration_eye: right for a stereo file, or add rotation and translation"
+                raise scene_fault(f"{self.calibration}: has no R and T of this camera; {remedy}", "calibration")
+            return {}
+        if self.rotation is not None:
+            raise scene_fault(f"is given together with R and T of {self.calibration}; remove one of them", "rotation")
+        return calibration.right._asdict()
 
 
 def _given(info: ValidationInfo) -> set[str]:

@@ -43,8 +43,8 @@ class Output(NamedTuple):
     """An output of a run, which an entry of a scene's `output` selects.
 
     Attributes:
-        name: entry of `output`. Of the sources labels, flow and stereo, also the field of `Labels`, `Flow` or `Stereo`
-            that is written, in the format of the file's suffix.
+        name: name of the output. Of the sources labels, flow and stereo, also the field of `Labels`, `Flow` or
+            `Stereo` that is written, in the format of the file's suffix.
         file: path of the file, or that of the first frame of a series.
         source: origin of the values: a field of `FrameOutputs`, positions or forces.
         description: content of the file, for users.
@@ -52,6 +52,7 @@ class Output(NamedTuple):
             does not depend on the pixels.
         needs_camera: whether the values are meaningful only with the camera's matrices.
         needs_stereo_pair: whether only the reference camera of a stereo pair has this output.
+        entry: entry of `output` that selects it; empty if it is the name.
     """
 
     name: str
@@ -61,6 +62,7 @@ class Output(NamedTuple):
     pixel_bytes: float = 0
     needs_camera: bool = False
     needs_stereo_pair: bool = False
+    entry: str = ""
 
     @property
     def result(self) -> str:
@@ -152,6 +154,23 @@ def _all_outputs() -> Iterator[Output]:
         needs_camera=True,
         needs_stereo_pair=True,
     )
+    description = (
+        "of the reference camera of a stereo pair: Middlebury's format, from the pixel to the place of its tissue or "
+        "instrument in the picture of the first camera that is `beside` it, at the same time, right and down [px], "
+        "also where it is hidden there; 1e10: background, or it is behind that camera or beyond its lens's limit"
+    )
+    yield Output(
+        "stereo", "stereo/0000.flo", "stereo", description, pixel_bytes=8, needs_camera=True, needs_stereo_pair=True
+    )
+    yield Output(
+        "stereo_occlusion",
+        "stereo-occlusion/0000.png",
+        "stereo",
+        "255 where the pixel's tissue or instrument is hidden or outside the picture in that camera, else 0",
+        pixel_bytes=0.5,
+        needs_stereo_pair=True,
+        entry="stereo",
+    )
     description = "255 where an instrument is visible, else 0"
     yield Output("instrument", "instrument/0000.png", "labels", description, pixel_bytes=0.5)
     description = (
@@ -167,7 +186,10 @@ def zero_padded(number: int) -> str:
     return f"{number:06}"
 
 
-OUTPUTS = {output.name: output for output in _all_outputs()}
+OUTPUTS = {output.name: output._replace(entry=output.entry or output.name) for output in _all_outputs()}
+
+# Entries of `output`.
+ENTRIES = list(dict.fromkeys(output.entry for output in OUTPUTS.values()))
 
 # Outputs with a file for every frame, by their folders.
 SERIES_FOLDERS = {output.result: output for output in OUTPUTS.values() if output.is_series}
@@ -196,7 +218,9 @@ def result_names(folders: Mapping[str, Collection[str]]) -> list[str]:
     """
     selected = [(folder, output) for output in OUTPUTS.values() for folder in folders if output.name in folders[folder]]
     selected.sort(key=lambda item: not item[1].is_series)
-    with_matrices = dict.fromkeys(folder for folder, output in selected if output.needs_camera)
+    # The labels of a stereo pair need the matrices of both cameras.
+    cameras = [folder for folder in folders if folder] or folders
+    with_matrices = cameras if any(output.needs_camera for _, output in selected) else ()
     names = [(folder, output.result) for folder, output in selected]
     names += [(folder, CAMERA_FILE) for folder in with_matrices]
     return [*(f"{folder}/{name}" if folder else name for folder, name in names), RUN_RECORD]

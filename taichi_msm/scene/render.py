@@ -38,8 +38,8 @@ from taichi_msm.scene.section import (
 )
 
 # A preset, by its name, or a pinhole camera.
-AnyCamera = Literal["top", "oblique"] | Camera
-PRESETS = ("top", "oblique")
+AnyCamera = Literal["top", "oblique", "fit"] | Camera
+PRESETS = ("top", "oblique", "fit")
 
 
 class Light(Section):
@@ -66,15 +66,17 @@ class Render(Section):
     )
     camera: AnyCamera = key(
         "top",
-        "top: orthographic, from above; oblique: tilted, shows depth; or a pinhole camera",
-        "top, oblique, or a mapping: {eye: [x, y, z], target: [x, y, z], up: [x, y, z], fov: degrees}, with pose or "
-        "poses in place of eye, and intrinsics or calibration in place of fov",
+        "top: orthographic, from above; oblique: tilted, shows depth; fit: as tilted, and the sheet at rest fills the "
+        "picture up to a margin of 2 %; or a pinhole camera",
+        "top, oblique, fit, or a mapping: {eye: [x, y, z], target: [x, y, z], up: [x, y, z], fov: degrees}, with pose "
+        "or poses in place of eye, and intrinsics or calibration in place of fov",
     )
     cameras: dict[str, AnyCamera] | None = key(
         None,
         "in place of camera: several cameras by name, each with its own folder of files; the first is the main camera, "
         "whose light is in all pictures",
-        "names of a-z, 0-9, _ and -, each with top, oblique, {eye: [x, y, z], ...} or {beside: NAME, baseline: metres}",
+        "names of a-z, 0-9, _ and -, each with top, oblique, fit, {eye: [x, y, z], ...}, {beside: NAME, baseline: "
+        "metres} or {beside: NAME, rotation: 3 x 3, translation: [x, y, z], ...}",
     )
     shading: Literal["none", "headlight", "tissue"] = key(
         "headlight",
@@ -100,11 +102,10 @@ class Render(Section):
 
     @field_validator("camera", mode="after")
     @classmethod
-    def _read_calibration(cls, camera: AnyCamera, info: ValidationInfo) -> AnyCamera:
+    def _read_files(cls, camera: AnyCamera, info: ValidationInfo) -> AnyCamera:
         if isinstance(camera, Camera) and camera.beside is not None:
             raise scene_fault("goes with render.cameras, where the other camera has its name", "beside")
-        # An invalid size is reported separately.
-        return camera.calibrated(info.data["size"]) if isinstance(camera, Camera) and "size" in info.data else camera
+        return _read_files(camera, info)
 
     @field_validator("cameras", mode="after")
     @classmethod
@@ -122,15 +123,13 @@ class Render(Section):
                 raise scene_fault("is the name of a camera that any scene has; take another name", name)
             if isinstance(camera, Camera) and camera.beside is not None:
                 _check_beside(name, cameras)
-        if "size" not in info.data:
-            return cameras
-        calibrated = {}
+        read = {}
         for name, camera in cameras.items():
             try:
-                calibrated[name] = camera.calibrated(info.data["size"]) if isinstance(camera, Camera) else camera
+                read[name] = _read_files(camera, info)
             except PydanticCustomError as error:
                 raise scene_fault(error.message(), name, *(error.context or {}).get("below", ())) from None
-        return calibrated
+        return read
 
     @model_validator(mode="before")
     @classmethod
@@ -174,24 +173,30 @@ class Render(Section):
         return self.model_copy(update={"cameras": {**self.cameras, self.main: camera}})
 
     def origin(self, name: str) -> tuple[AnyCamera, float]:
-        """Return the reference camera of a camera that is `beside` another one.
+        """Return the camera of which a camera with a `baseline` is a translated copy.
 
         Returns:
-            The reference camera, or the camera itself if it has none; the distance of the camera from it, along its
-            x axis [m].
+            That camera, or the camera itself if it is not a copy; the distance between them, along the x axis [m].
         """
         camera, distance = self.all_cameras[name], 0.0
-        while isinstance(camera, Camera) and camera.beside is not None:
-            distance += camera.baseline or 0.0
+        while isinstance(camera, Camera) and camera.beside is not None and camera.baseline is not None:
+            distance += camera.baseline
             camera = self.all_cameras[camera.beside]
         return camera, distance
 
-    def baseline(self, name: str) -> float:
-        """Return the distance from a camera to the first camera that is `beside` it [m], or 0 if there is none."""
-        for camera in self.all_cameras.values():
-            if isinstance(camera, Camera) and camera.beside == name and camera.baseline is not None:
-                return camera.baseline
-        return 0.0
+    def companion(self, name: str) -> str:
+        """Return the name of the first camera that is `beside` a camera, or "" if there is none."""
+        cameras = self.all_cameras.items()
+        return next((other for other, camera in cameras if isinstance(camera, Camera) and camera.beside == name), "")
+
+
+def _read_files(camera: AnyCamera, info: ValidationInfo) -> AnyCamera:
+    """Return a camera with the contents of its files."""
+    if not isinstance(camera, Camera):
+        return camera
+    camera = camera.with_poses()
+    # An invalid size is reported separately.
+    return camera.calibrated(info.data["size"]) if "size" in info.data else camera
 
 
 def _check_beside(name: str, cameras: Mapping[str, AnyCamera]) -> None:

@@ -11,7 +11,7 @@ from pydantic import (
     model_validator,
 )
 
-from taichi_msm.scene.outputs import OUTPUTS
+from taichi_msm.scene.outputs import ENTRIES, OUTPUTS
 from taichi_msm.scene.render import Render
 from taichi_msm.scene.section import (
     FRAME_TOLERANCE,
@@ -147,16 +147,16 @@ class Scene(Section):
     output: tuple[OutputName, ...] = key(
         ("png", "gif", "trajectory"),
         "results in addition to run.json; [] simulates only",
-        f"a list of {', '.join(OUTPUTS)}",
+        f"a list of {', '.join(ENTRIES)}",
     )
 
     @property
     def folders(self) -> dict[str, tuple[str, ...]]:
         """Names of the outputs by folder: a folder for each camera, and "" for the run."""
-        selected = [output for name, output in OUTPUTS.items() if name in self.output]
+        selected = [output for output in OUTPUTS.values() if output.entry in self.output]
         folders = {"": tuple(output.name for output in selected if not output.is_camera_output)}
         for camera in self.render.all_cameras:
-            has_pair = bool(self.render.baseline(camera))
+            has_pair = bool(self.render.companion(camera))
             possible = (output for output in selected if has_pair or not output.needs_stereo_pair)
             names = (output.name for output in possible if output.is_camera_output)
             folders[camera] = (*folders.get(camera, ()), *names)
@@ -182,9 +182,9 @@ class Scene(Section):
         return any(OUTPUTS[name].is_camera_output for name in self.output)
 
     @property
-    def has_instruments(self) -> bool:
-        """Whether any probe has an instrument."""
-        return any(probe.instrument is not None for probe in self.probes)
+    def shapes(self) -> tuple[str, ...]:
+        """Names of the shapes of all instruments, sorted."""
+        return tuple(sorted({probe.instrument.shape for probe in self.probes if probe.instrument is not None}))
 
     @property
     def kind(self) -> Literal["tissue", "springs"]:

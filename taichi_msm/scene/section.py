@@ -21,8 +21,8 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 from typing_extensions import Self
 
-from taichi_msm.errors import ArgumentError, Key, Problem, SceneError, did_you_mean
-from taichi_msm.scene.outputs import OUTPUTS
+from taichi_msm.errors import ArgumentError, Key, Problem, SceneError, did_you_mean, truncate
+from taichi_msm.scene.outputs import ENTRIES
 
 # Limits of a number's magnitude, so that products and quotients of two numbers neither overflow nor underflow.
 MAX_MAGNITUDE = 1e30
@@ -30,9 +30,6 @@ MIN_MAGNITUDE = 1e-30
 
 # Pydantic's type of the errors that our validators raise.
 SCENE_FAULT = "refused"
-
-# Limit of the length of a value in a message.
-MAX_VALUE_LENGTH = 60
 
 
 def scene_fault(message: str, *below: str | int) -> PydanticCustomError:
@@ -48,11 +45,6 @@ def scene_fault(message: str, *below: str | int) -> PydanticCustomError:
 def format_value(value: Any) -> str:
     """Format a value as in a scene file, truncated to the length of a message."""
     return truncate(json.dumps(value, ensure_ascii=False, default=repr))
-
-
-def truncate(text: str) -> str:
-    """Truncate a text to the length of a value in a message."""
-    return text if len(text) <= MAX_VALUE_LENGTH else text[:MAX_VALUE_LENGTH] + "..."
 
 
 def key_problems(error: ValidationError, section: type[BaseModel], data: Any) -> list[Problem]:
@@ -285,7 +277,7 @@ if TYPE_CHECKING:
     OutputName = str
 else:
     ModelMetaclass = type(BaseModel)
-    OutputName = Literal[tuple(OUTPUTS)]
+    OutputName = Literal[tuple(ENTRIES)]
 
 
 class _SectionMeta(ModelMetaclass):

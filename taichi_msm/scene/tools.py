@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     ConfigDict,
@@ -34,11 +34,28 @@ from taichi_msm.scene.section import (
 
 
 class Instrument(Section):
-    """Metal capsule, which touches the sheet if the tool is position-controlled, and is only drawn otherwise."""
+    """Metal tool, which touches the sheet if it is position-controlled, and is only drawn otherwise."""
 
-    radius: Positive = key(..., "radius of the capsule [m]", "a number above 0, in metres")
-    shaft: Vector = key(..., "direction from the tip along the capsule", "three numbers, not all 0: [x, y, z]")
-    length: Positive = key(..., "length of the capsule [m]", "a number above 0, in metres")
+    model_config = ConfigDict(json_schema_extra={"oneOf": [{"required": ["radius"]}, {"required": ["plate"]}]})
+
+    radius: Positive | None = key(None, "radius of a capsule, with round ends [m]", "a number above 0, in metres")
+    plate: Positive | None = key(
+        None, "in place of radius: radius of a plate, with flat ends [m]", "a number above 0, in metres"
+    )
+    shaft: Vector = key(..., "direction from the tip along the axis", "three numbers, not all 0: [x, y, z]")
+    length: Positive = key(..., "length of the axis [m]", "a number above 0, in metres")
+
+    @property
+    def shape(self) -> str:
+        """Name of the shape."""
+        return "capsule" if self.plate is None else "plate"
+
+    @property
+    def outer_radius(self) -> float:
+        """Radius of the shape [m]."""
+        radius = self.radius if self.plate is None else self.plate
+        assert radius is not None
+        return radius
 
     @field_validator("shaft", mode="after")
     @classmethod
@@ -46,6 +63,19 @@ class Instrument(Section):
         if not any(abs(number) >= MIN_MAGNITUDE for number in shaft):
             raise scene_fault("has no direction; take one such as [0.3, -0.5, 1]")
         return shaft
+
+    @model_validator(mode="after")
+    def _check_one_shape(self) -> Self:
+        if self.radius is None and self.plate is None:
+            raise scene_fault("missing; expected a number above 0, in metres; or plate, for a flat end", "radius")
+        if self.radius is not None and self.plate is not None:
+            raise scene_fault("does not go with radius, of a round end; remove one of them", "plate")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _dump_shape(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Omit the key of the other shape."""
+        return {name: value for name, value in dump(self).items() if value is not None}
 
 
 # Keys that only a force-controlled tool has, and those that only a position-controlled tool has.
@@ -83,7 +113,7 @@ class Probe(Section):
     path: Annotated[tuple[PathKeyframe, ...], Field(min_length=1)] | None = key(
         None,
         "in place of a force: position of the instrument; keyframes [[t, across, down, height], ...], linear between, "
-        "constant outside; height: of the lowest point of its round tip above the sheet at rest [m]; of a clamp its "
+        "constant outside; height: of the lowest point of its tip above the sheet at rest [m]; of a clamp its "
         "displacement, keyframes [[t, x, y, z], ...] [m], the first one [0, 0, 0, 0]",
         _PATH_EXPECTS,
     )
@@ -122,11 +152,14 @@ class Probe(Section):
     )
     instrument: Instrument | None = key(
         None,
-        "capsule that is drawn for the tool; with path it touches the sheet, and is required",
-        "a mapping with radius, shaft and length",
+        "solid that is drawn for the tool; with path it touches the sheet, and is required",
+        "a mapping with radius or plate, shaft and length",
     )
-    friction: NotNegative = key(
-        0.0, "with path: Coulomb's coefficient between the instrument and the sheet", "a number, 0 or more"
+    friction: Literal["rough"] | NotNegative = key(
+        0.0,
+        "with path: Coulomb's coefficient between the instrument and the sheet; in quasi-static scenes rough: points "
+        "that the instrument touches stick to it",
+        "a number, 0 or more, or rough",
     )
     grip: tuple[tuple[Number, Number], ...] = key(
         (),

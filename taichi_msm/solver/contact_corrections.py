@@ -29,7 +29,7 @@ def sum_corrections(layout: SheetLayout, arrays: SheetArrays, *, clear: bool) ->
     contact = layout.config.get(ContactTerm)
     if contact is None:
         return np.zeros((0, 3))
-    sums = np.empty((CORRECTIONS * contact.tools, layout.rows))
+    sums = np.empty((CORRECTIONS * len(contact.shapes), layout.rows))
     with compilation_options():
         _build_sum(layout.config)(layout.rows, layout.cols, clear, arrays.by_column, arrays.fields, sums)
     return sums.sum(axis=1).reshape(-1, CORRECTIONS)
@@ -39,7 +39,7 @@ def sum_corrections(layout: SheetLayout, arrays: SheetArrays, *, clear: bool) ->
 def _build_sum(config: KernelConfig) -> Callable[..., None]:
     """Build the kernel that sums the corrections in every row from left to right, per tool and component."""
     vector, vectors, lanes, serial = config.vector, config.vectors, config.lanes, config.lanes > 1
-    first, count = config.first_field(ContactTerm), CORRECTIONS * config.require(ContactTerm).tools
+    first, count = config.first_field(ContactTerm), CORRECTIONS * len(config.require(ContactTerm).shapes)
     by_area = config.by_area
 
     @ti.kernel

@@ -32,7 +32,7 @@ from taichi_msm.model.sheet import (
     tissue_problems,
 )
 from taichi_msm.model.time_grid import TimeGrid
-from taichi_msm.model.tools import MAX_STRIDE_RADII, Tool, build_tools, path_problems, too_fast
+from taichi_msm.model.tools import Tool, build_tools, path_problems, too_fast
 from taichi_msm.model.verlet import stability_limit
 from taichi_msm.scene.scene import Scene, Time
 from taichi_msm.scene.section import FRAME_TOLERANCE
@@ -388,10 +388,10 @@ class _PathChange:
         if not self._plan.scene.time.at_rest and (fault := too_fast(tool, grid, first)):
             yield Problem((*key, "path", fault[0] - first - 1), fault[1])
         deviation = _shape_change(old_tool, tool)
-        if deviation > MAX_STRIDE_RADII * tool.radius:
+        if deviation > tool.stride:
             yield Problem(
                 (*key, "instrument"),
-                f"changes its shape by {deviation:.3g} m in a step, over half its radius; change it little by little",
+                f"changes by {deviation:.3g} m in a step, over {tool.stride:.3g} m; change it little by little",
             )
         for n, (begin, end) in enumerate(self._given.grip):
             has_ended = end <= now + tolerance
@@ -418,6 +418,6 @@ def _past_keyframes(path: Sequence[Keyframe], now: float, tolerance: float) -> l
 
 
 def _shape_change(before: Tool, after: Tool) -> float:
-    """Bound the displacement [m] of points of a capsule whose shape changes while its lowest point is fixed."""
+    """Bound the displacement [m] of points of a tool whose shape changes while its lowest point is fixed."""
     ends = np.linalg.norm(after.length * after.axis - before.length * before.axis)
     return float(ends) + 2 * abs(after.radius - before.radius)

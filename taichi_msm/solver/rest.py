@@ -20,6 +20,7 @@ plane, so the iteration would not converge to it.
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -41,6 +42,7 @@ from taichi_msm.system.runtime import Device
 from taichi_msm.terms import fictitious_masses
 from taichi_msm.terms.contact import ContactTerm
 from taichi_msm.terms.contact_rest import grips, memory_after_grips, set_tools, touched_points
+from taichi_msm.terms.rough import compute_pulls, release, stick, stuck_points, without_rough_tools
 
 # Residual forces, relative to the largest force: at convergence, at the perturbation, and at convergence of a sheet
 # that can be unstable.
@@ -148,12 +150,25 @@ class QuasiStatics:
 
     def _touched(self) -> NDArray[np.bool_]:
         """Return whether each tool touches or holds each mass point, shape (tools, rows, cols)."""
-        return touched_points(len(self.plan.tools), self.sheet.read_memory()[self._contact])
+        return touched_points(len(self.plan.tools), self._read_contact())
 
     @property
     def _contact(self) -> slice:
         """The part of the memory that belongs to contact."""
         return self.layout.config.memory_slice(ContactTerm)
+
+    @property
+    def _contact_column(self) -> int:
+        """The first column of the load table that belongs to contact."""
+        return self.layout.config.first_column(ContactTerm)
+
+    def _read_contact(self) -> Array:
+        """Read the memory of contact, shape (numbers, rows, cols)."""
+        return self.sheet.read_memory()[self._contact]
+
+    def _write_contact(self, memory: Array) -> None:
+        """Write the memory of contact, shape (numbers, rows, cols)."""
+        self._relaxation.arrays.set_fields(self.layout.config.first_field(ContactTerm), memory)
 
     def close(self) -> None:
         """Release the memory."""
@@ -200,22 +215,25 @@ class QuasiStatics:
         contact = memory_after_grips(self.plan, frame, before.displacement, contact_before)
         held_before, held = grips(tools, contact_before), grips(tools, contact)
         if tools:
-            relaxation.arrays.set_fields(self.layout.config.first_field(ContactTerm), contact)
+            self._write_contact(contact)
         if self._interrupted:
             relaxation.place(before.displacement)
-        self._interrupted, residual = True, 0.0
-        *intermediate, end = self._shape_times(frame)
-        for time in (*intermediate, end):
+        self._interrupted, residual, rough = True, 0.0, any(tool.rough for tool in tools)
+        *_, end = times = self._shape_times(frame)
+        for start, time in pairwise(times):
             row = self.sheet.load_table(loads, frame)
-            set_tools(self.plan, frame, time, row[0, self.layout.config.first_column(ContactTerm) :])
+            set_tools(self.plan, frame, time, row[0, self._contact_column :])
             # After a release the flat shape is tried even if a tool is in the way.
             free = not (loads.strength.any() or held or self._is_clamp_displaced(time))
             free = free and (held_before or not self._meets_tool(time))
-            if free and self._try_flat(row):
-                residual = 0.0
-            else:
-                tolerance = FORCE_TOLERANCE if time == end else PERTURBATION_TOLERANCE
-                residual = self._relax(frame, row, tolerance, pause)
+            tolerance = FORCE_TOLERANCE if time == end else PERTURBATION_TOLERANCE
+            if rough:
+                self._stick(frame, (start, time), row, pause)
+            pull = math.inf
+            while pull > tolerance:
+                residual = self._balance(frame, row, tolerance, pause, free=free)
+                pull = self._release(time, row, tolerance) if rough else 0.0
+            residual = max(residual, pull)
         self._update_memory(row)
         self._interrupted, self.residual = False, residual
 
@@ -225,6 +243,32 @@ class QuasiStatics:
         changing = [term for term in config.terms if term.mark_update(row[0, config.first_column(type(term)) :])]
         if changing:
             self._relaxation.relax(1, math.inf, row)
+
+    def _stick(self, frame: int, times: tuple[float, float], row: NDArray[Any], pause: Pause) -> None:
+        """Let the mass points stick that rough tools reach between the current shape and the next one."""
+        plan, memory, start = self.plan, self._read_contact(), self.sheet.read_arrays(differences=False)[0]
+        after = stick(plan, memory, start, start, times)
+        if stuck_points(plan, memory).any() and (after != memory).any():
+            # To second order, mass points move as on a sheet that no further tool touches until they stick.
+            self._relax(frame, without_rough_tools(plan, row, self._contact_column), PERTURBATION_TOLERANCE, pause)
+            after = stick(plan, memory, start, self.sheet.read_arrays(differences=False)[0], times)
+        self._write_contact(after)
+
+    def _balance(self, frame: int, row: NDArray[Any], tolerance: float, pause: Pause, *, free: bool) -> float:
+        """Find the shape in which all forces balance, the flat one if `free`; return the relative residual."""
+        if free and not stuck_points(self.plan, self._read_contact()).any() and self._try_flat(row):
+            return 0.0
+        return self._relax(frame, row, tolerance, pause)
+
+    def _release(self, time: float, row: NDArray[Any], tolerance: float) -> float:
+        """Release mass points on which rough tools pull by more than a tolerance; return the largest relative pull."""
+        memory = self._read_contact()
+        shape, force = (self.sheet.read_arrays(differences=forces)[0] for forces in (False, True))
+        pulls = compute_pulls(self.plan, memory, shape, force, time)
+        largest = float(pulls.max()) / max(MIN_FORCE_N, self._relaxation.scale(row))
+        if largest > tolerance:
+            self._write_contact(release(self.plan, memory, pulls))
+        return largest
 
     def _meets_tool(self, time: float) -> bool:
         """Return whether a tool at a time [s] touches the current sheet."""
@@ -247,10 +291,11 @@ class QuasiStatics:
         return force == 0
 
     def _shape_times(self, frame: int) -> list[float]:
-        """Return the times of the intermediate shapes before a frame, and the time of the frame [s]."""
+        """Return the times of the frame before, of the intermediate shapes, and of a frame [s]."""
         rate = self.plan.grid.frames_per_second
         begin, end = max(0, frame - 1) / rate, frame / rate
-        return sorted({end, *(float(time) for tool in self.plan.tools for time in tool.substep_times(begin, end))})
+        times = {float(time) for tool in self.plan.tools for time in tool.substep_times(begin, end)}
+        return [begin, *sorted({end, *times})]
 
     def _relax(self, frame: int, row: NDArray[Any], tolerance: float, pause: Pause) -> float:
         """Iterate until the residual, relative to the largest force, is below a tolerance; return it."""
@@ -292,8 +337,8 @@ class QuasiStatics:
         stiffest = 1.0 if material.factors is None else float(material.factors.max())
         # Rounding may shorten a spring by 1e-9.
         compressed = self.read().shortest_spring < 1 - material.tension / stiffest - 1e-9
-        capsules = [n for n, tool in enumerate(self.plan.tools) if not isinstance(tool, Clamp)]
-        return compressed or bool(self._touched()[capsules].any())
+        touching = [n for n, tool in enumerate(self.plan.tools) if not isinstance(tool, Clamp)]
+        return compressed or bool(self._touched()[touching].any())
 
     def _perturb(self, force: float) -> None:
         """Displace every mass point at random, reproducibly, by at most the displacement due to a force [N]."""

@@ -73,6 +73,7 @@ class RunProgress:
     energy_growth: float = 0.0
     pierced_by: int = 0  # number, from 1, of the first probe reported by `piercing`; 0 without a report
     pierced_frame: int = 0  # frame of the report
+    max_displacement_frame: int = 0  # the first frame with the largest displacement
 
 
 Vector = tuple[float, float, float]

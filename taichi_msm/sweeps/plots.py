@@ -1,4 +1,4 @@
-"""Plots of a sweep: results against parameters, a contact sheet of last frames, and first-order sensitivities.
+"""Plots of a sweep: results against parameters, a contact sheet of frames, and first-order sensitivities.
 
 The first-order sensitivity index is the share of a result's variance explained by one parameter alone.
 
@@ -205,7 +205,7 @@ MAX_CAPTION_LINES = 8
 class Tile(NamedTuple):
     """Run in the contact sheet."""
 
-    frame: Image.Image | None  # last frame of the run
+    frame: Image.Image | None  # frame with the largest displacement
     status: str  # in place of a missing frame
     caption: list[str]  # unbreakable parts
 
@@ -225,7 +225,7 @@ def write_contact_sheet(
     """
     runs = result.sample_runs(36)
     complete = [run for run in runs if result.outcomes[run].status == "complete"]
-    frames, errors = _last_frames({run: result.run_directory(run) for run in complete}, executor, progress)
+    frames, errors = _largest_frames({run: result.run_directory(run) for run in complete}, executor, progress)
     if not frames:
         reason = WITHOUT_PICTURES if complete else f"{CONTACT} needs a complete run"
         return [], [f"no {CONTACT}: {errors[0]}" if errors else reason]
@@ -239,7 +239,7 @@ def write_contact_sheet(
         tiles.append(Tile(frames.get(run), outcome.status, [f"run {run}", *displacement, *map(printable, values)]))
     total = len(result.outcomes)
     subset = f"{total} runs" if len(runs) == total else f"{len(runs)} of {total} runs, evenly spread"
-    heading = printable(f"{result.sweep.scene.name}: the last frames of {subset}")
+    heading = printable(f"{result.sweep.scene.name}: the frames with the largest displacement of {subset}")
     sheet = _draw_tiles(tiles, _column_count(result, len(runs)), heading)
     with replacing(result.directory / CONTACT) as file:
         sheet.save(file, "JPEG", quality=90)
@@ -247,18 +247,18 @@ def write_contact_sheet(
     return [CONTACT], [lacks] if lacks else []
 
 
-def draw_last_frame(directory: Path) -> NDArray[np.uint8]:
-    """Draw the last frame of the run in a directory on one thread, shape (height, width, 3)."""
+def draw_largest_frame(directory: Path) -> NDArray[np.uint8]:
+    """Draw the frame of a run with the largest displacement on one thread, shape (height, width, 3)."""
     from taichi_msm.runs.playback import Playback
 
     with Playback(directory, threads=1) as run:
-        return run.draw(len(run.time) - 1)
+        return run.draw(read_run(directory).largest_frame)
 
 
-def _last_frames(
+def _largest_frames(
     directories: dict[int, Path], executor: Executor, progress: StageProgressCallback
 ) -> tuple[dict[int, Image.Image], list[str]]:
-    """Read or draw the last frames of complete runs; return them by run, and the errors."""
+    """Read or draw the frames of complete runs with the largest displacement; return them by run, and the errors."""
     frames: dict[int, Image.Image] = {}
     futures: dict[int, Future[NDArray[np.uint8]]] = {}
     errors = []
@@ -266,11 +266,13 @@ def _last_frames(
         try:
             finished = read_run(directory)
             if finished.has_output("png"):
-                frames[run] = Image.fromarray(finished.read_picture("png", finished.frames - 1))
+                frames[run] = Image.fromarray(finished.read_picture("png", finished.largest_frame))
             elif finished.has_output("gif"):
-                frames[run] = read_last_frame(finished.result_path("gif"))
+                # In the middle of the frame, whose beginning is rounded.
+                time = (finished.largest_frame + 0.5) / finished.scene.time.frames_per_second
+                frames[run] = read_gif_frame(finished.result_path("gif"), time)
             elif finished.has_output("trajectory") and finished.scene.image is not None:
-                futures[run] = executor.submit(draw_last_frame, directory.absolute())
+                futures[run] = executor.submit(draw_largest_frame, directory.absolute())
         except FilesError as error:
             errors.append(str(error))
     pending = set(futures.values())
@@ -285,16 +287,20 @@ def _last_frames(
     return frames, errors
 
 
-def read_last_frame(path: Path) -> Image.Image:
-    """Read the last frame of an animated GIF."""
+def read_gif_frame(path: Path, time: float) -> Image.Image:
+    """Read the picture that an animated GIF shows at a time [s], or its last one."""
     with reading(path), Image.open(path, formats=["GIF"]) as film:
-        film.seek(film.n_frames - 1)
+        for number in range(film.n_frames):
+            film.seek(number)
+            time -= film.info["duration"] / 1000
+            if time < 0:
+                break
         return film.convert("RGB")
 
 
 def _column_count(result: SweepResult, tiles: int) -> int:
     """Choose the number of columns: that of the values of a grid's last key, otherwise about that of the rows."""
-    last = list(result.sweep.settings.vary.values())[-1]
+    last = list(result.sweep.settings.distributions.values())[-1]
     if tiles == len(result.outcomes) and last.kind == "grid" and 1 < len(last.values) <= 8:
         return len(last.values)
     square = math.ceil(math.sqrt(tiles))
@@ -393,7 +399,9 @@ def varied_parameters(result: SweepResult, runs: Sequence[int]) -> list[VariedPa
     names = abbreviate_keys(result.sweep.keys)
     candidates = [
         parameter
-        for column, (name, distribution) in enumerate(zip(names, result.sweep.settings.vary.values(), strict=True))
+        for column, (name, distribution) in enumerate(
+            zip(names, result.sweep.settings.distributions.values(), strict=True)
+        )
         for parameter in _parameters(name, distribution, [result.values[run][column] for run in runs])
     ]
     return [parameter for parameter in candidates if len(np.unique(parameter.numbers)) > 1]

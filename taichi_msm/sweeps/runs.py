@@ -40,7 +40,7 @@ from taichi_msm.runs.directory import (
 )
 from taichi_msm.scene.outputs import RUN_RECORD, RUNS_FOLDER, SWEEP_RECORD, zero_padded
 from taichi_msm.sweeps.pool import DiedError
-from taichi_msm.sweeps.spec import Sweep
+from taichi_msm.sweeps.spec import RESULT_COLUMNS, Sweep
 from taichi_msm.system.compiler import result_versions, versions
 
 # Statuses of runs that are not repeated.
@@ -339,9 +339,6 @@ class Outcome:
 
 
 _OUTCOME = TypeAdapter(Outcome)
-
-# Columns of the table between the varied keys and the forces of the probes.
-RESULT_COLUMNS = ("status", "error", "max_displacement", "shortest_spring", "error_estimate", "mesh_error")
 
 
 def outcome_from_record(run: int, record: Mapping[str, Any]) -> Outcome:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+import keyword
 import math
 import os
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -17,7 +19,7 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field, field_validator, model_validator
 from typing_extensions import Self
 
-from taichi_msm.errors import ArgumentError, Key, Problem, SceneError
+from taichi_msm.errors import ArgumentError, Key, Problem, SceneError, truncate
 from taichi_msm.images import PICTURE_SUFFIXES, PictureError, file_sha256
 from taichi_msm.load.check import parse_model
 from taichi_msm.load.scene_file import (
@@ -43,8 +45,11 @@ from taichi_msm.scene.section import (
     format_value,
     key,
     scene_fault,
-    truncate,
 )
+from taichi_msm.sweeps.expressions import CONSTANTS, FUNCTIONS, ExpressionError, evaluate, replace_expressions
+
+# Columns of table.csv between the varied keys and the forces of the probes, which are followed by the seconds.
+RESULT_COLUMNS = ("status", "error", "max_displacement", "shortest_spring", "error_estimate", "mesh_error")
 
 MAX_RUNS = 10**7
 
@@ -64,34 +69,75 @@ class SweepSettings(Section):
     seed: Annotated[Integer, Field(ge=0)] = key(
         1, "seed of the samples and of the splits of a data set", "a whole number, 0 or more"
     )
+    variables: dict[str, Distribution] = key(
+        {},
+        "names of numbers for the expressions in set, and how each varies",
+        "a mapping, such as x: {uniform: [0, 1]}",
+    )
     vary: dict[str, Distribution] = key(
-        ...,
-        "keys of the scene by their dotted paths, and how each varies",
+        {},
+        "keys of the scene by their dotted paths, and how each varies; required without variables",
         "a mapping, such as tissue.young: {uniform: [1e4, 3e4]}",
     )
-    set: dict[str, Any] = key({}, "keys of the scene by their dotted paths, and their values in all runs", "a mapping")
+    set: dict[str, Any] = key(
+        {},
+        "keys of the scene by their dotted paths, and their values in all runs; a text that begins with = is an "
+        "expression of the variables",
+        "a mapping",
+    )
 
-    @field_validator("vary")
+    @property
+    def distributions(self) -> dict[str, Distribution]:
+        """Distributions of the variables and the varied keys, in the order of the dimensions and of the columns."""
+        return {**self.variables, **self.vary}
+
+    @property
+    def expressions(self) -> list[str]:
+        """Keys of `set` whose values contain expressions."""
+        found: dict[str, None] = {}
+        replace_expressions(self.set, lambda path, _: found.setdefault(str(path[0])))
+        return list(found)
+
+    @field_validator("variables")
     @classmethod
-    def _has_keys(cls, vary: dict[str, Distribution]) -> dict[str, Distribution]:
-        if not vary:
-            raise scene_fault("no keys; name at least one, such as tissue.young: {uniform: [1e4, 3e4]}")
-        return vary
+    def _check_variables(cls, variables: dict[str, Distribution]) -> dict[str, Distribution]:
+        for name, distribution in variables.items():
+            if name in {"run", *RESULT_COLUMNS, "seconds"}:
+                raise scene_fault("is the name of a column of table.csv; take another", name)
+            if (
+                name in {*FUNCTIONS, *CONSTANTS}
+                or keyword.iskeyword(name)
+                or not re.fullmatch(r"[A-Za-z_]\w*", name, re.A)
+            ):
+                raise scene_fault("is no name of a variable; take letters, digits and _, such as x1", name)
+            for value in distribution.values:
+                if isinstance(value, list) or not _numbers(value):
+                    raise scene_fault(
+                        f"{format_value(value)} is no number; variables are numbers", name, distribution.kind
+                    )
+        return variables
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
-        grids = [name for name, distribution in self.vary.items() if distribution.kind == "grid"]
+        varied = self.distributions
+        if not varied:
+            raise scene_fault("no keys; name at least one, such as tissue.young: {uniform: [1e4, 3e4]}", "vary")
+        if both := self.variables.keys() & self.vary.keys():
+            raise scene_fault(
+                "is also a key of vary, with its column in table.csv; take another name", "variables", min(both)
+            )
+        grids = [name for name, distribution in varied.items() if distribution.kind == "grid"]
         if self.samples is not None and grids:
             raise scene_fault(
                 f"{grids[0]} is a grid, which gives every combination; take choice, or leave out samples", "samples"
             )
-        if self.samples is None and len(grids) < len(self.vary):
+        if self.samples is None and len(grids) < len(varied):
             raise scene_fault("missing; expected the number of runs, as not every key is a grid", "samples")
-        if (runs := count_runs(self.vary, self.samples)) > MAX_RUNS:
+        if (runs := count_runs(varied, self.samples)) > MAX_RUNS:
             raise scene_fault(
                 f"{runs} combinations, more than the {MAX_RUNS} that can be run; take smaller grids", "vary"
             )
-        if (numbers := sum(distribution.dimensions for distribution in self.vary.values())) > MAX_DIMENSIONS:
+        if (numbers := sum(distribution.dimensions for distribution in varied.values())) > MAX_DIMENSIONS:
             raise scene_fault(f"{numbers} numbers, more than the {MAX_DIMENSIONS} that can vary; take fewer", "vary")
         keys = [_split_key(name) for name in (*self.set, *self.vary)]
         for number, later in enumerate(keys):
@@ -112,25 +158,37 @@ class Sweep:
 
     @property
     def keys(self) -> list[str]:
-        """The varied keys, as dotted paths."""
-        return list(self.settings.vary)
+        """The variables, and the varied keys as dotted paths."""
+        return list(self.settings.distributions)
 
     @property
     def runs(self) -> int:
         """The number of runs."""
-        return count_runs(self.settings.vary, self.settings.samples)
+        return count_runs(self.settings.distributions, self.settings.samples)
 
     def values(self) -> list[list[Any]]:
-        """Return the values of the varied keys, for every run."""
-        return run_values(self.settings.vary, self.settings.samples, self.settings.seed)
+        """Return the values of the variables and the varied keys, for every run."""
+        return run_values(self.settings.distributions, self.settings.samples, self.settings.seed)
 
     def sample_values(self, limit: int) -> list[list[Any]]:
-        """Return the values of the varied keys for at most `limit` runs, evenly spaced."""
-        return sample_run_values(self.settings.vary, self.settings.samples, self.settings.seed, limit)
+        """Return the values of the variables and the varied keys for at most `limit` runs, evenly spaced."""
+        return sample_run_values(self.settings.distributions, self.settings.samples, self.settings.seed, limit)
 
     def overrides(self, values: list[Any]) -> tuple[str, ...]:
-        """Return the arguments of `run --set` for a run."""
-        pairs = [*self.settings.set.items(), *zip(self.keys, values, strict=True)]
+        """Return the arguments of `run --set` for a run.
+
+        A key whose expression has no value for these variables is set to a text with the reason, so that the run is
+        refused.
+        """
+        settings, count = self.settings, len(self.settings.variables)
+        variables = dict(zip(settings.variables, values[:count], strict=True))
+        fixed = dict(settings.set)
+        for name, value in fixed.items():
+            try:
+                fixed[name] = replace_expressions(value, lambda _, text: evaluate(text, variables))
+            except ExpressionError as error:
+                fixed[name] = str(error)
+        pairs = [*fixed.items(), *zip(settings.vary, values[count:], strict=True)]
         return tuple(f"{name}={format_override(value)}" for name, value in pairs)
 
     @cached_property
@@ -164,10 +222,14 @@ class Sweep:
 
     def description(self) -> dict[str, Any]:
         """Return all settings that determine the results as JSON data; equal sweeps have equal descriptions."""
-        settings = self.settings.model_dump(mode="json", exclude={"scene", "vary"})
-        vary = {name: {distribution.kind: distribution.values} for name, distribution in self.settings.vary.items()}
+        settings = self.settings.model_dump(mode="json", exclude={"scene", "vary", "variables"})
+        variables, vary = (
+            {name: {distribution.kind: distribution.values} for name, distribution in section.items()}
+            for section in (self.settings.variables, self.settings.vary)
+        )
         scene = json.dumps(self.scene.document.data).encode()
         files = {os.path.relpath(path, self.scene.folder): digest for path, digest in self.files.items()}
+        settings |= {"variables": variables} if variables else {}  # Sweeps without them keep their description.
         return {**settings, "vary": vary, "digest": hashlib.sha256(scene).hexdigest(), "files": files}
 
 
@@ -178,7 +240,7 @@ def load_sweep(path: str | Path) -> Sweep:
         SceneError: with a line for each error of the file, in the order of the file.
     """
     draft = Draft(read_file(str(path), FileKind("sweep", "scene and vary")))
-    if "sheet" in draft.data and "vary" not in draft.data:
+    if "sheet" in draft.data and not {"vary", "variables"} & draft.data.keys():
         raise SceneError([f"{path}:1:1: a scene; use `taichi-msm run`, or name it by `scene:` in a sweep file"])
     sweep, problems = _checked(draft.data, Path(path).parent)
     draft.report(problems)
@@ -221,8 +283,25 @@ def _checked(data: dict[str, Any], folder: Path) -> tuple[Sweep | None, list[Pro
             problems += _unknown_keys(file, data)
         except SceneError as error:
             problems.append(Problem(("scene",), error.lines[0]))
+    problems += _expression_problems(data)
     settings, setting_problems = parse_model(SweepSettings, data)
     return (None if settings is None or file is None else Sweep(file, settings)), [*problems, *setting_problems]
+
+
+def _expression_problems(data: dict[str, Any]) -> list[Problem]:
+    """Check the expressions in `set`, with NaN for all variables, for which those of single runs have no problems."""
+    variables = data.get("variables")
+    names = dict.fromkeys(variables if isinstance(variables, dict) else (), math.nan)
+    problems = []
+
+    def check(path: Key, text: str) -> None:
+        try:
+            evaluate(text, names)
+        except ExpressionError as error:
+            problems.append(Problem(("set", *path), str(error)))
+
+    replace_expressions(_mappings(data)[1], check)
+    return problems
 
 
 def _normalised(path: Path) -> str:

@@ -53,6 +53,7 @@ from taichi_msm.sweeps.spec import Sweep, format_override
 from taichi_msm.system.compiler import versions
 from taichi_msm.system.files import read_regular
 from taichi_msm.system.process import available_memory, available_threads
+from taichi_msm.version import commit
 
 WITHOUT_MATPLOTLIB = f"{PLOT} needs matplotlib: pip install matplotlib"
 WITHOUT_SALIB = f"{SENSITIVITY} needs SALib: pip install SALib"
@@ -182,9 +183,10 @@ def write_dataset(result: SweepResult) -> WrittenFiles:
     sweep, complete = result.sweep, [outcome.run for outcome in result.outcomes if outcome.status == "complete"]
     common = _output_format(result.run_directory(complete[0])) if complete else {}
     # The sections of a scene that determine the output format.
-    differ = any(key.split(".")[0] in ("output", "render", "time") for key in sweep.keys)
-    splits = assign_splits(len(result.outcomes), sweep.settings.seed)
-    head = {"scene": sweep.settings.scene, **sweep.description(), "versions": versions(), **common}
+    settings = sweep.settings
+    differ = any(key.split(".")[0] in ("output", "render", "time") for key in (*settings.vary, *settings.expressions))
+    splits = assign_splits(len(result.outcomes), settings.seed)
+    head = {"scene": settings.scene, **sweep.description(), "versions": versions(), "commit": commit(), **common}
     with replacing(result.directory / DATASET) as file:
         file.write(b"{\n")
         for name, value in head.items():

@@ -11,12 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
+from taichi_msm.arithmetic import Operations
 from taichi_msm.model.loads import Schedule
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import Material
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
-from taichi_msm.terms.law import Law, LawFunctions, Operations
+from taichi_msm.terms.law import Law, LawFunctions
 
 # Rows of the array by_column. MOBILITY and AREA_SHARE have three each: for the first, a middle and the last row.
 MOBILITY, AREA_SHARE, REST_X, HAS_LEFT, HAS_RIGHT, COLUMN_ROWS = 0, 3, 6, 7, 8, 9
@@ -223,7 +224,7 @@ class KernelConfig:
 
     @property
     def operations(self) -> Operations:
-        """The operations of Taichi for laws."""
+        """The operations of Taichi for laws and shapes."""
         ti, lanes = self.ti, self.lanes
 
         @ti.func

@@ -1,12 +1,12 @@
 """Contact, friction and grips of position-controlled tools. Scene: `probes` with `path`.
 
-After each step, mass points that are neither fixed nor held are projected out of the tools' capsules, in the order of
-the probes. With the displacement u after the step, the centre c of a capsule's tip and its axis a, the correction is
+After each step, mass points that are neither fixed nor held are projected out of the tools' shapes, in the order of
+the probes. With the displacement u after the step, the tip c of a tool, and the depth and normal n of X + u - c in its
+shape (`taichi_msm.shapes`), the correction is
 
-    r = X + u - c,   s = clamp(r . a, 0, length),   r' = r - s a,   n = r' / |r'|  (+z if r' = 0)
-    where |r'| < radius:   correction = (radius - |r'|) n
-    with friction mu:      w = the part of (u + correction - u_before) - (c - c_before) perpendicular to n
-                           correction -= w min(1, mu (radius - |r'|) / |w|)
+    where depth > 0:     correction = depth n
+    with friction mu:    w = the part of (u + correction - u_before) - (c - c_before) perpendicular to n
+                         correction -= w min(1, mu depth / |w|)
 
 A grip holds the mass points that are within 1.5 radii of the tip's centre when it begins: u = u_then + c - c_then. A
 clamp, a tool of radius 0, holds its mass points from the start: u = c. In a step, a correction has the effect of the
@@ -30,6 +30,7 @@ from taichi_msm.model.loads import Schedule
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.tools import GRIP_RADII, Clamp
 from taichi_msm.scene.section import FRAME_TOLERANCE
+from taichi_msm.shapes.shape import MIN_DISTANCE_M
 from taichi_msm.terms.base import (
     DY,
     MOBILITY,
@@ -54,7 +55,6 @@ from taichi_msm.terms.contact_layout import (
     HOLDER,
     INVERSE_AXIS,
     LENGTH,
-    MIN_DISTANCE_M,
     RADIUS,
     TIP_AFTER,
     TIP_BEFORE,
@@ -70,21 +70,22 @@ from taichi_msm.terms.contact_rest import build_project_out, build_remove_contac
 class ContactTerm(Term):
     """Position-controlled tools."""
 
-    tools: int  # number of tools
+    shapes: tuple[str, ...]  # name of the shape of every tool
     has_friction: tuple[bool, ...]  # whether each tool has friction
-    grips: bool  # whether any tool can hold tissue
+    grips: bool  # whether any tool can hold tissue, as grips, clamps and rough tools do
 
     @classmethod
     def from_plan(cls, plan: Plan) -> Self | None:
         """Return the term's configuration; None without position-controlled tools."""
         tools = plan.tools
-        grips = any(tool.grips or isinstance(tool, Clamp) for tool in tools)
-        return cls(len(tools), tuple(tool.friction > 0 for tool in tools), grips) if tools else None
+        grips = any(tool.grips or tool.rough or isinstance(tool, Clamp) for tool in tools)
+        shapes = tuple(tool.shape.name for tool in tools)
+        return cls(shapes, tuple(tool.friction > 0 for tool in tools), grips) if tools else None
 
     @property
     def memory(self) -> tuple[str, ...]:
         """The corrections of every tool, and with grips the held mass points."""
-        names = tuple(f"correction {tool} {axis}" for tool in range(self.tools) for axis in "xyz")
+        names = tuple(f"correction {tool} {axis}" for tool in range(len(self.shapes)) for axis in "xyz")
         return (*names, "holder", *(f"held {axis}" for axis in "xyz")) if self.grips else names
 
     def fields(self, plan: Plan) -> NDArray[Any]:
@@ -92,13 +93,13 @@ class ContactTerm(Term):
         fields = super().fields(plan)
         for n, tool in enumerate(plan.tools):
             if isinstance(tool, Clamp):
-                fields[CORRECTIONS * self.tools + HOLDER, tool.points] = n + 1
+                fields[CORRECTIONS * len(plan.tools) + HOLDER, tool.points] = n + 1
         return fields
 
     @property
     def column_count(self) -> int:
         """Number of columns: the weight, and the columns of each tool."""
-        return COLUMNS + TOOL_COLUMNS * self.tools
+        return COLUMNS + TOOL_COLUMNS * len(self.shapes)
 
     def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
         """Compute the positions of the tools before and after every step and the states of their grips."""
@@ -130,6 +131,8 @@ class ContactTerm(Term):
 
     def supports(self, compiled: Self) -> str:
         """Return the reason why kernels compiled for other tools do not support these tools."""
+        if self.shapes != compiled.shapes:
+            return "the shape of an instrument cannot change; restart with the new scene"
         friction = zip(self.has_friction, compiled.has_friction, strict=True)
         if all(needed <= available for needed, available in friction) and self.grips <= compiled.grips:
             return ""
@@ -149,7 +152,8 @@ class ContactTerm(Term):
 
     def layout(self, config: KernelConfig) -> ContactLayout:
         """Return the columns and fields of the term."""
-        return ContactLayout(self.tools, self.grips, config.first_field(ContactTerm), config.first_column(ContactTerm))
+        first_field, first_column = config.first_field(ContactTerm), config.first_column(ContactTerm)
+        return ContactLayout(self.shapes, self.has_friction, self.grips, first_field, first_column)
 
     def _build_reaches(self, config: KernelConfig) -> Callable[..., Any]:
         """Build the Taichi function reaches(sheet, i, low, high, now).
@@ -157,7 +161,7 @@ class ContactTerm(Term):
         It returns whether a tool may touch or hold mass points of row `i`. In it `low` and `high` bound the
         displacements of the row along y and z, two numbers each, and `now` is a row of the load table.
         """
-        ti, real, vector, tools, grips = config.ti, config.real, config.vector, self.tools, self.grips
+        ti, real, vector, tools, grips = config.ti, config.real, config.vector, len(self.shapes), self.grips
         max_lane = build_max_lane(config)
         bases, holding = self.layout(config).bases, self.layout(config).grip_field + HOLDER
 
@@ -199,8 +203,14 @@ class ContactTerm(Term):
         It is called after the step of the row. In it `kind` is that of a `KernelRow`, `at` the row of u, and `now` a
         row of the load table.
         """
-        ti, vector, tools, has_friction, grips = config.ti, config.vector, self.tools, self.has_friction, self.grips
-        layout, penetration = self.layout(config), build_penetration(config)
+        ti, vector, tools, has_friction, grips = (
+            config.ti,
+            config.vector,
+            len(self.shapes),
+            self.has_friction,
+            self.grips,
+        )
+        layout, penetrations = self.layout(config), [build_penetration(config, shape) for shape in self.shapes]
         first_field, first, grip_field, base = layout.first_field, layout.first_column, layout.grip_field, layout.bases
         max_lane = build_max_lane(config)
 
@@ -238,7 +248,7 @@ class ContactTerm(Term):
                 sheet.fields[(grip_field + HOLDER) * rows * sheet.width + point] = held
                 free = ti.select(held == 0, free, vector(0))
             for tool in ti.static(range(tools)):
-                inside, normal_x, normal_y, normal_z = penetration(rest, u, now, base[tool])
+                inside, normal_x, normal_y, normal_z = penetrations[tool](rest, u, now, base[tool])
                 depth = ti.max(inside, 0) * free
                 corrected = depth
                 if ti.static(grips):

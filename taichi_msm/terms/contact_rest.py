@@ -1,9 +1,9 @@
-"""Contact in quasi-static equilibrium: contact forces of tools, and projection of mass points out of their capsules.
+"""Contact in quasi-static equilibrium: contact forces of tools, and projection of mass points out of their shapes.
 
 A tool can push a mass point that touches it but cannot pull it. Of the force F on the mass point, the tool therefore
-carries the part into the capsule, min(F . n, 0) n; the remainder, tangential or outward, must vanish in equilibrium.
-The normals n are stored in the fields of corrections and are 0 where a mass point touches no tool. Held mass points
-move with their tool, which carries their whole force.
+carries the part into the shape, min(F . n, 0) n; the remainder, tangential or outward, must vanish in equilibrium.
+The normals n are stored in the fields of corrections and are 0 where a mass point touches no tool. Held mass points,
+also those that stick to a rough tool, move with their tool, which carries their whole force.
 
 A mass point may touch several tools. Their contact forces and corrections are then found by projected Gauss-Seidel
 iteration.
@@ -37,7 +37,13 @@ Array = NDArray[np.float64]
 
 def build_remove_contact(config: KernelConfig, layout: ContactLayout) -> Callable[..., None]:
     """Build the Taichi function remove_contact(force, sheet, at), which removes contact forces at an entry."""
-    ti, vector, tools, grips, first_field = config.ti, config.vector, layout.tools, layout.grips, layout.first_field
+    ti, vector, tools, grips, first_field = (
+        config.ti,
+        config.vector,
+        len(layout.shapes),
+        layout.grips,
+        layout.first_field,
+    )
     holding, iterations = layout.grip_field + HOLDER, _iterations(tools)
 
     @ti.func
@@ -68,9 +74,13 @@ def build_project_out(config: KernelConfig, layout: ContactLayout) -> Callable[.
     It projects mass points out of the tools, removes their momentum into the tools, and moves held mass points with
     their tool.
     """
-    ti, vector, tools, grips = config.ti, config.vector, layout.tools, layout.grips
+    ti, vector, tools, grips = config.ti, config.vector, len(layout.shapes), layout.grips
     first_field, grip_field, base = layout.first_field, layout.grip_field, layout.bases
-    penetration, iterations = build_penetration(config), _iterations(tools)
+    penetrations = [build_penetration(config, shape) for shape in layout.shapes]
+    iterations = _iterations(tools)
+    # Holders, and the columns with the shift of their mass points: of grips, and of rough tools.
+    holders = [(tool + 1, base[tool] + GRIP_SHIFT) for tool in range(tools)]
+    holders += [(tools + tool + 1, base[tool] + TIP_AFTER) for tool in range(tools) if layout.has_friction[tool]]
 
     @ti.func
     def project_out(sheet: ti.template(), i, kind, b, now: ti.template()):
@@ -84,21 +94,18 @@ def build_project_out(config: KernelConfig, layout: ContactLayout) -> Callable[.
         free = ti.select(sheet.by_column[(MOBILITY + kind) * sheet.width + b] > 0, vector(1), vector(0))
         if ti.static(grips):
             held = sheet.fields[(grip_field + HOLDER) * field + at]
-            for tool in ti.static(range(tools)):
+            for holder, shift in ti.static(holders):
                 for c in ti.static(range(3)):
-                    target = (
-                        sheet.fields[(grip_field + HOLD_DISPLACEMENT + c) * field + at]
-                        + now[base[tool] + GRIP_SHIFT + c]
-                    )
-                    u[c] = ti.select(held == tool + 1, target, u[c])
-                    q[c] = ti.select(held == tool + 1, vector(0), q[c])
+                    target = sheet.fields[(grip_field + HOLD_DISPLACEMENT + c) * field + at] + now[shift + c]
+                    u[c] = ti.select(held == holder, target, u[c])
+                    q[c] = ti.select(held == holder, vector(0), q[c])
             free = ti.select(held > 0, vector(0), free)
         for tool in ti.static(range(tools)):
             for c in ti.static(range(3)):
                 sheet.fields[(first_field + CORRECTIONS * tool + c) * field + at] = vector(0)
         for _ in range(iterations):
             for tool in ti.static(range(tools)):
-                depth, x, y, z = penetration(rest, u, now, base[tool])
+                depth, x, y, z = penetrations[tool](rest, u, now, base[tool])
                 normal = [x, y, z]
                 touches = ti.select(depth > 0, free, vector(0))
                 inward = ti.min(q[0] * x + q[1] * y + q[2] * z, 0) * touches
@@ -132,15 +139,16 @@ def touched_points(tools: int, memory: Array) -> NDArray[np.bool_]:
     normals = memory[: CORRECTIONS * tools].reshape(tools, CORRECTIONS, *memory.shape[1:])
     touched = (normals != 0).any(axis=1)
     if len(memory) > CORRECTIONS * tools:
-        touched |= memory[CORRECTIONS * tools + HOLDER] == np.arange(1, tools + 1)[:, None, None]
+        holder = memory[CORRECTIONS * tools + HOLDER]
+        touched |= (holder > 0) & ((holder - 1) % tools == np.arange(tools)[:, None, None])
     return np.asarray(touched)
 
 
 def grips(tools: Sequence[Tool], memory: Array) -> bool:
     """Return whether the tip of any tool holds a mass point; see `touched_points`."""
-    capsules = [n + 1 for n, tool in enumerate(tools) if not isinstance(tool, Clamp)]
+    touching = [n + 1 for n, tool in enumerate(tools) if not isinstance(tool, Clamp)]
     begin = CORRECTIONS * len(tools) + HOLDER
-    return bool(np.isin(memory[begin : begin + 1], capsules).any())
+    return bool(np.isin(memory[begin : begin + 1], touching).any())
 
 
 def set_tools(plan: Plan, frame: int, time: float, columns: Array) -> None:
@@ -176,10 +184,12 @@ def memory_after_grips(plan: Plan, frame: int, displacement: Array, before: Arra
             holder[holder == n + 1] = 0
         if isinstance(tool, Clamp):
             holder[tool.points] = n + 1
+        if not tool.rough:
+            holder[holder == len(tools) + n + 1] = 0
     for n, (tool, start) in enumerate(zip(tools, starts, strict=True)):
         if start == frame:
             distance = np.linalg.norm(position - _centre_at_grip(plan, tool, frame), axis=-1)
-            gripped = (distance <= GRIP_RADII * tool.radius) & ~plan.fixed & (holder == 0)
+            gripped = (distance <= GRIP_RADII * tool.radius) & ~plan.fixed & ((holder == 0) | (holder > len(tools)))
             holder[gripped] = n + 1
             held_displacement[:, gripped] = displacement[gripped].T
     return memory

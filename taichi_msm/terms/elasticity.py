@@ -9,9 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.arithmetic import NUMPY
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import area_shares, spacing
-from taichi_msm.terms.law import NUMPY, LawFunctions
+from taichi_msm.terms.law import LawFunctions
 from taichi_msm.terms.locking import law_numbers
 from taichi_msm.terms.springs import MIN_SQUARED_LENGTH, spring_law, spring_stiffness
 

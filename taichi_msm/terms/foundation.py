@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
+from taichi_msm.arithmetic import NUMPY
 from taichi_msm.model.loads import Schedule
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import Material, area_shares, spacing
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Foundation, Sheet
 from taichi_msm.terms.base import AREA_SHARE, KernelConfig, Term
-from taichi_msm.terms.law import NUMPY
 from taichi_msm.terms.locking import LockingLaw, build_locking, law_numbers, make_stiffening
 
 

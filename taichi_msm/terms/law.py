@@ -25,21 +25,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
-import numpy as np
-
-
-class Operations(NamedTuple):
-    """Functions of NumPy or Taichi that laws use in addition to + - * /."""
-
-    sqrt: Callable[..., Any]
-    log: Callable[..., Any]
-    maximum: Callable[..., Any]
-    minimum: Callable[..., Any]
-    where: Callable[..., Any]
-    wrap: Callable[[Callable[..., Any]], Callable[..., Any]]  # makes a function callable by other functions of a law
-
-
-NUMPY = Operations(np.sqrt, np.log, np.maximum, np.minimum, np.where, lambda function: function)
+from taichi_msm.arithmetic import Operations
 
 
 class LawFunctions(NamedTuple):

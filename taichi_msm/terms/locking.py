@@ -15,8 +15,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
+from taichi_msm.arithmetic import Operations
 from taichi_msm.model.sheet import LockNumbers
-from taichi_msm.terms.law import Law, LawFunctions, Operations
+from taichi_msm.terms.law import Law, LawFunctions
 
 # Up to this y, atanh(y) - y is computed by its series.
 MAX_SERIES_Y = 0.1

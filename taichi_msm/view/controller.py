@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.model.surface import Capsule
+from taichi_msm.model.surface import Solid
 from taichi_msm.render.camera import View, frozen_camera, orbit_camera, pinhole, view
 from taichi_msm.render.picking import intersect_rest_plane
 from taichi_msm.render.renderer import Renderer, Shot
@@ -185,17 +185,17 @@ class Viewport:
         """Show or hide the mesh."""
         self._change(wireframe=not self.render.wireframe)
 
-    def draw(self, positions: NDArray[Any], capsules: Sequence[Capsule] = ()) -> Picture:
+    def draw(self, positions: NDArray[Any], instruments: Sequence[Solid] = ()) -> Picture:
         """Draw the sheet and instruments.
 
         Args:
             positions: of the mass points [m], shape (rows, cols, 3).
-            capsules: the instruments.
+            instruments: the instruments.
 
         Returns:
             The picture, shape (height, width, 3).
         """
-        return self._renderer.draw(Shot(positions, self.view, capsules), self.render)
+        return self._renderer.draw(Shot(positions, self.view, instruments), self.render)
 
     def project(self, point: NDArray[np.floating]) -> tuple[float, float] | None:
         """Project a point [m], shape (3,), to a pixel (x, y); None behind the camera."""

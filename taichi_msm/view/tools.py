@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.tools import MAX_STRIDE_RADII
 from taichi_msm.scene.tools import Probe
+from taichi_msm.shapes import SHAPES
 
 # Rise time from no force to the full force, and travel time from the highest to the deepest position [s].
 RISE_TIME_S = 0.2
@@ -185,7 +185,7 @@ class PositionControlledTool:
     that a run allows. A grip begins when the tip has reached its depth, and ends with the release.
 
     Args:
-        probe: has the instrument, and the friction if it is set; quasi-static sessions have no friction.
+        probe: has the instrument, and the friction if it is set; in quasi-static sessions rough or none.
         plan: of the session.
 
     Attributes:
@@ -194,15 +194,17 @@ class PositionControlledTool:
         position: current position of the tip.
         target: position to which the tip moves.
         engaged: whether the tool presses or grips.
+        grid: of the session; a change of the material changes its step.
     """
 
     def __init__(self, probe: Probe, plan: Plan) -> None:
         assert probe.instrument is not None
-        self._grid, self._sheet, self._radius = plan.grid, plan.scene.sheet, probe.instrument.radius
+        self.grid, self._sheet, self._radius = plan.grid, plan.scene.sheet, probe.instrument.outer_radius
+        self._stride = SHAPES[probe.instrument.shape].max_stride * self._radius
         self._max_depth = min(MAX_DEPTH_RADII * self._radius, 0.25 * min(self._sheet.size))
         self._hover_height = _rounded(HOVER_HEIGHT_RADII * self._radius)
         friction = probe.friction if "friction" in probe.model_fields_set else DEFAULT_FRICTION
-        if plan.scene.time.at_rest:
+        if plan.scene.time.at_rest and friction != "rough":
             friction = 0.0
         self._probe = Probe(path=((0.0, 0.5, 0.5, self._hover_height),), friction=friction, instrument=probe.instrument)
         # The default depth is the radius of the tip.
@@ -288,13 +290,13 @@ class PositionControlledTool:
 
     def _move_tip(self) -> None:
         """Move the tip towards its target, by at most the distance that a frame allows."""
-        max_rise = (HOVER_HEIGHT_RADII * self._radius + self._max_depth) / (RISE_TIME_S * self._grid.frames_per_second)
+        max_rise = (HOVER_HEIGHT_RADII * self._radius + self._max_depth) / (RISE_TIME_S * self.grid.frames_per_second)
         rise = self._target_height - self.height
         goal = self._target_height if abs(rise) <= max_rise else self.height + math.copysign(max_rise, rise)
         (across, down), (to_across, to_down), (height, width) = self.position, self.target, self._sheet.size
         distance = math.hypot((to_across - across) * width, (to_down - down) * height, goal - self.height)
         # The margin of 2 % allows for rounded positions.
-        max_distance = 0.98 * MAX_STRIDE_RADII * self._radius * self._grid.steps_per_frame
+        max_distance = 0.98 * self._stride * self.grid.steps_per_frame
         fraction = min(1.0, max_distance / distance) if distance > 0 else 1.0
         if fraction < 1:
             self.position = on_sheet((across + fraction * (to_across - across), down + fraction * (to_down - down)))
@@ -304,7 +306,7 @@ class PositionControlledTool:
 
     def _time(self, frame: int) -> float:
         """Return the time of a frame [s], bit-identical to that of its step, so that the tip is exactly at its key."""
-        return self._grid.time(frame * self._grid.steps_per_frame)
+        return self.grid.time(frame * self.grid.steps_per_frame)
 
 
 def _rounded(height: float) -> float:

@@ -176,6 +176,7 @@ def test_what_f32_cannot_reach_names_f64(device: Device, message: Messages) -> N
         choose_step(plan_of(made), device)
 
 
+@pytest.mark.slow
 def test_a_motion_that_does_not_converge_is_refused(device: Device, message: Messages) -> None:
     # Pushed in along the sheet without damping, the points collide and scatter.
     probe = {"force": [3e5, 1e5, -1e4], "falloff": 20}

@@ -61,6 +61,7 @@ def told(plan: Plan, device: Device) -> RunErrorEstimates:
     return known.estimates
 
 
+@pytest.mark.default_cases("18")
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_error_of_the_step_is_hardly_above_what_is_told(seed: int, image: str, device: Device) -> None:
     plan = plan_of(random_contact(seed, image))
@@ -73,6 +74,7 @@ def test_the_error_of_the_step_is_hardly_above_what_is_told(seed: int, image: st
     assert estimate.error <= 8 * error
 
 
+@pytest.mark.default_cases("18")
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_error_of_the_points_is_hardly_above_what_is_told(seed: int, image: str, device: Device) -> None:
     plan = plan_of(random_contact(seed, image, cells=4))
@@ -105,6 +107,7 @@ def walled(path: list[list[float]], rod: dict[str, Any], time: dict[str, Any], *
     return Scene.model_validate(made)
 
 
+@pytest.mark.slow
 def test_the_errors_of_a_drag_are_about_what_is_told(device: Device) -> None:
     """Told over true is between 0.67 and 4, of displacements and forces, as shares of the greatest."""
     path = [[0, 0.54, 0.35, 0.001], [0.15, 0.54, 0.35, -0.01], [0.48, 0.48, 0.37, -0.01], [0.54, 0.48, 0.37, 0.012]]
@@ -136,6 +139,7 @@ def moved_tissue(radius: float = 0.006, place: float = 0.4583) -> Scene:
     return walled(path, rod, {**time, "precision": "auto"}, sheet=sheet, tissue=soft, output=["forces"])
 
 
+@pytest.mark.default_cases("pressed-0.03")
 @pytest.mark.parametrize("tolerance", [0.03, pytest.param(0.003, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("case", [[PRESSED], [RUBBED], [HELD]], ids=["pressed", "rubbed", "held"])
 def test_a_tolerance_is_kept(case: list[dict[str, Any]], tolerance: float, device: Device) -> None:
@@ -188,6 +192,7 @@ def test_points_too_far_apart_for_a_tool_have_one_remedy(radius: float, message:
     message(notes_of(made, MOVED, None, mesh=MeshEstimate(0.3, at_most=True)))
 
 
+@pytest.mark.slow
 def test_tools_that_run_through_each_other_are_found() -> None:
     """Of random middle lines, some parallel, some of hardly any length."""
     rng, found = np.random.default_rng(5), 0
@@ -209,6 +214,7 @@ def test_tools_that_run_through_each_other_are_found() -> None:
     assert found == 60
 
 
+@pytest.mark.slow
 def test_the_error_with_tools_in_one_place_may_be_larger(device: Device, message: Messages) -> None:
     meets = moved([0, 0.8, 0.5, 0.01], [0.2, 0.55, 0.5, -0.02])
     plan = plan_of(touching([PRESSED, meets], time={"duration": 0.2}))
@@ -233,6 +239,7 @@ def test_the_pilot_of_the_points_is_compared_with_the_run(device: Device, monkey
     assert of_25.scene.sheet.points == (18, 18)  # 24 / √2 is 16.97.
 
 
+@pytest.mark.default_cases("0.0045")
 @pytest.mark.parametrize("radius", [0.003, 0.0045])
 def test_where_a_tip_is_as_narrow_as_a_cell_a_nearer_run_follows(radius: float, device: Device) -> None:
     """The first run differs by 50 or 80 %, of which the run is off by a tenth."""

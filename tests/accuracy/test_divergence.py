@@ -157,6 +157,13 @@ SOUND = {
 }
 
 
+@pytest.mark.default_cases(
+    "flies free, as nothing joins it to the border",
+    "virtual springs begin twice in a frame, each time farther away",
+    "is let go at a frame, but for rounding",
+    "a tool takes it along, and lets it fly sixty times as far as it is long",
+    "moves by less than f32 can square",
+)
 @pytest.mark.parametrize("name", SOUND)
 def test_what_is_sound_is_let_pass(name: str, device: Device) -> None:
     with Simulation(SOUND[name], threads=device.threads) as simulation:

@@ -160,6 +160,7 @@ def test_a_study_that_could_not_be_written_is_not_begun(
         message(done.stderr, out)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("stage", "runs"), [("heard", 0), ("stepping", 20)])
 def test_ctrl_c_leaves_what_a_study_has_done(stage: str, runs: int, small: Path, message: Messages) -> None:
     """In a folder of its own where there is an earlier study."""
@@ -197,6 +198,7 @@ def test_a_simulation_that_runs_away_stops_with_3(small: Path, program: Program,
     assert np.isfinite(np.load(small / "wild" / "trajectory.npz")["position"]).all()
 
 
+@pytest.mark.default_cases("encoder")
 @pytest.mark.parametrize(
     ("number", "code", "threads", "stopped"),
     [
@@ -271,6 +273,7 @@ def test_a_signal_before_the_first_frame_changes_nothing(
     assert (small / "kept" / "run.json").read_text() == earlier
 
 
+@pytest.mark.slow
 def test_a_stale_lock_does_not_cost_the_cache(small: Path) -> None:
     environment = {**os.environ, active_compiler().folder_variable: str(small / "cache")}
     lock = small / "cache" / active_compiler().lock
@@ -291,6 +294,7 @@ def test_a_stale_lock_does_not_cost_the_cache(small: Path) -> None:
         assert bool(kernels()) == kept, "someone else's lock is respected, a dead one's is not"
 
 
+@pytest.mark.slow
 def test_more_threads_than_cores_are_no_harm(small: Path) -> None:
     settings = ["--set", "sheet.points=[200,200]", "--set", "time.duration=0.1", "--set", "output=[]", "--out", "many"]
     done = own_process("run", "small.yaml", "--threads", "16", "--quiet", *settings, timeout=300)
@@ -498,6 +502,7 @@ def test_a_bug_is_one_line(
     message(err, "TAICHI_MSM_TRACEBACK=1")
 
 
+@pytest.mark.slow
 def test_warnings_of_libraries_end_no_command(small: Path, root: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": str(root), "PYTHONWARNINGS": "error"}
     command = [sys.executable, "-m", "taichi_msm", "run", "small.yaml", "--quiet", "--set", "output=[gif]"]
@@ -551,6 +556,7 @@ def shell(line: str, **environment: str) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.slow
 @needs_full
 @commands(TELLING)
 def test_errors_that_nobody_can_read_do_not_change_the_exit_code(command: str, here: Path) -> None:
@@ -559,6 +565,7 @@ def test_errors_that_nobody_can_read_do_not_change_the_exit_code(command: str, h
     assert (here / "output" / "small" / "trajectory.npz").exists() == (command == RUN)
 
 
+@pytest.mark.default_cases("run small.yaml --set output=[trajectory]")
 @needs_full
 @commands(PRINTING)
 def test_results_that_nobody_can_read_are_4(command: str, here: Path) -> None:
@@ -581,6 +588,7 @@ def test_results_that_nobody_can_read_are_4(command: str, here: Path) -> None:
         assert shell(f"msm {command} >&-").returncode == CODES[command]
 
 
+@pytest.mark.slow
 @needs_full
 def test_a_signal_is_heard_though_nobody_can_read_of_it(here: Path) -> None:
     command = ["run", "small.yaml", "--set", "render.size=[2048,2048]"]
@@ -590,6 +598,7 @@ def test_a_signal_is_heard_though_nobody_can_read_of_it(here: Path) -> None:
         assert process.wait(timeout=60) == 143
 
 
+@pytest.mark.default_cases("no folder")
 @pytest.mark.parametrize(
     "environment",
     [{"HOME": "", FOLDER: ""}, {"HOME": "/proc/none", FOLDER: ""}, {FOLDER: "/dev/null/below"}],
@@ -613,6 +622,7 @@ def test_a_current_folder_that_is_gone_is_one_clear_line(here: Path, message: Me
     message(done.stderr)
 
 
+@pytest.mark.slow
 def test_numbers_too_large_are_no_warning(here: Path, message: Messages) -> None:
     force = "--set probes.0.force=[0,0,1e30] --set probes.0.load=[[0,1e30]] --set probes.0.offset=-50"
     done = shell(f"msm {RUN} --quiet {force}")

@@ -14,11 +14,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from taichi_msm.exports import gltf
 from taichi_msm.exports.export import export
 from taichi_msm.exports.gltf import key_frames
 from taichi_msm.exports.inputs import unit_normals
+from taichi_msm.model.surface import place_instruments
+from taichi_msm.render.camera import view_at
+from taichi_msm.runs.finished import read_run
 from tests.golden import Messages
 from tests.runs.test_finished import change, change_scene
 from tests.scenes import speckle
@@ -49,7 +53,7 @@ class Glb(NamedTuple):
     def accessor(self, number: int) -> Array:
         accessor = self.document["accessors"][number]
         dtype = {5126: "<f4", 5125: "<u4"}[accessor["componentType"]]
-        size = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}[accessor["type"]]
+        size = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}[accessor["type"]]
         return np.frombuffer(self.view(accessor["bufferView"]), dtype).reshape(accessor["count"], size)
 
     @property
@@ -280,3 +284,85 @@ def test_a_run_of_many_frames_or_points_is_told_by_key_frames(
     message(done.notes, hide=r"(?<=than )\S+")
     apart = [found.at(frame / 10) - expected[frame].reshape(-1, 3) for frame in range(5)]
     assert np.linalg.norm(apart, axis=-1).max() == pytest.approx(keys.error, rel=1e-5)
+
+
+ROD = {"radius": 0.02, "shaft": [0.3, -0.4, 1], "length": 0.1}
+FINGER = {"path": [[0, 0.5, 0.5, 0.02], [0.4, 0.6, 0.4, -0.01]], "instrument": ROD}
+HELD = {"at": [0.3, 0.6], "force": [0, 0, 1], "load": [[0, 100]], "instrument": {**ROD, "shaft": [-1, 0, 0]}}
+
+
+@pytest.fixture
+def furnished(results: Path) -> Glb:
+    """A file of a run with two tools, one camera that moves and one that is orthographic."""
+    moving = {"eye": [[0, 0.1, -0.3, 0.4], [0.4, 0.3, 0.1, 0.5]], "up": [0.2, 1, 0], "fov": 50}
+    render = {"camera": None, "cameras": {"left": moving, "above": "top"}}
+    change_scene(results, probes=[FINGER, HELD], render=render, output=["trajectory"])
+    assert export(results, "gltf", results / "out").notes == []
+    return read_glb(results / "out" / "surface.glb")
+
+
+def pose_at(found: Glb, name: str, frame: int) -> tuple[Array, Array]:
+    """Translation and rotation matrix of a node in a frame."""
+    (number,) = [number for number, node in enumerate(found.document["nodes"]) if node["name"] == name]
+    values = {"rotation": np.array([0, 0, 0, 1.0])} | found.document["nodes"][number]
+    (animation,) = found.document["animations"]
+    for channel in animation["channels"]:
+        if channel["target"]["node"] == number:
+            sampler = animation["samplers"][channel["sampler"]]
+            np.testing.assert_allclose(found.accessor(sampler["input"])[:, 0], np.arange(5) / 10, rtol=1e-6)
+            values[channel["target"]["path"]] = found.accessor(sampler["output"])[frame]
+    return np.array(values["translation"]), Rotation.from_quat(values["rotation"]).as_matrix()
+
+
+def test_tools_are_capsules_where_the_run_had_them(furnished: Glb, results: Path) -> None:
+    run = read_run(results)
+    for index, name in enumerate(("probes.0", "probes.1")):
+        (mesh,) = [mesh for mesh in furnished.document["meshes"] if mesh["name"] == name]
+        (primitive,) = mesh["primitives"]
+        vertices, normals = (
+            furnished.accessor(primitive["attributes"][key]).astype(float) for key in ("POSITION", "NORMAL")
+        )
+        triangles = vertices[furnished.accessor(primitive["indices"]).reshape(-1, 3)]
+        outward = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+        for frame in (0, 4):
+            capsule = place_instruments(run.scene, run.positions()[frame], frame / 10)[index]
+            np.testing.assert_allclose(pose_at(furnished, name, frame)[0], capsule.tip, atol=1e-7)
+        nearest = np.clip(vertices @ capsule.axis, 0, capsule.length)[:, None] * capsule.axis
+        np.testing.assert_allclose(vertices - nearest, capsule.radius * normals, atol=1e-7)
+        middle = triangles.mean(axis=1)
+        nearest = np.clip(middle @ capsule.axis, 0, capsule.length)[:, None] * capsule.axis
+        assert (np.einsum("ij,ij->i", outward, middle - nearest) > 0).all()
+        ends = np.ptp(vertices @ capsule.axis)
+        assert ends == pytest.approx(capsule.length + 2 * capsule.radius, abs=1e-7)
+
+
+def test_cameras_see_what_those_of_the_run_saw(furnished: Glb, results: Path) -> None:
+    run, points = read_run(results), np.array([[0.1, 0.05, 0], [-0.15, 0.1, 0.02], [0, -0.1, -0.03]])
+    optics = {camera["name"]: camera for camera in furnished.document["cameras"]}
+    for name, frame in (("left", 0), ("left", 3), ("above", 3)):
+        eye, rotation = pose_at(furnished, name, frame)
+        x, y, z = ((points - eye) @ rotation).T
+        if name == "left":
+            lens = optics[name]["perspective"]
+            scale_y = 1 / np.tan(lens["yfov"] / 2) / -z
+            scale_x = scale_y / lens["aspectRatio"]
+        else:
+            lens = optics[name]["orthographic"]
+            scale_x, scale_y = 1 / lens["xmag"], 1 / lens["ymag"]
+            assert (lens["znear"] < -z).all()
+            assert (-z < lens["zfar"]).all()
+        pixels = np.stack([20 * (1 + x * scale_x), 15 * (1 - y * scale_y)], axis=-1)
+        # Poses are rounded to single precision.
+        np.testing.assert_allclose(pixels, view_at(run.scene, frame / 10, name).pixels(points), atol=1e-4)
+
+
+def test_the_validator_finds_nothing_in_tools_and_cameras(furnished: Glb, results: Path) -> None:
+    issues = validate((results / "out" / "surface.glb").read_bytes())["issues"]
+    assert {issue["code"] for issue in issues["messages"]} <= {"IMAGE_NPOT_DIMENSIONS"}
+
+
+def test_a_distortion_is_left_out_with_a_warning(results: Path, message: Messages) -> None:
+    intrinsics = {"fx": 40, "fy": 40, "cx": 19.5, "cy": 14.5}
+    camera = {"eye": [0, 0, 0.5], "intrinsics": intrinsics, "distortion": {"k1": 0.01}}
+    change_scene(results, render={"camera": camera})
+    message(export(results, "gltf", results / "out").notes, "camera")

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from taichi_msm import NotInstalledError, export
-from taichi_msm.model.surface import place_capsules
+from taichi_msm.model.surface import place_instruments
 from taichi_msm.runs.arrays import read_flo
 from taichi_msm.runs.finished import read_run
 from tests.golden import Messages
@@ -61,13 +61,8 @@ def test_a_recording_has_what_the_run_has(labelled_in_motion: Path, tmp_path: Pa
     for frame in range(FRAMES):
         assert found["/world/sheet time"][frame].total_seconds() == pytest.approx(frame / 10)
         np.testing.assert_allclose(found[sheet + "vertex_positions"][frame], positions[frame].reshape(-1, 3), atol=1e-7)
-        (capsule,) = place_capsules(finished.scene, positions[frame], frame / 10)
-        tool = {name: found[f"/world/tools/0 Capsules3D:{name}"][frame][0] for name in ("translations", "quaternions")}
-        np.testing.assert_allclose(tool["translations"], capsule.tip, atol=1e-6)
-        x, y, z, w = tool["quaternions"]
-        # The third column of the quaternion's matrix: what it makes of z.
-        turned = [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)]
-        np.testing.assert_allclose(turned, capsule.axis, atol=1e-6)
+        (capsule,) = place_instruments(finished.scene, positions[frame], frame / 10)
+        np.testing.assert_allclose(found["/world/tools/0 Transform3D:translation"][frame][0], capsule.tip, atol=1e-6)
         np.testing.assert_allclose(found["/world/tracks Points3D:positions"][frame], tracks["position"][:, frame])
         # Columns first, and from the camera to the world.
         matrix = np.array(found["/world/camera Transform3D:mat3x3"][frame]).reshape(3, 3).T

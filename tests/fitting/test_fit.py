@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from taichi_msm import ArgumentError, SceneError, Simulation, fit, load_scene, run
-from taichi_msm.fitting.checks import MIN_MOTION_SIGMAS, faults, largest_motion
+from taichi_msm.fitting.archive import read_observations
+from taichi_msm.fitting.checks import faults
 from taichi_msm.fitting.force_table import read_forces
-from taichi_msm.fitting.least_squares import ErrorCorrelation
-from taichi_msm.fitting.observations import Observations, project_points, read_observations
+from taichi_msm.fitting.observation import ErrorCorrelation
 from taichi_msm.fitting.parameters import Method, make_parameters
+from taichi_msm.fitting.points import MIN_MOTION_SIGMAS, Pixels
 from taichi_msm.fitting.predict import FitProblem, ForwardModel, Prediction, Runs, without_outputs
-from taichi_msm.fitting.rejection import by_pattern
 from taichi_msm.fitting.result import FitResult
 from taichi_msm.model.surface import surface_positions
 from taichi_msm.scene.scene import Scene
@@ -114,7 +114,7 @@ def test_a_camera_that_moves_and_bends_lines_sees_what_is_predicted(motion: Arra
     eye = [[0, 0, -0.06, 0.09], [0.4, 0.02, -0.05, 0.1]]
     made = changed(render__camera={"eye": eye, "fov": 40, "distortion": {"k1": -0.3, "k2": 0.1}})
     points = np.stack([surface_positions(each, made.render.refine, PLACES) for each in motion], axis=1)
-    seen = project_points(made, points, np.arange(11) / 25)
+    seen = Pixels("", np.arange(11) / 25, points, None, PLACES).observe(made, points)
     np.testing.assert_allclose(seen, pixels_in(made, motion, device), atol=1e-4)
 
 
@@ -128,6 +128,7 @@ def test_the_truth_comes_back_from_a_start_that_is_far_off(motion: Array) -> Non
     assert found.parameters["tissue.young"].start == 6e4
 
 
+@pytest.mark.slow
 def test_other_starts_are_tried_where_the_first_does_not_fit(motion: Array) -> None:
     # From a tool at the other end of the sheet nothing leads to the middle.
     start = changed(probes__0__at=[0.05, 0.05])
@@ -158,6 +159,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(tracks: dict[str, Array])
     assert 0.5 < float(np.std(ratios)) < 1.5
 
 
+@pytest.mark.default_cases("True")
 @pytest.mark.parametrize("bounded", [False, True])
 def test_a_profile_ends_where_the_others_can_no_longer_make_up_for_it(tracks: dict[str, Array], bounded: bool) -> None:
     # Errors so large that the motion is not linear in the damping; or a foundation that bounds keep from the truth.
@@ -177,6 +179,7 @@ def test_a_profile_ends_where_the_others_can_no_longer_make_up_for_it(tracks: di
     assert curve.max() > 1.9
 
 
+@pytest.mark.slow
 def test_what_pictures_cannot_tell_is_named_and_a_force_tells_it(
     tracks: dict[str, Array], tmp_path: Path, message: Messages
 ) -> None:
@@ -200,7 +203,7 @@ def test_what_pictures_cannot_tell_is_named_and_a_force_tells_it(
     assert told.identifiable
     assert told.unseen == []
     assert told.residual_force < 1e-4
-    assert told.fitted_forces.shape == (5, 3)
+    assert told.fitted[1].shape == (5, 3)
     np.testing.assert_allclose(values(told), [2e4, 3e5, 10, -2], rtol=1e-4)
 
 
@@ -286,6 +289,7 @@ def test_depths_and_forces_of_a_tool_tell_the_foundation(device: Device, tmp_pat
     assert record["residual_force"] < 0.001
 
 
+@pytest.mark.slow
 def test_what_is_far_off_counts_less_in_a_robust_fit(tracks: dict[str, Array]) -> None:
     seen, free = noisy(tracks, 0.1), ["tissue.foundation"]
     seen["pixel"][[7, 20]] += np.linspace(0, 40, 11)[:, None]
@@ -303,6 +307,7 @@ def test_a_robust_fit_of_good_tracks_is_nearly_the_same(tracks: dict[str, Array]
     np.testing.assert_allclose(np.array(robust.interval, float), np.array(plain.interval, float), rtol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robust", [False, True])
 def test_tracks_that_are_far_apart_for_their_errors_are_independent(tracks: dict[str, Array], robust: bool) -> None:
     errors = []
@@ -313,6 +318,7 @@ def test_tracks_that_are_far_apart_for_their_errors_are_independent(tracks: dict
     np.testing.assert_allclose(errors[0], errors[1], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_errors_that_are_alike_widen_the_intervals_and_are_told(tracks: dict[str, Array]) -> None:
     # Each frame's tracks are off by one number, as when a camera shakes.
     rng, seen = np.random.default_rng(2), noisy(tracks, 0.02)
@@ -327,6 +333,7 @@ def test_errors_that_are_alike_widen_the_intervals_and_are_told(tracks: dict[str
     assert (high - low) / (2 * 1.96) == pytest.approx(alike.parameters[free[0]].standard_error, rel=0.1)
 
 
+@pytest.mark.slow
 def test_the_points_move_what_is_found_about_as_far_as_is_said(device: Device) -> None:
     position = positions_in(changed(sheet__points=[33, 33]), device)[:, ::4, ::4]
     found = fit(changed(), {"time": np.arange(11) / 25, "position": position}, ["tissue.foundation"])
@@ -360,6 +367,7 @@ def test_side_by_side_and_one_after_another_give_the_same_bits(tracks: dict[str,
     assert found[0].runs == found[1].runs
 
 
+@pytest.mark.slow
 def test_a_number_below_0_stays_there_and_one_that_starts_at_0_needs_bounds(
     tracks: dict[str, Array], message: Messages
 ) -> None:
@@ -456,15 +464,15 @@ def test_motion_of_many_tracks_is_seen_though_it_is_smaller_than_their_errors(tr
     for moving in (True, False):
         pixel = tracks["pixel"][:, :1] + moving * motion + noise
         seen = read_observations({**tracks, "pixel": pixel, "sigma": 1.0}, 25)
-        assert largest_motion(seen, changed()) < MIN_MOTION_SIGMAS
-        assert bool(list(faults(seen, changed(), 1))) != moving
+        assert seen.signal(changed()) < MIN_MOTION_SIGMAS
+        assert bool(list(faults([seen], changed(), 1))) != moving
 
 
 def test_values_that_make_no_scene_give_no_run(device: Device, tracks: dict[str, Array]) -> None:
     scene = changed(tissue__damping=0)
     free = ["tissue.damping", "tissue.young"]
     parameters = make_parameters(scene, free, {"tissue.damping": (-100, 100)})
-    job = FitProblem("token", without_outputs(scene), parameters, read_observations(tracks, 25))
+    job = FitProblem("token", without_outputs(scene), parameters, (read_observations(tracks, 25),))
     predictor = ForwardModel(job, device.threads)
     # Less than no damping; springs without length, as a tenth of young does not bear the pretension.
     assert predictor.try_predict(np.array([-0.1, 0.0])) is None
@@ -559,7 +567,7 @@ def test_tables_of_other_programs_are_understood(tmp_path: Path, data: bytes) ->
     (tmp_path / "forces.csv").write_bytes(data)
     read = read_forces(tmp_path / "forces.csv", 0.1, 1)
     assert (read.time.tolist(), read.probe.tolist()) == ([0.1], [0])
-    np.testing.assert_array_equal(read.force, [[np.nan, np.nan, -0.5]])
+    np.testing.assert_array_equal(read.values, [[np.nan, np.nan, -0.5]])
 
 
 def test_forces_of_a_pipe_or_a_huge_file_are_refused(tmp_path: Path, message: Messages) -> None:
@@ -621,7 +629,7 @@ def test_what_is_visible_is_seen(tracks: dict[str, Array], message: Messages) ->
 
 def test_conventions_of_other_programs_are_asked_about(tracks: dict[str, Array], message: Messages) -> None:
     def answer(**more: Any) -> list[str]:
-        return list(faults(read_observations({**tracks, **more}, 25), changed(), 2))
+        return list(faults([read_observations({**tracks, **more}, 25)], changed(), 2))
 
     assert answer() == []
     for mark in (0, -9999):
@@ -671,9 +679,13 @@ def test_offsets_of_half_a_pixel_and_turned_axes_are_asked_about(
 def test_an_exact_fit_has_errors_next_to_0(device: Device, robust: bool) -> None:
     free = ["tissue.young", "tissue.foundation"]
     empty = read_observations({"time": np.arange(11) / 25, "coordinates": PLACES, "position": np.ones((36, 11, 3))}, 25)
-    job = FitProblem("token", without_outputs(changed()), make_parameters(changed(), free, {}), empty)
+    job = FitProblem("token", without_outputs(changed()), make_parameters(changed(), free, {}), (empty,))
     predictor = ForwardModel(job, device.threads)
-    seen = {"time": empty.time, "coordinates": PLACES, "position": predictor.predict(np.zeros(2), to_end=True).values}
+    seen = {
+        "time": empty.time,
+        "coordinates": PLACES,
+        "position": predictor.predict(np.zeros(2), to_end=True).values[0],
+    }
     predictor.close()
     found = fit(changed(), seen, free, robust=robust, profile=True, workers=1)
     assert found.residual == 0
@@ -840,10 +852,9 @@ def test_noise_is_not_taken_for_a_wrong_model(alike: ErrorCorrelation) -> None:
         left = left if alike.drift is None else np.cumsum(left, axis=1)
         left[rng.random(left.shape) < 0.05] *= 10
         left[rng.random(left.shape[:2]) < 0.1] = np.nan
-        wolves += by_pattern(Observations("", "pixel", times, PLACES, left, None), left, 10.0, alike) is not None
+        wolves += Pixels("", times, left, None, PLACES).pattern(left, 10.0, alike) is not None
     # Of 400, 0.4 are expected; more than 3 have a probability of 1e-3.
     assert wolves <= 3
     times = np.arange(40.0)
     wrong = np.sin(times / 6)[:, None] + rng.normal(0, 1, (36, 40, 2))
-    seen = Observations("", "pixel", times, PLACES, wrong, None)
-    assert by_pattern(seen, wrong, 10.0, alike) is not None
+    assert Pixels("", times, wrong, None, PLACES).pattern(wrong, 10.0, alike) is not None

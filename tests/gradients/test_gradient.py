@@ -135,6 +135,7 @@ def test_the_tangent_is_symmetric_and_that_of_the_force(kind: str, image: str) -
     np.testing.assert_allclose(changed[0], exact, rtol=0, atol=1e-13 * np.abs(exact).max())
 
 
+@pytest.mark.default_cases("tissue, free edges-12", "springs-1")
 @pytest.mark.parametrize("steps", [1, 12])
 @pytest.mark.parametrize("kind", KINDS)
 def test_material_numbers_are_those_of_complex_steps(kind: str, steps: int, image: str, device: Device) -> None:
@@ -189,6 +190,7 @@ def put_in(made: dict[str, Any], path: list[str], index: tuple[int, ...], change
     return made
 
 
+@pytest.mark.default_cases("tissue, free edges")
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_is_missed_by_every_number_is_of_second_order(kind: str, image: str, device: Device) -> None:
     """By every number of a tool; complex steps do the others."""
@@ -362,6 +364,7 @@ def test_a_sheet_at_rest_has_the_slopes_of_its_shapes(device: Device) -> None:
     assert along({}, some) == pytest.approx(float((found.maps["tissue.map"] * some).sum()), rel=2e-3)
 
 
+@pytest.mark.slow
 def test_a_flat_sheet_that_nothing_holds_stays_flat(device: Device) -> None:
     made: dict[str, Any] = copy.deepcopy(REST)
     made["tissue"] |= {"pretension": 0, "bending": 0, "foundation_active": "loaded"}

@@ -14,7 +14,7 @@ from taichi_msm.errors import SceneError
 from taichi_msm.load import cost
 from taichi_msm.load.cost import FORCE_ROW_BYTES, Budget, require_disk, size_problems
 from taichi_msm.runs.run import run
-from taichi_msm.scene.outputs import OUTPUTS
+from taichi_msm.scene.outputs import ENTRIES
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system import process
 from taichi_msm.system.process import available_memory, available_threads
@@ -106,13 +106,13 @@ def test_a_run_takes_no_more_disk_than_was_said(size: tuple[int, int], device: D
         time={"duration": 1},
         probes=[{"force": [3, 2, 0], "falloff": 0}],
         render={"size": size, "cameras": cameras, "shading": "none", "tracks": 3},
-        output=[*OUTPUTS],
+        output=ENTRIES,
     )
     run(made, tmp_path / "out", threads=device.threads)
     sizes = {path: path.stat().st_size for path in (tmp_path / "out").rglob("*") if path.is_file()}
     # Of each camera four kinds of labels and the pictures at 11 frames, two kinds between them, and four files; the
-    # disparity of one; three files of the run.
-    assert len(sizes) == 2 * (5 * 11 + 2 * 10 + 4) + 11 + 3
+    # disparity and two kinds of stereo of one; three files of the run.
+    assert len(sizes) == 2 * (5 * 11 + 2 * 10 + 4) + 3 * 11 + 3
     need = estimate(made)
     assert sum(sizes.values()) <= need.disk_bytes
     pictures = sum(size for path, size in sizes.items() if path.parent.name == "frames")

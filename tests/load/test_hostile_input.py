@@ -81,7 +81,7 @@ def in_bounds(folder: Path) -> Iterator[Callable[[Callable[[], object]], bool]]:
     assert sorted(folder.rglob("*")) == before
 
 
-@tries(SCENES)
+@tries(SCENES, 30)
 def test_damaged_scenes(tries: int, here: Path, root: Path) -> None:
     rng = random.Random(1)
     scenes = [path.read_bytes() for path in sorted((root / "scenes").glob("*.yaml"))]

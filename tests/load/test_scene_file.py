@@ -277,6 +277,7 @@ def test_a_billion_laughs_stay_small(load: Load) -> None:
     assert time.perf_counter() - before < 1
 
 
+@pytest.mark.default_cases("probes")
 @pytest.mark.parametrize(
     "text",
     [

@@ -63,6 +63,7 @@ def random_load(seed: int) -> list[list[float]]:
     return [[float(t), float(rng.uniform(-100, 100))] for t in times]
 
 
+@pytest.mark.default_cases("2")
 @pytest.mark.parametrize("seed", range(4))
 def test_the_average_is_the_integral_with_the_hat(seed: int) -> None:
     load = random_load(seed)

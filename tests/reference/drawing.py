@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.model.surface import Capsule
+from taichi_msm.model.surface import Solid
 from taichi_msm.render import uniforms
 from taichi_msm.render.camera import View, view
 from taichi_msm.scene.scene import Scene
@@ -161,7 +161,7 @@ def footprint(triangle: Array, at: Sampled, texels: tuple[int, int]) -> Array:
 
 
 def draw(
-    scene: Scene, position: Array, texture: NDArray[np.uint8], rods: Sequence[Capsule] = (), camera: View | None = None
+    scene: Scene, position: Array, texture: NDArray[np.uint8], rods: Sequence[Solid] = (), camera: View | None = None
 ) -> NDArray[np.uint8]:
     """Draw one frame of positions, shape (rows, cols, 3), a picture, shape (height, width, 3), and instruments."""
     factor, camera = scene.render.supersample, camera or view(scene)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.model.surface import Capsule
+from taichi_msm.model.surface import Solid
 from taichi_msm.render.camera import view
 from taichi_msm.scene.scene import Scene
 from tests.reference.drawing import look, refine, triangles, weights
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 TOUCHING = 1e-9
 
 
-def labels(scene: Scene, position: Array, rods: Sequence[Capsule] = ()) -> tuple[Array, Array, NDArray[np.bool_]]:
+def labels(scene: Scene, position: Array, rods: Sequence[Solid] = ()) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Find what each pixel shows at its centre.
 
     Returns:
@@ -35,7 +35,7 @@ def labels(scene: Scene, position: Array, rods: Sequence[Capsule] = ()) -> tuple
     return coordinates, np.where(np.isfinite(depth), depth, 0), nearer
 
 
-def normals(scene: Scene, position: Array, rods: Sequence[Capsule] = ()) -> Array:
+def normals(scene: Scene, position: Array, rods: Sequence[Solid] = ()) -> Array:
     """Give the unit normal of what each pixel shows at its centre, toward the camera; arguments as for `labels`.
 
     It is in OpenCV's axes of the camera, shape (height, width, 3); NaN where nothing is seen.

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.model.surface import Capsule
+from taichi_msm.model.surface import Solid
 from taichi_msm.render import uniforms
 from taichi_msm.render.camera import View
 from taichi_msm.scene.scene import Scene
@@ -160,7 +160,7 @@ def tissue(
     normal: Array,
     depth: Array,
     place: tuple[Array, Array, Array],
-    rods: Sequence[Capsule],
+    rods: Sequence[Solid],
 ) -> Array:
     """Shade wet tissue; see `render/shading.py`. Colours, shape (height, width, 3).
 
@@ -208,7 +208,7 @@ def metal(camera: View, factor: int, depth: Array, normal: Array) -> Array:
     return np.asarray(np.minimum(share[..., None] * np.array(uniforms.METAL) + gloss[..., None], 255))
 
 
-def meet(rods: Sequence[Capsule], camera: View, size: tuple[int, int], factor: int) -> tuple[Array, Array]:
+def meet(rods: Sequence[Solid], camera: View, size: tuple[int, int], factor: int) -> tuple[Array, Array]:
     """Find the instruments that samples show, by search: the distance to a rod is convex along a line of sight.
 
     Returns:
@@ -229,7 +229,7 @@ def meet(rods: Sequence[Capsule], camera: View, size: tuple[int, int], factor: i
 
     for rod in rods:
 
-        def outward(depth: Array, rod: Capsule = rod) -> Array:
+        def outward(depth: Array, rod: Solid = rod) -> Array:
             point = sight(depth) - rod.tip
             foot = np.clip(point @ rod.axis, 0, rod.length)
             return np.asarray(point - foot[..., None] * rod.axis)

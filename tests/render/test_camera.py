@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from taichi_msm.errors import SceneError
+from taichi_msm.model.sheet import rest_positions
 from taichi_msm.render.camera import camera_problems, view
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.camera import Camera
@@ -59,6 +60,20 @@ def test_right_is_right_and_up_is_up() -> None:
         assert pixel(made, [0.01, 0, 0])[0][0] > centre[0]
         assert pixel(made, [0, 0.01, 0])[0][1] < centre[1]
         assert pixel(made, [0, 0, 0.01])[1] < pixel(made, [0, 0, 0])[1]
+
+
+@pytest.mark.parametrize("sheet_size", [(0.3, 0.4), (2.0, 0.1), (1e-3, 0.5)])
+@pytest.mark.parametrize("size", [(100, 60), (40, 90), (640, 8), (1, 1)])
+def test_fit_fills_the_picture_up_to_its_margin(sheet_size: tuple[float, float], size: tuple[int, int]) -> None:
+    render = {"camera": "fit", "size": list(size)}
+    made = scene(sheet={"points": [3, 3], "size": list(sheet_size), "mass": 1e-3}, render=render)
+    pixels = np.array([pixel(made, list(point))[0] for point in rest_positions(made.sheet).reshape(-1, 3)])
+    x, y = pixels.T / np.reshape(size, (2, 1))
+    bounds = np.array([x.min(), 1 - x.max(), y.min(), 1 - y.max()])
+    # Rounding of numbers of about 1.
+    np.testing.assert_allclose(bounds[::2], bounds[1::2], atol=1e-12, err_msg="the sheet is in the middle")
+    assert bounds.min() == pytest.approx(0.02, abs=1e-12), "it touches the margin on two sides"
+    assert view(made).matrix[3] @ [0, -sheet_size[0] / 2, 0, 1] < view(made).matrix[3] @ [0, sheet_size[0] / 2, 0, 1]
 
 
 @pytest.mark.parametrize("away", [1e-3, 1.0, 1e6])

@@ -14,7 +14,7 @@ from taichi_msm.errors import SceneError
 from taichi_msm.lenses import MODELS
 from taichi_msm.lenses.model import MAX_RADIUS
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.model.surface import place_capsules
+from taichi_msm.model.surface import place_instruments
 from taichi_msm.render import tracking, uniforms
 from taichi_msm.render.camera import calibration, view
 from taichi_msm.render.labels import track_grid
@@ -259,7 +259,7 @@ def test_pictures_are_like_the_twins(lens: str, render: dict[str, Any], device: 
     made, texture = seen_through(lens, **render), speckle(13, 17)
     for shape in (dented, folded):
         position = shape(made)
-        placed = place_capsules(made, position, 0)
+        placed = place_instruments(made, position, 0)
         drawn = Rasterizer(made, texture).draw(position, rods=placed)
         apart = difference(drawn, reference.draw(made, position, texture, placed))
         # As without a lens (test_drawing.py).
@@ -268,6 +268,7 @@ def test_pictures_are_like_the_twins(lens: str, render: dict[str, Any], device: 
         assert 0.2 < (drawn.max(axis=-1) > 0).mean() < 0.95
 
 
+@pytest.mark.default_cases("fisheye-3")
 @cases(("fold", 0), ("fisheye", 3), lens=LENSES, refine=(0, 3))
 def test_large_cells_are_bent(lens: str, refine: int, device: Device) -> None:
     """Sides of cells 90 pixels long bend by up to 8 px, more than a tile, outward and inward."""
@@ -279,6 +280,7 @@ def test_large_cells_are_bent(lens: str, refine: int, device: Device) -> None:
     np.testing.assert_allclose(found.coordinates, coordinates, atol=1e-5)
 
 
+@pytest.mark.slow
 @cases(("fisheye", 4), lens=LENSES, lanes=(1, 4))
 def test_the_shape_of_a_tile_does_not_change_the_bits(lens: str, lanes: int, device: Device) -> None:
     renders: list[dict[str, Any]] = [{"shading": "tissue", "size": [79, 57]}, {"wireframe": True, "supersample": 3}]
@@ -287,11 +289,12 @@ def test_the_shape_of_a_tile_does_not_change_the_bits(lens: str, lanes: int, dev
         assert_alike_in_other_tiles(made, texture, folded(made), lanes)
 
 
+@pytest.mark.default_cases("endoscope-folded", "fisheye-folded")
 @cases(*((lens, folded) for lens in QUICK), ("fold", crumpled), lens=LENSES, shape=(dented, folded, crumpled))
 def test_labels_are_on_the_ray_of_each_pixel(lens: str, shape: Any, device: Device) -> None:
     made = seen_through(lens)
     position = shape(made)
-    placed = place_capsules(made, position, 0)
+    placed = place_instruments(made, position, 0)
     found, (coordinates, depth, instrument) = look(made, position), twin.labels(made, position, placed)
     alike = (np.isnan(found.coordinates[..., 0]) == np.isnan(coordinates[..., 0])) & (
         np.abs(found.depth - depth) < 1e-4 * depth.max()

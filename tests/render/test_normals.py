@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from taichi_msm import Playback, Simulation, run
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.model.surface import Capsule, place_capsules
+from taichi_msm.model.surface import Solid, place_instruments
 from taichi_msm.render.camera import view
 from taichi_msm.render.labels import LABELS, Labels, requested_labels
 from taichi_msm.render.rasterizer import Rasterizer, drawing_config
@@ -36,7 +36,7 @@ CAMERAS: dict[str, Any] = {
 EVERY_CAMERA = pytest.mark.parametrize("camera", CAMERAS)
 
 
-def look(made: Scene, position: Array, placed: list[Capsule] | None = None, **config: Any) -> Labels:
+def look(made: Scene, position: Array, placed: list[Solid] | None = None, **config: Any) -> Labels:
     kernel = drawing_config(made, picture=False, labels=LABELS)._replace(**config)
     found = Rasterizer(made, speckle(9, 9), kernel).look(position, rods=placed or []).labels
     assert found is not None
@@ -62,11 +62,12 @@ def axes(made: Scene) -> Array:
     return view(made).axes.T * [1, -1, -1]
 
 
+@pytest.mark.default_cases("folded-top", "crumpled-endoscope")
 @pytest.mark.parametrize(("shape", "camera"), [(folded, "top"), (dented, "pinhole"), (crumpled, "endoscope")])
 def test_normals_are_those_of_the_twin(shape: Any, camera: str, device: Device) -> None:
     made = with_instruments(drawable(camera=CAMERAS[camera]))
     position = shape(made)
-    placed = place_capsules(made, position, 0)
+    placed = place_instruments(made, position, 0)
     (_, depth, _, found), expected = look(made, position, placed), twin.normals(made, position, placed)
     np.testing.assert_array_equal(np.isnan(found), np.isnan(expected))
     seen = ~np.isnan(found[..., 0])
@@ -80,6 +81,7 @@ def test_normals_are_those_of_the_twin(shape: Any, camera: str, device: Device) 
     assert ((sight * found).sum(axis=-1)[seen] < 1e-6).all(), "toward the camera"
 
 
+@pytest.mark.default_cases("top", "calibrated")
 @EVERY_CAMERA
 def test_a_tilted_sheet_has_one_normal(camera: str, device: Device) -> None:
     made = with_instruments(drawable(camera=CAMERAS[camera]))
@@ -99,7 +101,7 @@ def test_a_tilted_sheet_has_one_normal(camera: str, device: Device) -> None:
 def test_a_rod_has_the_normals_of_its_side_and_of_its_round_tip(camera: str, device: Device) -> None:
     made = with_instruments(drawable(camera=CAMERAS[camera]))
     shaft = np.array([0.96, 0.0, 0.28])
-    rod = Capsule(np.array([-0.03, 0.02, 0.03]), shaft, 0.05, 0.03)
+    rod = Solid(np.array([-0.03, 0.02, 0.03]), shaft, 0.05, 0.03)
     found = look(made, rest_positions(made.sheet), [rod])
     tip, along = (rod.tip - view(made).eye) @ axes(made), shaft @ axes(made)
     away = points(made, found.depth) - tip
@@ -136,11 +138,12 @@ def test_normals_are_across_the_gradient_of_depth(camera: str, device: Device) -
     assert apart(found.normals[middle][one], across).max() < 1e-4
 
 
+@pytest.mark.slow
 def test_other_labels_keep_their_bits(device: Device) -> None:
     made = with_instruments(drawable(camera=CAMERAS["endoscope"]))
     position = folded(made)
     labels, without = (
-        look(made, position, place_capsules(made, position, 0), labels=requested_labels(asked))
+        look(made, position, place_instruments(made, position, 0), labels=requested_labels(asked))
         for asked in (LABELS, ())
     )
     assert labels.normals.shape == (60, 80, 3)

@@ -46,6 +46,7 @@ def folded() -> NDArray[np.float64]:
     return position
 
 
+@pytest.mark.default_cases("oblique-2")
 @pytest.mark.parametrize("refine", [0, 2])
 @pytest.mark.parametrize("camera", ["top", "oblique", NEAR_EYE], ids=["top", "oblique", "near"])
 def test_what_is_picked_is_what_is_drawn(camera: Any, refine: int, device: Device) -> None:

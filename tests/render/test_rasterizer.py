@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.model.surface import place_capsules
+from taichi_msm.model.surface import place_instruments
 from taichi_msm.render import bins, gpu, tracking
 from taichi_msm.render.camera import view
 from taichi_msm.render.cpu import Bands
@@ -73,6 +73,7 @@ def test_nothing_is_drawn_before_every_mass_point_is_projected(device: Device) -
         assert (together.draw(position) == alone.draw(position)).all()
 
 
+@pytest.mark.default_cases("oblique", "tissue below", "inside")
 @pytest.mark.parametrize(
     "render",
     [
@@ -100,6 +101,7 @@ def test_picture_is_like_the_twin(render: dict[str, Any], device: Device) -> Non
     assert (apart == 1).mean() < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distortion", [None, {"k1": -0.1}])
 def test_what_passes_behind_the_camera_is_looked_for_only_where_it_may_be_seen(
     distortion: Any, device: Device, monkeypatch: pytest.MonkeyPatch
@@ -128,7 +130,7 @@ def test_what_passes_behind_the_camera_is_looked_for_only_where_it_may_be_seen(
 def assert_alike_in_other_tiles(made: Scene, texture: NDArray[np.uint8], position: NDArray[Any], lanes: int) -> None:
     """Pictures and labels have the same bits if so many pixels are drawn at a time; labels have one sample a pixel."""
     config = drawing_config(made, labels=LABELS if made.render.supersample == 1 else ())
-    placed = place_capsules(made, position, 0)
+    placed = place_instruments(made, position, 0)
     expected = Rasterizer(made, texture, config).look(position, rods=placed)
     other = Rasterizer(made, texture, config._replace(lanes=lanes)).look(position, rods=placed)
     np.testing.assert_array_equal(other.picture, expected.picture)
@@ -149,6 +151,7 @@ def test_the_shape_of_a_tile_does_not_change_the_bits(lanes: int, device: Device
         assert_alike_in_other_tiles(made, texture, dented(made), lanes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parts", [gpu.MAX_PARTS, 100])
 def test_launches_do_not_change_the_bits(parts: int, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """On a GPU, many strips, many launches for the lists of a strip, several triangles taken together, shuffled lists.
@@ -158,7 +161,11 @@ def test_launches_do_not_change_the_bits(parts: int, device: Device, monkeypatch
     made = with_instruments(drawable((9, 11), size=[60, 50], refine=2, camera="top", supersample=2))
     rng = np.random.default_rng(6)
     position = rest_positions(made.sheet) + rng.normal(0, 0.03, (9, 11, 3)) * [1, 1, 0]
-    placed, texture, config = place_capsules(made, position, 0), speckle(30, 20), drawing_config(made)._replace(lanes=1)
+    placed, texture, config = (
+        place_instruments(made, position, 0),
+        speckle(30, 20),
+        drawing_config(made)._replace(lanes=1),
+    )
     begun: list[int] = []
     launch = launches.Launches.launch
 
@@ -188,6 +195,7 @@ def test_launches_do_not_change_the_bits(parts: int, device: Device, monkeypatch
         np.testing.assert_array_equal(picture, expected)
 
 
+@pytest.mark.slow
 def test_the_bound_of_a_thread_is_asserted(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """The finest cells, folded, with so many that all triangles of a cell are taken together, and all instruments."""
     made = with_instruments(drawable((4, 4), size=[9, 7], refine=64, camera="oblique", supersample=4))
@@ -195,12 +203,13 @@ def test_the_bound_of_a_thread_is_asserted(device: Device, monkeypatch: pytest.M
     position = np.random.default_rng(4).normal(0, 0.2, (4, 4, 3))
     drawing = Rasterizer(made, speckle(8, 8), drawing_config(made)._replace(lanes=1))
     monkeypatch.setattr(gpu, "MAX_PARTS", 1)
-    drawing.draw(position, rods=place_capsules(made, position, 0))
+    drawing.draw(position, rods=place_instruments(made, position, 0))
     monkeypatch.setattr(launches, "MAX_ROUNDS", launches.RESERVED_ROUNDS + 3 * 2 * 65**2)
     with pytest.raises(AssertionError):
-        drawing.draw(position, rods=place_capsules(made, position, 0))
+        drawing.draw(position, rods=place_instruments(made, position, 0))
 
 
+@pytest.mark.default_cases("headlight-oblique")
 @pytest.mark.parametrize(
     ("shading", "camera"),
     [
@@ -212,7 +221,7 @@ def test_the_bound_of_a_thread_is_asserted(device: Device, monkeypatch: pytest.M
 def test_instruments_are_like_the_twin(shading: str, camera: Any, device: Device) -> None:
     made = with_instruments(drawable(camera=camera, shading=shading))
     position, texture = dented(made), np.full((9, 9, 3), 120, np.uint8)
-    placed = place_capsules(made, position, 0)
+    placed = place_instruments(made, position, 0)
     drawn = Rasterizer(made, texture).draw(position, rods=placed)
     apart = difference(drawn, reference.draw(made, position, texture, placed))
     assert (apart > 1).mean() < 0.005, "but for outlines"
@@ -223,7 +232,7 @@ def test_instruments_are_like_the_twin(shading: str, camera: Any, device: Device
 def test_an_instrument_touches_the_sheet_at_the_control_point(device: Device) -> None:
     made = with_instruments(drawable(refine=4))
     position = dented(made)
-    for placed, (across, down) in zip(place_capsules(made, position, 0), ((0.4, 0.4), (0.7, 0.8)), strict=True):
+    for placed, (across, down) in zip(place_instruments(made, position, 0), ((0.4, 0.4), (0.7, 0.8)), strict=True):
         rows, cols = made.sheet.points
         patch = reference.refine(position, 4)
         near = patch[round(down * (rows - 1) * 5), round(across * (cols - 1) * 5)]
@@ -326,6 +335,7 @@ def test_there_are_no_gaps_between_the_triangles_of_a_crumpled_sheet(device: Dev
     assert draw(made, position, np.full((4, 4, 3), 255, np.uint8)).all()
 
 
+@pytest.mark.slow
 def test_a_sheet_that_passes_through_the_eye_is_seen_in_part(device: Device) -> None:
     texture = np.full((4, 4, 3), 255, np.uint8)
     drawing = None

@@ -19,7 +19,7 @@ from PIL import Image
 from taichi_msm import run
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.model.surface import place_capsules
+from taichi_msm.model.surface import place_instruments
 from taichi_msm.render.camera import view
 from taichi_msm.render.labels import requested_labels, track_grid
 from taichi_msm.render.rasterizer import Rasterizer, drawing_config
@@ -83,6 +83,7 @@ def runs(root: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, li
     return here, json.loads(done.stdout)
 
 
+@pytest.mark.slow
 def test_runs_on_a_gpu_are_those_on_the_cpu(
     runs: tuple[Path, list[Any]], device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -184,7 +185,7 @@ TINY = {"eye": [0, 0, 4], "fov": 10}
 def looks(made: Scene, texture: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
     """Draw and find, on the device that was started."""
     position, view_now = draped(made), view(made)
-    placed = place_capsules(made, position, 0)
+    placed = place_instruments(made, position, 0)
     found = Rasterizer(
         made, texture, drawing_config(made, labels=requested_labels(()) if made.render.supersample == 1 else ())
     ).look(position, rods=placed)
@@ -196,7 +197,7 @@ def looks(made: Scene, texture: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
     assert labels is not None
     seen |= {name: value for name, value in labels._asdict().items() if value.size}
     moved = position + np.array([0.002, 0.001, 0])
-    placed_then = place_capsules(made, moved, 0)
+    placed_then = place_instruments(made, moved, 0)
     seen["flow"], seen["occlusion"] = compute_flow(made, labels.coordinates, moved, view_now, placed_then)
     rough = position + np.random.default_rng(5).normal(0, 0.004, position.shape)
     seen["pixels"], seen["hidden"] = locate_points(made, track_grid(60), rough, view_now, placed)
@@ -275,6 +276,7 @@ def test_what_a_picture_takes_is_given_back(root: Path) -> None:
     assert int(done.stdout) < 3 * 24 * 199**2 / 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("output", ["png", *(pytest.param(one, marks=pytest.mark.slow) for one in ("depth", "tracks"))])
 def test_a_kernel_that_is_cut_short_is_an_error_of_one_line(
     output: str, small: Path, root: Path, message: Messages

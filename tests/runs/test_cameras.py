@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -15,9 +16,9 @@ from taichi_msm import ArgumentError, Playback, Simulation, resume, run
 from taichi_msm.errors import ForeignError, SceneError
 from taichi_msm.load import cost
 from taichi_msm.load.scene_file import load_plan, load_scene
-from taichi_msm.model.surface import place_capsules
+from taichi_msm.model.surface import place_instruments
 from taichi_msm.render import rasterizer
-from taichi_msm.render.camera import View, calibration, view, view_at
+from taichi_msm.render.camera import View, calibration, is_moving, pair_transform, view, view_at
 from taichi_msm.render.lens_table import undistortion_map
 from taichi_msm.render.rasterizer import Rasterizer
 from taichi_msm.runs.finished import read_run
@@ -41,6 +42,8 @@ SWAYING = {"eye": [[0, 0.1, -0.3, 0.3], [0.4, -0.1, -0.2, 0.35]], "up": [[0, 0, 
 RIGHT = {"beside": "left", "baseline": 0.02}
 STEREO = {"left": LEFT, "right": RIGHT}
 SWAYING_STEREO = {"left": SWAYING, "right": RIGHT}
+PAIR = "rotation: [[1, 0, 0], [0, 1, 0], [0, 0, 1]], translation: {}"
+TURN = cv2.Rodrigues(np.array([0.02, -0.1, 0.03]))[0]
 
 Cameras = dict[str, Any]
 
@@ -69,6 +72,9 @@ def test_each_camera_writes_what_it_would_write_alone(small: Path, device: Devic
         for file in ("trajectory.npz", "forces.csv"):
             assert written.pop(file, expected[file]) == expected.pop(file)
         found, alike = (json.loads(each) for each in (written.pop(f"{name}/camera.json"), expected.pop("camera.json")))
+        if name == "right":
+            pair = {"beside": "left", "rotation": np.eye(3).tolist(), "translation": [-0.02, 0, 0]}
+            assert {key: found.pop(key) for key in pair} == pair
         assert found.keys() == alike.keys()
         assert found.pop("model") == alike.pop("model")
         for key, value in alike.items():
@@ -107,9 +113,46 @@ def test_an_orthographic_pair_has_the_same_disparity_everywhere(small: Path, dev
         disparity = simulation.observe(None, "left").stereo
         sight = simulation.locate(np.array([[0.5, 0.5]]), "right").pixels
     assert disparity is not None
+    assert disparity.disparity is not None
+    assert disparity.stereo is None
     # 40 px are 0.4 m.
     np.testing.assert_allclose(np.unique(disparity.disparity), 2.0)
     np.testing.assert_allclose(sight, [[18, 15]], atol=1e-5)
+
+
+def test_a_right_camera_with_a_rotation_moves_along(small: Path) -> None:
+    """X_right = R X_left + T in every frame, with a lens of its own; labels of the pair belong to the left one."""
+    pair = {"rotation": TURN.tolist(), "translation": [-0.03, 0.004, 0.002]}
+    lens = {"intrinsics": {"fx": 30, "fy": 31, "cx": 18, "cy": 13}, "distortion": {"k1": -0.05, "p1": 0.002}}
+    left = {**SWAYING, "distortion": {"k1": -0.1}}
+    made = seen_by({"left": left, "right": {"beside": "left", **pair, **lens}}, "[stereo]")
+    assert made.folders == {"": (), "left": ("stereo", "stereo_occlusion"), "right": ()}
+    assert is_moving(made, "right")
+    for time in (0, 0.3):
+        pose, found = (calibration(view_at(made, time, name)) for name in ("left", "right"))
+        expected = TURN @ pose["pose"] + np.array([0, 0, 0, 1]) * np.array(pair["translation"])[:, None]
+        np.testing.assert_allclose(found["pose"], expected, atol=1e-12)
+    assert found["calibration"] == [[30, 0, 18], [0, 31, 13], [0, 0, 1]]
+    assert found["distortion"] == [-0.05, 0, 0.002, 0, 0, 0, 0, 0]
+    written = pair_transform(made.render.all_cameras["right"])
+    assert written.pop("beside") == "left"
+    for key, value in pair.items():
+        np.testing.assert_allclose(written[key], value, atol=1e-12)
+    assert Scene.model_validate(made.model_dump()).render == made.render
+
+
+@pytest.mark.parametrize("left", ["top", {**SWAYING, "distortion": {"k1": -0.1}}], ids=["top", "pinhole"])
+def test_without_a_lens_of_its_own_it_has_that_of_the_other(left: Any, small: Path) -> None:
+    pair = {"beside": "left", "rotation": TURN.tolist(), "translation": [-0.03, 0.004, 0.002]}
+    made = seen_by({"left": left, "right": pair, "third": {"beside": "right", "baseline": 0.1}})
+    one, other, third = (view_at(made, 0.2, name) for name in ("left", "right", "third"))
+    points = np.random.default_rng(0).uniform(-0.1, 0.1, (20, 3))
+    seen = (points - one.eye) @ one.axes.T * [1, -1, -1] @ TURN.T + pair["translation"]
+    np.testing.assert_allclose((points - other.eye) @ other.axes.T * [1, -1, -1], seen, atol=1e-12)
+    # Where the left camera sees points that are for it where these are for the right one.
+    there = one.eye + seen * [1, -1, -1] @ one.axes
+    np.testing.assert_allclose(other.pixels(points), one.pixels(there), atol=1e-9)
+    np.testing.assert_allclose(third.eye, other.eye + 0.1 * other.axes[0], atol=1e-12)
 
 
 @pytest.mark.parametrize("shading", [pytest.param("headlight", marks=pytest.mark.slow), "tissue"])
@@ -121,7 +164,7 @@ def test_the_light_is_that_of_the_main_camera(shading: str, device: Device) -> N
     del render["camera"]
     made = made.model_copy(update={"render": render})
     position, texture = dented(made), np.full((9, 9, 3), 120, np.uint8)
-    placed, config = place_capsules(made, position, 0), rasterizer.drawing_config(made)
+    placed, config = place_instruments(made, position, 0), rasterizer.drawing_config(made)
     on_cpu = Rasterizer(made, texture, config)
     of_gpu = Rasterizer(made, texture, config._replace(lanes=1)) if shading == "tissue" else on_cpu
     for name in made.render.all_cameras:
@@ -135,8 +178,9 @@ def test_the_light_is_that_of_the_main_camera(shading: str, device: Device) -> N
 
 
 def test_an_interrupted_run_goes_on_to_the_same_bits(small: Path, device: Device) -> None:
-    made = seen_by(SWAYING_STEREO, ALL.replace("tracks", "tracks, disparity"))
+    made = seen_by(SWAYING_STEREO, ALL.replace("tracks", "tracks, disparity, stereo"))
     run(made, "whole", threads=device.threads, estimate_error=False)
+    assert {path.parent.parent.name for path in Path("whole").rglob("stereo*/0004.*")} == {"left"}
     for n in (1, 3):
         frames = interrupted(made, f"part-{n}", device, after=n)["frames"]
         for camera in (Path(f"part-{n}/{name}") for name in ("left", "right")):
@@ -263,6 +307,13 @@ def refuse(message: Messages, cameras: str, *overrides: str) -> None:
         load_scene("s.yaml", overrides)
 
 
+NEAR = PAIR.format("[1, 0, 0]")
+
+
+def beside(keys: str) -> str:
+    return f"left: top,\n right: {{beside: left, {keys}}}"
+
+
 WRONG = {
     "not there": "left: top,\n right: {beside: lift, baseline: 1}",
     "not at all like one": "left: top,\n right: {beside: x, baseline: 1}",
@@ -275,6 +326,12 @@ WRONG = {
     "far away": "left: top,\n right: {beside: left, baseline: 1.0e+20}",
     "a baseline alone": "left: {eye: [0, 0, 1], baseline: 1}",
     "an eye of its own": "left: top,\n right: {beside: left, baseline: 1, eye: [0, 0, 1]}",
+    "a lens at a baseline": beside("baseline: 1, fov: 30"),
+    "a rotation alone": beside("rotation: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]"),
+    "no rotation": beside("rotation: [[1, 0, 0], [0, 1, 0], [0, 0, 2]], translation: [1, 0, 0]"),
+    "far away by its translation": beside(PAIR.format("[0, 1.0e+20, 0]")),
+    "a distortion without a lens": beside(f"{NEAR}, distortion: {{k1: 1}}"),
+    "folds of its own": beside(f"{NEAR}, fov: 90, distortion: {{k1: -1}}"),
     "no name": "Left: top",
     "a folder of labels": "flow: top",
     "a folder of exports": "export-obj: top",
@@ -298,8 +355,32 @@ def test_what_does_not_go_together_is_refused(small: Path, message: Messages) ->
     for override, cameras in (("render.cameras=null", [""]), ("render.camera=null", ["left"])):
         assert list(load_scene("s.yaml", ["render.camera=top", override]).render.all_cameras) == cameras
     refuse(message, "left: top", "output=[disparity]")
+    refuse(message, "left: top", "output=[stereo]")
     bent = "a: {eye: [0, 0, 1], distortion: {k1: -0.01}}, b: {beside: a, baseline: 1}"
     refuse(message, bent, "output=[disparity]")
+    refuse(message, beside(NEAR), "output=[stereo, disparity]")
+
+
+def test_a_pair_of_a_stereo_file(small: Path, message: Messages) -> None:
+    """R and T come from the file or, for a file of one camera, from the scene."""
+    matrices = [f"[[{fx}, 0, 20], [0, 41, 15], [0, 0, 1]]" for fx in (40, 43)]
+    eyes = [f"K{n}: {matrix}\nD{n}: [-0.0{n}, 0, 0, 0]\n" for n, matrix in enumerate(matrices, 1)]
+    rotation = TURN.tolist()
+    Path("pair.yml").write_text("".join(eyes) + f"R: {rotation}\nT: [-10, 2, 0.5]\n")
+    Path("right.yml").write_text(f"camera_matrix: {matrices[1]}\ndist_coeffs: [-0.02, 0, 0, 0]\n")
+    left = {**LEFT, "calibration": "pair.yml"}
+    right = {"beside": "left", "calibration": "pair.yml", "calibration_eye": "right", "calibration_unit": "mm"}
+    single = {"beside": "left", "calibration": "right.yml"}
+    place = {"rotation": rotation, "translation": [-0.01, 0.002, 0.0005]}
+    found = [seen_by({"left": left, "right": other}) for other in (right, {**single, **place})]
+    assert found[0].render == found[1].render
+    np.testing.assert_allclose(
+        pair_transform(found[0].render.all_cameras["right"])["translation"], [-0.01, 0.002, 5e-4]
+    )
+    assert [view_at(found[0], 0, name).scale[0] for name in ("left", "right")] == [40, 43]
+    for wrong in (single, {**right, **place}, {**right, "calibration_eye": "left"}):
+        with message.raises(SceneError):
+            seen_by({"left": left, "right": wrong})
 
 
 LENS = {"k1": -0.1, "p1": 0.002}

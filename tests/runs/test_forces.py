@@ -68,6 +68,7 @@ def test_the_force_of_a_tool_is_that_of_the_twin(precision: str, difference: str
             assert (peak.time, peak.force) == ((greatest + 1) / 25, forces[greatest][index])
 
 
+@pytest.mark.slow
 def test_points_at_an_open_edge_count_with_their_mass(device: Device) -> None:
     made = touching(EDGES["comes from beside"])
     made = made.model_copy(update={"sheet": made.sheet.model_copy(update={"fixed": "none"})})

@@ -13,7 +13,7 @@ from PIL import Image
 
 from taichi_msm import ArgumentError, FilesError, Playback, Simulation, run
 from taichi_msm.load.scene_file import load_scene
-from taichi_msm.model.surface import place_capsules
+from taichi_msm.model.surface import place_instruments
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.golden import Messages
@@ -65,7 +65,7 @@ def test_labels_are_those_of_the_twin(labelled: Results, small: Path) -> None:
     done, trajectory = labelled
     scene, position = small_scene(OBLIQUE, ROD), trajectory["position"].astype(float)
     for frame in range(5):
-        placed = place_capsules(scene, position[frame], trajectory["time"][frame])
+        placed = place_instruments(scene, position[frame], trajectory["time"][frame])
         coordinates, depth, instrument = twin.labels(scene, position[frame], placed)
         found = np.load(done / f"coordinates/{frame:04}.npy")
         assert (found.dtype, found.shape) == (np.float32, (30, 40, 2))

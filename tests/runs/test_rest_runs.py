@@ -103,6 +103,7 @@ def test_a_simulation_can_begin_again_in_motion(device: Device) -> None:
         assert simulation.positions().tobytes() == shape.tobytes()
 
 
+@pytest.mark.slow
 def test_a_run_tells_how_well_the_forces_balance(device: Device, tmp_path: Path) -> None:
     made = loaded().model_copy(update={"output": ("trajectory",)})
     record = run(made, tmp_path / "out", threads=device.threads)

@@ -96,6 +96,7 @@ CASES = {
 SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in list(CASES)[3:]]
 
 
+@pytest.mark.default_cases("plate, map")
 @pytest.mark.parametrize("name", [*list(CASES)[:3], *SLOW])
 def test_like_scipy(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: Device) -> None:
     monkeypatch.chdir(tmp_path)
@@ -145,6 +146,7 @@ def test_a_grip_holds_the_points_of_the_frame_before(device: Device) -> None:
     assert not rest.tool_forces().any()
 
 
+@pytest.mark.slow
 def test_one_frame_goes_the_way_of_many(device: Device) -> None:
     """At its end the middle of the tip is below the flat sheet, which it would push aside."""
     made = at_rest([moved([0, 0.5, 0.5, 0.001], [1, 0.5, 0.5, -0.06])])
@@ -178,6 +180,7 @@ def test_a_stepped_sheet_comes_to_the_same_rest(device: Device) -> None:
     assert_close(shape_of(plan_of(made), device), stepped.displacement())
 
 
+@pytest.mark.default_cases("made1")
 @pytest.mark.parametrize(
     "made",
     [
@@ -228,6 +231,7 @@ def softest(plan: Plan, u: Array, frame: int) -> float:
     return float(np.linalg.eigvalsh(matrix.toarray()).min())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", [1, -1])
 def test_what_has_buckled_goes_on_as_it_began(side: int, device: Device) -> None:
     lift = {**LIFT, "total": [0, 0, side * 0.05]}

@@ -198,6 +198,7 @@ def finite_elements(made: Scene) -> Array:
     return found[::2, ::2]
 
 
+@pytest.mark.default_cases("size0-0")
 @pytest.mark.parametrize(("size", "foundation"), [((0.1, 0.1), 0), ((0.08, 0.1), 2e6)])
 def test_a_load_in_the_plane_moves_it_like_finite_elements(
     size: tuple[float, float], foundation: float, device: Device
@@ -246,6 +247,7 @@ BENT: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.mark.default_cases("plate under tension-False", "membrane on a foundation-True")
 @pytest.mark.parametrize(
     ("name", "everywhere"), [*((name, False) for name in BENT), ("plate", True), ("membrane on a foundation", True)]
 )
@@ -274,6 +276,7 @@ def depth(points: int, device: Device) -> float:
     return float(found)
 
 
+@pytest.mark.slow
 def test_a_tool_presses_as_deep_at_any_number_of_points(device: Device) -> None:
     coarse, middle, fine = (depth(points, device) for points in MESHES)
     assert coarse == pytest.approx(fine, rel=0.01)
@@ -369,6 +372,7 @@ def test_the_bound_holds_for_any_tissue(seed: int, tmp_path: Path) -> None:
         assert frequency(made, displacement) <= highest_frequency(plan_of(made).material, made.sheet)
 
 
+@pytest.mark.default_cases("map, pretension, bending", "free")
 @pytest.mark.parametrize("name", ["stiff plate", "map, pretension, bending", "map, free edges", "free"])
 def test_just_under_the_limit_tissue_stays_bounded(name: str, device: Device, tmp_path: Path) -> None:
     """Kicked at random places in the first step, and then left alone for 10^5."""

@@ -169,6 +169,7 @@ def test_dop853_fails_where_no_step_is_small_enough(monkeypatch: pytest.MonkeyPa
         solve_with_dop853(plan_of(scene()), 1e-4, 1e-6, float("inf"), lambda: None)
 
 
+@pytest.mark.slow
 def test_dop853_is_left_out_where_tools_touch(device: Device, message: Messages) -> None:
     made = touching([PRESSED])
     with closing(SteppingStudy(plan_of(made), device, 0.01, study_of(made), nothing)) as measured:
@@ -241,6 +242,7 @@ def test_terms_are_left_out_of_the_kernel(device: Device) -> None:
     assert list(dict(scene_variants(scene(springs={}, damping=0, probes=[])))) == [""]
 
 
+@pytest.mark.slow
 def test_all_terms_are_timed_on_the_grid_of_the_whole_scene(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a stiff spring `auto` would take longer steps, and maybe others in f64."""
     grids = []

@@ -117,6 +117,7 @@ def rows(out: str) -> list[str]:
     return [line.rpartition(",")[0] for line in Path(out, "table.csv").read_text().splitlines()]
 
 
+@pytest.mark.slow
 def test_workers_need_no_inputs_and_one_may_die(lab: Path, machines: Machines, program: Program) -> None:
     address = machines.schedule()
     command = start_sweep("far", "--json", "--dask", address)

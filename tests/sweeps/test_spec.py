@@ -16,10 +16,18 @@ from scipy.special import ndtri
 from scipy.stats import qmc
 
 from taichi_msm.errors import SceneError
-from taichi_msm.load.scene_file import ANY_CAMERA, CAMERA_FILE_KEYS, PICTURE_KEYS, load_plan, parse_override
+from taichi_msm.load.scene_file import ANY_CAMERA, CAMERA_FILE_KEYS, PICTURE_KEYS, load_plan, parse_override, plan_file
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_PATH
-from taichi_msm.sweeps.spec import Distribution, format_override, load_sweep, run_values, sample_run_values
+from taichi_msm.sweeps.expressions import evaluate
+from taichi_msm.sweeps.spec import (
+    Distribution,
+    format_override,
+    load_sweep,
+    make_sweep,
+    run_values,
+    sample_run_values,
+)
 from tests.golden import Messages
 from tests.scenes import speckle
 
@@ -179,11 +187,61 @@ def test_every_key_of_a_scene_that_names_a_file_is_known() -> None:
     assert found == {*PICTURE_KEYS, *CAMERA_FILE_KEYS}
 
 
+def test_variables_take_the_first_dimensions_and_columns(folder: Path) -> None:
+    varied = {"damping": {"uniform": [0.01, 0.02]}}
+    expressions = {"probes.0.at": ["=x", "=1 - x"], "time.duration": "=n / 10", "sheet.points": ["=2*n**2 + 1", 9]}
+    variables = {"x": {"uniform": [0, 1]}, "n": {"choice": [2, 3]}}
+    made = make_sweep("small.yaml", {"samples": 4, "variables": variables, "vary": varied, "set": expressions})
+    assert made.keys == ["x", "n", "damping"]
+    for row, u in zip(made.values(), shares(3, 4, 1), strict=True):
+        assert row == pytest.approx([u[0], 2 + int(2 * u[1]), 0.01 + 0.01 * u[2]], rel=1e-15)
+        x, n, damping = row
+        assert made.overrides(row) == (
+            f"probes.0.at=[{x!r}, {1 - x!r}]",
+            f"time.duration={n / 10!r}",
+            f"sheet.points=[{2 * n * n + 1}, 9]",
+            f"damping={damping!r}",
+        )
+    assert made.description()["variables"] == variables
+    alone = make_sweep("small.yaml", {"variables": {"n": {"grid": [2, 3]}}, "set": {"time.duration": "=n / 10"}})
+    assert [alone.overrides(row) for row in alone.values()] == [("time.duration=0.2",), ("time.duration=0.3",)]
+    # Sweeps without variables keep the description that is in their sweep.json.
+    assert "variables" not in make_sweep("small.yaml", {"samples": 4, "vary": varied}).description()
+
+
+def test_an_expression_without_a_value_is_the_refusal_of_its_run(folder: Path, message: Messages) -> None:
+    settings = {"variables": {"x": {"grid": [0, 1]}}, "set": {"probes.0.at": [0.5, "=sqrt(x - 1)"]}}
+    made = make_sweep("small.yaml", settings)
+    refused, valid = (made.overrides(row) for row in made.values())
+    with message.raises(SceneError, "probes.0.at", "sqrt(x - 1)"):
+        plan_file(made.scene, refused)
+    assert plan_file(made.scene, valid).scene.probes[0].at == (0.5, 0.0)
+
+
+EXPRESSIONS = {
+    "=2**10 - 0x18": 1000,
+    "=-x**2 + max(x, 1, 2) * 3": 5.75,
+    "=min(x, cos(pi)) / (1 + 1)": -0.5,
+    "= sin(+x) / sqrt(4)": math.sin(0.5) / 2,
+    "=" + "-" * 198 + "1": 1,
+}
+
+
+@pytest.mark.parametrize("text", EXPRESSIONS)
+def test_an_expression_is_arithmetic(text: str) -> None:
+    found = evaluate(text, {"x": 0.5})
+    assert (found, type(found)) == (EXPRESSIONS[text], type(EXPRESSIONS[text]))
+
+
 GOOD = {"scene": "small.yaml", "samples": 2, "vary": {"damping": {"uniform": [0.01, 0.02]}}}
 
 
 def vary(way: Any, key: str = "damping") -> dict[str, Any]:
     return {"vary": {key: way}}
+
+
+def expression(text: str, **variables: Any) -> dict[str, Any]:
+    return {"variables": variables, "set": {"probes.0.force": [0, text, 1]}}
 
 
 # Changes of GOOD by their ids, and the key of the fault.
@@ -220,6 +278,17 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "no fourth probe": ({"set": {"probes.3.falloff": 5}}, "set.probes.3.falloff"),
     "replaced": ({"set": {"damping": 1}}, "vary"),
     "section replaced": ({"set": {"springs.shear": 3}, **vary({"choice": [{"shear": 1}]}, "springs")}, "vary"),
+    "a variable of texts": ({"variables": {"x": {"choice": ["a"]}}}, "variables.x.choice"),
+    "a variable of two": ({"variables": {"x": {"uniform": [[0, 0], [1, 1]]}}}, "variables.x.uniform"),
+    "a column": ({"variables": {"seconds": {"uniform": [0, 1]}}}, "variables.seconds"),
+    "a varied key": ({"variables": {"damping": {"uniform": [0, 1]}}}, "variables.damping"),
+    "a function": ({"variables": {"max": {"uniform": [0, 1]}}}, "variables.max"),
+    "unknown variable": (expression("=radius + 1", radios={"uniform": [0, 1]}), "set.probes.0.force.1"),
+    "too large a power": (expression("=x * 9**9**9", x={"uniform": [0, 1]}), "set.probes.0.force.1"),
+    "not allowed": (expression("=__import__('os').getpid()"), "set.probes.0.force.1"),
+    "arguments": (expression("=sqrt(1, 2)"), "set.probes.0.force.1"),
+    "no expression": (expression("=2 x"), "set.probes.0.force.1"),
+    "a long expression": (expression("=" + "-" * 200), "set.probes.0.force.1"),
     "equals sign": ({"set": {"damping=1": 1}}, "set.damping=1"),
     "unknown section set": ({"set": {"sprigns.shear": 1}}, "set.sprigns.shear"),
     "calibration outside": ({"set": {"render.camera": {"calibration": "/etc/hostname"}}}, "set.render.camera"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import shutil
+import subprocess
 import sys
 from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
@@ -26,7 +27,7 @@ from taichi_msm.sweeps.plots import (
     estimate_sensitivity,
     first_order_index,
     format_short,
-    read_last_frame,
+    read_gif_frame,
     varied_parameters,
     varied_results,
 )
@@ -155,13 +156,17 @@ def test_the_picture_shows_every_run(make: Make, ran: Path) -> None:
     rows = np.split(pixels[above : above + (len(pixels) - 63) // 2 * 2], 2)
     assert pixels.shape[1] == 20 + 4 * (width + 20)
     tiles = [row[:height, 20 + (width + 20) * column :][:, :width] for row in rows for column in range(4)]
-    with Image.open(ran / "frames" / "0004.png") as frame:
+    position = np.load(ran / "trajectory.npz")["position"]
+    largest = int(np.linalg.norm(position - position[0], axis=-1).max(axis=(1, 2)).argmax())
+    assert 0 < largest < 4
+    with Image.open(ran / "frames" / f"000{largest}.png") as frame:
         shown = np.asarray(frame.resize((width, height), Image.Resampling.LANCZOS)).astype(int)
     assert all(np.abs(tile - shown).mean() < 5 for run, tile in enumerate(tiles) if run != 3)
     # A grey field, with a word.
     assert 0.97 < (np.abs(tiles[3] - 0xE6) <= 2).all(axis=2).mean() < 1
 
 
+@pytest.mark.slow
 def test_the_same_results_give_the_same_bytes(make: Make, ran: Path) -> None:
     result = make(128)
     copy_runs(ran, result)
@@ -176,15 +181,16 @@ def test_the_same_results_give_the_same_bytes(make: Make, ran: Path) -> None:
 def test_a_damaged_picture_is_no_end(make: Make, ran: Path, message: Messages) -> None:
     result = make()
     copy_runs(ran, result)
-    damaged = result.run_directory(1) / "frames" / "0004.png"
+    damaged = result.run_directory(1) / "frames" / "0002.png"
     damaged.write_bytes(damaged.read_bytes()[:100])
     names, notes = write(result)
     assert CONTACT in names
-    message(notes, CONTACT, "0004.png", hide=r"(?<=decoded).*")
+    message(notes, CONTACT, "0002.png", hide=r"(?<=decoded).*")
 
 
+@pytest.mark.default_cases("frames-0")
 @pytest.mark.parametrize(("kept", "difference"), [("frames", 0), ("animation.gif", 10), ("trajectory.npz", 0)])
-def test_the_last_frame_comes_from_any_output(make: Make, ran: Path, kept: str, difference: float, pool: Pool) -> None:
+def test_the_frame_comes_from_any_output(make: Make, ran: Path, kept: str, difference: float, pool: Pool) -> None:
     """An animation has fewer colours; what is drawn again is the same."""
     result = make(2)
     copy_runs(ran, result)
@@ -197,10 +203,11 @@ def test_the_last_frame_comes_from_any_output(make: Make, ran: Path, kept: str, 
     assert np.abs(np.asarray(Image.open(result.directory / CONTACT)) - first).mean() <= difference
 
 
-def test_of_an_animation_the_last_picture_is_taken(tmp_path: Path) -> None:
+def test_of_an_animation_the_picture_at_a_time_is_taken(tmp_path: Path) -> None:
     red, blue = (Image.new("RGB", (40, 30), colour) for colour in ("red", "blue"))
-    red.save(tmp_path / "a.gif", save_all=True, append_images=[blue])
-    assert read_last_frame(tmp_path / "a.gif").getcolors() == [(40 * 30, (0, 0, 255))]
+    red.save(tmp_path / "a.gif", save_all=True, append_images=[blue, red], duration=[40, 80, 40])
+    for time, colour in ((0.039, (255, 0, 0)), (0.041, (0, 0, 255)), (0.119, (0, 0, 255)), (0.13, (255, 0, 0))):
+        assert read_gif_frame(tmp_path / "a.gif", time).getcolors() == [(40 * 30, colour)]
 
 
 def test_without_pictures_there_is_a_note_and_no_earlier_picture(make: Make) -> None:
@@ -283,7 +290,7 @@ def test_the_force_of_a_probe_has_a_column(make: Make) -> None:
     assert "probes.0.force" not in named.columns()
 
 
-def test_a_data_set_names_its_complete_runs(make: Make) -> None:
+def test_a_data_set_names_its_complete_runs_and_the_program(make: Make, ran: Path, root: Path) -> None:
     result = make(20)
     write(result)
     described = json.loads((result.directory / "dataset.json").read_text())
@@ -306,6 +313,9 @@ def test_a_data_set_names_its_complete_runs(make: Make) -> None:
     assert described["outputs"] == ["frames", "animation.gif", "trajectory.npz", "run.json"]
     assert (described["frames"], described["size"], described["frames_per_second"]) == (5, [40, 30], 10)
     assert "numpy" in described["versions"]
+    git = ["git", "-C", str(root), "rev-parse", "HEAD"]
+    expected = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip() or None
+    assert described["commit"] == json.loads((ran / "run.json").read_text())["commit"] == expected
 
 
 def test_runs_of_a_data_set_have_their_own_size(small: Path, pool: Pool) -> None:

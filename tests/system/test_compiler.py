@@ -176,6 +176,7 @@ def test_nothing_is_replaced_in_a_version_that_was_not_tested() -> None:
     assert replace(active_compiler(), tested_version="0.0.1").patches == []
 
 
+@pytest.mark.default_cases("users-variables0-True")
 @pytest.mark.parametrize(
     ("whose", "variables", "told"),
     [("users", {}, True), ("ours", {}, False), ("ours", {"TAICHI_MSM_TRACEBACK": "1"}, True)],

@@ -67,6 +67,7 @@ def test_the_threads_that_are_pinned_are_those_that_work(tmp_path: Path) -> None
     assert all(on == cores for main, ticks, on in threads if [main, ticks, on] not in workers)
 
 
+@pytest.mark.slow
 def test_a_process_may_have_many_sheets_and_gets_their_memory_back(device: runtime.Device) -> None:
     """More than Taichi's 512 trees of fields."""
 
@@ -232,6 +233,7 @@ print(len(sums))
 """
 
 
+@pytest.mark.slow
 def test_taichi_starts_again_after_a_stop(tmp_path: Path) -> None:
     done = python(tmp_path, AGAIN)
     assert (done.returncode, done.stdout, done.stderr) == (0, "1\n", "")

@@ -17,7 +17,7 @@ from taichi_msm.gradients.gradient import require_differentiable
 from taichi_msm.load.check import check_scene
 from taichi_msm.model.loads import evaluate_frame_loads
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.model.surface import place_capsules
+from taichi_msm.model.surface import place_instruments
 from taichi_msm.model.tools import Clamp, overlap, path_warnings
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.dynamics import choose_layout
@@ -260,8 +260,8 @@ def test_a_coarser_mesh_has_a_clamp_of_its_own_points() -> None:
 def test_nothing_is_drawn_and_nothing_touches() -> None:
     made = touching([RIGHT, TOP], sheet=LEFT)
     plan = plan_of(made)
-    assert not place_capsules(made, rest_positions(made.sheet), 0.2)
-    assert not made.has_instruments
+    assert not place_instruments(made, rest_positions(made.sheet), 0.2)
+    assert not made.shapes
     assert not plan.has_contact
     assert overlap(plan.tools, 0.4) is None
     assert not list(path_warnings(made, plan.tools))

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 
 from taichi_msm import Simulation, run
+from taichi_msm.arithmetic import NUMPY
 from taichi_msm.errors import SceneError
 from taichi_msm.gradients.gradient import Adjoint, gradient
 from taichi_msm.load.check import check_scene
@@ -25,7 +26,6 @@ from taichi_msm.solver.planning import make_plan
 from taichi_msm.solver.state import State
 from taichi_msm.system.runtime import Device
 from taichi_msm.terms.elasticity import energy_density
-from taichi_msm.terms.law import NUMPY
 from taichi_msm.terms.locking import LockingLaw, build_locking
 from tests import reference
 from tests.conftest import Program

@@ -305,6 +305,7 @@ def test_few_points_and_springs_have_no_mesh_error(load: Any, image: str) -> Non
     assert coarser_plan(plan_of(random_scene(1))) is None
 
 
+@pytest.mark.slow
 def test_a_tolerance_of_the_points_chooses_them(load: Any, device: Device, tmp_path: Path) -> None:
     made = load("sheet.tolerance=0.02", *SMOOTH)
     record: Any = run(made, tmp_path / "out", threads=device.threads)

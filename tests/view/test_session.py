@@ -19,7 +19,19 @@ from taichi_msm.model.sheet import rest_positions
 from taichi_msm.system.runtime import Device
 from taichi_msm.view import overlay, recording
 from taichi_msm.view import session as live_session
-from taichi_msm.view.events import KEYS, Drag, Event, Hover, Key, Press, Release, Strength, StrengthChange, Turn
+from taichi_msm.view.events import (
+    KEYS,
+    Drag,
+    Event,
+    Hover,
+    Key,
+    Material,
+    Press,
+    Release,
+    Strength,
+    StrengthChange,
+    Turn,
+)
 from taichi_msm.view.recording import Captures
 from taichi_msm.view.script import record_film
 from taichi_msm.view.session import Session, divide_frames
@@ -143,6 +155,7 @@ def test_a_drag_moves_the_control_point_with_the_pointer(begin: Begin) -> None:
     assert np.array(session.tool.position) * 24 == pytest.approx([16, 10], abs=0.4), "the tool is not there any more"
 
 
+@pytest.mark.default_cases("f64 with the scene's probes")
 @pytest.mark.parametrize(
     ("overrides", "play"),
     [
@@ -213,6 +226,28 @@ def test_reset_begins_anew(begin: Begin) -> None:
     session.handle(Press(60, 50))
     np.testing.assert_array_equal(advance(session, 5), first)
     assert session.recorded_scene().time.duration == pytest.approx(5 / session.frame_rate)
+
+
+def test_a_change_of_the_material_keeps_shape_and_motion(begin: Begin) -> None:
+    changed, same = begin(TILTED), begin(TILTED)
+    for session in (changed, same):
+        session.handle(Press(60, 50))
+        advance(session, 6)
+    changed.handle(Material("springs.structural", 20.0))
+    np.testing.assert_array_equal(advance(changed, 4), advance(same, 4), "the same material")
+    before, velocity = changed.positions().copy(), changed._simulation.velocities()
+    changed.handle(Material("springs.structural", 180.0))
+    np.testing.assert_array_equal(changed.positions(), before)
+    steps = changed._simulation._plan.grid.steps_per_frame / same._simulation._plan.grid.steps_per_frame
+    assert steps > 1.5, "stiffer springs need smaller steps"
+    np.testing.assert_allclose(changed._simulation.velocities(), velocity, rtol=1e-5)
+    # It comes to the same rest as a sheet of this material.
+    other = begin({**TILTED, "springs.structural": 180.0})
+    other.handle(Press(60, 50))
+    assert advance(changed, 150)[-1] == pytest.approx(advance(other, 160)[-1], abs=1e-4)
+    changed.handle(Key("r"))
+    assert (displacement(changed) < AT_REST).all()
+    assert changed.material()["springs.structural"] == (180.0, 20.0)
 
 
 def test_percent_by_wheel_and_keys_stays_between_nothing_and_all(begin: Begin) -> None:
@@ -371,6 +406,7 @@ def test_a_film_shows_the_tissue_alone(begin: Begin) -> None:
     assert np.abs(shown.astype(int) - alone).mean() > 15
 
 
+@pytest.mark.slow
 def test_a_session_too_long_for_a_file_says_so_before(
     begin: Begin, monkeypatch: pytest.MonkeyPatch, message: Messages
 ) -> None:
@@ -417,6 +453,7 @@ def test_a_name_of_two_lines_is_one_in_the_comment(small: Path) -> None:
     assert load_scene(keeper.save_scene(load_scene("small.yaml"))).sheet == load_scene("small.yaml").sheet
 
 
+@pytest.mark.slow
 def test_a_sheet_that_nothing_holds_may_fly_after_a_press(begin: Begin) -> None:
     # It flies on when the force is gone, farther than a sheet that was never pressed could.
     session = begin({**TILTED, "sheet.fixed": "none", "springs.virtual": 0.0, "probes.0.falloff": 0.0, "damping": 0.0})
@@ -546,6 +583,7 @@ def moved(session: Session) -> PositionControlledTool:
     return session.tool
 
 
+@pytest.mark.default_cases("f32")
 @pytest.mark.parametrize(
     ("overrides", "play"),
     [

@@ -1,13 +1,15 @@
-"""The loader of data sets in docs/ gives what is in the files of the runs."""
+"""Data sets for training give what is in the files of the runs."""
 
 from __future__ import annotations
 
 import importlib.util
 import json
 import pickle
-from collections.abc import Iterator, Mapping
+import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Protocol
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,8 +17,10 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import map_coordinates
 
-from docs.loader import Clips, Pairs, read_flow
 from taichi_msm import sweep
+from taichi_msm.datasets import Clips, Pairs
+from taichi_msm.errors import ArgumentError, FilesError, NotInstalledError
+from taichi_msm.runs.arrays import read_flo
 from tests.golden import Messages
 
 FRAMES, WIDTH, HEIGHT, RUNS = 6, 128, 96, 3
@@ -42,31 +46,32 @@ def data_set(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     scene = root / "scenes/sweeps/tracking-scene.yaml"
     rows = list(sweep(scene, vary, directory, samples=RUNS, overrides=overrides, workers=1))
     assert {row.status for row in rows} == {"complete"}
-    runs = [{"run": n, "folder": f"runs/{n:06}", "values": {}, "part": part} for n, part in enumerate(PARTS)]
-    (directory / "dataset.json").write_text(json.dumps({"runs": runs, "frames": FRAMES, "size": [WIDTH, HEIGHT]}))
+    described = json.loads((directory / "dataset.json").read_text())
+    for run, part in zip(described["runs"], PARTS, strict=True):
+        run["part"] = part
+    (directory / "dataset.json").write_text(json.dumps(described))
     return directory
 
 
-class MapStyle(Protocol):
-    """What PyTorch asks of a map-style data set."""
+class StandIn:
+    """What PyTorch's DataLoader does with a map-style data set in one worker."""
 
-    def __len__(self) -> int: ...
+    def __init__(self, data: Any, batch_size: int) -> None:
+        self._data, self._size = pickle.loads(pickle.dumps(data)), batch_size
 
-    def __getitem__(self, index: int) -> Mapping[str, Any]: ...
+    def __iter__(self) -> Iterator[dict[str, NDArray[Any]]]:
+        for first in range(0, len(self._data), self._size):
+            items = [self._data[index] for index in range(first, min(first + self._size, len(self._data)))]
+            yield {name: np.stack([item[name] for item in items]) for name in items[0]}
 
 
-def batches(data: MapStyle, size: int) -> Iterator[dict[str, NDArray[Any]]]:
-    """Load batches by two workers of PyTorch, or without it by what it does with such a data set."""
-    if importlib.util.find_spec("torch"):
-        from torch.utils.data import DataLoader
-
-        for batch in DataLoader(data, batch_size=size, num_workers=2, multiprocessing_context="spawn"):
-            yield {name: tensor.numpy() for name, tensor in batch.items()}
-        return
-    sent = pickle.loads(pickle.dumps(data))
-    for first in range(0, len(sent), size):
-        items = [sent[index] for index in range(first, min(first + size, len(sent)))]
-        yield {name: np.stack([item[name] for item in items]) for name in items[0]}
+@pytest.fixture
+def torch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """PyTorch, or where it is not installed a stand-in."""
+    if importlib.util.find_spec("torch") is None:
+        for name in ("torch", "torch.utils", "torch.utils.data"):
+            monkeypatch.setitem(sys.modules, name, ModuleType(name))
+        monkeypatch.setattr(sys.modules["torch.utils.data"], "DataLoader", StandIn, raising=False)
 
 
 def test_pairs_are_those_of_the_files(data_set: Path) -> None:
@@ -78,7 +83,7 @@ def test_pairs_are_those_of_the_files(data_set: Path) -> None:
     assert np.array_equal(pair["second"], shown[1].transpose(2, 0, 1))
     assert np.array_equal(pair["depth"], np.array(Image.open(folder / "depth/0003.tiff")))
     assert np.array_equal(pair["occluded"], np.array(Image.open(folder / "occlusion/0003.png")) == 255)
-    flow = read_flow(folder / "flow/0003.flo")
+    flow = read_flo(folder / "flow/0003.flo", (WIDTH, HEIGHT)).transpose(2, 0, 1)
     assert pair["flow"].shape == flow.shape == (2, HEIGHT, WIDTH)
     assert np.array_equal(pair["valid"], flow[0] < 1e10)
     assert 0 < pair["valid"].mean() < 1
@@ -117,17 +122,30 @@ def test_flow_leads_where_tracks_go(data_set: Path) -> None:
     assert 10 * error(0.5) < min(error(0), error(1))
 
 
-def test_batches_are_made_of_the_items(data_set: Path) -> None:
+def test_a_loader_makes_batches_of_the_items(data_set: Path, torch: None) -> None:
     pairs = Pairs(data_set, "train")
-    made = list(batches(pairs, 4))
+    made = list(pairs.loader(batch_size=4))
     assert [len(batch["flow"]) for batch in made] == [4, 4, 2]
     last: dict[str, Any] = {**pairs[-1]}
     assert all(np.array_equal(made[2][name][1], value) for name, value in last.items())
-    (clips,) = batches(Clips(data_set, "train", FRAMES), 2)
-    assert clips["video"].shape == (2, FRAMES, 3, HEIGHT, WIDTH)
-    assert clips["points"].shape == (2, TRACKS**2, FRAMES, 2)
+    (clips,) = Clips(data_set, "train", FRAMES).loader(batch_size=2)
+    assert tuple(clips["video"].shape) == (2, FRAMES, 3, HEIGHT, WIDTH)
+    assert tuple(clips["points"].shape) == (2, TRACKS**2, FRAMES, 2)
 
 
-def test_a_part_without_runs_is_refused(data_set: Path, message: Messages) -> None:
-    with message.raises(ValueError, "'valid'"):
+def test_what_is_no_data_set_is_refused(data_set: Path, tmp_path: Path, message: Messages) -> None:
+    with message.raises(ArgumentError, "'valid'"):
         Pairs(data_set, "valid")
+    with message.raises(FilesError, "dataset.json"):
+        Pairs(tmp_path, "train")
+    described = json.loads((data_set / "dataset.json").read_text())
+    (tmp_path / "dataset.json").write_text(json.dumps({**described, "outputs": ["frames", "run.json"]}))
+    with message.raises(ArgumentError, "flow"):
+        Pairs(tmp_path, "train")
+
+
+def test_pytorch_is_imported_when_used(data_set: Path, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
+    monkeypatch.setitem(sys.modules, "torch", None)
+    pairs = Pairs(data_set, "train")
+    with message.raises(NotInstalledError, "PyTorch"):
+        pairs.loader()

@@ -1,0 +1,94 @@
+"""COLMAP's models as text: cameras.txt and images.txt."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+from taichi_msm.camera_files.keys import Keys, listed
+from taichi_msm.camera_files.opencv import OpenCV
+from taichi_msm.camera_files.text import CameraFile
+from taichi_msm.camera_files.trajectory import Trajectory, TrajectoryReader, parse_numbers, pose_fault
+
+# A line of cameras.txt: id, model, width, height, parameters.
+CAMERA = re.compile(r"^(\d+) ([A-Z_]+) (\d+) (\d+)((?: [-+.\deE]+)+)[ \t\r]*$", re.MULTILINE)
+
+# A line of images.txt: id, quaternion w, x, y, z and translation, camera, name.
+IMAGE = re.compile(r"^(\d+)((?: [-+.\deE]+){7}) (\d+) (\S.*)$", re.MULTILINE)
+
+# Models: the number of focal lengths, the lens model, and the number of its coefficients.
+MODELS = {
+    "SIMPLE_PINHOLE": (1, "pinhole", 0),
+    "PINHOLE": (2, "pinhole", 0),
+    "SIMPLE_RADIAL": (1, "pinhole", 1),
+    "RADIAL": (1, "pinhole", 2),
+    "OPENCV": (2, "opencv", 4),
+    "FULL_OPENCV": (2, "opencv", 8),
+    "OPENCV_FISHEYE": (2, "fisheye", 4),
+    "SIMPLE_RADIAL_FISHEYE": (1, "fisheye", 1),
+    "RADIAL_FISHEYE": (1, "fisheye", 2),
+}
+
+
+class ColmapCameras(OpenCV):
+    """Reader of cameras.txt."""
+
+    name = "COLMAP"
+    recognised_by = "cameras.txt: a line `CAMERA_ID MODEL WIDTH HEIGHT PARAMS`"
+
+    def cameras(self, file: CameraFile) -> Sequence[Keys]:
+        """Return the only camera, with OpenCV's keys; COLMAP's first pixel has its centre at (0.5, 0.5)."""
+        cameras = CAMERA.findall(file.text)
+        if any(camera[1:] != cameras[0][1:] for camera in cameras):
+            raise file.fault(f"has several cameras, {listed(camera[0] for camera in cameras)}; keep the line of one")
+        return [_camera(file, *camera) for _, *camera in cameras[:1]]
+
+
+def _camera(file: CameraFile, name: str, width: str, height: str, parameters: str) -> Keys:
+    if name not in MODELS:
+        raise file.fault(f"{name}: a model that is not known; expected one of: {', '.join(MODELS)}")
+    focal_count, model, coefficient_count = MODELS[name]
+    numbers = Keys(file, {"PARAMS": parameters}).require("params", focal_count + 2 + coefficient_count, name)
+    fx, fy, (cx, cy) = numbers[0], numbers[focal_count - 1], numbers[focal_count : focal_count + 2]
+    values = [*numbers[focal_count + 2 :], *[0.0] * 4][: max(4, coefficient_count)]
+    matrix = [fx, 0, cx - 0.5, 0, fy, cy - 0.5, 0, 0, 1]
+    return Keys(file, {"K": matrix, "D": values, "model": model, "size": [width, height]})
+
+
+def _read_images(file: CameraFile) -> Trajectory | None:
+    """Read the images, in the order of the numbers at the end of their names, or else of their names."""
+    lines = [(n, line) for n, line in enumerate(file.text.splitlines(), 1) if line.strip() and line[0] != "#"]
+    if not lines or _image(lines[0][1]) is None:
+        return None
+    from scipy.spatial.transform import Rotation
+
+    images = []
+    for n, line in lines:
+        if (match := _image(line)) is not None:
+            images.append((match[4], n, [float(word) for word in match[2].split()], match[3]))
+        elif parse_numbers(line.split()[-1:]) is None:
+            raise file.fault("neither IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME nor points", n)
+    if len(cameras := {camera for *_, camera in images}) > 1:
+        raise file.fault(f"has images of cameras {listed(sorted(cameras))}; keep those of one")
+    ends = [re.search(r"(\d+)\D*$", name.rpartition(".")[0] or name) for name, *_ in images]
+    numbers = [int(end[1]) for end in ends if end]
+    if len({*numbers}) < len(images):
+        images.sort()
+        numbers = list(range(len(images)))
+    poses: list[tuple[int, list[float]]] = []
+    for number, (_, n, (w, x, y, z, *translation), _) in sorted(zip(numbers, images, strict=True)):
+        if fault := pose_fault((0, 0, 0, 0, x, y, z, w), None):
+            raise file.fault(fault, n)
+        inverse = Rotation.from_quat((x, y, z, w)).inv()
+        poses.append((n, [number, *(-inverse.apply(translation)).tolist(), *inverse.as_quat().tolist()]))
+    return Trajectory([row for _, row in poses], [n for n, _ in poses], has_times=False)
+
+
+def _image(line: str) -> re.Match[str] | None:
+    """Match the line of an image; the last word of a line of points is a number."""
+    return None if parse_numbers(line.split()[-1:]) else IMAGE.match(line)
+
+
+COLMAP_IMAGES = TrajectoryReader(
+    "COLMAP", "images.txt: lines `IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`; needs `poses_rate`", _read_images
+)

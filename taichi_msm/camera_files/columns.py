@@ -1,0 +1,139 @@
+"""Trajectories in columns: TUM's, t tx ty tz qx qy qz qw, and those of a header, as in EuRoC and TUM-VI."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from taichi_msm.camera_files.keys import listed
+from taichi_msm.camera_files.text import LENGTH_UNITS, CameraFile
+from taichi_msm.camera_files.trajectory import COLUMNS, MAX_NUMBER, Trajectory, TrajectoryReader, parse_numbers
+from taichi_msm.errors import truncate
+
+# Limits of the lengths of a header and of a name in it.
+MAX_HEADER_LENGTH, MAX_NAME_LENGTH = 2000, 80
+
+# Lower-case spellings of the names of columns, and of their units.
+_POSITION = r"(t|p|pos|(.*[^a-z])?position|trans|translation|[tp][^a-z].*[^a-z])?"
+_ROTATION = r"(q|quat|quaternion|(.*[^a-z])?orientation|rot|rotation|q[^a-z].*)"
+ROLES = (
+    r"t|ts|secs?|seconds|(.*[^a-z])?time([^a-z].*)?|.*(timestamp|stamp)([^a-z].*)?",
+    *(rf"{_POSITION}[^a-z]*{axis}" for axis in "xyz"),
+    *(rf"{_ROTATION}[^a-z]*{axis}" for axis in "xyzw"),
+)
+UNIT = re.compile(r"\s*[\[(]([^\])]*)[\])]|[^a-z](m?u?n?s|nsecs?)$")
+TIME_UNITS = {
+    **dict.fromkeys(("s", "sec", "seconds"), "s"),
+    **dict.fromkeys(("ms", "milliseconds"), "ms"),
+    **dict.fromkeys(("us", "\u00b5s", "\u03bcs", "microseconds"), "us"),
+    **dict.fromkeys(("ns", "nsec", "nsecs", "nanoseconds"), "ns"),
+}
+
+# Comments that state another order of the quaternion, or the inverse transform.
+OTHER_CONVENTION = re.compile(
+    r"\bw[\s,]*x[\s,]*y[\s,]*z\b|scalar[\s-]*first|\bq_?0\b|world[\s-]*(to|2)[\s-]*cam\w*|\bw2c\b|\bT_?cw\b",
+    re.IGNORECASE,
+)
+
+EUROC_COLUMNS = 17
+
+
+class _Columns(NamedTuple):
+    """Columns of a trajectory file.
+
+    Attributes:
+        indices: columns of t, tx, ty, tz, qx, qy, qz, qw.
+        column_count: number of all columns.
+        time_unit: unit of t, if the header has one.
+        length_unit: unit of the position, if the header has one.
+    """
+
+    indices: tuple[int, ...]
+    column_count: int
+    time_unit: str | None = None
+    length_unit: str | None = None
+
+
+TUM = _Columns(tuple(range(8)), 8)
+
+
+def _read(file: CameraFile) -> Trajectory:
+    """Read the rows; without a header, the columns are TUM's."""
+    rows: list[list[float]] = []
+    lines = []
+    columns = None
+    for n, line in enumerate(file.text.splitlines(), 1):
+        text, _, comment = line.strip().replace('"', "").partition("#")
+        if ";" in text:
+            text = text.replace(",", ".").replace(";", ",")  # Spreadsheets write this where decimals have commas.
+        words = text.replace(",", " ").split()
+        if (header := _header(text or comment, is_comment=not words)) and not rows:
+            columns = _columns(file, n, header)
+        elif header and _columns(file, n, header) != (columns or TUM):
+            raise file.fault("other columns than before; write a file of one order", n)
+        elif not words and not header and (match := OTHER_CONVENTION.search(comment)):
+            fault = f"a comment has {truncate(match[0])}, which is not understood"
+            raise file.fault(f"{fault}; name the columns in the first line: # {', '.join(COLUMNS)}", n)
+        elif words:
+            rows.append(_row(file, n, words, columns, separated="," in text))
+            lines.append(n)
+    columns = columns or TUM
+    return Trajectory(rows, lines, True, columns.time_unit, columns.length_unit)
+
+
+def _header(text: str, *, is_comment: bool) -> list[str]:
+    """Split a header into the names of columns; return an empty list for other lines."""
+    text = text.rpartition(":")[2].lower()
+    names = [name.strip() for name in text.split(",")] if "," in text else re.sub(r"\s+(?=[\[(])", "", text).split()
+    if len(text) > MAX_HEADER_LENGTH or max(map(len, names), default=0) > MAX_NAME_LENGTH:
+        return []
+    bare = [UNIT.sub("", name) for name in names]
+    rotations = sum(bool(re.fullmatch(rf"(.*[^a-z])?{_ROTATION}[^a-z]*[wxyz]", name)) for name in bare)
+    is_table = len(names) >= 7 and ("," in text or not is_comment)
+    is_header = rotations >= 4 or {*"wxyz"} <= {*bare} or is_table
+    return names if is_header and not any(re.match(r"[-+.]?\d", name) for name in names) else []
+
+
+def _columns(file: CameraFile, line: int, names: Sequence[str]) -> _Columns:
+    """Identify the columns of a header."""
+    bare = [UNIT.sub("", name) for name in names]
+    matches = [[n for n, name in enumerate(bare) if re.fullmatch(role, name)] for role in ROLES]
+    if any(len(columns) != 1 for columns in matches):
+        fault = f"columns {listed(names)} are not understood"
+        raise file.fault(f"{fault}; name them {', '.join(COLUMNS)}", line)
+    indices = tuple(columns[0] for columns in matches)
+    time, *lengths = [(match[1] or match[2] or "") if (match := UNIT.search(names[n])) else "" for n in indices[:4]]
+    if time not in {"", *TIME_UNITS} or {*lengths} - {""} not in (set(), *({unit} for unit in LENGTH_UNITS)):
+        fault = f"{', '.join(names[n] for n in indices[:4])}: units that are not understood"
+        raise file.fault(f"{fault}; write [s], [ms], [us] or [ns] for t, and [m] or [mm] for the others", line)
+    return _Columns(indices, len(names), TIME_UNITS.get(time), max(lengths) or None)
+
+
+def _row(
+    file: CameraFile, line: int, words: Sequence[str], columns: _Columns | None, *, separated: bool
+) -> list[float]:
+    """Convert the words of a line to a pose; `separated` states whether commas separate them."""
+    expected = columns or TUM
+    numbers = parse_numbers(words)
+    if numbers is None or len(numbers) != expected.column_count:
+        needed = f"eight numbers up to {MAX_NUMBER:g}: {' '.join(COLUMNS)}"
+        if expected.column_count != TUM.column_count:
+            needed = f"{expected.column_count} numbers up to {MAX_NUMBER:g}, one a column of the header"
+        origin = ""
+        if columns is None and len(words) == EUROC_COLUMNS:
+            origin = ", but 17 numbers, as EuRoC's; keep their header"
+        elif columns is None and separated:
+            origin = "; numbers with decimal commas need ; between them"
+        raise file.fault(f"not a pose{origin}; expected {needed}", line)
+    if separated and columns is None:
+        fault = "commas without a header, and w comes first in EuRoC's rows, last in TUM's"
+        raise file.fault(f"{fault}; name the columns in a first line: # {', '.join(COLUMNS)}", line)
+    return [numbers[n] for n in expected.indices]
+
+
+TABLES = TrajectoryReader(
+    "TUM, EuRoC, TUM-VI",
+    "lines `t tx ty tz qx qy qz qw`, or a header with names of columns, such as `#timestamp [ns],...`",
+    _read,
+)

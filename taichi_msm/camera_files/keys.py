@@ -1,0 +1,122 @@
+"""Keys of a calibration, which are looked up by any of their spellings."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping
+from itertools import zip_longest
+from typing import Any
+
+from taichi_msm.camera_files.text import MAX_DEPTH, CameraFile
+from taichi_msm.errors import truncate
+
+# Largest number in a calibration.
+MAX_NUMBER = 1e6
+
+# Largest relative difference of equal numbers that are rounded to different numbers of digits.
+ROUNDING_TOLERANCE = 1e-6
+
+
+class Keys:
+    """Keys of a camera in a calibration.
+
+    Attributes:
+        file: the file, for messages.
+        data: values by the names of keys.
+        folded: names reduced to lower-case letters and digits, and without a mark of the camera, by names.
+    """
+
+    def __init__(self, file: CameraFile, data: Mapping[str, Any], folded: Mapping[str, str] | None = None) -> None:
+        self.file = file
+        self.data = data
+        self.folded = {name: fold(name) for name in data} if folded is None else folded
+        self._read_names: set[str] = set()
+
+    def __str__(self) -> str:
+        return listed(self.data)
+
+    def values(self, spelling: str, kind: type = object) -> dict[str, Any]:
+        """Return the values of keys, without empty ones.
+
+        Args:
+            spelling: pattern of their folded names.
+            kind: type of their values.
+
+        Returns:
+            The values by names.
+        """
+        names = [name for name, value in self.data.items() if isinstance(value, kind)]
+        matches = {name: self.data[name] for name in names if re.fullmatch(spelling, self.folded[name])}
+        self._read_names |= matches.keys()
+        return {name: value for name, value in matches.items() if value is not None and value != ""}
+
+    def numbers(self, spelling: str) -> list[float] | None:
+        """Return the numbers of a key, or None if it is missing; the values of several matching keys must agree."""
+        matches = [(name, self._numbers(name, value)) for name, value in self.values(spelling).items()]
+        if not matches:
+            return None
+        (first, numbers), *others = matches
+        for name, values in others:
+            pairs = zip_longest(numbers, values, fillvalue=0.0)
+            if not all(math.isclose(a, b, rel_tol=ROUNDING_TOLERANCE) for a, b in pairs):
+                raise self.file.fault(f"{first} and {name} are not the same; keep the right one")
+        return numbers
+
+    def require(self, spelling: str, count: int, name: str) -> list[float]:
+        """Return the numbers of a required key.
+
+        Args:
+            spelling: pattern of the folded name.
+            count: number of numbers.
+            name: description of the key, for the message.
+        """
+        numbers = self.numbers(spelling)
+        if numbers is None or len(numbers) != count:
+            fault = f"has no {name}" if numbers is None else f"{name}: {len(numbers)} numbers, where {count} belong"
+            raise self.file.fault(f"{fault}; found {self}; write what belongs there")
+        return numbers
+
+    def unread(self, spelling: str) -> list[str]:
+        """Return the names of keys that match a spelling and were not looked up, except of empty values and zeros."""
+        names = [name for name in self.data if name not in self._read_names]
+        return [name for name in names if re.fullmatch(spelling, self.folded[name]) and any(flat(self.data[name]))]
+
+    def _numbers(self, name: str, value: Any) -> list[float]:
+        try:
+            numbers = [math.nan if isinstance(item, bool) else float(item) for item in flat(value)]
+        except (TypeError, ValueError, OverflowError):
+            numbers = [math.nan]
+        if isinstance(value, dict) and "data" not in value:
+            raise self.file.fault(f"{name}: has {listed(value)}; expected a matrix with rows, cols and data")
+        # The comparison is false for NaN.
+        if not all(abs(number) <= MAX_NUMBER for number in numbers):
+            fault = f"{truncate(str(value))} is not a list of numbers up to {MAX_NUMBER:g}"
+            raise self.file.fault(f"{name}: {fault}; write it as OpenCV does")
+        rows, cols = (value.get(side) if isinstance(value, dict) else None for side in ("rows", "cols"))
+        if isinstance(rows, int) and isinstance(cols, int) and rows * cols != len(numbers):
+            fault = f"has {len(numbers)} numbers, and {rows} rows of {cols}; write what belongs there"
+            raise self.file.fault(f"{name}: {fault}")
+        return numbers
+
+
+def fold(name: object) -> str:
+    """Reduce a name to its lower-case letters and digits."""
+    return re.sub(r"[^a-z0-9]", "", str(name).lower())
+
+
+def listed(names: Iterable[Any]) -> str:
+    """Format up to 12 names for a message."""
+    shown, names = 12, list(names)
+    more = f" and {len(names) - shown} more" if len(names) > shown else ""
+    return ", ".join(truncate(str(name)) for name in names[:shown]) + more
+
+
+def flat(value: Any) -> list[Any]:
+    """Flatten nested lists, the data of a matrix or the words of a text, up to MAX_DEPTH."""
+    items = [value["data"]] if isinstance(value, dict) and "data" in value else [value]
+    for _ in range(MAX_DEPTH):
+        if not any(isinstance(item, list) for item in items):
+            break
+        items = [inner for item in items for inner in (item if isinstance(item, list) else [item])]
+    return [word for item in items for word in (item.split() if isinstance(item, str) else [item])]

@@ -1,0 +1,170 @@
+"""Calibrations by OpenCV (YAML, XML, JSON) and ROS (camera_info), of one camera, in the spellings of many scripts.
+
+Other formats are converted to these keys.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+from taichi_msm.camera_files.calibration import Calibration, CalibrationReader, StereoPose
+from taichi_msm.camera_files.keys import Keys, fold, listed
+from taichi_msm.camera_files.text import CameraFile
+from taichi_msm.errors import truncate
+from taichi_msm.lenses import MODELS
+
+# Spellings of a key, reduced to lower-case letters and digits.
+_PICTURE = "(image|img|picture|frame|camera|cam)"
+MATRIX = (
+    r"mtx|[km]|kmat(rix)?|intrinsics?(mat|matrix)?(mtx)?|"
+    r"(camera|cam|calibration)(mat|matrix|mtx|k|intrinsics?)(mtx|matrix)?"
+)
+COEFFICIENTS = (
+    r"(camera|cam|lens)?(d|dist|distort|distortion)"
+    r"(s|coeff?s?|coefficients?|params?|parameters?|vec|vector|mat|matrix|values)?"
+)
+WIDTH, HEIGHT = f"{_PICTURE}?(width|w)", f"{_PICTURE}?(height|h)"
+SIZE = f"{_PICTURE}?(size|resolution|res|dims?)"
+LENS = r"(camera|cam|lens|distortion|dist|projection|calibration|calib)?(model|type)(name|type)?|lens|projection"
+LENS_OR_DEVICE = r"lens|type|projection"
+FISHEYE = r"(is|use)?fisheye(model)?"
+ROTATION = r"r|rot|rotation|rmat|(rot|rotation)(mat|matrix)"
+TRANSLATION = r"t|tvec|trans|translation|(trans|translation)(vec|vector)"
+
+# Keys that are not read but change the projection, unless they are empty or 0.
+UNSUPPORTED = (
+    r".*(distort(?!ed)|distorsion|coef|radial|tangential|prism|fisheye|omni|mirror|polynom|skew).*|kc|[kps][1-6]|"
+    rf"(?!new|opt).*(cameramat|intrinsic).*|{_PICTURE}?(shape|dimensions?)|"
+    rf"{_PICTURE}(size|resolution|width|height).*|alpha|beta|lambda|(lens|dist).*model.*|"
+    r"binning|scale(factor)?|undistort(ed)?|rectified|roi|crop(ped)?"
+)
+
+# Lens models by their names in files; empty for names of several models.
+NO_DISTORTION = "none"
+LENSES = {
+    **dict.fromkeys(("pinhole", "perspective", "mono", "monocular"), ""),
+    **dict.fromkeys(("plumbbob", "rationalpolynomial", "rational", "radtan", "radialtangential", "opencv"), "pinhole"),
+    **dict.fromkeys(("equidistant", "equi", "fisheye", "opencvfisheye", "kannalabrandt", "kannalabrandt4"), "fisheye"),
+    **dict.fromkeys(("omnidir", "omnidirectional", "omni", "mei", "unified"), "omnidir"),
+    **dict.fromkeys(("none", "nodistortion", "undistorted"), NO_DISTORTION),
+}
+FLAGS = {
+    **dict.fromkeys(("1", "true", "yes", "on"), "fisheye"),
+    **dict.fromkeys(("0", "false", "no", "off"), "pinhole"),
+}
+
+# Numbers of coefficients that OpenCV writes. Those after the first 8 are not supported and must be 0.
+COEFFICIENT_COUNTS, SUPPORTED_COEFFICIENTS = (0, 4, 5, 8, 12, 14), 8
+
+# Smallest focal length [px].
+MIN_FOCAL_LENGTH_PX = 1e-3
+
+_REMEDY = "write camera_matrix: [fx, 0, cx, 0, fy, cy, 0, 0, 1], distortion_coefficients: [k1, k2, p1, p2]"
+
+
+class OpenCV(CalibrationReader):
+    """Reader of the keys of one camera."""
+
+    name = "OpenCV, ROS"
+    recognised_by = "a matrix `camera_matrix`, `K`, `mtx`, ..., with `distortion_coefficients`, `D`, `dist`, ..."
+
+    def cameras(self, file: CameraFile) -> Sequence[Keys]:
+        """Return all keys as those of the only camera."""
+        return [Keys(file, file.data)]
+
+    def read(self, keys: Keys) -> Calibration:
+        """Read the keys of a camera."""
+        file, matrix, values = keys.file, keys.numbers(MATRIX), keys.numbers(COEFFICIENTS)
+        if matrix is None:
+            raise file.fault(f"has no camera matrix that is known; found {keys}; {_REMEDY}")
+        if len(matrix) != 9 or [matrix[n] for n in (1, 3, 6, 7, 8)] != [0, 0, 0, 0, 1] or min(matrix[::4]) <= 0:
+            raise file.fault("its camera matrix is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]; write it like that")
+        (fx, _, cx), (_, fy, cy) = matrix[:3], matrix[3:6]
+        if (focal := min(fx, fy)) < MIN_FOCAL_LENGTH_PX:
+            raise file.fault(f"its focal length is {focal:g}; write it in pixels, {MIN_FOCAL_LENGTH_PX:g} or more")
+        xi = keys.numbers("xi") or []
+        model = _model(keys, values or (), has_xi=any(xi))
+        if values is None and model != NO_DISTORTION:
+            fault = "has a camera matrix, and no distortion that is known"
+            remedy = "write distortion_coefficients, [0, 0, 0, 0] where there is none"
+            raise file.fault(f"{fault}; found {keys}; {remedy}")
+        size = _size(keys)
+        if names := keys.unread(UNSUPPORTED):
+            fault = f"{listed(names)}: not understood, and may change what the camera sees"
+            raise file.fault(f"{fault}; found {keys}; {_REMEDY}, or remove what does not matter")
+        model, values = ("pinhole", []) if model == NO_DISTORTION else (model, values or [])
+        lens = _coefficients(file, model, [*xi, *values] if model == "omnidir" else values)
+        return Calibration((fx, fy), (cx, cy), size, model, lens)
+
+    def pose(self, keys: Keys) -> StereoPose | None:
+        """Read R and T, which have no mark; R1 and R2 would be rotations of the rectification."""
+        shared = Keys(keys.file, {name: keys.data[name] for name in keys.data if keys.folded[name] == fold(name)})
+        if not shared.values(ROTATION) and not shared.values(TRANSLATION):
+            return None
+        rotation = shared.require(ROTATION, 9, "rotation R")
+        rows = tuple(tuple(rotation[n : n + 3]) for n in (0, 3, 6))
+        return StereoPose(rows, tuple(shared.require(TRANSLATION, 3, "translation T")))
+
+
+def _model(keys: Keys, values: Sequence[float], *, has_xi: bool) -> str:
+    """Return the lens model, or "none" where the file states that; all names of models in the file must agree."""
+    sources = {"omnidir": "xi"} if has_xi else {}  # names of keys by their models
+    for name, value in keys.values(LENS).items():
+        model = LENSES.get(fold(value))
+        if model is None:
+            if re.fullmatch(LENS_OR_DEVICE, keys.folded[name]):
+                continue  # The name of a device.
+            known = "plumb_bob, radtan, rational_polynomial, equidistant, fisheye, omnidir, none"
+            fault = f"{name}: {truncate(str(value))} is not known; found {keys}"
+            raise keys.file.fault(f"{fault}; expected one of: {known}")
+        if model == NO_DISTORTION and any(values):
+            coefficients = ", ".join(f"{number:g}" for number in values)
+            remedy = "write the model of these, such as plumb_bob or equidistant, or zeros"
+            raise keys.file.fault(f"{name}: {value}, and coefficients that are not 0: {coefficients}; {remedy}")
+        sources |= {model: name} if model else {}
+    for name, value in keys.values(FISHEYE).items():
+        if (flag := fold(value)) not in FLAGS:
+            raise keys.file.fault(f"{name}: {truncate(str(value))} is neither true nor false")
+        sources[FLAGS[flag]] = name
+    if {"omnidir", NO_DISTORTION} & sources.keys():
+        sources.pop("pinhole", None)  # As its distortion, or none of it.
+    if len(sources) > 1:
+        (one, first), (other, second), *_ = sources.items()
+        raise keys.file.fault(f"{first} is {one}, {second} is {other}; keep the right one")
+    return next(iter(sources), "pinhole")
+
+
+def _coefficients(file: CameraFile, model: str, values: Sequence[float]) -> dict[str, float]:
+    """Return the coefficients of a lens model by their names; trailing ones may be missing."""
+    names = tuple(MODELS[model].coefficients)
+    if len(values) not in (COEFFICIENT_COUNTS if model == "pinhole" else (len(names),)):
+        expected = "4, 5, 8, 12 or 14: k1, k2, p1, p2, k3, ..." if model == "pinhole" else f"those of {model}: "
+        expected += "" if model == "pinhole" else ", ".join(names)
+        raise file.fault(f"{len(values)} distortion coefficients; expected {expected}")
+    if any(others := values[SUPPORTED_COEFFICIENTS:]):
+        number = 1 + SUPPORTED_COEFFICIENTS + next(n for n, value in enumerate(others) if value)
+        fault = f"distortion coefficient {number} is not 0"
+        raise file.fault(f"{fault}; thin prisms and tilted sensors are not modelled, calibrate without")
+    return dict(zip(names, values, strict=False))
+
+
+def _size(keys: Keys) -> tuple[int, int] | None:
+    """Return the width and height of the pictures [px], or None if the file does not contain them."""
+    width, height, both = (keys.numbers(spelling) for spelling in (WIDTH, HEIGHT, SIZE))
+    if bool(width) != bool(height):
+        raise keys.file.fault(f"has only one of image_width and image_height; found {keys}; write both")
+    sizes = [width + height] if width and height else []
+    sizes += [both] if both else []
+    if any(len(size) != 2 or size != sizes[0] or min(size) < 1 for size in sizes):
+        text = " and ".join(f"[{', '.join(f'{number:g}' for number in size)}]" for size in sizes)
+        raise keys.file.fault(f"its size is {text}; write one [width, height] of the pictures")
+    size = (round(sizes[0][0]), round(sizes[0][1])) if sizes else None
+    # ROS may bin or crop pictures, while its camera matrix remains that of the full picture.
+    regions = keys.values("roi", dict).values()
+    is_cropped = any(region.get(name) for region in regions for name in ("x_offset", "y_offset"))
+    is_cropped |= any(region.get("width") not in (None, 0, *(size or ())[:1]) for region in regions)
+    if is_cropped or any(value not in (0, 1) for value in keys.values("binning[xy]").values()):
+        fault = "of pictures that are binned or cut, while its camera matrix is of whole ones"
+        raise keys.file.fault(f"{fault}; write that of the pictures, without binning_x, binning_y and roi")
+    return size

@@ -1,0 +1,40 @@
+"""StereoCalibration.ini of the StereoMIS data set: OpenCV's coefficients kc_0 to kc_7, lengths in millimetres."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from taichi_msm.camera_files.keys import Keys, listed
+from taichi_msm.camera_files.opencv import OpenCV
+from taichi_msm.camera_files.text import CameraFile
+
+# Keys of a section by those of OpenCV.
+KEYS = {
+    "intrinsics": ("fc_x", "fc_y", "cc_x", "cc_y"),
+    "D": ("kc_0", "kc_1", "kc_2", "kc_3"),
+    "size": ("res_x", "res_y"),
+    "R": tuple(f"r_{n}" for n in range(9)),
+    "T": tuple(f"t_{n}" for n in range(3)),
+}
+MORE_COEFFICIENTS = ("kc_4", "kc_5", "kc_6", "kc_7")
+
+
+class StereoMIS(OpenCV):
+    """Reader of the ini file."""
+
+    name = "StereoMIS"
+    recognised_by = "an ini file with `[StereoLeft]`, `[StereoRight]`"
+    unit = 1e-3
+
+    def cameras(self, file: CameraFile) -> Sequence[Keys]:
+        """Return the sections of the cameras, with OpenCV's keys."""
+        return [_camera(file, file.data[name]) for name in ("StereoLeft", "StereoRight") if name in file.data]
+
+
+def _camera(file: CameraFile, section: Mapping[str, str]) -> Keys:
+    values = {key: [section[name] for name in names if name in section] for key, names in KEYS.items()}
+    if missing := [name for key in ("intrinsics", "D", "size") for name in KEYS[key] if name not in section]:
+        raise file.fault(f"has no {listed(missing)}; found {listed(section)}; write what belongs there")
+    values["D"] += [section.get(name, "0") for name in MORE_COEFFICIENTS]
+    fx, fy, cx, cy = values["intrinsics"]
+    return Keys(file, {**values, "intrinsics": [fx, "0", cx, "0", fy, cy, "0", "0", "1"]})

@@ -1,0 +1,103 @@
+"""The table of readers of trajectories."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from taichi_msm.camera_files.colmap import COLMAP_IMAGES
+from taichi_msm.camera_files.columns import TABLES
+from taichi_msm.camera_files.kitti import KITTI
+from taichi_msm.camera_files.text import LENGTH_UNITS, CameraFile
+from taichi_msm.camera_files.trajectory import Trajectory, TrajectoryReader, pose_fault
+
+# The first one that recognises a file reads it.
+READERS: tuple[TrajectoryReader, ...] = (COLMAP_IMAGES, KITTI, TABLES)
+
+# Limit of the size of a file; COLMAP's contains the points of every picture.
+MAX_BYTES = 2**27
+
+# Units of time by their number in a second.
+TIME_UNITS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+
+# Later times without a unit are probably not seconds [s]: they would be in the year 5138.
+MAX_TIME_S = 1e11
+
+
+class PoseKeys(NamedTuple):
+    """Keys of a camera that describe its trajectory file.
+
+    Attributes:
+        poses_unit: unit of lengths, m or mm.
+        poses_time: unit of times, s, ms, us or ns.
+        poses_start: time of the scene's beginning: of the file, or, before its first pose, after that one [s].
+        poses_rate: poses per second of a file without times.
+    """
+
+    poses_unit: str | None = None
+    poses_time: str | None = None
+    poses_start: float | None = None
+    poses_rate: float | None = None
+
+
+def read_poses(path: str, keys: PoseKeys = PoseKeys()) -> tuple[tuple[float, ...], ...]:  # noqa: B008
+    """Read a trajectory.
+
+    Args:
+        path: path of the file.
+        keys: keys of the camera that describe the file.
+
+    Returns:
+        Rows of time [s], position x, y, z [m] and quaternion x, y, z, w, from the camera to the world.
+
+    Raises:
+        CameraFileError: when the file is invalid or not supported; the message contains the line.
+    """
+    file = CameraFile(path, MAX_BYTES)
+    trajectory = next(found for reader in READERS if (found := reader.read(file)) is not None)
+    if not trajectory.rows:
+        raise file.fault("no poses; expected lines t tx ty tz qx qy qz qw")
+    scale = LENGTH_UNITS[_agreed(file, "poses_unit", keys.poses_unit, trajectory.length_unit) or "m"]
+    times = _times(file, trajectory, keys)
+    rows: list[tuple[float, ...]] = []
+    for n, time, (_, x, y, z, *quaternion) in zip(trajectory.lines, times, trajectory.rows, strict=True):
+        row = (time, scale * x, scale * y, scale * z, *quaternion)
+        if fault := pose_fault(row, rows[-1] if rows else None):
+            raise file.fault(fault, n)
+        rows.append(row)
+    return tuple(rows)
+
+
+def _times(file: CameraFile, trajectory: Trajectory, keys: PoseKeys) -> list[float]:
+    """Return the times of the poses in the scene [s]."""
+    numbers = [row[0] for row in trajectory.rows]
+    if not trajectory.has_times:
+        if keys.poses_time is not None:
+            raise file.fault("has no times; set poses_rate, the poses per second, in place of poses_time")
+        if keys.poses_rate is None:
+            raise file.fault("has no times; set poses_rate, the poses per second")
+        spacing = math.gcd(*(int(number - numbers[0]) for number in numbers)) or 1
+        times = [(number - numbers[0]) / spacing / keys.poses_rate for number in numbers]
+    else:
+        if keys.poses_rate is not None:
+            raise file.fault("has times of its own; remove poses_rate")
+        unit = _agreed(file, "poses_time", keys.poses_time, trajectory.time_unit)
+        if unit is None and max(map(abs, numbers)) > MAX_TIME_S:
+            raise file.fault(f"has the time {numbers[0]:.0f}, hardly in seconds; set poses_time: s, ms, us or ns")
+        times = [number / TIME_UNITS[unit or "s"] for number in numbers]
+    if (start := keys.poses_start) is None:
+        return times
+    if start > times[-1]:
+        times_text = f"{times[0]:.15g} s to {times[-1]:.15g} s"
+        raise file.fault(f"poses_start: {start:.15g} s is after its poses, at {times_text}; take a time of these")
+    # A time before the first pose counts from it. Differences of large times are rounded to their resolution.
+    is_after_first = start >= times[0] or math.isclose(start, times[0], abs_tol=1e-9)
+    origin, digits = start if is_after_first else times[0] + start, int(-math.log10(math.ulp(times[-1])))
+    return [round(time - origin, digits) for time in times]
+
+
+def _agreed(file: CameraFile, key: str, value: str | None, found: str | None) -> str | None:
+    """Return the unit that a key of the camera or the file contains, if any does."""
+    if value is not None and found is not None and value != found:
+        raise file.fault(f"its header has {found}, and {key} is {value}; keep the right one")
+    return value if value is not None else found

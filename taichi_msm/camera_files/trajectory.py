@@ -1,0 +1,78 @@
+"""Trajectory of a camera, and the interface of its readers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from taichi_msm.camera_files.text import CameraFile
+
+# Largest deviation from 1 of the norm of a quaternion, and from 0 of the entries of R R^T - 1.
+NORM_TOLERANCE = 1e-3
+
+# Largest number in a trajectory.
+MAX_NUMBER = 1e30
+
+COLUMNS = ("t", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
+
+
+class Trajectory(NamedTuple):
+    """Poses of a camera, in the units of the file.
+
+    Attributes:
+        rows: time, position x, y, z and quaternion x, y, z, w, from the camera to the world; without times, the number
+            of the picture in place of the time.
+        lines: numbers of the lines of the rows, for messages.
+        has_times: whether the file contains times.
+        time_unit: unit of the times that the file contains, if it does.
+        length_unit: unit of the lengths that the file contains, if it does.
+    """
+
+    rows: Sequence[Sequence[float]]
+    lines: Sequence[int]
+    has_times: bool
+    time_unit: str | None = None
+    length_unit: str | None = None
+
+
+class TrajectoryReader(NamedTuple):
+    """Reader of a format of trajectories.
+
+    Attributes:
+        name: name of the format, for users.
+        recognised_by: content by which a file is recognised, for users.
+        read: function that returns the trajectory, or None if the file has another format; it raises a CameraFileError
+            with the line of a fault.
+    """
+
+    name: str
+    recognised_by: str
+    read: Callable[[CameraFile], Trajectory | None]
+
+
+def parse_numbers(words: Sequence[str]) -> list[float] | None:
+    """Convert words to numbers, or return None if one of them is not a number or out of range."""
+    try:
+        numbers = [math.nan if "_" in word else float(word) for word in words]
+    except ValueError:
+        return None
+    return numbers if all(abs(number) <= MAX_NUMBER for number in numbers) else None
+
+
+def pose_fault(row: Sequence[float], previous: Sequence[float] | None) -> str:
+    """Check a row of a trajectory.
+
+    Args:
+        row: time [s], position [m] and quaternion.
+        previous: previous row; None for the first.
+
+    Returns:
+        The fault and its remedy, or an empty text.
+    """
+    if previous is not None and row[0] <= previous[0]:
+        times = f"is at {row[0]:.15g} s, the pose before it at {previous[0]:.15g} s"
+        return f"{times}; sort them, each later than the last"
+    if abs(math.hypot(*row[4:]) - 1) > NORM_TOLERANCE:
+        return f"its quaternion has the length {math.hypot(*row[4:]):g}, so it is no rotation; write one of length 1"
+    return ""

@@ -1,0 +1,167 @@
+"""Data sets of sweeps for PyTorch.
+
+`Pairs` and `Clips` are map-style data sets of NumPy arrays, of which PyTorch's `DataLoader` makes batches of tensors:
+
+    pairs = Pairs("output/tracking", "train")
+    for batch in pairs.loader(batch_size=4, shuffle=True, num_workers=2):
+        flow, valid = batch["flow"], batch["valid"]  # (4, 2, height, width), (4, height, width)
+
+Pixels are counted to the right and down from the picture's upper left corner, so that the centre of the first pixel is
+at (0.5, 0.5); `grid_sample` with `align_corners=False` takes them as 2 x / width - 1, 2 y / height - 1. Where flow is
+unknown, `valid` is False and the flow is 0.
+
+PyTorch is imported by `loader` only.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, ClassVar, TypedDict
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from taichi_msm.errors import ArgumentError, FilesError, NotInstalledError
+from taichi_msm.runs.arrays import read_flo
+from taichi_msm.scene.outputs import OUTPUTS
+
+# The magnitude of unknown flow in a file is larger [px].
+MAX_FLOW_PX = 1e9
+
+
+class Pair(TypedDict):
+    """Two successive frames, and the labels of the first."""
+
+    first: NDArray[np.uint8]  # RGB, shape (3, height, width)
+    second: NDArray[np.uint8]
+    flow: NDArray[np.float32]  # displacement to the right and down [px], shape (2, height, width)
+    valid: NDArray[np.bool_]  # where flow is known: tissue, not an instrument or the background; shape (height, width)
+    occluded: NDArray[np.bool_]  # where the tissue is hidden or outside the picture in the second frame
+    depth: NDArray[np.float32]  # along the viewing direction [m]; 0: background
+
+
+class Clip(TypedDict):
+    """Successive frames, and the tracks through them."""
+
+    video: NDArray[np.uint8]  # RGB, shape (frames, 3, height, width)
+    points: NDArray[np.float32]  # projected material points [px], shape (points, frames, 2); 0 behind the eye
+    visible: NDArray[np.bool_]  # shape (points, frames)
+
+
+class _Split:
+    """Runs of a split of a data set, cut into items of `length` frames that begin every `stride` frames."""
+
+    outputs: ClassVar[tuple[str, ...]]  # that the items are made of, as in `output` of a scene
+
+    def __init__(self, directory: str | Path, split: str, length: int, stride: int, camera: str) -> None:
+        self.directory, self._camera = Path(directory), camera
+        try:
+            content = json.loads((self.directory / "dataset.json").read_text(encoding="utf-8"))
+        except OSError as error:
+            remedy = "name the folder that `taichi-msm sweep` wrote"
+            raise FilesError(f"{self.directory / 'dataset.json'}: {error.strerror}; {remedy}") from None
+        # Number, folder, split ("part") and varied "values" of each run.
+        self.runs: list[dict[str, Any]] = [run for run in content["runs"] if run["part"] == split]
+        if not self.runs:
+            splits = ", ".join(sorted({run["part"] for run in content["runs"]})) or "none, as no run is complete"
+            raise ArgumentError(f"split: {split!r} has no runs in {directory}; the splits are {splits}")
+        written = {Path(name) for name in content["outputs"]}
+        if missing := [name for name in self.outputs if Path(camera, OUTPUTS[name].result) not in written]:
+            remedy = f"run the sweep with set: {{output: [{', '.join(self.outputs)}]}}"
+            raise ArgumentError(f"directory: {self.directory / camera} has no {', '.join(missing)}; {remedy}")
+        self._size = content["size"]
+        self._length, self._stride = length, stride
+        self._items = max(0, (content["frames"] - length) // stride + 1)  # of a run
+
+    def __len__(self) -> int:
+        return len(self.runs) * self._items
+
+    def loader(self, **options: Any) -> Any:
+        """Return a `torch.utils.data.DataLoader` of this data set.
+
+        Args:
+            **options: arguments of the loader, such as batch_size, shuffle and num_workers.
+
+        Raises:
+            NotInstalledError: when PyTorch is not installed.
+        """
+        try:
+            from torch.utils.data import DataLoader
+        except ImportError:
+            raise NotInstalledError("a loader needs PyTorch, which is not installed; pip install torch") from None
+        return DataLoader(self, **options)
+
+    def _find(self, index: int) -> tuple[Path, int]:
+        """Return the folder of the camera in the run of an item, and the item's first frame."""
+        run, item = divmod(range(len(self))[index], self._items)
+        return self.directory / self.runs[run]["folder"] / self._camera, item * self._stride
+
+
+class Pairs(_Split):
+    """All pairs of successive frames of a split of a data set.
+
+    Args:
+        directory: of the sweep.
+        split: train, val or test.
+        camera: name of the camera, of a scene with several.
+
+    Raises:
+        ArgumentError: when the split has no runs, or the runs lack outputs.
+        FilesError: when the directory has no data set.
+    """
+
+    outputs = ("png", "flow", "occlusion", "depth")
+
+    def __init__(self, directory: str | Path, split: str, camera: str = "") -> None:
+        super().__init__(directory, split, length=2, stride=1, camera=camera)
+
+    def __getitem__(self, index: int) -> Pair:
+        folder, frame = self._find(index)
+        width, height = self.runs[index // self._items].get("size", self._size)
+        flow = read_flo(folder / OUTPUTS["flow"].path(frame), (width, height)).transpose(2, 0, 1)
+        valid = np.abs(flow).max(axis=0) < MAX_FLOW_PX
+        return {
+            "first": _pixels(folder, "png", frame).transpose(2, 0, 1),
+            "second": _pixels(folder, "png", frame + 1).transpose(2, 0, 1),
+            "flow": np.where(valid, flow, np.float32(0)),
+            "valid": valid,
+            "occluded": _pixels(folder, "occlusion", frame) > 0,
+            "depth": _pixels(folder, "depth", frame),
+        }
+
+
+class Clips(_Split):
+    """Successive clips of a split of a data set.
+
+    Args:
+        directory: as for `Pairs`.
+        split: as for `Pairs`.
+        frames: number of frames of a clip.
+        camera: as for `Pairs`.
+
+    Raises:
+        ArgumentError, FilesError: as for `Pairs`.
+    """
+
+    outputs = ("png", "tracks")
+
+    def __init__(self, directory: str | Path, split: str, frames: int = 24, camera: str = "") -> None:
+        super().__init__(directory, split, length=frames, stride=frames, camera=camera)
+
+    def __getitem__(self, index: int) -> Clip:
+        folder, first = self._find(index)
+        frames = range(first, first + self._length)
+        with np.load(folder / OUTPUTS["tracks"].path()) as tracks:
+            points, occluded = (tracks[name][:, frames] for name in ("points", "occluded"))
+        return {
+            "video": np.stack([_pixels(folder, "png", frame).transpose(2, 0, 1) for frame in frames]),
+            "points": np.nan_to_num(points),
+            "visible": ~occluded,
+        }
+
+
+def _pixels(folder: Path, output: str, frame: int) -> NDArray[Any]:
+    with Image.open(folder / OUTPUTS[output].path(frame)) as image:
+        return np.array(image)

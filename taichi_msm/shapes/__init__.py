@@ -1,0 +1,7 @@
+"""Shapes of tools: the table of them, and a file per shape."""
+
+from taichi_msm.shapes.capsule import Capsule
+from taichi_msm.shapes.plate import Plate
+from taichi_msm.shapes.shape import Shape
+
+SHAPES: dict[str, Shape] = {shape.name: shape for shape in (Capsule(), Plate())}

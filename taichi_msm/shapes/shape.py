@@ -1,0 +1,73 @@
+"""Interface of the shape of a tool, and what NumPy and kernels share of it.
+
+A shape is convex and has an axis, from its tip c along the unit vector a: it lies within `radius` of the points c + s a
+with 0 <= s <= length. Its formulas are plain arithmetic: NumPy calls them as they are, kernels call them wrapped by
+Taichi.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.arithmetic import Operations
+
+Array = NDArray[np.float64]
+
+# Distances below this count as 0; the square is representable in f32.
+MIN_DISTANCE_M = 1e-18
+
+
+class Shape(ABC):
+    """The shape of a tool.
+
+    Attributes:
+        name: the shape, for messages.
+        max_stride: largest displacement of a tool in a step, in radii.
+    """
+
+    name: ClassVar[str]
+    max_stride: ClassVar[float]
+
+    @abstractmethod
+    def build_depth(self, operations: Operations) -> Callable[..., Any]:
+        """Build depth(x, y, z, a_x, a_y, a_z, length, radius) for points relative to the tip.
+
+        It returns the depth inside the shape, negative outside, and the unit normal at the nearest point of its
+        surface, outward, in three components.
+        """
+
+    @abstractmethod
+    def build_ray(self, operations: Operations) -> Callable[..., Any]:
+        """Build intersect(d_d, d_a, o_a, o_d, o_o, length, radius) for lines o + t d, relative to the tip.
+
+        d_d is d . d, and so on. It returns t where the line enters the shape, whether it does, and numbers `foot` and
+        `end`: the outward normal there is `end` a, if that is not 0, and otherwise o + t d - `foot` a.
+        """
+
+    @abstractmethod
+    def profile(self, length: float, radius: float) -> Array:
+        """Return the outline that meshes revolve about the axis, from its end to the tip, shape (points, 4).
+
+        Of each point, its place along the axis and its distance from it [m], and the same components of its normal.
+        """
+
+    @abstractmethod
+    def tip_height(self, axis: Array, radius: float) -> float:
+        """Return the height of the tip above the lowest point of the end of the shape [m]."""
+
+    @abstractmethod
+    def gap(self, tip: Array, axis: Array, length: float, radius: float, half: Array) -> float:
+        """Return the distance of the shape from a flat rectangle around the origin [m], negative where it is inside.
+
+        Args:
+            tip: the tip [m], shape (3,).
+            axis: unit vector from the tip along the shape, shape (3,).
+            length: of the axis [m].
+            radius: of the shape [m].
+            half: half the sides of the rectangle, and 0 [m], shape (3,).
+        """

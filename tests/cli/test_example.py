@@ -1,0 +1,55 @@
+"""The shipped scenes without a clone of the repository."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from taichi_msm.cli import example
+from taichi_msm.load.scene_file import load_plan
+from taichi_msm.sweeps.spec import load_sweep
+from tests.conftest import Program
+from tests.golden import Messages
+
+
+def test_every_shipped_scene_is_listed_and_written_with_its_pictures(
+    root: Path, tmp_path: Path, program: Program, message: Messages
+) -> None:
+    listed = program("example").stdout
+    message(listed)
+    names = [line.split()[0] for line in listed.splitlines()]
+    assert sorted(names) == sorted(
+        path.stem for folder in ("", "sweeps") for path in root.glob(f"scenes/{folder}/*.yaml")
+    )
+    for name in names:
+        *files, last = program("example", name, str(tmp_path / name)).stdout.splitlines()
+        assert all(Path(file).is_file() for file in files)
+        command, scene = last.split()[-2:]
+        assert (command, scene) == ("sweep" if name in ("stiffness", "tracking") else "run", files[0])
+    assert load_sweep(tmp_path / "tracking/sweeps/tracking.yaml").files.keys() >= set(
+        map(str, (tmp_path / "tracking/sweeps/textures").iterdir())
+    )
+    plan = load_plan(tmp_path / "tumour/tumour.yaml")
+    assert Path(str(plan.scene.image)).is_relative_to(tmp_path), "and its maps are there"
+
+
+def test_scenes_share_pictures_and_nothing_is_overwritten(tmp_path: Path, program: Program, message: Messages) -> None:
+    here = str(tmp_path)
+    assert program("example", "press", here).returncode == program("example", "drag", here).returncode == 0
+    again = program("example", "press", here)
+    assert again.returncode == 4
+    message(again.stderr, "press.yaml")
+    (tmp_path / "textures" / "mucosa.png").write_text("mine")
+    other = program("example", "grasp", here)
+    assert other.returncode == 4
+    message(other.stderr, "mucosa.png")
+    assert (tmp_path / "textures" / "mucosa.png").read_text() == "mine"
+    assert not (tmp_path / "grasp.yaml").exists()
+    unknown = program("example", "pres")
+    assert unknown.returncode == 2
+    message(unknown.stderr, "press")
+
+
+def test_the_wheel_has_the_scenes(root: Path) -> None:
+    text = (root / "pyproject.toml").read_text(encoding="utf-8")
+    assert '[tool.hatch.build.targets.wheel.force-include]\n"scenes" = "taichi_msm/scenes"\n' in text
+    assert example.scenes_folder() == root / "scenes"

@@ -1,0 +1,65 @@
+"""The reference for rough tools at rest: SciPy's equilibria, and what sticks to a tool between them, point by point."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq, minimize_scalar
+
+from taichi_msm.model.loads import evaluate_frame_loads
+from taichi_msm.model.plan import Plan
+from tests.reference.dynamics import force
+from tests.reference.rest import away, clearance, equilibrium
+
+Array = NDArray[np.float64]
+
+
+def rough_frames(plan: Plan, start: Array) -> Iterator[tuple[Array, Array, NDArray[np.bool_]]]:
+    """Give the displacements at each frame, the force of the only tool, and what sticks to it, of a sheet at `start`.
+
+    Each frame is one shape, which the sheet reaches without touching the tool elsewhere.
+    """
+    u, stuck, anchor = start, np.zeros(plan.fixed.shape, dtype=bool), np.zeros_like(start)
+    rate = plan.grid.frames_per_second
+    for frame in range(1, plan.grid.frames + 1):
+        loads, times = evaluate_frame_loads(plan, frame), ((frame - 1) / rate, frame / rate)
+        after = _centre(plan, times[1])
+        untouched = u
+        if stuck.any():
+            untouched = equilibrium(plan, loads, np.where(stuck[..., None], anchor + after, u), stuck)
+        for i, j in np.argwhere(~plan.fixed & ~stuck):
+            share = _first_touch(plan, u, untouched, (i, j), times)
+            if share is not None:
+                stuck[i, j] = True
+                middle = _centre(plan, times[0] + share * (times[1] - times[0]))
+                anchor[i, j] = u[i, j] + share * (untouched[i, j] - u[i, j]) - middle
+        while True:
+            u = equilibrium(plan, loads, np.where(stuck[..., None], anchor + after, untouched), stuck)
+            others = force(plan.scene, u, loads, 0)
+            pulls = np.where(stuck, (others * away(plan, u, times[1])[0]).sum(axis=-1), 0)
+            if pulls.max() <= 1e-7 * np.abs(others).max():
+                break
+            stuck = stuck & (pulls <= pulls.max() / 2)
+        assert clearance(plan, u, times[1])[0][~stuck].min() > 0
+        yield u, -others[stuck].sum(axis=0), stuck.copy()
+
+
+def _centre(plan: Plan, time: float) -> Array:
+    return plan.tools[0].tip_centre(np.array([time]))[0]
+
+
+def _first_touch(
+    plan: Plan, before: Array, after: Array, point: tuple[int, int], times: tuple[float, float]
+) -> float | None:
+    """Find the share of the way at which a point comes within the tool, whose clearance is convex along the way."""
+
+    def gap(share: float) -> float:
+        u = before + share * (after - before)
+        return float(clearance(plan, u, times[0] + share * (times[1] - times[0]))[0][point])
+
+    if gap(0) <= 1e-9 * plan.tools[0].radius:
+        return 0.0
+    nearest = 1.0 if gap(1) < 0 else float(minimize_scalar(gap, bounds=(0, 1), method="bounded").x)
+    return float(brentq(gap, 0, nearest, xtol=1e-14)) if gap(nearest) < 0 else None
