@@ -1,12 +1,13 @@
 """Make the pictures of the README and of the pages on scenes, labels, sweeps and live sessions, from what is shipped.
 
-    python docs/make_figures.py
+    PYTHONPATH=. python docs/make_figures.py
 
-Needs the extras `test` and `bench`, for the plots and the photograph. Takes about two minutes.
+Needs the extras `test` and `bench`, for the plots and the photograph, and Chromium. Takes about two minutes.
 """
 
 from __future__ import annotations
 
+import asyncio
 import json
 import shutil
 import tempfile
@@ -25,7 +26,9 @@ from taichi_msm.scene.camera import Camera
 from taichi_msm.sweeps.spec import load_sweep
 from taichi_msm.view.recording import Captures
 from taichi_msm.view.script import load_script, record_film, schedule_events
+from taichi_msm.view.server import Server, listen
 from taichi_msm.view.session import Session
+from tests.view.chromium import chromium
 
 Floats = NDArray[np.float64]
 
@@ -188,6 +191,35 @@ def live(name: str, size: int, rate: float, seconds: float) -> None:
         )
 
 
+def page(width: int, height: int) -> None:
+    """Keep what Chromium shows of a session with the scene press, whose tissue becomes stiffer under the tool."""
+
+    async def press(session: Session, folder: Path) -> None:
+        server = Server(session, listen(0), "scenes/press.yaml")
+        serving = asyncio.create_task(server.run(lambda: None))
+        async with chromium(folder / "profile") as tab:
+            await tab.open(server.url, width, height)
+            await tab.until("state !== null && state.time > 0.3")
+            for strength in (40, 70, 100):
+                await tab.value(f"send('strength', {strength}); send('press', 200, 300, false)")
+                await tab.until(f"state.time > {session.frame / session.frame_rate + 1.0}")
+                await tab.value("send('release')")
+                await tab.until(f"state.time > {session.frame / session.frame_rate + 0.5}")
+            await tab.value("send('press', 230, 310, false)")
+            await tab.until(f"state.time > {session.frame / session.frame_rate + 0.7}")
+            await tab.value("send('material', 'tissue.foundation', 4.5e5)")
+            await tab.until(f"state.time > {session.frame / session.frame_rate + 0.7}")
+            await tab.screenshot(folder / "page.png")
+        serving.cancel()
+        await asyncio.wait([serving])
+
+    scene = load_scene(SCENES / "press.yaml", {"render.size": [720, 720], "render.supersample": 2})
+    with tempfile.TemporaryDirectory() as directory, Session(scene, Captures(Path(directory), "press.yaml")) as session:
+        asyncio.run(press(session, Path(directory)))
+        with Image.open(Path(directory) / "page.png") as picture:
+            picture.convert("RGB").save(IMAGES / "browser.jpg", quality=84)
+
+
 def sweep() -> None:
     """Keep the pictures that the sweep stiffness ends with, smaller."""
     with tempfile.TemporaryDirectory() as directory:
@@ -234,6 +266,7 @@ def main() -> None:
     indentation()
     palpation()
     live("live", 250, 10, 4.8)
+    page(1280, 800)
     stages = frames(SCENES / "figure-3.yaml", STAGES, (560, 420))
     grid(stages, 2).save(IMAGES / "figure-3.jpg", quality=90)
     stills = [frames(SCENES / f"{name}.yaml", (moment,), (400, 400))[0] for name, moment in MOMENTS.items()]

@@ -1,27 +1,33 @@
-"""Make the picture of labels.md and its line on flow, which is checked by what it is for: to warp a frame.
+"""Make the pictures of labels.md and its lines on flow and on stereo pairs, each checked by what it is for.
 
     PYTHONPATH=. python docs/make_labels.py
 
 What frame i + 1 shows where flow leads from a pixel of frame i is what frame i shows there, but for light, which is
 switched off for that. What is left comes from filtering, and beside outlines from pixels that show both sides of them.
 Light is then switched on again, at first without highlights and the lamp's direction, which leaves the tool's shadow.
+
+Where `stereo` leads from a pixel of the left picture is in the same row once OpenCV has rectified both.
 """
 
 from __future__ import annotations
 
 import colorsys
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from taichi_msm import Flow, Labels, Simulation, load_scene
+from taichi_msm.render.camera import calibration
 
 ROOT = Path(__file__).parent.parent
 PICTURE = ROOT / "docs" / "images" / "labels.jpg"
 PAGE = ROOT / "docs" / "labels.md"
-START, END = "<!-- warping: made by docs/make_labels.py -->\n", "<!-- end of warping -->\n"
+PAIR_PICTURE = ROOT / "docs" / "images" / "pair.jpg"
+MARKS = "<!-- {}: made by docs/make_labels.py -->\n", "<!-- end of {} -->\n"
 
 # The frame before the fold of grasp.yaml drops, when everything moves.
 SCENE, FRAME = "grasp", 21
@@ -29,6 +35,23 @@ SIZE, GAP, SAMPLES = 300, 6, 3
 
 # How many times differences are shown as large as they are.
 STRONGER = 6
+
+# A stereo pair whose cameras turn towards each other, each with a lens of its own, and its correspondences [px].
+LEFT = {
+    "intrinsics": {"fx": 540.0, "fy": 539.0, "cx": 243.2, "cy": 237.1},
+    "distortion": {"k1": -0.34, "k2": 0.12, "p1": 0.0006, "p2": -0.0004},
+    "eye": [-0.004, -0.06, 0.07],
+    "target": [0.0, -0.004, 0.0],
+}
+TURN = cv2.Rodrigues(np.radians([0.8, -3.2, 2.5]))[0]
+RIGHT = {
+    "beside": "left",
+    "rotation": TURN.tolist(),
+    "translation": [-0.0054, 0.0003, -0.0002],
+    "intrinsics": {"fx": 562.0, "fy": 560.0, "cx": 236.0, "cy": 242.5},
+    "distortion": {"k1": -0.38, "k2": 0.15, "p1": -0.0008, "p2": 0.0003},
+}
+PAIR_SIZE, SPACING = 480, 80
 
 Image8 = NDArray[np.uint8]
 
@@ -112,8 +135,73 @@ def page(panels: dict[str, Image8]) -> Image.Image:
     return sheet
 
 
+def marked(picture: Image8, points: NDArray[np.float64], *, rows: bool) -> Image8:
+    """Draw coloured circles around points, and in rectified pictures their rows."""
+    marked = picture.copy()
+    for n, (x, y) in enumerate(points.tolist()):
+        colour = tuple(int(255 * part) for part in colorsys.hsv_to_rgb(n / len(points), 0.6, 1))
+        if rows:
+            cv2.line(marked, (0, round(y)), (picture.shape[1], round(y)), colour, 1, cv2.LINE_AA)
+        cv2.circle(marked, (round(16 * x), round(16 * y)), 16 * 6, colour, 2, cv2.LINE_AA, 4)
+    return marked
+
+
+def pair() -> str:
+    """Draw a stereo pair with its correspondences, as it is and rectified; return how well these agree."""
+    settings: dict[str, Any] = {
+        "render.camera": None,
+        "render.cameras": {"left": LEFT, "right": RIGHT},
+        "render.size": [PAIR_SIZE, PAIR_SIZE],
+        "output": ["stereo"],
+    }
+    with Simulation(load_scene(ROOT / "scenes" / f"{SCENE}.yaml", settings)) as simulation:
+        simulation.advance(FRAME)
+        seen = simulation.observe(None, "left")
+        pictures = [simulation.draw(name) for name in ("left", "right")]
+        cameras = [calibration(simulation.renderer.resolve_camera(name)) for name in ("left", "right")]
+    assert seen.stereo is not None
+    stereo, hidden = seen.stereo.stereo, seen.stereo.stereo_occlusion
+    assert stereo is not None
+    assert hidden is not None
+    lenses = [(np.array(each["calibration"]), np.array(each["distortion"])) for each in cameras]
+    size, translation = (PAIR_SIZE, PAIR_SIZE), np.array(RIGHT["translation"])[:, None]
+    rectified = cv2.stereoRectify(*lenses[0], *lenses[1], size, TURN, translation, alpha=0)
+    turns, matrices = rectified[:2], rectified[2:4]
+    rows, columns = np.nonzero((stereo[..., 0] < 1e9) & (hidden == 0))
+    left = np.stack([columns, rows], axis=-1).astype(float)
+    both = [left, left + stereo[rows, columns]]
+
+    def rectify(criteria: tuple[int, int, float]) -> list[NDArray[np.float64]]:
+        undistort = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
+        return [
+            undistort(points[:, None], *lens, R=turn, P=matrix, criteria=criteria)[:, 0]
+            for points, lens, turn, matrix in zip(both, lenses, turns, matrices, strict=True)
+        ]
+
+    found = [rectify((3, iterations, 1e-9)) for iterations in (100, 5)]
+    apart = [float(np.abs(one[:, 1] - other[:, 1]).max()) for one, other in found]
+    shown = ((left + SPACING // 2) % SPACING == 0).all(axis=1)
+    shown &= ((found[0][0] > 0) & (found[0][0] < PAIR_SIZE)).all(axis=1)
+    flat = [
+        cv2.remap(picture, *cv2.initUndistortRectifyMap(*lens, turn, matrix, size, cv2.CV_32FC1), cv2.INTER_LINEAR)
+        for picture, lens, turn, matrix in zip(pictures, lenses, turns, matrices, strict=True)
+    ]
+    upper, lower = (
+        np.hstack([marked(each, points[shown], rows=rows) for each, points in zip(drawn, places, strict=True)])
+        for drawn, places, rows in ((pictures, both, False), (flat, found[0], True))
+    )
+    Image.fromarray(np.vstack([upper, np.full((GAP, 2 * PAIR_SIZE, 3), 255, np.uint8), lower])).save(
+        PAIR_PICTURE, quality=88
+    )
+    return (
+        "In the picture, corresponding points of the rectified pictures are in the same row to\n"
+        f"{apart[0]:.4f} px. Without `criteria`, after OpenCV's five iterations, they are up to {apart[1]:.2f} px\n"
+        "apart, and more where lenses distort more. (`docs/make_labels.py` makes the picture and these lines.)\n"
+    )
+
+
 def main() -> None:
-    """Write the picture, and to the page what is left after warping."""
+    """Write the pictures, and to the page what is left after warping and rectifying."""
     settings = [f"render.size=[{SIZE},{SIZE}]", f"render.supersample={SAMPLES}"]
     lit = load_scene(ROOT / "scenes" / f"{SCENE}.yaml", settings)
     plain = load_scene(ROOT / "scenes" / f"{SCENE}.yaml", [*settings, "render.shading=none"])
@@ -147,9 +235,11 @@ def main() -> None:
         "if light comes from everywhere, too (`light.ambient: 1`): the shadow, and filtering. To compare frames by\n"
         "their colours, draw them with `shading: none`. (`docs/make_labels.py` makes the picture and these lines.)\n"
     )
-    begin, rest = PAGE.read_text(encoding="utf-8").split(START)
-    PAGE.write_text(begin + START + said + END + rest.split(END)[1], encoding="utf-8")
-    print(said, end="")
+    for name, lines in (("warping", said), ("pair", pair())):
+        start, end = (mark.format(name) for mark in MARKS)
+        begin, rest = PAGE.read_text(encoding="utf-8").split(start)
+        PAGE.write_text(begin + start + lines + end + rest.split(end)[1], encoding="utf-8")
+        print(lines, end="")
 
 
 if __name__ == "__main__":

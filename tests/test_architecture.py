@@ -145,6 +145,11 @@ def test_only_the_window_imports_pygame() -> None:
     assert [path.stem for path in MODULES if "view.window" in imports(path)] == ["study"]
 
 
+def test_only_the_server_of_sessions_imports_tornado() -> None:
+    assert [path.stem for path in MODULES if "tornado" in third_party(path)] == ["server"]
+    assert [path.stem for path in MODULES if "view.server" in imports(path)] == ["study"]
+
+
 @pytest.mark.slow
 def test_what_needs_no_window_does_not_load_pygame(small: Path) -> None:
     commands = [
@@ -155,6 +160,6 @@ def test_what_needs_no_window_does_not_load_pygame(small: Path) -> None:
     ]
     code = (
         f"import sys; from taichi_msm.cli.main import main; codes = [main(words) for words in {commands}]; "
-        "sys.exit(any(codes) or 'pygame' in sys.modules)"
+        "sys.exit(any(codes) or not {'pygame', 'tornado'}.isdisjoint(sys.modules))"
     )
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)

@@ -258,13 +258,22 @@ def test_the_python_shown_runs(
     assert Path("output/from-python/animation.gif").exists()
 
 
-def test_the_way_from_pixels_to_points_is_exact(small: Path) -> None:
-    lens = "intrinsics: {fx: 40, fy: 40, cx: 20, cy: 15}, distortion: {k1: -0.3, k2: 0.1, p1: 0.001}"
-    settings = [f"render.camera={{eye: [0, 0, 0.25], {lens}}}", "output=[depth]", "render.supersample=1"]
+def test_the_ways_from_pixels_to_points_are_exact(small: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    left = "intrinsics: {fx: 40, fy: 40, cx: 20, cy: 15}, distortion: {k1: -0.3, k2: 0.1, p1: 0.001}"
+    right = "intrinsics: {fx: 42, fy: 41, cx: 19, cy: 14}, distortion: {k1: -0.2, p2: 0.001}"
+    place = "beside: left, rotation: [[0.9992, 0, 0.04], [0, 1, 0], [-0.04, 0, 0.9992]], translation: [-0.02, 0.002, 0]"
+    cameras = f"render.cameras={{left: {{eye: [0, 0, 0.25], {left}}}, right: {{{place}, {right}}}}}"
+    settings = [cameras, "output=[depth, stereo]", "render.supersample=1"]
     run(load_scene("small.yaml", settings), "out")
+    (pair,) = [block for block in blocks(DOCS / "labels.md", "py") if "stereoRectify" in block]
+    exec(pair.replace("output/pair", "out"), {})
+    row, depth = map(float, capfd.readouterr().out.split())
+    # Coordinates in f32 are good to 3e-5 px, and that of 0.25 m, of which 3 px of disparity tell.
+    assert row < 1e-4
+    assert depth < 1e-5
     (shown,) = [block for block in blocks(DOCS / "labels.md", "py") if "projectPoints" in block]
     found: dict[str, Any] = {}
-    exec(shown.replace("output/grasp", "out"), found)
+    exec(shown.replace("output/grasp", "out/left"), found)
     pixels = np.stack([found["columns"], found["rows"]], axis=-1)
     assert len(pixels) > 500, "the sheet fills the picture"
     # 2e-3 with OpenCV's five iterations.

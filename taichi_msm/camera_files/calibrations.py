@@ -41,9 +41,10 @@ def read_calibration(
     """
     file = CameraFile(path, MAX_BYTES)
     reader, cameras = next((reader, cameras) for reader in READERS if (cameras := reader.cameras(file)))
-    if eye == EYES[0]:
-        return reader.read(cameras[0])
-    if len(cameras) < len(EYES):
+    if eye == EYES[0] or len(cameras) < len(EYES):
+        calibration = reader.read(cameras[0])
+        if eye == EYES[0]:
+            return calibration
         raise file.fault(f"{reader.name}: has one camera; name a file of a stereo pair, or remove calibration_eye")
     calibration, pose = reader.read(cameras[1]), reader.pose(cameras[1])
     if pose is None:

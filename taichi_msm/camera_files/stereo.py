@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 from taichi_msm.camera_files.keys import Keys, flat, fold
 from taichi_msm.camera_files.opencv import MATRIX, OpenCV
 from taichi_msm.camera_files.text import CameraFile
 
-# Marks of the left and the right camera, around the name of a key.
+# Marks of the left and the right camera, around the name of a key or as that of a section.
 MARKS = (
-    (r"(.+?)_?1", r"(.+?)_?2"),
+    (r"(.+?)_?1|cam(?:era)?_?1_(.+)", r"(.+?)_?2|cam(?:era)?_?2_(.+)"),
     (r"(?i:left)_?(.+)|(.+?)_?(?i:left)", r"(?i:right)_?(.+)|(.+?)_?(?i:right)"),
     (r"[lL]_(.+)|(.+?)(?:_l|_?L)", r"[rR]_(.+)|(.+?)(?:_r|_?R)"),
-    (r"(.+?)_?0", r"(.+?)_?1"),
+    (r"(.+?)_?0|cam(?:era)?_?0_(.+)", r"(.+?)_?1|cam(?:era)?_?1_(.+)"),
 )
 
 
@@ -27,20 +28,30 @@ class Stereo(OpenCV):
 
     def cameras(self, file: CameraFile) -> Sequence[Keys]:
         """Return the keys of each camera, if both have a matrix, with those that have no mark."""
+        data = _without_sections(file.data)
         for marks in MARKS:
-            eyes = [_marked(file, mark) for mark in marks]
-            if all(any(_is_matrix(file, *item) for item in eye.items()) for eye in eyes):
-                shared = {key: fold(key) for key in file.data if not any(key in eye for eye in eyes)}
+            eyes = [_marked(data, mark) for mark in marks]
+            if all(any(_is_matrix(name, data[key]) for key, name in eye.items()) for eye in eyes):
+                shared = {key: fold(key) for key in data if not any(key in eye for eye in eyes)}
                 folded = [{**shared, **eye} for eye in eyes]
-                return [Keys(file, {key: file.data[key] for key in names}, names) for names in folded]
+                return [Keys(file, {key: data[key] for key in names}, names) for names in folded]
         return ()
 
 
-def _marked(file: CameraFile, mark: str) -> dict[str, str]:
+def _without_sections(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the keys, those of sections after the name of the section, as left_K."""
+    flattened: dict[str, Any] = {}
+    for key, value in data.items():
+        is_section = isinstance(value, dict) and "data" not in value
+        flattened |= {f"{key}_{name}": inner for name, inner in value.items()} if is_section else {key: value}
+    return flattened
+
+
+def _marked(keys: Iterable[str], mark: str) -> dict[str, str]:
     """Return the keys that have a mark, each with its folded name without it."""
-    matches = {key: re.fullmatch(mark, str(key)) for key in file.data}
+    matches = {key: re.fullmatch(mark, str(key)) for key in keys}
     return {key: fold("".join(filter(None, match.groups()))) for key, match in matches.items() if match}
 
 
-def _is_matrix(file: CameraFile, key: str, name: str) -> bool:
-    return bool(re.fullmatch(MATRIX, name)) and len(flat(file.data[key])) == 9
+def _is_matrix(name: str, value: Any) -> bool:
+    return bool(re.fullmatch(MATRIX, name)) and len(flat(value)) == 9

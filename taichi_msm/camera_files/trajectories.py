@@ -90,9 +90,10 @@ def _times(file: CameraFile, trajectory: Trajectory, keys: PoseKeys) -> list[flo
     if start > times[-1]:
         times_text = f"{times[0]:.15g} s to {times[-1]:.15g} s"
         raise file.fault(f"poses_start: {start:.15g} s is after its poses, at {times_text}; take a time of these")
-    # A time before the first pose counts from it.
-    origin = start if start >= times[0] else times[0] + start
-    return [time - origin for time in times]
+    # A time before the first pose counts from it. Differences of large times are rounded to their resolution.
+    is_after_first = start >= times[0] or math.isclose(start, times[0], abs_tol=1e-9)
+    origin, digits = start if is_after_first else times[0] + start, int(-math.log10(math.ulp(times[-1])))
+    return [round(time - origin, digits) for time in times]
 
 
 def _agreed(file: CameraFile, key: str, value: str | None, found: str | None) -> str | None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -27,9 +29,12 @@ from taichi_msm.cli.session import (
     report_interruption,
     result_directory,
 )
-from taichi_msm.errors import printable
+from taichi_msm.errors import FilesError, NotInstalledError, printable
 from taichi_msm.runs.directory import require_no_link
 from taichi_msm.system.process import Interruption, write_stderr
+
+if TYPE_CHECKING:
+    from taichi_msm.view.session import Session
 
 
 @program.command()
@@ -112,9 +117,21 @@ def study(
 @arch_option
 @threads_option
 @click.option("--play", is_flag=True, help="Let the scene's own probes act as well.")
-@click.option("--record", metavar="FILE.gif", help="Film the session instead of opening a window.")
-@click.option("--seconds", type=click.FloatRange(min=0, max=3600, min_open=True), metavar="N", help="How long to film.")
-@click.option("--script", metavar="EVENTS", help="Events of the film: a YAML file.")
+@click.option("--browser", is_flag=True, help="Serve a page to a browser, on this machine only.")
+@click.option(
+    "--port", type=click.IntRange(0, 65535), metavar="N", help="Port of the page.  [default: a free one]", default=0
+)
+@click.option(
+    "--origin", "origins", multiple=True, metavar="URL", help="Origin of the page behind a proxy; may be repeated."
+)
+@click.option("--record", metavar="FILE", help="Film the session as .gif or .mp4.")
+@click.option(
+    "--seconds",
+    type=click.FloatRange(min=0, max=3600, min_open=True),
+    metavar="N",
+    help="With --record: film so long, without a window.",
+)
+@click.option("--script", metavar="EVENTS", help="With --seconds: events of the film, a YAML file.")
 def view(
     scene: str,
     out: str | None,
@@ -123,6 +140,9 @@ def view(
     arch: str,
     threads: int | None,
     play: bool,
+    browser: bool,
+    port: int,
+    origins: tuple[str, ...],
     record: str | None,
     seconds: float | None,
     script: str | None,
@@ -130,14 +150,18 @@ def view(
     """Press the tissue of SCENE with the mouse."""
     from taichi_msm.load.scene_file import load_scene
 
-    if (record is None) != (seconds is None):
-        raise click.UsageError("--record FILE.gif and --seconds N go together")
-    if record is None and script is not None:
-        raise click.UsageError("--script needs --record; in the window you press with the mouse")
+    if seconds is not None and record is None:
+        raise click.UsageError("--seconds N goes with --record FILE")
+    if script is not None and seconds is None:
+        raise click.UsageError("--script needs --record FILE and --seconds N; otherwise you press with the mouse")
+    if browser and seconds is not None:
+        raise click.UsageError("--seconds films without a page; leave out --browser, or --seconds")
+    if (port or origins) and not browser:
+        raise click.UsageError("--port and --origin go with --browser")
     if seconds is not None and math.isnan(seconds):
         raise click.BadParameter("nan is not a number of seconds", param_hint="--seconds")
-    if record is not None and Path(record).suffix.lower() != ".gif":
-        raise click.BadParameter(f"{record} is not the name of a GIF; let it end in .gif", param_hint="--record")
+    film = None if record is None else _film_path(record)
+    permitted = [_require_origin(origin) for origin in origins]
     loaded = load_scene(scene, overrides, image)
     directory = result_directory(out, f"{Path(scene).stem}-live")
 
@@ -161,27 +185,81 @@ def view(
 
     try:
         with prefix_errors(scene):
-            if record is None or seconds is None:
-                from taichi_msm.view.window import Window, run_session
-
-                with Window(f"taichi-msm {scene}", loaded.render.size) as window:
-                    window.announce("one moment: compiling")
-                    with begin() as session:
-                        run_session(session, window, interruption.raise_if_requested)
-            else:
+            if film is not None and seconds is not None:
                 with begin() as session, ProgressDisplay(quiet=False) as bar:
                     events = (
                         schedule_events(loaded_script, session.frame_rate, loaded.render.size) if loaded_script else ()
                     )
                     progress = partial(interruptible_progress(bar, interruption), "film")
-                    record_film(session, Path(record), seconds, events, progress, notices.append)
-                click.echo(printable(record))
+                    record_film(session, film, seconds, events, progress, notices.append)
+                click.echo(printable(str(film)))
+                return DIVERGED if session.divergence_error else DONE
+            if browser:
+                _serve(begin, scene, port, permitted, film, interruption)
+            else:
+                from taichi_msm.view.window import Window, run_session
+
+                with Window(f"taichi-msm {scene}", loaded.render.size) as window:
+                    window.announce("one moment: compiling")
+                    with begin() as session:
+                        if film is not None:
+                            session.start_film(film)
+                        run_session(session, window, interruption.raise_if_requested)
     except KeyboardInterrupt:
         return report_interruption(
-            interruption, False, "interrupted" if record is None else "interrupted; no film was written"
+            interruption, False, "interrupted" if seconds is None else "interrupted; no film was written"
         )
     finally:
         write_stderr(notices)
         for path in captures.saved:
             click.echo(printable(str(path)))
-    return DIVERGED if record is not None and session.divergence_error else DONE
+    return DONE
+
+
+def _film_path(record: str) -> Path:
+    """Return the path of a film, after checking its format."""
+    from taichi_msm.scene.outputs import PYAV_NOT_INSTALLED, is_pyav_installed
+
+    path = Path(record)
+    if path.suffix.lower() not in (".gif", ".mp4"):
+        message = f"{record} is not the name of a GIF or MP4; let it end in .gif or .mp4"
+        raise click.BadParameter(message, param_hint="--record")
+    if path.suffix.lower() == ".mp4" and not is_pyav_installed():
+        raise NotInstalledError(f"--record {record}: {PYAV_NOT_INSTALLED}")
+    if path.is_dir():
+        raise FilesError(f"{path}: a directory; choose another --record")
+    return path
+
+
+def _require_origin(url: str) -> str:
+    """Return a URL as browsers write it as an origin."""
+    from urllib.parse import urlsplit
+
+    origin = url.rstrip("/").lower()
+    parts = urlsplit(origin)
+    if parts.scheme not in ("http", "https") or not parts.hostname or f"{parts.scheme}://{parts.netloc}" != origin:
+        message = f"{url} is not an origin; give the scheme, host and port of the page, as https://hub.example.org"
+        raise click.BadParameter(message, param_hint="--origin")
+    return origin
+
+
+def _serve(
+    begin: Callable[[], Session],
+    title: str,
+    port: int,
+    origins: list[str],
+    film: Path | None,
+    interruption: Interruption,
+) -> None:
+    """Serve a session to browsers until it ends."""
+    import asyncio
+
+    from taichi_msm.view.server import Server, listen
+
+    with listen(port) as listener, begin() as session:
+        server = Server(session, listener, title, origins)
+        if film is not None:
+            session.start_film(film)
+        click.echo(server.url)
+        write_stderr(["open this address in a browser; Ctrl-C ends the session"])
+        asyncio.run(server.run(interruption.raise_if_requested))

@@ -1,16 +1,24 @@
-"""Read the arrays of observations from an .npz."""
+"""Reader of observed points, from an .npz or a mapping of the same arrays.
+
+It has `time` (T,) [s], `coordinates` (N, 2), across and down, and `position` (N, T, 3) [m] or `pixel` (N, T, 2) [px],
+NaN where not observed; optionally `sigma`, the standard deviation of their errors. A run's trajectory.npz and
+tracks.npz are accepted too.
+"""
 
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import SceneError
+from taichi_msm.errors import SceneError, as_array, did_you_mean
+from taichi_msm.fitting.points import Pixels, PointObservation, Positions
 from taichi_msm.images import irregular_kind
+from taichi_msm.scene.section import MAX_MAGNITUDE
 from taichi_msm.system.process import available_memory
 
 NEEDS = "time (T,), coordinates (N, 2) and position (N, T, 3) or pixel (N, T, 2)"
@@ -33,6 +41,104 @@ SUGGESTIVE_NAME_PARTS = (
     "unit",
     "scale",
 )
+
+KINDS: dict[str, type[PointObservation]] = {"position": Positions, "pixel": Pixels}
+
+
+def read_observations(observed: str | Path | Mapping[str, Any], rate: float) -> PointObservation:
+    """Read observations from a file, or from a mapping of the same arrays.
+
+    Args:
+        observed: path of an .npz, or a mapping.
+        rate: frames per second of the scene, for a tracks.npz.
+
+    Raises:
+        SceneError: when arrays are missing, unknown, or have other shapes.
+    """
+    if isinstance(observed, Mapping):
+        filled = {
+            key: np.ma.filled(1.0 * value, np.nan) if np.ma.isMA(value) else value for key, value in observed.items()
+        }
+        require_understood("observed", names := [str(key) for key in filled])
+        arrays = {str(key): as_array(value, str(key)) for key, value in filled.items()}
+        return _checked("observed", arrays, names, rate)
+    return _checked(str(observed), *read_archive(str(observed)), rate)
+
+
+def _checked(name: str, arrays: dict[str, NDArray[Any]], names: list[str], rate: float) -> PointObservation:
+    """Validate arrays, and build observations; `names`: of all arrays in the source."""
+    arrays = _thinned(_masked(name, arrays, rate))
+    kinds = [kind for kind in ("position", "pixel") if kind in arrays]
+    missing = [key for key in ("time", "coordinates") if key not in arrays]
+    if missing := missing + ([] if kinds else ["position or pixel"]):
+        found = ", ".join(map(ascii, names[:20])) or "nothing"
+        suggestion = did_you_mean(missing[0].partition(" ")[0], names).replace("; did you mean", "; is it")
+        raise SceneError([f"{name}: {missing[0]}: missing; expected {NEEDS}, and it has {found}{suggestion}"])
+    if len(kinds) == 2:
+        raise SceneError([f"{name}: has both position and pixel; leave one of them out"])
+    kind = kinds[0]
+    for key in ("time", "coordinates", kind):
+        if arrays[key].dtype.kind not in "fiu":
+            raise SceneError([f"{name}: {key}: {arrays[key].dtype} is no number; expected {NEEDS}"])
+    time, coordinates, values = (np.asarray(arrays[key], np.float64) for key in ("time", "coordinates", kind))
+    size = 3 if kind == "position" else 2
+    points, times = len(coordinates) if coordinates.ndim else 0, len(time) if time.ndim else 0
+    expected = {"time": (times,), "coordinates": (points, 2), kind: (points, times, size)}
+    for key, array in (("time", time), ("coordinates", coordinates), (kind, values)):
+        if array.shape != expected[key] or array.size == 0:
+            message = f"{name}: {key}: shape {array.shape}; expected {NEEDS}"
+            if key == kind and array.shape == (times, points, size):
+                message = f"{name}: {key}: shape {array.shape}; the points come first: take {key}.swapaxes(0, 1)"
+            raise SceneError([message])
+    if not np.isfinite(time).all():
+        raise SceneError([f"{name}: time: holds NaN or infinity; give the time of every column in seconds"])
+    if not ((coordinates >= 0) & (coordinates <= 1)).all():
+        message = "give across and down as fractions of the sheet, 0 to 1, from its upper left corner"
+        raise SceneError([f"{name}: coordinates: {coordinates.flat[np.abs(coordinates - 0.5).argmax()]:g}; {message}"])
+    # Points with a missing coordinate are not observed.
+    values = np.where(np.isfinite(values).all(axis=2, keepdims=True), values, np.nan)
+    if not np.isfinite(values).any():
+        fault = f"every one of the {points} points is NaN or occluded at all {times} times; there are no observations"
+        raise SceneError([f"{name}: {fault}"])
+    if (largest := np.nanmax(np.abs(values))) > MAX_MAGNITUDE:
+        raise SceneError([f"{name}: {kind}: {largest:g}; take NaN where not observed"])
+    observed = KINDS[kind](name, time, values, None, coordinates)
+    return observed.with_sigma(arrays.get("sigma"))
+
+
+def _masked(name: str, arrays: dict[str, NDArray[Any]], rate: float) -> dict[str, NDArray[Any]]:
+    """Apply the masks `visible` and `occluded`, and rename the `points` of a tracks.npz to `pixel`."""
+    arrays = dict(arrays)
+    flags = {key: arrays.pop(key) for key in ("visible", "occluded") if key in arrays}
+    key = next((key for key in ("points", "pixel", "position") if key in arrays), "points")
+    for flag, array in flags.items():
+        shape = arrays[key].shape[:2] if key in arrays else ()
+        if array.shape != shape or array.dtype.kind not in "biu" or not np.isin(array, (0, 1)).all():
+            fault = f"{array.dtype} of shape {array.shape}; take true or false for every point and time (N, T)"
+            raise SceneError([f"{name}: {flag}: {fault}, as {key} has them"])
+        if arrays[key].dtype.kind in "fiu" and arrays[key].ndim == 3:
+            arrays[key] = np.where((array != (flag == "visible"))[..., None], np.nan, arrays[key])
+    if flags and key == "points":
+        arrays = {
+            array_name: array for array_name, array in arrays.items() if array_name in ("time", "coordinates", "points")
+        }
+        arrays["pixel"] = arrays.pop("points")
+        arrays.setdefault("time", np.arange(arrays["pixel"].shape[1]) / rate)
+    return arrays
+
+
+def _thinned(arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Convert the arrays of a trajectory.npz, thinned to at most 64 points per side."""
+    position = arrays.get("position")
+    if position is not None and position.ndim == 4 and min(position.shape[:3]) > 0 and "coordinates" not in arrays:
+        rows, cols = (np.unique(np.linspace(0, n - 1, min(n, 64)).round().astype(int)) for n in position.shape[1:3])
+        down, across = np.meshgrid(
+            rows / max(position.shape[1] - 1, 1), cols / max(position.shape[2] - 1, 1), indexing="ij"
+        )
+        thinned = position[:, rows[:, None], cols].reshape(len(position), len(rows) * len(cols), position.shape[3])
+        coordinates = np.stack([across.ravel(), down.ravel()], axis=1)
+        return {**arrays, "coordinates": coordinates, "position": thinned.swapaxes(0, 1)}
+    return arrays
 
 
 def read_archive(name: str) -> tuple[dict[str, NDArray[Any]], list[str]]:

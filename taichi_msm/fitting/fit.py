@@ -19,12 +19,11 @@ from taichi_msm.accuracy.mesh import CONTACT_ORDER
 from taichi_msm.errors import SceneError, StageProgressCallback, writing
 from taichi_msm.fitting import rejection
 from taichi_msm.fitting import result as result_module
-from taichi_msm.fitting.checks import faults, faults_at_solution, faults_at_start, largest_motion
-from taichi_msm.fitting.conventions import force_unit
+from taichi_msm.fitting.archive import read_observations
+from taichi_msm.fitting.checks import faults, faults_at_solution, faults_at_start, unit_faults
 from taichi_msm.fitting.force_table import read_forces
 from taichi_msm.fitting.least_squares import (
     MAX_RELATIVE_ERROR,
-    ErrorCorrelation,
     Misfit,
     Profile,
     ProfilePoint,
@@ -35,15 +34,17 @@ from taichi_msm.fitting.least_squares import (
     uncertainty,
     unseen,
 )
+from taichi_msm.fitting.machine_curve import CurveRuns, has_curve, search_by_curve
 from taichi_msm.fitting.machine_fit import (
     TABLE_OPTIONS,
     explanations,
     fitted_tests,
     read_machine_problem,
     table_paths,
+    unknown_notes,
 )
 from taichi_msm.fitting.machine_model import MachineProblem
-from taichi_msm.fitting.observations import Forces, read_observations, with_sigma
+from taichi_msm.fitting.observation import ErrorCorrelation, Observation
 from taichi_msm.fitting.parameters import (
     Bounds,
     Method,
@@ -52,6 +53,7 @@ from taichi_msm.fitting.parameters import (
     make_parameters,
     require_types,
 )
+from taichi_msm.fitting.points import PointObservation
 from taichi_msm.fitting.predict import FitProblem, Prediction, Runs, without_outputs
 from taichi_msm.fitting.report import publication, write_report
 from taichi_msm.fitting.result import Estimate, FitResult, FittedMap
@@ -135,9 +137,12 @@ def fit(
             publisher = stack.enter_context(publication(Path(directory)))
         if settings is not None:
             name = str(Path(directory or "", FittedMap.FILE))
-            result = fit_map(initial, problem.observations, settings, name, progress)
+            (points,) = problem.observations
+            assert isinstance(points, PointObservation)
+            result = fit_map(initial, points, settings, name, progress)
         else:
-            runs = stack.enter_context(Runs(problem, workers, progress))
+            kind = CurveRuns if has_curve(problem) else Runs
+            runs = stack.enter_context(kind(problem, workers, progress))
             result = _fit(runs, initial, method)
         result = replace(result, seconds=time.perf_counter() - start)
         if directory is not None:
@@ -155,7 +160,8 @@ def _read_problem(
     method: Method,
 ) -> tuple[FitProblem, MapSettings | None]:
     """Read observations of points and forces, and check them; returns also the settings of a map."""
-    observations = with_sigma(read_observations(observed, initial.time.frames_per_second), method.get("sigma"))
+    points = read_observations(observed, initial.time.frames_per_second).with_sigma(method.get("sigma"))
+    observations: tuple[Observation, ...] = (points,)
     if unused := [name for name in TABLE_OPTIONS if method.get(name)]:
         raise SceneError([f"--{unused[0]}: is of tables of a testing machine; leave it out"])
     settings = map_settings(initial, free, bounds, method.get("resolution"))
@@ -167,14 +173,12 @@ def _read_problem(
         raise SceneError([f"--free {KEY}: --{conflicting[0]} is of fits of numbers; leave it out"])
     parameters = () if settings is not None else make_parameters(initial, free, bounds)
     if forces is not None:
-        observations = replace(observations, forces=read_forces(forces[0], forces[1], len(initial.probes)))
+        observations = (points, read_forces(forces[0], forces[1], len(initial.probes)))
     if (correlation := method.get("correlation")) is not None:
         if not 0 < correlation < math.inf:
             raise SceneError([f"--correlation {correlation:g}: take a number of pixels above 0"])
-        if observations.kind != "pixel":
-            raise SceneError(
-                [f"{observations.name}: --correlation is in pixels, and these are positions; leave it out"]
-            )
+        if not points.correlation_remedy:
+            raise SceneError([f"{points.name}: --correlation is in pixels, and these are positions; leave it out"])
     if (drift := method.get("drift")) is not None and not 0 < drift < math.inf:
         raise SceneError([f"--drift {drift:g}: take a number of seconds above 0"])
     if settings is None and (found := list(faults(observations, initial, len(parameters)))):
@@ -199,60 +203,80 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
     )
     if not any(probe.moved for probe in scene.probes):
         # The forces of force-controlled tools do not depend on the tissue.
-        found += force_unit(observations, first)
+        found += unit_faults(observations, first)
     if found:
         raise SceneError(found)
-    motion = 1.0 if machine else largest_motion(observations, scene) or 1.0
-    misfit = Misfit(observations, motion, robust=method.get("robust", False))
-    search = Search(runs, misfit)
-    if machine:
-        search.remember(start, first)
-    solution = search.best(start)
-    if not machine and (found := list(faults_at_solution(observations, scene, first, solution.predicted))):
+    signals = [observed.signal(scene) or 1.0 for observed in observations]
+    misfit = Misfit(observations, signals, robust=method.get("robust", False))
+    if isinstance(runs, CurveRuns):
+        search, solution = search_by_curve(runs, misfit, start, first)
+    else:
+        search = Search(runs, misfit)
+        if machine:
+            search.remember(start, first)
+        solution = search.best(start)
+    if found := list(faults_at_solution(observations, scene, first, solution.predicted)):
         raise SceneError(found)
     uncertainties = uncertainty(misfit, solution, search.jacobian(solution), error_correlation)
+    if isinstance(runs, CurveRuns):
+        runs.by_tangent = False
     profiles = Profiler(parameters, misfit, solution, uncertainties).profiles(runs) if method.get("profile") else None
     mesh, shifts = _mesh(runs, misfit, solution, uncertainties)
     estimates = [
         _estimate(parameters[n], x, n, uncertainties, profiles, shifts) for n, x in enumerate(solution.x.tolist())
     ]
-    unidentified = unseen(parameters, solution.x, uncertainties, forces=observations.forces is not None)
-    values, forces = np.split(misfit.of(solution.predicted), misfit.count[:1])
+    unidentified = unseen(
+        parameters, solution.x, uncertainties, forces=any(observed.noun == "forces" for observed in observations)
+    )
     rejection_reason = _rejection(misfit, solution, uncertainties, error_correlation)
     fitted_values = {parameter.key: estimate.value for parameter, estimate in zip(parameters, estimates, strict=True)}
-    tests = fitted_tests(machine, fitted_values, solution.predicted.forces) if machine else ()
+    tests = fitted_tests(machine, fitted_values, solution.predicted.values[0]) if machine else ()
+    has_sigma = all(observed.sigma is not None for observed in observations)
+    summaries: dict[str, Any] = {}
+    for observed, residuals, sigma in zip(
+        observations, misfit.split(misfit.of(solution.predicted)), uncertainties.scales, strict=True
+    ):
+        summaries |= observed.summary(residuals, sigma)
     return FitResult(
+        **summaries,
         parameters={parameter.key: estimate for parameter, estimate in zip(parameters, estimates, strict=True)},
         correlation=uncertainties.correlation.tolist(),
-        residual=float(np.sqrt(np.mean(values**2))) if len(values) else None,
-        residual_force=float(np.sqrt(np.mean(forces**2))) if len(forces) else None,
-        sigma=uncertainties.scales.values if len(values) else None,
-        unit=observations.unit,
-        sigma_force=None if observations.forces is None else float(np.mean(observations.forces.sigma)),
         rejection=rejection_reason,
-        chi_square=float(uncertainties.residuals @ uncertainties.residuals) if observations.sigma is not None else None,
+        chi_square=float(uncertainties.residuals @ uncertainties.residuals) if has_sigma else None,
         degrees_of_freedom=uncertainties.freedom,
         identifiable=all(estimate.identifiable for estimate in estimates),
         unseen=unidentified,
         mesh_error=mesh,
         runs=runs.count,
         notes=[
-            *([] if machine else force_unit(observations, first)),
+            *unit_faults(observations, first),
             *(note for fitted in tests for note in fitted.loading.test.notes),
             *result_module.search_notes(solution, parameters, fits_well=search.fits_well(solution)),
             *result_module.mesh_notes(parameters, solution.x, uncertainties, shifts),
             *result_module.correlation_notes(parameters, uncertainties, unidentified),
+            *unknown_notes(
+                tests,
+                {
+                    key: value
+                    for (key, value), each in zip(fitted_values.items(), estimates, strict=True)
+                    if not each.identifiable
+                },
+            ),
             *(
                 explanations(tests, fits_contact=any(parameter.key.startswith("contact") for parameter in parameters))
                 if rejection_reason
                 else ()
             ),
-            *result_module.residual_notes(observations, solution, uncertainties, motion, error_correlation),
+            *result_module.residual_notes(misfit, solution, uncertainties, error_correlation),
         ],
         scene=Scene(**runs.job.fitted_data(as_data(scene), fitted_values)),
+        other_scenes=[
+            Scene(**machine.place(as_data(scene), fitted_values, n))
+            for n in range(1, len(tests))
+            if machine is not None
+        ],
         observations=observations,
         fitted=solution.predicted.values,
-        fitted_forces=solution.predicted.forces,
         tests=tests,
         curves={
             parameter.key: _curve(parameter, n, solution.x, uncertainties, profiles)
@@ -265,37 +289,29 @@ def _rejection(
     misfit: Misfit, solution: Solution, uncertainties: Uncertainty, error_correlation: ErrorCorrelation
 ) -> str | None:
     """Return the reason for rejecting the model, or None."""
-    observations, forces = misfit.observations, uncertainties.residuals[misfit.count[0] :]
+    observations, parts = misfit.observations, misfit.split(uncertainties.residuals)
+    predictions, reason = solution.predicted.values, None
     # Outliers have full weight here, also in a robust fit.
-    suffix = " of the plain residuals" if misfit.robust else ""
-    if observations.sigma is not None:
+    name = "chi-square of the plain residuals" if misfit.robust else "chi-square"
+    if all(observed.sigma is not None for observed in observations):
         total = float(uncertainties.residuals @ uncertainties.residuals)
-        reason = rejection.by_chi_square(total, uncertainties.freedom, uncertainties.independent, f"chi-square{suffix}")
-    else:
-        reason = rejection.by_pattern(
-            observations, solution.predicted.values - observations.values, misfit.motion, error_correlation
-        )
-    if reason is None and len(forces):
-        name = f"chi-square{suffix} of the forces"
-        reason = rejection.by_chi_square(float(forces @ forces), len(forces), len(forces), name)
-    if reason is not None and observations.forces is not None and misfit.count[0]:
-        reason += _larger_part(
-            uncertainties.residuals[: misfit.count[0]], forces, observations.forces, solution.predicted.forces
-        )
-    return reason
+        reason = rejection.by_chi_square(total, uncertainties.freedom, uncertainties.independent, name)
+    for observed, values, part, signal in zip(observations, predictions, parts, misfit.signals, strict=True):
+        if reason is None and observed.sigma is None:
+            reason = observed.pattern(values - observed.values, signal, error_correlation)
+        elif reason is None and observed.is_independent:
+            squares = float(part @ part)
+            reason = rejection.by_chi_square(squares, len(part), len(part), f"{name} of the {observed.noun}")
+    return None if reason is None else reason + _larger_part(observations, parts, predictions)
 
 
-def _larger_part(values: Array, forces: Array, measured: Forces, predicted: Array) -> str:
-    """Describe the larger residuals [sigma], of coordinates or forces, and a common factor of the forces."""
-    of_values, of_forces = (float(np.mean(residuals**2)) for residuals in (values, forces))
-    if max(of_values, of_forces) < 2.0 * min(of_values, of_forces):
+def _larger_part(observations: Sequence[Observation], parts: Sequence[Array], predictions: Sequence[Array]) -> str:
+    """Describe the observation with the largest residuals [sigma], and a common factor of its values."""
+    squares = [float(np.mean(part**2)) for part in parts]
+    if len(parts) == 1 or max(squares) < 2.0 * min(squares):
         return ""
-    if of_values > of_forces:
-        return ", mostly of the coordinates"
-    predicted_square = float(np.nansum(predicted**2 * np.isfinite(measured.force)))
-    factor = float(np.nansum(predicted * measured.force)) / predicted_square if predicted_square else 1.0
-    common = f", which are {factor:.3g} times the predicted ones" if abs(factor - 1) > 0.02 else ""
-    return f", mostly of the forces{common}"
+    largest = int(np.argmax(squares))
+    return f", mostly of the {observations[largest].noun}{observations[largest].factor_note(predictions[largest])}"
 
 
 def _mesh(

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from taichi_msm.errors import SceneError
-from taichi_msm.fitting.observations import Forces
+from taichi_msm.fitting.forces import ToolForces
 from taichi_msm.images import irregular_kind
 from taichi_msm.scene.section import MAX_MAGNITUDE
 
@@ -28,7 +28,7 @@ BYTE_ORDER_MARKS = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
 NUMBER_PATTERN = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 
-def read_forces(path: str | Path, sigma: float, probes: int) -> Forces:
+def read_forces(path: str | Path, sigma: float, probes: int) -> ToolForces:
     """Read a forces.csv.
 
     Args:
@@ -51,7 +51,7 @@ def read_forces(path: str | Path, sigma: float, probes: int) -> Forces:
         raise SceneError([f"{name}: {fault}; {EXPECTED}, and numbers in them"])
     if unknown := [index for index in probe.tolist() if index not in range(probes)]:
         raise SceneError([f"{name}: probe: {unknown[0]:g}; the scene has {probes}, numbered from 0"])
-    return Forces(name, time, probe.astype(np.intp), force, sigma)
+    return ToolForces(name, time, force, sigma, probe.astype(np.intp))
 
 
 def _text(name: str) -> str:

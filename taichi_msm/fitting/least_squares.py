@@ -38,7 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import SceneError
-from taichi_msm.fitting.observations import Observations
+from taichi_msm.fitting.observation import ErrorCorrelation, Observation
 from taichi_msm.fitting.parameters import Parameter, rounded
 from taichi_msm.fitting.predict import Prediction, Runs, difference_step
 
@@ -47,18 +47,12 @@ Array = NDArray[np.float64]
 # Larger residuals are downweighted in robust fits.
 OUTLIER_SIGMAS = 2.0
 
-# Largest residuals of a good fit, as a share of the motion and in sigma; a poor fit is repeated from other starts.
-MAX_RESIDUAL_SHARE, MAX_RESIDUAL_SIGMAS = 0.1, 2.0
-
 # Largest log of the factor between alternative starts and the first one.
 MAX_START_LOG = np.log(10.0)
 
 
-class Scales(NamedTuple):
-    """Standard deviations of the residuals."""
-
-    values: float  # [m] or [px]
-    forces: float | Array  # [N], of all or of each
+# Standard deviations of the residuals of every observation, in its unit: of all, or of each.
+Scales = tuple["float | Array", ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,33 +67,34 @@ class Solution:
 
 
 class Misfit:
-    """Residuals of predictions, flattened to one axis: values first, forces last.
+    """Residuals of predictions, flattened to one axis, one observation after the other.
 
     Args:
         observations: the observations.
-        motion: root mean square of the observed motion [m] or [px].
+        signals: root mean square of what a fit explains of each, in its unit.
         robust: whether outliers are downweighted.
 
     Attributes:
-        count: number of values, and of force components.
+        count: number of values of each observation.
     """
 
-    def __init__(self, observations: Observations, motion: float, *, robust: bool) -> None:
-        self.observations, self.motion, self.robust = observations, motion, robust
-        self._known = observations.known
-        self._values = observations.values[self._known]
-        forces = np.empty((0, 3)) if observations.forces is None else observations.forces.force
-        self._known_forces = np.isfinite(forces)
-        self._forces = forces[self._known_forces]
-        self.count = self._values.size, self._forces.size
+    def __init__(self, observations: Sequence[Observation], signals: Sequence[float], *, robust: bool) -> None:
+        self.observations, self.signals, self.robust = observations, signals, robust
+        self._known = [observed.known for observed in observations]
+        self.count = [int(known.sum()) for known in self._known]
+        self._observed = self._flatten([observed.values for observed in observations])
 
     def row(self, predicted: Prediction) -> Array:
-        """Return the predictions of all observed values and forces, shape (numbers,)."""
-        return np.concatenate([predicted.values[self._known], predicted.forces[self._known_forces]])
+        """Return the predictions of all observed values, shape (numbers,)."""
+        return self._flatten(predicted.values)
 
     def of(self, predicted: Prediction) -> Array:
-        """Return predicted minus observed [m] or [px], and [N], shape (numbers,)."""
-        return self.row(predicted) - np.concatenate([self._values, self._forces])
+        """Return predicted minus observed, in the units of the observations, shape (numbers,)."""
+        return self.row(predicted) - self._observed
+
+    def split(self, rows: Array) -> list[Array]:
+        """Split rows, shape (numbers, ...), by observation."""
+        return np.split(rows, np.cumsum(self.count)[:-1])
 
     def scaled(self, rows: Array, scales: Scales) -> Array:
         """Divide rows, shape (numbers, ...), by their standard deviations."""
@@ -119,13 +114,23 @@ class Misfit:
         rho = 2 * OUTLIER_SIGMAS**2 * (np.sqrt(self.robust_factor(residuals)) - 1) if self.robust else residuals**2
         return float(np.sum(rho)) / 2
 
-    def sigma(self, predicted: Prediction, parameters: int) -> float:
-        """Estimate the standard deviation of the values from their residuals [m] or [px]."""
-        residuals = self.of(predicted)[: self.count[0]]
-        mean_square = np.sum(residuals**2) / max(1, len(residuals) - parameters)
-        # 1.4826 is the ratio of sigma to the median of the magnitudes, of normal errors.
-        sigma = 1.4826 * np.median(np.abs(residuals)) if self.robust else np.sqrt(mean_square)
-        return max(float(sigma), 1e-9 * self.motion)
+    def deviations(self, predicted: Prediction, parameters: int) -> list[float]:
+        """Estimate the standard deviation of every observation from its residuals, in its unit."""
+        found = []
+        for residuals, signal in zip(self.split(self.of(predicted)), self.signals, strict=True):
+            mean_square = np.sum(residuals**2) / max(1, len(residuals) - parameters)
+            # 1.4826 is the ratio of sigma to the median of the magnitudes, of normal errors.
+            sigma = 1.4826 * np.median(np.abs(residuals)) if self.robust else np.sqrt(mean_square)
+            found.append(max(float(sigma), 1e-9 * signal))
+        return found
+
+    def scales(self, unknown: Sequence[float]) -> Scales:
+        """Return the standard deviations of all observations; `unknown`: those where they are not given."""
+        given = zip(self.observations, unknown, strict=True)
+        return tuple(sigma if observed.sigma is None else observed.sigma for observed, sigma in given)
+
+    def _flatten(self, values: Sequence[Array]) -> Array:
+        return np.concatenate([each[known] for each, known in zip(values, self._known, strict=True)])
 
 
 class Search:
@@ -134,22 +139,23 @@ class Search:
     Args:
         runs: computes predictions.
         misfit: the residuals; the initial value of an unknown sigma is the observed motion.
+        limits: smallest and largest coordinates, each of shape (n,); by default those of the parameters.
     """
 
-    def __init__(self, runs: Runs, misfit: Misfit) -> None:
+    def __init__(self, runs: Runs, misfit: Misfit, limits: tuple[Array, Array] | None = None) -> None:
         self._runs, self._misfit = runs, misfit
         self._delta = difference_step(runs.job.scene)
-        limits = np.array([parameter.limits for parameter in runs.job.parameters])
-        self._limits = limits[:, 0], limits[:, 1]
+        low, high = np.array([parameter.limits for parameter in runs.job.parameters]).T
+        self._limits = limits or (low, high)
         self._known: dict[bytes, Prediction | None] = {}
         self._neighbours: dict[bytes, Prediction | None] = {}
 
     def best(self, start: Array) -> Solution:
         """Minimise from a start, and from two alternative starts if the fit is poor."""
-        solution = self._solve(start)
+        solution = self.refine(start)
         if self.fits_well(solution):
             return solution
-        starts = self._alternative_starts()
+        starts = self.alternative_starts()
         self._runs.expected += len(starts)
         costs = [
             (self._cost(predicted, solution.scales), n)
@@ -157,7 +163,7 @@ class Search:
             if predicted is not None
         ]
         for _, n in sorted(costs)[:2]:
-            candidate = self._solve(starts[n])
+            candidate = self.refine(starts[n])
             # Costs are comparable only with the same sigma.
             if self._cost(candidate.predicted, solution.scales) < self._cost(solution.predicted, solution.scales):
                 solution = candidate
@@ -166,31 +172,16 @@ class Search:
         return solution
 
     def fits_well(self, solution: Solution) -> bool:
-        """Return whether the residuals are small."""
-        observations = self._misfit.observations
-        if observations.forces is not None:
-            residuals, limit = (
-                solution.predicted.forces - observations.forces.force,
-                MAX_RESIDUAL_SHARE**2 * np.nanmean(observations.forces.force**2),
-            )
-            variance = float(np.mean(np.square(observations.forces.sigma)))
-            if np.nanmean(residuals**2) > max(limit, MAX_RESIDUAL_SIGMAS**2 * variance):
-                return False
-        if not self._misfit.count[0]:
-            return True
-        sigma = self._misfit.sigma(solution.predicted, len(solution.x))
-        return sigma <= (
-            MAX_RESIDUAL_SHARE * self._misfit.motion
-            if observations.sigma is None
-            else MAX_RESIDUAL_SIGMAS * observations.sigma
-        )
+        """Return whether the residuals of all observations are small."""
+        misfit = self._misfit
+        residuals = misfit.split(misfit.of(solution.predicted))
+        deviations = misfit.deviations(solution.predicted, len(solution.x))
+        each = zip(misfit.observations, residuals, deviations, misfit.signals, strict=True)
+        return all(observed.fits_well(part, deviation, signal) for observed, part, deviation, signal in each)
 
     def jacobian(self, solution: Solution) -> Array:
-        """Return the Jacobian of the predictions by x, shape (numbers, parameters).
-
-        Differences are central, or forward for machine tests, whose many frames take long and whose forces are smooth.
-        """
-        return self._differences(solution.x, solution.predicted, signs=(1, -1) if self._misfit.count[0] else (1,))
+        """Return the Jacobian of the predictions by x, shape (numbers, parameters)."""
+        return self._differences(solution.x, solution.predicted, signs=self._runs.job.signs)
 
     def remember(self, x: Array, predicted: Prediction) -> None:
         """Store a prediction that is known."""
@@ -203,21 +194,21 @@ class Search:
             self._known[key] = self._runs.predict_one(x)
         return self._known[key]
 
-    def _solve(self, start: Array) -> Solution:
+    def refine(self, start: Array) -> Solution:
         """Minimise from a start, alternating with an unknown sigma."""
-        observations, robust = self._misfit.observations, self._misfit.robust
-        scales = Scales(
-            observations.sigma or self._misfit.motion, observations.forces.sigma if observations.forces else 1.0
-        )
-        if robust and observations.sigma is None and (predicted := self._predict(start)) is not None:
-            scales = scales._replace(values=self._misfit.sigma(predicted, len(start)))
+        misfit = self._misfit
+        is_unknown = any(observed.sigma is None for observed in misfit.observations)
+        scales = misfit.scales(misfit.signals)
+        if misfit.robust and is_unknown and (predicted := self._predict(start)) is not None:
+            scales = misfit.scales(misfit.deviations(predicted, len(start)))
         solution = self._minimise(start, scales)
-        alternates = observations.sigma is None and (observations.forces is not None or robust)
+        alternates = is_unknown and (len(misfit.observations) > 1 or misfit.robust)
         for _ in range(6 if alternates else 0):
-            sigma = self._misfit.sigma(solution.predicted, len(start))
-            if abs(sigma / solution.scales.values - 1) < 0.02:
+            scales = misfit.scales(misfit.deviations(solution.predicted, len(start)))
+            pairs = zip(scales, solution.scales, strict=True)
+            if all(np.abs(np.divide(new, old) - 1).max() < 0.02 for new, old in pairs):
                 break
-            solution = self._minimise(solution.x, scales._replace(values=sigma))
+            solution = self._minimise(solution.x, scales)
         return solution
 
     def _minimise(self, start: Array, scales: Scales) -> Solution:
@@ -301,12 +292,12 @@ class Search:
     def _cost(self, predicted: Prediction, scales: Scales) -> float:
         return self._misfit.cost(self._misfit.residuals(predicted, scales))
 
-    def _alternative_starts(self) -> list[Array]:
+    def alternative_starts(self) -> list[Array]:
         """Return a Sobol sequence of starts within the bounds, at least 8 per parameter, or 8 for machine tests."""
         from scipy.stats import qmc
 
         low, high = (np.clip(limit, -MAX_START_LOG, MAX_START_LOG) for limit in self._limits)
-        count = 8 * len(low) if self._misfit.count[0] else 8
+        count = 8 * len(low) if len(self._runs.job.signs) > 1 else 8
         shares = qmc.Sobol(len(low), seed=1).random_base2((count - 1).bit_length())
         return list(qmc.scale(shares, low, high))
 
@@ -316,13 +307,6 @@ MIN_COMPONENT = 1e-3
 
 # Largest standard deviation of an identified direction.
 MAX_DIRECTION_DEVIATION = 0.5
-
-
-class ErrorCorrelation(NamedTuple):
-    """Correlation lengths of the errors of tracks; None: independent."""
-
-    correlation: float | None  # of two tracks [px]
-    drift: float | None  # of two times [s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -393,9 +377,7 @@ def uncertainty(
     """
     parameters = len(solution.x)
     freedom = max(1, sum(misfit.count) - parameters)
-    scales = solution.scales
-    if misfit.observations.sigma is None:
-        scales = scales._replace(values=misfit.sigma(solution.predicted, parameters))
+    scales = misfit.scales(misfit.deviations(solution.predicted, parameters))
     residuals, jacobian = misfit.residuals(solution.predicted, scales), misfit.scaled(derivatives, scales)
     robust_factor = misfit.robust_factor(residuals)
     weighted = jacobian * robust_factor[:, None] ** (-0.75)
@@ -417,35 +399,10 @@ def uncertainty(
 
 
 def _correlated(misfit: Misfit, rows: Array, error_correlation: ErrorCorrelation) -> tuple[Array, float]:
-    """Compute U^T K U, and the effective number of observations tr(K)^2 / tr(K^2); errors of forces are independent."""
-    values, observations = misfit.count[0], misfit.observations
-    # Distances are those of mean observed positions; tracks without observations are left out.
-    is_tracked: NDArray[np.bool_] = np.any(observations.is_observed, axis=1)
-    space, time = _correlations(observations, is_tracked, error_correlation)
-    by_track = np.zeros((*observations.values.shape, rows.shape[1]))
-    by_track[observations.known] = rows[:values]
-    by_track = by_track[is_tracked]
-    correlated = np.einsum("st,ntcp->nscp", time, np.tensordot(space, by_track, 1))
-    forces = len(rows) - values
-    is_observed = observations.is_observed[is_tracked].astype(float)
-    square = forces + observations.values.shape[2] * float(np.sum(space**2 * (is_observed @ time**2 @ is_observed.T)))
-    matrix = np.tensordot(by_track, correlated, ((0, 1, 2), (0, 1, 2))) + rows[values:].T @ rows[values:]
-    return matrix, len(rows) ** 2 / square
-
-
-def _correlations(
-    observations: Observations, is_tracked: NDArray[np.bool_], error_correlation: ErrorCorrelation
-) -> tuple[Array, Array]:
-    """Return the correlations of the errors of tracks, shape (tracks, tracks), and of times, shape (T, T)."""
-    from scipy.spatial.distance import cdist
-
-    space, time = np.eye(int(is_tracked.sum())), np.eye(len(observations.time))
-    if error_correlation.correlation is not None:
-        pixels = np.nanmean(observations.values[is_tracked], axis=1)
-        space = np.exp(-cdist(pixels, pixels) / error_correlation.correlation)
-    if error_correlation.drift is not None:
-        time = np.exp(-np.abs(observations.time[:, None] - observations.time) / error_correlation.drift)
-    return space, time
+    """Compute U^T K U, and the effective number of observations tr(K)^2 / tr(K^2)."""
+    pairs = zip(misfit.observations, misfit.split(rows), strict=True)
+    matrices, squares = zip(*(observed.correlated(part, error_correlation) for observed, part in pairs), strict=True)
+    return np.sum(matrices, axis=0), len(rows) ** 2 / sum(squares)
 
 
 # Relative tolerance of the end of an interval.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from taichi_msm.errors import SceneError
 from taichi_msm.fitting.machine_model import MachineProblem, contact_keys, machine_parameters, observe_tests
 from taichi_msm.fitting.machine_tables import cut_window, read_machine_test
-from taichi_msm.fitting.machine_test import Loading, build_loading, find_approach
+from taichi_msm.fitting.machine_test import Loading, build_loading, find_approach, late_contact_note
 from taichi_msm.fitting.parameters import Bounds, Method, as_data, rounded
 from taichi_msm.fitting.predict import without_outputs
 from taichi_msm.scene.scene import Scene
@@ -47,6 +47,13 @@ class FittedTest:
     def residual(self) -> float:
         """Root mean square of the residual over the frames [N]."""
         return float(np.sqrt(np.mean((self.force - self.loading.force) ** 2)))
+
+    @property
+    def rise(self) -> float:
+        """Time between contact and the largest force [s]."""
+        loading = self.loading
+        in_contact = loading.travel(self.contact) > 0
+        return float(loading.time[loading.force.argmax()] - loading.time[in_contact.argmax()])
 
     def as_json(self) -> dict[str, Any]:
         """Return JSON data, as in fit.json."""
@@ -114,14 +121,19 @@ def read_machine_problem(
         if (window := method.get("window")) is not None:
             test = cut_window(test, *window)
         contact = contacts[n if len(contacts) > 1 else 0] if contacts else None
-        tests.append(build_loading(test, scene, rate, contact))
+        loading = build_loading(test, scene, rate, contact, is_clamp=approach.is_clamp)
+        key = contact_keys(len(paths))[n]
+        is_found = contact is None and not approach.is_clamp and key not in free
+        if is_found and (note := late_contact_note(loading, key)):
+            loading = replace(loading, test=replace(loading.test, notes=(*loading.test.notes, note)))
+        tests.append(loading)
     parameters = machine_parameters(scene, tests, free, bounds, approach.probe)
     placed = Scene(**tests[0].place(as_data(without_outputs(scene)), approach))
-    observations = observe_tests(tests)
+    observations = observe_tests(tests, approach)
     if (count := sum(len(loading.force) for loading in tests)) <= len(parameters):
         fault = f"{count} frames, too few for {len(parameters)} parameters; raise --rate"
         raise SceneError([f"{observations.name}: {fault}"])
-    return MachineProblem(secrets.token_hex(8), placed, parameters, observations, tuple(tests), approach)
+    return MachineProblem(secrets.token_hex(8), placed, parameters, (observations,), tuple(tests), approach)
 
 
 def fitted_tests(job: MachineProblem, values: Mapping[str, float], forces: Array) -> tuple[FittedTest, ...]:
@@ -132,6 +144,29 @@ def fitted_tests(job: MachineProblem, values: Mapping[str, float], forces: Array
         FittedTest(loading, values.get(key, loading.contact), force)
         for loading, key, force in zip(job.tests, keys, np.split(forces[:, 0], ends), strict=True)
     )
+
+
+def unknown_notes(tests: Sequence[FittedTest], values: Mapping[str, float]) -> Iterator[str]:
+    """Yield the reasons for parameters that the tests do not identify, one per line.
+
+    Args:
+        tests: the fitted tests.
+        values: values of these parameters, by key.
+    """
+    for key, value in values.items():
+        if key.startswith("tissue.relaxation.") and key.endswith(".time"):
+            shortest = min(fitted.rise for fitted in tests)
+            longest = max(float(fitted.loading.test.time[-1]) for fitted in tests)
+            if value < shortest:
+                yield f"{key}: {value:.2g} s is shorter than the rise of the force, {shortest:.2g} s; press faster"
+            elif value > longest:
+                yield f"{key}: {value:.2g} s is longer than the test, {longest:.2g} s; hold for longer"
+        elif key == "tissue.foundation.lock":
+            reach = max(float(fitted.loading.travel(fitted.contact).max()) for fitted in tests)
+            if value > reach:
+                yield f"{key}: {value:.2g} m is beyond the depth reached, {reach:.2g} m; press deeper, or leave it out"
+        elif key == "tissue.stiffening.lock":
+            yield f"{key}: the test does not stretch the tissue far enough; pull further, or leave it out"
 
 
 def explanations(tests: Sequence[FittedTest], *, fits_contact: bool) -> Iterator[str]:
@@ -161,8 +196,8 @@ def _explain(fitted: FittedTest, *, fits_contact: bool) -> Iterator[str]:
     model_fall = 1 - float(at_ends[1] / at_ends[0]) if last > peak and at_ends[0] > 0 else 0.0
     if fall > MIN_FALL_SHARE and model_fall < 0.5 * fall:
         yield (
-            f"the force falls by {rounded(100 * fall)} % while the tool is held, and the model's by "
-            f"{rounded(100 * max(model_fall, 0.0))} %: relaxation? Free the shares and times of tissue.relaxation"
+            f"the force falls by {100 * fall:.0f} % while the tool is held, and the model's by "
+            f"{100 * max(model_fall, 0.0):.0f} %: relaxation? Free the shares and times of tissue.relaxation"
         )
         return
     at_peak = float(travel[loading.force.argmax()])

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import Pause, SceneError
+from taichi_msm.fitting.forces import Forces
 from taichi_msm.fitting.machine_test import Approach, Loading
-from taichi_msm.fitting.observations import Forces, Observations
+from taichi_msm.fitting.observation import ObservationModel
 from taichi_msm.fitting.parameters import Bounds, Parameter, make_parameters, with_values
 from taichi_msm.fitting.predict import FitProblem, ForwardModel, Prediction
 from taichi_msm.load.check import check_scene
@@ -31,6 +32,9 @@ def contact_keys(count: int) -> list[str]:
 class MachineProblem(FitProblem):
     """Scene, parameters and machine tests of a fit."""
 
+    # Tests have many frames, and smooth forces.
+    signs: ClassVar[tuple[int, ...]] = (1,)
+
     tests: tuple[Loading, ...]
     approach: Approach
 
@@ -44,13 +48,22 @@ class MachineProblem(FitProblem):
 
     def place(self, data: dict[str, Any], values: Mapping[str, float], n: int) -> dict[str, Any]:
         """Return a scene's data with parameter values, by key, and with the path and the times of test n."""
+        contact = values.get(contact_keys(len(self.tests))[n])
+        return self.tests[n].place(self.with_scene_values(data, values), self.approach, contact)
+
+    def with_scene_values(self, data: dict[str, Any], values: Mapping[str, float]) -> dict[str, Any]:
+        """Return a scene's data with parameter values by key, except depths of contact."""
         of_scene = [parameter for parameter in self.parameters if parameter.key not in contact_keys(len(self.tests))]
-        data = with_values(data, of_scene, [values[parameter.key] for parameter in of_scene])
-        return self.tests[n].place(data, self.approach, values.get(contact_keys(len(self.tests))[n]))
+        return with_values(data, of_scene, [values[parameter.key] for parameter in of_scene])
+
+    def reach(self, values: Mapping[str, float]) -> float:
+        """Return the greatest travel of all tests [m] with parameter values by key."""
+        keys = contact_keys(len(self.tests))
+        return max(float(test.travel(values.get(key)).max()) for test, key in zip(self.tests, keys, strict=True))
 
 
 class MachineModel(ForwardModel):
-    """Forward model of machine tests; its values are empty, its forces of shape (frames of all tests, 1)."""
+    """Forward model of machine tests; predicts `MachineForces`, of shape (frames of all tests, 1)."""
 
     job: MachineProblem
 
@@ -60,34 +73,37 @@ class MachineModel(ForwardModel):
         steps: int | None = None,
         *,
         coarse: int = 0,
-        to_end: bool = False,  # noqa: ARG002  # The runs end with their tests.
+        to_end: bool = False,  # The runs end with their tests.
         pause: Pause = lambda: None,
     ) -> Prediction:
         """Simulate all tests with the parameters at x; arguments and errors as of `ForwardModel.predict`."""
         forces, most_steps = [], 0
         for n in range(len(self.job.tests)):
             simulation, plan = self.start(self.plan(x, n), steps, coarse)
-            forces.append(self._forces(simulation, plan.grid.frames, pause))
+            forces.append(self.forces(simulation, plan.grid.frames, pause))
             most_steps = max(most_steps, plan.grid.steps_per_frame)
-        return Prediction(np.empty((0, 0, 3)), np.concatenate(forces)[:, None], most_steps, np.zeros(1))
+        return Prediction((np.concatenate(forces),), most_steps, np.zeros(1))
+
+    def forces(self, simulation: Simulation, frames: int, pause: Pause) -> Array:
+        """Return the forces along the tool's direction in a run of a number of frames [N], shape (frames + 1, 1)."""
+        (observed,) = self.job.observations
+        model = observed.build_model(self.job.scene, frames + 1)
+        (recorded,) = self.record([model], simulation, frames + 1, pause)
+        return model.predict(recorded)
 
     def plan(self, x: Array, n: int = 0) -> Plan:
         """Plan the scene of test n with the parameters at x; SceneError: it is not valid."""
+        return check_scene(Scene(**self.job.place(self.data, self.values(x), n)), self.maps)
+
+    def values(self, x: Array) -> dict[str, float]:
+        """Return the parameter values by key at x; SceneError: they are out of range."""
         values = {
             parameter.key: parameter.value(coordinate)
             for parameter, coordinate in zip(self.job.parameters, x.tolist(), strict=True)
         }
         if not np.isfinite(list(values.values())).all():
             raise SceneError(["the values are out of range"])
-        return check_scene(Scene(**self.job.place(self.data, values, n)), self.maps)
-
-    def _forces(self, simulation: Simulation, frames: int, pause: Pause) -> Array:
-        """Return the forces along the tool's direction at the frames of a run [N], shape (frames + 1,)."""
-        forces = []
-        for frame in range(frames + 1):
-            simulation.advance(min(frame, 1), pause)
-            forces.append(simulation.forces()[self.job.approach.probe].force)
-        return np.array(forces) @ self.job.approach.direction
+        return values
 
 
 def machine_parameters(
@@ -134,17 +150,39 @@ def _contact_parameter(key: str, test: Loading, bounds: Bounds | None) -> Parame
     return Parameter(key, test.contact, low, high, high - low)
 
 
-def observe_tests(tests: Sequence[Loading]) -> Observations:
-    """Return the forces of machine tests as observations without points."""
-    name = ", ".join(loading.test.name for loading in tests)
+class MachineForceModel(ObservationModel):
+    """Map from the run of a machine test to the forces at its frames."""
+
+    def __init__(self, approach: Approach) -> None:
+        self._approach = approach
+
+    def record(self, simulation: Simulation) -> Array:
+        """Return the force of the tool in the current frame [N], shape (3,)."""
+        return np.array(simulation.forces()[self._approach.probe].force)
+
+    def predict(self, recorded: Array) -> Array:
+        """Return the forces along the direction of the tool at all frames [N], shape (frames, 1)."""
+        return np.asarray(recorded @ self._approach.direction[:, None])
+
+
+@dataclass(frozen=True, eq=False)
+class MachineForces(Forces):
+    """Forces at the frames of all tests along the direction of the tool, of shape (frames, 1)."""
+
+    approach: Approach
+
+    def build_model(self, scene: Scene, frames: int) -> MachineForceModel:
+        """Build the map from the run of a test."""
+        return MachineForceModel(self.approach)
+
+
+def observe_tests(tests: Sequence[Loading], approach: Approach) -> MachineForces:
+    """Return the forces of machine tests."""
     lengths = [len(loading.force) for loading in tests]
-    forces = Forces(
-        name,
+    return MachineForces(
+        ", ".join(loading.test.name for loading in tests),
         np.concatenate([loading.scene_time for loading in tests]),
-        np.repeat(np.arange(len(tests)), lengths),
         np.concatenate([loading.force for loading in tests])[:, None],
-        np.repeat([loading.noise for loading in tests], lengths),
+        np.repeat([loading.sigma for loading in tests], lengths),
+        approach,
     )
-    empty = np.empty((0, 0, 3))
-    # The unit of no value; with a sigma, none is estimated.
-    return Observations(name, "position", np.empty(0), np.empty((0, 2)), empty, 1.0, forces)

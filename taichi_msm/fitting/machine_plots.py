@@ -9,24 +9,23 @@ from matplotlib.axes import Axes
 
 from taichi_msm.errors import printable
 from taichi_msm.fitting.machine_fit import FittedTest
-from taichi_msm.fitting.result import FitResult
 from taichi_msm.plot_style import BLUE, GREY, SILVER, VERMILION
 
 
-def _plot_time(axes: Axes, result: FitResult, fitted: FittedTest) -> None:
+def _plot_time(axes: Axes, fitted: FittedTest, *, several: bool) -> None:
     """Plot the force over time: all rows of the table, frames, and the fitted force."""
     loading = fitted.loading
     axes.plot(loading.test.time, loading.test.force, ".", color=SILVER, markersize=2, label="table")
     axes.plot(loading.time, loading.force, ".", color=VERMILION, markersize=3, label="measured, of a frame")
     axes.plot(loading.time, fitted.force, color=BLUE, label="fitted")
     # The file is in the title of the figure if there is one test only.
-    title = "Force over time" if len(result.tests) == 1 else printable(Path(loading.test.name).name)
+    title = printable(Path(loading.test.name).name) if several else "Force over time"
     axes.set_title(title, parse_math=False)
     axes.set(xlabel="time [s]", ylabel="force [N]")
     axes.legend()
 
 
-def _plot_depth(axes: Axes, _result: FitResult, fitted: FittedTest) -> None:
+def _plot_depth(axes: Axes, fitted: FittedTest, **_: bool) -> None:
     """Plot the force over depth, with the depth of contact."""
     loading = fitted.loading
     axes.plot(1000 * loading.test.depth, loading.test.force, ".", color=SILVER, markersize=2)
@@ -37,7 +36,7 @@ def _plot_depth(axes: Axes, _result: FitResult, fitted: FittedTest) -> None:
     axes.legend()
 
 
-def _plot_residual(axes: Axes, _result: FitResult, fitted: FittedTest) -> None:
+def _plot_residual(axes: Axes, fitted: FittedTest, **_: bool) -> None:
     """Plot fitted minus measured force over time, with twice the noise on either side."""
     loading = fitted.loading
     axes.axhspan(-2 * loading.noise, 2 * loading.noise, color=SILVER, alpha=0.4, linewidth=0, label="2 x noise")

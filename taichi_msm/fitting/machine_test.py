@@ -1,7 +1,7 @@
 """Test of a testing machine as a scene, whose position-controlled tool follows the depths of the table.
 
-The tool moves along a line, from the first contact with the sheet at rest. Until the table's depth exceeds the depth of
-contact, it waits there.
+The tool moves along a line, from the first contact with the sheet at rest, or a clamp from its rest. Until the table's
+depth exceeds the depth of contact, it waits there; that of a clamp is the depth of the first row.
 
 Frames are equidistant in time. The equilibria of tissue without relaxation do not depend on time: their frames are
 equidistant in depth, from slightly above the contact to the greatest depth, and later rows are not used. The depth and
@@ -40,19 +40,24 @@ DEVIATION_PER_MEDIAN = 1.48
 # Forces above this are due to contact [noise].
 CONTACT_NOISES = 5.0
 
-# Accuracy of predicted forces, as a share of the peak: the smallest noise.
+# Accuracy of predicted forces, as a share of the peak.
 FORCE_ACCURACY = 1e-5
+
+# A contact is late if 5 noises are more than this share of the peak, and force and depth of the rows of the noise have
+# a larger rank correlation: of 10 independent ones, it has a probability of 0.015.
+MIN_LATE_SHARE, MIN_LATE_CORRELATION = 0.01, 0.55
 
 
 @dataclass(frozen=True, eq=False)
 class Approach:
-    """Line of a position-controlled tool, from its first contact with the sheet at rest."""
+    """Line of a position-controlled tool, from its first contact with the sheet at rest, or from a clamp's rest."""
 
     probe: int  # index of the tool in the scene
-    start: Array  # centre of the tip at first contact [m], shape (3,)
+    start: Array  # centre of the tip at first contact, or 0, the displacement of a clamp at rest [m], shape (3,)
     direction: Array  # unit vector, shape (3,)
     radius: float  # of the tip [m]
     size: tuple[float, float]  # height and width of the sheet [m]
+    is_clamp: bool
 
     def keyframes(self, times: Array, travel: Array) -> list[list[float]]:
         """Return the path of the tool.
@@ -62,11 +67,27 @@ class Approach:
             travel: distance from the first contact at these times [m], shape (n,).
 
         Returns:
-            Keyframes [t, across, down, height].
+            Keyframes [t, across, down, height], of a clamp [t, x, y, z].
         """
         height, width = self.size
         x, y, z = (self.start + travel[:, None] * self.direction).T
+        if self.is_clamp:
+            return np.stack([times, x, y, z], axis=1).tolist()
         return np.stack([times, x / width + 0.5, 0.5 - y / height, z - self.radius], axis=1).tolist()
+
+    def place(self, data: dict[str, Any], times: Array, travel: Array, rate: float) -> dict[str, Any]:
+        """Return a scene's data with the path of the tool, and the times, of a test.
+
+        Args:
+            data: a scene.
+            times: times of the frames [s], shape (n,).
+            travel: distance from the first contact at the frames [m], shape (n,).
+            rate: frames per second.
+        """
+        probes = list(data["probes"])
+        probes[self.probe] = {**probes[self.probe], "path": self.keyframes(times, travel)}
+        time = {**data["time"], "duration": (len(times) - 1) / rate, "frames_per_second": rate}
+        return {**data, "probes": probes, "time": time}
 
 
 def find_approach(scene: Scene) -> Approach:
@@ -74,20 +95,18 @@ def find_approach(scene: Scene) -> Approach:
     tools = build_tools(scene.probes, scene.sheet)
     if len(tools) != 1:
         fault = f"{len(tools)} position-controlled tools, and a table of a testing machine is of one"
-        raise SceneError([f"probes: {fault}; give one probe a path and an instrument, and no other"])
+        raise SceneError([f"probes: {fault}; give one probe a path and an instrument or a clamp, and no other"])
     (tool,) = tools
-    if isinstance(tool, Clamp):
-        fault = "a clamp does not follow a table; fit its forces with --forces, or press with an instrument"
-        raise SceneError([f"probes.{tool.probe}.clamp: {fault}"])
     key, offsets = f"probes.{tool.probe}.path", tool.tip_centres - tool.tip_centres[0]
     farthest = offsets[np.linalg.norm(offsets, axis=1).argmax()]
     if not farthest.any():
         raise SceneError([f"{key}: stays at one place; give it a second key, in the direction of the test"])
     direction = farthest / np.linalg.norm(farthest)
-    start = _first_contact(tool, direction, scene)
+    is_clamp = isinstance(tool, Clamp)
+    start = np.zeros(3) if is_clamp else _first_contact(tool, direction, scene)
     if start is None:
         raise SceneError([f"{key}: the line from its first key to the farthest misses the sheet; direct it there"])
-    return Approach(tool.probe, start, direction, tool.radius, scene.sheet.size)
+    return Approach(tool.probe, start, direction, tool.radius, scene.sheet.size, is_clamp)
 
 
 def _first_contact(tool: Tool, direction: Array, scene: Scene) -> Array | None:
@@ -116,7 +135,7 @@ class Loading:
     time: Array  # of the table at every frame [s], shape (frames,)
     depth: Array  # of the table at every frame [m], shape (frames,)
     force: Array  # measured, along the tool's direction [N], shape (frames,)
-    noise: float  # standard deviation of the force [N]
+    noise: float  # standard deviation of the force in the first rows [N]
     contact: float  # depth of contact [m of the table]
 
     @property
@@ -128,6 +147,11 @@ class Loading:
     def peak(self) -> float:
         """Largest measured force of a frame [N]."""
         return float(self.force.max())
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of measured minus predicted forces [N]."""
+        return max(self.noise, FORCE_ACCURACY * self.peak)
 
     @property
     def contact_range(self) -> tuple[float, float]:
@@ -148,48 +172,40 @@ class Loading:
             approach: line of its tool.
             contact: depth of contact [m of the table]; None: that of the test.
         """
-        probes = list(data["probes"])
-        path = approach.keyframes(self.scene_time, self.travel(contact))
-        probes[approach.probe] = {**probes[approach.probe], "path": path}
-        times = {"duration": (len(self.depth) - 1) / self.rate, "frames_per_second": self.rate}
-        return {**data, "probes": probes, "time": {**data["time"], **times}}
+        return approach.place(data, self.scene_time, self.travel(contact), self.rate)
 
 
-def build_loading(test: MachineTest, scene: Scene, rate: float | None = None, contact: float | None = None) -> Loading:
+def build_loading(
+    test: MachineTest, scene: Scene, rate: float | None = None, contact: float | None = None, *, is_clamp: bool = False
+) -> Loading:
     """Compute noise, contact and frames of a machine test.
 
     Args:
         test: the test.
         scene: the scene; its motion and relaxation determine the frames.
         rate: frames per second; None: 10 or less, or equidistant in depth.
-        contact: depth of contact [m of the table]; None: found from the forces.
+        contact: depth of contact [m of the table]; None: found from the forces, or the first row of a clamp.
+        is_clamp: whether the tool is a clamp.
 
     Raises:
         SceneError: when the force does not rise with the depth, or the depth of contact is outside the table.
     """
-    count = max(MIN_NOISE_ROWS, math.ceil(NOISE_SHARE * len(test.force)))
-    offset = float(np.median(test.force[:count]))
-    noise = max(DEVIATION_PER_MEDIAN * float(np.median(np.abs(test.force[:count] - offset))), test.digit)
+    first = test.force[: _noise_rows(test)]
+    offset = float(np.median(first))
+    noise = max(DEVIATION_PER_MEDIAN * float(np.median(np.abs(first - offset))), test.digit)
     test = replace(test, force=test.force - offset, time=test.time - test.time[0])
     peak = int(test.force.argmax())
-    noise = max(noise, FORCE_ACCURACY * float(test.force[peak]))
-    # The last row without a significant force before the peak; the first row if there is none.
-    without_force = np.flatnonzero(test.force[: peak + 1] <= CONTACT_NOISES * noise)
-    contact_row = int(without_force[-1]) if len(without_force) else 0
-    if contact_row == peak:
-        fault = f"the force never exceeds its noise, {noise:.3g} N, by {CONTACT_NOISES:g} times"
-        raise SceneError([f"{test.name}: {fault}; choose the force by --columns, or cut the table by --window"])
-    if test.depth[peak] <= test.depth[contact_row]:
+    if contact is not None and not test.depth.min() <= contact < test.depth.max():
+        limits = f"{test.depth.min():.4g} to {test.depth.max():.4g} m"
+        raise SceneError([f"--contact {contact:g}: {test.name}: the depths of the table are {limits}"])
+    if contact is None:
+        contact = float(test.depth[0 if is_clamp else _contact_row(test, noise, peak)])
+    if test.depth[peak] <= contact:
         fault = (
-            f"the depth falls from {test.depth[contact_row]:.4g} to {test.depth[peak]:.4g} m while the force rises to "
+            f"the depth falls from {contact:.4g} to {test.depth[peak]:.4g} m while the force rises to "
             f"{test.force[peak]:.4g} N: is it counted against the motion of the tool?"
         )
         raise SceneError([f"{test.name}: {fault} Choose another by --columns, or change its sign"])
-    if contact is None:
-        contact = float(test.depth[contact_row])
-    elif not test.depth.min() <= contact < test.depth.max():
-        limits = f"{test.depth.min():.4g} to {test.depth.max():.4g} m"
-        raise SceneError([f"--contact {contact:g}: {test.name}: the depths of the table are {limits}"])
     if rate is None and scene.time.at_rest and not (scene.tissue and scene.tissue.relaxation):
         return _in_depth(test, noise, contact)
     if rate is None:
@@ -198,6 +214,43 @@ def build_loading(test: MachineTest, scene: Scene, rate: float | None = None, co
     time = np.arange(frames + 1) / rate
     depth, force = _means(test.time, time, 0.5 / rate, (test.depth, test.force))
     return Loading(test, rate, time, depth, force, noise, contact)
+
+
+def _noise_rows(test: MachineTest) -> int:
+    """Return the number of rows from which the noise is estimated."""
+    return max(MIN_NOISE_ROWS, math.ceil(NOISE_SHARE * len(test.force)))
+
+
+def _contact_row(test: MachineTest, noise: float, peak: int) -> int:
+    """Return the last row without a significant force before the peak; the first row if there is none."""
+    without_force = np.flatnonzero(test.force[: peak + 1] <= CONTACT_NOISES * noise)
+    row = int(without_force[-1]) if len(without_force) else 0
+    if row == peak:
+        fault = f"the force never exceeds its noise in the first {_noise_rows(test)} rows, {noise:.3g} N, by 5 times"
+        remedy = "if the tool touches from the start, give its depth by --contact; or choose the force by --columns"
+        raise SceneError([f"{test.name}: {fault}; {remedy}, or cut the table by --window"])
+    return row
+
+
+def late_contact_note(loading: Loading, key: str) -> str | None:
+    """Return a note about a force that rises in the rows of the noise, so that the contact is found late, or None.
+
+    Args:
+        loading: the test.
+        key: parameter of its depth of contact.
+    """
+    from scipy.stats import kendalltau
+
+    test, count = loading.test, _noise_rows(loading.test)
+    significant = CONTACT_NOISES * loading.noise
+    correlation = kendalltau(test.depth[:count], test.force[:count]).statistic
+    if not (significant > MIN_LATE_SHARE * loading.peak and correlation > MIN_LATE_CORRELATION):
+        return None
+    return (
+        f"{test.name}: the force rises within the first {count} rows, from which its noise, {loading.noise:.3g} N, is "
+        f"estimated: the tool touches earlier than at {loading.contact:.4g} m, where the force is {significant:.3g} N; "
+        f"find the depth by --free {key}, or give it by --contact"
+    )
 
 
 def _in_depth(test: MachineTest, noise: float, contact: float) -> Loading:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import partial, singledispatch
 from typing import BinaryIO
 
 import numpy as np
@@ -20,7 +20,11 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, ScalarForm
 from numpy.typing import NDArray
 
 from taichi_msm.errors import printable
+from taichi_msm.fitting.forces import ToolForces
+from taichi_msm.fitting.machine_model import MachineForces
 from taichi_msm.fitting.machine_plots import MACHINE_PANELS
+from taichi_msm.fitting.observation import Observation
+from taichi_msm.fitting.points import PointObservation
 from taichi_msm.fitting.result import FitResult, FittedMap
 from taichi_msm.fitting.tikhonov import SmoothnessWeight
 from taichi_msm.plot_style import BLUE, DPI, GREY, ORANGE, SILVER, STYLE, TWO_COLUMN_WIDTH, VERMILION
@@ -42,37 +46,20 @@ def plot(result: FitResult, file: BinaryIO) -> None:
 
 
 def _figure(result: FitResult) -> Figure:
-    forces = result.observations.forces is not None
-    point_count, time_count = (
-        result.observations.is_observed.any(axis=1).sum(),
-        result.observations.is_observed.any(axis=0).sum(),
-    )
-    # A single time shows no motion, a single point no map of residuals.
-    plots: list[Callable[[Axes, FitResult], None]] = [
-        plot_panel
-        for plot_panel, is_shown in (
-            (_plot_motion, time_count > 1),
-            (_plot_match, time_count > 1),
-            (_plot_residuals, point_count > 1),
-        )
-        if is_shown
-    ]
-    if result.tests:
-        plots = [partial(plot_panel, fitted=fitted) for fitted in result.tests for plot_panel in MACHINE_PANELS]
-    elif forces:
-        plots.append(_plot_forces)
+    pairs = zip(result.observations, result.fitted, strict=True)
+    plots = [plot_panel for observed, fitted in pairs for plot_panel in observation_panels(observed, fitted, result)]
     count = len(plots) + len(result.parameters) + 3 * (result.map is not None)
     rows = math.ceil(count / COLUMN_COUNT)
     engine = ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1)
     figure = Figure(figsize=(TWO_COLUMN_WIDTH, 2.7 * rows + 0.5), dpi=DPI, layout=engine)
     FigureCanvasAgg(figure)
-    figure.suptitle(f"Fit to {printable(result.observations.name)}", x=0.01, ha="left", parse_math=False)
+    figure.suptitle(f"Fit to {printable(result.observations[0].name)}", x=0.01, ha="left", parse_math=False)
     panels = list(figure.subplots(rows, COLUMN_COUNT, squeeze=False).ravel())
     if result.map is not None:
         plot_map(panels[:COLUMN_COUNT], result.map, result.scene.sheet)
         panels, count = panels[COLUMN_COUNT:], count - COLUMN_COUNT
     for axes, plot_panel in zip(panels, plots, strict=False):
-        plot_panel(axes, result)
+        plot_panel(axes)
     for axes, key in zip(panels[len(plots) :], result.parameters, strict=False):
         _plot_parameter(axes, result, key)
     for axes in panels[count:]:
@@ -80,72 +67,100 @@ def _figure(result: FitResult) -> Figure:
     return figure
 
 
-def _unit(result: FitResult) -> tuple[float, str]:
-    return (1000.0, "mm") if result.unit == "m" else (1.0, "px")
+Panel = Callable[[Axes], None]
 
 
-def _plot_motion(axes: Axes, result: FitResult) -> None:
+@singledispatch
+def observation_panels(observed: Observation, fitted: Array, result: FitResult) -> list[Panel]:
+    """Return functions that plot the panels of an observation.
+
+    Args:
+        observed: the observation.
+        fitted: its values in the fitted scene.
+        result: of the fit.
+    """
+    raise NotImplementedError(type(observed).__name__)
+
+
+@observation_panels.register
+def _point_panels(observed: PointObservation, fitted: Array, result: FitResult) -> list[Panel]:
+    point_count, time_count = (int(observed.is_observed.any(axis=axis).sum()) for axis in (1, 0))
+    # A single time shows no motion, a single point no map of residuals.
+    panels = [_plot_motion, _plot_match] * (time_count > 1)
+    panels += [partial(_plot_residuals, sheet=result.scene.sheet)] * (point_count > 1)
+    return [partial(panel, observed=observed, fitted=fitted) for panel in panels]
+
+
+@observation_panels.register
+def _force_panels(observed: ToolForces, fitted: Array, _result: FitResult) -> list[Panel]:
+    return [partial(_plot_forces, observed=observed, fitted=fitted)]
+
+
+@observation_panels.register
+def _machine_panels(_observed: MachineForces, _fitted: Array, result: FitResult) -> list[Panel]:
+    several = len(result.tests) > 1
+    return [partial(panel, fitted=test, several=several) for test in result.tests for panel in MACHINE_PANELS]
+
+
+def _unit(observed: PointObservation) -> tuple[float, str]:
+    return (1000.0, "mm") if observed.unit == "m" else (1.0, "px")
+
+
+def _plot_motion(axes: Axes, observed: PointObservation, fitted: Array) -> None:
     """Plot the three points of largest motion over time, along their principal direction."""
-    observations, (scale, unit) = result.observations, _unit(result)
-    order, centre = np.argsort(observations.time), np.nanmean(result.fitted, axis=1, keepdims=True)
-    motion = np.nan_to_num(result.fitted - centre)
+    scale, unit = _unit(observed)
+    order, centre = np.argsort(observed.time), np.nanmean(fitted, axis=1, keepdims=True)
+    motion = np.nan_to_num(fitted - centre)
     for number, n in enumerate(np.argsort(-np.linalg.norm(motion, axis=(1, 2)))[:3]):
         along = np.linalg.svd(motion[n], full_matrices=False).Vh[0]
         along = along if along[np.argmax(np.abs(along))] > 0 else -along
-        fitted, points = (scale * (values[n] - centre[n]) @ along for values in (result.fitted, observations.values))
-        axes.plot(observations.time[order], fitted[order], color=BLUE, label="fitted" if number == 0 else None)
+        line, points = (scale * (values[n] - centre[n]) @ along for values in (fitted, observed.values))
+        axes.plot(observed.time[order], line[order], color=BLUE, label="fitted" if number == 0 else None)
         label = "observed" if number == 0 else None
-        axes.plot(observations.time, points, ".", color=VERMILION, markersize=3, label=label)
+        axes.plot(observed.time, points, ".", color=VERMILION, markersize=3, label=label)
     axes.set(title="The points that move most", xlabel="time [s]", ylabel=f"place along the motion [{unit}]")
     axes.legend()
 
 
-def _plot_match(axes: Axes, result: FitResult) -> None:
+def _plot_match(axes: Axes, observed: PointObservation, fitted: Array) -> None:
     """Plot observed against fitted values, both relative to the mean fitted position."""
-    observations, (scale, unit) = result.observations, _unit(result)
-    centre = np.nanmean(result.fitted, axis=1, keepdims=True)
-    fitted, observed = (
-        scale * (values - centre)[observations.known] for values in (result.fitted, observations.values)
-    )
-    subset = slice(None, None, math.ceil(len(fitted) / 20000) or 1)
-    axes.scatter(fitted[subset], observed[subset], 2, color=BLUE, alpha=0.4, linewidths=0)
-    if len(fitted):
-        ends = [float(fitted.min()), float(fitted.max())]
+    scale, unit = _unit(observed)
+    centre = np.nanmean(fitted, axis=1, keepdims=True)
+    x, y = (scale * (values - centre)[observed.known] for values in (fitted, observed.values))
+    subset = slice(None, None, math.ceil(len(x) / 20000) or 1)
+    axes.scatter(x[subset], y[subset], 2, color=BLUE, alpha=0.4, linewidths=0)
+    if len(x):
+        ends = [float(x.min()), float(x.max())]
         axes.plot(ends, ends, color=GREY, linewidth=0.8)
     axes.set(title="Observed against fitted", xlabel=f"fitted, from the mean [{unit}]", ylabel=f"observed [{unit}]")
 
 
-def _plot_residuals(axes: Axes, result: FitResult) -> None:
+def _plot_residuals(axes: Axes, observed: PointObservation, fitted: Array, sheet: Sheet) -> None:
     """Plot the residual of every point on the sheet."""
-    observations, (scale, unit) = result.observations, _unit(result)
-    residuals = scale * np.sqrt(
-        np.nanmean(np.where(observations.known, result.fitted - observations.values, np.nan) ** 2, axis=(1, 2))
-    )
-    across, down = observations.coordinates.T
+    scale, unit = _unit(observed)
+    residuals = scale * np.sqrt(np.nanmean((fitted - observed.values) ** 2, axis=(1, 2)))
+    across, down = observed.coordinates.T
     dots = axes.scatter(across, down, 14, c=residuals, cmap="viridis", vmin=0)
-    height, width = result.scene.sheet.size
+    height, width = sheet.size
     axes.set(title="Residual", xlim=(0, 1), ylim=(1, 0), xlabel="across", ylabel="down", aspect=height / width)
     assert isinstance(axes.figure, Figure)
     axes.figure.colorbar(dots, ax=axes, label=f"root mean square [{unit}]", shrink=0.8)
 
 
-def _plot_forces(axes: Axes, result: FitResult) -> None:
+def _plot_forces(axes: Axes, observed: ToolForces, fitted: Array) -> None:
     """Plot the force of every tool over time."""
-    forces = result.observations.forces
-    assert forces is not None
-    for probe in np.unique(forces.probe):
-        rows = np.flatnonzero(forces.probe == probe)
-        rows = rows[np.argsort(forces.time[rows])]
+    for probe in np.unique(observed.probe):
+        rows = np.flatnonzero(observed.probe == probe)
+        rows = rows[np.argsort(observed.time[rows])]
         is_first = len(axes.lines) == 0
-        for component in np.flatnonzero(np.isfinite(forces.force[rows]).any(axis=0)):
-            fitted, observed = (force[rows, component] for force in (result.fitted_forces, forces.force))
-            axes.plot(forces.time[rows], fitted, color=BLUE, label="fitted" if is_first else None)
-            axes.plot(
-                forces.time[rows], observed, ".", color=VERMILION, markersize=3, label="observed" if is_first else None
-            )
-            largest = np.argmax(np.abs(fitted))
-            if abs(fitted[largest]) > 0.1 * np.abs(result.fitted_forces).max():
-                axes.text(forces.time[rows[largest]], fitted[largest], f"  {'xyz'[component]}")
+        for component in np.flatnonzero(np.isfinite(observed.values[rows]).any(axis=0)):
+            line, points = (force[rows, component] for force in (fitted, observed.values))
+            axes.plot(observed.time[rows], line, color=BLUE, label="fitted" if is_first else None)
+            label = "observed" if is_first else None
+            axes.plot(observed.time[rows], points, ".", color=VERMILION, markersize=3, label=label)
+            largest = np.argmax(np.abs(line))
+            if abs(line[largest]) > 0.1 * np.abs(fitted).max():
+                axes.text(observed.time[rows[largest]], line[largest], f"  {'xyz'[component]}")
             is_first = False
     axes.set(title="Forces on the sheet", xlabel="time [s]", ylabel="force [N]")
     axes.legend()

@@ -10,14 +10,14 @@ import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, wait
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.accuracy.mesh import coarser_plan, estimate_mesh_error
 from taichi_msm.errors import DivergedError, ExecutorError, Pause, SceneError, StageProgressCallback
-from taichi_msm.fitting.observations import ObservationModel, Observations, time_in_frames, time_weights
+from taichi_msm.fitting.observation import Observation, ObservationModel, time_in_frames
 from taichi_msm.fitting.parameters import Parameter, as_data, with_values
 from taichi_msm.load import cost
 from taichi_msm.load.check import check_scene
@@ -33,10 +33,9 @@ Array = NDArray[np.float64]
 
 
 class Prediction(NamedTuple):
-    """Predicted observations and forces."""
+    """Predicted observations."""
 
-    values: Array  # as in the observations, shape (N, T, 3 or 2); NaN behind the camera
-    forces: Array  # [N], shape (rows, 3)
+    values: tuple[Array, ...]  # of every observation, with its shape; NaN where a point is behind the camera
     steps: int  # per frame
     motion: Array  # largest displacement of the observed points at every simulated frame [m]
 
@@ -48,7 +47,8 @@ class FitProblem:
     token: str  # identifies the fit in worker processes
     scene: Scene  # with initial values
     parameters: tuple[Parameter, ...]
-    observations: Observations
+    observations: tuple[Observation, ...]
+    signs: ClassVar[tuple[int, ...]] = (1, -1)  # of the finite differences at the solution
 
     def build_model(self, threads: int | None) -> ForwardModel:
         """Build the forward model on a number of threads; None: all cores."""
@@ -73,12 +73,7 @@ class ForwardModel:
         plan = check_scene(job.scene)
         self.maps, self._threads = plan.maps, threads
         self._simulation: Simulation | None = None
-        observations = job.observations
-        times = (
-            observations.time
-            if observations.forces is None
-            else np.concatenate([observations.time, observations.forces.time])
-        )
+        times = np.concatenate([observed.time for observed in job.observations])
         self._frames = max(2, math.ceil(time_in_frames(job.scene, times).max()) + 1)
 
     def predict(
@@ -130,7 +125,8 @@ class ForwardModel:
             predicted = self.predict(x, steps, **options)
         except (SceneError, DivergedError):
             return None
-        return predicted if np.isfinite(predicted.values[self.job.observations.known]).all() else None
+        pairs = zip(predicted.values, self.job.observations, strict=True)
+        return predicted if all(np.isfinite(values[observed.known]).all() for values, observed in pairs) else None
 
     def plan(self, x: Array) -> Plan:
         """Plan the scene with the parameters at x; SceneError: it is not valid."""
@@ -143,20 +139,24 @@ class ForwardModel:
         return check_scene(Scene(**data), self.maps)
 
     def _run(self, simulation: Simulation, plan: Plan, to_end: bool, pause: Pause) -> Prediction:
-        observations, scene = self.job.observations, plan.scene
         # The mesh of a coarse run differs.
-        model, points, forces = ObservationModel(scene, observations, self._frames), [], []
-        for frame in range(max(self._frames, plan.grid.frames + 1) if to_end else self._frames):
+        models = [observed.build_model(plan.scene, self._frames) for observed in self.job.observations]
+        frames = max(self._frames, plan.grid.frames + 1) if to_end else self._frames
+        pairs = list(zip(models, self.record(models, simulation, frames, pause), strict=True))
+        values = tuple(model.predict(recorded[: self._frames]) for model, recorded in pairs)
+        motion = np.max([model.motion(recorded) for model, recorded in pairs], axis=0)
+        return Prediction(values, plan.grid.steps_per_frame, motion)
+
+    def record(
+        self, models: Sequence[ObservationModel], simulation: Simulation, frames: int, pause: Pause
+    ) -> list[Array]:
+        """Return what models record of a number of frames, a stack of records for each."""
+        records: list[list[Array]] = [[] for _ in models]
+        for frame in range(frames):
             simulation.advance(min(frame, 1), pause)
-            points.append(model.points_on_sheet(simulation.positions()))
-            if observations.forces is not None:
-                forces.append([tool.force for tool in simulation.forces()])
-        values, tool_forces = model.observe(model.interpolate(np.array(points[: self._frames]))), np.empty((0, 3))
-        if observations.forces is not None:
-            rows, shares = len(observations.forces.time), time_weights(scene, observations.forces.time, self._frames)
-            at_times = shares @ np.array(forces[: self._frames]).reshape(self._frames, -1)
-            tool_forces = at_times.reshape(rows, -1, 3)[np.arange(rows), observations.forces.probe]
-        return Prediction(values, tool_forces, plan.grid.steps_per_frame, model.motion(np.array(points)))
+            for model, of_model in zip(models, records, strict=True):
+                of_model.append(model.record(simulation))
+        return [np.array(of_model) for of_model in records]
 
     def close(self) -> None:
         """Release the simulation."""

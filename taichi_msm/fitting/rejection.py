@@ -13,8 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.fitting.least_squares import ErrorCorrelation
-from taichi_msm.fitting.observations import Observations
+from taichi_msm.fitting.observation import ErrorCorrelation
 
 Array = NDArray[np.float64]
 
@@ -39,25 +38,26 @@ def by_chi_square(chi_square: float, freedom: int, independent: float, what: str
 
 
 def by_pattern(
-    observations: Observations, residuals: Array, motion: float, error_correlation: ErrorCorrelation
+    residuals: Array, time: Array, coordinates: Array, motion: float, error_correlation: ErrorCorrelation, remedy: str
 ) -> str | None:
     """Return the reason for rejection by correlated residuals, or None.
 
     Args:
-        observations: the observations.
         residuals: shape (N, T, numbers) [m] or [px].
+        time: times of the observations [s], shape (T,).
+        coordinates: of the points on the sheet, shape (N, 2).
         motion: root mean square of the motion [m] or [px].
         error_correlation: given correlation lengths of the errors.
+        remedy: where the errors of neighbouring points are correlated.
     """
     # Smaller residuals are due to rounding and the tolerance of the search.
     if np.sqrt(np.nanmean(residuals**2)) < 1e-4 * motion:
         return None
     limit = 4.0 * np.nanmedian(np.abs(residuals))
-    clipped = np.nan_to_num(np.clip(residuals, -limit, limit))[:, np.argsort(observations.time)]
+    clipped = np.nan_to_num(np.clip(residuals, -limit, limit))[:, np.argsort(time)]
     if error_correlation.correlation is None:
-        first, second = _neighbours(observations)
+        first, second = _neighbours(coordinates)
         if _has_mean((clipped[first] * clipped[second]).sum(axis=(1, 2)), 24):
-            remedy = "give --correlation PX" if observations.kind == "pixel" else "give --sigma"
             fault = "the residuals of neighbouring points are correlated, unlike independent errors"
             return f"{fault}; if the errors are, {remedy}"
     if error_correlation.drift is None:
@@ -68,12 +68,12 @@ def by_pattern(
     return None
 
 
-def _neighbours(observations: Observations) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _neighbours(coordinates: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the pairs of points and their four nearest neighbours, each once."""
     from scipy.spatial import KDTree
 
-    count = len(observations.coordinates)
-    nearest = KDTree(observations.coordinates).query(observations.coordinates, min(count, 4 + 1))[1].reshape(count, -1)
+    count = len(coordinates)
+    nearest = KDTree(coordinates).query(coordinates, min(count, 4 + 1))[1].reshape(count, -1)
     pairs = np.stack([np.repeat(np.arange(count), nearest.shape[1]), nearest.ravel()], axis=1)
     pairs = np.unique(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1), axis=0)
     return pairs[:, 0], pairs[:, 1]

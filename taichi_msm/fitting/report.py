@@ -1,4 +1,7 @@
-"""Files of a fit: fit.json, scene.yaml, copies of the scene's pictures, fit.png, and the pictures of a map."""
+"""Files of a fit: fit.json, scene.yaml, copies of the scene's pictures, fit.png, and the pictures of a map.
+
+Machine tests after the first one have scenes of their own, scene-1.yaml and so on.
+"""
 
 from __future__ import annotations
 
@@ -16,13 +19,14 @@ from PIL import Image
 from taichi_msm.errors import printable
 from taichi_msm.fitting.result import FitResult, FittedMap, sixteen_bits
 from taichi_msm.runs.directory import IsListed, Publication, PublicationSpec, create_file, list_files, write_new_file
+from taichi_msm.scene.scene import Scene
 from taichi_msm.system.compiler import versions
 
 RECORD, SCENE, PLOT, PICTURES = "fit.json", "scene.yaml", "fit.png", "pictures"
 
 MAP, ERRORS = FittedMap.FILE, "map-error.png"
 
-PATTERNS = (r"fit\.json", r"scene\.yaml", r"fit\.png", r"map\.png", r"map-error\.png", rf"{PICTURES}/.+")
+PATTERNS = (r"fit\.json", r"scene(-\d+)?\.yaml", r"fit\.png", r"map\.png", r"map-error\.png", rf"{PICTURES}/.+")
 
 
 def _is_fit_file(record: Mapping[str, Any]) -> IsListed:
@@ -39,7 +43,10 @@ def publication(directory: Path) -> Publication:
 def write_report(result: FitResult, published: Publication) -> None:
     """Write and publish the files of a fit."""
     folder = published.new_folder
-    write_new_file(folder / SCENE, _scene_text(result, folder).encode())
+    names: dict[str, str] = {}
+    for n, scene in enumerate([result.scene, *result.other_scenes]):
+        name = f"scene-{n}.yaml" if n else SCENE
+        write_new_file(folder / name, _scene_text(result, scene, folder, names).encode())
     if result.map is not None:
         _write_png(result.map.grey, folder / MAP)
         # White: unknown, or with an error above 100 %.
@@ -63,9 +70,8 @@ def _write_png(grey: NDArray[np.uint16], path: Path) -> None:
         Image.fromarray(grey).save(file, "PNG")
 
 
-def _scene_text(result: FitResult, folder: Path) -> str:
-    """Format the fitted scene, and copy its pictures to the folder."""
-    names: dict[str, str] = {}
+def _scene_text(result: FitResult, scene: Scene, folder: Path, names: dict[str, str]) -> str:
+    """Format a fitted scene, and copy its pictures to the folder; `names` are those of the copies, by path."""
 
     def copied(path: str) -> str:
         if path not in names:
@@ -78,7 +84,6 @@ def _scene_text(result: FitResult, folder: Path) -> str:
             names[path] = f"{PICTURES}/{name}"
         return names[path]
 
-    scene = result.scene
     if result.map is not None and scene.tissue is not None:
         # The fitted map is written elsewhere; another picture may have its name.
         scene = scene.model_copy(update={"tissue": scene.tissue.model_copy(update={"map": None})})
@@ -89,4 +94,4 @@ def _scene_text(result: FitResult, folder: Path) -> str:
     summary = (
         ", ".join(f"{key} {estimate.value:.6g}" for key, estimate in result.parameters.items()) or f"tissue.map, {MAP}"
     )
-    return f"# Fitted to {printable(result.observations.name)}: {printable(summary)}; more in {RECORD}.\n{text}"
+    return f"# Fitted to {printable(result.observations[0].name)}: {printable(summary)}; more in {RECORD}.\n{text}"

@@ -10,10 +10,11 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.fitting.least_squares import ErrorCorrelation, ProfilePoint, Solution, Uncertainty, UnidentifiedGroup
+from taichi_msm.fitting.least_squares import Misfit, ProfilePoint, Solution, Uncertainty, UnidentifiedGroup
 from taichi_msm.fitting.machine_fit import FittedTest
-from taichi_msm.fitting.observations import Observations
+from taichi_msm.fitting.observation import ErrorCorrelation, Observation
 from taichi_msm.fitting.parameters import Parameter, rounded
+from taichi_msm.fitting.points import PointObservation
 from taichi_msm.fitting.tikhonov import SmoothnessWeight
 from taichi_msm.scene.scene import Scene
 
@@ -122,21 +123,21 @@ class FitResult:
         notes: warnings, a line each.
         scene: fitted scene; a map refers to map.png in the given directory.
         observations: the observations.
-        fitted: predicted observations of the fitted scene.
-        fitted_forces: predicted forces of the fitted scene [N], shape (rows, 3).
+        fitted: values of every observation, predicted by the fitted scene.
         curves: profiles of the parameters by key, or their quadratic approximations.
         map: estimated map; None for a fit of numbers.
         tests: the machine tests with their fitted forces.
+        other_scenes: fitted scenes of the machine tests after the first one.
     """
 
     parameters: dict[str, Estimate] = field(default_factory=dict)
     correlation: list[list[float]] = field(default_factory=list)
-    residual: float | None
+    residual: float | None = None
     residual_force: float | None = None
     sigma_force: float | None = None
     rejection: str | None = None
-    sigma: float | None
-    unit: str
+    sigma: float | None = None
+    unit: str = "m"
     chi_square: float | None
     degrees_of_freedom: int
     identifiable: bool
@@ -146,12 +147,12 @@ class FitResult:
     seconds: float = 0.0
     notes: list[str]
     scene: Scene = field(repr=False)
-    observations: Observations = field(repr=False)
-    fitted: Array = field(repr=False)
-    fitted_forces: Array = field(repr=False, default_factory=lambda: np.empty((0, 3)))
+    observations: tuple[Observation, ...] = field(repr=False)
+    fitted: tuple[Array, ...] = field(repr=False)
     curves: dict[str, list[ProfilePoint]] = field(repr=False, default_factory=dict)
     map: FittedMap | None = None
     tests: tuple[FittedTest, ...] = ()
+    other_scenes: Sequence[Scene] = field(repr=False, default_factory=list)
 
     @property
     def model_rejected(self) -> bool:
@@ -163,7 +164,7 @@ class FitResult:
         names = "model_rejected correlation residual residual_force sigma sigma_force unit chi_square "
         names += "degrees_of_freedom identifiable mesh_error"
         return {
-            "observed": self.observations.name,
+            "observed": self.observations[0].name,
             "parameters": {key: item._asdict() for key, item in self.parameters.items()},
             **{name: getattr(self, name) for name in (*names.split(), "runs", "seconds", "notes")},
             "unseen": [item.as_json() for item in self.unseen],
@@ -173,7 +174,6 @@ class FitResult:
 
     def summary(self) -> list[str]:
         """Format the result in lines."""
-        observations = self.observations
         intervals = "intervals" if self.map is None else "errors of the fields"
         lines = (
             []
@@ -183,16 +183,18 @@ class FitResult:
         lines += [f"{key}: {_format_estimate(item)}" for key, item in self.parameters.items()]
         lines += [item.text for item in self.unseen]
         lines += [] if self.map is None else [self.map.summary()]
-        points, times = observations.is_observed.shape
         chi_text = ""
         if self.chi_square is not None:
             chi_text = f", chi-square {self.chi_square:.3g} for {self.degrees_of_freedom} degrees of freedom"
         lines += [_format_test(fitted) + chi_text for fitted in self.tests]
         force_text = "" if self.residual_force is None else f", {self.residual_force:.3g} N"
-        if self.residual is not None:
-            lines.append(
-                f"residual {self.residual:.3g} {self.unit} of {points} points at {times} times{force_text}{chi_text}"
-            )
+        for observed in self.observations:
+            if isinstance(observed, PointObservation):
+                points, times = observed.is_observed.shape
+                lines.append(
+                    f"residual {self.residual:.3g} {self.unit} of {points} points at {times} times"
+                    f"{force_text}{chi_text}"
+                )
         if self.mesh_error is not None:
             qualifier = "at most about " if any(probe.moved for probe in self.scene.probes) else ""
             error = f"{qualifier}{rounded(100 * self.mesh_error)} % of the largest displacement"
@@ -219,10 +221,6 @@ def _format_estimate(estimate: Estimate) -> str:
     error_text = "?" if error > 1000 * max(abs(estimate.value), abs(estimate.start)) else rounded(error)
     suffix = "" if estimate.identifiable else ": not identifiable"
     return f"{written(estimate.value)} +- {error_text}, 95 % {low} to {high}, from {estimate.start:.6g}{suffix}"
-
-
-# Smallest correlation of residuals for a warning.
-MIN_ERROR_CORRELATION = 0.3
 
 
 def search_notes(solution: Solution, parameters: Sequence[Parameter], *, fits_well: bool) -> Iterator[str]:
@@ -267,46 +265,12 @@ def correlation_notes(
 
 
 def residual_notes(
-    observations: Observations,
-    solution: Solution,
-    uncertainties: Uncertainty,
-    motion: float,
-    error_correlation: ErrorCorrelation,
+    misfit: Misfit, solution: Solution, uncertainties: Uncertainty, error_correlation: ErrorCorrelation
 ) -> Iterator[str]:
-    """Yield warnings about residuals above sigma, and correlated residuals."""
+    """Yield warnings about residuals above sigma, and those of every observation."""
     if uncertainties.factor > 1.5:
         factor = rounded(math.sqrt(uncertainties.factor))
         yield f"the residual is {factor} times sigma, and the intervals are widened by this factor"
-    if not observations.values.size:
-        return
-    residuals = solution.predicted.values - observations.values
-    if np.sqrt(np.nanmean(residuals**2)) < max(1e-6 * motion, 0.1 * (observations.sigma or 0.0)):
-        if observations.sigma is None:
-            yield "the residual is next to 0, and so are the intervals; give the standard deviation by --sigma"
-        return
-    in_space, in_time = _residual_correlations(residuals, observations.coordinates)
-    if in_space > MIN_ERROR_CORRELATION and error_correlation.correlation is None:
-        remedy = "; give --correlation PX" if observations.kind == "pixel" else ""
-        fault = f"the residuals of neighbouring points are correlated (by {in_space:.2f})"
-        yield f"{fault}, so that the intervals are too narrow{remedy}"
-    elif in_time > MIN_ERROR_CORRELATION and error_correlation.drift is None:
-        fault = f"the residuals of a point are correlated in time (by {in_time:.2f})"
-        yield f"{fault}, so that the intervals are too narrow; give --drift SECONDS"
-
-
-def _residual_correlations(residuals: Array, coordinates: Array) -> tuple[float, float]:
-    """Return the correlations of residuals, shape (N, T, numbers), of nearest neighbours and of successive times."""
-    from scipy.spatial import KDTree
-
-    def correlation(first: Array, second: Array) -> float:
-        product, square = first * second, first**2 + second**2
-        is_known = np.isfinite(product)
-        return 2 * float(product[is_known].sum()) / max(float(square[is_known].sum()), 1e-300)
-
-    # The nearest point is the point itself, the second its neighbour.
-    in_space = (
-        correlation(residuals, residuals[KDTree(coordinates).query(coordinates, 2)[1][:, 1]])
-        if len(residuals) > 1
-        else 0.0
-    )
-    return in_space, correlation(residuals[:, 1:], residuals[:, :-1])
+    each = zip(misfit.observations, solution.predicted.values, misfit.signals, strict=True)
+    for observed, predicted, signal in each:
+        yield from observed.residual_notes(predicted, signal, error_correlation)

@@ -14,8 +14,8 @@ from taichi_msm.accuracy.mesh import coarser_plan
 from taichi_msm.errors import SceneError, StageProgressCallback
 from taichi_msm.fitting.checks import faults, faults_at_start
 from taichi_msm.fitting.least_squares import MAX_RELATIVE_ERROR, ProfilePoint
-from taichi_msm.fitting.observations import ObservationModel, Observations
 from taichi_msm.fitting.parameters import Bounds, Parameter, make_parameters, rounded
+from taichi_msm.fitting.points import PointModel, PointObservation
 from taichi_msm.fitting.predict import Prediction, mesh_error, without_outputs
 from taichi_msm.fitting.rejection import by_chi_square
 from taichi_msm.fitting.result import Estimate, FitResult, FittedMap
@@ -95,7 +95,7 @@ def map_settings(
 
 
 def fit_map(
-    scene: Scene, observations: Observations, settings: MapSettings, image: str, progress: StageProgressCallback
+    scene: Scene, observations: PointObservation, settings: MapSettings, image: str, progress: StageProgressCallback
 ) -> FitResult:
     """Estimate a map.
 
@@ -126,7 +126,7 @@ def fit_map(
     start = np.clip(np.log(_initial_factors(plan, settings.resolution)), *limits).ravel()
     start = np.append(start, [0.0] * (settings.force is not None))
     device = runtime.start("cpu")
-    adjoint, model = Adjoint(plan, device), ObservationModel(plan.scene, observations, plan.grid.frames + 1)
+    adjoint, model = Adjoint(plan, device), PointModel(plan.scene, observations, plan.grid.frames + 1)
 
     def report_progress() -> None:
         done = search.runs if search is not None else 0
@@ -139,7 +139,7 @@ def fit_map(
     mesh_shift = 0.0
     if (coarse_plan := coarser_plan(plan)) is not None:
         coarse_factors = MapGrid(settings.resolution, _cells(coarse_plan)).factors(start[:cell_count])
-        coarse_model = ObservationModel(coarse_plan.scene, observations, coarse_plan.grid.frames + 1)
+        coarse_model = PointModel(coarse_plan.scene, observations, coarse_plan.grid.frames + 1)
         coarse_points = coarse_model.points(Adjoint(coarse_plan, device).run(coarse_factors, report_progress))
         # Richardson's estimate of order 2 for half the cells per side.
         differences = (coarse_model.observe(coarse_points) - model.observe(points))[observations.known] / 3.0
@@ -184,8 +184,8 @@ def fit_map(
         runs=search.runs + 1,
         notes=list(_notes(observations, solution, fitted_map, mesh_shift, limits, residuals)),
         scene=fitted_scene,
-        observations=observations,
-        fitted=fitted,
+        observations=(observations,),
+        fitted=(fitted,),
         map=fitted_map,
     )
 
@@ -204,7 +204,7 @@ def _curve(estimate: Estimate, solution: MapSolution) -> list[ProfilePoint]:
     return [ProfilePoint(estimate.value * math.exp(n * deviation), float(n)) for n in np.linspace(-3, 3, 25)]
 
 
-def _faults(observations: Observations, scene: Scene, settings: MapSettings) -> Iterator[str]:
+def _faults(observations: PointObservation, scene: Scene, settings: MapSettings) -> Iterator[str]:
     """Yield the faults that need no run."""
     if observations.sigma is None:
         fault = "the errors of the observations decide how smooth a map is; give their standard deviation by --sigma"
@@ -222,15 +222,15 @@ def _faults(observations: Observations, scene: Scene, settings: MapSettings) -> 
         remedy = "take fewer fields or points"
         yield f"--resolution {settings.resolution}: {fault}, and {free / 2**30:.3g} GiB is free; {remedy}"
         return
-    yield from faults(observations, scene, settings.resolution**2)
+    yield from faults([observations], scene, settings.resolution**2)
 
 
-def _initial_points(position: Array, model: ObservationModel, observations: Observations, scene: Scene) -> Array:
+def _initial_points(position: Array, model: PointModel, observations: PointObservation, scene: Scene) -> Array:
     """Return the observed points in the initial run [m], shape (N, T, 3); SceneError: implausible observations."""
     at_frames = np.array([model.points_on_sheet(frame) for frame in position])
     points = model.interpolate(at_frames)
-    prediction = Prediction(model.observe(points), np.empty((0, 3)), 0, model.motion(at_frames))
-    if invalid := list(faults_at_start(observations, scene, prediction)):
+    prediction = Prediction((model.observe(points),), 0, model.motion(at_frames))
+    if invalid := list(faults_at_start([observations], scene, prediction)):
         raise SceneError(invalid)
     return points
 
@@ -264,7 +264,7 @@ def _cells(plan: Plan) -> tuple[int, int]:
 
 
 def _notes(
-    observations: Observations,
+    observations: PointObservation,
     solution: MapSolution,
     fitted_map: FittedMap,
     mesh_shift: float,

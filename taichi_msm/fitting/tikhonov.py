@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import SceneError
-from taichi_msm.fitting.observations import ObservationModel, Observations
 from taichi_msm.fitting.parameters import Bounds
+from taichi_msm.fitting.points import PointModel, PointObservation
 from taichi_msm.gradients.gradient import Adjoint
 from taichi_msm.scene.scene import Scene
 
@@ -131,8 +131,8 @@ class MapSearch:
     def __init__(
         self,
         adjoint: Adjoint,
-        model: ObservationModel,
-        observations: Observations,
+        model: PointModel,
+        observations: PointObservation,
         sigma: float,
         grid: MapGrid,
         limits: tuple[float, float],

@@ -28,7 +28,7 @@ from taichi_msm.scene.tools import Probe
 from taichi_msm.shapes import SHAPES
 from taichi_msm.shapes.shape import Shape
 
-# Largest displacement of a rough tool between two equilibria, in radii: its force depends on where it first touches.
+# The same between two equilibria for a rough tool, whose force depends on where mass points first touch it.
 ROUGH_STRIDE_RADII = 1 / 16
 
 # Largest displacement of a clamp between two equilibria, in lengths of the shortest spring at rest.
@@ -170,7 +170,7 @@ def build_tools(probes: Sequence[Probe], sheet: Sheet) -> tuple[Tool, ...]:
         tip_centres = np.stack([(across - 0.5) * width, (0.5 - down) * height, tips], axis=1)
         solid = axis, instrument.length, radius, shape
         friction = math.inf if probe.friction == "rough" else probe.friction
-        stride = min(shape.max_stride, ROUGH_STRIDE_RADII if friction == math.inf else math.inf) * radius
+        stride = min(shape.max_stride, ROUGH_STRIDE_RADII if friction == math.inf else 1) * radius
         tools.append(Tool(index, time, tip_centres, heights, *solid, friction, probe.grip, stride))
     return tuple(tools)
 

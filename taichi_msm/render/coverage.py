@@ -288,13 +288,21 @@ def intersect_instrument(x, y, index, uniforms: ti.template(), shapes: ti.templa
     d_x, d_y = across * uniforms[uni.PINHOLE], up * uniforms[uni.PINHOLE]
     a_x, a_y, a_z = uniforms[axis], uniforms[axis + 1], uniforms[axis + 2]
     length, radius = uniforms[base + uni.LENGTH], uniforms[base + uni.RADIUS]
+    d_d, d_a = d_x * d_x + d_y * d_y + 1.0, d_x * a_x + d_y * a_y - a_z
+    o_a, o_d, o_o = o_x * a_x + o_y * a_y, o_x * d_x + o_y * d_y, o_x * o_x + o_y * o_y
     first = ti.static(compile_ray(shapes[0]))
-    t, is_hit, n_x, n_y, n_z = first(o_x, o_y, d_x, d_y, a_x, a_y, a_z, length, radius)
+    t, is_hit, foot, end = first(d_d, d_a, o_a, o_d, o_o, length, radius)
     for shape in ti.static(shapes[1:]):
         if uniforms[base + uni.KIND] == ti.static(uni.KINDS[shape]):
             other = ti.static(compile_ray(shape))
-            t, is_hit, n_x, n_y, n_z = other(o_x, o_y, d_x, d_y, a_x, a_y, a_z, length, radius)
-    return ti.select(is_hit, start + t, INFINITY), n_x, n_y, n_z
+            t, is_hit, foot, end = other(d_d, d_a, o_a, o_d, o_o, length, radius)
+    is_side = end == 0.0
+    return (
+        ti.select(is_hit, start + t, INFINITY),
+        ti.select(is_side, o_x + d_x * t - a_x * foot, end * a_x * radius),
+        ti.select(is_side, o_y + d_y * t - a_y * foot, end * a_y * radius),
+        ti.select(is_side, t * (-1.0) - a_z * foot, end * a_z * radius),
+    )
 
 
 @ti.func

@@ -6,6 +6,7 @@ import io
 import math
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from html import escape
 from itertools import count
 from string import Template
@@ -209,6 +210,26 @@ class Simulation:
             self._dynamics.close()
             self._dynamics = build_dynamics(self._plan, self.device, cores=self._cores)
         self._reset()
+
+    def change_material(self, scene: Plan | Scene | Mapping[str, Any]) -> None:
+        """Continue from the last frame with another material; shape, velocities, time and probes stay.
+
+        Args:
+            scene: differs from the current scene in the values of `tissue`, `springs` and `damping` only.
+
+        Raises:
+            SceneError: as for `Simulation`.
+        """
+        self._require_open()
+        before, state = self._plan, self.save().state
+        plan = resolve(check_scene(scene), self.device).plan.with_probes(self.scene.probes)
+        steps = self.frame * plan.grid.steps_per_frame
+        # Differences are those of a step, which the stability limit may have changed.
+        difference = state.difference * state.difference.dtype.type(plan.grid.step / before.grid.step)
+        self._dynamics.restart(plan, state._replace(steps=steps, difference=difference))
+        self._plan, self.renderer.scene = plan, plan.scene
+        progress = replace(self.progress, energy=self._dynamics.read().energy)
+        self._monitor, self._force_recorder = DivergenceMonitor(plan, progress), ForceRecorder(plan)
 
     def save(self) -> Snapshot:
         """Return the state from which another simulation of the scene can continue.

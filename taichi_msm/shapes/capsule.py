@@ -37,13 +37,8 @@ class Capsule(Shape):
         """Build the intersection with the cylinder, or with the sphere around the nearer end of the axis."""
         sqrt, maximum, minimum, where = operations.sqrt, operations.maximum, operations.minimum, operations.where
 
-        def intersect(o_x, o_y, d_x, d_y, a_x, a_y, a_z, length, radius):
+        def intersect(d_d, d_a, o_a, o_d, o_o, length, radius):
             # The cylinder: a t^2 + 2 b t + c = 0.
-            d_d = d_x * d_x + d_y * d_y + 1.0
-            d_a = d_x * a_x + d_y * a_y - a_z
-            o_a = o_x * a_x + o_y * a_y
-            o_d = o_x * d_x + o_y * d_y
-            o_o = o_x * o_x + o_y * o_y
             a = maximum(d_d - d_a * d_a, 1e-12)
             b = o_d - o_a * d_a
             c = o_o - o_a * o_a - radius * radius
@@ -60,7 +55,7 @@ class Capsule(Shape):
             t = where(on_side, t_side, t_end)
             is_hit = (discriminant >= 0.0) & (on_side | (discriminant_end >= 0.0))
             foot = maximum(minimum(o_a + t * d_a, length), 0.0)
-            return t, is_hit, o_x + d_x * t - a_x * foot, o_y + d_y * t - a_y * foot, t * (-1.0) - a_z * foot
+            return t, is_hit, foot, t * 0.0
 
         return intersect
 

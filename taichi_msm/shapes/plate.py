@@ -49,15 +49,11 @@ class Plate(Shape):
         """Build the intersection with the interval of t inside the infinite cylinder and between the ends."""
         sqrt, maximum, where = operations.sqrt, operations.maximum, operations.where
 
-        def intersect(o_x, o_y, d_x, d_y, a_x, a_y, a_z, length, radius):
-            d_a = d_x * a_x + d_y * a_y - a_z
-            o_a = o_x * a_x + o_y * a_y
+        def intersect(d_d, d_a, o_a, o_d, o_o, length, radius):
             # The side, without the components along the axis: a t^2 + 2 b t + c = 0.
-            p_x, p_y, p_z = o_x - o_a * a_x, o_y - o_a * a_y, o_a * a_z * (-1.0)
-            q_x, q_y, q_z = d_x - d_a * a_x, d_y - d_a * a_y, d_a * a_z * (-1.0) - 1.0
-            a = maximum(q_x * q_x + q_y * q_y + q_z * q_z, MIN_COSINE)
-            b = p_x * q_x + p_y * q_y + p_z * q_z
-            c = p_x * p_x + p_y * p_y + p_z * p_z - radius * radius
+            a = maximum(d_d - d_a * d_a, MIN_COSINE)
+            b = o_d - o_a * d_a
+            c = o_o - o_a * o_a - radius * radius
             discriminant = b * b - a * c
             half = sqrt(maximum(discriminant, 0.0)) / a
             enters_side, leaves_side = b * (-1.0) / a - half, half - b / a
@@ -68,14 +64,7 @@ class Plate(Shape):
             leaves_end = (where(d_a < 0.0, 0.0, length) - o_a) / slope
             t = maximum(enters_side, enters_end)
             is_hit = (discriminant >= 0.0) & (t <= leaves_side) & (t <= leaves_end)
-            is_side = enters_side > enters_end
-            return (
-                t,
-                is_hit,
-                where(is_side, p_x + q_x * t, sign * a_x * radius),
-                where(is_side, p_y + q_y * t, sign * a_y * radius),
-                where(is_side, p_z + q_z * t, sign * a_z * radius),
-            )
+            return t, is_hit, o_a + t * d_a, where(enters_side > enters_end, 0.0, sign)
 
         return intersect
 

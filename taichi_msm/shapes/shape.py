@@ -43,10 +43,10 @@ class Shape(ABC):
 
     @abstractmethod
     def build_ray(self, operations: Operations) -> Callable[..., Any]:
-        """Build intersect(o_x, o_y, d_x, d_y, a_x, a_y, a_z, length, radius) for rays (o_x + t d_x, o_y + t d_y, -t).
+        """Build intersect(d_d, d_a, o_a, o_d, o_o, length, radius) for lines o + t d, relative to the tip.
 
-        Points are relative to the tip. It returns t of the first intersection, whether there is one, and an outward
-        normal of any length, in three components.
+        d_d is d . d, and so on. It returns t where the line enters the shape, whether it does, and numbers `foot` and
+        `end`: the outward normal there is `end` a, if that is not 0, and otherwise o + t d - `foot` a.
         """
 
     @abstractmethod

@@ -79,11 +79,8 @@ class ContactTerm(Term):
         """Return the term's configuration; None without position-controlled tools."""
         tools = plan.tools
         grips = any(tool.grips or tool.rough or isinstance(tool, Clamp) for tool in tools)
-        return (
-            cls(tuple(tool.shape.name for tool in tools), tuple(tool.friction > 0 for tool in tools), grips)
-            if tools
-            else None
-        )
+        shapes = tuple(tool.shape.name for tool in tools)
+        return cls(shapes, tuple(tool.friction > 0 for tool in tools), grips) if tools else None
 
     @property
     def memory(self) -> tuple[str, ...]:

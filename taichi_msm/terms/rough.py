@@ -1,9 +1,9 @@
 """Rough tools in quasi-static equilibrium, to which the mass points that they touch stick. Scene: `friction: rough`.
 
-Between two shapes tools and mass points move along straight lines. A mass point with the displacement u' that the
-shape of a tool reaches when its tip is at c' sticks to it: with the tip at c, u = u' + c - c'. It is held as by a grip
-(`contact_rest`) until the tool would pull it, that is, until the sum F of all other forces on it points out of the
-shape, F . n > 0.
+Between two shapes tools and mass points move along straight lines. A mass point with the displacement u' that a
+tool reaches when its tip is at c' sticks to it: with the tip at c, u = u' + c - c'. It is
+held as by a grip (`contact_rest`) until the tool would pull it, that is, until the sum F of all other forces on it
+points out of the tool, F . n > 0.
 """
 
 from __future__ import annotations
@@ -19,11 +19,8 @@ from taichi_msm.terms.contact_layout import COLUMNS, CORRECTIONS, HOLD_DISPLACEM
 
 Array = NDArray[np.float64]
 
-# A mass point within this share of the radius above the surface of a shape touches it.
+# A mass point within this share of the radius above the surface of a tool touches it.
 TOUCH_TOLERANCE = 1e-9
-
-# Number of bisections of a motion, to rounding.
-BISECTIONS = 53
 
 # Mass points are released together if the pulls on them exceed this share of the largest pull.
 RELEASE_SHARE = 0.5
@@ -44,14 +41,14 @@ def stick(plan: Plan, memory: Array, start: Array, end: Array, times: tuple[floa
     free, earliest = ~plan.fixed & (fields[HOLDER] == 0), np.full(plan.fixed.shape, np.inf)
     for n, tool in enumerate(tools):
         if tool.rough:
-            before, after = (u - c for u, c in zip((start, end), tool.tip_centre(np.array(times)), strict=True))
-            share = np.full(plan.fixed.shape, np.inf)
-            share[free] = _first_touch(tool, (rest + before)[free], (rest + after)[free])
-            touched = share < earliest
+            first, last = tool.tip_centre(np.array(times))
+            share = _first_touch(tool, rest + start - first, end - start - (last - first))
+            touched = free & (share <= 1) & (share < earliest)
             earliest[touched] = share[touched]
+            by = share[touched, None]
             fields[HOLDER, touched] = len(tools) + n + 1
-            relative = before[touched] + share[touched, None] * (after - before)[touched]
-            fields[HOLD_DISPLACEMENT:, touched] = relative.T
+            shift = by * (end[touched] - start[touched] - (last - first))
+            fields[HOLD_DISPLACEMENT:, touched] = (start[touched] - first + shift).T
     return memory
 
 
@@ -84,8 +81,9 @@ def compute_pulls(plan: Plan, memory: Array, displacement: Array, force: Array, 
     holder, pulls = memory[CORRECTIONS * len(tools) + HOLDER], np.zeros(plan.fixed.shape)
     for n, tool in enumerate(tools):
         stuck = holder == len(tools) + n + 1
-        _, normal = _depth_and_normal(tool, position[stuck] - tool.tip_centre(np.array([time]))[0])
-        pulls[stuck] = np.maximum((force[stuck] * normal).sum(axis=-1), 0)
+        r = position[stuck] - tool.tip_centre(np.array([time]))[0]
+        _, *normal = tool.shape.build_depth(NUMPY)(*r.T, *tool.axis, tool.length, tool.radius)
+        pulls[stuck] = np.maximum((force[stuck].T * normal).sum(axis=0), 0)
     return pulls
 
 
@@ -96,27 +94,19 @@ def release(plan: Plan, memory: Array, pulls: Array) -> Array:
     return memory
 
 
-def _first_touch(tool: Tool, start: Array, end: Array) -> Array:
-    """Return the first share of a motion relative to a tool at which points touch it, infinite if they do not.
+def _first_touch(tool: Tool, r: Array, motion: Array) -> Array:
+    """Return the first share of a motion relative to a tool at which a point touches it, infinite if it does not.
 
     Args:
         tool: the tool.
-        start: positions relative to its tip before the motion [m], shape (points, 3).
-        end: positions relative to its tip after the motion [m], shape (points, 3).
+        r: positions relative to the centre of the tip [m], shape (..., 3).
+        motion: of the points relative to the tool [m], shape (..., 3).
     """
-    share = np.where(_depth_and_normal(tool, end)[0] > 0, 1.0, np.inf)
-    entering = np.isfinite(share)
-    low, high = np.zeros(entering.sum()), np.ones(entering.sum())
-    for _ in range(BISECTIONS):
-        middle = (low + high) / 2
-        inside = _depth_and_normal(tool, start[entering] + middle[:, None] * (end - start)[entering])[0] > 0
-        low, high = np.where(inside, low, middle), np.where(inside, middle, high)
-    share[entering] = high
-    share[_depth_and_normal(tool, start)[0] >= -TOUCH_TOLERANCE * tool.radius] = 0
-    return share
-
-
-def _depth_and_normal(tool: Tool, r: Array) -> tuple[Array, Array]:
-    """Return the depths of points [m], shape (points,), at r from the tip of a tool, and the normals, (points, 3)."""
-    depth, *normal = tool.shape.build_depth(NUMPY)(*r.T, *tool.axis, tool.length, tool.radius)
-    return depth, np.stack(np.broadcast_arrays(*normal), axis=-1)
+    distance = np.linalg.norm(motion, axis=-1)
+    direction = motion / np.maximum(distance, np.finfo(float).tiny)[..., None]
+    products = direction @ tool.axis, r @ tool.axis, (r * direction).sum(axis=-1), (r * r).sum(axis=-1)
+    t, enters, *_ = tool.shape.build_ray(NUMPY)(1.0, *products, tool.length, tool.radius)
+    depth, *_ = tool.shape.build_depth(NUMPY)(*np.moveaxis(r, -1, 0), *tool.axis, tool.length, tool.radius)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first = np.where(enters & (t >= 0) & (distance > 0), t / distance, np.inf)
+    return np.asarray(np.where(depth >= -TOUCH_TOLERANCE * tool.radius, 0.0, first))

@@ -56,7 +56,20 @@ class Key(NamedTuple):
     name: str
 
 
-Event = Hover | Press | Drag | Release | Turn | Strength | StrengthChange | Key
+class Material(NamedTuple):
+    """A key of `material.MATERIAL` gets another value; the tissue keeps its shape."""
+
+    key: str
+    value: float
+
+
+Event = Hover | Press | Drag | Release | Turn | Strength | StrengthChange | Key | Material
+
+QUIT = Key("q")
+
+# Switching the tool may compile another kernel.
+SWITCH_TOOL = Key("f")
+COMPILING = "one moment: compiling"
 
 # Increment of the strength per notch of the wheel or press of a key [% of the full force or depth].
 STRENGTH_STEP = 5.0
@@ -87,5 +100,5 @@ KEYS = {
     "w": "save the session as a scene, which run repeats",
     "i": "the figures on and off",
     "h": "the keys on and off",
-    "q": "quit; so does Escape",
+    "q": "quit; in the window so does Escape",
 }

@@ -27,9 +27,9 @@ _DUMPER: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 
 class Film:
-    """A GIF of a session, encoded in a hidden folder while the session runs; `close` removes it unless it was moved.
+    """A film of a session, encoded in a hidden folder while the session runs; `close` removes it unless it was moved.
 
-    The constructor and the methods raise a FilesError when the GIF cannot be written.
+    The constructor and the methods raise a FilesError when the film cannot be written.
 
     Args:
         folder: parent of the hidden folder.
@@ -38,19 +38,37 @@ class Film:
         subframes: frames of the session per picture.
         begin: first frame of the session.
         option: name of the option in messages.
+        suffix: .gif or .mp4.
 
     Attributes:
         pictures: number of pictures so far.
     """
 
     def __init__(
-        self, folder: Path, render: Render, rate: float, subframes: int, begin: int = 0, option: str = "--out"
+        self,
+        folder: Path,
+        render: Render,
+        rate: float,
+        subframes: int,
+        begin: int = 0,
+        option: str = "--out",
+        suffix: str = ".gif",
     ) -> None:
         self.pictures = 0
+        self._format = suffix.lower().removeprefix(".")
         self._subframes, self._begin, self._location = subframes, begin, (folder, option)
         with writing(*self._location), ExitStack() as opened:
             self._hidden = opened.enter_context(hidden_folder(folder))
-            job = EncodingJob((self._hidden,), render.size, rate, png=False, gif=True, background=render.background)
+            job = EncodingJob(
+                (self._hidden,),
+                render.size,
+                rate,
+                png=False,
+                gif=self._format == "gif",
+                background=render.background,
+                mp4=self._format == "mp4",
+                quality=render.quality,
+            )
             self._encoder = Encoder(job)
             opened.callback(self._encoder.abort)
             self._opened = opened.pop_all()
@@ -72,7 +90,7 @@ class Film:
         """Finish a film with at least one picture; return its file, which the caller must move."""
         with writing(*self._location):
             self._encoder.finish(pause)
-        return self._hidden / OUTPUTS["gif"].path()
+        return self._hidden / OUTPUTS[self._format].path()
 
     def close(self) -> None:
         """Stop the encoder, and remove the hidden folder."""
@@ -118,10 +136,18 @@ class Captures:
             (hidden / "session").write_text(text, "utf-8")
             return self._move_to_free_name(hidden / "session", "session", ".yaml")
 
-    def save_film(self, film: Film) -> Path:
-        """Finish and save a film with at least one picture; return its path."""
-        with closing(film), writing(self.folder):
-            return self._move_to_free_name(film.finish(), "film", ".gif")
+    def save_film(self, film: Film, path: Path | None = None) -> Path:
+        """Finish and save a film with at least one picture; return its path.
+
+        Args:
+            film: the film.
+            path: replaces an earlier file; None: a free name in the folder.
+        """
+        with closing(film), writing(path or self.folder):
+            if path is None:
+                return self._move_to_free_name(film.finish(), "film", ".gif")
+            self.saved.append(film.finish().replace(path))
+            return path
 
     def _move_to_free_name(self, draft: Path, stem: str, suffix: str) -> Path:
         self.saved.append(move_to_free_name(draft, self.folder, stem, suffix))

@@ -177,11 +177,11 @@ def record_film(
     progress: Callable[[int, int], None] = lambda done, total: None,
     notify: Callable[[str], None] = lambda notice: None,
 ) -> None:
-    """Run a session without a window, and record a GIF, which replaces an earlier file at the end.
+    """Run a session without a window, and record a film, which replaces an earlier file at the end.
 
     Args:
         session: a new session.
-        path: the GIF.
+        path: the film, .gif or .mp4.
         seconds: duration of the film [s].
         events: as returned by `schedule_events`; consumed lazily.
         progress: called often with the finished and total frames; an exception from it stops the session.
@@ -190,15 +190,13 @@ def record_film(
     Raises:
         FilesError: when the film cannot be written; or, after it was written, when an event could not save its file.
     """
-    if path.is_dir():
-        raise FilesError(f"{path}: a directory; choose another {OPTION}")
     frames = round(seconds * session.frame_rate)
     events = iter(events)
     upcoming = next(events, None)
     failures: list[FilesError] = []
     notice = ""
     rate, subframes = session.frame_rate / session.subframes, session.subframes
-    with closing(Film(path.parent, session.scene.render, rate, subframes, option=OPTION)) as gif:
+    with closing(Film(path.parent, session.scene.render, rate, subframes, 0, OPTION, path.suffix)) as film:
         for frame in range(frames + 1):
             progress(frame, frames)
             while upcoming is not None and upcoming[0] <= frame:
@@ -211,7 +209,7 @@ def record_film(
                 notice = session.notice
                 upcoming = next(events, None)
             if frame % subframes == 0:
-                gif.add_frame(session.picture(), frame, partial(progress, frame, frames))
+                film.add_frame(session.picture(), frame, partial(progress, frame, frames))
             if frame < frames:
                 session.advance()
             if session.divergence_error:
@@ -220,6 +218,6 @@ def record_film(
         if upcoming is not None:
             notify(f"the film ends at {frame / session.frame_rate:g} s, before some of the script's events")
         with writing(path, OPTION):
-            gif.finish(partial(progress, frames, frames)).replace(path)
+            film.finish(partial(progress, frames, frames)).replace(path)
     if failures:
         raise failures[0]

@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +28,7 @@ from taichi_msm.solver.planning import plan_variant, with_time
 from taichi_msm.system import runtime
 from taichi_msm.view import events, overlay
 from taichi_msm.view.controller import Controller, Viewport
+from taichi_msm.view.material import MAX_FACTOR, material_values, with_value
 from taichi_msm.view.recording import Captures, Film, count_probe_values
 from taichi_msm.view.tools import ForceControlledTool, PositionControlledTool, SheetPosition
 
@@ -38,6 +41,8 @@ NOTICE_DURATION_S = 3.0
 def divide_frames(plan: Plan) -> tuple[Plan, int]:
     """Divide the frames of a scene into equal subframes, at most `MAX_FRAME_RATE` per second.
 
+    With `precision: auto` they are in f32, which takes half the time: a session steps all the time, unlike a run.
+
     Returns:
         The plan with subframes as frames, and the number of subframes per frame of the scene.
     """
@@ -47,7 +52,10 @@ def divide_frames(plan: Plan) -> tuple[Plan, int]:
         steps = plan.grid.steps_per_frame
         while steps % subframes:
             subframes -= 1
-    return plan_variant(plan, with_time(scene, frames_per_second=scene.time.frames_per_second * subframes)), subframes
+    changes: dict[str, Any] = {"frames_per_second": scene.time.frames_per_second * subframes}
+    if scene.time.precision == "auto" and scene.time.tolerance is None:
+        changes["precision"] = "f32"
+    return plan_variant(plan, with_time(scene, **changes)), subframes
 
 
 class Session:
@@ -98,6 +106,7 @@ class Session:
         scene = plan.scene
         self._captures = captures
         self._film: Film | None = None
+        self._film_path: Path | None = None
         self._scene_probes = tuple(probe for probe in scene.probes if play or probe.clamp is not None)
         # Without outputs, their kernels are not compiled.
         self._plan = replace(plan, scene=scene.model_copy(update={"output": ()}))
@@ -109,7 +118,7 @@ class Session:
         plan = self._with_tool(tool)
         self.scene = scene.model_copy(update={"probes": plan.scene.probes})
         self._show_figures, self._show_keys = True, False
-        self._single_step = self._has_warned_of_length = self.paused = False
+        self._single_step = self._has_warned_of_length = self._material_changed = self.paused = False
         # Elapsed frames, including those of pauses.
         self._elapsed = 0
         self._notice, self._notice_until = "", 0
@@ -120,7 +129,7 @@ class Session:
         progress("compile")
         self._simulation = Simulation(plan, arch, threads, texture)
         self._simulation.compile(lambda: progress("compile"))
-        self._initial_state = self._simulation.save()
+        self._scene_material = material_values(scene)
         self.viewport = Viewport(self._simulation.renderer, play=play)
         self._controller = Controller(self.tool, self.viewport, self._simulation)
         self._draw()
@@ -143,11 +152,22 @@ class Session:
         """Return the displacement of the tissue at the tool [m]."""
         return float(np.linalg.norm(self._touched_point() - [*self._rest_point(self.tool.position), 0.0]))
 
+    def depth(self) -> float:
+        """Return the depth of the tissue at the tool below the sheet at rest [m]; negative above it."""
+        return -float(self._touched_point()[2])
+
+    def tool_force(self) -> float:
+        """Return the force between tool and tissue in the last frame [N]."""
+        return float(np.linalg.norm(self._simulation.forces()[-1].force))
+
     def felt_force(self) -> float:
         """Return the mean force on a position-controlled tool in the last frame [N]; 0 for other tools."""
-        if isinstance(self.tool, ForceControlledTool):
-            return 0.0
-        return float(np.linalg.norm(self._simulation.forces()[-1].force))
+        return 0.0 if isinstance(self.tool, ForceControlledTool) else self.tool_force()
+
+    def material(self) -> dict[str, tuple[float, float]]:
+        """Return the values that an event `Material` can change, by key: the current one, and the scene's."""
+        current = material_values(self.scene)
+        return {key: (current[key], initial) for key, initial in self._scene_material.items()}
 
     def recorded_scene(self) -> Scene:
         """Return the session as a scene, whose run is bit-identical."""
@@ -186,6 +206,8 @@ class Session:
                 self.handle(events.Strength(self.tool.strength + percent))
             case events.Key(name):
                 self._handle_key(name)
+            case events.Material(key, value):
+                self._change_material(key, value)
 
     def advance(self) -> None:
         """Advance by a frame, without motion while paused."""
@@ -211,11 +233,50 @@ class Session:
         weight = 1 / 20 if self.frame_time_s else 1.0
         self.frame_time_s += weight * (duration - self.frame_time_s)
 
+    @property
+    def filming(self) -> bool:
+        """Whether a film is running."""
+        return self._film is not None
+
+    def start_film(self, path: Path | None = None) -> None:
+        """Start a film.
+
+        Args:
+            path: where it is saved at its end, replacing an earlier file; None: a free name in the folder of captures.
+
+        Raises:
+            FilesError: when it cannot be written.
+        """
+        folder, option, suffix = (
+            (self._captures.folder, "--out", ".gif") if path is None else (path.parent, "--record", path.suffix)
+        )
+        rate = self.frame_rate / self.subframes
+        self._film = Film(folder, self.scene.render, rate, self.subframes, self._elapsed, option, suffix)
+        self._film_path = path
+        if path is not None:
+            # A session that ends at once has a film, too.
+            self._film.add_frame(self._draw(), self._elapsed)
+
     def picture(self, pacing: str = "") -> Picture:
         """Draw the tissue and the overlay; append the picture without text to a running film.
 
         Args:
             pacing: text about the speed of the session.
+
+        Returns:
+            The picture, shape (height, width, 3).
+        """
+        picture = self.bare_picture()
+        above = self._figure_lines(pacing) if self._show_figures else ["paused"] if self.paused else []
+        keys, bar = (events.POINTER | events.KEYS if self._show_keys else None), None
+        # A small picture has no space for both.
+        if self._show_figures and self._max_felt_force > 0 and keys is None:
+            bar = overlay.ValueBar(self.felt_force(), self._max_felt_force, "N")
+        overlay.write_text(picture, above, self.notice, keys, bar)
+        return picture
+
+    def bare_picture(self) -> Picture:
+        """Draw the tissue, with a mark at a tool without an instrument; append the picture to a running film.
 
         Returns:
             The picture, shape (height, width, 3).
@@ -232,12 +293,6 @@ class Session:
                 self._film.close()
                 self._film = None
                 self.show_notice(str(error))
-        above = self._figure_lines(pacing) if self._show_figures else ["paused"] if self.paused else []
-        keys, bar = (events.POINTER | events.KEYS if self._show_keys else None), None
-        # A small picture has no space for both.
-        if self._show_figures and self._max_felt_force > 0 and keys is None:
-            bar = overlay.ValueBar(self.felt_force(), self._max_felt_force, "N")
-        overlay.write_text(picture, above, self.notice, keys, bar)
         return picture
 
     def show_notice(self, notice: str) -> None:
@@ -298,8 +353,7 @@ class Session:
                 self._single_step = self.paused
             case "r":
                 self._controller.reset()
-                self._simulation.restore(self._initial_state)
-                self._simulation.steer((*self._scene_probes, self.tool.recorded_probe(0)))
+                self._simulation.restart(self._with_tool(self.tool))
                 self.viewport.set_time(0.0)
                 self._reset_figures()
             case "f":
@@ -308,10 +362,11 @@ class Session:
                 self.show_notice(f"saved {self._captures.save_picture(self._draw())}")
             case "g":
                 if self._film is None:
-                    rate = self.frame_rate / self.subframes
-                    self._film = Film(self._captures.folder, self.scene.render, rate, self.subframes, self._elapsed)
+                    self.start_film()
                 else:
                     self._end_film()
+            case "w" if self._material_changed:
+                self.show_notice("no scene repeats a session whose material changed: reset (r), then do it again")
             case "w":
                 self.show_notice(f"saved {self._captures.save_scene(self.recorded_scene())}")
             case "i":
@@ -344,15 +399,35 @@ class Session:
         self._controller.reset()
         self._simulation.restart(plan)
         self._simulation.compile()
-        self._initial_state = self._simulation.save()
         self.tool = self._controller.tool = tool
         self.frame_time_s = 0.0
         self._reset_figures()
         session_tools = [tool for tool in plan.tools if tool.probe == len(self._scene_probes)]
         self.show_notice("; ".join(path_warnings(plan.scene, session_tools)))
 
+    def _change_material(self, key: str, value: float) -> None:
+        """Change a value of the material, and continue; a reset then begins with this material."""
+        initial = self._scene_material.get(key, 0.0)
+        # The margin allows for rounding.
+        if not initial / MAX_FACTOR * 0.999 <= value <= initial * MAX_FACTOR * 1.001:
+            self.show_notice(f"{key}: {value:g} is not from {initial / MAX_FACTOR:g} to {initial * MAX_FACTOR:g}")
+            return
+        if self.divergence_error:
+            self.show_notice("the simulation diverged: reset it (r) first")
+            return
+        try:
+            plan = check_scene(with_value(self._plan.scene, key, value), self._plan.maps)
+            self._simulation.change_material(plan)
+        except (SceneError, DivergedError) as error:
+            self.show_notice(str(error))
+            return
+        self._plan, self._material_changed = plan, True
+        self.scene = with_value(self.scene, key, value)
+        if self._position_tool is not None:
+            self._position_tool.grid = plan.grid
+
     def _reset_figures(self) -> None:
-        self._single_step = self._has_warned_of_length = False
+        self._single_step = self._has_warned_of_length = self._material_changed = False
         self._max_felt_force, self.divergence_error = 0.0, ""
 
     def _end_film(self) -> None:
@@ -361,7 +436,7 @@ class Session:
         if film is None:
             return
         if film.pictures > 0:
-            self.show_notice(f"saved {self._captures.save_film(film)}")
+            self.show_notice(f"saved {self._captures.save_film(film, self._film_path)}")
         else:
             film.close()
             self.show_notice("no film was saved: it had no picture yet")

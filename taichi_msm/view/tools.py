@@ -194,11 +194,12 @@ class PositionControlledTool:
         position: current position of the tip.
         target: position to which the tip moves.
         engaged: whether the tool presses or grips.
+        grid: of the session; a change of the material changes its step.
     """
 
     def __init__(self, probe: Probe, plan: Plan) -> None:
         assert probe.instrument is not None
-        self._grid, self._sheet, self._radius = plan.grid, plan.scene.sheet, probe.instrument.outer_radius
+        self.grid, self._sheet, self._radius = plan.grid, plan.scene.sheet, probe.instrument.outer_radius
         self._stride = SHAPES[probe.instrument.shape].max_stride * self._radius
         self._max_depth = min(MAX_DEPTH_RADII * self._radius, 0.25 * min(self._sheet.size))
         self._hover_height = _rounded(HOVER_HEIGHT_RADII * self._radius)
@@ -289,13 +290,13 @@ class PositionControlledTool:
 
     def _move_tip(self) -> None:
         """Move the tip towards its target, by at most the distance that a frame allows."""
-        max_rise = (HOVER_HEIGHT_RADII * self._radius + self._max_depth) / (RISE_TIME_S * self._grid.frames_per_second)
+        max_rise = (HOVER_HEIGHT_RADII * self._radius + self._max_depth) / (RISE_TIME_S * self.grid.frames_per_second)
         rise = self._target_height - self.height
         goal = self._target_height if abs(rise) <= max_rise else self.height + math.copysign(max_rise, rise)
         (across, down), (to_across, to_down), (height, width) = self.position, self.target, self._sheet.size
         distance = math.hypot((to_across - across) * width, (to_down - down) * height, goal - self.height)
         # The margin of 2 % allows for rounded positions.
-        max_distance = 0.98 * self._stride * self._grid.steps_per_frame
+        max_distance = 0.98 * self._stride * self.grid.steps_per_frame
         fraction = min(1.0, max_distance / distance) if distance > 0 else 1.0
         if fraction < 1:
             self.position = on_sheet((across + fraction * (to_across - across), down + fraction * (to_down - down)))
@@ -305,7 +306,7 @@ class PositionControlledTool:
 
     def _time(self, frame: int) -> float:
         """Return the time of a frame [s], bit-identical to that of its step, so that the tip is exactly at its key."""
-        return self._grid.time(frame * self._grid.steps_per_frame)
+        return self.grid.time(frame * self.grid.steps_per_frame)
 
 
 def _rounded(height: float) -> float:

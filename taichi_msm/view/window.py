@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -14,7 +13,22 @@ from taichi_msm.errors import DeviceError, FilesError, Pause
 from taichi_msm.runs.media import Picture
 from taichi_msm.system.process import discarded_output
 from taichi_msm.view import overlay
-from taichi_msm.view.events import KEYS, STRENGTH_STEP, Drag, Event, Hover, Key, Press, Release, StrengthChange, Turn
+from taichi_msm.view.events import (
+    COMPILING,
+    KEYS,
+    QUIT,
+    STRENGTH_STEP,
+    SWITCH_TOOL,
+    Drag,
+    Event,
+    Hover,
+    Key,
+    Press,
+    Release,
+    StrengthChange,
+    Turn,
+)
+from taichi_msm.view.pacing import Pacing
 from taichi_msm.view.session import Session
 
 # Without a greeting on stdout, and without disabling the effects of the desktop.
@@ -31,15 +45,6 @@ import pygame  # noqa: E402
 TEXT_KEYS = {" ": "space", "=": "up", "+": "up", "-": "down", "\x1b": "q"}
 ARROW_KEYS = {pygame.K_UP: "up", pygame.K_DOWN: "down"}
 SHIFT_KEYS = {pygame.K_LSHIFT, pygame.K_RSHIFT}
-
-QUIT = Key("q")
-
-# Switching the tool may compile another kernel.
-SWITCH_TOOL = Key("f")
-COMPILING = "one moment: compiling"
-
-# Longer delays are not caught up, and no picture waits longer for its frames [s].
-MAX_DELAY_S = 0.1
 
 
 class Window:
@@ -228,50 +233,6 @@ def key_name(event: pygame.Event) -> str | None:
         typed = chr(ord("a") + event.scancode - pygame.KSCAN_A)
     name = ARROW_KEYS.get(event.key) or TEXT_KEYS.get(typed, typed)
     return name if name in KEYS else None
-
-
-class Pacing:
-    """Scheduler that synchronises simulated with real time.
-
-    Args:
-        rate: frames per second of the session.
-        clock: returns the current time [s].
-    """
-
-    def __init__(self, rate: float, clock: Callable[[], float]) -> None:
-        self._rate = rate
-        self._clock = clock
-        self._next = clock()
-        # Start [s] and number of simulated frames of each recent picture.
-        self._pictures: deque[tuple[float, int]] = deque()
-
-    def delay_s(self) -> float:
-        """Return the time until the next frame is due [s]."""
-        return max(0.0, self._next - self._clock())
-
-    def due_frames(self) -> Iterator[int]:
-        """Yield the number of each due frame, until none is due or the delay of the picture exceeds `MAX_DELAY_S`."""
-        start = self._clock()
-        self._next = max(self._next, start - MAX_DELAY_S)
-        count = 0
-        while self._next <= self._clock() and (count == 0 or self._clock() < start + MAX_DELAY_S):
-            self._next += 1 / self._rate
-            yield count
-            count += 1
-        self._pictures.append((start, count))
-        # The speed is averaged over 1 s.
-        while start - self._pictures[0][0] > 1.0:
-            self._pictures.popleft()
-
-    def status(self) -> str:
-        """Format the pictures per second, and the speed relative to real time if it is below 95 %."""
-        if len(self._pictures) < 2:
-            return ""
-        seconds = self._pictures[-1][0] - self._pictures[0][0]
-        rate = f"{(len(self._pictures) - 1) / seconds:.0f} pictures/s"
-        # The last picture is excluded, as its duration is not known yet.
-        speed = sum(count for _, count in list(self._pictures)[:-1]) / self._rate / seconds
-        return rate if speed >= 0.95 else f"{rate}  ·  too slow: {speed:.2f} x real time"
 
 
 def run_session(session: Session, window: Window, pause: Pause) -> None:

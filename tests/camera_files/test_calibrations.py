@@ -155,6 +155,13 @@ def stereomis() -> str:
     return text
 
 
+def sections() -> str:
+    """A file with a section per camera."""
+    left = {"K": MATRIX.tolist(), "D": COEFFICIENTS, "size": [40, 30]}
+    right = {"K": RIGHT.tolist(), "D": [0.25, 0, 0, 0], "size": [40, 30]}
+    return json.dumps({"cam0": left, "cam1": right, "R": ROTATION.tolist(), "T": STIR["translation"]})
+
+
 @pytest.mark.parametrize(
     ("write", "unit"),
     [
@@ -165,6 +172,7 @@ def stereomis() -> str:
                 *(("cameraMatrix", "distCoeffs", "1", "2"), ("camera_matrix", "dist_coeffs", "_left", "_right")),
             )
         ),
+        pytest.param(sections, None, id="sections"),
         pytest.param(partial(json.dumps, STIR), None, id="STIR"),
         pytest.param(lambda: KALIBR, None, id="Kalibr"),
         pytest.param(stereomis, None, id="StereoMIS"),

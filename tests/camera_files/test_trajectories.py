@@ -109,17 +109,29 @@ def test_a_gap_in_the_names_of_pictures_is_a_gap_in_time(small: Path) -> None:
         (EUROC.replace(" [ns]", ""), {"poses_time": "ns"}),
         (EUROC, {"poses_time": "ns", "poses_unit": "m"}),
         (SINCE_1970, {"poses_start": 0}),
+        (SINCE_1970, {"poses_start": 1520530308}),
+        (TUM.replace("\n0.", "\n1305031098."), {"poses_start": 1305031098}),
         (TUM.replace("\n0.", "\n7."), {"poses_start": 7}),
         (TUM.replace("\n0.", "\n7."), {"poses_start": 0}),
     ],
-    ids=["mm", "mm by header", "ns", "ns twice", "since 1970", "a time", "the first pose"],
+    ids=[
+        "mm",
+        "mm by header",
+        "ns",
+        "ns twice",
+        "since 1970",
+        "a time since 1970",
+        "a time of TUM",
+        "a time",
+        "the first pose",
+    ],
 )
 def test_keys_of_the_camera_describe_the_file(text: str, keys: dict[str, object], small: Path) -> None:
     Path("poses.txt").write_text(text)
     made = load_scene("small.yaml", {"render.camera": {"poses": "poses.txt", **keys}}).render.camera
     assert isinstance(made, Camera)
     assert isinstance(made.poses, tuple)
-    np.testing.assert_allclose(np.array(made.poses), np.loadtxt(TUM.splitlines()), atol=3e-7, rtol=1e-15)
+    np.testing.assert_allclose(np.array(made.poses), np.loadtxt(TUM.splitlines()), rtol=1e-15)
     # What was read is kept, in place of the file and its keys.
     assert Camera(**made.model_dump()) == made.model_copy()
 

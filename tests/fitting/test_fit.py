@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from taichi_msm import ArgumentError, SceneError, Simulation, fit, load_scene, run
-from taichi_msm.fitting.checks import MIN_MOTION_SIGMAS, faults, largest_motion
+from taichi_msm.fitting.archive import read_observations
+from taichi_msm.fitting.checks import faults
 from taichi_msm.fitting.force_table import read_forces
-from taichi_msm.fitting.least_squares import ErrorCorrelation
-from taichi_msm.fitting.observations import Observations, project_points, read_observations
+from taichi_msm.fitting.observation import ErrorCorrelation
 from taichi_msm.fitting.parameters import Method, make_parameters
+from taichi_msm.fitting.points import MIN_MOTION_SIGMAS, Pixels
 from taichi_msm.fitting.predict import FitProblem, ForwardModel, Prediction, Runs, without_outputs
-from taichi_msm.fitting.rejection import by_pattern
 from taichi_msm.fitting.result import FitResult
 from taichi_msm.model.surface import surface_positions
 from taichi_msm.scene.scene import Scene
@@ -114,7 +114,7 @@ def test_a_camera_that_moves_and_bends_lines_sees_what_is_predicted(motion: Arra
     eye = [[0, 0, -0.06, 0.09], [0.4, 0.02, -0.05, 0.1]]
     made = changed(render__camera={"eye": eye, "fov": 40, "distortion": {"k1": -0.3, "k2": 0.1}})
     points = np.stack([surface_positions(each, made.render.refine, PLACES) for each in motion], axis=1)
-    seen = project_points(made, points, np.arange(11) / 25)
+    seen = Pixels("", np.arange(11) / 25, points, None, PLACES).observe(made, points)
     np.testing.assert_allclose(seen, pixels_in(made, motion, device), atol=1e-4)
 
 
@@ -203,7 +203,7 @@ def test_what_pictures_cannot_tell_is_named_and_a_force_tells_it(
     assert told.identifiable
     assert told.unseen == []
     assert told.residual_force < 1e-4
-    assert told.fitted_forces.shape == (5, 3)
+    assert told.fitted[1].shape == (5, 3)
     np.testing.assert_allclose(values(told), [2e4, 3e5, 10, -2], rtol=1e-4)
 
 
@@ -464,15 +464,15 @@ def test_motion_of_many_tracks_is_seen_though_it_is_smaller_than_their_errors(tr
     for moving in (True, False):
         pixel = tracks["pixel"][:, :1] + moving * motion + noise
         seen = read_observations({**tracks, "pixel": pixel, "sigma": 1.0}, 25)
-        assert largest_motion(seen, changed()) < MIN_MOTION_SIGMAS
-        assert bool(list(faults(seen, changed(), 1))) != moving
+        assert seen.signal(changed()) < MIN_MOTION_SIGMAS
+        assert bool(list(faults([seen], changed(), 1))) != moving
 
 
 def test_values_that_make_no_scene_give_no_run(device: Device, tracks: dict[str, Array]) -> None:
     scene = changed(tissue__damping=0)
     free = ["tissue.damping", "tissue.young"]
     parameters = make_parameters(scene, free, {"tissue.damping": (-100, 100)})
-    job = FitProblem("token", without_outputs(scene), parameters, read_observations(tracks, 25))
+    job = FitProblem("token", without_outputs(scene), parameters, (read_observations(tracks, 25),))
     predictor = ForwardModel(job, device.threads)
     # Less than no damping; springs without length, as a tenth of young does not bear the pretension.
     assert predictor.try_predict(np.array([-0.1, 0.0])) is None
@@ -567,7 +567,7 @@ def test_tables_of_other_programs_are_understood(tmp_path: Path, data: bytes) ->
     (tmp_path / "forces.csv").write_bytes(data)
     read = read_forces(tmp_path / "forces.csv", 0.1, 1)
     assert (read.time.tolist(), read.probe.tolist()) == ([0.1], [0])
-    np.testing.assert_array_equal(read.force, [[np.nan, np.nan, -0.5]])
+    np.testing.assert_array_equal(read.values, [[np.nan, np.nan, -0.5]])
 
 
 def test_forces_of_a_pipe_or_a_huge_file_are_refused(tmp_path: Path, message: Messages) -> None:
@@ -629,7 +629,7 @@ def test_what_is_visible_is_seen(tracks: dict[str, Array], message: Messages) ->
 
 def test_conventions_of_other_programs_are_asked_about(tracks: dict[str, Array], message: Messages) -> None:
     def answer(**more: Any) -> list[str]:
-        return list(faults(read_observations({**tracks, **more}, 25), changed(), 2))
+        return list(faults([read_observations({**tracks, **more}, 25)], changed(), 2))
 
     assert answer() == []
     for mark in (0, -9999):
@@ -679,9 +679,13 @@ def test_offsets_of_half_a_pixel_and_turned_axes_are_asked_about(
 def test_an_exact_fit_has_errors_next_to_0(device: Device, robust: bool) -> None:
     free = ["tissue.young", "tissue.foundation"]
     empty = read_observations({"time": np.arange(11) / 25, "coordinates": PLACES, "position": np.ones((36, 11, 3))}, 25)
-    job = FitProblem("token", without_outputs(changed()), make_parameters(changed(), free, {}), empty)
+    job = FitProblem("token", without_outputs(changed()), make_parameters(changed(), free, {}), (empty,))
     predictor = ForwardModel(job, device.threads)
-    seen = {"time": empty.time, "coordinates": PLACES, "position": predictor.predict(np.zeros(2), to_end=True).values}
+    seen = {
+        "time": empty.time,
+        "coordinates": PLACES,
+        "position": predictor.predict(np.zeros(2), to_end=True).values[0],
+    }
     predictor.close()
     found = fit(changed(), seen, free, robust=robust, profile=True, workers=1)
     assert found.residual == 0
@@ -848,10 +852,9 @@ def test_noise_is_not_taken_for_a_wrong_model(alike: ErrorCorrelation) -> None:
         left = left if alike.drift is None else np.cumsum(left, axis=1)
         left[rng.random(left.shape) < 0.05] *= 10
         left[rng.random(left.shape[:2]) < 0.1] = np.nan
-        wolves += by_pattern(Observations("", "pixel", times, PLACES, left, None), left, 10.0, alike) is not None
+        wolves += Pixels("", times, left, None, PLACES).pattern(left, 10.0, alike) is not None
     # Of 400, 0.4 are expected; more than 3 have a probability of 1e-3.
     assert wolves <= 3
     times = np.arange(40.0)
     wrong = np.sin(times / 6)[:, None] + rng.normal(0, 1, (36, 40, 2))
-    seen = Observations("", "pixel", times, PLACES, wrong, None)
-    assert by_pattern(seen, wrong, 10.0, alike) is not None
+    assert Pixels("", times, wrong, None, PLACES).pattern(wrong, 10.0, alike) is not None

@@ -13,9 +13,17 @@ from numpy.typing import NDArray
 
 from taichi_msm import SceneError, Simulation, fit, load_scene
 from taichi_msm.cli.fit import parse_window
-from taichi_msm.fitting.machine_fit import FittedTest, explanations
+from taichi_msm.fitting.machine_curve import relax
+from taichi_msm.fitting.machine_fit import FittedTest, explanations, unknown_notes
 from taichi_msm.fitting.machine_tables import MachineTest
-from taichi_msm.fitting.machine_test import CONTACT_NOISES, DEPTH_FRAMES, MAX_FRAMES, build_loading, find_approach
+from taichi_msm.fitting.machine_test import (
+    CONTACT_NOISES,
+    DEPTH_FRAMES,
+    MAX_FRAMES,
+    build_loading,
+    find_approach,
+    late_contact_note,
+)
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
@@ -63,13 +71,13 @@ def ramp() -> tuple[Array, Array]:
     return time, CONTACT + DEEPEST * np.clip((time - CONTACT_S) / (RISE_S - CONTACT_S), -0.4, 1)
 
 
-def forces_of(data: dict[str, Any]) -> Array:
-    """Forces on the tool at the frames of a scene [N]."""
+def forces_of(data: dict[str, Any], axis: int = 2) -> Array:
+    """Forces on the tool along an axis at the frames of a scene [N]."""
     with Simulation(data) as simulation:
         forces = []
         for frame in range(simulation.scene.time.frames + 1):
             simulation.advance(min(frame, 1))
-            forces.append(-simulation.forces()[0].force[2])
+            forces.append(-simulation.forces()[0].force[axis])
     return np.array(forces)
 
 
@@ -150,6 +158,40 @@ def test_contact_is_the_last_row_without_a_force_before_the_peak() -> None:
     assert at_once.contact == time[9]
 
 
+def test_a_contact_is_found_with_the_noise_of_the_table() -> None:
+    """Also where the noise is far below the accuracy of predicted forces."""
+    time = np.linspace(0, 10, 1001)
+    loading = build_loading(machine_test(time, time, np.maximum(time - 5, 0) ** 3, 1e-9), scene())
+    assert loading.noise == 1e-9
+    assert loading.contact == pytest.approx(5)
+
+
+def test_a_force_that_rises_in_the_rows_of_the_noise_is_noted(message: Messages) -> None:
+    time, random = np.linspace(0, 5, 101), np.random.default_rng(0)
+    early = build_loading(machine_test(time, time, time**2, 1e-3), scene())
+    message(str(late_contact_note(early, "contact")), "--free contact")
+    for force in (random.normal(0, 0.1, 101) + 9 * np.maximum(time - 3, 0), 1e-3 * time + 9 * np.maximum(time - 1, 0)):
+        assert late_contact_note(build_loading(machine_test(time, time, force, 1e-3), scene()), "contact") is None
+
+
+def test_a_load_that_is_held_relaxes_exponentially() -> None:
+    n, branches = np.arange(20), [(0.3, 0.5), (0.2, 3.0)]
+    expected = 1 - sum(share * (1 - np.exp(-0.1 * n / time)) for share, time in branches)
+    np.testing.assert_allclose(relax(np.ones(20), branches, 0.1), expected, rtol=1e-13)
+    assert relax(n.astype(float), [], 0.1).tolist() == n.tolist()
+
+
+def test_parameters_without_information_are_explained(message: Messages) -> None:
+    time = np.linspace(0, 8, 401)
+    depth = 1e-3 * np.clip(time - 1, 0, 3)
+    loading = build_loading(machine_test(time, depth, 1000 * depth), scene(relaxation=[BRANCH]))
+    fitted = FittedTest(loading, loading.contact, loading.force)
+    assert fitted.rise == pytest.approx(3, abs=0.11)
+    values = {"tissue.relaxation.0.time": 0.02, "tissue.relaxation.1.time": 90.0, "tissue.relaxation.1.share": 0.1}
+    values |= {"tissue.foundation.lock": 0.1, "tissue.stiffening.lock": 4.0}
+    message(unknown_notes([fitted], values), "shorter", "longer", "beyond", "stretch")
+
+
 def test_the_tool_waits_until_contact() -> None:
     time = np.linspace(0, 10, 1001)
     loading = build_loading(
@@ -213,7 +255,7 @@ def test_the_parameters_of_a_tissue_that_relaxes_come_back_and_its_scene_runs_al
     assert (tmp_path / "out/fit.png").stat().st_size > 10000
     np.testing.assert_allclose(
         forces_of(json.loads(load_scene(tmp_path / "out/scene.yaml").model_dump_json(exclude_none=True))),
-        result.fitted_forces[:, 0],
+        result.fitted[0][:, 0],
         atol=1e-6,
     )
 
@@ -295,12 +337,30 @@ def test_options_of_other_fits_are_refused(pressed: str, options: dict[str, Any]
         fit(scene(), pressed, **{"free": free, **options})
 
 
-def test_a_clamp_follows_no_table(message: Messages) -> None:
-    made = scene().model_dump(mode="json", exclude_none=True)
-    made["sheet"]["fixed"] = ["left"]
-    made["probes"] = [{"clamp": "right", "path": [[0, 0, 0, 0], [1, 1e-3, 0, 0]]}]
-    with message.raises(SceneError, "probes.0.clamp"):
-        find_approach(Scene.model_validate(made))
+def test_a_clamp_follows_a_table_from_its_first_row(device: Device, tmp_path: Path) -> None:
+    """Its displacement is the table's from the first row, and its force is along its motion."""
+    initial = Scene.model_validate(
+        {
+            "sheet": {"points": [3, 5], "size": [0.01, 0.02], "fixed": ["left"]},
+            "tissue": {"young": 2e5, "thickness": 2e-3},
+            "probes": [{"clamp": "right", "path": [[0, 0, 0, 0], [1, 1e-3, 0, 0]]}],
+            "time": {"duration": 1, "motion": "quasistatic"},
+            "output": [],
+        }
+    )
+    time = np.arange(16.0)
+    pull = 5e-4 * np.maximum(time - 9, 0)
+    path = np.stack([time, pull, 0 * time, 0 * time], axis=1).tolist()
+    pulled = changed(initial, probes__0__path=path, time__duration=15.0, time__frames_per_second=1.0, tissue__young=1e5)
+    force = -forces_of(pulled, axis=0)
+    assert force[-1] > 0.1
+    # An offset of the force, which is subtracted; and counted the other way, as machines do.
+    table = write(tmp_path / "pulled.csv", time, -5e-3 - pull, -0.3 - force)
+    result = fit(initial, table, ["tissue.young"], rate=1, workers=1)
+    (fitted,) = result.tests
+    assert (fitted.contact, fitted.loading.force[-1]) == pytest.approx((5e-3, force[-1]), abs=1e-6)
+    assert result.parameters["tissue.young"].value == pytest.approx(1e5, rel=1e-3)
+    assert np.array(result.scene.probes[0].path)[-1].tolist() == pytest.approx([15, 3e-3, 0, 0], abs=1e-7)
 
 
 def test_a_window_is_two_numbers(message: Messages) -> None:
@@ -328,5 +388,7 @@ def test_the_command_fits_tables(pressed: str, tmp_path: Path, program: Program)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert len(found["tests"]) == 2
+    for name in ("scene", "scene-1"):
+        assert load_scene(tmp_path / f"out/{name}.yaml").time.duration == 4
     assert found["parameters"]["tissue.foundation.young"]["value"] == pytest.approx(FOUNDATION["young"], rel=0.01)
     assert found["tests"][0]["frames"] == 4 * RATE + 1

@@ -16,7 +16,8 @@ from PIL import Image
 
 from taichi_msm import SceneError, fit, load_scene
 from taichi_msm.accuracy.mesh import estimate_mesh_error
-from taichi_msm.fitting.observations import ObservationModel, Observations, read_observations
+from taichi_msm.fitting.archive import KINDS, read_observations
+from taichi_msm.fitting.points import PointModel, Positions
 from taichi_msm.fitting.predict import without_outputs
 from taichi_msm.fitting.tikhonov import MapGrid, MapSearch
 from taichi_msm.gradients.gradient import Adjoint
@@ -68,8 +69,8 @@ def seen_in(truth: Scene, device: Device, factors: Array, times: Array, error: f
     """Positions of the places in a scene with a map, with errors of that standard deviation [m]."""
     plan = check_scene(truth)
     position = Adjoint(plan, device).run(MapGrid(len(factors), (8, 8)).factors(np.log(factors).ravel()))
-    empty = Observations("", "position", times, PLACES, np.zeros((len(PLACES), len(times), 3)), None)
-    points = ObservationModel(truth, empty, len(position)).points(position)
+    empty = Positions("", times, np.zeros((len(PLACES), len(times), 3)), None, PLACES)
+    points = PointModel(truth, empty, len(position)).points(position)
     noise = np.random.default_rng(1).normal(0, error, points.shape)
     return {"time": times, "coordinates": PLACES, "position": points + noise, "sigma": error}
 
@@ -219,7 +220,7 @@ def test_points_behind_the_eye_are_refused(device: Device, message: Messages) ->
         fit(low, seen, ["tissue.map"], resolution=2)
     # As where they get there while the map changes.
     there, fields, adjoint = read_observations(seen, 1), MapGrid(2, (8, 8)), Adjoint(check_scene(low), device)
-    search = MapSearch(adjoint, ObservationModel(low, there, 3), there, 1.0, fields, (-2, 2), lambda: None)
+    search = MapSearch(adjoint, PointModel(low, there, 3), there, 1.0, fields, (-2, 2), lambda: None)
     with message.raises(SceneError, "behind the eye"):
         search.predict(np.zeros(4))
 
@@ -229,9 +230,9 @@ def test_the_slope_of_the_misfit_is_that_of_differences(device: Device, kind: An
     """By the fields, and by the factor of the forces."""
     times = np.array([0.7, 2.0] if kind == "pixel" else [0.08, 0.16])
     seen = read_observations(seen_in(made, device, TRUTH, times, 1e-4), 1)
-    seen = Observations("", kind, seen.time, PLACES, seen.values[..., : 3 if kind == "position" else 2], 1e-4)
+    seen = KINDS[kind]("", seen.time, seen.values[..., : 3 if kind == "position" else 2], 1e-4, PLACES)
     plan, fields, limits = check_scene(made), MapGrid(4, (8, 8)), (-2.0, 2.0)
-    model = ObservationModel(plan.scene, seen, plan.grid.frames + 1)
+    model = PointModel(plan.scene, seen, plan.grid.frames + 1)
     search = MapSearch(Adjoint(plan, device), model, seen, 1.0, fields, limits, lambda: None, force_limits=limits)
     x, change = np.random.default_rng(0).normal(0, 0.2, (2, 17))
     for way in (change, 0.2 * np.eye(17)[16]):

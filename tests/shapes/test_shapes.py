@@ -25,23 +25,27 @@ def test_a_ray_ends_where_it_enters(name: str) -> None:
     axis = np.array([0.6, -0.48, 0.64])
     numbers = *axis, 0.3, 0.1
     depth, intersect = (build(NUMPY) for build in (SHAPES[name].build_depth, SHAPES[name].build_ray))
-    origin, direction = np.zeros((3, 4000)), np.full((3, 4000), -1.0)
-    origin[:2], direction[:2] = rng.uniform(-0.3, 0.3, (2, 4000)), rng.uniform(-1, 1, (2, 4000))
-    t, is_hit, *normal = intersect(*origin[:2], *direction[:2], *numbers)
-    along = np.linspace(-1, 1, 2001)[:, None]
-    inside = depth(*(o + along * d for o, d in zip(origin, direction, strict=True)), *numbers)[0] > 0
+    origin = rng.normal(size=(4000, 3))
+    origin *= 2 / np.linalg.norm(origin, axis=1, keepdims=True)
+    direction = rng.uniform(-0.2, 0.4, (4000, 3)) - origin
+    products = ((direction**2).sum(axis=1), direction @ axis, origin @ axis, (origin * direction).sum(axis=1))
+    t, is_hit, foot, end = intersect(*products, (origin**2).sum(axis=1), *numbers[3:])
+    along = np.linspace(0, 2, 2001)[:, None]
+    inside = depth(*(o + along * d for o, d in zip(origin.T, direction.T, strict=True)), *numbers)[0] > 0
     assert 0.1 < inside.any(axis=0).mean() < 0.95
     # Rays that only graze the shape may slip between samples.
     assert (is_hit >= inside.any(axis=0)).all()
     assert (is_hit != inside.any(axis=0)).mean() < 0.01
     hits = is_hit & inside.any(axis=0)
-    found, *outward = depth(*(origin + t * direction), *numbers)
+    points = origin + t[:, None] * direction
+    found, *outward = depth(*points.T, *numbers)
     np.testing.assert_allclose(found[hits], 0, atol=1e-9)
     first = along[inside.argmax(axis=0), 0]
     assert ((first - t)[hits] >= -1e-9).all()
     assert ((first - t)[hits] <= 1e-3 + 1e-9).mean() > 0.98
-    unit = np.array(normal) / np.linalg.norm(normal, axis=0)
-    assert np.linalg.norm(unit - outward, axis=0)[hits].max() < 1e-6
+    normal = np.where(end[:, None] != 0, end[:, None] * axis, points - foot[:, None] * axis)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    assert np.linalg.norm(normal.T - outward, axis=0)[hits].max() < 1e-6
 
 
 def pressed_by_a_plate(**changes: object) -> Scene:

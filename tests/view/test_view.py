@@ -23,9 +23,10 @@ from taichi_msm import load_scene
 from taichi_msm.cli.main import main
 from taichi_msm.errors import SceneError
 from taichi_msm.scene.scene import Scene
-from taichi_msm.view.events import Drag, Hover, Key, Press, Release, Strength, StrengthChange, Turn
+from taichi_msm.view.events import QUIT, Drag, Hover, Key, Press, Release, Strength, StrengthChange, Turn
+from taichi_msm.view.pacing import MAX_DELAY_S, Pacing
 from taichi_msm.view.script import load_script, schedule_events
-from taichi_msm.view.window import MAX_DELAY_S, QUIT, InputReader, Pacing, fit_picture, initial_window_size
+from taichi_msm.view.window import InputReader, fit_picture, initial_window_size
 from tests.conftest import Program
 from tests.golden import Messages
 from tests.outputs import duration
@@ -59,8 +60,11 @@ def test_a_script_is_done_and_filmed(small: Path, program: Program, message: Mes
 @pytest.mark.parametrize(
     "arguments",
     [
-        "--record a.gif",
+        "--seconds 1",
         "--script a.yaml",
+        "--port 8000",
+        "--browser --record a.gif --seconds 1",
+        "--browser --origin hub.example.org",
         "--record a.png --seconds 1",
         "--record a.gif --seconds 0",
         "--record a.gif --seconds nan",
@@ -75,6 +79,14 @@ def test_what_view_refuses(arguments: str, small: Path, capsys: pytest.CaptureFi
     # What click says of a range depends on its version.
     message(said.err, hide=r"0\.0 is not.*(?= \(see)")
     assert sorted(path.name for path in small.iterdir()) == ["small.yaml", "speckle.png"]
+
+
+def test_mp4_needs_pyav(
+    small: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, message: Messages
+) -> None:
+    monkeypatch.setattr("taichi_msm.scene.outputs.is_pyav_installed", lambda: False)
+    assert main(["view", "small.yaml", "--record", "a.mp4"]) == 2
+    message(capsys.readouterr().err, "--record", "pip")
 
 
 # Scripts with a fault, and where it is.

@@ -1,0 +1,351 @@
+"""Fast approximation of quasi-static machine tests: one curve of elastic force over travel, relaxed in time.
+
+All elastic forces relax alike, so that the shape of the tissue at rest depends on the travel of the tool only. With f,
+the elastic force over the travel, computed at few travels and interpolated, the force of every test at frame n is
+
+    F_n = (1 - G) f_n + sum of (s_i + share_i phi_i f_n)
+
+with shares, phi and the memory s_i of `terms/viscoelasticity.py`. Depths of contact, shares and times need no further
+curve, and log f is nearly linear in the logarithms of the other parameters, or in the reciprocal of a lock, with slopes
+from a curve each. This model is minimised within a trust region, and compared with a curve at its minimum, until it
+does not improve.
+
+It neglects the memory of mass points that leave the tool, and of those that slide along it. Therefore it is finally
+compared with runs of the tests, whose difference from the model is added to it. The Jacobian is that of the model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.errors import DivergedError, SceneError
+from taichi_msm.fitting.least_squares import Misfit, Search, Solution
+from taichi_msm.fitting.machine_model import MachineModel, MachineProblem, contact_keys
+from taichi_msm.fitting.predict import Prediction, Runs, difference_step, mesh_error
+from taichi_msm.load.check import check_scene
+from taichi_msm.model.plan import Plan
+from taichi_msm.scene.scene import Scene
+
+Array = NDArray[np.float64]
+
+# Travels of a curve above 0, and its reach beyond the greatest travel if depths of contact are free.
+TRAVELS, CONTACT_MARGIN = 24, 0.05
+
+# Share of branches in the runs of a curve, with which the tissue does not relax, but has the kernels of the tests.
+NO_SHARE = 1e-12
+
+# Initial and largest trust region of the parameters of a curve, in units of x.
+FIRST_REGION, MAX_REGION = 0.5, 2.0
+
+# Largest number of steps, and changes of the cost below which they end: relative, and absolute, which is a third of a
+# standard deviation of a parameter.
+MAX_STEPS, MIN_RELATIVE_CHANGE, MIN_CHANGE = 20, 1e-3, 0.05
+
+# Change of the forces by a change of x of 1 [sigma], below which a parameter is also searched from a smaller value.
+MIN_INFORMATION = 3.0
+
+# Number of starts of the parameters that need no curve.
+RELAXATION_STARTS = 64
+
+# Keys of stiffnesses, which are scaled by the measured forces before the search.
+STIFFNESSES = ("young", "foundation", "structural")
+
+# Largest logarithm of the factor of these starts.
+START_LOG = np.log(10.0)
+
+
+def has_curve(job: object) -> bool:
+    """Return whether the tests of a fit are quasi-static, and of a scene with one tool, which grips nothing."""
+    if not (isinstance(job, MachineProblem) and job.scene.time.at_rest):
+        return False
+    return len(job.scene.probes) == 1 and not job.scene.probes[0].grip
+
+
+def relax(elastic: Array, branches: Sequence[tuple[float, float]], h: float) -> Array:
+    """Return the force of tissue that relaxes.
+
+    Args:
+        elastic: elastic force at every frame, shape (frames,).
+        branches: share and time [s] of every branch.
+        h: time between frames [s].
+
+    Returns:
+        The force, shape (frames,).
+    """
+    if not branches:
+        return elastic
+    shares, times = np.array(branches).T
+    decay = np.exp(-h / times)
+    phi = -np.expm1(-h / times) * times / h
+    force, memory = elastic.copy(), shares * (decay - phi) * elastic[0]
+    for n in range(1, len(elastic)):
+        force[n] = (1 - shares.sum() + shares @ phi) * elastic[n] + memory.sum()
+        memory = decay * memory - shares * phi * (1 - decay) * elastic[n]
+    return force
+
+
+@dataclass(frozen=True, eq=False)
+class _Tangent:
+    """A curve, and its dependence on the parameters."""
+
+    x: Array  # coordinates of the parameters, shape (n,)
+    reach: float  # greatest travel [m]
+    forces: Array  # at x, shape (TRAVELS + 1,)
+    slopes: Array  # derivatives of their logarithms, shape (n, TRAVELS + 1)
+
+
+class CurveRuns(Runs):
+    """Predictions of machine tests by a tangent, or curves, with a correction of every frame; see `Runs`.
+
+    Attributes:
+        by_tangent: whether predictions are by the tangent.
+        of_curve: mask of the parameters on which a curve depends, shape (n,).
+        of_contact: mask of the depths of contact, shape (n,).
+    """
+
+    job: MachineProblem
+    _predictor: MachineModel
+    _tangent: _Tangent
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self._curves: dict[tuple[object, ...], Array] = {}
+        self._correction: Array | float = 0.0
+        self.by_tangent = True
+        keys = [parameter.key for parameter in self.job.parameters]
+        self.of_curve = np.array([not key.startswith(("contact", "tissue.relaxation.")) for key in keys])
+        self.of_contact = np.array([key.startswith("contact") for key in keys])
+        self._of_lock = np.array([key.endswith(".lock") for key in keys])
+
+    def first(self, x: Array) -> Prediction:
+        """Predict with the initial values; raises as `ForwardModel.predict` does."""
+        self._predictor.compile(x, self._report_progress)
+        predicted = self.run_curve(x)
+        assert predicted is not None
+        return predicted
+
+    def predict_one(self, x: Array, steps: int | None = None) -> Prediction | None:
+        """Predict at x by the tangent, or a curve; None if that fails."""
+        if not self.by_tangent:
+            return self.predict_coarse(x, 0)
+        tangent = self._tangent
+        try:
+            values = self._predictor.values(x)
+        except SceneError:
+            return None
+        distance = x - tangent.x
+        distance = np.where(self._of_lock, -np.expm1(-distance), distance)
+        return self._predict(values, tangent.reach, tangent.forces * np.exp(distance @ tangent.slopes))
+
+    def predict_many(self, coordinates: Sequence[Array], steps: int | None = None) -> list[Prediction | None]:
+        """Predict at several x as `predict_one` does."""
+        return [self.predict_one(x, steps) for x in coordinates]
+
+    def predict_coarse(self, x: Array, halvings: int) -> Prediction | None:
+        """Predict by a curve with the cells per side halved `halvings` times; None if that fails."""
+        try:
+            return self.run_curve(x, halvings)
+        except (SceneError, DivergedError):
+            return None
+
+    def mesh_error(self, x: Array) -> float | None:
+        """Estimate the mesh error at x, in the run of the curve."""
+        values = self._predictor.values(x)
+        return mesh_error(self._plan_curve(values, self._reach(values)), self._report_progress)
+
+    def run_curve(self, x: Array, halvings: int = 0) -> Prediction | None:
+        """Predict by a curve at x; None if the shares are too large; raises as `ForwardModel.predict` does.
+
+        Args:
+            x: coordinates of the parameters, shape (n,).
+            halvings: number of halvings of the cells per side.
+        """
+        values = self._predictor.values(x)
+        reach = self._reach(values)
+        return self._predict(values, reach, self._forces(values, reach, halvings))
+
+    def run_tests(self, x: Array) -> Prediction:
+        """Run the tests with the parameters at x; raises as `ForwardModel.predict` does."""
+        self.count += len(self.job.tests)
+        return self._predictor.predict(x, pause=self._report_progress)
+
+    def correct(self, x: Array, predicted: Prediction) -> None:
+        """Correct further predictions, so that the one at x is `predicted`."""
+        if (by_tangent := self.predict_one(x)) is not None:
+            self._correction = self._correction + predicted.values[0] - by_tangent.values[0]
+
+    def set_tangent(self, x: Array) -> None:
+        """Set the tangent to the curve at x; raises as `ForwardModel.predict` does."""
+        values = self._predictor.values(x)
+        reach = self._reach(values)
+        forces, slopes = self._forces(values, reach), np.zeros((len(x), TRAVELS + 1))
+        for n in np.flatnonzero(self.of_curve):
+            shifted, delta = x.copy(), difference_step(self.job.scene)
+            delta = delta if x[n] + delta <= self.job.parameters[n].limits[1] else -delta
+            shifted[n] += delta
+            moved = self._forces(self._predictor.values(shifted), reach)
+            is_pressed = (forces > 0) & (moved > 0)
+            slopes[n] = np.log(np.where(is_pressed, moved, 1.0) / np.where(is_pressed, forces, 1.0)) / delta
+        self._tangent = _Tangent(x, reach, forces, slopes)
+
+    @property
+    def reach(self) -> float:
+        """Greatest travel of the tangent's curve [m]."""
+        return self._tangent.reach
+
+    def _reach(self, values: dict[str, float]) -> float:
+        return self.job.reach(values) * (1 + CONTACT_MARGIN * self.of_contact.any())
+
+    def _predict(self, values: dict[str, float], reach: float, forces: Array) -> Prediction | None:
+        """Predict the tests by a curve; None if the shares are too large."""
+        from scipy.interpolate import PchipInterpolator
+
+        curve = PchipInterpolator(np.linspace(0, reach, TRAVELS + 1), forces)
+        branches = [
+            tuple(values.get(f"tissue.relaxation.{n}.{key}", branch[key]) for key in ("share", "time"))
+            for n, branch in enumerate(self._predictor.data.get("tissue", {}).get("relaxation", ()))
+        ]
+        if sum(share for share, _ in branches) >= 1:
+            return None
+        of_tests = [
+            relax(curve(loading.travel(values.get(key))), branches, 1 / loading.rate)
+            for loading, key in zip(self.job.tests, contact_keys(len(self.job.tests)), strict=True)
+        ]
+        return Prediction((np.concatenate(of_tests)[:, None] + self._correction,), 1, np.zeros(1))
+
+    def _forces(self, values: dict[str, float], reach: float, halvings: int = 0) -> Array:
+        """Run a curve; return its forces at equidistant travels [N], shape (TRAVELS + 1,)."""
+        of_curve = [value for value, matters in zip(values.values(), self.of_curve, strict=True) if matters]
+        key = (halvings, reach, *of_curve)
+        if key not in self._curves:
+            self._report_progress()
+            simulation, plan = self._predictor.start(self._plan_curve(values, reach), None, halvings)
+            self._curves[key] = self._predictor.forces(simulation, plan.grid.frames, self._report_progress)[:, 0]
+            self.count += 1
+        return self._curves[key]
+
+    def _plan_curve(self, values: dict[str, float], reach: float) -> Plan:
+        """Plan a run with equidistant travels up to `reach` [m], without relaxation."""
+        data = self.job.with_scene_values(self._predictor.data, values)
+        if branches := data.get("tissue", {}).get("relaxation"):
+            no_branches = [{**branch, "share": NO_SHARE} for branch in branches]
+            data = {**data, "tissue": {**data["tissue"], "relaxation": no_branches}}
+        time, travel = np.arange(TRAVELS + 1.0), np.linspace(0, reach, TRAVELS + 1)
+        return check_scene(Scene(**self.job.approach.place(data, time, travel, 1.0)), self._predictor.maps)
+
+
+def search_by_curve(runs: CurveRuns, misfit: Misfit, start: Array, first: Prediction) -> tuple[Search, Solution]:
+    """Minimise from a start by tangents, curves, and runs of the tests.
+
+    Args:
+        runs: the predictions.
+        misfit: the residuals.
+        start: coordinates of the parameters, shape (n,).
+        first: prediction there.
+
+    Returns:
+        The search by the last tangent, and the solution with the forces of the tests.
+
+    Raises:
+        SceneError: when the curve next to an estimate is not valid.
+        DivergedError: when it diverges.
+    """
+    search = Search(runs, misfit)
+    solution = _descend(runs, misfit, _scaled(runs, misfit, start, first), by_tests=False)
+    starts = []
+    if not search.fits_well(solution):
+        costs = []
+        for x in search.alternative_starts():
+            if (predicted := runs.predict_coarse(x, 0)) is not None:
+                costs.append((misfit.cost(misfit.residuals(predicted, solution.scales)), x.tolist()))
+        starts = [np.array(x) for _, x in sorted(costs)[:2]]
+    # Beyond the forces measured, a lock or factor has no effect, but may have a better value where it has.
+    information = np.linalg.norm(misfit.scaled(search.jacobian(solution), solution.scales), axis=0)
+    for n in np.flatnonzero(runs.of_curve & (information < MIN_INFORMATION)):
+        starts.append(solution.x.copy())
+        starts[-1][n] = max(start[n] - 1, runs.job.parameters[n].limits[0])
+    for x in starts:
+        with suppress(SceneError, DivergedError):
+            solution = min(solution, _descend(runs, misfit, x, by_tests=False), key=lambda each: each.cost)
+    runs.set_tangent(solution.x)
+    solution = _descend(runs, misfit, solution.x, by_tests=True)
+    runs.correct(solution.x, solution.predicted)
+    return Search(runs, misfit), solution
+
+
+def _scaled(runs: CurveRuns, misfit: Misfit, x: Array, initial: Prediction) -> Array:
+    """Scale the stiffnesses so that the `initial` forces have the size of the measured ones."""
+    predicted = misfit.row(initial)
+    measured = predicted - misfit.of(initial)
+    ratio = np.linalg.norm(measured) / max(float(np.linalg.norm(predicted)), 1e-300)
+    is_stiffness = [parameter.is_log and parameter.path[-1] in STIFFNESSES for parameter in runs.job.parameters]
+    low, high = np.array([parameter.limits for parameter in runs.job.parameters]).T
+    return np.clip(np.where(is_stiffness, x + np.log(ratio), x), low, high)
+
+
+def _descend(runs: CurveRuns, misfit: Misfit, start: Array, *, by_tests: bool) -> Solution:
+    """Minimise the tangent within a trust region, and evaluate its minimum by a curve or the tests, repeatedly."""
+    scales = misfit.scales(misfit.signals)
+
+    def evaluate(x: Array) -> Solution:
+        predicted = runs.run_tests(x) if by_tests else runs.run_curve(x)
+        assert predicted is not None
+        return Solution(x, predicted, scales, misfit.cost(misfit.residuals(predicted, scales)), converged=False)
+
+    def is_at_end(cost: float, current: float) -> bool:
+        return abs(current - cost) <= max(MIN_RELATIVE_CHANGE * current, MIN_CHANGE)
+
+    current = evaluate(start)
+    trial, region = current, np.where(runs.of_curve, FIRST_REGION, np.inf)
+    for step in range(MAX_STEPS):
+        if step and is_at_end(trial.cost, current.cost):
+            return replace(min(trial, current, key=lambda each: each.cost), converged=True)
+        if trial.cost <= current.cost:
+            if not by_tests:
+                runs.set_tangent(trial.x)
+            runs.correct(trial.x, trial.predicted)
+            current, region = trial, np.minimum(2 * region, np.where(runs.of_curve, MAX_REGION, np.inf))
+        else:
+            shrunk = np.minimum(region, np.abs(trial.x - current.x)) / 4
+            region = shrunk if by_tests else np.where(runs.of_curve, shrunk.max(where=runs.of_curve, initial=0), region)
+        limits = _limits(runs, current.x, region)
+        starts = [current.x] if by_tests or step else [current.x, *_relaxation_starts(runs, misfit, current, limits)]
+        minimum = min((Search(runs, misfit, limits).refine(x) for x in starts), key=lambda each: each.cost)
+        if is_at_end(minimum.cost, current.cost):
+            return replace(current, converged=True)
+        try:
+            trial = evaluate(minimum.x)
+        except (SceneError, DivergedError):
+            trial = replace(minimum, cost=np.inf)
+    return current
+
+
+def _limits(runs: CurveRuns, x: Array, region: Array) -> tuple[Array, Array]:
+    """Return the bounds of x within the trust region, and of depths of contact within the reach of the curve."""
+    low, high = np.array([parameter.limits for parameter in runs.job.parameters]).T
+    margin = np.array([CONTACT_MARGIN * runs.reach / (parameter.scale or 1) for parameter in runs.job.parameters])
+    below = np.where(runs.of_contact, np.minimum(region, margin), region)
+    return np.maximum(low, x - below), np.minimum(high, x + region)
+
+
+def _relaxation_starts(runs: CurveRuns, misfit: Misfit, current: Solution, limits: tuple[Array, Array]) -> list[Array]:
+    """Return the two best of many starts of the parameters that need no curve."""
+    free = np.flatnonzero(~runs.of_curve)
+    if not len(free):
+        return []
+    from scipy.stats import qmc
+
+    low, high = (np.clip(limit[free], current.x[free] - START_LOG, current.x[free] + START_LOG) for limit in limits)
+    costs = []
+    for shares in qmc.Sobol(len(free), seed=1).random(RELAXATION_STARTS):
+        x = current.x.copy()
+        x[free] = low + shares * (high - low)
+        if (predicted := runs.predict_one(x)) is not None:
+            costs.append((misfit.cost(misfit.residuals(predicted, current.scales)), x.tolist()))
+    return [np.array(x) for _, x in sorted(costs)[:2]]

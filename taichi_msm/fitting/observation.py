@@ -1,0 +1,158 @@
+"""Interface of an observation: measured values, and how a fit predicts, weighs, doubts and describes them."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from typing_extensions import Self
+
+from taichi_msm.errors import SceneError
+from taichi_msm.runs.simulation import Simulation
+from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.section import MAX_MAGNITUDE, MIN_MAGNITUDE
+
+Array = NDArray[np.float64]
+
+# Largest residual of a good fit, as a share of the signal and in sigma.
+MAX_RESIDUAL_SHARE, MAX_RESIDUAL_SIGMAS = 0.1, 2.0
+
+
+class ErrorCorrelation(NamedTuple):
+    """Correlation lengths of the errors of tracks; None: independent."""
+
+    correlation: float | None  # of two tracks [px]
+    drift: float | None  # of two times [s]
+
+
+class ObservationModel(ABC):
+    """Map from a run to the values of an observation."""
+
+    @abstractmethod
+    def record(self, simulation: Simulation) -> Array:
+        """Return what the model needs of the current frame."""
+
+    @abstractmethod
+    def predict(self, recorded: Array) -> Array:
+        """Return the values of the observation, from the records of all frames."""
+
+    def motion(self, recorded: Array) -> Array:
+        """Return the largest displacement of what is observed at each frame [m], shape (frames,)."""
+        return np.zeros(len(recorded))
+
+
+@dataclass(frozen=True, eq=False)
+class Observation(ABC):
+    """Measured values of any shape, NaN where not measured.
+
+    Attributes:
+        noun: name of the values, for messages.
+        unit: of the values and of sigma.
+        is_independent: whether the errors are independent, so that the values alone may reject a model.
+    """
+
+    noun: ClassVar[str]
+    unit: ClassVar[str]
+    is_independent: ClassVar[bool] = False
+
+    name: str  # of the file, in messages
+    time: Array  # of the values [s]
+    values: Array
+    sigma: float | Array | None  # standard deviation of the errors, of all or of each known value; None: estimated
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Mask of the measured values, with their shape."""
+        return np.isfinite(self.values)
+
+    def with_sigma(self, sigma: Any) -> Self:
+        """Replace sigma unless it is None; SceneError: not a positive number."""
+        if sigma is None:
+            return self
+        array = np.asarray(sigma)
+        is_number = array.dtype.kind in "fiu" and array.size == 1
+        if not (is_number and MIN_MAGNITUDE <= (value := float(array.ravel()[0])) <= MAX_MAGNITUDE):
+            shown = f"{value:g}" if is_number else f"{array.dtype} of shape {array.shape}"
+            remedy = f"take one number above 0, the standard deviation of the errors [{self.unit}], or leave it out"
+            raise SceneError([f"{self.name}: sigma: {shown}; {remedy}"])
+        return replace(self, sigma=value)
+
+    @abstractmethod
+    def build_model(self, scene: Scene, frames: int) -> ObservationModel:
+        """Build the map from a run of a scene; `frames`: their number, from the first one."""
+
+    @abstractmethod
+    def signal(self, scene: Scene) -> float:
+        """Return the root mean square of the values that a fit explains; 0 where there is none."""
+
+    @abstractmethod
+    def fits_well(self, residuals: Array, deviation: float, signal: float) -> bool:
+        """Return whether residuals are small.
+
+        Args:
+            residuals: of the known values.
+            deviation: their estimated standard deviation.
+            signal: as of `signal`.
+        """
+
+    @abstractmethod
+    def summary(self, residuals: Array, sigma: float | Array) -> dict[str, Any]:
+        """Return the fields of a `FitResult`: residual, and sigma as given or estimated."""
+
+    def faults(self, scene: Scene) -> Iterator[str]:
+        """Yield the faults that need no run: units, lost values."""
+        yield from ()
+
+    def is_still(self, scene: Scene) -> bool:
+        """Return whether the values show no motion."""
+        return False
+
+    def faults_at_start(self, scene: Scene, predicted: Array, *, same_camera: bool) -> Iterator[str]:
+        """Yield the faults that a run of the scene shows, with the camera of the observation or a fitted one."""
+        yield from ()
+
+    def opposed(self, scene: Scene, *predictions: Array) -> Iterator[str]:
+        """Yield components of the sign opposite to all predictions."""
+        yield from ()
+
+    def unit_faults(self, *predictions: Array) -> Iterator[str]:
+        """Yield the unit that explains the ratio of the values to all predictions."""
+        yield from ()
+
+    def pattern(self, residuals: Array, signal: float, correlation: ErrorCorrelation) -> str | None:
+        """Return the reason to reject a model by a pattern of the residuals, with the shape of the values, or None."""
+        return None
+
+    def factor_note(self, predicted: Array) -> str:
+        """Describe a common factor of the values and the prediction, or return an empty string."""
+        return ""
+
+    def correlated(self, rows: Array, correlation: ErrorCorrelation) -> tuple[Array, float]:
+        """Return R^T K R for rows R, shape (numbers, n), of known values, and tr(K^2), with K the errors' correlation.
+
+        Errors are independent by default.
+        """
+        return rows.T @ rows, float(len(rows))
+
+    def residual_notes(self, predicted: Array, signal: float, correlation: ErrorCorrelation) -> Iterator[str]:
+        """Yield warnings about the residuals."""
+        yield from ()
+
+
+def time_in_frames(scene: Scene, time: Array) -> Array:
+    """Convert times [s] to frame numbers, rounded to six decimals, so that frames are integers."""
+    return np.round(time * scene.time.frames_per_second, 6)
+
+
+def time_weights(scene: Scene, time: Array, frames: int) -> Any:
+    """Return the weights of linear interpolation at times [s] between frames, sparse, shape (T, frames)."""
+    from scipy.sparse import csr_matrix
+
+    position, row = time_in_frames(scene, time), np.arange(len(time))
+    before = np.clip(np.floor(position), 0, frames - 2).astype(int)
+    shares, frame = np.stack([1 - position + before, position - before]), np.stack([before, before + 1])
+    return csr_matrix((shares.ravel(), (np.tile(row, 2), frame.ravel())), (len(time), frames))

@@ -1,0 +1,50 @@
+"""Values of the material that a session can change."""
+
+from __future__ import annotations
+
+from operator import attrgetter
+from typing import Any
+
+from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.section import Section
+
+# Name and unit of the keys; those of a scene that are not above 0 cannot be changed.
+MATERIAL = {
+    "tissue.young": ("Young's modulus", "Pa"),
+    "tissue.foundation": ("foundation", "N/m³"),
+    "tissue.foundation.young": ("foundation", "Pa"),
+    "tissue.damping": ("damping", "1/s"),
+    "springs.structural": ("structural springs", "N/m"),
+    "springs.shear": ("shear springs", "N/m"),
+    "springs.virtual": ("virtual springs", "N/m"),
+    "damping": ("damping", "N s/m"),
+}
+
+# Largest factor, and its inverse the smallest, of the scene's value.
+MAX_FACTOR = 10.0
+
+
+def material_values(scene: Scene) -> dict[str, float]:
+    """Return the values above 0 of the material of a scene, by key."""
+    values = {}
+    for key in MATERIAL:
+        try:
+            value = attrgetter(key)(scene)
+        except AttributeError:
+            continue
+        if isinstance(value, (int, float)) and value > 0:
+            values[key] = float(value)
+    return values
+
+
+def with_value(section: Any, key: str, value: float) -> Any:
+    """Return a copy of a section.
+
+    Args:
+        section: the scene, or one of its sections.
+        key: dotted path of a key in it.
+        value: its new value.
+    """
+    name, _, rest = key.partition(".")
+    below: Section | float = with_value(getattr(section, name), rest, value) if rest else value
+    return section.model_copy(update={name: below})

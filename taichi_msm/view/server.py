@@ -1,0 +1,348 @@
+"""A session in browsers: a server on the loopback interface only sends pictures and readings, and receives events.
+
+Tornado serves it: one wheel without dependencies (docs/decisions/0032). The session and the server share a thread, as
+Taichi holds Python's lock while a kernel runs.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import hmac
+import io
+import json
+import secrets
+import socket
+import time
+from collections import deque
+from collections.abc import Collection
+from importlib.resources import files
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+from PIL import Image
+from tornado.httpserver import HTTPServer
+from tornado.httputil import HTTPServerRequest
+from tornado.web import Application, HTTPError, RequestHandler
+from tornado.websocket import WebSocketClosedError, WebSocketHandler
+
+from taichi_msm.errors import DeviceError, FilesError, Pause
+from taichi_msm.runs.media import Picture
+from taichi_msm.view.events import COMPILING, KEYS, POINTER, QUIT, STRENGTH_STEP, SWITCH_TOOL, Event, Release
+from taichi_msm.view.material import MATERIAL, MAX_FACTOR
+from taichi_msm.view.messages import MAX_BYTES, parse_message
+from taichi_msm.view.pacing import Pacing
+from taichi_msm.view.session import Session
+from taichi_msm.view.tools import PositionControlledTool
+
+ADDRESS = "127.0.0.1"
+LOOPBACK_NAMES = {ADDRESS, "localhost", "::1"}
+
+# The files of the page, by their path below the token, and their types.
+PAGE = {
+    "": ("index.html", "text/html"),
+    "style.css": ("style.css", "text/css"),
+    "view.js": ("view.js", "text/javascript"),
+}
+
+HEADERS = {
+    "Cache-Control": "no-store",
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src data:; "
+    "connect-src 'self'; frame-ancestors 'self'",
+    "Referrer-Policy": "no-referrer",
+    "Server": "taichi-msm",
+    "X-Content-Type-Options": "nosniff",
+}
+
+# Quality of the JPEGs; at 85, 512 x 512 pixels of tissue take 2 ms and 33 kB.
+JPEG_QUALITY = 85
+
+# Number of pictures on the way to a page, so that a slow connection lags by no more than these.
+MAX_UNREAD_PICTURES = 3
+
+MAX_PAGES = 16
+
+# Number of events that the page that steers may send within a frame, and of readings kept for a page.
+MAX_EVENTS = 500
+MAX_READINGS = 1000
+
+# Shortest wait for events between two pictures, and wait while no page is open [s].
+MIN_WAIT_S = 0.001
+IDLE_WAIT_S = 0.05
+
+
+def listen(port: int) -> socket.socket:
+    """Listen on a port of the loopback interface; 0: a free one.
+
+    Raises:
+        DeviceError: when the port cannot be used.
+    """
+    try:
+        listener = socket.create_server((ADDRESS, port))
+    except OSError as error:
+        reason = "is in use" if error.errno == errno.EADDRINUSE else f"cannot be used ({error.strerror})"
+        raise DeviceError(f"--port {port}: {reason}; take another, or leave --port out for a free one") from None
+    listener.setblocking(False)
+    return listener
+
+
+class Server:
+    """Server of a session to pages in browsers. The page that has been open longest steers, the others watch.
+
+    Args:
+        session: a new session.
+        listener: see `listen`.
+        title: of the page.
+        origins: of pages behind a proxy, in addition to the loopback interface's own.
+
+    Attributes:
+        url: address of the page, with a random token.
+        pages: connected pages, in the order of their connection.
+    """
+
+    def __init__(self, session: Session, listener: socket.socket, title: str, origins: Collection[str] = ()) -> None:
+        self._session, self._listener, self._origins, self._title = session, listener, origins, title
+        self._port, self._token = listener.getsockname()[1], secrets.token_urlsafe(24)
+        self.url = f"http://{ADDRESS}:{self._port}/{self._token}/"
+        self.pages: list[_Connection] = []
+        self._events: deque[Event] = deque()
+        self._handled = 0
+        # The last picture, as it was drawn and as it was sent.
+        self._picture: Picture | None = None
+        self._jpeg = b""
+
+    async def run(self, pause: Pause) -> None:
+        """Serve the session until the page that steers quits.
+
+        Args:
+            pause: called before every picture; an exception from it ends the session.
+        """
+        handlers: list[Any] = [(r"/[^/]+/socket", _Connection, {"server": self}), (r".*", _Page, {"server": self})]
+        application = Application(
+            handlers,
+            log_function=lambda handler: None,
+            websocket_max_message_size=MAX_BYTES,
+            websocket_ping_interval=20,
+        )
+        http = HTTPServer(application, max_body_size=MAX_BYTES)
+        http.add_socket(self._listener)
+        try:
+            await self._run(pause)
+        finally:
+            http.stop()
+            for page in self.pages:
+                page.send(json.dumps({"ended": True}))
+                page.close(1001)
+            await asyncio.sleep(0.1)  # in which the pages receive it
+            await http.close_all_connections()
+
+    def permits(self, request: HTTPServerRequest) -> bool:
+        """Return whether a request has the token, and an origin, if any, that is known."""
+        token = request.path.lstrip("/").partition("/")[0]
+        origin = request.headers.get("Origin")
+        known = origin is None or origin in self._origins or self._is_own(origin, request.host)
+        return hmac.compare_digest(token.encode("utf-8", "replace"), self._token.encode()) and known
+
+    def _is_own(self, origin: str, host: str) -> bool:
+        """Return whether an origin is this server's, or that of a port that `ssh -L` forwards to it."""
+        try:
+            parts, forwarded = urlsplit(origin), urlsplit(f"//{host}").port
+            own = f"{parts.scheme}://{parts.netloc}" == origin and parts.scheme == "http"
+            return own and parts.hostname in LOOPBACK_NAMES and parts.port in (self._port, forwarded)
+        except ValueError:
+            return False
+
+    def connect(self, page: _Connection) -> None:
+        """Add a page, and describe the session to it."""
+        session = self._session
+        material = [
+            {"key": key, "name": MATERIAL[key][0], "unit": MATERIAL[key][1], "initial": initial}
+            for key, (_, initial) in session.material().items()
+        ]
+        self.pages.append(page)
+        description = {
+            "title": self._title,
+            "size": session.viewport.render.size,
+            "strength_step": STRENGTH_STEP,
+            "material": material,
+            "max_factor": MAX_FACTOR,
+            "keys": POINTER | KEYS,
+        }
+        page.send(json.dumps(description))
+
+    def disconnect(self, page: _Connection) -> None:
+        """Remove a page; if it steered, the tool lets go, and the next page steers."""
+        if page is self.pages[0]:
+            self._events.append(Release())
+        self.pages.remove(page)
+
+    def receive(self, page: _Connection, message: str | bytes) -> None:
+        """Process a message of a page; describe the fault of a message that is not valid to it."""
+        try:
+            event = parse_message(message)
+        except (ValueError, RecursionError) as error:
+            page.send(json.dumps({"error": str(error)}))
+            return
+        if event is None:
+            page.unread = max(0, page.unread - 1)
+        elif page is self.pages[0]:
+            if len(self._events) < MAX_EVENTS:
+                self._events.append(event)
+            else:
+                page.close(1008, "too many events")
+
+    async def _run(self, pause: Pause) -> None:
+        session = self._session
+        pacing = Pacing(session.frame_rate, time.perf_counter)
+        while True:
+            pause()
+            await asyncio.sleep(max(MIN_WAIT_S, pacing.delay_s()) if self.pages else IDLE_WAIT_S)
+            while self._events:
+                event = self._events.popleft()
+                if event == QUIT:
+                    return
+                if event == SWITCH_TOOL:
+                    await self._announce(COMPILING)
+                try:
+                    session.handle(event)
+                except FilesError as error:
+                    # A full disk must not end the session.
+                    session.show_notice(str(error))
+                self._handled += 1
+            if not self.pages:
+                continue
+            for _ in pacing.due_frames():
+                self._advance()
+            if not session.viewport.is_compiled:
+                await self._announce(COMPILING)
+            self._show(pacing.status())
+
+    def _advance(self) -> None:
+        """Advance the session by a frame, and keep its readings for every page."""
+        session, before = self._session, self._session.frame
+        session.advance()
+        if session.frame != before:
+            time_s = session.frame / session.frame_rate
+            reading = [float(f"{value:.5g}") for value in (time_s, session.tool_force(), session.depth())]
+            for page in self.pages:
+                page.readings.append(reading)
+
+    def _show(self, pacing: str) -> None:
+        """Send the state, and the picture if it has changed, to the pages that have read the earlier ones."""
+        ready = [page for page in self.pages if page.unread < MAX_UNREAD_PICTURES]
+        if not (ready or self._session.filming):
+            return
+        picture = self._session.bare_picture()
+        if self._picture is None or not np.array_equal(picture, self._picture):
+            self._picture, self._jpeg = picture, encode_jpeg(picture)
+        state = self._state(pacing)
+        for page in ready:
+            own = {"steers": page is self.pages[0], "readings": list(page.readings)}
+            header = json.dumps({**state, **own}, allow_nan=False).encode()
+            jpeg = b"" if page.jpeg is self._jpeg else self._jpeg
+            page.send(len(header).to_bytes(4, "big") + header + jpeg)
+            page.jpeg = self._jpeg
+            page.unread += 1
+            page.readings.clear()
+
+    def _state(self, pacing: str) -> dict[str, Any]:
+        """Return the state of the session for a page."""
+        session, tool = self._session, self._session.tool
+        return {
+            "handled": self._handled,
+            "time": session.frame / session.frame_rate,
+            "watching": len(self.pages) - 1,
+            "strength": tool.strength,
+            "by_position": isinstance(tool, PositionControlledTool),
+            "paused": session.paused,
+            "filming": session.filming,
+            "light": session.viewport.render.shading != "none",
+            "mesh": session.viewport.render.wireframe,
+            "notice": session.notice,
+            "pacing": pacing,
+            "material": {key: current for key, (current, _) in session.material().items()},
+        }
+
+    async def _announce(self, notice: str) -> None:
+        """Show a notice on all pages before a longer pause."""
+        for page in self.pages:
+            page.send(json.dumps({"notice": notice}))
+        await asyncio.sleep(MIN_WAIT_S)
+
+
+def encode_jpeg(picture: Picture) -> bytes:
+    """Encode a picture, shape (height, width, 3), as JPEG."""
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, "JPEG", quality=JPEG_QUALITY)
+    return file.getvalue()
+
+
+class _Guarded(RequestHandler):
+    """A handler of requests that the server permits."""
+
+    def initialize(self, server: Server) -> None:
+        self.server = server
+
+    def prepare(self) -> None:
+        if not self.server.permits(self.request):
+            raise HTTPError(403)
+
+    def set_default_headers(self) -> None:
+        for name, value in HEADERS.items():
+            self.set_header(name, value)
+
+
+class _Page(_Guarded):
+    """The files of the page."""
+
+    def get(self) -> None:
+        token, slash, name = self.request.path.lstrip("/").partition("/")
+        if not slash:
+            self.redirect(f"{token}/")
+            return
+        if name not in PAGE:
+            raise HTTPError(404)
+        file, kind = PAGE[name]
+        self.set_header("Content-Type", f"{kind}; charset=utf-8")
+        self.write((files("taichi_msm.view") / "page" / file).read_bytes())
+
+
+class _Connection(_Guarded, WebSocketHandler):
+    """The connection of a page.
+
+    Attributes:
+        unread: number of pictures that the page has not read yet.
+        readings: time [s], force [N] and depth [m] of the frames since the last picture.
+        jpeg: the last picture that was sent to it.
+    """
+
+    def open(self) -> None:
+        self.unread = 0
+        self.readings: deque[list[float]] = deque(maxlen=MAX_READINGS)
+        self.jpeg = b""
+        self.set_nodelay(True)
+        if len(self.server.pages) < MAX_PAGES:
+            self.server.connect(self)
+        else:
+            self.close(1013, "too many pages")
+
+    def on_message(self, message: str | bytes) -> None:
+        if self in self.server.pages:
+            self.server.receive(self, message)
+
+    def on_close(self) -> None:
+        if self in self.server.pages:
+            self.server.disconnect(self)
+
+    def check_origin(self, origin: str) -> bool:  # noqa: ARG002
+        """Permit the origins that `prepare` has checked."""
+        return True
+
+    def send(self, message: str | bytes) -> None:
+        """Send a message, unless the page has left."""
+        try:
+            sent = self.write_message(message, binary=isinstance(message, bytes))
+        except WebSocketClosedError:
+            return
+        sent.add_done_callback(lambda future: future.cancelled() or future.exception())
