@@ -14,6 +14,7 @@ from taichi_msm.accuracy.contact_warnings import tool_contact_warnings
 from taichi_msm.errors import SceneError
 from taichi_msm.load.check import check_scene
 from taichi_msm.runs.run import resume, run
+from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.tools import Probe
 from taichi_msm.solver.dynamics import choose_layout
@@ -201,6 +202,14 @@ def test_what_cannot_be_rough_is_refused(name: str, message: Messages) -> None:
     key, make = REFUSED[name]
     with message.raises(SceneError, key):
         check_scene(make())
+
+
+def test_steering_to_a_number_is_refused(device: Device, message: Messages) -> None:
+    made, path = at_rest([ball([0, 0.5, 0.5, 0.001])], sheet=SMALL, tissue=SOFT), [[0.5, 0.5, 0.5, 0.002]]
+    with Simulation(made, threads=device.threads) as simulation:
+        simulation.steer([{"path": path, "friction": 0.0}])
+        with message.raises(SceneError, "probes.0.friction"):
+            simulation.steer([{"path": path, "friction": 0.3}])
 
 
 def test_a_tip_that_slides_is_told_to_be_rough(message: Messages) -> None:
