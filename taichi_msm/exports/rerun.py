@@ -35,6 +35,7 @@ from taichi_msm.exports.inputs import (
 )
 from taichi_msm.model.surface import place_instruments, refine_surface
 from taichi_msm.render.camera import OPENCV_SIGNS, View, calibration, is_moving, view_at
+from taichi_msm.render.labels import NO_FLOW
 from taichi_msm.render.texture import load_texture
 from taichi_msm.runs.arrays import read_flo
 from taichi_msm.runs.finished import FinishedRun, reading
@@ -161,4 +162,6 @@ def _log_pictures(run: FinishedRun, frame: int, entity: str, recording: Any) -> 
         path = run.result_path("flow", frame)
         with reading(path):
             flow = read_flo(path, run.scene.render.size)
-        recording.log(f"{entity}/flow", rerun.Tensor(flow, dim_names=("height", "width", "right and down")))
+        largest = float(np.abs(flow[flow < NO_FLOW / 2]).max(initial=1.0))
+        tensor = rerun.Tensor(flow, dim_names=("height", "width", "right and down"), value_range=(-largest, largest))
+        recording.log(f"{entity}/flow", tensor)

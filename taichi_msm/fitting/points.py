@@ -27,7 +27,7 @@ from taichi_msm.fitting.observation import (
     time_weights,
 )
 from taichi_msm.model.surface import surface_weights
-from taichi_msm.render.camera import view
+from taichi_msm.render.camera import view_at
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 
@@ -359,7 +359,9 @@ class Pixels(PointObservation):
 
     def observe(self, scene: Scene, points: Array) -> Array:
         """Project points by the scene's main camera; NaN behind the eye, or beyond the lens."""
-        return np.stack([view(scene, each).pixels(points[:, n]) for n, each in enumerate(self.time.tolist())], axis=1)
+        return np.stack(
+            [view_at(scene, each).pixels(points[:, n]) for n, each in enumerate(self.time.tolist())], axis=1
+        )
 
     def backward(self, scene: Scene, points: Array, gradient: Array) -> Array:
         """Convert the gradient by central differences of the projection; see `PointObservation.backward`."""

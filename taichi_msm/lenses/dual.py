@@ -39,6 +39,9 @@ class Dual:
         ratio = self.value / value
         return Dual(ratio, (self.slope - slope * ratio) / value)
 
+    def __rsub__(self, other: Any) -> Dual:
+        return Dual(other - self.value, -self.slope)
+
     __radd__, __rmul__ = __add__, __mul__
 
 

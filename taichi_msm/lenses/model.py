@@ -14,6 +14,9 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.polynomial import Polynomial
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
 
 # Maximum valid radius of any lens.
 MAX_RADIUS = math.tan(math.radians(88))
@@ -67,6 +70,10 @@ class LensModel(ABC):
     @abstractmethod
     def limit(self, coefficients: Sequence[float]) -> float:
         """Return the least radius at which the distortion folds back or has a pole, at most `MAX_RADIUS`."""
+
+    def undistort(self, distorted: Array, coefficients: Sequence[float]) -> Array | None:
+        """Invert the formula in closed form, with NaN beyond the limit; None if only Newton's method can."""
+        return None
 
     def without_tangential(self, coefficients: Sequence[float]) -> tuple[float, ...]:
         """Return the coefficients with p1 = p2 = 0."""

@@ -18,10 +18,13 @@ import numpy as np
 from numpy.polynomial import Polynomial
 
 from taichi_msm.lenses.fisheye import MIN_SQUARED_RADIUS
-from taichi_msm.lenses.model import MAX_RADIUS, NUMPY, Coefficient, LensModel, Operations, positive_roots
+from taichi_msm.lenses.model import MAX_RADIUS, NUMPY, Array, Coefficient, LensModel, Operations, positive_roots
 
-# Steps of Newton's method; lenses of endoscopes need 6.
-NEWTON_STEPS = 12
+# Steps of the iteration; lenses of endoscopes need 3, those that fold back 5.
+STEPS = 5
+
+# Discriminant of the parabola's roots at which the lens ends, just before the fold, where it is 0.
+MIN_DISCRIMINANT = 1e-7
 
 # Maximum error of t, 1e-6 px at a focal length of 1000 px, and the number of radii at which it is verified.
 ROOT_TOLERANCE, ROOT_CHECKS = 1e-9, 2048
@@ -52,18 +55,31 @@ class Scaramuzza(LensModel):
             r = sqrt(maximum(x * x + y * y, MIN_SQUARED_RADIUS))
             # The solution with a3 = a4 = 0, at most the stereographic one.
             t = 2.0 * r / (1.0 + sqrt(1.0 + maximum(b2 * (-4.0), 1.0) * r * r))
-            for _ in range(NEWTON_STEPS):
-                g = 1.0 + t * t * (b2 + t * (b3 + t * b4))
-                slope = t * (2.0 * b2 + t * (3.0 * b3 + t * (4.0 * b4)))
-                t = t + (t - r * g) / (r * slope - 1.0)
+            for _ in range(STEPS):
+                # The nearer root of the parabola that touches h = t - r g; Newton's method is slow near a fold.
+                h = t - r * (1.0 + t * t * (b2 + t * (b3 + t * b4)))
+                first = 1.0 - r * t * (2.0 * b2 + t * (3.0 * b3 + t * (4.0 * b4)))
+                second = r * (2.0 * b2 + t * (6.0 * b3 + t * (12.0 * b4)))
+                t = t - 2.0 * h / (first + sqrt(maximum(first * first + 2.0 * h * second, MIN_DISCRIMINANT)))
             ratio = t / r
             u, v = x * ratio, y * ratio
             return c * u + d * v, e * u + v
 
         return distort
 
+    def undistort(self, distorted: Array, coefficients: Sequence[float]) -> Array:
+        """Return (u, v) / g(t)."""
+        a0, a2, a3, a4, c, d, e = coefficients
+        x, y = np.moveaxis(distorted, -1, 0)
+        u, v = np.stack([x - d * y, c * y - e * x]) / (c - d * e)
+        t = np.hypot(u, v)
+        radial = a0, a2, a3, a4, 1.0, 0.0, 0.0
+        end, _ = self.build(NUMPY)(np.array(self.limit(coefficients)), 0.0, *radial)
+        g = np.where(t < end, 1 + t * t * a0 * (a2 + t * a0 * (a3 + t * a0 * a4)), np.nan)
+        return np.stack([u / g, v / g], axis=-1)
+
     def limit(self, coefficients: Sequence[float]) -> float:
-        """Return the radius up to which r = t / g(t) increases and Newton's method finds t."""
+        """Return the radius up to which r = t / g(t) increases and the iteration finds t."""
         a0, a2, a3, a4, *_ = coefficients
         t = Polynomial([0, 1])
         g = Polynomial([1, 0, a2 * a0, a3 * a0**2, a4 * a0**3])

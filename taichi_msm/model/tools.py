@@ -211,15 +211,19 @@ def path_problems(scene: Scene, tools: Sequence[Tool], grid: TimeGrid) -> Iterat
         if depth > 1e-9 * tool.radius:
             text = f"the instrument is {depth:.3g} m in the sheet at rest at 0 s; begin above it, at a greater height"
             yield Problem(key, text)
-        if tool.rough and not scene.time.at_rest:
-            text = "rough needs time.motion: quasistatic; give Coulomb's coefficient, such as 0.3"
-            yield Problem(("probes", tool.probe, "friction"), text)
-        if scene.time.at_rest:
-            if 0 < tool.friction < math.inf:
-                text = f"{tool.friction:g} needs time.motion: dynamic, as at rest nothing slides; take rough or 0"
-                yield Problem(("probes", tool.probe, "friction"), text)
-        elif fault := too_fast(tool, grid):
+        if problem := friction_problem(tool, at_rest=scene.time.at_rest):
+            yield Problem(("probes", tool.probe, "friction"), problem)
+        if not scene.time.at_rest and (fault := too_fast(tool, grid)):
             yield Problem((*key, fault[0]), fault[1])
+
+
+def friction_problem(tool: Tool, *, at_rest: bool) -> str:
+    """Return a message about friction that tools do not have in motion, or at rest; empty if there is none."""
+    if tool.rough and not at_rest:
+        return "rough needs time.motion: quasistatic; give Coulomb's coefficient, such as 0.3"
+    if at_rest and 0 < tool.friction < math.inf:
+        return f"{tool.friction:g} needs time.motion: dynamic, as at rest nothing slides; take rough or 0"
+    return ""
 
 
 def _clamp_problems(clamp: Clamp, scene: Scene) -> Iterator[Problem]:

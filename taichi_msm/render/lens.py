@@ -44,7 +44,7 @@ class Lens(NamedTuple):
         return self._distort_with_jacobian(points)[1]
 
     def undistort(self, distorted: Array) -> Array:
-        """Invert `distort` by Newton's method, starting from the solution without tangential distortion.
+        """Invert `distort`, in closed form or by Newton's method from the solution without tangential distortion.
 
         Args:
             distorted: distorted normalised image coordinates, shape (..., 2).
@@ -52,6 +52,9 @@ class Lens(NamedTuple):
         Returns:
             Undistorted coordinates, shape (..., 2); NaN without a solution within the limit of the lens.
         """
+        inverse = MODELS[self.model].undistort(distorted, self.coefficients)
+        if inverse is not None:
+            return inverse
         limit = self.limit
         # Without the limit itself, which may be a pole.
         radii = limit * np.sin(np.linspace(0, np.pi / 2, 4097)[:-1])

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.model.surface import Solid
 from taichi_msm.render import uniforms as uni
-from taichi_msm.render.camera import View, view, view_at
+from taichi_msm.render.camera import View, view_at
 from taichi_msm.render.config import DrawingConfig
 from taichi_msm.render.cpu import Bands
 from taichi_msm.render.gpu import Threads
@@ -69,7 +69,7 @@ class Rasterizer:
     def __init__(self, scene: Scene, texture: NDArray[np.uint8], config: DrawingConfig | None = None) -> None:
         self.scene = scene
         self.config = config or drawing_config(scene)
-        self._view = view(scene)
+        self._view = view_at(scene, 0.0)
         self._cached: tuple[View, NDArray[np.float32]] | None = None
         self._optics: tuple[object, ...] = ()
         self._texture_size = texture.shape[1], texture.shape[0]

@@ -63,7 +63,7 @@ class Renderer:
     def restart(self, scene: Scene) -> None:
         """Replace the scene, and discard its rasterisers."""
         self._rasterizers.clear()
-        self.scene, self.view = scene, view(scene)
+        self.scene, self.view = scene, view_at(scene, 0.0)
         names = scene.render.all_cameras
         self._has_moving_camera = any(is_moving(scene, name) for name in names)
         self._views = {name: self.view if name == scene.render.main else view_at(scene, 0.0, name) for name in names}

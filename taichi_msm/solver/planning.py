@@ -32,7 +32,7 @@ from taichi_msm.model.sheet import (
     tissue_problems,
 )
 from taichi_msm.model.time_grid import TimeGrid
-from taichi_msm.model.tools import Tool, build_tools, path_problems, too_fast
+from taichi_msm.model.tools import Tool, build_tools, friction_problem, path_problems, too_fast
 from taichi_msm.model.verlet import stability_limit
 from taichi_msm.scene.scene import Scene, Time
 from taichi_msm.scene.section import FRAME_TOLERANCE
@@ -385,7 +385,10 @@ class _PathChange:
         grid, sheet = self._plan.grid, self._plan.scene.sheet
         (old_tool,), (tool,) = build_tools((self._before,), sheet), build_tools((self.probe,), sheet)
         first = len(self._past) - 1
-        if not self._plan.scene.time.at_rest and (fault := too_fast(tool, grid, first)):
+        at_rest = self._plan.scene.time.at_rest
+        if problem := friction_problem(tool, at_rest=at_rest):
+            yield Problem((*key, "friction"), problem)
+        if not at_rest and (fault := too_fast(tool, grid, first)):
             yield Problem((*key, "path", fault[0] - first - 1), fault[1])
         deviation = _shape_change(old_tool, tool)
         if deviation > tool.stride:

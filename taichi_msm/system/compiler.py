@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import ast
+import inspect
+import linecache
 import os
 import platform
+import re
 import sys
-from collections.abc import Mapping
+import textwrap
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib import import_module
 from pathlib import Path
+from types import FrameType, SimpleNamespace
 from typing import Any
 
 from taichi_msm.errors import DeviceError, NotInstalledError, did_you_mean
@@ -96,7 +102,12 @@ class Compiler:
         before = os.environ.get(level)
         os.environ[level] = "error"
         try:
-            return import_module(self.name)
+            with _fast_frames():
+                package = import_module(self.name)
+            if self.name == "taichi" and self.version == self.tested_version:
+                decorators: Any = import_module("taichi.lang.kernel_impl")
+                decorators._inside_class = _is_in_class
+            return package
         except ImportError as error:
             raise NotInstalledError(f"{self.title} cannot be imported: {error}; {self.remedy}") from error
         finally:
@@ -108,8 +119,9 @@ class Compiler:
     def patches(self) -> Patches:
         """Patches that are applied while a kernel of this package is parsed; empty for an untested version.
 
-        They omit the source lines that a compiler prepares for error messages at every node. It parses all kernels in
-        every process, because the keys of its cache depend on the parsed kernels.
+        They omit the source lines that a compiler prepares for error messages at every node, and find the source of a
+        function once, not for each of its calls. It parses all kernels in every process, because the keys of its cache
+        depend on the parsed kernels.
         """
         if "TAICHI_MSM_TRACEBACK" in os.environ or self.version != self.tested_version:
             return []
@@ -120,9 +132,14 @@ class Compiler:
             def read(context: Any, node: ast.AST) -> Any:
                 return getattr(reader.ASTTransformer, f"build_{type(node).__name__}")(context, node)
 
+            sources = import_module("taichi.lang.kernel_impl")
             return [
                 (nodes.ASTTransformerContext, "get_pos_info", lambda context, node: ""),
                 (reader, "build_stmt", read),
+                (sources, "getsourcefile", cache(sources.getsourcefile)),
+                (sources, "getsourcelines", cache(sources.getsourcelines)),
+                # Taichi wraps every line into itself.
+                (sources, "textwrap", SimpleNamespace(fill=lambda line, **_: line.rstrip(), dedent=textwrap.dedent)),
             ]
         kernels = import_module("quadrants.lang.kernel")
         look_up = kernels.Kernel._try_load_fastcache
@@ -137,6 +154,35 @@ class Compiler:
             (kernels.Kernel, "_try_load_fastcache", skip_dataclasses),
             (kernels._kernel_impl_dataclass, "unpack_ast_struct_expressions", lambda tree, struct_locals: tree),
         ]
+
+
+# Taichi's decorators look at the line around them, to find out whether it begins a class. `inspect.getframeinfo` also
+# searches all modules for it, which takes a third of Taichi's import.
+
+
+def _frame_info(frame: FrameType, context: int = 1) -> inspect.Traceback:  # noqa: ARG001
+    file, line = frame.f_code.co_filename, frame.f_lineno
+    return inspect.Traceback(file, line, frame.f_code.co_name, [linecache.getline(file, line)], 0)
+
+
+@contextmanager
+def _fast_frames() -> Iterator[None]:
+    """Replace `inspect.getframeinfo` within the block."""
+    original = inspect.getframeinfo
+    inspect.getframeinfo = _frame_info  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        inspect.getframeinfo = original
+
+
+def _is_in_class(level_of_class_stackframe: int) -> bool:
+    """Return whether the line of a frame of the stack begins a class, as Taichi's function does."""
+    try:
+        (line,) = _frame_info(sys._getframe(level_of_class_stackframe)).code_context or [""]
+    except ValueError:
+        return False
+    return re.match(r"\s*(class |@(\w+\.)?data_oriented)", line) is not None
 
 
 _TAICHI = Compiler(

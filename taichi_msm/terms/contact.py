@@ -138,7 +138,7 @@ class ContactTerm(Term):
             return ""
         return (
             "friction and grips cannot be added where there were none; restart with the new scene, such as with a "
-            "friction of 1e-9, or with a grip that ends before the start"
+            "friction of 1e-9, at rest rough, or with a grip that ends before the start"
         )
 
     def build_correction(self, config: KernelConfig) -> Correction:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,7 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_PROBES
 from taichi_msm.solver.planning import plan_variant, with_time
 from taichi_msm.system import runtime
+from taichi_msm.system.process import available_threads
 from taichi_msm.view import events, overlay
 from taichi_msm.view.controller import Controller, Viewport
 from taichi_msm.view.material import MAX_FACTOR, material_values, with_value
@@ -40,6 +42,8 @@ NOTICE_DURATION_S = 3.0
 def divide_frames(plan: Plan) -> tuple[Plan, int]:
     """Divide the frames of a scene into equal subframes, at most `MAX_FRAME_RATE` per second.
 
+    With `precision: auto` they are in f32, which takes half the time: a session steps all the time, unlike a run.
+
     Returns:
         The plan with subframes as frames, and the number of subframes per frame of the scene.
     """
@@ -49,7 +53,10 @@ def divide_frames(plan: Plan) -> tuple[Plan, int]:
         steps = plan.grid.steps_per_frame
         while steps % subframes:
             subframes -= 1
-    return plan_variant(plan, with_time(scene, frames_per_second=scene.time.frames_per_second * subframes)), subframes
+    changes: dict[str, Any] = {"frames_per_second": scene.time.frames_per_second * subframes}
+    if scene.time.precision == "auto" and scene.time.tolerance is None:
+        changes["precision"] = "f32"
+    return plan_variant(plan, with_time(scene, **changes)), subframes
 
 
 class Session:
@@ -121,7 +128,8 @@ class Session:
         # Since the last reset [N].
         self._max_felt_force = 0.0
         progress("compile")
-        self._simulation = Simulation(plan, arch, threads, texture)
+        # Workers spin while they wait for each other; one core is left for the browser.
+        self._simulation = Simulation(plan, arch, threads, texture, max(1, available_threads() - 1))
         self._simulation.compile(lambda: progress("compile"))
         self._scene_material = material_values(scene)
         self.viewport = Viewport(self._simulation.renderer, play=play)

@@ -44,7 +44,10 @@ def undistorted(camera: View, x: Array, y: Array) -> tuple[Array, Array]:
     if camera.lens.model == "scaramuzza":
         # Its own direction: from the sensor to the ray, in closed form.
         a, b = scaramuzza_ray(camera.lens.coefficients, x - camera.centre[0], y - camera.centre[1])
-        good = np.hypot(a, b) < camera.lens.limit
+        # Beyond a fold a pixel has the ray of another one.
+        u, v = scaramuzza_pixel(camera.lens.coefficients, a, b)
+        there = np.hypot(u - x + camera.centre[0], v - y + camera.centre[1]) < 1e-3
+        good = there & (np.hypot(a, b) < camera.lens.limit)
         return (
             np.where(good, camera.centre[0] + camera.scale[0] * a, np.nan),
             np.where(good, camera.centre[1] + camera.scale[1] * b, np.nan),
