@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 from functools import cache
 from pathlib import Path
 
@@ -12,6 +11,8 @@ __version__ = "0.1.0"
 @cache
 def commit() -> str | None:
     """Return the commit of the clone that this package is in; None if it is installed, or without git."""
+    import subprocess  # Slow to import, and most commands do not need it.
+
     folder = Path(__file__).parents[1] / ".git"
     if not folder.exists():
         return None
