@@ -50,8 +50,8 @@ def scene_keys() -> str:
     return "| key | meaning | value | default |\n|---|---|---|---|\n" + "\n".join(rows(whole, whole["$defs"])) + "\n"
 
 
-def window_keys() -> str:
-    """Give the table of what the pointer and the keys do in the window."""
+def page_keys() -> str:
+    """Give the table of what the pointer and the keys do on the page of a session."""
     lines = [f"| {name} | {does} |" for name, does in POINTER.items()]
     lines += [f"| `{name}` | {does} |" for name, does in KEYS.items()]
     return "| | |\n|---|---|\n" + "\n".join(lines) + "\n"
@@ -84,7 +84,7 @@ def readers(table: Sequence[CalibrationReader] | Sequence[TrajectoryReader]) -> 
 # What makes each table, by its page and its name there.
 TABLES: dict[tuple[str, str], Callable[[], str]] = {
     ("keys", "keys"): scene_keys,
-    ("view", "hands"): window_keys,
+    ("view", "hands"): page_keys,
     ("sweep", "sweep keys"): partial(model_keys, SweepSettings, "key", "meaning", "value", "default"),
     ("sweep", "distributions"): partial(model_keys, Distribution, "way", "how the key varies", "value"),
     ("cameras", "calibrations"): partial(readers, calibrations.READERS),

@@ -117,7 +117,9 @@ def study(
 @arch_option
 @threads_option
 @click.option("--play", is_flag=True, help="Let the scene's own probes act as well.")
-@click.option("--browser", is_flag=True, help="Serve a page to a browser, on this machine only.")
+@click.option(
+    "--browser", is_flag=True, expose_value=False, help="Show the session on a page in a browser: the default."
+)
 @click.option(
     "--port", type=click.IntRange(0, 65535), metavar="N", help="Port of the page.  [default: a free one]", default=0
 )
@@ -129,7 +131,7 @@ def study(
     "--seconds",
     type=click.FloatRange(min=0, max=3600, min_open=True),
     metavar="N",
-    help="With --record: film so long, without a window.",
+    help="With --record: film so long, without a page.",
 )
 @click.option("--script", metavar="EVENTS", help="With --seconds: events of the film, a YAML file.")
 def view(
@@ -140,24 +142,21 @@ def view(
     arch: str,
     threads: int | None,
     play: bool,
-    browser: bool,
     port: int,
     origins: tuple[str, ...],
     record: str | None,
     seconds: float | None,
     script: str | None,
 ) -> int:
-    """Press the tissue of SCENE with the mouse."""
+    """Press the tissue of SCENE with the mouse or a finger, on a page in a browser."""
     from taichi_msm.load.scene_file import load_scene
 
     if seconds is not None and record is None:
         raise click.UsageError("--seconds N goes with --record FILE")
     if script is not None and seconds is None:
         raise click.UsageError("--script needs --record FILE and --seconds N; otherwise you press with the mouse")
-    if browser and seconds is not None:
-        raise click.UsageError("--seconds films without a page; leave out --browser, or --seconds")
-    if (port or origins) and not browser:
-        raise click.UsageError("--port and --origin go with --browser")
+    if (port or origins) and seconds is not None:
+        raise click.UsageError("--seconds films without a page; leave out --port and --origin, or --seconds")
     if seconds is not None and math.isnan(seconds):
         raise click.BadParameter("nan is not a number of seconds", param_hint="--seconds")
     film = None if record is None else _film_path(record)
@@ -194,17 +193,7 @@ def view(
                     record_film(session, film, seconds, events, progress, notices.append)
                 click.echo(printable(str(film)))
                 return DIVERGED if session.divergence_error else DONE
-            if browser:
-                _serve(begin, scene, port, permitted, film, interruption)
-            else:
-                from taichi_msm.view.window import Window, run_session
-
-                with Window(f"taichi-msm {scene}", loaded.render.size) as window:
-                    window.announce("one moment: compiling")
-                    with begin() as session:
-                        if film is not None:
-                            session.start_film(film)
-                        run_session(session, window, interruption.raise_if_requested)
+            _serve(begin, scene, port, permitted, film, interruption)
     except KeyboardInterrupt:
         return report_interruption(
             interruption, False, "interrupted" if seconds is None else "interrupted; no film was written"

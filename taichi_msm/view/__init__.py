@@ -1,1 +1,1 @@
-"""The live session: interactive simulation in a window, or filmed from a script."""
+"""The live session: interactive simulation in browsers, or filmed from a script."""

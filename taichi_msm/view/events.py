@@ -100,5 +100,5 @@ KEYS = {
     "w": "save the session as a scene, which run repeats",
     "i": "the figures on and off",
     "h": "the keys on and off",
-    "q": "quit; in the window so does Escape",
+    "q": "quit",
 }

@@ -65,12 +65,6 @@ def write_text(
     _blend(picture, panel, edge, height - len(panel) - edge)
 
 
-def announce(picture: Picture, text: str) -> None:
-    """Write text over the middle of a picture, shape (height, width, 3), in place."""
-    panel = _panel(_letter_size(picture), text)
-    _blend(picture, panel, (picture.shape[1] - panel.shape[1]) // 2, (len(picture) - len(panel)) // 2)
-
-
 def mark_tool(picture: Picture, pixel: tuple[float, float], *, pulls: bool) -> None:
     """Draw a ring around the tool, in place.
 

@@ -1,4 +1,4 @@
-"""Scripts of input events, read from YAML files, and films of sessions without a window."""
+"""Scripts of input events, read from YAML files, and films of sessions without a page."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class ScriptEvent(Section):
         description="percent of the full force, or of the greatest depth",
         expects="for percent a number from -100 to 100",
     )
-    name: str | None = key(None, description="a key of the window", expects="for key the name of one")
+    name: str | None = key(None, description="a key of the page", expects="for key the name of one")
     seconds: Seconds = key(0.0, description="duration [s]", expects=SECONDS)
 
     @model_validator(mode="after")
@@ -177,7 +177,7 @@ def record_film(
     progress: Callable[[int, int], None] = lambda done, total: None,
     notify: Callable[[str], None] = lambda notice: None,
 ) -> None:
-    """Run a session without a window, and record a film, which replaces an earlier file at the end.
+    """Run a session without a page, and record a film, which replaces an earlier file at the end.
 
     Args:
         session: a new session.

@@ -1,4 +1,4 @@
-"""Interactive session: event handling, simulation and picture, independent of a window and a clock."""
+"""Interactive session: event handling, simulation and picture, independent of a page and a clock."""
 
 from __future__ import annotations
 
