@@ -40,6 +40,9 @@ TRAVELS, CONTACT_MARGIN = 24, 0.05
 # Share of branches in the runs of a curve, with which the tissue does not relax, but has the kernels of the tests.
 NO_SHARE = 1e-12
 
+# Largest sum of the shares in the model, and the sum to which larger ones are reduced, with a margin for differences.
+MAX_SHARES, RESTART_SHARES = 0.999, 0.98
+
 # Initial and largest trust region of the parameters of a curve, in units of x.
 FIRST_REGION, MAX_REGION = 0.5, 2.0
 
@@ -126,9 +129,7 @@ class CurveRuns(Runs):
     def first(self, x: Array) -> Prediction:
         """Predict with the initial values; raises as `ForwardModel.predict` does."""
         self._predictor.compile(x, self._report_progress)
-        predicted = self.run_curve(x)
-        assert predicted is not None
-        return predicted
+        return self.run_curve(x)
 
     def predict_one(self, x: Array, steps: int | None = None) -> Prediction | None:
         """Predict at x by the tangent, or a curve; None if that fails."""
@@ -159,8 +160,8 @@ class CurveRuns(Runs):
         values = self._predictor.values(x)
         return mesh_error(self._plan_curve(values, self._reach(values)), self._report_progress)
 
-    def run_curve(self, x: Array, halvings: int = 0) -> Prediction | None:
-        """Predict by a curve at x; None if the shares are too large; raises as `ForwardModel.predict` does.
+    def run_curve(self, x: Array, halvings: int = 0) -> Prediction:
+        """Predict by a curve at x; raises as `ForwardModel.predict` does.
 
         Args:
             x: coordinates of the parameters, shape (n,).
@@ -179,6 +180,19 @@ class CurveRuns(Runs):
         """Correct further predictions, so that the one at x is `predicted`."""
         if (by_tangent := self.predict_one(x)) is not None:
             self._correction = self._correction + predicted.values[0] - by_tangent.values[0]
+
+    def with_valid_shares(self, x: Array) -> Array:
+        """Return x with free shares reduced, if the sum of all shares is too large."""
+        values = self._predictor.values(x)
+        branches = enumerate(self._predictor.data.get("tissue", {}).get("relaxation", ()))
+        shares = {f"tissue.relaxation.{n}.share": float(branch["share"]) for n, branch in branches}
+        free = [key for key in shares if key in values]
+        total = sum((shares | {key: values[key] for key in free}).values())
+        if total <= MAX_SHARES or not free:
+            return x
+        of_free = sum(values[key] for key in free)
+        reduction = np.log(max(RESTART_SHARES - (total - of_free), NO_SHARE) / of_free)
+        return x + reduction * np.array([parameter.key in free for parameter in self.job.parameters])
 
     def set_tangent(self, x: Array) -> None:
         """Set the tangent to the curve at x; raises as `ForwardModel.predict` does."""
@@ -202,8 +216,8 @@ class CurveRuns(Runs):
     def _reach(self, values: dict[str, float]) -> float:
         return self.job.reach(values) * (1 + CONTACT_MARGIN * self.of_contact.any())
 
-    def _predict(self, values: dict[str, float], reach: float, forces: Array) -> Prediction | None:
-        """Predict the tests by a curve; None if the shares are too large."""
+    def _predict(self, values: dict[str, float], reach: float, forces: Array) -> Prediction:
+        """Predict the tests by a curve."""
         from scipy.interpolate import PchipInterpolator
 
         curve = PchipInterpolator(np.linspace(0, reach, TRAVELS + 1), forces)
@@ -211,8 +225,9 @@ class CurveRuns(Runs):
             tuple(values.get(f"tissue.relaxation.{n}.{key}", branch[key]) for key in ("share", "time"))
             for n, branch in enumerate(self._predictor.data.get("tissue", {}).get("relaxation", ()))
         ]
-        if sum(share for share, _ in branches) >= 1:
-            return None
+        # Larger shares are scaled, as the search would not leave a wall there.
+        scale = min(1.0, MAX_SHARES / max(sum(share for share, _ in branches), NO_SHARE))
+        branches = [(scale * share, time) for share, time in branches]
         of_tests = [
             relax(curve(loading.travel(values.get(key))), branches, 1 / loading.rate)
             for loading, key in zip(self.job.tests, contact_keys(len(self.job.tests)), strict=True)
@@ -295,7 +310,6 @@ def _descend(runs: CurveRuns, misfit: Misfit, start: Array, *, by_tests: bool) -
 
     def evaluate(x: Array) -> Solution:
         predicted = runs.run_tests(x) if by_tests else runs.run_curve(x)
-        assert predicted is not None
         return Solution(x, predicted, scales, misfit.cost(misfit.residuals(predicted, scales)), converged=False)
 
     def is_at_end(cost: float, current: float) -> bool:
@@ -320,7 +334,7 @@ def _descend(runs: CurveRuns, misfit: Misfit, start: Array, *, by_tests: bool) -
         if is_at_end(minimum.cost, current.cost):
             return replace(current, converged=True)
         try:
-            trial = evaluate(minimum.x)
+            trial = evaluate(runs.with_valid_shares(minimum.x))
         except (SceneError, DivergedError):
             trial = replace(minimum, cost=np.inf)
     return current
