@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator
 
-# Longer delays are not caught up, and no picture waits longer for its frames [s].
+# Longer delays are not caught up [s].
 MAX_DELAY_S = 0.1
+
+# After this time of stepping the next picture follows, although frames are due [s].
+MAX_STEPPING_S = 0.03
 
 
 class Pacing:
@@ -29,11 +32,11 @@ class Pacing:
         return max(0.0, self._next - self._clock())
 
     def due_frames(self) -> Iterator[int]:
-        """Yield the number of each due frame, until none is due or the delay of the picture exceeds `MAX_DELAY_S`."""
+        """Yield the number of each due frame, until none is due or they took `MAX_STEPPING_S`."""
         start = self._clock()
         self._next = max(self._next, start - MAX_DELAY_S)
         count = 0
-        while self._next <= self._clock() and (count == 0 or self._clock() < start + MAX_DELAY_S):
+        while self._next <= self._clock() and (count == 0 or self._clock() < start + MAX_STEPPING_S):
             self._next += 1 / self._rate
             yield count
             count += 1

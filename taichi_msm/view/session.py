@@ -26,6 +26,7 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_PROBES
 from taichi_msm.solver.planning import plan_variant, with_time
 from taichi_msm.system import runtime
+from taichi_msm.system.process import available_threads
 from taichi_msm.view import events, overlay
 from taichi_msm.view.controller import Controller, Viewport
 from taichi_msm.view.material import MAX_FACTOR, material_values, with_value
@@ -127,7 +128,8 @@ class Session:
         # Since the last reset [N].
         self._max_felt_force = 0.0
         progress("compile")
-        self._simulation = Simulation(plan, arch, threads, texture)
+        # Workers spin while they wait for each other; one core is left for the browser.
+        self._simulation = Simulation(plan, arch, threads, texture, max(1, available_threads() - 1))
         self._simulation.compile(lambda: progress("compile"))
         self._scene_material = material_values(scene)
         self.viewport = Viewport(self._simulation.renderer, play=play)

@@ -1,0 +1,210 @@
+"""Fit published tests of testing machines, and write docs/machine-fits.md.
+
+    python docs/make_machine.py WORKBOOK STRIP ... [--only SHEET ...]
+    python docs/make_machine.py WORKBOOK STRIP --draw SHEET
+
+The files are those named on the page; strips are skin or mucosa by their names. A fit that is already in
+docs/machine-fits.json is kept, so that the script continues where it was interrupted: delete the file to repeat all.
+With --draw it fits a strip and a sheet again, and draws them. Takes about half a minute of a core per test.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from taichi_msm import FitResult, SceneError, fit
+from taichi_msm.fitting.machine_tables import read_machine_test
+from taichi_msm.fitting.table_grids import read_workbook
+from taichi_msm.plot_style import BLUE, DPI, STYLE, VERMILION
+
+DOCS = Path(__file__).parent
+RECORD, PAGE, TEMPLATE = DOCS / "machine-fits.json", DOCS / "machine-fits.md", DOCS / "machine-fits.template"
+
+# Length, width and thickness of the strips [m], by the name of the tissue in the file's name.
+STRIPS = {"skin": (0.0346, 0.0092, 0.0024), "mucosa": (0.03167, 0.00689, 0.00128)}
+
+BEEF_KEYS = {
+    "young [kPa]": ("tissue.foundation.young", 1e-3),
+    "lock [mm]": ("tissue.foundation.lock", 1e3),
+    "contact [mm]": ("contact", 1e3),
+    "share 1": ("tissue.relaxation.0.share", 1),
+    "time 1 [s]": ("tissue.relaxation.0.time", 1),
+    "share 2": ("tissue.relaxation.1.share", 1),
+    "time 2 [s]": ("tissue.relaxation.1.time", 1),
+}
+STRIP_KEYS = {
+    "young [kPa]": ("tissue.young", 1e-3),
+    "lock": ("tissue.stiffening.lock", 1),
+    "factor": ("tissue.stiffening.factor", 1),
+}
+
+
+def beef_scene(thickness: float, depth: float) -> dict[str, Any]:
+    """Return a ball of 5 mm radius above a slice, with a lock of 1.8 times the largest depth; lengths in metres."""
+    return {
+        "sheet": {"points": [31, 31], "size": [0.03, 0.03]},
+        "tissue": {
+            # The sheet is soft, so that the force is that of the foundation.
+            **{"young": 1e3, "thickness": 1e-3, "foundation_active": "always"},
+            "foundation": {"young": 5e4, "depth": thickness, "lock": 1.8 * depth},
+            "relaxation": [{"share": 0.5, "time": 0.3}, {"share": 0.2, "time": 4.0}],
+        },
+        "probes": [
+            {
+                "path": [[0, 0.5, 0.5, 0.001], [1, 0.5, 0.5, -0.005]],
+                "instrument": {"radius": 0.005, "shaft": [0, 0, 1], "length": 0.05},
+                "friction": "rough",
+            }
+        ],
+        "time": {"duration": 1, "motion": "quasistatic"},
+        "output": [],
+    }
+
+
+def strip_scene(length: float, width: float, thickness: float) -> dict[str, Any]:
+    """Return a strip that a clamp pulls; lengths in metres."""
+    return {
+        "sheet": {"points": [9, 31], "size": [width, length], "fixed": ["left"]},
+        "tissue": {"young": 1e5, "thickness": thickness, "stiffening": {"lock": 0.5, "factor": 10}},
+        "probes": [{"clamp": "right", "path": [[0, 0, 0, 0], [1, 0.01, 0, 0]]}],
+        "time": {"duration": 1, "motion": "quasistatic"},
+        "output": [],
+    }
+
+
+def fit_sheet(workbook: str, sheet: str) -> FitResult:
+    """Fit a sheet of the workbook."""
+    gap = read_machine_test(workbook, ["depth=Ecartement entre outils, mm"], sheet).depth
+    free = [key for key, _ in BEEF_KEYS.values()]
+    return fit(beef_scene(float(gap[0]), float(np.ptp(gap))), workbook, free, sheet=sheet, workers=1)
+
+
+def fit_strip(path: str) -> FitResult:
+    """Fit a strip up to its largest force."""
+    test = read_machine_test(path)
+    size = STRIPS[next(name for name in STRIPS if name in Path(path).name)]
+    window = (0.0, float(test.time[test.force.argmax()]))
+    return fit(strip_scene(*size), path, [key for key, _ in STRIP_KEYS.values()], window=window, workers=1)
+
+
+def summarise(result: FitResult) -> dict[str, Any]:
+    """Return the numbers of a fit for the record."""
+    (test,) = result.tests
+    parameters = {key: [each.value, *each.interval] for key, each in result.parameters.items()}
+    # The branch with the shorter time is the first.
+    branch = "tissue.relaxation.{}.{}"
+    if (
+        branch.format(0, "time") in parameters
+        and parameters[branch.format(0, "time")] > parameters[branch.format(1, "time")]
+    ):
+        for name in ("share", "time"):
+            first, second = (branch.format(n, name) for n in range(2))
+            parameters[first], parameters[second] = parameters[second], parameters[first]
+    difference = np.abs(test.force - test.loading.force) / test.loading.peak
+    return {
+        "parameters": parameters,
+        "not_identifiable": [key for key, each in result.parameters.items() if not each.identifiable],
+        "peak": test.loading.peak,
+        "rms": test.residual / test.loading.peak,
+        "largest": float(difference.max()),
+        "rejected": result.model_rejected,
+        "runs": result.runs,
+        "seconds": result.seconds,
+    }
+
+
+def table(record: dict[str, Any], keys: dict[str, tuple[str, float]]) -> list[str]:
+    """Format fits with the same parameters as a table."""
+    lines = [f"| test | rms [% of peak] | largest | {' | '.join(keys)} |", "|---" * (3 + len(keys)) + "|"]
+    for name, numbers in record.items():
+        if "error" in numbers:
+            lines.append(f"| {name} | {numbers['error']} |")
+        elif set(numbers["parameters"]) == {key for key, _ in keys.values()}:
+            cells = [_cell(numbers, key, scale) for key, scale in keys.values()]
+            lines.append(
+                f"| {name} | {100 * numbers['rms']:.2f} | {100 * numbers['largest']:.1f} | {' | '.join(cells)} |"
+            )
+    return lines
+
+
+def _cell(numbers: dict[str, Any], key: str, scale: float) -> str:
+    """Format a value with its interval; an end beyond a bound is left open."""
+    if key in numbers["not_identifiable"]:
+        return "not identifiable"
+    value, low, high = (None if number is None else scale * number for number in numbers["parameters"][key])
+    if low is None and high is not None:
+        return f"below {high:.2g}"
+    return f"{value:.3g} ({'…' if low is None else f'{low:.3g}'} to {'…' if high is None else f'{high:.3g}'})"
+
+
+def write_page(record: dict[str, Any]) -> None:
+    """Write the page from its template."""
+    beef = [numbers for numbers in record.values() if "contact" in numbers.get("parameters", ())]
+    rms = 100 * np.array([numbers["rms"] for numbers in beef] or [np.nan])
+    text = TEMPLATE.read_text(encoding="utf-8")
+    for name, lines in {
+        "beef": table(record, BEEF_KEYS),
+        "strips": table(record, STRIP_KEYS),
+        "count": [str(len(beef))],
+        "median": [f"{np.median(rms):.2g}"],
+        "ninth": [f"{np.quantile(rms, 0.9):.2g}"],
+        "worst": [f"{rms.max():.2g}"],
+        "rejected": [str(sum(numbers["rejected"] for numbers in beef))],
+    }.items():
+        text = text.replace(f"{{{name}}}", "\n".join(lines))
+    PAGE.write_text(text, encoding="utf-8")
+
+
+def draw(pressed: FitResult, pulled: FitResult) -> None:
+    """Draw measured and fitted forces over time and over depth."""
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(1, 3, figsize=(12, 3.6), layout="constrained")
+        titles = "Beef, pressed and held", "Beef", "Pig skin, pulled"
+        for panel, title, result in zip(axes, titles, (pressed, pressed, pulled), strict=True):
+            (test,) = result.tests
+            loading = test.loading
+            over_time = panel is axes[0]
+            at = loading.time if over_time else 1000 * (loading.depth - loading.depth[0])
+            panel.plot(at, loading.force, ".", color=VERMILION, markersize=4, label="measured")
+            panel.plot(at, test.force, color=BLUE, label="fitted")
+            panel.set(xlabel="time [s]" if over_time else "depth [mm]", ylabel="force [N]", title=title)
+        axes[2].set_xlabel("pull [mm]")
+        axes[0].legend()
+        figure.savefig(DOCS / "images" / "machine-fits.png", dpi=DPI)
+        plt.close(figure)
+
+
+def main() -> None:
+    """Fit the tests that are not in the record, and write the page."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("workbook")
+    parser.add_argument("strips", nargs="*")
+    parser.add_argument("--only", nargs="*", help="sheets of the workbook")
+    parser.add_argument("--draw", help="sheet of the workbook")
+    options = parser.parse_args()
+    if options.draw:
+        draw(fit_sheet(options.workbook, options.draw), fit_strip(options.strips[0]))
+        return
+    record = json.loads(RECORD.read_text(encoding="utf-8")) if RECORD.exists() else {}
+    sheets = options.only or [name for name in read_workbook(options.workbook) if name.startswith("230403-")]
+    tests = {Path(path).stem: (fit_strip, (path,)) for path in options.strips}
+    tests |= {name: (fit_sheet, (options.workbook, name)) for name in sheets}
+    for name, (run, arguments) in tests.items():
+        if name not in record:
+            try:
+                record[name] = summarise(run(*arguments))
+            except SceneError as error:
+                record[name] = {"error": str(error)}
+            RECORD.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+            print(name, json.dumps({key: record[name].get(key) for key in ("rms", "seconds", "error")}), flush=True)
+    write_page(record)
+
+
+if __name__ == "__main__":
+    main()
