@@ -220,7 +220,7 @@ def test_every_command_is_understood() -> None:
             cli_options.program.commands[name].make_context(name, arguments)
 
 
-@pytest.mark.parametrize("pages", [WITH_COMMANDS[:3], pytest.param(WITH_COMMANDS, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("pages", [WITH_COMMANDS[:1], pytest.param(WITH_COMMANDS, marks=pytest.mark.slow)])
 def test_the_commands_work(pages: list[Path], small_scenes: Path, program: Program) -> None:
     seen = set()
     for page in pages:
@@ -284,6 +284,7 @@ def test_the_ways_from_pixels_to_points_are_exact(small: Path, capfd: pytest.Cap
 WITH_EXAMPLES = ["run", "Playback", "export", "fit", "gradient", "load_scene", "Scene", "Simulation"]
 
 
+@pytest.mark.default_cases("run", "gradient", "Playback")
 @pytest.mark.parametrize("name", WITH_EXAMPLES)
 def test_the_example_of_a_docstring_gives_what_it_shows(name: str, examples_folder: Path) -> None:
     tests = doctest.DocTestFinder(recurse=False).find(getattr(taichi_msm, name), name, globs={})
@@ -364,6 +365,7 @@ def test_the_citation_is_of_this_version() -> None:
     assert citation["references"][0]["title"] in read(README)
 
 
+@pytest.mark.slow
 def test_the_notebook_runs(device: Device, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr(process, "available_threads", lambda: device.threads)

@@ -239,7 +239,7 @@ def test_the_pilot_of_the_points_is_compared_with_the_run(device: Device, monkey
     assert of_25.scene.sheet.points == (18, 18)  # 24 / √2 is 16.97.
 
 
-@pytest.mark.default_cases("0.0045")
+@pytest.mark.slow
 @pytest.mark.parametrize("radius", [0.003, 0.0045])
 def test_where_a_tip_is_as_narrow_as_a_cell_a_nearer_run_follows(radius: float, device: Device) -> None:
     """The first run differs by 50 or 80 %, of which the run is off by a tenth."""

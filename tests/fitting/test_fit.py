@@ -118,6 +118,7 @@ def test_a_camera_that_moves_and_bends_lines_sees_what_is_predicted(motion: Arra
     np.testing.assert_allclose(seen, pixels_in(made, motion, device), atol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_truth_comes_back_from_a_start_that_is_far_off(motion: Array) -> None:
     start = changed(tissue__young=6e4, tissue__foundation=6e4, tissue__damping=1000, probes__0__at=[0.4, 0.6])
     free = ["tissue.young", "tissue.foundation", "tissue.damping", "probes.0.at.0"]
@@ -207,6 +208,7 @@ def test_what_pictures_cannot_tell_is_named_and_a_force_tells_it(
     np.testing.assert_allclose(values(told), [2e4, 3e5, 10, -2], rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_product_is_known_where_its_factors_are_not(motion: Array) -> None:
     # At rest and without bending, young and thickness act only as their product.
     scene = changed(time__motion="quasistatic")

@@ -267,6 +267,7 @@ def test_the_parameters_of_a_tissue_that_relaxes_come_back_and_its_scene_runs_al
     )
 
 
+@pytest.mark.slow
 def test_the_depth_of_contact_is_found_within_bounds(pressed: str) -> None:
     true = scene(relaxation=[BRANCH])
     result = fit(true, pressed, ["contact"], rate=RATE, contact=[1.3e-3], bounds={"contact": (0.8e-3, 2e-3)}, workers=1)

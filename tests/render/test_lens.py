@@ -268,7 +268,7 @@ def test_pictures_are_like_the_twins(lens: str, render: dict[str, Any], device: 
         assert 0.2 < (drawn.max(axis=-1) > 0).mean() < 0.95
 
 
-@pytest.mark.default_cases("fisheye-3")
+@pytest.mark.slow
 @cases(("fold", 0), ("fisheye", 3), lens=LENSES, refine=(0, 3))
 def test_large_cells_are_bent(lens: str, refine: int, device: Device) -> None:
     """Sides of cells 90 pixels long bend by up to 8 px, more than a tile, outward and inward."""

@@ -138,6 +138,7 @@ def assert_alike_in_other_tiles(made: Scene, texture: NDArray[np.uint8], positio
         np.testing.assert_array_equal(label, same)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lanes", [*(pytest.param(lanes, marks=pytest.mark.slow) for lanes in (1, 4)), 8])
 def test_the_shape_of_a_tile_does_not_change_the_bits(lanes: int, device: Device) -> None:
     # One lane is the form for GPUs; 31 x 57 pixels are whole tiles of no shape.

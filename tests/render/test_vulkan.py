@@ -126,6 +126,7 @@ def touched() -> Scene:
     return made.model_copy(update={"output": ("trajectory", "forces")})
 
 
+@pytest.mark.slow
 def test_tools_touch_on_a_gpu_as_on_the_cpu(
     runs: tuple[Path, list[Any]], device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -62,6 +62,7 @@ def alone(camera: Any, output: str) -> Scene:
     return load_scene("small.yaml", [*of_one, f"output={output}"])
 
 
+@pytest.mark.slow
 def test_each_camera_writes_what_it_would_write_alone(small: Path, device: Device) -> None:
     record = run(seen_by({**STEREO, "sway": SWAYING}, ALL, UNLIT), "out", threads=device.threads, estimate_error=False)
     moved = {"eye": [0.05 + 0.02, 0, 0.5], "target": [0.05 + 0.02, 0, 0]}
@@ -155,6 +156,7 @@ def test_without_a_lens_of_its_own_it_has_that_of_the_other(left: Any, small: Pa
     np.testing.assert_allclose(third.eye, other.eye + 0.1 * other.axes[0], atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shading", [pytest.param("headlight", marks=pytest.mark.slow), "tissue"])
 def test_the_light_is_that_of_the_main_camera(shading: str, device: Device) -> None:
     side = {"eye": [0.35, 0.1, 0.3], "up": [0.1, 1, 0]}
@@ -251,6 +253,7 @@ def test_cameras_have_names_in_python(stereo: Path, device: Device, message: Mes
             playback.draw(0, "lift")
 
 
+@pytest.mark.slow
 def test_two_lenses_find_their_places_once_each(small: Path, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     cameras = {name: {**LEFT, "distortion": {"k1": k1}} for name, k1 in (("a", -0.1), ("b", -0.2))}
     found: list[View] = []

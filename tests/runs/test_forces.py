@@ -170,6 +170,7 @@ def test_without_probes_there_is_a_table_without_rows(device: Device, tmp_path: 
     assert len(table_of(tmp_path)) == 1
 
 
+@pytest.mark.slow
 def test_forces_have_the_same_bits_with_any_number_of_threads(tmp_path: Path, device: Device) -> None:
     """Also a thread, in a process of its own."""
     probes = json.dumps([{**PRESSED, "friction": 0.3}])

@@ -152,6 +152,7 @@ def test_labels_need_no_picture_and_masks_alone_no_camera(small: Path, device: D
     assert not Path("masks/camera.json").exists()
 
 
+@pytest.mark.slow
 def test_labels_of_an_earlier_run_go_and_other_files_stay(small: Path, device: Device, message: Messages) -> None:
     short = small_scene("output=[depth]", "time.duration=0.2")
     made("out", device, ALL)

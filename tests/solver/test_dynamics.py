@@ -335,6 +335,7 @@ def test_a_restart_is_a_new_start(device: Device) -> None:
             np.testing.assert_array_equal(frames, simulate(made, device))
 
 
+@pytest.mark.default_cases("30")
 @pytest.mark.parametrize("patience", [0, 30])
 def test_workers_that_give_up_waiting_go_on_to_the_same_bits(
     patience: int, device: Device, monkeypatch: pytest.MonkeyPatch

@@ -390,6 +390,7 @@ def test_just_under_the_limit_tissue_stays_bounded(name: str, device: Device, tm
     assert max(energies) < 4 * energies[0]
 
 
+@pytest.mark.slow
 def test_a_wide_sheet_gets_the_whole_of_a_tool(device: Device) -> None:
     """Of tissue and of springs, as the twin has it and as the first step of the kernel moves it."""
     total = [0.3, -0.2, -1.0]

@@ -191,6 +191,7 @@ def test_dop853_is_left_out_where_tools_touch(device: Device, message: Messages)
     assert known.error == max_norm(fine - half) / max_norm(fine)
 
 
+@pytest.mark.slow
 def test_a_study_takes_no_steps_in_which_a_tool_moves_too_far(device: Device) -> None:
     fast = moved([0, 0.5, 0.5, 0.1], [0.1, 0.9, 0.5, 0.1], instrument={"radius": 0.005})
     made = touching([fast], time={"step": 0.001, "duration": 0.04})
@@ -467,6 +468,7 @@ def test_an_interruption_leaves_what_is_done(device: Device) -> None:
         assert measured.study.stepping
 
 
+@pytest.mark.slow
 def test_without_a_term_a_given_step_may_be_unstable(device: Device, tmp_path: Path) -> None:
     """A map of soft places, left out, makes the sheet stiffer than the step allows; it is timed all the same."""
     Image.new("L", (3, 3), 0).save(tmp_path / "map.png")

@@ -97,6 +97,7 @@ def test_what_a_clamp_holds(device: Device) -> None:
             simulation.advance()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short_launches")
 @pytest.mark.parametrize("case", ["with a rod", "a corner of two"])
 def test_lanes_workers_and_passes_do_not_change_the_bits(case: str, device: Device) -> None:
@@ -150,6 +151,7 @@ def test_at_rest_like_scipy(device: Device) -> None:
     np.testing.assert_allclose(rest.tool_forces()[0], -others, rtol=0, atol=1e-6 * np.abs(others).max())
 
 
+@pytest.mark.default_cases("True")
 @pytest.mark.parametrize("mapped", [False, True])
 def test_under_tension_force_and_energy_are_those_of_the_twin(
     mapped: bool, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

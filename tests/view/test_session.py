@@ -589,7 +589,7 @@ def moved(session: Session) -> PositionControlledTool:
     return session.tool
 
 
-@pytest.mark.default_cases("f32")
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("overrides", "play"),
     [

@@ -148,6 +148,7 @@ events:
     ]
 
 
+@pytest.mark.slow
 def test_an_interrupted_film_leaves_the_one_that_was_there(small: Path, message: Messages) -> None:
     Path("live.gif").write_bytes(b"before")
     filming = ["view", "small.yaml", "--record", "live.gif", "--seconds", "3600"]
