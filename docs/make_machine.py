@@ -2,10 +2,12 @@
 
     python docs/make_machine.py WORKBOOK STRIP ... [--only SHEET ...]
     python docs/make_machine.py WORKBOOK STRIP --draw SHEET
+    python docs/make_machine.py WORKBOOK STRIP --draw-scenes
 
 The files are those named on the page; strips are skin or mucosa by their names. A fit that is already in
 docs/machine-fits.json is kept, so that the script continues where it was interrupted: delete the file to repeat all.
-With --draw it fits a strip and a sheet again, and draws them. Takes about half a minute of a core per test.
+With --draw it fits a strip and a sheet again, and draws them. With --draw-scenes it draws scenes/beef.yaml and
+scenes/skin.yaml over their tests. Takes about half a minute of a core per test.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 
-from taichi_msm import FitResult, SceneError, fit
+from taichi_msm import FitResult, SceneError, Simulation, fit, load_scene
 from taichi_msm.fitting.machine_tables import read_machine_test
 from taichi_msm.fitting.table_grids import read_workbook
 from taichi_msm.plot_style import BLUE, DPI, STYLE, VERMILION
@@ -28,6 +30,10 @@ RECORD, PAGE, TEMPLATE = DOCS / "machine-fits.json", DOCS / "machine-fits.md", D
 
 # Length, width and thickness of the strips [m], by the name of the tissue in the file's name.
 STRIPS = {"skin": (0.0346, 0.0092, 0.0024), "mucosa": (0.03167, 0.00689, 0.00128)}
+
+GAP = "depth=Ecartement entre outils, mm"
+# The slice of scenes/beef.yaml.
+SLICE = "230403-FF2A"
 
 BEEF_KEYS = {
     "young [kPa]": ("tissue.foundation.young", 1e-3),
@@ -80,7 +86,7 @@ def strip_scene(length: float, width: float, thickness: float) -> dict[str, Any]
 
 def fit_sheet(workbook: str, sheet: str) -> FitResult:
     """Fit a sheet of the workbook."""
-    gap = read_machine_test(workbook, ["depth=Ecartement entre outils, mm"], sheet).depth
+    gap = read_machine_test(workbook, [GAP], sheet).depth
     free = [key for key, _ in BEEF_KEYS.values()]
     return fit(beef_scene(float(gap[0]), float(np.ptp(gap))), workbook, free, sheet=sheet, workers=1)
 
@@ -180,6 +186,47 @@ def draw(pressed: FitResult, pulled: FitResult) -> None:
         plt.close(figure)
 
 
+def simulate(name: str) -> np.ndarray:
+    """Return time [s], place of the tip [m] and force [N] of a shipped scene's tool, shape (frames + 1, 7)."""
+    rows = []
+    with Simulation(load_scene(DOCS.parent / "scenes" / f"{name}.yaml", {"output": []})) as simulation:
+        for frame in range(simulation.scene.time.frames + 1):
+            simulation.advance(min(frame, 1))
+            (tool,) = simulation.forces()
+            rows.append((simulation.time, *tool.tip, *tool.force))
+    return np.array(rows)
+
+
+def draw_scenes(workbook: str, strip: str) -> None:
+    """Draw the forces of the shipped scenes over the measured ones: of beef over time, of skin over the pull."""
+    pressed, pulled = read_machine_test(workbook, [GAP], SLICE), read_machine_test(strip)
+    contact = json.loads(RECORD.read_text(encoding="utf-8"))[SLICE]["parameters"]["contact"][0]
+    start = np.interp(contact, pressed.depth[0] - pressed.depth, pressed.time)
+    offset = np.median(pressed.force[pressed.time < start])
+    beef, skin = simulate("beef"), simulate("skin")
+    until = pulled.force.argmax() + 1
+    panels = {
+        "beef.yaml": (pressed.time - start, pressed.force - offset, beef[:, 0], -beef[:, 6], "time [s]"),
+        "skin.yaml": (
+            *(1000 * (pulled.depth - pulled.depth[0])[:until], pulled.force[:until]),
+            *(1000 * (skin[:, 1] - skin[0, 1]), skin[:, 4], "pull [mm]"),
+        ),
+    }
+    with plt.style.context(STYLE, after_reset=True):
+        figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
+        for panel, (name, (at, measured, frames, force, label)) in zip(axes, panels.items(), strict=True):
+            shared = frames <= at[-1]
+            difference = 100 * (force - np.interp(frames, at, measured))[shared] / measured.max()
+            rms, largest = np.sqrt(np.mean(difference**2)), np.abs(difference).max()
+            shown = slice(None, None, max(1, len(at) // 150))
+            panel.plot(at[shown], measured[shown], ".", color=VERMILION, markersize=4, label="measured")
+            panel.plot(frames, force, color=BLUE, label="scene")
+            panel.set(xlabel=label, ylabel="force [N]", title=f"{name}: rms {rms:.2g} %, largest {largest:.2g} %")
+        axes[0].legend()
+        figure.savefig(DOCS / "images" / "machine-scenes.png", dpi=DPI)
+        plt.close(figure)
+
+
 def main() -> None:
     """Fit the tests that are not in the record, and write the page."""
     parser = argparse.ArgumentParser()
@@ -187,7 +234,11 @@ def main() -> None:
     parser.add_argument("strips", nargs="*")
     parser.add_argument("--only", nargs="*", help="sheets of the workbook")
     parser.add_argument("--draw", help="sheet of the workbook")
+    parser.add_argument("--draw-scenes", action="store_true")
     options = parser.parse_args()
+    if options.draw_scenes:
+        draw_scenes(options.workbook, options.strips[0])
+        return
     if options.draw:
         draw(fit_sheet(options.workbook, options.draw), fit_strip(options.strips[0]))
         return

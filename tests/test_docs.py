@@ -394,6 +394,19 @@ def test_shipped_scenes_are_valid() -> None:
         assert load_scene(path).time.frames >= 25
 
 
+def test_scenes_of_measured_tissue_have_the_fitted_numbers() -> None:
+    fits = json.loads(read(DOCS / "machine-fits.json"))
+    for name, test in ("beef", "230403-FF2A"), ("skin", "pig-skin-05-p-1"):
+        document = yaml.safe_load(read(ROOT / "scenes" / f"{name}.yaml"))
+        for key, (value, _, _) in fits[test]["parameters"].items():
+            if key == "contact":  # of the table, not of the scene
+                continue
+            number: Any = document
+            for part in key.split("."):
+                number = number[int(part) if part.isdecimal() else part]
+            assert float(number) == pytest.approx(value, rel=2e-3), key
+
+
 def test_every_promise_has_its_test() -> None:
     named = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", read(DOCS / "tests.md").split("\n## Mutants\n")[0])
     assert len(named) > 100
