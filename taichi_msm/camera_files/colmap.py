@@ -11,10 +11,10 @@ from taichi_msm.camera_files.text import CameraFile
 from taichi_msm.camera_files.trajectory import Trajectory, TrajectoryReader, parse_numbers, pose_fault
 
 # A line of cameras.txt: id, model, width, height, parameters.
-CAMERA = re.compile(r"^(\d+) ([A-Z_]+) (\d+) (\d+)((?: [-+.\deE]+)+)[ \t\r]*$", re.MULTILINE)
+CAMERA = re.compile(r"^(\d+)[ \t]+([A-Z_]+)[ \t]+(\d+)[ \t]+(\d+)((?:[ \t]+[-+.\deE]+)+)[ \t\r]*$", re.MULTILINE)
 
 # A line of images.txt: id, quaternion w, x, y, z and translation, camera, name.
-IMAGE = re.compile(r"^(\d+)((?: [-+.\deE]+){7}) (\d+) (\S.*)$", re.MULTILINE)
+IMAGE = re.compile(r"^(\d+)((?:[ \t]+[-+.\deE]+){7})[ \t]+(\d+)[ \t]+(\S.*)$", re.MULTILINE)
 
 # Models: the number of focal lengths, the lens model, and the number of its coefficients.
 MODELS = {
@@ -70,8 +70,12 @@ def _read_images(file: CameraFile) -> Trajectory | None:
             raise file.fault("neither IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME nor points", n)
     if len(cameras := {camera for *_, camera in images}) > 1:
         raise file.fault(f"has images of cameras {listed(sorted(cameras))}; keep those of one")
-    ends = [re.search(r"(\d+)\D*$", name.rpartition(".")[0] or name) for name, *_ in images]
-    numbers = [int(end[1]) for end in ends if end]
+    stems = [name.rpartition(".")[0] or name for name, *_ in images]
+    # Such as 1305031102.975304.png.
+    times = [float(match[1]) for stem in stems if (match := re.fullmatch(r"(?:.*\D)??(\d+\.\d+)", stem))]
+    has_times = len({*times}) == len(images)
+    ends = [re.search(r"(\d+)\D*$", stem) for stem in stems]
+    numbers: list[float] = times if has_times else [int(end[1]) for end in ends if end]
     if len({*numbers}) < len(images):
         images.sort()
         numbers = list(range(len(images)))
@@ -81,7 +85,7 @@ def _read_images(file: CameraFile) -> Trajectory | None:
             raise file.fault(fault, n)
         inverse = Rotation.from_quat((x, y, z, w)).inv()
         poses.append((n, [number, *(-inverse.apply(translation)).tolist(), *inverse.as_quat().tolist()]))
-    return Trajectory([row for _, row in poses], [n for n, _ in poses], has_times=False)
+    return Trajectory([row for _, row in poses], [n for n, _ in poses], has_times)
 
 
 def _image(line: str) -> re.Match[str] | None:

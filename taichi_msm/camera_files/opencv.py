@@ -5,11 +5,12 @@ Other formats are converted to these keys.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 
 from taichi_msm.camera_files.calibration import Calibration, CalibrationReader, StereoPose
-from taichi_msm.camera_files.keys import Keys, fold, listed
+from taichi_msm.camera_files.keys import ROUNDING_TOLERANCE, Keys, fold, listed
 from taichi_msm.camera_files.text import CameraFile
 from taichi_msm.errors import truncate
 from taichi_msm.lenses import MODELS
@@ -37,7 +38,7 @@ UNSUPPORTED = (
     r".*(distort(?!ed)|distorsion|coef|radial|tangential|prism|fisheye|omni|mirror|polynom|skew).*|kc|[kps][1-6]|"
     rf"(?!new|opt).*(cameramat|intrinsic).*|{_PICTURE}?(shape|dimensions?)|"
     rf"{_PICTURE}(size|resolution|width|height).*|alpha|beta|lambda|(lens|dist).*model.*|"
-    r"binning|scale(factor)?|undistort(ed)?|rectified|roi|crop(ped)?"
+    r"binning|scale(factor)?|undistort(ed)?|rectified|roi|crop(ped|[xywh])?|offset[xy]|alphac|tau[xy]?|tilt.*|calibration"
 )
 
 # Lens models by their names in files; empty for names of several models.
@@ -83,6 +84,7 @@ class OpenCV(CalibrationReader):
         (fx, _, cx), (_, fy, cy) = matrix[:3], matrix[3:6]
         if (focal := min(fx, fy)) < MIN_FOCAL_LENGTH_PX:
             raise file.fault(f"its focal length is {focal:g}; write it in pixels, {MIN_FOCAL_LENGTH_PX:g} or more")
+        _require_agreement(keys, (fx, fy), (cx, cy))
         xi = keys.numbers("xi") or []
         model = _model(keys, values or (), has_xi=any(xi))
         if values is None and model != NO_DISTORTION:
@@ -105,6 +107,21 @@ class OpenCV(CalibrationReader):
         rotation = shared.require(ROTATION, 9, "rotation R")
         rows = tuple(tuple(rotation[n : n + 3]) for n in (0, 3, 6))
         return StereoPose(rows, tuple(shared.require(TRANSLATION, 3, "translation T")))
+
+
+def _require_agreement(keys: Keys, focal: Sequence[float], centre: Sequence[float]) -> None:
+    """Require that further keys of focal lengths and principal point agree with the camera matrix."""
+    expected = {"fx": focal[:1], "fy": focal[1:], "cx": centre[:1], "cy": centre[1:]}
+    expected |= {"focal(length)?s?|f": focal, "principalpoint|pp|centre|center": centre}
+    for spelling, values in expected.items():
+        numbers = keys.numbers(spelling)
+        if numbers and not all(
+            math.isclose(a, b, rel_tol=ROUNDING_TOLERANCE) for a, b in zip(numbers, values, strict=False)
+        ):
+            found = ", ".join(f"{number:g}" for number in numbers)
+            raise keys.file.fault(
+                f"{listed(keys.values(spelling))}: {found}, and the camera matrix has others; keep one"
+            )
 
 
 def _model(keys: Keys, values: Sequence[float], *, has_xi: bool) -> str:

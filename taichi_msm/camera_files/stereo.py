@@ -6,7 +6,8 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from taichi_msm.camera_files.keys import Keys, flat, fold
+from taichi_msm.camera_files.calibration import StereoPose
+from taichi_msm.camera_files.keys import Keys, flat, fold, listed
 from taichi_msm.camera_files.opencv import MATRIX, OpenCV
 from taichi_msm.camera_files.text import CameraFile
 
@@ -25,6 +26,13 @@ class Stereo(OpenCV):
     name = "OpenCV stereo, SCARED, STIR"
     recognised_by = "`K1`, `D1`, `K2`, `D2` (or `M1`, `cameraMatrix1`, `leftcameramat`, `K_l`, ...), with `R`, `T`"
     unit = None
+
+    def pose(self, keys: Keys) -> StereoPose | None:
+        """Read R and T, beside which nothing may state another unit or pose."""
+        if names := keys.unread(r"units?|[rt]c?m+|rt|extrinsics?"):
+            fault = f"{listed(names)}: not understood; write R, 3 x 3, and T, 3 numbers"
+            raise keys.file.fault(f"{fault}, in metres, or set calibration_unit: mm, and remove these")
+        return super().pose(keys)
 
     def cameras(self, file: CameraFile) -> Sequence[Keys]:
         """Return the keys of each camera, if both have a matrix, with those that have no mark."""

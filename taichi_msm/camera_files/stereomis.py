@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 
 from taichi_msm.camera_files.keys import Keys, listed
@@ -16,6 +17,7 @@ KEYS = {
     "R": tuple(f"r_{n}" for n in range(9)),
     "T": tuple(f"t_{n}" for n in range(3)),
 }
+SECTIONS = ("StereoLeft", "StereoRight")
 MORE_COEFFICIENTS = ("kc_4", "kc_5", "kc_6", "kc_7")
 
 
@@ -28,13 +30,21 @@ class StereoMIS(OpenCV):
 
     def cameras(self, file: CameraFile) -> Sequence[Keys]:
         """Return the sections of the cameras, with OpenCV's keys."""
-        return [_camera(file, file.data[name]) for name in ("StereoLeft", "StereoRight") if name in file.data]
+        if not any(name in file.data for name in SECTIONS):
+            return []
+        if missing := [name for name in SECTIONS if not isinstance(file.data.get(name), dict)]:
+            raise file.fault(f"has no keys in {listed(missing)}; found {listed(file.data)}; write both cameras")
+        return [_camera(file, file.data[name]) for name in SECTIONS]
 
 
 def _camera(file: CameraFile, section: Mapping[str, str]) -> Keys:
     values = {key: [section[name] for name in names if name in section] for key, names in KEYS.items()}
     if missing := [name for key in ("intrinsics", "D", "size") for name in KEYS[key] if name not in section]:
         raise file.fault(f"has no {listed(missing)}; found {listed(section)}; write what belongs there")
+    known = {*MORE_COEFFICIENTS, *(name for names in KEYS.values() for name in names)}
+    others = [name for name in section if name not in known and re.match(r"(kc|fc|cc|res|r|t)_|skew|alpha", name)]
+    if others:
+        raise file.fault(f"{listed(others)}: not understood; found {listed(section)}; remove what does not matter")
     values["D"] += [section.get(name, "0") for name in MORE_COEFFICIENTS]
     fx, fy, cx, cy = values["intrinsics"]
     return Keys(file, {**values, "intrinsics": [fx, "0", cx, "0", fy, cy, "0", "0", "1"]})

@@ -216,7 +216,7 @@ def reading(path: Path) -> Iterator[None]:
     """Convert any exception in the block to a FilesError; damaged archives and records raise many types."""
     try:
         yield
-    except FilesError:
+    except (FilesError, ImportError):
         raise
     except Exception as error:
         # EINVAL: offsets in a damaged file may be impossible.

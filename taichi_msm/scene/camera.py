@@ -421,6 +421,8 @@ class Camera(Section):
         if self.beside is None or calibration.right is None:
             if self.beside is not None and self.rotation is None:
                 remedy = "set calibration_eye: right for a stereo file, or add rotation and translation"
+                if self.calibration_eye == "right":
+                    remedy = "write R, 3 x 3, and T, 3 numbers, as stereoCalibrate, or add rotation and translation"
                 raise scene_fault(f"{self.calibration}: has no R and T of this camera; {remedy}", "calibration")
             return {}
         if self.rotation is not None:

@@ -132,6 +132,7 @@ cam1:
   resolution: [40, 30]
   rostopic: /cam1/image_raw
 """
+OMNI_KALIBR = KALIBR.replace("pinhole", "omni").replace("radtan", "equidistant").replace("[61", "[1.25, 61")
 _SECTION = """\
 [Stereo{}]
 res_x = 40
@@ -394,7 +395,8 @@ D = "D: [-0.3, 0.1, 0.001, -0.002, 0.03]\n"
         pytest.param(K + "D: [0, 0, 0, 0]\nmodel: omnidir", id="omnidirectional without xi"),
         pytest.param(K + "D: [0, 0, 0, 0]\nfisheye: 1\nxi: 1", id="omnidirectional and fisheye"),
         pytest.param(
-            KALIBR.replace("pinhole", "omni").replace("radtan", "equidistant"), id="omnidirectional of Kalibr"
+            KALIBR.replace("pinhole", "omni").replace("radtan", "equidistant").replace("[61", "[1.25, 61"),
+            id="omnidirectional of Kalibr",
         ),
         pytest.param(OCAMCALIB.replace("-1.2e+02 0.0", "-1.2e+02 1.0"), id="OCamCalib"),
         pytest.param(K + D + "radial_distortion: [0.1]\nrms: 0.2", id="other distortion"),
@@ -407,7 +409,11 @@ D = "D: [-0.3, 0.1, 0.001, -0.002, 0.03]\n"
         pytest.param(PRINTED.replace("width: 0", "width: 20"), id="width of ROS"),
         pytest.param(K.replace("K", "M1") + K.replace("K", "M2") + "D1: 3\nD2: [0, 0, 0, 0]", id="stereo pair"),
         pytest.param(KALIBR.replace("distortion_coeffs: [-0.3, 0.1, 0.001, -0.002]", "x: 1"), id="Kalibr"),
-        pytest.param(KALIBR.replace("pinhole", "ds"), id="projection of Kalibr"),
+        pytest.param(KALIBR.replace("pinhole", "ds", 1), id="projection of Kalibr"),
+        pytest.param(KALIBR.replace("[61.5", "[1.25, 61.5", 1), id="intrinsics of Kalibr"),
+        pytest.param("StereoLeft:\nStereoRight:\n", id="StereoMIS without keys"),
+        pytest.param("K: [60, 0, 20, 0, 60, 15, 0, 0, 1]\nD: [0, 0, 0, 0]\nfx: 50\n", id="another focal length"),
+        pytest.param("K: [60, 0, 20, 0, 60, 15, 0, 0, 1]\nD: [0, 0, 0, 0]\nalpha_c: 0.01\n", id="skew of Bouguet"),
         pytest.param(KALIBR.replace("radtan", "fov"), id="distortion of Kalibr"),
         pytest.param("; of two\n[StereoLeft]\nfc_x = 3\n", id="StereoMIS"),
         pytest.param("[Camera]\nfc_x = 3\n", id="ini file"),
@@ -511,3 +517,12 @@ def test_files_are_in_the_folder_of_the_scene(small: Path, message: Messages) ->
     Path("camera.yml").rename("inner/camera.yml")
     Path("inner/s.yaml").write_text(text.replace("PATH", "camera.yml"))
     assert isinstance(load_scene("inner/s.yaml", image="speckle.png").render.camera, Camera)
+
+
+def test_the_camera_of_a_run_is_read_in_opencvs_pixels(small: Path) -> None:
+    camera = {"size": [40, 30], "projection": [[1.0] * 4] * 3, "intrinsics": [[60, 0, 20], [0, 61, 15], [0, 0, 1]]}
+    camera |= {"calibration": [[60, 0, 19.5], [0, 61, 14.5], [0, 0, 1]], "model": "omnidir"}
+    Path("camera.json").write_text(json.dumps({**camera, "distortion": [1.1, 0.1, 0.0, 0.01, 0.02]}))
+    found = read_calibration("camera.json")
+    assert (found.model, found.focal, found.centre, found.size) == ("omnidir", (60, 61), (19.5, 14.5), (40, 30))
+    assert found.coefficients == {"xi": 1.1, "k1": 0.1, "k2": 0.0, "p1": 0.01, "p2": 0.02}

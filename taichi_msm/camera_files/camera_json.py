@@ -1,0 +1,40 @@
+"""camera.json of a run, with the lens and the matrix in OpenCV's pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from taichi_msm.camera_files.calibration import Calibration, CalibrationReader
+from taichi_msm.camera_files.keys import Keys
+from taichi_msm.camera_files.text import CameraFile
+from taichi_msm.errors import truncate
+from taichi_msm.lenses import MODELS
+
+KEYS = {"size", "projection", "calibration", "model", "distortion"}
+
+
+class CameraJson(CalibrationReader):
+    """Reader of camera.json."""
+
+    name = "camera.json"
+    recognised_by = "a run's camera.json of a pinhole: `projection`, `calibration`, `model`, `distortion`"
+
+    def cameras(self, file: CameraFile) -> Sequence[Keys]:
+        """Return the only camera."""
+        return [Keys(file, file.data)] if file.data.keys() >= KEYS else []
+
+    def read(self, keys: Keys) -> Calibration:
+        """Read `calibration`, not `intrinsics`, whose first pixel has its centre at (0.5, 0.5)."""
+        model = keys.data["model"]
+        if model not in MODELS:
+            fault = f"model: {truncate(str(model))} is not known; expected one of: {', '.join(MODELS)}"
+            raise keys.file.fault(fault)
+        names = tuple(MODELS[model].coefficients)
+        fx, _, cx, _, fy, cy, *_ = keys.require("calibration", 9, "calibration")
+        width, height = keys.require("size", 2, "size")
+        values = keys.require("distortion", len(names), "distortion")
+        focal = None if model == "scaramuzza" else (fx, fy)
+        return Calibration(focal, (cx, cy), (round(width), round(height)), model, dict(zip(names, values, strict=True)))
+
+    def pose(self, keys: Keys) -> None:
+        """Return None, as there is one camera."""
