@@ -160,7 +160,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(tracks: dict[str, Array])
     assert 0.5 < float(np.std(ratios)) < 1.5
 
 
-@pytest.mark.default_cases("True")
+@pytest.mark.slow
 @pytest.mark.parametrize("bounded", [False, True])
 def test_a_profile_ends_where_the_others_can_no_longer_make_up_for_it(tracks: dict[str, Array], bounded: bool) -> None:
     # Errors so large that the motion is not linear in the damping; or a foundation that bounds keep from the truth.
@@ -792,6 +792,7 @@ def test_methods_are_those_that_are_described() -> None:
     assert all(f"{name}" in fit.__doc__ for name in Method.__annotations__)
 
 
+@pytest.mark.slow
 def test_tracks_that_drift_widen_the_intervals(tracks: dict[str, Array]) -> None:
     seen = noisy(tracks, 0.05)
     seen["pixel"] += np.cumsum(np.random.default_rng(3).normal(0, 0.1, tracks["pixel"].shape), axis=1)

@@ -245,6 +245,7 @@ def test_a_table_that_shows_no_contact_is_refused(case: str, message: Messages) 
         build_loading(test, scene(), contact=11.0 if case == "contact" else None)
 
 
+@pytest.mark.slow
 def test_the_parameters_of_a_tissue_that_relaxes_come_back_and_its_scene_runs_alone(
     pressed: str, tmp_path: Path
 ) -> None:

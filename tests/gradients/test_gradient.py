@@ -135,7 +135,7 @@ def test_the_tangent_is_symmetric_and_that_of_the_force(kind: str, image: str) -
     np.testing.assert_allclose(changed[0], exact, rtol=0, atol=1e-13 * np.abs(exact).max())
 
 
-@pytest.mark.default_cases("tissue, free edges-12", "springs-1")
+@pytest.mark.default_cases("tissue, free edges-12")
 @pytest.mark.parametrize("steps", [1, 12])
 @pytest.mark.parametrize("kind", KINDS)
 def test_material_numbers_are_those_of_complex_steps(kind: str, steps: int, image: str, device: Device) -> None:

@@ -244,6 +244,7 @@ def draped(made: Scene) -> NDArray[np.float64]:
     return position
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case", [pytest.param(case, marks=() if case == "pinhole" else pytest.mark.slow) for case in LOOKED_AT]
 )

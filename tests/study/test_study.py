@@ -285,6 +285,7 @@ def points(device: Device) -> Study:
     return points_study(tissue(), device, 2.0)
 
 
+@pytest.mark.slow
 def test_the_error_of_points_is_of_order_2(points: Study) -> None:
     found = points.points
     assert points.notes == []

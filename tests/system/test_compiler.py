@@ -230,7 +230,7 @@ both = pytest.mark.skipif(find_spec(OTHER.name) is None, reason="needs both comp
         ("press", ["output=[png, trajectory]", "time.precision=f32"]),
         ("tumour", ["output=[png, trajectory]", "time.precision=f64", "time.frames_per_second=50"]),
         ("two-tools", ["output=[png, trajectory]"]),
-        ("grasp", ["output=[png, trajectory, coordinates, depth, flow, occlusion, instrument, tracks]"]),
+        ("grasp", ["output=[png, trajectory, coordinates, depth, normals, flow, occlusion, instrument, tracks]"]),
     ],
 )
 def test_both_compilers_give_the_same_bytes(

@@ -207,6 +207,7 @@ def test_a_held_foundation_relaxes_as_prony_says(device: Device) -> None:
     assert h < min(times)
 
 
+@pytest.mark.default_cases("dynamic")
 @pytest.mark.parametrize("motion", ["dynamic", "quasistatic"])
 def test_slopes_of_a_scene(motion: str, device: Device) -> None:
     data = pressed("everything", time={"motion": motion})
