@@ -526,3 +526,22 @@ def test_the_camera_of_a_run_is_read_in_opencvs_pixels(small: Path) -> None:
     found = read_calibration("camera.json")
     assert (found.model, found.focal, found.centre, found.size) == ("omnidir", (60, 61), (19.5, 14.5), (40, 30))
     assert found.coefficients == {"xi": 1.1, "k1": 0.1, "k2": 0.0, "p1": 0.01, "p2": 0.02}
+
+
+ONE = "KN: [60, 0, 20, 0, 60, 15, 0, 0, 1]\nDN: [0, 0, 0, 0]\n"
+PAIR = ONE.replace("N", "1") + ONE.replace("N", "2")
+
+
+@pytest.mark.parametrize(
+    ("eye", "text"),
+    [
+        ("right", PAIR + "R: [2, 0, 0, 0, 1, 0, 0, 0, 1]\nT: [-0.004, 0, 0]\n"),
+        ("right", PAIR + "R: [1, 0, 0, 0, 1, 0, 0, 0, 1]\nT: [-4, 0, 0]\nunits: mm\n"),
+        ("left", stereomis().replace("kc_0", "skew = 2\nkc_0", 1)),
+    ],
+    ids=["no rotation", "units", "key of StereoMIS"],
+)
+def test_what_is_no_pair_is_refused(eye: Literal["left", "right"], text: str, small: Path, message: Messages) -> None:
+    Path("pair.yml").write_text(text)
+    with message.raises(CameraFileError, "pair.yml: "):
+        read_calibration("pair.yml", eye)
