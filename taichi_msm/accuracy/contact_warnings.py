@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.arithmetic import NUMPY
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions, spacing
 from taichi_msm.model.tools import Tool, touching_tools
@@ -15,6 +16,9 @@ from taichi_msm.solver.state import RunProgress
 
 # At a larger depth of a tip, in radii of the tip, the mass points of a soft sheet slide off sideways.
 MAX_INDENTATION_RATIO = 1 / 5
+
+# Smallest depth of the tissue in a tool that its axis pierces, in radii.
+MIN_PIERCING_RATIO = 0.1
 
 
 def tool_contact_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
@@ -77,7 +81,9 @@ def _pierces(tool: Tool, position: NDArray[np.floating], time: float) -> bool:
         weights = np.roll(x, -1, 1) * np.roll(y, -2, 1) - np.roll(x, -2, 1) * np.roll(y, -1, 1)
         inside = ((weights >= 0).all(axis=1) | (weights <= 0).all(axis=1)) & (weights.sum(axis=1) != 0)
         height = (weights * triangle[..., 0]).sum(axis=1)[inside] / weights.sum(axis=1)[inside]
-        if ((height >= 0) & (height <= tool.length)).any():
+        # The tip of a plate lies on the tissue that it presses.
+        depth, *_ = tool.shape.build_depth(NUMPY)(*np.outer(tool.axis, height), *tool.axis, tool.length, tool.radius)
+        if ((height >= 0) & (height <= tool.length) & (depth > MIN_PIERCING_RATIO * tool.radius)).any():
             return True
     return False
 

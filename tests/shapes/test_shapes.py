@@ -70,6 +70,7 @@ def test_a_plate_resists_by_its_area(device: Device) -> None:
         (felt,) = simulation.forces()
         np.testing.assert_allclose(felt.force, [0, 0, -K * points * cell**2 * 4e-4], rtol=1e-6, atol=1e-9)
         shown = simulation.labels().instrument
+        assert simulation.progress.pierced_by == 0
     pixels = np.hypot(*np.meshgrid(*2 * [(np.arange(100) - 49.5) * SIDE / 100]))
     np.testing.assert_array_equal(shown == 255, pixels < RADIUS)
 
