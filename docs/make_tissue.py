@@ -132,9 +132,9 @@ def draw_stretching() -> None:
         two.plot(STRETCHES, equal, color=BLUE, linewidth=1.8)
         strong = stretch_lattice(np.pi / 8, STRONG)[1]
         three.plot(STRETCHES, strong, ":", color=PURPLE, linewidth=1.8, label="the same, lock 0.3, factor 30")
-        for law in ((0.3, 10.0), STRONG, (0.3, 100.0)):
-            ends = [stretch_lattice(angle, law)[1][-1] for angle in angles.values()]
-            print(f"width at {STRETCHES[-1]}, lock and factor {law}: {ends[0]:.3f}, off the rows {ends[1]:.3f}")
+        for numbers in ((0.3, 10.0), STRONG, (0.3, 100.0)):
+            ends = [stretch_lattice(angle, numbers)[1][-1] for angle in angles.values()]
+            print(f"width at {STRETCHES[-1]}, lock and factor {numbers}: {ends[0]:.3f}, off the rows {ends[1]:.3f}")
         three.plot(STRETCHES, STRETCHES**-0.5, color=INK, linewidth=0.8, label="incompressible solids")
         for stretch in (1.1, 1.15, 1.2, 1.3):
             at = np.argmin(abs(STRETCHES - stretch))
