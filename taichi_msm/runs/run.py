@@ -333,7 +333,7 @@ class _Run:
                 time = frame / scene.time.frames_per_second
                 for camera, previous in observed.items():
                     observed[camera] = simulation.observe(previous.labels, camera, position, time)
-            writer.add(position, observed, simulation.forces(), report)
+            writer.add(position, observed, simulation.forces())
             if self._path_dependence:
                 self._path_dependence.check_frame(frame, position - rest)
             if self._error and frame > 0:
@@ -341,23 +341,16 @@ class _Run:
                     tool_forces = [simulation.forces()[tool.probe].force for tool in self._context.plan.tools]
                     forces = np.array(tool_forces).reshape(-1, 3) if frame >= self._resumed else None
                     self._error.compare_frame(position - rest, report, forces)
-        try:
+        # All frames are finished; after an interruption, the estimate of the coarse companion run remains valid.
+        with suppress(KeyboardInterrupt):
             if self._error:
-                displacements = (
-                    (writer.read_positions(frame) - rest for frame in range(1, self._frames)) if scene.output else None
-                )
+                displacements = (writer.read_positions(frame) - rest for frame in range(1, self._frames))
                 with stage("pilot"):
-                    self._error.finish(displacements, partial(self._progress, "pilot"))
+                    self._error.finish(displacements if scene.output else None, partial(self._progress, "pilot"))
             if self._path_dependence and self._repeats_solution:
+                report = partial(self._progress, "pilot", 0, 1)
                 with stage("pilot"):
-                    self._path_dependence.finish(
-                        self._context.device, self._cores, partial(self._progress, "pilot", 0, 1)
-                    )
-        except KeyboardInterrupt:
-            # All frames are finished; the estimate of the coarse companion run remains valid.
-            writer.finish()
-        else:
-            writer.finish(partial(self._progress, "frames", self._frames, self._frames))
+                    self._path_dependence.finish(self._context.device, self._cores, report)
 
     def save_finished_frames(self) -> dict[str, Any]:
         """Save the state and the finished frames of an interrupted run; reraise if there is no new frame."""
@@ -367,10 +360,9 @@ class _Run:
             # A divergence within this frame will recur in the resumed run.
             with suppress(DivergedError):
                 writer.save(simulation.save())
-        # Queued pictures are discarded, to end soon; there may be no new frame then.
         if writer.frames > self._resumed:
-            writer.finish(discard_queued=True)
-        if writer.frames <= self._resumed:
+            writer.finish()
+        if writer.frames <= self._resumed:  # an incomplete last frame was dropped
             raise KeyboardInterrupt
         return {"status": "interrupted"}
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from typing_extensions import NotRequired
 
-from taichi_msm.errors import Pause, writing
+from taichi_msm.errors import writing
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.surface import surface_positions
 from taichi_msm.model.tool_force import ProbeRecord
@@ -25,8 +25,7 @@ from taichi_msm.render.labels import FrameOutputs, track_grid
 from taichi_msm.runs.arrays import ChunkedArray, write_arrays, write_flo
 from taichi_msm.runs.checkpoint import CHECKPOINT_FOLDER, CHECKPOINT_PATTERNS, Checkpoint
 from taichi_msm.runs.directory import IsListed, Publication, PublicationSpec, create_file, write_new_file
-from taichi_msm.runs.encoder import Encoder
-from taichi_msm.runs.media import EncodingJob, PictureWriter
+from taichi_msm.runs.encoder import Encoder, EncodingJob, PictureWriter
 from taichi_msm.scene import outputs
 from taichi_msm.scene.outputs import CAMERA_FILE, OUTPUTS
 from taichi_msm.scene.scene import Scene
@@ -113,7 +112,6 @@ class ResultWriter:
         position: NDArray[Any],
         observed: Mapping[str, FrameOutputs],
         forces: Sequence[TipForce] = (),
-        pause: Pause = lambda: None,
     ) -> None:
         """Add the next frame.
 
@@ -121,7 +119,6 @@ class ResultWriter:
             position: positions of the mass points [m], shape (rows, cols, 3).
             observed: pictures and labels, by the names of the cameras.
             forces: force of every probe; unused for a frame that the checkpoint contains.
-            pause: as for `Encoder.add`.
         """
         with writing(self._directory):
             # Positions are stored first, so that an interruption never leaves a picture without positions.
@@ -135,7 +132,7 @@ class ResultWriter:
                 labels.add(self.frames, observed[name], position)
             if self._encoder:
                 pictures = [frame.picture for frame in observed.values() if frame.picture is not None]
-                self._encoder.add(np.stack(pictures) if len(pictures) > 1 else pictures[0][None], pause)
+                self._encoder.add(np.stack(pictures) if len(pictures) > 1 else pictures[0][None])
             self.frames += 1
 
     @property
@@ -153,18 +150,13 @@ class ResultWriter:
         with writing(self._directory):
             return self._checkpoint.load()
 
-    def finish(self, pause: Pause = lambda: None, *, discard_queued: bool = False) -> None:
-        """Wait until all frames are encoded, and write the files that combine frames.
-
-        Args:
-            pause: as for `Encoder.finish`.
-            discard_queued: as for `Encoder.finish`.
-        """
+    def finish(self) -> None:
+        """Wait until all frames are encoded, and write the files that combine frames."""
         if self._finished:
             return
         with writing(self._directory):
             if self._encoder:
-                self.frames, self.encode_seconds = self._encoder.finish(pause, discard_queued=discard_queued)
+                self.frames, self.encode_seconds = self._encoder.finish()
             for labels in self._labels.values():
                 labels.finish(self.frames)
             if self.frames and "trajectory" in self._scene.output:

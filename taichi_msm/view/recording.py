@@ -12,12 +12,12 @@ from typing import Any
 import yaml
 from PIL import Image
 
-from taichi_msm.errors import FilesError, Pause, printable, writing
+from taichi_msm.errors import FilesError, printable, writing
 from taichi_msm.load.scene_file import MAX_BYTES
 from taichi_msm.load.yaml_reader import MAX_NODES
 from taichi_msm.runs.directory import hidden_folder, move_to_free_name
-from taichi_msm.runs.encoder import Encoder
-from taichi_msm.runs.media import EncodingJob, Picture
+from taichi_msm.runs.encoder import Encoder, EncodingJob
+from taichi_msm.runs.media import Picture
 from taichi_msm.scene.outputs import OUTPUTS
 from taichi_msm.scene.render import Render
 from taichi_msm.scene.scene import Scene
@@ -73,23 +73,22 @@ class Film:
             opened.callback(self._encoder.abort)
             self._opened = opened.pop_all()
 
-    def add_frame(self, picture: Picture, frame: int, pause: Pause = lambda: None) -> None:
+    def add_frame(self, picture: Picture, frame: int) -> None:
         """Append a picture, repeated in place of missing earlier ones.
 
         Args:
             picture: shape (height, width, 3).
             frame: number of the session's frame.
-            pause: called while the encoder is busy.
         """
         with writing(*self._location):
             while self.pictures * self._subframes <= frame - self._begin:
-                self._encoder.add(picture[None], pause)
+                self._encoder.add(picture[None])
                 self.pictures += 1
 
-    def finish(self, pause: Pause = lambda: None) -> Path:
+    def finish(self) -> Path:
         """Finish a film with at least one picture; return its file, which the caller must move."""
         with writing(*self._location):
-            self._encoder.finish(pause)
+            self._encoder.finish()
         return self._hidden / OUTPUTS[self._format].path()
 
     def close(self) -> None:

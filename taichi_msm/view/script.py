@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -209,7 +208,7 @@ def record_film(
                 notice = session.notice
                 upcoming = next(events, None)
             if frame % subframes == 0:
-                film.add_frame(session.picture(), frame, partial(progress, frame, frames))
+                film.add_frame(session.picture(), frame)
             if frame < frames:
                 session.advance()
             if session.divergence_error:
@@ -218,6 +217,6 @@ def record_film(
         if upcoming is not None:
             notify(f"the film ends at {frame / session.frame_rate:g} s, before some of the script's events")
         with writing(path, OPTION):
-            film.finish(partial(progress, frames, frames)).replace(path)
+            film.finish().replace(path)
     if failures:
         raise failures[0]

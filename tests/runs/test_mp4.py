@@ -17,7 +17,8 @@ from PIL import Image
 
 from taichi_msm import SceneError, run
 from taichi_msm.load.scene_file import load_scene
-from taichi_msm.runs.media import EncodingJob, Mp4Writer, PictureWriter
+from taichi_msm.runs.encoder import EncodingJob, PictureWriter
+from taichi_msm.runs.media import Mp4Writer
 from taichi_msm.scene import outputs
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
