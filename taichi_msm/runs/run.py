@@ -38,7 +38,7 @@ from taichi_msm.render.camera import view_at
 from taichi_msm.render.labels import FrameOutputs
 from taichi_msm.render.notes import drawing_warnings
 from taichi_msm.render.texture import load_texture
-from taichi_msm.runs.manifest import Manifest, input_digests, read_manifest
+from taichi_msm.runs.checkpoint import Manifest, input_digests, read_manifest
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.runs.writer import ResultWriter, RunRecord
 from taichi_msm.scene.scene import Scene

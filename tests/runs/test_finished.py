@@ -16,8 +16,8 @@ from PIL import Image
 from taichi_msm.errors import FilesError, SceneError
 from taichi_msm.load.scene_file import load_plan, load_scene
 from taichi_msm.model.plan import Plan
+from taichi_msm.runs.checkpoint import input_digests
 from taichi_msm.runs.finished import read_run
-from taichi_msm.runs.manifest import input_digests
 from taichi_msm.runs.playback import Playback
 from taichi_msm.runs.run import resume, run
 from taichi_msm.runs.writer import RunRecord
