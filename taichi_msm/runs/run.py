@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
@@ -43,7 +43,7 @@ from taichi_msm.runs.simulation import Simulation
 from taichi_msm.runs.writer import ResultWriter, RunRecord
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.planning import ENCODING_WORK
-from taichi_msm.solver.state import ProbeForces, RunProgress
+from taichi_msm.solver.state import RunProgress
 from taichi_msm.system import process, runtime
 from taichi_msm.system.compiler import versions
 from taichi_msm.system.runtime import Device
@@ -264,14 +264,12 @@ class _Run:
         self._frames = plan.grid.frames + 1
         progress("compile", 0, self._frames)
         self._cores = cores = free_cores(plan)
-        # The writer is created first, so that its encoder starts while kernels are compiled.
+        # The writer is created first, so that its encoder starts while kernels are compiled. With one thread, no core
+        # is free for the encoder.
+        in_subprocess = device.threads > 1
         self._writer = opened.enter_context(
             ResultWriter(
-                context.directory,
-                plan,
-                manifest.as_json(),
-                resumes=resumes,
-                encode_in_subprocess=device.threads > 1,  # with one thread, no core is free for it
+                context.directory, plan, manifest.as_json(), resumes=resumes, encode_in_subprocess=in_subprocess
             )
         )
         self._simulation = opened.enter_context(Simulation(plan, device.arch, device.threads, context.texture, cores))
@@ -298,42 +296,34 @@ class _Run:
             self._writer.read_positions(frame)
 
     def prepare(self) -> None:
-        """Compile, and restore the simulation and its companion runs to the state of the unfinished run."""
-        writer, rest = self._writer, rest_positions(self._context.plan.scene.sheet)
+        """Compile, and restore the simulation to the state of the unfinished run."""
         with self._stopwatch.stage("compile"):
             self._simulation.compile(partial(self._progress, "compile", 0, self._frames))
             if self._error:
                 self._error.compile()
-        if writer.saved:
-            self._simulation.restore(writer.saved)
-        if self._path_dependence and self._context.plan.scene.output:
-            for frame in range(writer.frames):
-                self._path_dependence.check_frame(frame, writer.read_positions(frame) - rest)
-        if self._error:
-            with self._stopwatch.stage("pilot"):
-                for frame in range(1, writer.frames):
-                    report = partial(self._progress, "pilot", frame, writer.frames)
-                    self._error.compare_frame(writer.read_positions(frame) - rest, report)
+        if self._writer.saved:
+            self._simulation.restore(self._writer.saved)
 
     def simulate_frames(self) -> None:
-        """Simulate, draw and write every missing frame, and complete the results."""
+        """Simulate, draw and write every missing frame, and estimate the error."""
         writer, simulation, scene = self._writer, self._simulation, self._context.plan.scene
         stage, rest = self._stopwatch.stage, rest_positions(scene.sheet)
         observed = dict.fromkeys(scene.render.all_cameras, FrameOutputs())
         # Frames without steps are reported as a separate stage, because they distort the estimated remaining time.
         redrawn_frames = max(self._resumed, 1)
-        for frame in range(writer.frames, self._frames):
+        for frame in range(0 if scene.output else writer.frames, self._frames):
             kind, total = ("redraw", redrawn_frames) if frame < redrawn_frames else ("frames", self._frames)
             report = partial(self._progress, kind, frame, total)
             report()
             with stage("simulate"):
                 simulation.advance(max(0, frame - simulation.frame), self._pause)
             position = writer.read_positions(frame) if frame < self._resumed else simulation.positions()
-            with stage("render"):
-                time = frame / scene.time.frames_per_second
-                for camera, previous in observed.items():
-                    observed[camera] = simulation.observe(previous.labels, camera, position, time)
-            writer.add(position, observed, simulation.forces())
+            if frame == writer.frames:  # without pictures and labels, stored frames are complete
+                with stage("render"):
+                    time = frame / scene.time.frames_per_second
+                    for camera, previous in observed.items():
+                        observed[camera] = simulation.observe(previous.labels, camera, position, time)
+                writer.add(position, observed, simulation.forces())
             if self._path_dependence:
                 self._path_dependence.check_frame(frame, position - rest)
             if self._error and frame > 0:
@@ -362,7 +352,7 @@ class _Run:
                 writer.save(simulation.save())
         if writer.frames > self._resumed:
             writer.finish()
-        if writer.frames <= self._resumed:  # an incomplete last frame was dropped
+        if writer.frames <= self._resumed:  # also if an incomplete last frame was dropped
             raise KeyboardInterrupt
         return {"status": "interrupted"}
 
@@ -372,9 +362,8 @@ class _Run:
         self._error, self._estimates = None, RunErrorEstimates(reason="the run diverged")
         ending: dict[str, Any] = {"status": "diverged", "error": str(error), "dump": None}
         with suppress(KeyboardInterrupt):
-            diagnosis = self._simulation.diagnose(
-                writer.load(), partial(self._progress, "diagnosis", writer.frames, self._frames)
-            )
+            report = partial(self._progress, "diagnosis", writer.frames, self._frames)
+            diagnosis = self._simulation.diagnose(writer.load(), report)
             ending["error"] = diagnosis.message
             if diagnosis.last_sound_state:
                 ending["dump"] = writer.save(diagnosis.last_sound_state)
@@ -382,23 +371,17 @@ class _Run:
 
     def publish_results(self, ending: dict[str, Any]) -> RunRecord:
         """Publish the results together with run.json."""
-        writer, simulation, device, stopwatch = self._writer, self._simulation, self._context.device, self._stopwatch
+        writer, simulation, device = self._writer, self._simulation, self._context.device
         self._progress("write", writer.frames, self._frames)
         writer.finish()
-        estimates = self._error.estimates if self._error else self._estimates
-        stages = ["startup", *(["pilot"] if "pilot" in stopwatch.seconds else []), "compile", "simulate", "render"]
-        seconds = {stage: stopwatch.seconds.get(stage, 0.0) for stage in stages}
+        seconds = self._stopwatch.seconds
+        stages = ["startup", *(["pilot"] if "pilot" in seconds else []), "compile", "simulate", "render"]
+        timings = {stage: seconds.get(stage, 0.0) for stage in stages}
         record = {
             **ending,
-            **_run_entries(
-                self._context,
-                simulation.progress,
-                simulation.felt,
-                estimates,
-                self._path_dependence.warnings() if self._path_dependence else (),
-            ),
+            **self._scene_entries(),
             "resumed": self._resumed,
-            "timings": {**seconds, "encode": writer.encode_seconds, "total": stopwatch.total()},
+            "timings": {**timings, "encode": writer.encode_seconds, "total": self._stopwatch.total()},
             "arch": device.arch,
             "device": device.name,
             "threads": device.threads,
@@ -408,6 +391,45 @@ class _Run:
             "commit": commit(),
         }
         return cast(RunRecord, writer.publish(record))
+
+    def _scene_entries(self) -> dict[str, Any]:
+        """Build the entries of run.json about the scene, the last frame and the errors."""
+        manifest, plan, progress = self._context.manifest, self._context.plan, self._simulation.progress
+        scene = plan.scene
+        estimates = self._error.estimates if self._error else self._estimates
+        probes = [
+            ProbeRecord(
+                **record,
+                greatest_force=math.hypot(*peak.force),
+                greatest_force_vector=list(peak.force),
+                greatest_force_time=peak.time,
+            )
+            for record, peak in zip(probe_records(scene), self._simulation.felt.greatest, strict=True)
+        ]
+        notes = [
+            *run_warnings(plan, probes, progress, *estimates, _is_affordable, _pixels_per_metre(scene)),
+            *(self._path_dependence.warnings() if self._path_dependence else ()),
+            *drawing_warnings(scene),
+        ]
+        # Picture paths are as given; only the sections sheet and time contain resolved values.
+        simulated = manifest.given.model_copy(update={"sheet": scene.sheet, "time": scene.time})
+        return {
+            "scene": simulated.model_dump(mode="json"),
+            "asked": _chosen_keys(manifest.given, scene),
+            "working_directory": manifest.folder,
+            "sha256": dict(manifest.sha256),
+            "overrides": list(manifest.overrides),
+            "points": list(scene.sheet.points),
+            **_step_entries(plan, progress),
+            "max_displacement": progress.max_displacement,
+            "max_displacement_frame": progress.max_displacement_frame,
+            "shortest_spring": progress.shortest_spring,
+            "longest_spring": progress.longest_spring,
+            "probes": probes,
+            "notes": notes,
+            "error_estimate": _error_record(estimates),
+            **({"error_estimate_reason": estimates.reason} if estimates.estimate is None else {}),
+        }
 
     def _pause(self) -> None:
         """Report the progress within a frame, and save the state when due."""
@@ -428,49 +450,6 @@ def _choose_companions(context: _RunContext, *, resumed: bool) -> CompanionRuns:
     if companions.planned and resumed and not context.plan.scene.output:
         return CompanionRuns(reason="the frames before the interruption were not kept")
     return companions
-
-
-def _run_entries(
-    context: _RunContext,
-    progress: RunProgress,
-    felt: ProbeForces,
-    estimates: RunErrorEstimates,
-    path_dependence: Iterable[str],
-) -> dict[str, Any]:
-    """Build the entries of run.json about the scene, the last frame and the errors."""
-    manifest, plan = context.manifest, context.plan
-    scene = plan.scene
-    probes = [
-        ProbeRecord(
-            **record,
-            greatest_force=math.hypot(*peak.force),
-            greatest_force_vector=list(peak.force),
-            greatest_force_time=peak.time,
-        )
-        for record, peak in zip(probe_records(scene), felt.greatest, strict=True)
-    ]
-    return {
-        # Picture paths are as given; only the sections sheet and time contain resolved values.
-        "scene": manifest.given.model_copy(update={"sheet": scene.sheet, "time": scene.time}).model_dump(mode="json"),
-        "asked": _chosen_keys(manifest.given, scene),
-        "working_directory": manifest.folder,
-        "sha256": dict(manifest.sha256),
-        "overrides": list(manifest.overrides),
-        "points": list(scene.sheet.points),
-        **_step_entries(plan, progress),
-        "max_displacement": progress.max_displacement,
-        "max_displacement_frame": progress.max_displacement_frame,
-        "shortest_spring": progress.shortest_spring,
-        "longest_spring": progress.longest_spring,
-        "probes": probes,
-        "notes": [
-            *run_warnings(plan, probes, progress, *estimates, _is_affordable, _pixels_per_metre(scene)),
-            *path_dependence,
-            *drawing_warnings(scene),
-        ],
-        "error_estimate": error_record(estimates),
-        **({"error_estimate_reason": estimates.reason} if estimates.estimate is None else {}),
-    }
 
 
 def _step_entries(plan: Plan, progress: RunProgress) -> dict[str, Any]:
@@ -521,7 +500,7 @@ def _pixels_per_metre(scene: Scene) -> float | None:
     return scale if math.isfinite(scale) else None
 
 
-def error_record(estimates: RunErrorEstimates) -> dict[str, Any] | None:
+def _error_record(estimates: RunErrorEstimates) -> dict[str, Any] | None:
     """Build the error estimate for run.json; unknown values are null."""
     estimate, mesh, keys = estimates.estimate, estimates.mesh, ("error", "rounding", "in_f64", "order", "at_least")
     if estimate is not None:
