@@ -56,16 +56,16 @@ class Publication:
     Args:
         directory: destination; created if missing.
         spec: kind of the publication.
-        names: names of all files that may be published; checked at entry for conflicts with foreign files.
+        names: names of all files that may be published; checked for conflicts with foreign files.
 
     Raises:
-        FilesError: at entry and in `publish`, when another process publishes to the directory, or a foreign file is at
+        FilesError: here and in `publish`, when another process publishes to the directory, or a foreign file is at
             the path of a result.
         OSError: when the directory cannot be written.
 
     Attributes:
         staging_folder: folder for unpublished files.
-        new_folder: folder for the new files under their final names; created at entry.
+        new_folder: folder for the new files under their final names.
         keep_companion: whether the companion folder is kept at exit.
     """
 
@@ -73,18 +73,30 @@ class Publication:
         self.staging_folder = directory / STAGING_FOLDER
         self.new_folder = self.staging_folder / NEW_FOLDER
         self.keep_companion = True
-        self._directory = directory
-        self._spec = spec
-        self._names = names
-        self._record = directory / spec.record
+        self._directory, self._spec, self._record = directory, spec, directory / spec.record
         self._companion, inner = spec.companion or ("", ())
         self._patterns = [
             *(rf"{folder}/{pattern}" for folder in (NEW_FOLDER, READY_FOLDER) for pattern in spec.patterns),
             *(rf"{self._companion}/{pattern}" for pattern in inner),
             *(LOCK_FILE, re.escape(PREVIOUS_RECORD)),
         ]
-        self._lock: BinaryIO
-        self._open = ExitStack()
+        with ExitStack() as opened:
+            opened.enter_context(ensured_folder(directory))
+            try:
+                self._lock = self._acquire(opened)
+            except BlockingIOError:
+                fault = f"another {spec.name} is writing there; choose another --out"
+                raise FilesError(f"{directory}: {fault}") from None
+            self._complete()
+            self._clear()
+            earlier = self._listed_results(self._record)
+            if spec.exclusive:
+                for name in list_files(directory, spec.patterns, strict=True, ignored=(STAGING_FOLDER,)):
+                    if name not in earlier:
+                        raise ForeignError.at(directory / name, FILE)
+            self._require_free(names, earlier)
+            self.new_folder.mkdir()
+            self._open = opened.pop_all()
 
     @property
     def lock_descriptors(self) -> tuple[int, ...]:
@@ -101,23 +113,6 @@ class Publication:
         self._complete()
 
     def __enter__(self) -> Publication:
-        with ExitStack() as opened:
-            opened.enter_context(ensured_folder(self._directory))
-            try:
-                opened.enter_context(self._acquire())
-            except BlockingIOError:
-                fault = f"another {self._spec.name} is writing there; choose another --out"
-                raise FilesError(f"{self._directory}: {fault}") from None
-            self._complete()
-            self._clear()
-            earlier = self._listed_results(self._record)
-            if self._spec.exclusive:
-                for name in list_files(self._directory, self._spec.patterns, strict=True, ignored=(STAGING_FOLDER,)):
-                    if name not in earlier:
-                        raise ForeignError.at(self._directory / name, FILE)
-            self._require_free(self._names, earlier)
-            self.new_folder.mkdir()
-            self._open = opened.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -194,20 +189,22 @@ class Publication:
         keep = (LOCK_FILE, self._companion) if self.keep_companion else (LOCK_FILE,)
         clear_folder(self.staging_folder, self._patterns, keep)
 
-    def _acquire(self) -> ExitStack:
+    def _acquire(self, opened: ExitStack) -> BinaryIO:
         """Create the staging folder, and lock it until all processes with the lock's descriptor have ended."""
+        path = self.staging_folder / LOCK_FILE
         # An ending run may delete the folder before the lock is opened or acquired.
         for _ in range(100):
-            with suppress(FileNotFoundError), ExitStack() as opened:
+            with suppress(FileNotFoundError), ExitStack() as attempt:
                 with suppress(FileExistsError):
                     self.staging_folder.mkdir()
                 # Raise an error for foreign files before anything is written.
                 list(list_files(require_kind(self.staging_folder, FOLDER), self._patterns, strict=True))
-                opened.callback(_try_to_remove, self.staging_folder.rmdir)
-                self._lock = opened.enter_context(lock_file(self.staging_folder / LOCK_FILE))
-                if os.path.samestat(os.fstat(self._lock.fileno()), (self.staging_folder / LOCK_FILE).lstat()):
-                    opened.callback(_try_to_remove, (self.staging_folder / LOCK_FILE).unlink)
-                    return opened.pop_all()
+                attempt.callback(_try_to_remove, self.staging_folder.rmdir)
+                lock = attempt.enter_context(lock_file(path))
+                if os.path.samestat(os.fstat(lock.fileno()), path.lstat()):
+                    attempt.callback(_try_to_remove, path.unlink)
+                    opened.push(attempt.pop_all())
+                    return lock
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
 
 

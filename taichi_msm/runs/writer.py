@@ -61,7 +61,7 @@ class ResultWriter:
         encode_in_subprocess: whether pictures are encoded in a separate process; otherwise, `add` encodes them.
 
     Raises:
-        FilesError: at entry and in all methods, when the directory cannot be written, another run writes there, or a
+        FilesError: here and in all methods, when the directory cannot be written, another run writes there, or a
             foreign file is at the path of a result.
 
     Attributes:
@@ -79,23 +79,37 @@ class ResultWriter:
         resumes: bool = False,
         encode_in_subprocess: bool = True,
     ) -> None:
-        self.saved: Snapshot | None = None
-        self.frames = 0
-        self.encode_seconds = 0.0
-        self._directory = directory
+        self._directory, self._manifest = directory, manifest
         self._scene = scene = plan.scene
-        self._manifest = manifest
-        self._resumes = resumes
-        self._encodes_in_subprocess = encode_in_subprocess
-        names = outputs.file_names(outputs.result_names(scene.folders), scene.time.frames + 1)
-        self._publication = Publication(directory, RUN_PUBLICATION, names)
-        folder = self._publication.staging_folder / CHECKPOINT_FOLDER
-        self._checkpoint = Checkpoint(folder, plan)
-        staged = self._publication.new_folder
-        self._labels = {name: LabelWriter(staged / name, scene, name) for name in scene.render.all_cameras}
-        self._encoder: Encoder | PictureWriter | None = None
-        self._open = ExitStack()
         self._finished = False
+        self.encode_seconds = 0.0
+        names = outputs.file_names(outputs.result_names(scene.folders), scene.time.frames + 1)
+        with writing(directory), ExitStack() as opened:
+            self._publication = opened.enter_context(Publication(directory, RUN_PUBLICATION, names))
+            staged = self._publication.new_folder
+            for name in scene.render.all_cameras if scene.renders else ():
+                (staged / name).mkdir(exist_ok=True)
+            self._labels = {name: LabelWriter(staged / name, scene, name) for name in scene.render.all_cameras}
+            self._encoder: Encoder | PictureWriter | None = None
+            if scene.draws:
+                job = EncodingJob(
+                    folders=tuple(staged / name for name in scene.render.all_cameras),
+                    size=scene.render.size,
+                    rate=scene.time.frames_per_second,
+                    png="png" in scene.output,
+                    gif="gif" in scene.output,
+                    background=scene.render.background,
+                    mp4="mp4" in scene.output,
+                    quality=scene.render.quality,
+                )
+                locks = self._publication.lock_descriptors
+                self._encoder = Encoder(job, locks) if encode_in_subprocess else PictureWriter(job)
+                opened.callback(self._encoder.abort)
+            self._checkpoint = Checkpoint(self._publication.staging_folder / CHECKPOINT_FOLDER, plan)
+            opened.callback(self._checkpoint.close)
+            self.saved = self._checkpoint.reopen() if resumes else None
+            self.frames = 0 if scene.renders else self.stored_frames
+            self._open = opened.pop_all()
 
     @property
     def stored_frames(self) -> int:
@@ -213,30 +227,6 @@ class ResultWriter:
                 rows.writerows((time, force.probe, *force.tip, *force.force) for force in forces)
 
     def __enter__(self) -> ResultWriter:
-        scene = self._scene
-        with writing(self._directory), ExitStack() as opened:
-            opened.enter_context(self._publication)
-            for name in scene.render.all_cameras if scene.renders else ():
-                (self._publication.new_folder / name).mkdir(exist_ok=True)
-            if scene.draws:
-                job = EncodingJob(
-                    folders=tuple(self._publication.new_folder / name for name in scene.render.all_cameras),
-                    size=scene.render.size,
-                    rate=scene.time.frames_per_second,
-                    png="png" in scene.output,
-                    gif="gif" in scene.output,
-                    background=scene.render.background,
-                    mp4="mp4" in scene.output,
-                    quality=scene.render.quality,
-                )
-                locks = self._publication.lock_descriptors
-                self._encoder = Encoder(job, locks) if self._encodes_in_subprocess else PictureWriter(job)
-                opened.callback(self._encoder.abort)
-            opened.callback(self._checkpoint.close)
-            if self._resumes:
-                self.saved = self._checkpoint.reopen()
-            self.frames = 0 if scene.renders else self.stored_frames
-            self._open = opened.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
