@@ -316,16 +316,7 @@ else:
 HIDDEN_FOLDER_PATTERN, LOCK_FILE, DRAFT_FILE = r"\.partial-[0-9a-f]{16}", "lock", "draft"
 
 # Files that a hidden folder may contain.
-STAGED_PATTERNS = (
-    LOCK_FILE,
-    DRAFT_FILE,
-    "picture",
-    "session",
-    "copy",
-    r"animation\.gif",
-    r"study\.(?:png|md|json)",
-    r"sweep\.json",
-)
+STAGED_PATTERN = r"lock|draft|picture|session|copy|animation\.(?:gif|mp4)|study\.(?:png|md|json)|sweep\.json"
 
 
 @contextmanager
@@ -364,7 +355,7 @@ def _clear_abandoned(folder: Path) -> None:
         if re.fullmatch(HIDDEN_FOLDER_PATTERN, hidden.name) and entry_kind(hidden) == FOLDER:
             # Folders that are locked, incomplete, of another user or with foreign files are kept.
             with suppress(OSError, FilesError):
-                list(list_files(hidden, STAGED_PATTERNS, strict=True))
+                list(list_files(hidden, [STAGED_PATTERN], strict=True))
                 if entry_kind(hidden / LOCK_FILE) == FILE:
                     with (hidden / LOCK_FILE).open("ab", 0) as file:
                         is_abandoned = _try_lock(file)

@@ -15,7 +15,7 @@ import struct
 from collections import deque
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,13 +74,6 @@ class Palette:
         return indices
 
 
-class _TimedFrame(NamedTuple):
-    """A queued frame of a GIF."""
-
-    start: int  # time at which it appears [1/100 s]
-    indices: Picture  # palette indices, shape (height, width)
-
-
 class GifWriter:
     """Writer of an endlessly looping GIF. Frame f lasts from f / rate to (f + 1) / rate, rounded to 1/100 s.
 
@@ -99,8 +92,8 @@ class GifWriter:
         self._palette = palette
         self._frames = 0
         self._latest: Picture | None = None
-        # Two frames are queued, because a short last frame shortens its predecessor.
-        self._queue: deque[_TimedFrame] = deque()
+        # Start times [1/100 s] and palette indices. Two frames are queued, because a short last one shortens the other.
+        self._queue: deque[tuple[int, Picture]] = deque()
         self._screen: Picture | None = None
         self._file = file
         self._file.write(b"GIF89a" + struct.pack("<HHBBB", *size, 0xF7, 0, 0) + palette.table.tobytes())
@@ -112,14 +105,14 @@ class GifWriter:
         self._frames += 1
         self._latest = picture
         queue = self._queue
-        if queue and start - queue[-1].start < MIN_GIF_DELAY:
+        if queue and start - queue[-1][0] < MIN_GIF_DELAY:
             return
         indices = self._palette.indices(picture)
-        if queue and np.array_equal(indices, queue[-1].indices):
+        if queue and np.array_equal(indices, queue[-1][1]):
             return
-        queue.append(_TimedFrame(start, indices))
+        queue.append((start, indices))
         if len(queue) > 2:
-            self._write_first(until=queue[1].start)
+            self._write_first(until=queue[1][0])
 
     def close(self) -> None:
         """Write the queued frames and close the file."""
@@ -133,15 +126,15 @@ class GifWriter:
 
     def _write_last(self, indices: Picture) -> None:
         """Write the queued frames, and the latest frame at the end."""
-        first, last = self._queue[0], self._queue.pop()
+        first, last = self._queue[0][0], self._queue.pop()[0]
         end = self._centiseconds(self._frames)
-        start = min(last.start, end - MIN_GIF_DELAY)
-        if start - first.start < MIN_GIF_DELAY:
+        start = min(last, end - MIN_GIF_DELAY)
+        if start - first < MIN_GIF_DELAY:
             self._queue.clear()
-            start = first.start
+            start = first
         else:
             self._write_first(until=start)
-        self._queue.append(_TimedFrame(start, indices))
+        self._queue.append((start, indices))
         self._write_first(until=max(end, start + 1))
 
     def _write_first(self, until: int) -> None:

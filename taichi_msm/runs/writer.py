@@ -24,24 +24,18 @@ from taichi_msm.render.camera import calibration, is_moving, pair_transform, pos
 from taichi_msm.render.labels import FrameOutputs, track_grid
 from taichi_msm.runs.arrays import ChunkedArray, write_arrays, write_flo
 from taichi_msm.runs.checkpoint import CHECKPOINT_FOLDER, CHECKPOINT_PATTERNS, Checkpoint
-from taichi_msm.runs.directory import IsListed, Publication, PublicationSpec, create_file, write_new_file
+from taichi_msm.runs.directory import Publication, PublicationSpec, create_file, write_new_file
 from taichi_msm.runs.encoder import Encoder, EncodingJob, PictureWriter
 from taichi_msm.scene import outputs
 from taichi_msm.scene.outputs import CAMERA_FILE, OUTPUTS
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.state import Snapshot, TipForce
 
-
-def _is_listed_in(record: Mapping[str, Any]) -> IsListed:
-    """Return the predicate of the file names that a record lists."""
-    return partial(outputs.is_result, set(record["outputs"]), int(record["frames"]))
-
-
 RUN_PUBLICATION = PublicationSpec(
     "run",
     outputs.RUN_RECORD,
     outputs.RESULT_PATTERNS,
-    _is_listed_in,
+    lambda record: partial(outputs.is_result, set(record["outputs"]), int(record["frames"])),
     companion=(CHECKPOINT_FOLDER, CHECKPOINT_PATTERNS),
 )
 
@@ -300,9 +294,8 @@ _LABEL_WRITERS: dict[str, Callable[[BinaryIO, Any], None]] = {
     ".npy": np.save,
     ".tiff": lambda file, depth: Image.fromarray(depth).save(file, "TIFF"),
     ".flo": write_flo,
-    ".png": lambda file, mask: Image.fromarray(mask).save(
-        file, "PNG", compress_level=1
-    ),  # masks consist of few large areas
+    # Masks consist of few large areas.
+    ".png": lambda file, mask: Image.fromarray(mask).save(file, "PNG", compress_level=1),
 }
 
 
