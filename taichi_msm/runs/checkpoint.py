@@ -87,14 +87,11 @@ class Manifest:
         return cast(dict[str, Any], _MANIFEST_ADAPTER.dump_python(self, mode="json"))
 
     def require_same_inputs(self, sha256: Mapping[str, str], versions: Mapping[str, str]) -> None:
-        """Check that resuming the run yields the same bits as an uninterrupted run.
+        """Raise a FilesError if a file or a version has changed, so that resuming might not yield the same bits.
 
         Args:
             sha256: current digests of picture, maps and cameras, from `input_digests`.
             versions: current versions.
-
-        Raises:
-            FilesError: when a file or a relevant version has changed.
         """
         for key, path in self.scene.pictures.items():
             if sha256.get(key) != self.sha256.get(key):
@@ -252,11 +249,7 @@ class Checkpoint:
         self._state_path.unlink(missing_ok=True)
 
     def reopen(self) -> Snapshot | None:
-        """Open the checkpoint of an earlier run to continue it.
-
-        Returns:
-            The last saved state; None when the run continues from its first frame.
-        """
+        """Open the checkpoint of an earlier run; return its last saved state, None to continue from the first frame."""
         self.close()
         saved = self.load()
         self.frames = 0 if saved is None else saved.progress.frame + 1
@@ -273,12 +266,7 @@ class Checkpoint:
         return saved
 
     def add(self, position: NDArray[Any], forces: Sequence[TipForce]) -> None:
-        """Store the next frame.
-
-        Args:
-            position: positions of the mass points [m], shape (rows, cols, 3).
-            forces: the force of every probe.
-        """
+        """Store the next frame: positions of the mass points [m], shape (rows, cols, 3), and forces of all probes."""
         if self._file:
             parts = np.ascontiguousarray(position, self.precision), _tip_force_array(forces)[: self._stored_probes]
             self._file.seek(self.frames * self._record.itemsize)
@@ -299,8 +287,7 @@ class Checkpoint:
     def save(self, saved: Snapshot) -> str:
         """Save a state in place of the previous one; all frames up to it must be stored.
 
-        Returns:
-            Path of the archive, which contains the fields of `State` and `RunProgress` by name.
+        Returns the path of the archive, which contains the fields of `State` and `RunProgress` by name.
         """
         start = time.perf_counter()
         self._write_state(_state_arrays(saved))

@@ -145,9 +145,7 @@ class Publication:
         for folder in sorted(parent_folders(names)):
             # Checked here, so that it fails before the run and not during the moves.
             path = require_kind(self._directory / folder, FOLDER)
-            if entry_kind(path) is None:
-                continue
-            if not os.access(path, os.W_OK):
+            if entry_kind(path) is not None and not os.access(path, os.W_OK):
                 raise PermissionError(errno.EACCES, f"{folder} is not a writable directory")
         for name in names:
             actual = entry_kind(self._directory / name)
@@ -237,11 +235,9 @@ def require_kind(path: Path, wanted: str) -> Path:
 
 
 def require_no_link(folder: Path, option: str) -> Path:
-    """Return a default folder, which may have come with the scene; raise a FilesError if it is a symbolic link.
+    """Return a default folder; raise a FilesError if it is a link, which may have come with the scene.
 
-    Args:
-        folder: the folder.
-        option: command-line option that selects it, for messages.
+    `option` is the command-line option that selects another folder.
     """
     try:
         is_link = folder.is_symlink()
@@ -282,24 +278,14 @@ def list_files(top: Path, patterns: Collection[str], *, strict: bool, ignored: C
 
 
 def clear_folder(top: Path, patterns: Collection[str], keep: Collection[str] = ()) -> None:
-    """Delete the contents of a folder.
-
-    Args:
-        top: the folder.
-        patterns: patterns of all permitted files, as for `list_files`.
-        keep: names of entries to keep.
-
-    Raises:
-        ForeignError: when an entry matches no pattern; nothing is deleted then.
-    """
+    """Delete the contents of a folder but for the names in `keep`; raise a ForeignError first, as `list_files` does."""
     list(list_files(top, patterns, strict=True))
     for path in list(top.iterdir()):
-        if path.name in keep:
-            continue
-        if entry_kind(path) == FOLDER:
-            shutil.rmtree(path)
-        else:
-            path.unlink()
+        if path.name not in keep:
+            if entry_kind(path) == FOLDER:
+                shutil.rmtree(path)
+            else:
+                path.unlink()
 
 
 def parent_folders(names: Iterable[str]) -> set[str]:
@@ -406,8 +392,7 @@ def write_new_file(path: Path, data: bytes) -> None:
 def lock_file(path: Path) -> BinaryIO:
     """Lock a file, created if missing, until it is closed here and in all processes that inherit it.
 
-    Raises:
-        BlockingIOError: when another process holds the lock.
+    Raises a BlockingIOError when another process holds the lock.
     """
     file = path.open("ab", 0)
     try:

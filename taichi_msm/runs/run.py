@@ -51,17 +51,10 @@ from taichi_msm.version import commit
 
 
 class Stopwatch:
-    """Timer of the stages of a run. A nested stage pauses the outer one.
-
-    Args:
-        started: `time.perf_counter()` at the beginning of the stage startup; None for now.
-
-    Attributes:
-        seconds: time spent in each stage [s].
-    """
+    """Timer of the stages of a run, the first of which is startup. A nested stage pauses the outer one."""
 
     def __init__(self, started: float | None) -> None:
-        self.seconds: dict[str, float] = {}
+        self.seconds: dict[str, float] = {}  # time spent in each stage
         self._stage = "startup"
         self._started = self._last = time.perf_counter() if started is None else started
 
@@ -201,16 +194,14 @@ def resume(
 
 def _find_unfinished(context: _RunContext) -> Manifest | None:
     """Find the unfinished run in the directory, if it produces the same bits and the same error estimate."""
-    manifest = context.manifest
     try:
         unfinished, _ = read_manifest(context.directory)
     except (FilesError, SceneError):
         return None
-    if not manifest.has_same_bits_as(unfinished):
-        return None
-    if _choose_companions(context, resumed=True) != _choose_companions(context, resumed=False):
-        return None
-    return replace(manifest, versions=unfinished.versions)
+    same_estimate = _choose_companions(context, resumed=True) == _choose_companions(context, resumed=False)
+    if context.manifest.has_same_bits_as(unfinished) and same_estimate:
+        return replace(context.manifest, versions=unfinished.versions)
+    return None
 
 
 def _with_versions(manifest: Manifest) -> Manifest:
@@ -406,8 +397,12 @@ class _Run:
             )
             for record, peak in zip(probe_records(scene), self._simulation.felt.greatest, strict=True)
         ]
+
+        def takes_an_hour_at_most(plan: Plan) -> bool:
+            return cost.estimate_duration(plan).seconds <= 3600
+
         notes = [
-            *run_warnings(plan, probes, progress, *estimates, _is_affordable, _pixels_per_metre(scene)),
+            *run_warnings(plan, probes, progress, *estimates, takes_an_hour_at_most, _pixels_per_metre(scene)),
             *(self._path_dependence.warnings() if self._path_dependence else ()),
             *drawing_warnings(scene),
         ]
@@ -482,11 +477,6 @@ def _chosen_keys(given: Scene, scene: Scene) -> dict[str, Any]:
     keys = ("sheet.points", "sheet.tolerance", "time.step", "time.precision", "time.tolerance")
     pairs = [(key, attrgetter(key)(given), attrgetter(key)(scene)) for key in keys]
     return {key: requested for key, requested, resolved in pairs if requested != resolved}
-
-
-def _is_affordable(plan: Plan) -> bool:
-    """Return whether a run takes an estimated hour at most, so that a warning may recommend it."""
-    return cost.estimate_duration(plan).seconds <= 3600
 
 
 def _pixels_per_metre(scene: Scene) -> float | None:

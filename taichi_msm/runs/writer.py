@@ -121,12 +121,12 @@ class ResultWriter:
         observed: Mapping[str, FrameOutputs],
         forces: Sequence[TipForce] = (),
     ) -> None:
-        """Add the next frame.
+        """Add the next frame, which may be in the checkpoint already.
 
         Args:
             position: positions of the mass points [m], shape (rows, cols, 3).
             observed: pictures and labels, by the names of the cameras.
-            forces: force of every probe; unused for a frame that the checkpoint contains.
+            forces: force of every probe.
         """
         with writing(self._directory):
             # Positions are stored first, so that an interruption never leaves a picture without positions.
@@ -174,14 +174,7 @@ class ResultWriter:
         self._finished = True
 
     def publish(self, record: Mapping[str, Any]) -> dict[str, Any]:
-        """Write run.json and replace earlier results.
-
-        Args:
-            record: content of run.json, except for the entries "frames" and "outputs".
-
-        Returns:
-            The complete content of run.json.
-        """
+        """Replace earlier results; write and return run.json, which is `record` with "frames" and "outputs" added."""
         self.finish()
         with writing(self._directory):
             results = outputs.result_names(self._scene.folders if self.frames else {})
@@ -228,15 +221,9 @@ class ResultWriter:
 
 
 class LabelWriter:
-    """Writer of the labels of a camera, frame by frame.
+    """Writer of the labels of a camera, frame by frame; an unnamed camera has an empty name."""
 
-    Args:
-        folder: destination of the files.
-        scene: the scene, whose `output` selects the labels.
-        camera: name of the camera; empty for an unnamed camera.
-    """
-
-    def __init__(self, folder: Path, scene: Scene, camera: str = "") -> None:
+    def __init__(self, folder: Path, scene: Scene, camera: str) -> None:
         self._folder, self._scene, self._camera = folder, scene, camera
         selected = [output for name, output in OUTPUTS.items() if name in scene.folders[camera]]
         self._frame_outputs = [output for output in selected if output.source in ("labels", "flow", "stereo")]
@@ -249,13 +236,7 @@ class LabelWriter:
         self._added = 0
 
     def add(self, frame: int, observed: FrameOutputs, position: NDArray[Any]) -> None:
-        """Write the labels of a frame and the optical flow from the previous frame.
-
-        Args:
-            frame: index of the frame.
-            observed: labels and flow of the frame.
-            position: positions of the mass points [m], shape (rows, cols, 3).
-        """
+        """Write the labels of a frame, and the tracks with positions of mass points [m], shape (rows, cols, 3)."""
         self._added = frame + 1
         for output in self._frame_outputs:
             number = frame - 1 if output.is_frame_pair else frame

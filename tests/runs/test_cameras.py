@@ -18,15 +18,13 @@ from taichi_msm.load import cost
 from taichi_msm.load.scene_file import load_plan, load_scene
 from taichi_msm.model.surface import place_instruments
 from taichi_msm.render import rasterizer
-from taichi_msm.render.camera import View, calibration, is_moving, pair_transform, view, view_at
-from taichi_msm.render.lens_table import undistortion_map
+from taichi_msm.render.camera import calibration, is_moving, pair_transform, view, view_at
 from taichi_msm.render.rasterizer import Rasterizer
 from taichi_msm.runs.finished import read_run
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from taichi_msm.view.recording import Captures
 from taichi_msm.view.session import Session
-from tests.conftest import Program
 from tests.golden import Messages
 from tests.outputs import files, results
 from tests.reference import drawing
@@ -203,15 +201,6 @@ def test_a_run_with_another_main_camera_is_another_run(small: Path, device: Devi
     assert (record["status"], record["resumed"]) == ("complete", 0)
 
 
-def test_a_run_is_repeated_with_its_cameras(small: Path, program: Program) -> None:
-    command = ["run", "small.yaml", "--set", f"render.cameras={json.dumps(STEREO)}", "--set", "output=[png]"]
-    assert program(*command, "--out", "first", "--set", "render.cameras.left.fov=50").returncode == 0
-    assert program("run", "--again", "first", "--out", "second").returncode == 0
-    assert results(Path("first")) == results(Path("second"))
-    assert list(read_run("second").scene.render.all_cameras) == ["left", "right"]
-    assert read_run("second").scene.render.origin("right")[0].fov == 50  # type: ignore[union-attr]
-
-
 def test_results_replace_those_of_other_cameras_and_nothing_else(
     small: Path, device: Device, message: Messages
 ) -> None:
@@ -224,10 +213,6 @@ def test_results_replace_those_of_other_cameras_and_nothing_else(
     shutil.copy("speckle.png", "out/left/frames/0002.png")
     with message.raises(ForeignError, "out/left/frames/0002.png"):
         run(seen_by(STEREO), "out", threads=device.threads, estimate_error=False)
-    Path("plain").mkdir()
-    Path("plain/right").write_text("a file")
-    with message.raises(ForeignError, "plain/right"):
-        run(seen_by(STEREO), "plain", threads=device.threads, estimate_error=False)
 
 
 def test_cameras_have_names_in_python(stereo: Path, device: Device, message: Messages) -> None:
@@ -244,31 +229,9 @@ def test_cameras_have_names_in_python(stereo: Path, device: Device, message: Mes
         np.testing.assert_array_equal(playback.draw(2), playback.draw(2, "left"))
         found_then = playback.flow(1, 2, "left", "right").flow
         assert not np.array_equal(found_then, playback.flow(1, 2, "left").flow)
-        there = playback.positions[2], float(playback.time[2])
-        np.testing.assert_array_equal(
-            found_then, playback._simulation.flow(playback.labels(1, "left"), "right", *there).flow
-        )
         assert playback.draw(0, "oblique").shape == (256, 320, 3)
         with message.raises(ArgumentError, "camera"):
             playback.draw(0, "lift")
-
-
-@pytest.mark.slow
-def test_two_lenses_find_their_places_once_each(small: Path, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    cameras = {name: {**LEFT, "distortion": {"k1": k1}} for name, k1 in (("a", -0.1), ("b", -0.2))}
-    found: list[View] = []
-
-    def counted(camera: View, *arguments: Any, **more: Any) -> Any:
-        found.append(camera)
-        return undistortion_map(camera, *arguments, **more)
-
-    monkeypatch.setattr(rasterizer, "undistortion_map", counted)
-    made = seen_by({**cameras, "c": {"beside": "b", "baseline": 0.1}}, "[png, depth]")
-    with Simulation(made, threads=device.threads) as simulation:
-        for _ in range(3):
-            for name in "abc":
-                simulation.observe(None, name)
-    assert len(found) == 2
 
 
 def test_the_budget_counts_every_camera(small: Path) -> None:

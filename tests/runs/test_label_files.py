@@ -11,13 +11,13 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from taichi_msm import ArgumentError, FilesError, Playback, Simulation, run
+from taichi_msm import ArgumentError, Playback, Simulation, run
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.model.surface import place_instruments
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.golden import Messages
-from tests.outputs import files, results
+from tests.outputs import results
 from tests.reference import labels as twin
 from tests.reference.drawing import refine as refined
 from tests.scenes import SMALL, speckle
@@ -150,31 +150,6 @@ def test_labels_need_no_picture_and_masks_alone_no_camera(small: Path, device: D
     masks = small_scene("output=[occlusion, instrument]")
     run(masks, "masks", threads=device.threads, estimate_error=False)
     assert not Path("masks/camera.json").exists()
-
-
-@pytest.mark.slow
-def test_labels_of_an_earlier_run_go_and_other_files_stay(small: Path, device: Device, message: Messages) -> None:
-    short = small_scene("output=[depth]", "time.duration=0.2")
-    made("out", device, ALL)
-    Path("out/flow/notes.txt").write_text("mine")
-    run(short, "out", threads=device.threads, estimate_error=False)
-    found = files(Path("out"))
-    assert found.pop("flow/notes.txt") == b"mine"
-    assert sorted(found) == ["camera.json", "depth/0000.tiff", "depth/0001.tiff", "depth/0002.tiff", "run.json"]
-    Path("out/run.json").unlink()
-    with message.raises(FilesError, "depth/0000.tiff"):
-        run(short, "out", threads=device.threads, estimate_error=False)
-
-
-def test_labels_and_flow_from_python(labelled: Results, small: Path, device: Device) -> None:
-    done, _ = labelled
-    with Simulation(small_scene(OBLIQUE, ROD), threads=device.threads) as simulation:
-        simulation.advance(2)
-        before = simulation.labels()
-        simulation.advance()
-        labels, flow = simulation.labels(), simulation.flow(before)
-    np.testing.assert_array_equal(labels.coordinates, np.load(done / "coordinates/0003.npy"))
-    np.testing.assert_array_equal(flow.flow, read_flow(done / "flow/0002.flo"))
 
 
 def test_a_run_is_played_back(labelled: Results, device: Device, message: Messages) -> None:
