@@ -37,15 +37,13 @@ class EncodingJob(NamedTuple):
     folders: tuple[Path, ...]  # destination of each camera
     size: tuple[int, int]  # width and height [px]
     rate: float  # frames per second
-    png: bool  # whether to write frames/0000.png and so on
-    gif: bool  # whether to write animation.gif
+    outputs: tuple[str, ...]  # of which png, gif and mp4 are written
     background: tuple[int, int, int]  # a colour that the GIF contains exactly
-    mp4: bool = False  # whether to write animation.mp4
-    quality: int = 65  # of the MP4 [%]
+    quality: int  # of the MP4 [%]
 
     def still_paths(self, number: int) -> list[Path]:
         """Return the paths of a frame's PNGs, one per camera; none if PNGs are not written."""
-        return [folder / OUTPUTS["png"].path(number) for folder in self.folders if self.png]
+        return [folder / OUTPUTS["png"].path(number) for folder in self.folders if "png" in self.outputs]
 
 
 class EncodingReport(NamedTuple):
@@ -125,11 +123,11 @@ class PictureWriter:
         """Open the videos of all cameras; their first pictures determine the palettes."""
         job = self._job
         for camera, folder in enumerate(job.folders):
-            if job.gif:
+            if "gif" in job.outputs:
                 file = self._files.enter_context(create_file(folder / OUTPUTS["gif"].path()))
                 palette = Palette(predict_colours(pictures[camera]), job.background)
                 self._videos.append((camera, GifWriter(file, job.size, job.rate, palette)))
-            if job.mp4:
+            if "mp4" in job.outputs:
                 file = self._files.enter_context(create_file(folder / OUTPUTS["mp4"].path()))
                 self._videos.append((camera, Mp4Writer(file, job.size, job.rate, job.quality)))
 

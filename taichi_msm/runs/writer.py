@@ -86,16 +86,9 @@ class ResultWriter:
             self._labels = {name: LabelWriter(staged / name, scene, name) for name in scene.render.all_cameras}
             self._encoder: Encoder | PictureWriter | None = None
             if scene.draws:
-                job = EncodingJob(
-                    folders=tuple(staged / name for name in scene.render.all_cameras),
-                    size=scene.render.size,
-                    rate=scene.time.frames_per_second,
-                    png="png" in scene.output,
-                    gif="gif" in scene.output,
-                    background=scene.render.background,
-                    mp4="mp4" in scene.output,
-                    quality=scene.render.quality,
-                )
+                folders = tuple(staged / name for name in scene.render.all_cameras)
+                render, rate = scene.render, scene.time.frames_per_second
+                job = EncodingJob(folders, render.size, rate, scene.output, render.background, render.quality)
                 locks = self._publication.lock_descriptors
                 self._encoder = Encoder(job, locks) if encode_in_subprocess else PictureWriter(job)
                 opened.callback(self._encoder.abort)
@@ -116,10 +109,7 @@ class ResultWriter:
             return self._checkpoint.read_positions(frame)
 
     def add(
-        self,
-        position: NDArray[Any],
-        observed: Mapping[str, FrameOutputs],
-        forces: Sequence[TipForce] = (),
+        self, position: NDArray[Any], observed: Mapping[str, FrameOutputs], forces: Sequence[TipForce] = ()
     ) -> None:
         """Add the next frame, which may be in the checkpoint already.
 

@@ -59,16 +59,7 @@ class Film:
         self._subframes, self._begin, self._location = subframes, begin, (folder, option)
         with writing(*self._location), ExitStack() as opened:
             self._hidden = opened.enter_context(hidden_folder(folder))
-            job = EncodingJob(
-                (self._hidden,),
-                render.size,
-                rate,
-                png=False,
-                gif=self._format == "gif",
-                background=render.background,
-                mp4=self._format == "mp4",
-                quality=render.quality,
-            )
+            job = EncodingJob((self._hidden,), render.size, rate, (self._format,), render.background, render.quality)
             self._encoder = Encoder(job)
             opened.callback(self._encoder.abort)
             self._opened = opened.pop_all()
