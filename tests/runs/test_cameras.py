@@ -286,7 +286,6 @@ WRONG = {
     "itself": "left: top,\n right: {beside: right, baseline: 1}",
     "a cycle": "left: top,\n a: {beside: b, baseline: 1}, b: {beside: a, baseline: 1}",
     "the main one": "right: {beside: left, baseline: 1},\n left: top",
-    "one name": "left: top,\n left: oblique",
     "no baseline": "left: top,\n right: {beside: left}",
     "baseline 0": "left: top,\n right: {beside: left, baseline: 0}",
     "far away": "left: top,\n right: {beside: left, baseline: 1.0e+20}",
@@ -301,8 +300,6 @@ WRONG = {
     "no name": "Left: top",
     "a folder of labels": "flow: top",
     "a folder of exports": "export-obj: top",
-    "wrong below a name that is a key": "eye: {eye: [1, 2]}",
-    "nothing to see": "left: top, right: {eye: [0, 0, 0]}",
     "a calibration that is not there": "left: top, right: {eye: [0, 0, 1], calibration: a.yml}",
 }
 

@@ -17,7 +17,6 @@ from taichi_msm.errors import DamagedError
 from taichi_msm.runs.checkpoint import FRAMES_FILE, STATE_FILE, Checkpoint, Manifest, read_manifest
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.state import PeakForce, ProbeForces, RunProgress, Snapshot, State, TipForce
-from tests.golden import Messages
 from tests.scenes import plan_of, scene
 
 FRAMES = 3
@@ -153,12 +152,12 @@ FORGED: dict[str, Callable[[dict[str, Any]], object]] = {
 
 
 @pytest.mark.parametrize("case", FORGED)
-def test_a_forged_state_is_refused(case: str, out: Path, message: Messages) -> None:
+def test_a_forged_state_is_refused(case: str, out: Path) -> None:
     path = out / ".partial" / "checkpoint" / STATE_FILE
     repacked(path, lambda arrays: None)
     read(out)
     repacked(path, FORGED[case])
-    with message.raises(DamagedError):
+    with pytest.raises(DamagedError):
         read(out)
 
 
@@ -195,22 +194,19 @@ def test_parts_of_another_run_are_refused(name: str, out: Path, tmp_path: Path) 
         read(out)
 
 
-def test_positions_that_are_no_numbers_are_refused(out: Path) -> None:
-    """With a checksum that is right."""
-    checkpoint = checkpoint_in(out)
-    checkpoint.reopen()
-    checkpoint.frames = 1
-    checkpoint.add(np.full((2, 3, 3), math.nan), forces(1))
-    checkpoint.close()
-    with pytest.raises(DamagedError):
-        read(out)
-
-
-def test_frames_that_are_exchanged_are_found(out: Path) -> None:
+def test_frames_that_are_exchanged_or_no_numbers_are_refused(out: Path) -> None:
     path = out / ".partial" / "checkpoint" / FRAMES_FILE
     data = path.read_bytes()
     size = len(data) // FRAMES
     path.write_bytes(data[size : 2 * size] + data[:size] + data[2 * size :])
+    with pytest.raises(DamagedError):
+        read(out)
+    path.write_bytes(data)
+    checkpoint = checkpoint_in(out)
+    checkpoint.reopen()
+    checkpoint.frames = 1
+    checkpoint.add(np.full((2, 3, 3), math.nan), forces(1))  # with a checksum that is right
+    checkpoint.close()
     with pytest.raises(DamagedError):
         read(out)
 
@@ -236,8 +232,8 @@ PLANS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("change", PLANS.values(), ids=PLANS)
-def test_a_forged_plan_is_refused(change: dict[str, Any], out: Path, message: Messages) -> None:
+def test_a_forged_plan_is_refused(change: dict[str, Any], out: Path) -> None:
     forged = json.dumps({**manifest().as_json(), **change}).encode()
     repacked(out / ".partial" / "checkpoint" / STATE_FILE, lambda a: a.update(manifest=np.frombuffer(forged, np.uint8)))
-    with message.raises(DamagedError, STATE_FILE):
+    with pytest.raises(DamagedError, match=STATE_FILE):
         read_manifest(out)

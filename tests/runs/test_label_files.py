@@ -177,8 +177,6 @@ WRONG: dict[str, Any] = {
     "outside": lambda one: one.locate([[0.5, 1.5]]),
     "a pair": lambda one: one.locate([0.5, 0.5]),
     "not a number": lambda one: one.locate([[np.nan, 0.5]]),
-    "positions": lambda one: one.labels(positions=np.zeros((3, 3))),
-    "time": lambda one: one.draw(time="now"),
 }
 
 
