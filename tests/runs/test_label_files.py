@@ -26,7 +26,6 @@ ALL = "output=[png, coordinates, depth, normals, flow, occlusion, instrument, tr
 OBLIQUE = "render.camera=oblique"
 ROD = "probes.0.instrument={radius: 0.01, shaft: [1, -0.5, 0.6], length: 0.2}"
 
-
 Results = tuple[Path, dict[str, NDArray[Any]]]
 
 
@@ -167,20 +166,3 @@ def test_a_run_is_played_back(labelled: Results, device: Device, message: Messag
         for frame in (-1, 5, 1.0, True):
             with message.raises(ArgumentError, "frame"):
                 playback.draw(frame)  # type: ignore[arg-type]
-
-
-WRONG: dict[str, Any] = {
-    "no labels": lambda one: one.flow("labels"),
-    "another shape": lambda one: one.flow(one.labels()._replace(coordinates=np.zeros((3, 3, 2)))),
-    "no array": lambda one: one.flow(one.labels()._replace(coordinates="none")),
-    "other numbers": lambda one: one.flow(one.labels()._replace(coordinates=one.labels().coordinates * 7)),
-    "outside": lambda one: one.locate([[0.5, 1.5]]),
-    "a pair": lambda one: one.locate([0.5, 0.5]),
-    "not a number": lambda one: one.locate([[np.nan, 0.5]]),
-}
-
-
-@pytest.mark.parametrize("call", WRONG.values(), ids=WRONG)
-def test_wrong_arguments(call: Any, small: Path, device: Device, message: Messages) -> None:
-    with Simulation(small_scene(), threads=device.threads) as simulation, message.raises(ArgumentError):
-        call(simulation)

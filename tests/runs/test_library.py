@@ -88,6 +88,16 @@ WRONG: dict[str, tuple[Callable[[Simulation, Any], object], list[Any]]] = {
             np.zeros((4, 5, 3)),
         ],
     ),
+    "labels": (
+        lambda one, value: one.flow(value(one.labels())),
+        [
+            lambda labels: "labels",
+            lambda labels: labels._replace(coordinates=np.zeros((3, 3, 2))),
+            lambda labels: labels._replace(coordinates="none"),
+            lambda labels: labels._replace(coordinates=labels.coordinates * 7),
+        ],
+    ),
+    "coordinates": (Simulation.locate, [[[0.5, 1.5]], [0.5, 0.5], [[np.nan, 0.5]]]),
     "camera": (Simulation.draw, [3, "side", {"eye": [0, 0]}, {"eye": [0, 0, 0]}]),
     "frames": (Simulation.advance, [-1, 1.5, "2", None]),
     "frames played": (lambda one, value: one.play(value), [-1]),

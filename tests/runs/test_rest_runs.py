@@ -83,13 +83,6 @@ def test_it_goes_on_from_what_was_saved_and_after_an_interruption(device: Device
     assert evaluations > 100
 
 
-def test_loads_can_be_steered(device: Device) -> None:
-    with Simulation(at_rest([LOADED]), threads=device.threads) as simulation:
-        simulation.steer([{**PUSH, "total": [0, 0, 1]}])
-        simulation.advance()
-        assert simulation.positions()[..., 2].max() > 0.005
-
-
 def test_a_simulation_can_begin_again_in_motion(device: Device) -> None:
     tissue = {**TISSUE, "density": 1000, "damping": 10}
     still, moving = at_rest([PUSH], tissue=tissue), at_rest([PUSH], tissue=tissue, time={"motion": "dynamic"})
