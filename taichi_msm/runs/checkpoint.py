@@ -208,23 +208,13 @@ class Checkpoint:
         scene = plan.scene
         self.frames = 0
         self.precision = np.dtype(np.float32 if plan.grid.precision == "f32" else np.float64)
-        self._state_path, self._frames_path = folder / STATE_FILE, folder / FRAMES_FILE
-        self._grid = plan.grid
-        self._shape, self._probes = (*scene.sheet.points, 3), len(scene.probes)
-        self._memory_shape = (len(memory_names(plan)), *scene.sheet.points)
-        self._next_save = 0.0
-        self._manifest = b""
-        # Without outputs, the frames are not needed.
-        self._keeps_frames = bool(scene.output)
-        self._file: BinaryIO | None = None
-        self._stored_probes = self._probes if scene.asks_for("forces") else 0
-        self._record = np.dtype(
-            [
-                ("checksum", np.int64),
-                ("position", self.precision, self._shape),
-                ("forces", np.float64, (self._stored_probes, FORCE_COLUMNS)),
-            ]
-        )
+        self._plan, self._state_path, self._frames_path = plan, folder / STATE_FILE, folder / FRAMES_FILE
+        self._next_save, self._manifest = 0.0, b""
+        self._file: BinaryIO | None = None  # without outputs, the frames are not needed
+        self._stored_probes = len(scene.probes) if scene.asks_for("forces") else 0
+        position = "position", self.precision, (*scene.sheet.points, 3)
+        forces = "forces", np.float64, (self._stored_probes, FORCE_COLUMNS)
+        self._record = np.dtype([("checksum", np.int64), position, forces])
 
     @property
     def is_save_due(self) -> bool:
@@ -239,7 +229,7 @@ class Checkpoint:
         self.invalidate()
         clear_folder(folder, CHECKPOINT_PATTERNS)
         self._manifest = json.dumps(manifest).encode()
-        if self._keeps_frames:
+        if self._plan.scene.output:
             # Unbuffered, so that stored frames survive when the process is killed.
             self._file = create_file(self._frames_path, buffering=0)
         self._write_state({})
@@ -253,7 +243,7 @@ class Checkpoint:
         self.close()
         saved = self.load()
         self.frames = 0 if saved is None else saved.progress.frame + 1
-        if self._keeps_frames:
+        if self._plan.scene.output:
             try:
                 self._file = self._frames_path.open("r+b", buffering=0)
             except FileNotFoundError:
@@ -297,18 +287,17 @@ class Checkpoint:
 
     def load(self) -> Snapshot | None:
         """Read the last saved state; None if there is none."""
-        empty = _state_arrays(Snapshot(State(0, np.empty(0), np.empty(0)), RunProgress(), ProbeForces((), ())))
-        types = {name: (array.dtype, array.shape) for name, array in empty.items()}
-        types["forces"] = types["forces"][0], (self._probes, FORCE_COLUMNS)
-        types["greatest"] = types["greatest"][0], (self._probes, PEAK_FORCE_COLUMNS)
-        types |= dict.fromkeys(("displacement", "difference"), (self.precision, self._shape))
-        types["memory"] = self.precision, self._memory_shape
+        scene, grid, zero = self._plan.scene, self._plan.grid, (0.0, 0.0, 0.0)
+        position = np.empty((*scene.sheet.points, 3), self.precision)
+        memory = np.empty((len(memory_names(self._plan)), *scene.sheet.points), self.precision)
+        felt = ProbeForces((TipForce(0, zero, zero),) * len(scene.probes), (PeakForce(0, zero),) * len(scene.probes))
+        expected = _state_arrays(Snapshot(State(0, position, position, memory), RunProgress(), felt))
         try:
             with self._state_path.open("rb") as file, zipfile.ZipFile(file) as archive:
                 self._manifest = _manifest_bytes(archive)
                 if len(archive.namelist()) == 1:
                     return None
-                arrays = {name: read_array(archive, name, *expected) for name, expected in types.items()}
+                arrays = {name: read_array(archive, name, each.dtype, each.shape) for name, each in expected.items()}
         except FileNotFoundError:
             return None
         except Exception:  # zipfile raises almost any type for a forged archive
@@ -316,10 +305,9 @@ class Checkpoint:
         progress = RunProgress(**{field.name: arrays[field.name].item() for field in fields(RunProgress)})
         state = State(int(arrays["steps"]), arrays["displacement"], arrays["difference"], arrays["memory"])
         greatest = tuple(PeakForce(time, (x, y, z)) for time, x, y, z in arrays["greatest"].tolist())
-        steps_per_frame = self._grid.steps_per_frame
         if not (
-            progress.frame <= self._grid.frames
-            and progress.frame * steps_per_frame <= state.steps <= (progress.frame + 1) * steps_per_frame
+            progress.frame <= grid.frames
+            and 0 <= state.steps - progress.frame * grid.steps_per_frame <= grid.steps_per_frame
             and all(np.isfinite(array).all() for array in arrays.values())
             and all(value >= 0 for value in asdict(progress).values())
         ):
