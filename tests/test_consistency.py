@@ -12,9 +12,8 @@ from tests.consistency import AGREEMENTS, CAMERAS, STEREO, measured, scene
 
 
 # The other cameras are compared with the twin in tests/render.
-@pytest.mark.parametrize(
-    "camera", [pytest.param(name, marks=() if name == "rational" else pytest.mark.slow) for name in CAMERAS]
-)
+@pytest.mark.default_cases("rational", "moving")
+@pytest.mark.parametrize("camera", CAMERAS)
 def test_labels_agree(camera: str, tmp_path: Path, device: Device) -> None:
     run(scene(CAMERAS[camera]), tmp_path, threads=device.threads, estimate_error=False)
     worst = measured(tmp_path, camera, device.threads)
