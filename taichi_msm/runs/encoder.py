@@ -71,7 +71,7 @@ class PictureWriter:
         self._videos: list[tuple[int, GifWriter | Mp4Writer]] = []  # with the index of the camera
         self._files = ExitStack()
         self._pending: deque[Future[None]] = deque()
-        self._still_executor = ThreadPoolExecutor(max(1, min(max_queued, os.cpu_count() or 1)))
+        self._still_executor = ThreadPoolExecutor(max(1, min(max_queued * len(job.folders), os.cpu_count() or 1)))
         self._video_executor = ThreadPoolExecutor(1)
 
     def add(self, pictures: Picture) -> None:
@@ -237,8 +237,8 @@ def _encode_stream() -> EncodingReport:
     job: EncodingJob = pickle.load(sys.stdin.buffer)
     shape = len(job.folders), *reversed(job.size), 3
     size = math.prod(shape)
-    # At most 4 frames and 256 MiB are queued.
-    writer = PictureWriter(job, max(1, min(4, (256 << 20) // size)))
+    # At least a frame is queued, at most 4 pictures and 256 MiB: an interrupted run still encodes them.
+    writer = PictureWriter(job, max(1, min(4 // len(job.folders), (256 << 20) // size)))
     try:
         while len(data := sys.stdin.buffer.read(size)) == size:
             writer.add(np.frombuffer(data, np.uint8).reshape(shape))
