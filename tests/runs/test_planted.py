@@ -72,16 +72,6 @@ def pipe(name: str) -> Plant:
     return plant(name, lambda path, treasure: os.mkfifo(path))
 
 
-def device(name: str) -> Plant:
-    def make(path: Path, treasure: Path) -> None:
-        try:
-            os.mknod(path, 0o600 | stat.S_IFCHR, Path("/dev/zero").stat().st_rdev)
-        except (OSError, AttributeError):
-            pytest.skip("needs the right to make devices")
-
-    return plant(name, make)
-
-
 def file(name: str, text: str = "mine") -> Plant:
     return plant(name, lambda path, treasure: path.write_text(text))
 
@@ -99,7 +89,6 @@ PLANTED = {
     "the lock leads elsewhere": link(".partial/lock", "lock"),
     "the lock never ends": link(".partial/lock", "/dev/zero"),
     "the lock is a pipe": pipe(".partial/lock"),
-    "the lock is a device": device(".partial/lock"),
     "the whole results lead elsewhere": link(".partial/whole"),
     "the record of whole results is a pipe": pipe(".partial/whole/run.json"),
     "the record of whole results names what is elsewhere": file(
@@ -112,7 +101,6 @@ PLANTED = {
     "the checkpoint leads elsewhere": link(".partial/checkpoint"),
     "the state leads elsewhere": link(".partial/checkpoint/state.npz", "state.npz"),
     "the state is a pipe": pipe(".partial/checkpoint/state.npz"),
-    "the state is a device": device(".partial/checkpoint/state.npz"),
     "the stored frames lead elsewhere": link(".partial/checkpoint/frames", "frames"),
     "the draft leads elsewhere": link(f".partial/checkpoint/.partial-{16 * 'a'}/draft", "draft"),
     "a draft is the user's": file(".partial/checkpoint/draft"),
