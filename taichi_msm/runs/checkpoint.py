@@ -30,18 +30,7 @@ from taichi_msm.images import PictureError, file_sha256
 from taichi_msm.model.plan import Plan
 from taichi_msm.render.camera import camera_problems
 from taichi_msm.runs.arrays import read_array, read_rows, write_arrays
-from taichi_msm.runs.directory import (
-    DRAFT_FILE,
-    FILE,
-    FOLDER,
-    HIDDEN_FOLDER_PATTERN,
-    LOCK_FILE,
-    STAGING_FOLDER,
-    clear_folder,
-    create_file,
-    replacing,
-    require_kind,
-)
+from taichi_msm.runs.directory import FILE, FOLDER, STAGING_FOLDER, clear_folder, create_file, require_kind
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.planning import try_plan
 from taichi_msm.solver.state import PeakForce, ProbeForces, RunProgress, Snapshot, State, TipForce
@@ -52,9 +41,8 @@ from taichi_msm.terms import memory_names
 # A folder without the state file is not a checkpoint.
 CHECKPOINT_FOLDER, STATE_FILE, FRAMES_FILE = "checkpoint", "state.npz", "frames"
 CHECKPOINT_PATTERNS = (
-    r"(?:state\.npz|frames)",
+    r"(?:state\.npz|state\.new|frames)",
     r"(?:manifest\.json|positions|forces)",  # of earlier versions
-    rf"{HIDDEN_FOLDER_PATTERN}/(?:{LOCK_FILE}|{DRAFT_FILE})",
 )
 
 # A manifest contains the scene twice; a scene file may have 1 MiB.
@@ -320,8 +308,11 @@ class Checkpoint:
             self._file.close()
 
     def _write_state(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        with replacing(self._state_path) as file:
+        draft = self._state_path.with_suffix(".new")
+        draft.unlink(missing_ok=True)
+        with create_file(draft) as file:
             write_arrays(file, {"manifest": np.frombuffer(self._manifest, np.uint8), **arrays})
+        draft.replace(self._state_path)
 
     def _read(self, frame: int) -> tuple[NDArray[Any], NDArray[np.float64]]:
         """Read positions and forces of a frame; raise a DamagedError unless they are finite and their checksum fits."""

@@ -14,8 +14,7 @@ from PIL import Image
 
 from taichi_msm import ArgumentError, Playback, Simulation, resume, run
 from taichi_msm.errors import ForeignError, SceneError
-from taichi_msm.load import cost
-from taichi_msm.load.scene_file import load_plan, load_scene
+from taichi_msm.load.scene_file import load_scene
 from taichi_msm.model.surface import place_instruments
 from taichi_msm.render import rasterizer
 from taichi_msm.render.camera import calibration, is_moving, pair_transform, view, view_at
@@ -231,17 +230,6 @@ def test_cameras_have_names_in_python(stereo: Path, device: Device, message: Mes
         assert playback.draw(0, "oblique").shape == (256, 320, 3)
         with message.raises(ArgumentError, "camera"):
             playback.draw(0, "lift")
-
-
-def test_the_budget_counts_every_camera(small: Path) -> None:
-    def need(cameras: Cameras) -> cost.Budget:
-        of_three = [f"render.cameras={json.dumps(cameras)}", "output=[png, tracks, trajectory]"]
-        return cost.estimate_budget(load_plan("small.yaml", of_three))
-
-    one, three = need({"a": LEFT}), need(dict.fromkeys("abc", LEFT))
-    assert three.picture_bytes == 3 * one.picture_bytes
-    assert three.track_bytes == 3 * one.track_bytes
-    assert three.trajectory_bytes == one.trajectory_bytes
 
 
 @pytest.mark.parametrize("play", [True, False])

@@ -261,7 +261,7 @@ def full_disk(*_: object, **__: object) -> None:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-@pytest.mark.parametrize("target", ["checkpoint.create_file", "checkpoint.replacing", "writer.write_new_file"])
+@pytest.mark.parametrize("target", ["checkpoint.create_file", "checkpoint.write_arrays", "writer.write_new_file"])
 def test_a_full_disk_is_one_line_and_changes_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, target: str, message: Messages
 ) -> None:
