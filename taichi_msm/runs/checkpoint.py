@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import time
 import zipfile
 import zlib
@@ -30,7 +31,7 @@ from taichi_msm.images import PictureError, file_sha256
 from taichi_msm.model.plan import Plan
 from taichi_msm.render.camera import camera_problems
 from taichi_msm.runs.arrays import read_array, read_rows, write_arrays
-from taichi_msm.runs.directory import FILE, FOLDER, STAGING_FOLDER, clear_folder, create_file, require_kind
+from taichi_msm.runs.directory import FILE, FOLDER, STAGING_FOLDER, create_file, require_kind
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.planning import try_plan
 from taichi_msm.solver.state import PeakForce, ProbeForces, RunProgress, Snapshot, State, TipForce
@@ -212,10 +213,11 @@ class Checkpoint:
     def begin(self, manifest: Mapping[str, Any]) -> None:
         """Begin the checkpoint of a new run in place of an earlier one."""
         self.close()
-        folder = self._state_path.parent
-        folder.mkdir(exist_ok=True)
         self.invalidate()
-        clear_folder(folder, CHECKPOINT_PATTERNS)
+        folder = self._state_path.parent
+        if folder.exists():
+            shutil.rmtree(folder)
+        folder.mkdir()
         self._manifest = json.dumps(manifest).encode()
         if self._plan.scene.output:
             # Unbuffered, so that stored frames survive when the process is killed.

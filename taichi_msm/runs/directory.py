@@ -184,8 +184,13 @@ class Publication:
 
     def _clear(self) -> None:
         """Delete the contents of the staging folder except for the lock and a kept companion."""
+        list(list_files(self.staging_folder, self._patterns, strict=True))  # raises an error for foreign files
         keep = (LOCK_FILE, self._companion) if self.keep_companion else (LOCK_FILE,)
-        clear_folder(self.staging_folder, self._patterns, keep)
+        for path in [path for path in self.staging_folder.iterdir() if path.name not in keep]:
+            if entry_kind(path) == FOLDER:
+                shutil.rmtree(path)
+            else:
+                path.unlink()
 
     def _acquire(self, opened: ExitStack) -> BinaryIO:
         """Create the staging folder, and lock it until all processes with the lock's descriptor have ended."""
@@ -275,17 +280,6 @@ def list_files(top: Path, patterns: Collection[str], *, strict: bool, ignored: C
                 raise ForeignError.at(path, actual)
 
     return walk(top, "")
-
-
-def clear_folder(top: Path, patterns: Collection[str], keep: Collection[str] = ()) -> None:
-    """Delete the contents of a folder but for the names in `keep`; raise a ForeignError first, as `list_files` does."""
-    list(list_files(top, patterns, strict=True))
-    for path in list(top.iterdir()):
-        if path.name not in keep:
-            if entry_kind(path) == FOLDER:
-                shutil.rmtree(path)
-            else:
-                path.unlink()
 
 
 def parent_folders(names: Iterable[str]) -> set[str]:

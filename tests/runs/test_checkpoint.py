@@ -7,6 +7,7 @@ import json
 import math
 import zipfile
 from collections.abc import Callable
+from operator import methodcaller
 from pathlib import Path
 from typing import Any
 
@@ -235,8 +236,8 @@ PLANS: dict[str, dict[str, Any]] = {
 def test_a_forged_plan_is_refused(out: Path, message: Messages) -> None:
     errors = set()
     for change in PLANS.values():
-        forged = np.frombuffer(json.dumps({**manifest().as_json(), **change}).encode(), np.uint8)
-        repacked(out / ".partial" / "checkpoint" / STATE_FILE, lambda a, forged=forged: a.update(manifest=forged))
+        forged = {"manifest": np.frombuffer(json.dumps({**manifest().as_json(), **change}).encode(), np.uint8)}
+        repacked(out / ".partial" / "checkpoint" / STATE_FILE, methodcaller("update", forged))
         with pytest.raises(DamagedError, match=STATE_FILE) as caught:
             read_manifest(out)
         errors.add(str(caught.value))
