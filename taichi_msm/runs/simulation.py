@@ -271,7 +271,9 @@ class Simulation:
 
     def positions(self) -> Array:
         """Return the positions of the mass points [m], shape (rows, cols, 3), in the scene's precision; read-only."""
-        return self._position
+        self._solve_first_frame()
+        assert self._frame_positions is not None
+        return self._frame_positions
 
     def forces(self) -> list[TipForce]:
         """Return the tip position and the force on the sheet of every probe at the last frame."""
@@ -290,11 +292,11 @@ class Simulation:
             Velocities [m/s], shape (rows, cols, 3), in the scene's precision; 0 at the start.
         """
         self._require_open()
-        return self._dynamics.state().difference / self._position.dtype.type(self._plan.grid.step)
+        return self._dynamics.state().difference / self.positions().dtype.type(self._plan.grid.step)
 
     def surface(self) -> Surface:
         """Return the refined surface as a triangle mesh with texture coordinates."""
-        return refine_surface(self._position, self.scene.render.refine)
+        return refine_surface(self.positions(), self.scene.render.refine)
 
     def diagnose(self, start: Snapshot | None = None, pause: Pause = lambda: None) -> Diagnosis:
         """Determine why the simulation diverged in `advance`. Afterwards, call `restore` before `advance`.
@@ -390,7 +392,7 @@ class Simulation:
         if not (is_real_array(point, (2,)) and np.isfinite(point).all()):
             raise ArgumentError(f"pixel: {pixel!r}; take two numbers, x to the right and y down")
         x, y = point.tolist()
-        return pick(self._position, self.scene.render.refine, self.renderer.resolve_camera(camera, self.time), (x, y))
+        return pick(self.positions(), self.scene.render.refine, self.renderer.resolve_camera(camera, self.time), (x, y))
 
     def observe(
         self,
@@ -465,13 +467,6 @@ class Simulation:
         remedy = "keep its `scene` and what `save` returns, and `restore` that in a new one"
         raise MsmError(f"a Simulation cannot be pickled or copied; {remedy}")
 
-    @property
-    def _position(self) -> Array:
-        """Positions at the last frame [m]; a quasi-static first frame is solved if necessary."""
-        self._solve_first_frame()
-        assert self._frame_positions is not None
-        return self._frame_positions
-
     def _solve_first_frame(self, pause: Pause = lambda: None) -> None:
         """Solve the equilibrium of the first frame, if it is still missing."""
         if self._frame_positions is None:
@@ -505,9 +500,9 @@ class Simulation:
         """Validate positions and time, place the instruments, and set up the camera."""
         self._require_open()
         if positions is None:
-            positions = self._position
+            positions = self.positions()
         else:
-            positions, shape = as_array(positions, "positions"), self._position.shape
+            positions, shape = as_array(positions, "positions"), self.positions().shape
             if not is_real_array(positions, shape):
                 raise ArgumentError(
                     f"positions: {positions.dtype} of shape {positions.shape}; take numbers of shape {shape}"
