@@ -21,8 +21,6 @@ from taichi_msm.scene.scene import Scene
 from tests.golden import Messages
 from tests.scenes import plan_of, scene, speckle
 
-pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs links and pipes")
-
 # Everything that a run might reach beyond its folder.
 TREASURE = "notes.txt 0000.png frames state.npz run.json lock new/a.txt draft"
 

@@ -8,7 +8,6 @@ import os
 import re
 import shutil
 import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -268,7 +267,6 @@ def test_another_picture_or_version_is_not_gone_on_with(
     assert files(small / "parts") == before
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="kills with SIGKILL")
 def test_a_run_that_is_killed_goes_on_to_the_same_bits(small: Path, device: Device) -> None:
     """At every stage of a run and of one that goes on."""
     duration = "time.duration=0.8"
