@@ -29,6 +29,7 @@ from taichi_msm.load.scene_file import plan_file
 from taichi_msm.model.plan import Plan
 from taichi_msm.runs.directory import MAX_RECORD_BYTES, replacing
 from taichi_msm.scene.outputs import RUN_RECORD
+from taichi_msm.sweeps.expressions import replace_expressions
 from taichi_msm.sweeps.plots import (
     PlotData,
     estimate_sensitivity,
@@ -184,7 +185,8 @@ def write_dataset(result: SweepResult) -> WrittenFiles:
     common = _output_format(result.run_directory(complete[0])) if complete else {}
     # The sections of a scene that determine the output format.
     settings = sweep.settings
-    differ = any(key.split(".")[0] in ("output", "render", "time") for key in (*settings.vary, *settings.expressions))
+    expressions = (key for key, value in settings.set.items() if replace_expressions(value, lambda *_: None) != value)
+    differ = any(key.split(".")[0] in ("output", "render", "time") for key in (*settings.vary, *expressions))
     splits = assign_splits(len(result.outcomes), settings.seed)
     head = {"scene": settings.scene, **sweep.description(), "versions": versions(), "commit": commit(), **common}
     with replacing(result.directory / DATASET) as file:
@@ -339,7 +341,7 @@ def estimate_cost(sweep: Sweep) -> SweepCost:
     """Estimate the cost of a sweep from at most 64 of its runs."""
     plans: list[Plan] = []
     errors: list[str] = []
-    for values in sweep.sample_values(64):
+    for values in sweep.values(64):
         try:
             plans.append(plan_file(sweep.scene, sweep.overrides(values)))
         except SceneError as error:

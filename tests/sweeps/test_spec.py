@@ -20,14 +20,7 @@ from taichi_msm.load.scene_file import ANY_CAMERA, CAMERA_FILE_KEYS, PICTURE_KEY
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_PATH
 from taichi_msm.sweeps.expressions import evaluate
-from taichi_msm.sweeps.spec import (
-    Distribution,
-    format_override,
-    load_sweep,
-    make_sweep,
-    run_values,
-    sample_run_values,
-)
+from taichi_msm.sweeps.spec import Distribution, Sweep, SweepSettings, format_override, load_sweep, make_sweep
 from tests.golden import Messages
 from tests.scenes import speckle
 
@@ -40,19 +33,24 @@ def shares(dimensions: int, samples: int, seed: int) -> Any:
 
 
 def values(samples: int | None, **vary: dict[str, Any]) -> list[list[Any]]:
-    return run_values({name: Distribution(**one) for name, one in vary.items()}, samples, 3)
+    return made(samples, **vary).values()
+
+
+def made(samples: int | None, **vary: dict[str, Any]) -> Sweep:
+    scene: Any = None
+    return Sweep(scene, SweepSettings(scene="any.yaml", samples=samples, seed=3, vary=vary))
 
 
 def test_every_number_and_every_choice_takes_a_dimension_in_the_order_of_the_keys() -> None:
-    made = values(
+    rows = values(
         5,
         a={"uniform": [2, 3]},
         b={"log_uniform": [[1, 10], [100, 10]]},
         c={"choice": ["x", "y", "z"]},
         d={"normal": [1, 0.5]},
     )
-    assert len(made) == 5
-    for row, u in zip(made, shares(5, 5, 3)[:5], strict=True):
+    assert len(rows) == 5
+    for row, u in zip(rows, shares(5, 5, 3)[:5], strict=True):
         # Rounding: a few operations on numbers near these.
         assert row[0] == pytest.approx(2 + u[0], rel=1e-15)
         assert row[1] == pytest.approx([100 ** u[1], 10.0], rel=1e-14)
@@ -79,11 +77,11 @@ def test_a_lists_numbers_keep_their_shape() -> None:
 
 
 def test_some_runs_are_spread_over_all() -> None:
-    vary = {"a": Distribution(grid=list(range(10))), "b": Distribution(grid=list(range(1000)))}
-    every = run_values(vary, None, 3)
-    assert every[1234] == [1, 234]
-    assert [every.index(row) for row in sample_run_values(vary, None, 3, 4)] == [1250, 3750, 6250, 8750]
-    assert sample_run_values({"a": vary["a"]}, None, 3, 100) == [[n] for n in range(10)]
+    ten = {"grid": list(range(10))}
+    grids = made(None, a=ten, b={"grid": list(range(1000))})
+    assert grids.values()[1234] == [1, 234]
+    assert grids.values(4) == [[1, 250], [3, 750], [6, 250], [8, 750]]
+    assert made(None, a=ten).values(100) == [[n] for n in range(10)]
 
 
 def test_grids_give_every_combination_the_last_key_fastest() -> None:
@@ -191,18 +189,18 @@ def test_variables_take_the_first_dimensions_and_columns(folder: Path) -> None:
     varied = {"damping": {"uniform": [0.01, 0.02]}}
     expressions = {"probes.0.at": ["=x", "=1 - x"], "time.duration": "=n / 10", "sheet.points": ["=2*n**2 + 1", 9]}
     variables = {"x": {"uniform": [0, 1]}, "n": {"choice": [2, 3]}}
-    made = make_sweep("small.yaml", {"samples": 4, "variables": variables, "vary": varied, "set": expressions})
-    assert made.keys == ["x", "n", "damping"]
-    for row, u in zip(made.values(), shares(3, 4, 1), strict=True):
+    swept = make_sweep("small.yaml", {"samples": 4, "variables": variables, "vary": varied, "set": expressions})
+    assert swept.keys == ["x", "n", "damping"]
+    for row, u in zip(swept.values(), shares(3, 4, 1), strict=True):
         assert row == pytest.approx([u[0], 2 + int(2 * u[1]), 0.01 + 0.01 * u[2]], rel=1e-15)
         x, n, damping = row
-        assert made.overrides(row) == (
+        assert swept.overrides(row) == (
             f"probes.0.at=[{x!r}, {1 - x!r}]",
             f"time.duration={n / 10!r}",
             f"sheet.points=[{2 * n * n + 1}, 9]",
             f"damping={damping!r}",
         )
-    assert made.description()["variables"] == variables
+    assert swept.description()["variables"] == variables
     alone = make_sweep("small.yaml", {"variables": {"n": {"grid": [2, 3]}}, "set": {"time.duration": "=n / 10"}})
     assert [alone.overrides(row) for row in alone.values()] == [("time.duration=0.2",), ("time.duration=0.3",)]
     # Sweeps without variables keep the description that is in their sweep.json.
@@ -211,11 +209,11 @@ def test_variables_take_the_first_dimensions_and_columns(folder: Path) -> None:
 
 def test_an_expression_without_a_value_is_the_refusal_of_its_run(folder: Path, message: Messages) -> None:
     settings = {"variables": {"x": {"grid": [0, 1]}}, "set": {"probes.0.at": [0.5, "=sqrt(x - 1)"]}}
-    made = make_sweep("small.yaml", settings)
-    refused, valid = (made.overrides(row) for row in made.values())
+    swept = make_sweep("small.yaml", settings)
+    refused, valid = (swept.overrides(row) for row in swept.values())
     with message.raises(SceneError, "probes.0.at", "sqrt(x - 1)"):
-        plan_file(made.scene, refused)
-    assert plan_file(made.scene, valid).scene.probes[0].at == (0.5, 0.0)
+        plan_file(swept.scene, refused)
+    assert plan_file(swept.scene, valid).scene.probes[0].at == (0.5, 0.0)
 
 
 EXPRESSIONS = {

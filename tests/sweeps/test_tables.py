@@ -33,7 +33,7 @@ from taichi_msm.sweeps.plots import (
 )
 from taichi_msm.sweeps.pool import Pool
 from taichi_msm.sweeps.runs import CONTACT, REPORT_FILES, Outcome, SweepResult, register_sweep
-from taichi_msm.sweeps.spec import make_sweep, run_values
+from taichi_msm.sweeps.spec import make_sweep
 from taichi_msm.sweeps.tables import WITHOUT_MATPLOTLIB, WITHOUT_SALIB, assign_splits, write_reports
 from tests.golden import Messages
 
@@ -55,7 +55,7 @@ def make(small: Path, ran: Path) -> Make:
 
     def made(samples: int = 8, vary: dict[str, Any] = VARY, **settings: Any) -> SweepResult:
         described = make_sweep("small.yaml", {"vary": vary, "samples": samples, "seed": 1, **settings})
-        values = run_values(described.settings.vary, samples, 1)
+        values = described.values()
         outcomes = [
             Outcome(run, "diverged", "why", 9.0)
             if run % 7 == 3
