@@ -49,9 +49,9 @@ def sweep(
 ) -> int:
     """Run a scene many times with varied values, as SWEEP says, and write a table of the results."""
     from taichi_msm.cli.console import ProgressDisplay
-    from taichi_msm.sweeps.runs import begin_sweep
+    from taichi_msm.sweeps.runs import begin_sweep, run_missing
     from taichi_msm.sweeps.spec import load_sweep
-    from taichi_msm.sweeps.sweep import finish_sweep, open_executor, run_missing
+    from taichi_msm.sweeps.sweep import finish_sweep, open_executor
     from taichi_msm.sweeps.tables import choose_worker_count, cost_line, count_statuses, estimate_cost, summary_lines
 
     if workers is not None and dask is not None:
@@ -65,7 +65,8 @@ def sweep(
     if not yes and (loaded.runs > MAX_UNCONFIRMED_RUNS or cost.seconds > 86400):
         raise click.UsageError(f"{cost_line(loaded.runs, cost, chosen)}; add --yes if that is meant")
     state = begin_sweep(loaded, directory, shard or (1, 1))
-    outcomes, missing, total = state.done, len(state.missing), state.total
+    outcomes, missing = state.outcomes, len(state.missing)
+    total = len(outcomes) + missing
     chosen = choose_worker_count(cost, missing, workers)
     if not as_json:
         write_stderr([f"{len(outcomes)} of {total} runs have ended before"] if outcomes else [])

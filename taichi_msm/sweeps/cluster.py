@@ -128,7 +128,9 @@ class Cluster(Executor):
         try:
             if function is execute_run:
                 (task,) = arguments
-                dask_future = self._executor.submit(_execute_run, self._name, task.run, task.overrides)
+                dask_future = self._executor.submit(
+                    _execute_run, self._name, task.run, task.overrides, task.directory.absolute()
+                )
             else:
                 dask_future = self._executor.submit(_call, self._name, function, *arguments)
         except ClosedClientError:
@@ -170,10 +172,10 @@ def _call(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
         return function(*arguments)
 
 
-def _execute_run(name: str, run: int, overrides: tuple[str, ...]) -> Outcome:
+def _execute_run(name: str, run: int, overrides: tuple[str, ...], directory: Path) -> Outcome:
     inputs = _inputs(name)
     with suppress(KeyboardInterrupt):
-        task = RunTask(run, inputs.scene, overrides, inputs.directory, inputs.home)
+        task = RunTask(run, inputs.scene, overrides, directory, inputs.home)
         outcome: Outcome = _call(name, execute_run, task, inputs.pause)
         inputs.pause("", 0, 0)
         return outcome

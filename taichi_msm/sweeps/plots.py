@@ -32,8 +32,8 @@ from taichi_msm.errors import FilesError, StageProgressCallback, printable
 from taichi_msm.plot_style import BLUE, DPI, GREY, INK, ONE_COLUMN_WIDTH, ORANGE, PALE, STYLE, VERMILION
 from taichi_msm.runs.directory import replacing
 from taichi_msm.runs.finished import read_run, reading
-from taichi_msm.sweeps.runs import CONTACT, POLL_INTERVAL_S, SweepResult
-from taichi_msm.sweeps.spec import Distribution
+from taichi_msm.sweeps.runs import CONTACT, POLL_INTERVAL_S, SweepState
+from taichi_msm.sweeps.spec import Distribution, spread
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -211,37 +211,37 @@ class Tile(NamedTuple):
 
 
 def write_contact_sheet(
-    result: SweepResult, executor: Executor, progress: StageProgressCallback
+    state: SweepState, executor: Executor, progress: StageProgressCallback
 ) -> tuple[list[str], list[str]]:
     """Write the contact sheet, if any run has a frame.
 
     Args:
-        result: the finished sweep.
+        state: the finished sweep.
         executor: draws the runs that have a trajectory but no pictures.
         progress: called with the stage, the drawn and the total number of frames.
 
     Returns:
         Names of the written files, and warnings.
     """
-    runs = result.sample_runs(36)
-    complete = [run for run in runs if result.outcomes[run].status == "complete"]
-    frames, errors = _largest_frames({run: result.run_directory(run) for run in complete}, executor, progress)
+    runs = spread(len(state.outcomes), 36)
+    complete = [run for run in runs if state.outcomes[run].status == "complete"]
+    frames, errors = _largest_frames({run: state.run_directory(run) for run in complete}, executor, progress)
     if not frames:
         reason = WITHOUT_PICTURES if complete else f"{CONTACT} needs a complete run"
         return [], [f"no {CONTACT}: {errors[0]}" if errors else reason]
-    names = abbreviate_keys(result.sweep.keys)
+    names = abbreviate_keys(state.sweep.keys)
     tiles = []
     for run in runs:
-        values = [f"{name} = {format_short(value)}" for name, value in zip(names, result.values[run], strict=True)]
-        outcome = result.outcomes[run]
+        values = [f"{name} = {format_short(value)}" for name, value in zip(names, state.values[run], strict=True)]
+        outcome = state.outcomes[run]
         largest = outcome.max_displacement
         displacement = [] if largest is None else [f"max_displacement = {format_short(largest)}"]
         tiles.append(Tile(frames.get(run), outcome.status, [f"run {run}", *displacement, *map(printable, values)]))
-    total = len(result.outcomes)
+    total = len(state.outcomes)
     subset = f"{total} runs" if len(runs) == total else f"{len(runs)} of {total} runs, evenly spread"
-    heading = printable(f"{result.sweep.scene.name}: the frames with the largest displacement of {subset}")
-    sheet = _draw_tiles(tiles, _column_count(result, len(runs)), heading)
-    with replacing(result.directory / CONTACT) as file:
+    heading = printable(f"{state.sweep.scene.name}: the frames with the largest displacement of {subset}")
+    sheet = _draw_tiles(tiles, _column_count(state, len(runs)), heading)
+    with replacing(state.directory / CONTACT) as file:
         sheet.save(file, "JPEG", quality=90)
     lacks = f"{CONTACT} lacks the frames of {len(errors)} runs, for example: {errors[0]}" if errors else ""
     return [CONTACT], [lacks] if lacks else []
@@ -298,10 +298,10 @@ def read_gif_frame(path: Path, time: float) -> Image.Image:
         return film.convert("RGB")
 
 
-def _column_count(result: SweepResult, tiles: int) -> int:
+def _column_count(state: SweepState, tiles: int) -> int:
     """Choose the number of columns: that of the values of a grid's last key, otherwise about that of the rows."""
-    last = list(result.sweep.settings.distributions.values())[-1]
-    if tiles == len(result.outcomes) and last.kind == "grid" and 1 < len(last.values) <= 8:
+    last = list(state.sweep.settings.distributions.values())[-1]
+    if tiles == len(state.outcomes) and last.kind == "grid" and 1 < len(last.values) <= 8:
         return len(last.values)
     square = math.ceil(math.sqrt(tiles))
     return min(square, square + 1, key=lambda columns: -tiles % columns)
@@ -394,28 +394,28 @@ class VariedParameter(NamedTuple):
     labels: Sequence[str] = ()  # of at most MAX_LABELS non-numeric values
 
 
-def varied_parameters(result: SweepResult, runs: Sequence[int]) -> list[VariedParameter]:
+def varied_parameters(state: SweepState, runs: Sequence[int]) -> list[VariedParameter]:
     """Return the parameters that differ between the numbered runs, in the order of the keys."""
-    names = abbreviate_keys(result.sweep.keys)
+    names = abbreviate_keys(state.sweep.keys)
     candidates = [
         parameter
         for column, (name, distribution) in enumerate(
-            zip(names, result.sweep.settings.distributions.values(), strict=True)
+            zip(names, state.sweep.settings.distributions.values(), strict=True)
         )
-        for parameter in _parameters(name, distribution, [result.values[run][column] for run in runs])
+        for parameter in _parameters(name, distribution, [state.values[run][column] for run in runs])
     ]
     return [parameter for parameter in candidates if len(np.unique(parameter.numbers)) > 1]
 
 
-def varied_results(result: SweepResult, runs: Sequence[int]) -> dict[str, NDArray[np.float64]]:
+def varied_results(state: SweepState, runs: Sequence[int]) -> dict[str, NDArray[np.float64]]:
     """Return the results that differ between the numbered runs.
 
     Returns:
         Columns of the table by name, shape (runs,); NaN where a run is incomplete or lacks the result.
     """
-    outcomes = [result.outcomes[run] for run in runs]
+    outcomes = [state.outcomes[run] for run in runs]
     columns = {}
-    for name, values in result.columns().items():
+    for name, values in state.columns().items():
         if name in ("status", "error", "seconds"):
             continue
         numbers = [

@@ -20,12 +20,11 @@ from taichi_msm.sweeps.pool import Pool
 from taichi_msm.sweeps.runs import (
     FINAL_STATUSES,
     Outcome,
-    SweepResult,
     SweepState,
     begin_sweep,
-    execute_tasks,
+    lock_reports,
     read_outcome,
-    report_lock,
+    run_missing,
 )
 from taichi_msm.sweeps.spec import make_sweep
 from taichi_msm.sweeps.tables import choose_worker_count, estimate_cost, write_reports
@@ -92,7 +91,7 @@ def sweep(
 
     def execute() -> Iterator[Outcome]:
         with open_executor(executor, worker_count, state, progress) as opened:
-            yield from list(state.done)
+            yield from list(state.outcomes)
             yield from run_missing(state, opened, progress)
             finish_sweep(state, opened, progress)
 
@@ -136,23 +135,6 @@ def open_executor(
     pool.shutdown()
 
 
-def run_missing(state: SweepState, executor: Executor, progress: StageProgressCallback) -> Iterator[Outcome]:
-    """Execute the missing runs of a sweep, and yield their outcomes in order of completion.
-
-    Args:
-        state: the sweep; outcomes are appended to `state.done`.
-        executor: executes the runs.
-        progress: called several times a second; an exception from it ends the sweep.
-
-    Raises:
-        LostExecutorError: when the executor accepts no more runs.
-    """
-    done = state.done
-    for outcome in execute_tasks(state.missing, executor, lambda: progress("runs", len(done), state.total)):
-        done.append(outcome)
-        yield outcome
-
-
 def finish_sweep(state: SweepState, executor: Executor, progress: StageProgressCallback) -> tuple[list[str], list[str]]:
     """Write the table and the other reports of a sweep.
 
@@ -167,12 +149,12 @@ def finish_sweep(state: SweepState, executor: Executor, progress: StageProgressC
     Raises:
         FilesError: when the table cannot be written.
     """
-    directory, total, sweep = state.directory, state.total, state.sweep
-    with writing(directory), report_lock(directory, lambda: progress("runs", total, total)):
+    directory, total = state.directory, len(state.values)
+    with writing(directory), lock_reports(directory, lambda: progress("runs", total, total)):
         # A run that was locked by another command may be finished now.
         tasks = {task.run: task for task in state.missing}
-        rows = [
-            (None if row.status in FINAL_STATUSES else read_outcome(tasks[row.run], sweep)) or row
-            for row in sorted(state.done, key=lambda row: row.run)
+        state.outcomes[:] = [
+            (None if row.status in FINAL_STATUSES else read_outcome(tasks[row.run], state.sweep)) or row
+            for row in sorted(state.outcomes, key=lambda row: row.run)
         ]
-        return write_reports(SweepResult(directory, sweep, state.values, rows), executor, progress)
+        return write_reports(state, executor, progress)

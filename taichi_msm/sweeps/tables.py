@@ -48,9 +48,9 @@ from taichi_msm.sweeps.runs import (
     STATUSES,
     TABLE,
     Outcome,
-    SweepResult,
+    SweepState,
 )
-from taichi_msm.sweeps.spec import Sweep, format_override
+from taichi_msm.sweeps.spec import Sweep, format_override, spread
 from taichi_msm.system.compiler import versions
 from taichi_msm.system.files import read_regular
 from taichi_msm.system.process import available_memory, available_threads
@@ -63,11 +63,11 @@ WITHOUT_SALIB = f"{SENSITIVITY} needs SALib: pip install SALib"
 WrittenFiles = tuple[list[str], list[str]]
 
 
-def write_reports(result: SweepResult, executor: Executor, progress: StageProgressCallback) -> WrittenFiles:
+def write_reports(state: SweepState, executor: Executor, progress: StageProgressCallback) -> WrittenFiles:
     """Write the reports of a sweep, each atomically, and remove outdated ones.
 
     Args:
-        result: the finished sweep.
+        state: the finished sweep.
         executor: draws the last frames of runs without pictures.
         progress: called with the stage, the drawn and the total number of frames.
 
@@ -77,45 +77,45 @@ def write_reports(result: SweepResult, executor: Executor, progress: StageProgre
     Raises:
         FilesError: when the table cannot be written.
     """
-    writers: dict[str, Callable[[SweepResult], WrittenFiles]] = {
+    writers: dict[str, Callable[[SweepState], WrittenFiles]] = {
         PARQUET: write_parquet,
         DATASET: write_dataset,
         CONTACT: partial(write_contact_sheet, executor=executor, progress=progress),
         PLOT: _write_plots,
     }
-    with writing(result.directory):
-        write_table(result)
+    with writing(state.directory):
+        write_table(state)
         names, notes = [TABLE], list[str]()
         for name, write in writers.items():
             try:
-                new_names, new_notes = write(result)
+                new_names, new_notes = write(state)
             except Exception as error:
                 # A failing report must not discard hours of runs.
                 new_names, new_notes = [], [f"{name} could not be made: {type(error).__name__}: {error}"]
             names += new_names
             notes += new_notes
         for name in set(REPORT_FILES).difference(names):
-            (result.directory / name).unlink(missing_ok=True)
+            (state.directory / name).unlink(missing_ok=True)
     return names, notes
 
 
-def _write_plots(result: SweepResult) -> WrittenFiles:
+def _write_plots(state: SweepState) -> WrittenFiles:
     """Write sensitivity.csv if there are enough runs, and sweep.png if complete runs differ."""
     # More runs would slow down the plots without changing them visibly.
-    runs = result.sample_runs(4096)
-    varied, columns = varied_parameters(result, runs), varied_results(result, runs)
+    runs = spread(len(state.outcomes), 4096)
+    varied, columns = varied_parameters(state, runs), varied_results(state, runs)
     names: list[str] = []
     notes: list[str] = []
     if not (varied and columns):
         return names, [f"no {PLOT}: it needs complete runs with results that differ"]
-    failed = np.array([result.outcomes[run].status != "complete" for run in runs])
+    failed = np.array([state.outcomes[run].status != "complete" for run in runs])
     try:
         indices = estimate_sensitivity(varied, columns)
     except ImportError:
         indices = []
         notes.append(WITHOUT_SALIB)
     if indices:
-        with replacing(result.directory / SENSITIVITY) as file:
+        with replacing(state.directory / SENSITIVITY) as file:
             for row in [indices[0]._fields, *indices]:
                 file.write(f"{csv_line(row)}\n".encode("utf-8", "backslashreplace"))
         names.append(SENSITIVITY)
@@ -123,40 +123,40 @@ def _write_plots(result: SweepResult) -> WrittenFiles:
         import matplotlib  # noqa: F401
     except ImportError:
         return names, [*notes, WITHOUT_MATPLOTLIB]
-    complete = sum(outcome.status == "complete" for outcome in result.outcomes)
-    subset = f", {len(runs)} of them shown" if len(runs) < len(result.outcomes) else ""
-    title = f"{result.sweep.scene.name}: {complete} of {len(result.outcomes)} runs complete{subset}"
-    with replacing(result.directory / PLOT) as file:
+    complete = sum(outcome.status == "complete" for outcome in state.outcomes)
+    subset = f", {len(runs)} of them shown" if len(runs) < len(state.outcomes) else ""
+    title = f"{state.sweep.scene.name}: {complete} of {len(state.outcomes)} runs complete{subset}"
+    with replacing(state.directory / PLOT) as file:
         plot(PlotData(title, varied, columns, failed, indices), file)
     return [*names, PLOT], notes
 
 
-def write_table(result: SweepResult) -> None:
+def write_table(state: SweepState) -> None:
     """Write table.csv, with a row for each run."""
-    with replacing(result.directory / TABLE) as file:
-        for row in [_names(result), *_rows(result, format_override)]:
+    with replacing(state.directory / TABLE) as file:
+        for row in [_names(state), *_rows(state, format_override)]:
             file.write(f"{csv_line(row)}\n".encode("utf-8", "backslashreplace"))
 
 
-def write_parquet(result: SweepResult) -> WrittenFiles:
+def write_parquet(state: SweepState) -> WrittenFiles:
     """Write table.parquet if pyarrow is installed."""
     try:
         import pyarrow
         from pyarrow import parquet
     except ImportError:
         return [], []
-    rows = zip(*_rows(result, lambda value: value), strict=True)
-    columns: dict[str, Any] = dict(zip(_names(result), map(list, rows), strict=True))
-    for name in result.sweep.keys:
+    rows = zip(*_rows(state, lambda value: value), strict=True)
+    columns: dict[str, Any] = dict(zip(_names(state), map(list, rows), strict=True))
+    for name in state.sweep.keys:
         # Columns of mixed types, such as numbers and lists, become text.
         try:
             pyarrow.array(columns[name])
         except pyarrow.ArrowException:
             columns[name] = list(map(format_override, columns[name]))
-    for name in result.columns():  # explicit types, for columns without values
+    for name in state.columns():  # explicit types, for columns without values
         kind = pyarrow.string() if name in ("status", "error") else pyarrow.float64()
         columns[name] = pyarrow.array(columns[name], kind)
-    with replacing(result.directory / PARQUET) as file:
+    with replacing(state.directory / PARQUET) as file:
         parquet.write_table(pyarrow.table(columns), file)
     return [PARQUET], []
 
@@ -168,36 +168,36 @@ def csv_line(row: Iterable[Any]) -> str:
     return text.getvalue()
 
 
-def _names(result: SweepResult) -> list[str]:
-    return ["run", *result.sweep.keys, *result.columns()]
+def _names(state: SweepState) -> list[str]:
+    return ["run", *state.sweep.keys, *state.columns()]
 
 
-def _rows(result: SweepResult, write: Callable[[Any], Any]) -> Iterator[list[Any]]:
+def _rows(state: SweepState, write: Callable[[Any], Any]) -> Iterator[list[Any]]:
     """Yield the rows of the table, with the values of the keys converted by `write`."""
-    columns = zip(*result.columns().values(), strict=True)
-    for values, outcome, results in zip(result.values, result.outcomes, columns, strict=True):
+    columns = zip(*state.columns().values(), strict=True)
+    for values, outcome, results in zip(state.values, state.outcomes, columns, strict=True):
         yield [outcome.run, *map(write, values), *results]
 
 
-def write_dataset(result: SweepResult) -> WrittenFiles:
+def write_dataset(state: SweepState) -> WrittenFiles:
     """Write dataset.json, with a line for every complete run."""
-    sweep, complete = result.sweep, [outcome.run for outcome in result.outcomes if outcome.status == "complete"]
-    common = _output_format(result.run_directory(complete[0])) if complete else {}
+    sweep, complete = state.sweep, [outcome.run for outcome in state.outcomes if outcome.status == "complete"]
+    common = _output_format(state.run_directory(complete[0])) if complete else {}
     # The sections of a scene that determine the output format.
     settings = sweep.settings
     expressions = (key for key, value in settings.set.items() if replace_expressions(value, lambda *_: None) != value)
     differ = any(key.split(".")[0] in ("output", "render", "time") for key in (*settings.vary, *expressions))
-    splits = assign_splits(len(result.outcomes), settings.seed)
+    splits = assign_splits(len(state.outcomes), settings.seed)
     head = {"scene": settings.scene, **sweep.description(), "versions": versions(), "commit": commit(), **common}
-    with replacing(result.directory / DATASET) as file:
+    with replacing(state.directory / DATASET) as file:
         file.write(b"{\n")
         for name, value in head.items():
             file.write(f'"{name}": '.encode() + _json(value) + b",\n")
         file.write(b'"runs": [')
         for run in complete:
-            directory = result.run_directory(run)
-            folder = directory.relative_to(result.directory).as_posix()
-            values = dict(zip(sweep.keys, result.values[run], strict=True))
+            directory = state.run_directory(run)
+            folder = directory.relative_to(state.directory).as_posix()
+            values = dict(zip(sweep.keys, state.values[run], strict=True))
             outputs = _output_format(directory) if differ else {}
             row = {"run": run, "folder": folder, "part": splits[run], "values": values, **outputs}
             file.write((b"" if run == complete[0] else b",") + b"\n" + _json(row))

@@ -28,9 +28,9 @@ from taichi_msm.images import file_sha256
 from taichi_msm.load import cost as cost_module
 from taichi_msm.sweeps import tables
 from taichi_msm.sweeps.pool import PARENT_POLL_S, DiedError, Pool
-from taichi_msm.sweeps.runs import Outcome, RunTask, SweepState, begin_sweep, execute_tasks, register_sweep
+from taichi_msm.sweeps.runs import Outcome, RunTask, SweepState, begin_sweep, register_sweep, run_missing
 from taichi_msm.sweeps.spec import load_sweep, make_sweep
-from taichi_msm.sweeps.sweep import finish_sweep, run_missing
+from taichi_msm.sweeps.sweep import finish_sweep
 from tests.conftest import Program
 from tests.golden import Messages
 from tests.outputs import files, results
@@ -286,9 +286,8 @@ def one_ended(many: Path) -> Callable[..., SweepState]:
 
 def test_a_run_that_diverged_is_not_taken_again(one_ended: Callable[..., SweepState]) -> None:
     state = one_ended()
-    assert state.done == [Outcome(2, "diverged", "at 0.1 s", 1.0, 0.5, forces=(3.0,))]
+    assert state.outcomes == [Outcome(2, "diverged", "at 0.1 s", 1.0, 0.5, forces=(3.0,))]
     assert [task.run for task in state.missing] == [0, 1, 3]
-    assert state.total == 4
 
 
 @pytest.mark.parametrize(
@@ -401,7 +400,7 @@ def test_a_run_that_cannot_be_is_refused_and_one_that_fails_is_tried_again(
     def take_all() -> list[Outcome]:
         state = begin_sweep(described, Path("out"))
         list(run_missing(state, pool, quiet))
-        return sorted(state.done, key=number)
+        return sorted(state.outcomes, key=number)
 
     first, second = take_all()
     assert (first.status, second.status) == ("failed", "refused")
@@ -448,6 +447,12 @@ def test_the_processes_of_a_pool_end_with_it(tmp_path: Path) -> None:
     raise AssertionError("it is still there")
 
 
+def state_of(runs: int) -> SweepState:
+    """A sweep whose runs are only numbers."""
+    nothing: Any = None
+    return SweepState(Path(), nothing, [], [], [RunTask(run, nothing, (), Path(), Path()) for run in range(runs)])
+
+
 class Dying(Executor):
     """An executor whose workers die of run 1 so many times."""
 
@@ -467,8 +472,7 @@ class Dying(Executor):
 
 @pytest.mark.parametrize(("times", "status"), [(1, "complete"), (2, "died")])
 def test_a_run_whose_worker_died_is_taken_once_more(times: int, status: str) -> None:
-    tasks = [RunTask(run, None, (), Path(), Path()) for run in range(3)]  # type: ignore[arg-type]
-    ends = {row.run: row for row in execute_tasks(tasks, Dying(times), lambda: None)}
+    ends = {row.run: row for row in run_missing(state_of(3), Dying(times), quiet)}
     assert [ends[run].status for run in range(3)] == ["complete", status, "complete"]
     assert ends[1].error == ("its process was ended by SIGKILL, twice" if times == 2 else "")
 
@@ -478,7 +482,7 @@ def test_an_executor_that_takes_no_more_runs_is_an_error(message: Messages) -> N
     with pytest.raises(Exception, match="terminated abruptly"):
         executor.submit(end_at_once).result()
     with message.raises(MsmError, "ProcessPoolExecutor", hide=r"(?<=runs: ).*(?=; )"):
-        list(execute_tasks([RunTask(0, None, (), Path(), Path())], executor, lambda: None))  # type: ignore[arg-type]
+        list(run_missing(state_of(1), executor, quiet))
 
 
 def test_there_is_a_process_for_each_core_as_far_as_memory_goes(monkeypatch: pytest.MonkeyPatch) -> None:

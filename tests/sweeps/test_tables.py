@@ -32,7 +32,7 @@ from taichi_msm.sweeps.plots import (
     varied_results,
 )
 from taichi_msm.sweeps.pool import Pool
-from taichi_msm.sweeps.runs import CONTACT, REPORT_FILES, Outcome, SweepResult, register_sweep
+from taichi_msm.sweeps.runs import CONTACT, REPORT_FILES, Outcome, SweepState, register_sweep
 from taichi_msm.sweeps.spec import make_sweep
 from taichi_msm.sweeps.tables import WITHOUT_MATPLOTLIB, WITHOUT_SALIB, assign_splits, write_reports
 from tests.golden import Messages
@@ -42,7 +42,7 @@ VARY = {
     "probes.0.at": {"uniform": [[0.3, 0.5], [0.7, 0.5]]},
     "image": {"choice": ["speckle.png", "other.png"]},
 }
-Make = Callable[..., SweepResult]
+Make = Callable[..., SweepState]
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ def make(small: Path, ran: Path) -> Make:
     """
     shutil.copy("speckle.png", "other.png")
 
-    def made(samples: int = 8, vary: dict[str, Any] = VARY, **settings: Any) -> SweepResult:
+    def made(samples: int = 8, vary: dict[str, Any] = VARY, **settings: Any) -> SweepState:
         described = make_sweep("small.yaml", {"vary": vary, "samples": samples, "seed": 1, **settings})
         values = described.values()
         outcomes = [
@@ -62,7 +62,7 @@ def make(small: Path, ran: Path) -> Make:
             else Outcome(run, "complete", "", np.log(row[0]), 0.9, None)
             for run, row in enumerate(values)
         ]
-        result = SweepResult(small / "out", described, values, outcomes)
+        result = SweepState(small / "out", described, values, outcomes)
         for run in range(samples):
             result.run_directory(run).mkdir(parents=True, exist_ok=True)
             shutil.copy(ran / "run.json", result.run_directory(run))
@@ -71,12 +71,12 @@ def make(small: Path, ran: Path) -> Make:
     return made
 
 
-def write(result: SweepResult, executor: Executor | None = None) -> tuple[list[str], list[str]]:
+def write(result: SweepState, executor: Executor | None = None) -> tuple[list[str], list[str]]:
     """Write the reports without progress."""
     return write_reports(result, executor or ThreadPoolExecutor(1), lambda stage, done, total: None)
 
 
-def copy_runs(ran: Path, result: SweepResult) -> None:
+def copy_runs(ran: Path, result: SweepState) -> None:
     """Give every complete run the results of one."""
     for outcome in result.outcomes:
         if outcome.status == "complete":
