@@ -13,18 +13,18 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from concurrent.futures import CancelledError, Executor, Future
+from concurrent.futures import BrokenExecutor, CancelledError, Future
 from contextlib import contextmanager, suppress
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-from distributed import Client, KilledWorker, Reschedule, Security, WorkerPlugin, get_worker
+from distributed import Client, Reschedule, Security, WorkerPlugin, get_worker
+from distributed.cfexecutor import ClientExecutor
 from distributed.client import ClosedClientError
 from distributed.comm import connect
 from distributed.utils import LoopRunner, silence_logging_cmgr
 
-from taichi_msm.errors import ExecutorError, LostExecutorError, MsmError, StageProgressCallback
+from taichi_msm.errors import ExecutorError, LostExecutorError, StageProgressCallback
 from taichi_msm.images import use_copies
 from taichi_msm.scene.outputs import SWEEP_RECORD
 from taichi_msm.sweeps.runs import Outcome, RunTask, execute_run
@@ -111,59 +111,23 @@ class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
         return ""
 
 
-class Cluster(Executor):
-    """Executor for the workers of a scheduler, which sends only the number and the overrides of each run."""
+class Cluster(ClientExecutor):  # type: ignore[misc]
+    """Executor for the workers of a scheduler, which sends only the number, overrides and directory of each run."""
 
     def __init__(self, client: Any, name: str) -> None:
-        self._executor, self._name = client.get_executor(pure=False), name
+        super().__init__(client, pure=False)
+        self._name = name
 
-    def submit(self, function: Callable[..., Any], /, *arguments: Any, **_: Any) -> Future[Any]:
-        """Schedule a call in an idle worker.
-
-        Args:
-            function: an importable function.
-            *arguments: its positional arguments; named ones are not supported.
-        """
-        result: Future[Any] = Future()
+    def submit(self, function: Callable[..., Any], /, *arguments: Any) -> Future[Any]:
+        """Schedule a call of an importable function in an idle worker."""
+        call: tuple[Any, ...] = (_call, self._name, function, *arguments)
+        if function is execute_run:
+            (task,) = arguments
+            call = (_execute_run, self._name, task.run, task.overrides, task.directory.absolute())
         try:
-            if function is execute_run:
-                (task,) = arguments
-                dask_future = self._executor.submit(
-                    _execute_run, self._name, task.run, task.overrides, task.directory.absolute()
-                )
-            else:
-                dask_future = self._executor.submit(_call, self._name, function, *arguments)
-        except ClosedClientError:
-            _cancel(result)
-        else:
-            dask_future.add_done_callback(partial(_forward_result, result))
-        return result
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Shut down the executor.
-
-        Args:
-            wait: whether to wait for all calls.
-            cancel_futures: whether to cancel pending calls, without waiting for running ones.
-        """
-        self._executor.shutdown(wait and not cancel_futures)
-
-
-def _forward_result(result: Future[Any], dask_future: Future[Any]) -> None:
-    """Forward the result of a call, with a reproducible message for dead workers."""
-    if dask_future.cancelled():
-        _cancel(result)
-    elif isinstance(error := dask_future.exception(), KilledWorker):
-        result.set_exception(MsmError(f"its workers died, {error.allowed_failures + 1} one after another"))
-    elif error is not None:
-        result.set_exception(error)
-    else:
-        result.set_result(dask_future.result())
-
-
-def _cancel(result: Future[Any]) -> None:
-    result.cancel()
-    result.set_running_or_notify_cancel()
+            return super().submit(*call)
+        except ClosedClientError as error:
+            raise BrokenExecutor(str(error)) from error
 
 
 def _call(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
@@ -220,14 +184,14 @@ def cluster_connection(
             yield cluster
         except ExecutorError as error:
             # Within the block, runs are cancelled only by a lost connection.
-            if lost := isinstance(error.__cause__, (CancelledError, OSError)):
+            if lost := isinstance(error.__cause__, (BrokenExecutor, CancelledError, OSError)):
                 raise LostExecutorError(f"lost the scheduler at {address}") from error
             raise
         finally:
             if not lost:
                 # The connection may be lost, or another command for this directory may have removed the plugin.
                 with suppress(OSError, ValueError):
-                    cluster.shutdown(cancel_futures=True)
+                    cluster.shutdown(wait=False)
                     client.unregister_worker_plugin(name)
             client.close()
 

@@ -239,7 +239,9 @@ def run_missing(state: SweepState, executor: Executor, progress: StageProgressCa
             outcome = Outcome(task.run, "died", f"{error}, twice")
         except Exception as error:
             # `execute_run` raises nothing: the worker has died. Other executors have their own retries.
-            outcome = Outcome(task.run, "died", " ".join(str(error).split()))
+            failures = getattr(error, "allowed_failures", None)  # of dask's KilledWorker, whose text has an address
+            reason = str(error) if failures is None else f"its workers died, {failures + 1} one after another"
+            outcome = Outcome(task.run, "died", " ".join(reason.split()))
         state.outcomes.append(outcome)
         yield outcome
         for task in islice(remaining, 1):
