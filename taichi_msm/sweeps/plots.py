@@ -43,9 +43,6 @@ PANEL_WIDTH_IN = 1.75
 
 CHARACTERS_PER_INCH = 17
 
-# Margin at the ends of an axis, as a fraction of its length.
-AXIS_MARGIN = 0.05
-
 UNITS = {"max_displacement": " [m]", "force": " [N]", "greatest": " [N]"}
 
 
@@ -176,15 +173,8 @@ def _format_axis(axes: Axes, parameter: VariedParameter) -> None:
         axes.xaxis.set_major_locator(MaxNLocator(3))
     axes.xaxis.set_major_formatter(FuncFormatter(_tick_label))
     # The limits include failed runs.
-    axes.set_xlim(*_axis_limits(parameter))
-
-
-def _axis_limits(parameter: VariedParameter) -> tuple[float, float]:
-    low, high = float(parameter.numbers.min()), float(parameter.numbers.max())
-    if parameter.is_logarithmic:
-        factor = (high / low) ** AXIS_MARGIN
-        return low / factor, high * factor
-    return low - AXIS_MARGIN * (high - low), high + AXIS_MARGIN * (high - low)
+    axes.update_datalim([(number, 1) for number in parameter.numbers], updatey=False)
+    axes.autoscale(axis="x")
 
 
 def _tick_label(number: float, _: int) -> str:
@@ -353,7 +343,18 @@ def _wrap(parts: Iterable[str], fits: Callable[[str], bool]) -> list[str]:
 
 def abbreviate_keys(keys: Sequence[str]) -> list[str]:
     """Abbreviate dotted keys to their shortest unambiguous suffix that starts with a word."""
-    return [next(name for name in _suffixes(key) if _is_unambiguous(name, key, keys)) for key in keys]
+    names = []
+    for key in keys:
+        parts = key.split(".")
+        suffixes = (".".join(parts[start:]) for start in reversed(range(1, len(parts))))
+        rivals = [f".{rival}" for rival in keys if rival != key]
+        unambiguous = (
+            name
+            for name in suffixes
+            if not name[0].isdigit() and not any(rival.endswith(f".{name}") for rival in rivals)
+        )
+        names.append(next(unambiguous, key))
+    return names
 
 
 def format_short(value: Any) -> str:
@@ -367,18 +368,6 @@ def format_short(value: Any) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{name} {format_short(item)}" for name, item in value.items())
     return json.dumps(value)
-
-
-def _suffixes(key: str) -> Iterable[str]:
-    """Return the suffixes of a dotted key, from short to long."""
-    parts = key.split(".")
-    return (".".join(parts[start:]) for start in reversed(range(len(parts))))
-
-
-def _is_unambiguous(name: str, key: str, keys: Sequence[str]) -> bool:
-    return name == key or not (
-        name[0].isdigit() or any(f".{rival}".endswith(f".{name}") for rival in keys if rival != key)
-    )
 
 
 # Largest number of labels of a parameter; with more values, it has none.
@@ -413,14 +402,12 @@ def varied_results(state: SweepState, runs: Sequence[int]) -> dict[str, NDArray[
     Returns:
         Columns of the table by name, shape (runs,); NaN where a run is incomplete or lacks the result.
     """
-    outcomes = [state.outcomes[run] for run in runs]
+    complete = [state.outcomes[run].status == "complete" for run in runs]
     columns = {}
     for name, values in state.columns().items():
         if name in ("status", "error", "seconds"):
             continue
-        numbers = [
-            values[run] if outcome.status == "complete" else None for run, outcome in zip(runs, outcomes, strict=True)
-        ]
+        numbers = [values[run] if is_complete else None for run, is_complete in zip(runs, complete, strict=True)]
         column = np.array(numbers, dtype=np.float64)
         if len(np.unique(column[np.isfinite(column)])) > 1:
             columns[name] = column
@@ -435,9 +422,10 @@ def is_wide_range(numbers: NDArray[np.float64]) -> bool:
 def _parameters(name: str, distribution: Distribution, values: list[Any]) -> Iterator[VariedParameter]:
     """Yield the parameters of a key, one for each component of a list of numbers."""
     if distribution.kind not in ("choice", "grid"):
-        is_logarithmic = distribution.kind == "log_uniform"
-        for suffix, *components in zip(_component_indices(values[0]), *map(_flatten, values), strict=True):
-            yield VariedParameter(name + suffix, np.array(components, dtype=np.float64), is_logarithmic)
+        components = np.array(values, dtype=np.float64)
+        for index in np.ndindex(components.shape[1:]):
+            suffix = "".join(f"[{n}]" for n in index)
+            yield VariedParameter(name + suffix, components[(slice(None), *index)], distribution.kind == "log_uniform")
         return
     if all(type(value) in (int, float) for value in distribution.values):
         numbers = np.array(values, dtype=np.float64)
@@ -449,23 +437,6 @@ def _parameters(name: str, distribution: Distribution, values: list[Any]) -> Ite
         yield VariedParameter(name, numbers, labels=[format_short(json.loads(text)) for text in ranks])
     else:
         yield VariedParameter(f"{name} ({len(ranks)} values)", numbers)
-
-
-def _flatten(value: Any) -> Iterator[float]:
-    if isinstance(value, list):
-        for item in value:
-            yield from _flatten(item)
-    else:
-        yield value
-
-
-def _component_indices(value: Any) -> Iterator[str]:
-    """Yield the index of each number in a nested list, such as [0] and [1]."""
-    if isinstance(value, list):
-        for index, item in enumerate(value):
-            yield from (f"[{index}]{rest}" for rest in _component_indices(item))
-    else:
-        yield ""
 
 
 # With fewer runs, indices are too inaccurate to rank parameters.
