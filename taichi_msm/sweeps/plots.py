@@ -39,9 +39,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-PANEL_WIDTH_IN = 1.75
-
-CHARACTERS_PER_INCH = 17
+PANEL_WIDTH_IN, CHARACTERS_PER_INCH = 1.75, 17
 
 UNITS = {"max_displacement": " [m]", "force": " [N]", "greatest": " [N]"}
 
@@ -57,15 +55,7 @@ class PlotData(NamedTuple):
 
 
 def plot(data: PlotData, file: BinaryIO) -> None:
-    """Plot sweep.png, with a panel for each result and each of the most sensitive parameters.
-
-    Args:
-        data: results and parameters of the runs.
-        file: receives the PNG.
-
-    Raises:
-        ImportError: when Matplotlib is not installed.
-    """
+    """Plot sweep.png, with a panel for each result and each of the most sensitive parameters, to a file."""
     from matplotlib import style
 
     with style.context(STYLE, after_reset=True), warnings.catch_warnings():
@@ -79,7 +69,6 @@ def _figure(data: PlotData) -> Figure:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
-    from matplotlib.ticker import FuncFormatter
 
     indices = {(index.result, index.parameter): index for index in data.indices}
     parameters = _most_sensitive(data)
@@ -96,7 +85,7 @@ def _figure(data: PlotData) -> Figure:
         if is_wide_range(numbers):
             row[0].set_yscale("log")
         else:
-            row[0].yaxis.set_major_formatter(FuncFormatter(_tick_label))
+            row[0].yaxis.set_major_formatter(_tick_label)
         for axes, parameter in zip(row, parameters, strict=True):
             _plot_runs(axes, parameter, numbers, data.failed)
             if index := indices.get((name, parameter.name)):
@@ -111,8 +100,7 @@ def _most_sensitive(data: PlotData) -> list[VariedParameter]:
     largest = dict.fromkeys((parameter.name for parameter in data.parameters), -math.inf)
     for index in data.indices:
         largest[index.parameter] = max(index.first_order, largest[index.parameter])
-    ranked = sorted(data.parameters, key=lambda parameter: -largest[parameter.name])
-    chosen = {parameter.name for parameter in ranked[:8]}
+    chosen = sorted(largest, key=lambda name: -largest[name])[:8]
     return [parameter for parameter in data.parameters if parameter.name in chosen]
 
 
@@ -122,9 +110,9 @@ def _legend(data: PlotData, drawn: Sequence[VariedParameter]) -> Iterator[str]:
         yield "parameter alone, with its 95 % interval (RBD-FAST)."
     if data.failed.any():
         yield "x: a run that failed."
-    drawn_names = {parameter.name for parameter in drawn}
-    if rest := [parameter.name for parameter in data.parameters if parameter.name not in drawn_names]:
-        yield f"Not shown, as less sensitive: {', '.join(rest)}." if data.indices else f"Not shown: {', '.join(rest)}."
+    shown = {parameter.name for parameter in drawn}
+    if rest := [parameter.name for parameter in data.parameters if parameter.name not in shown]:
+        yield f"Not shown{', as less sensitive' if data.indices else ''}: {', '.join(rest)}."
 
 
 def _plot_runs(axes: Axes, parameter: VariedParameter, numbers: NDArray[np.float64], failed: NDArray[np.bool_]) -> None:
@@ -141,10 +129,7 @@ def _plot_runs(axes: Axes, parameter: VariedParameter, numbers: NDArray[np.float
 
 def _plot_index(axes: Axes, index: SensitivityIndex) -> None:
     """Plot the index as a bar above a panel, whose width is 1."""
-    low, middle, high = (
-        min(max(value, 0.0), 1.0)
-        for value in (index.first_order - index.confidence, index.first_order, index.first_order + index.confidence)
-    )
+    low, middle, high = np.clip(index.first_order + index.confidence * np.array([-1, 0, 1]), 0, 1)
     line_style: dict[str, Any] = {"transform": axes.transAxes, "clip_on": False, "solid_capstyle": "butt"}
     for left, right, colour, width in ((0, 1, PALE, 5), (0, middle, ORANGE, 5), (low, high, INK, 0.8)):
         axes.plot([left, right], [1.06, 1.06], color=colour, linewidth=width, **line_style)
@@ -153,16 +138,15 @@ def _plot_index(axes: Axes, index: SensitivityIndex) -> None:
 
 
 def _format_axis(axes: Axes, parameter: VariedParameter) -> None:
-    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
     name = textwrap.fill(printable(parameter.name), round(CHARACTERS_PER_INCH * PANEL_WIDTH_IN))
     axes.set_xlabel(name, parse_math=False)
     if parameter.labels:
         labels = [textwrap.shorten(printable(label), 12, placeholder="…") for label in parameter.labels]
         # A panel has space for 20 characters.
-        rotated: dict[str, Any] = (
-            {"rotation": 30, "ha": "right", "rotation_mode": "anchor"} if sum(map(len, labels)) > 20 else {}
-        )
+        is_long = sum(map(len, labels)) > 20
+        rotated: dict[str, Any] = {"rotation": 30, "ha": "right", "rotation_mode": "anchor"} if is_long else {}
         axes.set_xticks(range(len(labels)), labels, parse_math=False, **rotated)
         return
     if parameter.is_logarithmic:
@@ -171,7 +155,7 @@ def _format_axis(axes: Axes, parameter: VariedParameter) -> None:
         axes.xaxis.set_minor_formatter(NullFormatter())
     else:
         axes.xaxis.set_major_locator(MaxNLocator(3))
-    axes.xaxis.set_major_formatter(FuncFormatter(_tick_label))
+    axes.xaxis.set_major_formatter(_tick_label)
     # The limits include failed runs.
     axes.update_datalim([(number, 1) for number in parameter.numbers], updatey=False)
     axes.autoscale(axis="x")
@@ -187,9 +171,7 @@ def _tick_label(number: float, _: int) -> str:
 
 WITHOUT_PICTURES = f"{CONTACT} needs pictures of the runs; take set: {{output: [png]}}, or trajectory, and an image"
 
-GAP_PX, LINE_HEIGHT_PX = 20, 23
-
-MAX_CAPTION_LINES = 8
+GAP_PX, LINE_HEIGHT_PX, MAX_CAPTION_LINES = 20, 23, 8
 
 
 class Tile(NamedTuple):
@@ -203,16 +185,7 @@ class Tile(NamedTuple):
 def write_contact_sheet(
     state: SweepState, executor: Executor, progress: StageProgressCallback
 ) -> tuple[list[str], list[str]]:
-    """Write the contact sheet, if any run has a frame.
-
-    Args:
-        state: the finished sweep.
-        executor: draws the runs that have a trajectory but no pictures.
-        progress: called with the stage, the drawn and the total number of frames.
-
-    Returns:
-        Names of the written files, and warnings.
-    """
+    """Write the contact sheet, if any run has a frame; arguments and result as of `tables.write_reports`."""
     runs = spread(len(state.outcomes), 36)
     complete = [run for run in runs if state.outcomes[run].status == "complete"]
     frames, errors = _largest_frames({run: state.run_directory(run) for run in complete}, executor, progress)
@@ -233,8 +206,7 @@ def write_contact_sheet(
     sheet = _draw_tiles(tiles, _column_count(state, len(runs)), heading)
     with replacing(state.directory / CONTACT) as file:
         sheet.save(file, "JPEG", quality=90)
-    lacks = f"{CONTACT} lacks the frames of {len(errors)} runs, for example: {errors[0]}" if errors else ""
-    return [CONTACT], [lacks] if lacks else []
+    return [CONTACT], [f"{CONTACT} lacks the frames of {len(errors)} runs, for example: {errors[0]}"] if errors else []
 
 
 def draw_largest_frame(directory: Path) -> NDArray[np.uint8]:
@@ -370,17 +342,13 @@ def format_short(value: Any) -> str:
     return json.dumps(value)
 
 
-# Largest number of labels of a parameter; with more values, it has none.
-MAX_LABELS = 8
-
-
 class VariedParameter(NamedTuple):
     """Parameter that differs between runs."""
 
     name: str  # abbreviated key, with the index of a list's component
     numbers: NDArray[np.float64]  # values, or indices of non-numeric values; shape (runs,)
     is_logarithmic: bool = False
-    labels: Sequence[str] = ()  # of at most MAX_LABELS non-numeric values
+    labels: Sequence[str] = ()  # of at most eight non-numeric values
 
 
 def varied_parameters(state: SweepState, runs: Sequence[int]) -> list[VariedParameter]:
@@ -433,7 +401,7 @@ def _parameters(name: str, distribution: Distribution, values: list[Any]) -> Ite
         return
     ranks = {text: rank for rank, text in enumerate(dict.fromkeys(map(json.dumps, distribution.values)))}
     numbers = np.array([ranks[json.dumps(value)] for value in values], dtype=np.float64)
-    if len(ranks) <= MAX_LABELS:
+    if len(ranks) <= 8:
         yield VariedParameter(name, numbers, labels=[format_short(json.loads(text)) for text in ranks])
     else:
         yield VariedParameter(f"{name} ({len(ranks)} values)", numbers)
@@ -458,7 +426,7 @@ def estimate_sensitivity(
     """Estimate the first-order sensitivities of results in at least `MIN_RUNS` runs.
 
     Args:
-        parameters: the parameters, with numbers of shape (runs,).
+        parameters: the parameters.
         results: by name, shape (runs,); NaN where a run lacks the result.
 
     Raises:

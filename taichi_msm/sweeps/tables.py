@@ -115,9 +115,7 @@ def _write_plots(state: SweepState) -> WrittenFiles:
         indices = []
         notes.append(WITHOUT_SALIB)
     if indices:
-        with replacing(state.directory / SENSITIVITY) as file:
-            for row in [indices[0]._fields, *indices]:
-                file.write(f"{csv_line(row)}\n".encode("utf-8", "backslashreplace"))
+        _write_csv(state.directory / SENSITIVITY, [indices[0]._fields, *indices])
         names.append(SENSITIVITY)
     try:
         import matplotlib  # noqa: F401
@@ -133,9 +131,10 @@ def _write_plots(state: SweepState) -> WrittenFiles:
 
 def write_table(state: SweepState) -> None:
     """Write table.csv, with a row for each run."""
-    with replacing(state.directory / TABLE) as file:
-        for row in [_names(state), *_rows(state, format_override)]:
-            file.write(f"{csv_line(row)}\n".encode("utf-8", "backslashreplace"))
+    columns = _columns(state)
+    for name in state.sweep.keys:
+        columns[name] = list(map(format_override, columns[name]))
+    _write_csv(state.directory / TABLE, [list(columns), *zip(*columns.values(), strict=True)])
 
 
 def write_parquet(state: SweepState) -> WrittenFiles:
@@ -145,8 +144,7 @@ def write_parquet(state: SweepState) -> WrittenFiles:
         from pyarrow import parquet
     except ImportError:
         return [], []
-    rows = zip(*_rows(state, lambda value: value), strict=True)
-    columns: dict[str, Any] = dict(zip(_names(state), map(list, rows), strict=True))
+    columns: dict[str, Any] = _columns(state)
     for name in state.sweep.keys:
         # Columns of mixed types, such as numbers and lists, become text.
         try:
@@ -161,22 +159,24 @@ def write_parquet(state: SweepState) -> WrittenFiles:
     return [PARQUET], []
 
 
+def _columns(state: SweepState) -> dict[str, list[Any]]:
+    """Return the columns of the table by name."""
+    values = map(list, zip(*state.values, strict=True))
+    runs = [outcome.run for outcome in state.outcomes]
+    return {"run": runs, **dict(zip(state.sweep.keys, values, strict=True)), **state.columns()}
+
+
+def _write_csv(path: Path, rows: Iterable[Iterable[Any]]) -> None:
+    with replacing(path) as file:
+        for row in rows:
+            file.write(f"{csv_line(row)}\n".encode("utf-8", "backslashreplace"))
+
+
 def csv_line(row: Iterable[Any]) -> str:
     """Format a row of a CSV file, without the line break."""
     text = io.StringIO()
     csv.writer(text, lineterminator="").writerow(row)
     return text.getvalue()
-
-
-def _names(state: SweepState) -> list[str]:
-    return ["run", *state.sweep.keys, *state.columns()]
-
-
-def _rows(state: SweepState, write: Callable[[Any], Any]) -> Iterator[list[Any]]:
-    """Yield the rows of the table, with the values of the keys converted by `write`."""
-    columns = zip(*state.columns().values(), strict=True)
-    for values, outcome, results in zip(state.values, state.outcomes, columns, strict=True):
-        yield [outcome.run, *map(write, values), *results]
 
 
 def write_dataset(state: SweepState) -> WrittenFiles:
