@@ -46,10 +46,6 @@ TRANSPORT_REQUIREMENTS = {
 class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
     """Worker plugin with the common inputs of all runs of a sweep.
 
-    Args:
-        sweep: has the scene and the files.
-        directory: of the sweep.
-
     Attributes:
         error: reason why the worker cannot execute runs; empty if it can.
         copies: local copies of the files, by their paths on the machine where the sweep was started.

@@ -32,7 +32,7 @@ from taichi_msm.errors import FilesError, StageProgressCallback, printable
 from taichi_msm.plot_style import BLUE, DPI, GREY, INK, ONE_COLUMN_WIDTH, ORANGE, PALE, STYLE, VERMILION
 from taichi_msm.runs.directory import replacing
 from taichi_msm.runs.finished import read_run, reading
-from taichi_msm.sweeps.runs import CONTACT, POLL_INTERVAL_S, SweepState
+from taichi_msm.sweeps.runs import POLL_INTERVAL_S, SweepState
 from taichi_msm.sweeps.spec import Distribution, spread
 
 if TYPE_CHECKING:
@@ -169,7 +169,7 @@ def _tick_label(number: float, _: int) -> str:
     return f"{float(digits):g}e{int(exponent)}"
 
 
-WITHOUT_PICTURES = f"{CONTACT} needs pictures of the runs; take set: {{output: [png]}}, or trajectory, and an image"
+WITHOUT_PICTURES = "contact.jpg needs pictures of the runs; take set: {output: [png]}, or trajectory, and an image"
 
 GAP_PX, LINE_HEIGHT_PX, MAX_CAPTION_LINES = 20, 23, 8
 
@@ -182,31 +182,31 @@ class Tile(NamedTuple):
     caption: list[str]  # unbreakable parts
 
 
-def write_contact_sheet(
-    state: SweepState, executor: Executor, progress: StageProgressCallback
-) -> tuple[list[str], list[str]]:
-    """Write the contact sheet, if any run has a frame; arguments and result as of `tables.write_reports`."""
+def write_contact_sheet(state: SweepState, executor: Executor, progress: StageProgressCallback) -> list[str]:
+    """Write contact.jpg, if any run has a frame; arguments as of `tables.write_reports`; return warnings."""
     runs = spread(len(state.outcomes), 36)
     complete = [run for run in runs if state.outcomes[run].status == "complete"]
     frames, errors = _largest_frames({run: state.run_directory(run) for run in complete}, executor, progress)
     if not frames:
-        reason = WITHOUT_PICTURES if complete else f"{CONTACT} needs a complete run"
-        return [], [f"no {CONTACT}: {errors[0]}" if errors else reason]
+        reason = WITHOUT_PICTURES if complete else "contact.jpg needs a complete run"
+        return [f"no contact.jpg: {errors[0]}" if errors else reason]
     names = abbreviate_keys(state.sweep.keys)
     tiles = []
     for run in runs:
-        values = [f"{name} = {format_short(value)}" for name, value in zip(names, state.values[run], strict=True)]
         outcome = state.outcomes[run]
-        largest = outcome.max_displacement
-        displacement = [] if largest is None else [f"max_displacement = {format_short(largest)}"]
-        tiles.append(Tile(frames.get(run), outcome.status, [f"run {run}", *displacement, *map(printable, values)]))
+        caption = [f"run {run}"]
+        if outcome.max_displacement is not None:
+            caption.append(f"max_displacement = {format_short(outcome.max_displacement)}")
+        for name, value in zip(names, state.values[run], strict=True):
+            caption.append(printable(f"{name} = {format_short(value)}"))
+        tiles.append(Tile(frames.get(run), outcome.status, caption))
     total = len(state.outcomes)
     subset = f"{total} runs" if len(runs) == total else f"{len(runs)} of {total} runs, evenly spread"
     heading = printable(f"{state.sweep.scene.name}: the frames with the largest displacement of {subset}")
     sheet = _draw_tiles(tiles, _column_count(state, len(runs)), heading)
-    with replacing(state.directory / CONTACT) as file:
+    with replacing(state.directory / "contact.jpg") as file:
         sheet.save(file, "JPEG", quality=90)
-    return [CONTACT], [f"{CONTACT} lacks the frames of {len(errors)} runs, for example: {errors[0]}"] if errors else []
+    return [f"contact.jpg lacks the frames of {len(errors)} runs, for example: {errors[0]}"] if errors else []
 
 
 def draw_largest_frame(directory: Path) -> NDArray[np.uint8]:

@@ -16,17 +16,8 @@ from typing import Any, BinaryIO, ClassVar, Literal, NamedTuple, get_args
 
 from pydantic import ConfigDict, TypeAdapter
 
-from taichi_msm.errors import (
-    ExecutorError,
-    FilesError,
-    ForeignError,
-    LostExecutorError,
-    MsmError,
-    Pause,
-    SceneError,
-    StageProgressCallback,
-    writing,
-)
+from taichi_msm import errors
+from taichi_msm.errors import FilesError, LostExecutorError, SceneError, StageProgressCallback
 from taichi_msm.load import cost
 from taichi_msm.load.scene_file import ParsedFile, plan_file
 from taichi_msm.runs.directory import (
@@ -44,6 +35,9 @@ from taichi_msm.sweeps.pool import DiedError
 from taichi_msm.sweeps.spec import RESULT_COLUMNS, Sweep
 from taichi_msm.system.compiler import result_versions, versions
 from taichi_msm.system.files import read_regular
+
+# Reports written at the end of a sweep.
+REPORT_FILES = ("table.csv", "table.parquet", "dataset.json", "contact.jpg", "sensitivity.csv", "sweep.png")
 
 # Statuses of runs that are not repeated.
 FINAL_STATUSES = ("complete", "diverged")
@@ -69,7 +63,7 @@ def register_sweep(directory: Path, sweep: Sweep) -> list[list[Any]]:
     if not record.exists():
         for name in (RUNS_FOLDER, *REPORT_FILES, RUN_RECORD):
             if (directory / name).exists():
-                raise ForeignError.at(directory / name, "something")
+                raise errors.ForeignError.at(directory / name, "something")
         content = {
             "scene": sweep.settings.scene,
             **description,
@@ -77,7 +71,7 @@ def register_sweep(directory: Path, sweep: Sweep) -> list[list[Any]]:
             "versions": versions(),
             "values": values,
         }
-        with writing(directory), hidden_folder(directory) as hidden:
+        with errors.writing(directory), hidden_folder(directory) as hidden:
             (hidden / SWEEP_RECORD).write_text(json.dumps(content) + "\n", encoding="utf-8", errors="backslashreplace")
             link_without_replacing(hidden / SWEEP_RECORD, record)  # unless another shard was faster
     # Values are compared as text: 1 differs from 1.0, and NaN equals itself.
@@ -171,7 +165,7 @@ def read_outcome(task: RunTask, sweep: Sweep) -> Outcome | None:
     return None
 
 
-def lock_reports(directory: Path, pause: Pause) -> BinaryIO:
+def lock_reports(directory: Path, pause: errors.Pause) -> BinaryIO:
     """Lock a sweep's reports until the file is closed; `pause` is called while another command holds the lock."""
     while True:
         try:
@@ -227,7 +221,7 @@ def run_missing(state: SweepState, executor: Executor, progress: StageProgressCa
         task = pending.pop(future)
         try:
             outcome = future.result()
-        except ExecutorError as error:
+        except errors.ExecutorError as error:
             raise LostExecutorError(str(error)) from error
         except (BrokenExecutor, CancelledError) as error:
             raise lost(error) from error
@@ -284,7 +278,7 @@ def execute_run(task: RunTask, progress: StageProgressCallback = lambda stage, d
         return outcome_from_record(task.run, record)
     except SceneError as error:  # also for a picture that cannot be decoded
         status, reason = "refused", "; ".join(error.lines)
-    except MsmError as error:
+    except errors.MsmError as error:
         status, reason = "failed", str(error)
     except Exception as error:
         status, reason = "failed", f"a bug, please report it: {type(error).__name__}: {error}"
@@ -344,14 +338,3 @@ def outcome_from_record(run: int, record: Mapping[str, Any]) -> Outcome:
             "seconds": record["timings"]["total"],
         }
     )
-
-
-# Reports written at the end of a sweep.
-REPORT_FILES = TABLE, PARQUET, DATASET, CONTACT, PLOT, SENSITIVITY = (
-    "table.csv",
-    "table.parquet",
-    "dataset.json",
-    "contact.jpg",
-    "sweep.png",
-    "sensitivity.csv",
-)

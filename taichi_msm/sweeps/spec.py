@@ -433,7 +433,7 @@ def make_sweep(scene: str | Path, settings: Mapping[str, Any]) -> Sweep:
     try:
         data = json.loads(json.dumps({**settings, "scene": Path(scene).name}))
     except (TypeError, ValueError) as error:
-        raise ArgumentError(f"vary, overrides: {error}; use numbers, text, lists, dicts") from None
+        raise ArgumentError(f"vary, variables, overrides: {error}; use numbers, text, lists, dicts") from None
     sweep, problems = _checked(data, Path(scene).parent)
     if sweep is None or problems:
         raise SceneError([str(problem) for problem in problems])

@@ -35,6 +35,7 @@ def sweep(
     vary: Mapping[str, Mapping[str, Any]],
     directory: str | Path,
     *,
+    variables: Mapping[str, Mapping[str, Any]] | None = None,
     samples: int | None = None,
     seed: int = 1,
     overrides: Mapping[str, Any] | None = None,
@@ -52,9 +53,10 @@ def sweep(
         vary: distributions by dotted key, as in a sweep file. Paths of files are relative to the scene file, and below
             its folder.
         directory: receives runs/, table.csv and the other reports.
+        variables: distributions of the numbers in expressions of `overrides`, by name, as in a sweep file.
         samples: number of runs; None: every combination of the keys' grids.
         seed: seed of the samples.
-        overrides: values of keys in all runs, by dotted key.
+        overrides: values of keys in all runs, by dotted key; texts that begin with = are expressions of the variables.
         executor: executes the runs; None: processes on this machine. Its workers must be processes with one thread,
             with scene and directory at the same paths. A string is the address of a dask.distributed scheduler.
         workers: number of processes on this machine; None: one per core, limited by the free memory.
@@ -83,7 +85,8 @@ def sweep(
         raise ArgumentError(f"scene: {scene!r}; take the path of a scene file")
     if workers is not None and not (type(workers) is int and 1 <= workers <= MAX_WORKERS):
         raise ArgumentError(f"workers: {workers!r}; take a whole number, 1 to {MAX_WORKERS}, or None")
-    settings = {"vary": vary, "seed": seed, "set": overrides or {}} | ({} if samples is None else {"samples": samples})
+    settings = {"variables": variables or {}, "vary": vary, "seed": seed, "set": overrides or {}}
+    settings |= {} if samples is None else {"samples": samples}
     spec = make_sweep(scene, settings)
     # The caller may change the current directory meanwhile.
     state = begin_sweep(spec, Path(directory).absolute())
@@ -122,17 +125,16 @@ def open_executor(
             raise NotInstalledError(message) from None
         with cluster_connection(executor, state.sweep, state.directory, progress) as cluster:
             yield cluster
-        return
-    if executor is not None:
+    elif executor is not None:
         yield executor
-        return
-    pool = Pool(workers)
-    try:
-        yield pool
-    except BaseException:
-        pool.shutdown(cancel_futures=True)
-        raise
-    pool.shutdown()
+    else:
+        pool = Pool(workers)
+        try:
+            yield pool
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+        pool.shutdown()
 
 
 def finish_sweep(state: SweepState, executor: Executor, progress: StageProgressCallback) -> tuple[list[str], list[str]]:

@@ -382,6 +382,16 @@ def test_it_is_started_from_python_with_any_executor(many: Path, pool: Pool, mes
     assert not Path("wrong").exists()
 
 
+def test_variables_from_python_are_those_of_the_file(many: Path, pool: Pool) -> None:
+    variables, overrides = {"n": {"grid": [1, 2]}}, {"time.duration": "=n / 10", "output": []}
+    rows = list(sweep("small.yaml", {}, "out", variables=variables, overrides=overrides, executor=pool))
+    assert {row.status for row in rows} == {"complete"}
+    assert [row["n"] for row in table("out")] == ["1", "2"]
+    # The file of the same sweep goes on in the folder.
+    (many / "many.yaml").write_text(json.dumps({"scene": "small.yaml", "variables": variables, "set": overrides}))
+    assert begin_sweep(load_sweep("many.yaml"), Path("out")).missing == []
+
+
 def number(row: Outcome) -> int:
     return row.run
 

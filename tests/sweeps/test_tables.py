@@ -32,7 +32,7 @@ from taichi_msm.sweeps.plots import (
     varied_results,
 )
 from taichi_msm.sweeps.pool import Pool
-from taichi_msm.sweeps.runs import CONTACT, REPORT_FILES, Outcome, SweepState, register_sweep
+from taichi_msm.sweeps.runs import REPORT_FILES, Outcome, SweepState, register_sweep
 from taichi_msm.sweeps.spec import make_sweep
 from taichi_msm.sweeps.tables import WITHOUT_MATPLOTLIB, WITHOUT_SALIB, assign_splits, write_reports
 from tests.golden import Messages
@@ -147,9 +147,9 @@ def test_the_picture_shows_every_run(make: Make, ran: Path) -> None:
     result = make()
     copy_runs(ran, result)
     names, notes = write(result)
-    assert names == ["table.csv", "table.parquet", "dataset.json", CONTACT, "sweep.png"]
+    assert names == ["table.csv", "table.parquet", "dataset.json", "contact.jpg", "sweep.png"]
     assert notes == []
-    with Image.open(result.directory / CONTACT) as picture:
+    with Image.open(result.directory / "contact.jpg") as picture:
         pixels = np.asarray(picture).astype(int)
     # Two rows of four frames of 40 x 30, made larger, with 20 pixels between them, and captions of some lines below.
     width, height, above = 330, 248, 43
@@ -184,8 +184,8 @@ def test_a_damaged_picture_is_no_end(make: Make, ran: Path, message: Messages) -
     damaged = result.run_directory(1) / "frames" / "0002.png"
     damaged.write_bytes(damaged.read_bytes()[:100])
     names, notes = write(result)
-    assert CONTACT in names
-    message(notes, CONTACT, "0002.png", hide=r"(?<=decoded).*")
+    assert "contact.jpg" in names
+    message(notes, "contact.jpg", "0002.png", hide=r"(?<=decoded).*")
 
 
 @pytest.mark.default_cases("frames-0")
@@ -195,12 +195,12 @@ def test_the_frame_comes_from_any_output(make: Make, ran: Path, kept: str, diffe
     result = make(2)
     copy_runs(ran, result)
     write(result, pool)
-    first = np.asarray(Image.open(result.directory / CONTACT)).astype(int)
+    first = np.asarray(Image.open(result.directory / "contact.jpg")).astype(int)
     for run, name in itertools.product(range(2), {"frames", "animation.gif", "trajectory.npz"} - {kept}):
         path = result.run_directory(run) / name
         shutil.rmtree(path) if path.is_dir() else path.unlink()
     assert write(result, pool)[1] == []
-    assert np.abs(np.asarray(Image.open(result.directory / CONTACT)) - first).mean() <= difference
+    assert np.abs(np.asarray(Image.open(result.directory / "contact.jpg")) - first).mean() <= difference
 
 
 def test_of_an_animation_the_picture_at_a_time_is_taken(tmp_path: Path) -> None:
@@ -212,11 +212,11 @@ def test_of_an_animation_the_picture_at_a_time_is_taken(tmp_path: Path) -> None:
 
 def test_without_pictures_there_is_a_note_and_no_earlier_picture(make: Make) -> None:
     result = make()
-    (result.directory / CONTACT).touch()
+    (result.directory / "contact.jpg").touch()
     names, notes = write(result)
     assert notes == [WITHOUT_PICTURES]
-    assert CONTACT not in names
-    assert not (result.directory / CONTACT).exists()
+    assert "contact.jpg" not in names
+    assert not (result.directory / "contact.jpg").exists()
 
 
 def test_without_libraries_there_are_notes(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -330,7 +330,7 @@ def test_runs_of_a_data_set_have_their_own_size(small: Path, pool: Pool) -> None
     with Image.open(rows[1]["folder"].join(["out/", "/frames/0001.png"])) as frame:
         assert list(frame.size) == sizes[1]
     assert {path.name for path in Path("out").iterdir()} == {
-        *("runs", "sweep.json", "table.csv", "table.parquet", "dataset.json", CONTACT),
+        *("runs", "sweep.json", "table.csv", "table.parquet", "dataset.json", "contact.jpg"),
     }
 
 
