@@ -34,14 +34,6 @@ from taichi_msm.system.compiler import result_versions, versions
 # Time limit for the answer of a scheduler [s].
 MAX_WAIT_S = 10
 
-# Further requirements of transports.
-_CERTIFICATES = "certificates; name them in dask's configuration, under distributed.comm.tls"
-TRANSPORT_REQUIREMENTS = {
-    "tls": _CERTIFICATES,
-    "wss": _CERTIFICATES,
-    "ucx": "UCX, which is not installed; pip install distributed-ucxx, or use tcp://",
-}
-
 
 class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
     """Worker plugin with the common inputs of all runs of a sweep.
@@ -202,9 +194,11 @@ def _client(address: str) -> Any:
             return Client(address, timeout=MAX_WAIT_S, set_as_default=False)
     except (OSError, asyncio.TimeoutError):
         raise ExecutorError(f"{address}: no dask scheduler answers; {remedy}") from None
-    except TypeError as error:  # raised by a transport whose requirements are not installed
-        needs = TRANSPORT_REQUIREMENTS.get(address.partition("://")[0], " ".join(str(error).split()))
-        raise ExecutorError(f"{address}: needs {needs}") from None
+    except TypeError:  # raised by a transport whose requirements are not installed
+        remedy = (
+            "name certificates in dask's configuration, under distributed.comm.tls, or pip install distributed-ucxx"
+        )
+        raise ExecutorError(f"{address}: this transport is not set up; {remedy}") from None
     except Exception as error:
         raise ExecutorError(f"{address}: {' '.join(str(error).split())}; {remedy}") from None
 

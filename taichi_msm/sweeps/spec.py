@@ -22,19 +22,8 @@ from typing_extensions import Self
 
 from taichi_msm.errors import ArgumentError, Key, Problem, SceneError, truncate
 from taichi_msm.images import PICTURE_SUFFIXES, PictureError, file_sha256
+from taichi_msm.load import scene_file
 from taichi_msm.load.check import parse_model
-from taichi_msm.load.scene_file import (
-    PICTURE_KEYS,
-    SCENE_KIND,
-    Draft,
-    FileKind,
-    Override,
-    ParsedFile,
-    is_below,
-    names_file,
-    parse_key,
-    read_file,
-)
 from taichi_msm.load.yaml_reader import UnreadableError, read_yaml
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import (
@@ -294,7 +283,7 @@ def spread(total: int, limit: int) -> list[int]:
 class Sweep:
     """Scene file and the variation of its keys; paths in the values are relative to the scene file."""
 
-    scene: ParsedFile
+    scene: scene_file.ParsedFile
     settings: SweepSettings
 
     @property
@@ -409,7 +398,7 @@ def load_sweep(path: str | Path) -> Sweep:
     Raises:
         SceneError: with a line for each error of the file, in the order of the file.
     """
-    draft = Draft(read_file(str(path), FileKind("sweep", "scene and vary")))
+    draft = scene_file.Draft(scene_file.read_file(str(path), scene_file.FileKind("sweep", "scene and vary")))
     if "sheet" in draft.data and not {"vary", "variables"} & draft.data.keys():
         raise SceneError([f"{path}:1:1: a scene; use `taichi-msm run`, or name it by `scene:` in a sweep file"])
     sweep, problems = _checked(draft.data, Path(path).parent)
@@ -443,25 +432,26 @@ def make_sweep(scene: str | Path, settings: Mapping[str, Any]) -> Sweep:
 def _checked(data: dict[str, Any], folder: Path) -> tuple[Sweep | None, list[Problem]]:
     """Check the content of a sweep file in a folder, and read its scene; return the sweep and all errors."""
     problems: list[Problem] = []
+    sections = (data.get(name) for name in ("variables", "vary", "set"))
+    variables, vary, fixed = (section if isinstance(section, dict) else {} for section in sections)
     file, name = None, data.get("scene")
     if isinstance(name, str) and name:
         path = folder / name
-        problems += _relocate(data, folder, path.parent)
+        problems += _relocate(vary, fixed, folder, path.parent)
         try:
             # Without its folder, as errors of runs must not depend on the current directory.
-            file = read_file(_normalised(path), SCENE_KIND)._replace(name=path.name)
-            problems += _unknown_keys(file, data)
+            file = scene_file.read_file(_normalised(path), scene_file.SCENE_KIND)._replace(name=path.name)
+            problems += _unknown_keys(file, vary, fixed)
         except SceneError as error:
             problems.append(Problem(("scene",), error.lines[0]))
-    problems += _expression_problems(data)
+    problems += _expression_problems(variables, fixed)
     settings, setting_problems = parse_model(SweepSettings, data)
     return (None if settings is None or file is None else Sweep(file, settings)), [*problems, *setting_problems]
 
 
-def _expression_problems(data: dict[str, Any]) -> list[Problem]:
+def _expression_problems(variables: dict[str, Any], fixed: dict[str, Any]) -> list[Problem]:
     """Check the expressions in `set`, with NaN for all variables, for which those of single runs have no problems."""
-    variables = data.get("variables")
-    names = dict.fromkeys(variables if isinstance(variables, dict) else (), math.nan)
+    names = dict.fromkeys(variables, math.nan)
     problems = []
 
     def check(path: Key, text: str) -> None:
@@ -470,7 +460,7 @@ def _expression_problems(data: dict[str, Any]) -> list[Problem]:
         except ExpressionError as error:
             problems.append(Problem(("set", *path), str(error)))
 
-    replace_expressions(_mappings(data)[1], check)
+    replace_expressions(fixed, check)
     return problems
 
 
@@ -493,16 +483,16 @@ def format_override(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-def _relocate(data: dict[str, Any], folder: Path, home: Path) -> Iterator[Problem]:
+def _relocate(vary: dict[str, Any], fixed: dict[str, Any], folder: Path, home: Path) -> Iterator[Problem]:
     """Expand file patterns, and convert paths from the base `folder` to the base `home`, the scene's folder."""
-    vary, fixed = _mappings(data)
     places: list[tuple[Key, Any]] = []  # of values, and the list or mapping that contains them
     for name, distribution in vary.items():
         for kind in {"choice", "grid"} & set(distribution if isinstance(distribution, dict) else ()):
-            if isinstance(pattern := distribution[kind], str) and names_file(_split_key(name)):
-                distribution[kind] = _matches(pattern, folder, name)
+            key = _split_key(name)
+            if isinstance(pattern := distribution[kind], str) and scene_file.names_file(key):
+                distribution[kind] = _matches(pattern, folder, key)
                 if not distribution[kind]:
-                    noun = _file_noun(_split_key(name))
+                    noun = _file_noun(key)
                     message = f"{format_value(pattern)} matches no {noun}; give a pattern relative to the sweep file"
                     yield Problem(("vary", name, kind), message)
             if isinstance(values := distribution[kind], list):
@@ -512,7 +502,7 @@ def _relocate(data: dict[str, Any], folder: Path, home: Path) -> Iterator[Proble
 
     def relocated(place: Key, key: Key, text: str) -> str:
         path, noun = folder / text, _file_noun(key)
-        if not (is_below(path, folder) or is_below(path, home)):
+        if not (scene_file.is_below(path, folder) or scene_file.is_below(path, home)):
             message = f"{text} is neither below the sweep file's folder nor below the scene's; put the {noun} there"
             problems.append(Problem(place, message))
         elif not os.path.isfile(path):  # noqa: PTH113  # Path.is_file raises an error for a long name
@@ -526,20 +516,20 @@ def _relocate(data: dict[str, Any], folder: Path, home: Path) -> Iterator[Proble
     yield from problems
 
 
-def _matches(pattern: str, folder: Path, name: str) -> list[str]:
+def _matches(pattern: str, folder: Path, key: Key) -> list[str]:
     """Return the files of a key that match a pattern relative to a folder."""
-    suffixes = PICTURE_SUFFIXES if _split_key(name) in PICTURE_KEYS else ("",)
+    suffixes = PICTURE_SUFFIXES if key in scene_file.PICTURE_KEYS else ("",)
     names = sorted(glob(pattern, root_dir=folder))  # noqa: PTH207  # Path.glob refuses absolute patterns
     return [text for text in names if text.lower().endswith(suffixes) and (folder / text).is_file()]
 
 
 def _file_noun(key: Key) -> str:
-    return "picture" if key in PICTURE_KEYS else "file"
+    return "picture" if key in scene_file.PICTURE_KEYS else "file"
 
 
 def _map_files(path: Key, value: Any, change: Callable[[Key, str], str]) -> Any:
     """Apply a function to the file paths in the value of a key."""
-    if names_file(path):
+    if scene_file.names_file(path):
         return change(path, value) if isinstance(value, str) and 0 < len(value) <= MAX_PATH else value
     if isinstance(value, dict):
         return {name: _map_files((*path, name), item, change) for name, item in value.items()}
@@ -548,17 +538,16 @@ def _map_files(path: Key, value: Any, change: Callable[[Key, str], str]) -> Any:
 
 def _split_key(name: str) -> Key:
     """Split a dotted key; empty if `--set` does not accept it."""
-    return parse_key(name.strip()) if "=" not in name else ()
+    return scene_file.parse_key(name.strip()) if "=" not in name else ()
 
 
-def _unknown_keys(scene: ParsedFile, data: dict[str, Any]) -> Iterator[Problem]:
+def _unknown_keys(scene: scene_file.ParsedFile, vary: dict[str, Any], fixed: dict[str, Any]) -> Iterator[Problem]:
     """Check that a scene has the keys, by trying one value of each."""
-    vary, fixed = _mappings(data)
     trials: dict[Key, Any] = {("set", name): value for name, value in fixed.items()}
     for name, distribution in vary.items():
         values = next(iter(distribution.values()), None) if isinstance(distribution, dict) else None
         trials["vary", name] = values[0] if isinstance(values, list) and values else None
-    draft = Draft(scene)
+    draft = scene_file.Draft(scene)
     keys = {}
     for path, value in trials.items():
         if not (key := _split_key(str(path[1]))):
@@ -567,7 +556,7 @@ def _unknown_keys(scene: ParsedFile, data: dict[str, Any]) -> Iterator[Problem]:
         keys[path] = key
         known = len(draft.problems)
         # Copied, as later overrides may change a part of the value.
-        draft.override(Override("", key, deepcopy(value)))
+        draft.override(scene_file.Override("", key, deepcopy(value)))
         yield from (Problem(path, problem.message) for _, problem in draft.problems[known:])
     for problem in parse_model(Scene, draft.data)[1]:
         if not problem.message.startswith("unknown key"):
@@ -581,9 +570,3 @@ def _unknown_keys(scene: ParsedFile, data: dict[str, Any]) -> Iterator[Problem]:
         for path in related or [("scene",)]:
             prefix = f"{problem.key}: " if problem.path != keys.get(path) else ""
             yield Problem(path, f"{prefix}{problem.message}")
-
-
-def _mappings(data: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the sections `vary` and `set`; empty where not a mapping."""
-    vary, fixed = (data.get(name) for name in ("vary", "set"))
-    return vary if isinstance(vary, dict) else {}, fixed if isinstance(fixed, dict) else {}
