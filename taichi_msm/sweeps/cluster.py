@@ -195,10 +195,8 @@ def _client(address: str) -> Any:
     except (OSError, asyncio.TimeoutError):
         raise ExecutorError(f"{address}: no dask scheduler answers; {remedy}") from None
     except TypeError:  # raised by a transport whose requirements are not installed
-        remedy = (
-            "name certificates in dask's configuration, under distributed.comm.tls, or pip install distributed-ucxx"
-        )
-        raise ExecutorError(f"{address}: this transport is not set up; {remedy}") from None
+        needs = "tls needs certificates in dask's configuration, under distributed.comm.tls; ucx needs distributed-ucxx"
+        raise ExecutorError(f"{address}: the transport is not set up; {needs}") from None
     except Exception as error:
         raise ExecutorError(f"{address}: {' '.join(str(error).split())}; {remedy}") from None
 
