@@ -242,11 +242,9 @@ def test_a_worker_that_would_lose_results_or_change_them_is_refused(lab: Path, m
     [
         ("tcp://127.0.0.1:1", "dask scheduler"),
         ("nowhere", "give the address"),
-        # Transports whose requirements are missing.
-        ("tls://127.0.0.1:1", "tls"),
-        ("ucx://127.0.0.1:1", "pip install"),
+        ("tls://127.0.0.1:1", "certificates"),
     ],
-    ids=["nobody", "no port", "tls", "ucx"],
+    ids=["nobody", "no port", "tls"],
 )
 def test_a_transport_whose_requirements_are_missing(
     address: str, word: str, lab: Path, program: Program, monkeypatch: pytest.MonkeyPatch, message: Messages
