@@ -113,10 +113,9 @@ def test_parameters_are_the_numbers_that_vary(make: Make) -> None:
     assert np.isnan(columns["max_displacement"]).tolist() == [run == 3 for run in range(8)]
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_sensitivity_of_a_linear_function(seed: int) -> None:
+def test_sensitivity_of_a_linear_function() -> None:
     # The variances of 3 x and y are as 9 to 1. The largest error with the first 40 seeds is 0.09.
-    points = qmc.Sobol(2, seed=np.random.default_rng(seed)).random(64)
+    points = qmc.Sobol(2, seed=np.random.default_rng(0)).random(64)
     for column, share in enumerate((0.9, 0.1)):
         index, confidence = first_order_index(points[:, column], 3 * points[:, 0] + points[:, 1])
         assert index == pytest.approx(share, abs=0.12)
@@ -334,11 +333,12 @@ def test_runs_of_a_data_set_have_their_own_size(small: Path, pool: Pool) -> None
     }
 
 
-@pytest.mark.parametrize("name", REPORT_FILES)
-def test_what_is_no_file_of_a_sweep_stays(make: Make, name: str, message: Messages) -> None:
+def test_what_is_no_file_of_a_sweep_stays(make: Make, message: Messages) -> None:
     result = make()
     shutil.rmtree(result.directory / "runs")
-    (result.directory / name).write_text("mine")
-    with message.raises(ForeignError, name):
-        register_sweep(result.directory, result.sweep)
-    assert (result.directory / name).read_text() == "mine"
+    for name in REPORT_FILES:
+        (result.directory / name).write_text("mine")
+        with message.raises(ForeignError, name):
+            register_sweep(result.directory, result.sweep)
+        assert (result.directory / name).read_text() == "mine"
+        (result.directory / name).unlink()
