@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -45,12 +46,12 @@ class Machines:
     """A scheduler and its workers, whose logs are kept."""
 
     def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._started: list[subprocess.Popen[bytes]] = []
+        self.folder = folder
+        self.started: list[subprocess.Popen[bytes]] = []
 
     def schedule(self, **settings: str) -> str:
         """Start a scheduler; returns its address."""
-        file = self._folder / f"scheduler-{len(self._started)}.json"
+        file = self.folder / f"scheduler-{len(self.started)}.json"
         words = ["--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(file)]
         self.scheduler = self._start("dask_scheduler", *words, **settings)
         # It exists a moment before it holds anything.
@@ -62,31 +63,26 @@ class Machines:
         return self._start("dask_worker", address, *(words or ("--nthreads", "1", "--no-nanny")))
 
     def log(self, process: subprocess.Popen[bytes]) -> str:
-        """Read what a process has said so far."""
-        return (self._folder / f"{self._started.index(process)}.log").read_text()
-
-    def stop(self) -> None:
-        """End all processes."""
-        for process in self._started:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
+        return (self.folder / f"{self.started.index(process)}.log").read_text()
 
     def _start(self, program: str, *words: str, **settings: str) -> subprocess.Popen[bytes]:
         command = [sys.executable, "-m", f"distributed.cli.{program}", "--no-dashboard", *words]
-        environment = {**os.environ, "DASK_TEMPORARY_DIRECTORY": str(self._folder), **settings}
-        with (self._folder / f"{len(self._started)}.log").open("wb") as log:
+        environment = {**os.environ, "DASK_TEMPORARY_DIRECTORY": str(self.folder), **settings}
+        with (self.folder / f"{len(self.started)}.log").open("wb") as log:
             process = subprocess.Popen(
-                command, cwd=self._folder, env=environment, stdout=log, stderr=log, start_new_session=True
+                command, cwd=self.folder, env=environment, stdout=log, stderr=log, start_new_session=True
             )
-        self._started.append(process)
+        self.started.append(process)
         return process
 
 
 @pytest.fixture
 def machines(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machines]:
-    started = Machines(tmp_path_factory.mktemp("machines"))
-    yield started
-    started.stop()
+    machines = Machines(tmp_path_factory.mktemp("machines"))
+    yield machines
+    for process in machines.started:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
 
 
 @pytest.fixture
@@ -203,14 +199,11 @@ def test_ctrl_c_frees_the_workers(lab: Path, machines: Machines, message: Messag
 @pytest.fixture
 def cluster() -> Iterator[Callable[[int], str]]:
     """Start a scheduler with a worker of some threads in this process; gives its address."""
+    options = {"n_workers": 1, "processes": False, "protocol": "tcp", "host": "127.0.0.1", "dashboard_address": ":0"}
     with ExitStack() as stack:
-
-        def start(threads: int) -> str:
-            options = {"protocol": "tcp", "host": "127.0.0.1", "dashboard_address": ":0"}
-            started = distributed.LocalCluster(n_workers=1, threads_per_worker=threads, processes=False, **options)
-            return str(stack.enter_context(started).scheduler_address)
-
-        yield start
+        yield lambda threads: str(
+            stack.enter_context(distributed.LocalCluster(threads_per_worker=threads, **options)).scheduler_address
+        )
 
 
 def test_a_worker_of_two_threads_is_refused(
@@ -259,15 +252,9 @@ def test_a_transport_whose_requirements_are_missing(
 def test_a_command_whose_inputs_another_one_has_removed_ends_well(lab: Path, cluster: Callable[[int], str]) -> None:
     address, described = cluster(1), load_sweep("here/sweep.yaml")
     register_sweep(lab / "out", described)
-    with (
-        cluster_connection(address, described, lab / "out", quiet),
-        cluster_connection(address, described, lab / "out", quiet),
-    ):
+    connection = partial(cluster_connection, address, described, lab / "out", lambda stage, done, total: None)
+    with connection(), connection():
         pass
-
-
-def quiet(stage: str, done: int, total: int) -> None:
-    """Report nothing."""
 
 
 def test_dask_with_workers_or_without_distributed(

@@ -118,20 +118,9 @@ def test_each_run_is_that_of_run_with_its_cells(many: Path, program: Program, me
         assert one[key] == other[key]
 
 
-def test_it_goes_on_with_what_is_missing(many: Path, pool: Pool) -> None:
-    go(pool, "out")
-    before, rows = runs("out"), table("out")
-    first, second = [Path("out/runs") / f"{int(row['run']):06}" for row in rows if row["status"] == "complete"]
-    shutil.rmtree(first)
-    record = (second / "run.json").read_bytes()
-    go(pool, "out")
-    assert (table("out"), runs("out")) == (rows, before)
-    assert (second / "run.json").read_bytes() == record, "it was run again"
-
-
 @pytest.fixture(scope="module")
-def whole(pool: Pool, tmp_path_factory: pytest.TempPathFactory) -> tuple[list[dict[str, str]], dict[str, bytes]]:
-    """The table and the runs of the sweep of `many`."""
+def whole(pool: Pool, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the sweep of `many`; to be read only."""
     folder = tmp_path_factory.mktemp("whole")
     Image.fromarray(speckle(30, 40)).save(folder / "speckle.png")
     (folder / "small.yaml").write_text(SMALL)
@@ -139,16 +128,26 @@ def whole(pool: Pool, tmp_path_factory: pytest.TempPathFactory) -> tuple[list[di
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         go(pool, "out")
-        return table("out"), runs("out")
+    return folder / "out"
 
 
-def test_shards_change_nothing(many: Path, pool: Pool, whole: tuple[Any, Any]) -> None:
+def test_it_goes_on_with_what_is_missing(many: Path, pool: Pool, whole: Path) -> None:
+    shutil.copytree(whole, "out")
+    first, second = [Path("out/runs") / f"{int(row['run']):06}" for row in table("out") if row["status"] == "complete"]
+    shutil.rmtree(first)
+    record = (second / "run.json").read_bytes()
+    go(pool, "out")
+    assert (table("out"), runs("out")) == (table(whole), runs(whole))
+    assert (second / "run.json").read_bytes() == record, "it was run again"
+
+
+def test_shards_change_nothing(many: Path, pool: Pool, whole: Path) -> None:
     for part in (2, 1, 3):
         go(pool, "parts", (part, 3))
-    assert runs("parts") == whole[1]
+    assert runs("parts") == runs(whole)
     assert not Path("parts/table.csv").exists()
     go(pool, "parts")
-    assert (table("parts"), runs("parts")) == whole
+    assert (table("parts"), runs("parts")) == (table(whole), runs(whole))
 
 
 @pytest.mark.slow
@@ -259,9 +258,8 @@ def one_ended(many: Path) -> Callable[..., SweepState]:
     record = {"status": "diverged", "error": "at 0.1 s", "max_displacement": 1.0, "shortest_spring": 0.5}
     rest: dict[str, Any] = {"error_estimate": None, "notes": ["not known"], "timings": {"total": 2.0}}
     rest["probes"] = [{"greatest_force": 3.0}]
-    described = load_sweep("many.yaml")
-    values = register_sweep(Path("out"), described)
-    rest |= {"overrides": list(described.overrides(values[2])), "sha256": {"image": file_sha256("speckle.png")}}
+    rest |= {"overrides": begin_sweep(load_sweep("many.yaml"), Path("out")).missing[2].overrides}
+    rest |= {"sha256": {"image": file_sha256("speckle.png")}}
     Path("out/runs/000002").mkdir(parents=True)
     file = Path("out/runs/000002/run.json")
 
@@ -302,13 +300,13 @@ def test_a_record_of_another_run_does_not_count(one_ended: Callable[..., SweepSt
 
 
 @pytest.mark.slow
-def test_two_commands_for_a_folder_leave_one_table(many: Path, whole: tuple[Any, Any]) -> None:
+def test_two_commands_for_a_folder_leave_one_table(many: Path, whole: Path) -> None:
     command = [sys.executable, "-m", "taichi_msm", "sweep", "many.yaml", "--workers", "1", "--out", "both", "--json"]
     processes = [subprocess.Popen(command, stdout=subprocess.PIPE) for _ in range(2)]
     answers = [json.loads(process.communicate()[0]) for process in processes]
     assert not [note for answer in answers for note in answer["notes"] if "could not be made" in note]
     # The later of both has seen all runs.
-    assert (table("both"), runs("both")) == whole
+    assert (table("both"), runs("both")) == (table(whole), runs(whole))
 
 
 def test_a_dry_run_writes_nothing(many: Path, program: Program) -> None:
@@ -338,7 +336,7 @@ def test_many_runs_must_be_meant(many: Path, program: Program, message: Messages
 
 
 def test_a_shard_is_a_part_of_the_runs(many: Path, program: Program, message: Messages) -> None:
-    for part in ("0/3", "4/3", "3", "a/b", "1/0"):
+    for part in ("0/3", "4/3", "a/b"):
         done = program("sweep", "many.yaml", "--shard", part)
         assert done.returncode == 2
         message(done.stderr, part)
@@ -410,17 +408,14 @@ def end_at_once() -> None:
 
 def test_a_pool_replaces_a_process_that_was_killed(message: Messages) -> None:
     pool = Pool(2)
-    try:
-        with message.raises(DiedError, "SIGKILL"):
-            pool.submit(end_at_once).result()
-        first, second = (pool.submit(os.getpid).result() for _ in range(2))
-        assert os.getpid() not in (first, second)
-        with pytest.raises(ValueError, match="invalid literal"):
-            pool.submit(int, "a").result()
-    finally:
-        begun = time.monotonic()
-        waiting = [pool.submit(time.sleep, 30) for _ in range(3)]
-        pool.shutdown(cancel_futures=True)
+    with message.raises(DiedError, "SIGKILL"):
+        pool.submit(end_at_once).result()
+    assert os.getpid() != pool.submit(os.getpid).result()
+    with pytest.raises(ValueError, match="invalid literal"):
+        pool.submit(int, "a").result()
+    begun = time.monotonic()
+    waiting = [pool.submit(time.sleep, 30) for _ in range(3)]
+    pool.shutdown(cancel_futures=True)
     assert waiting[2].cancelled()
     assert time.monotonic() - begun < 20, "it waited for a call"
 
