@@ -43,20 +43,8 @@ REPORT_FILES = ("table.csv", "table.parquet", "dataset.json", "contact.jpg", "se
 FINAL_STATUSES = ("complete", "diverged")
 
 
-def register_sweep(directory: Path, sweep: Sweep) -> list[list[Any]]:
-    """Write the description of a sweep to its directory, or check that the directory contains the same sweep.
-
-    Args:
-        directory: of the sweep.
-        sweep: the sweep.
-
-    Returns:
-        Values of the varied keys for each run.
-
-    Raises:
-        SceneError: when the directory contains another sweep, or versions with other results.
-        FilesError: when the directory cannot be read or written, contains foreign files, or is damaged.
-    """
+def _register(sweep: Sweep, directory: Path) -> list[list[Any]]:
+    """Write the description of a sweep to its directory, or check it there; return the values of the runs."""
     record = require_kind(directory / SWEEP_RECORD, FILE)
     require_kind(directory / RUNS_FOLDER, FOLDER)
     description, values = sweep.description(), sweep.values()
@@ -137,9 +125,10 @@ def begin_sweep(sweep: Sweep, directory: Path, shard: tuple[int, int] = (1, 1)) 
         shard: part I of N as (I, N), 1 <= I <= N.
 
     Raises:
-        SceneError, FilesError: as `register_sweep`.
+        SceneError: when the directory contains another sweep, or versions with other results.
+        FilesError: when the directory cannot be read or written, contains foreign files, or is damaged.
     """
-    state = SweepState(directory, sweep, register_sweep(directory, sweep), [])
+    state = SweepState(directory, sweep, _register(sweep, directory), [])
     part, parts = shard
     home = Path.cwd()
     for run in range(part - 1, len(state.values), parts):
@@ -161,7 +150,7 @@ def read_outcome(task: RunTask, sweep: Sweep) -> Outcome | None:
             has_same_overrides = tuple(record["overrides"]) == task.overrides
             has_same_files = sweep.digests.issuperset(record["sha256"].values())
             if record["status"] in FINAL_STATUSES and has_same_overrides and has_same_files:
-                return outcome_from_record(task.run, record)
+                return _outcome_from_record(task.run, record)
     return None
 
 
@@ -275,7 +264,7 @@ def execute_run(task: RunTask, progress: StageProgressCallback = lambda stage, d
         record = run_module.run(
             plan, task.directory, threads=1, overrides=task.overrides, started=time.perf_counter(), progress=progress
         )
-        return outcome_from_record(task.run, record)
+        return _outcome_from_record(task.run, record)
     except SceneError as error:  # also for a picture that cannot be decoded
         status, reason = "refused", "; ".join(error.lines)
     except errors.MsmError as error:
@@ -313,16 +302,8 @@ class Outcome:
 _OUTCOME = TypeAdapter(Outcome)
 
 
-def outcome_from_record(run: int, record: Mapping[str, Any]) -> Outcome:
-    """Extract the outcome of a run from its record.
-
-    Args:
-        run: number of the run.
-        record: content of run.json.
-
-    Raises:
-        ValueError: when the record was not written by a run.
-    """
+def _outcome_from_record(run: int, record: Mapping[str, Any]) -> Outcome:
+    """Extract the outcome of a run from its run.json; ValueError, KeyError, ...: it was not written by a run."""
     estimate = record["error_estimate"] or {}
     return _OUTCOME.validate_python(
         {

@@ -138,19 +138,7 @@ def open_executor(
 
 
 def finish_sweep(state: SweepState, executor: Executor, progress: StageProgressCallback) -> tuple[list[str], list[str]]:
-    """Write the table and the other reports of a sweep.
-
-    Args:
-        state: the sweep, after all its runs have ended.
-        executor: draws frames for the contact sheet.
-        progress: called several times a second.
-
-    Returns:
-        Names of the written files, and warnings.
-
-    Raises:
-        FilesError: when the table cannot be written.
-    """
+    """Write the table and the other reports of a sweep whose runs have ended, as `tables.write_reports`."""
     directory, total = state.directory, len(state.values)
     with writing(directory), lock_reports(directory, lambda: progress("runs", total, total)):
         # A run that was locked by another command may be finished now.

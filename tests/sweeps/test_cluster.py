@@ -19,7 +19,7 @@ import pytest
 
 from taichi_msm import sweep
 from taichi_msm.errors import MsmError
-from taichi_msm.sweeps.runs import register_sweep
+from taichi_msm.sweeps.runs import begin_sweep
 from taichi_msm.sweeps.spec import load_sweep
 from tests.conftest import Program
 from tests.golden import Messages
@@ -251,7 +251,7 @@ def test_a_transport_whose_requirements_are_missing(
 
 def test_a_command_whose_inputs_another_one_has_removed_ends_well(lab: Path, cluster: Callable[[int], str]) -> None:
     address, described = cluster(1), load_sweep("here/sweep.yaml")
-    register_sweep(lab / "out", described)
+    begin_sweep(described, lab / "out")
     connection = partial(cluster_connection, address, described, lab / "out", lambda stage, done, total: None)
     with connection(), connection():
         pass

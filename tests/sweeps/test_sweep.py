@@ -28,7 +28,7 @@ from taichi_msm.images import file_sha256
 from taichi_msm.load import cost as cost_module
 from taichi_msm.sweeps import tables
 from taichi_msm.sweeps.pool import PARENT_POLL_S, DiedError, Pool
-from taichi_msm.sweeps.runs import Outcome, RunTask, SweepState, begin_sweep, register_sweep, run_missing
+from taichi_msm.sweeps.runs import Outcome, RunTask, SweepState, begin_sweep, run_missing
 from taichi_msm.sweeps.spec import load_sweep, make_sweep
 from taichi_msm.sweeps.sweep import finish_sweep
 from tests.conftest import Program
@@ -192,7 +192,7 @@ def test_another_sweep_in_the_folder_is_refused(many: Path, program: Program, me
     originals = {"many.yaml": text, "small.yaml": SMALL, "camera.yml": CALIBRATION}
     for name, content in originals.items():
         (many / name).write_text(content)
-    register_sweep(Path("out"), load_sweep("many.yaml"))
+    begin_sweep(load_sweep("many.yaml"), Path("out"))
     before = files(Path("out"))
     sha256 = hashlib.sha256(CALIBRATION.encode()).hexdigest()
     assert json.loads(before["sweep.json"])["files"]["camera.yml"] == sha256
@@ -218,7 +218,7 @@ def test_another_sweep_in_the_folder_is_refused(many: Path, program: Program, me
 def test_values_that_are_not_those_of_the_sweep_file_are_refused(
     many: Path, program: Program, message: Messages
 ) -> None:
-    register_sweep(Path("out"), load_sweep("many.yaml"))
+    begin_sweep(load_sweep("many.yaml"), Path("out"))
     record = json.loads(Path("out/sweep.json").read_text())
     values = record["values"]
     forged = [
@@ -243,7 +243,7 @@ def test_nothing_is_written_through_a_link(many: Path, program: Program, name: s
     link = many / "out" / name
     link.parent.mkdir(parents=True)
     if name == "runs/000002":
-        register_sweep(Path("out2"), load_sweep("many.yaml"))
+        begin_sweep(load_sweep("many.yaml"), Path("out2"))
         shutil.copy("out2/sweep.json", "out")
     link.symlink_to(many / "far")
     done = program("sweep", "many.yaml", "--out", "out")
@@ -385,7 +385,7 @@ def test_a_run_that_cannot_be_is_refused_and_one_that_fails_is_tried_again(
     (many / "torn.png").write_bytes(whole[: len(whole) // 2])
     settings = {"vary": {"image": {"grid": ["speckle.png", "torn.png"]}}, "set": {"time.duration": 0.1}}
     described = make_sweep("small.yaml", settings)
-    register_sweep(Path("out"), described)
+    begin_sweep(described, Path("out"))
     (many / "out/runs/000000").mkdir(parents=True)
     (many / "out/runs/000000/frames").write_text("in the way")
 

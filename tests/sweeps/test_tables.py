@@ -32,7 +32,7 @@ from taichi_msm.sweeps.plots import (
     varied_results,
 )
 from taichi_msm.sweeps.pool import Pool
-from taichi_msm.sweeps.runs import REPORT_FILES, Outcome, SweepState, register_sweep
+from taichi_msm.sweeps.runs import REPORT_FILES, Outcome, SweepState, begin_sweep
 from taichi_msm.sweeps.spec import make_sweep
 from taichi_msm.sweeps.tables import WITHOUT_MATPLOTLIB, WITHOUT_SALIB, assign_splits, write_reports
 from tests.golden import Messages
@@ -334,6 +334,6 @@ def test_what_is_no_file_of_a_sweep_stays(make: Make, message: Messages) -> None
     for name in REPORT_FILES:
         (result.directory / name).write_text("mine")
         with message.raises(ForeignError, name):
-            register_sweep(result.directory, result.sweep)
+            begin_sweep(result.sweep, result.directory)
         assert (result.directory / name).read_text() == "mine"
         (result.directory / name).unlink()
