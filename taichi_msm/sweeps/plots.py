@@ -354,21 +354,19 @@ class VariedParameter(NamedTuple):
 def varied_parameters(state: SweepState, runs: Sequence[int]) -> list[VariedParameter]:
     """Return the parameters that differ between the numbered runs, in the order of the keys."""
     names = abbreviate_keys(state.sweep.keys)
-    candidates = [
+    columns = zip(*(state.values[run] for run in runs), strict=True)
+    return [
         parameter
-        for column, (name, distribution) in enumerate(
-            zip(names, state.sweep.settings.distributions.values(), strict=True)
-        )
-        for parameter in _parameters(name, distribution, [state.values[run][column] for run in runs])
+        for key in zip(names, state.sweep.settings.distributions.values(), columns, strict=True)
+        for parameter in _parameters(*key)
+        if len(np.unique(parameter.numbers)) > 1
     ]
-    return [parameter for parameter in candidates if len(np.unique(parameter.numbers)) > 1]
 
 
 def varied_results(state: SweepState, runs: Sequence[int]) -> dict[str, NDArray[np.float64]]:
-    """Return the results that differ between the numbered runs.
+    """Return the results that differ between the numbered runs: columns of the table, shape (runs,).
 
-    Returns:
-        Columns of the table by name, shape (runs,); NaN where a run is incomplete or lacks the result.
+    They have NaN where a run is incomplete or lacks the result.
     """
     complete = [state.outcomes[run].status == "complete" for run in runs]
     columns = {}
@@ -387,7 +385,7 @@ def is_wide_range(numbers: NDArray[np.float64]) -> bool:
     return bool(np.nanmin(numbers) > 0 and np.nanmax(numbers) > 50 * np.nanmin(numbers))
 
 
-def _parameters(name: str, distribution: Distribution, values: list[Any]) -> Iterator[VariedParameter]:
+def _parameters(name: str, distribution: Distribution, values: Sequence[Any]) -> Iterator[VariedParameter]:
     """Yield the parameters of a key, one for each component of a list of numbers."""
     if distribution.kind not in ("choice", "grid"):
         components = np.array(values, dtype=np.float64)
@@ -407,10 +405,6 @@ def _parameters(name: str, distribution: Distribution, values: list[Any]) -> Ite
         yield VariedParameter(f"{name} ({len(ranks)} values)", numbers)
 
 
-# With fewer runs, indices are too inaccurate to rank parameters.
-MIN_RUNS = 64
-
-
 class SensitivityIndex(NamedTuple):
     """First-order sensitivity of a result to a parameter."""
 
@@ -423,7 +417,7 @@ class SensitivityIndex(NamedTuple):
 def estimate_sensitivity(
     parameters: Sequence[VariedParameter], results: Mapping[str, NDArray[np.float64]]
 ) -> list[SensitivityIndex]:
-    """Estimate the first-order sensitivities of results in at least `MIN_RUNS` runs.
+    """Estimate the first-order sensitivities of results in at least 64 runs.
 
     Args:
         parameters: the parameters.
@@ -435,7 +429,7 @@ def estimate_sensitivity(
     indices = []
     for name, column in results.items():
         known = np.isfinite(column)
-        if np.count_nonzero(known) >= MIN_RUNS:
+        if np.count_nonzero(known) >= 64:  # With fewer, indices are too inaccurate to rank parameters.
             indices += [
                 SensitivityIndex(name, parameter.name, *first_order_index(parameter.numbers[known], column[known]))
                 for parameter in parameters
