@@ -161,7 +161,7 @@ def _format_axis(axes: Axes, parameter: VariedParameter) -> None:
     axes.autoscale(axis="x")
 
 
-def _tick_label(number: float, _: int) -> str:
+def _tick_label(number: float, _: float) -> str:
     """Format a number with its exponent, as a common one above the axis would overlap the sensitivity bar."""
     if number == 0 or 1e-3 <= abs(number) < 1e5:
         return f"{number:.10g}"
@@ -389,9 +389,10 @@ def _parameters(name: str, distribution: Distribution, values: Sequence[Any]) ->
     """Yield the parameters of a key, one for each component of a list of numbers."""
     if distribution.kind not in ("choice", "grid"):
         components = np.array(values, dtype=np.float64)
-        for index in np.ndindex(components.shape[1:]):
+        columns = components.reshape(len(values), -1).T
+        for index, numbers in zip(np.ndindex(components.shape[1:]), columns, strict=True):
             suffix = "".join(f"[{n}]" for n in index)
-            yield VariedParameter(name + suffix, components[(slice(None), *index)], distribution.kind == "log_uniform")
+            yield VariedParameter(name + suffix, numbers, distribution.kind == "log_uniform")
         return
     if all(type(value) in (int, float) for value in distribution.values):
         numbers = np.array(values, dtype=np.float64)
