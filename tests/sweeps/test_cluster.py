@@ -38,7 +38,7 @@ CALIBRATION = "K: [50, 0, 20, 0, 50, 15, 0, 0, 1]\nD: [0, 0, 0, 0]\nwidth: 40\nh
 POSES = "0 0 0 0.4 1 0 0 0\n999 0 0 0.5 1 0 0 0\n"
 
 # Until something happens that must [s].
-SOON = 60.0
+SOON = 150.0
 
 
 class Machines:
