@@ -1,4 +1,4 @@
-"""Figure of a study: work-precision diagrams of stepping, drawing and meshes, and the cost of every term."""
+"""Figure of a study: work-precision diagrams of stepping, drawing and meshes."""
 
 from __future__ import annotations
 
@@ -29,7 +29,6 @@ from taichi_msm.plot_style import (
     ONE_COLUMN_WIDTH,
     ORANGE,
     PURPLE,
-    SILVER,
     SKY,
     STYLE,
     TWO_COLUMN_WIDTH,
@@ -40,7 +39,6 @@ from taichi_msm.study.format import (
     format_number,
     is_mostly_rounding,
     machine_summary,
-    time_unit,
 )
 from taichi_msm.study.result import DrawingMeasurement, Study
 from taichi_msm.system.compiler import compiler_label
@@ -51,7 +49,6 @@ PRECISION_LINES: dict[str, dict[str, Any]] = {
     "f32": {"linestyle": "-", "marker": "o"},
     "f64": {"linestyle": (0, (3.5, 1.8)), "marker": "s"},
 }
-DOP853_LINE: dict[str, Any] = {"color": INK, "linestyle": ":", "marker": "D"}
 TOLERANCE_LINE: dict[str, Any] = {"color": GREY, "linewidth": 0.8, "linestyle": (0, (6, 3))}
 RECOMMENDED_MARKER: dict[str, Any] = {"ls": "none", "marker": "o", "ms": 11, "mfc": "none", "mec": INK, "zorder": 5}
 BOUND_MARKER: dict[str, Any] = {"mfc": "white"}
@@ -61,7 +58,7 @@ SUPERSAMPLE_COLOURS = (SKY, BLUE, GREEN, ORANGE, PURPLE, VERMILION)
 MARKERS = "osD^vPX"
 
 # Mosaic by the number of panels.
-PANEL_MOSAICS = {1: "A", 2: "AB", 3: "AB;AC", 4: "AB;CD"}
+PANEL_MOSAICS = {1: "A", 2: "AB", 3: "AB;AC"}
 
 Panel = Callable[[Axes, Study], None]
 
@@ -87,8 +84,6 @@ def panels(study: Study) -> Iterator[Panel]:
         yield _plot_drawing
     if any(_drawable(mesh.error) for mesh in study.points):
         yield _plot_meshes
-    if study.terms:
-        yield _plot_terms
 
 
 def _drawable(value: float | None) -> bool:
@@ -110,7 +105,7 @@ def _figure(study: Study) -> Figure:
         f"{_recommendation_line(study)}\n{machine}", x=0.01, ha="left", size=8, parse_math=False, wrap=True
     )
     axes = figure.subplot_mosaic(layout)
-    for name, panel in zip("ABCD", study_panels, strict=False):
+    for name, panel in zip("ABC", study_panels, strict=False):
         panel(axes[name], study)
     return figure
 
@@ -135,12 +130,10 @@ def _plot_stepping(axes: Axes, study: Study) -> None:
         diverged = [point.seconds.median for point in points if point.error is None]
         right = axes.get_yaxis_transform()
         axes.plot([0.985] * len(diverged), diverged, "x", color=line["color"], transform=right)
-    if study.peers:
-        handles.append(_plot_line(axes, study.peers, DOP853_LINE, "SciPy DOP853"))
     best = study.best_stepping
     if best is not None and _drawable(best.error):
         axes.plot([best.error or 0.0], [best.seconds.median], **RECOMMENDED_MARKER)
-    _scale_errors(axes, [*study.stepping, *study.peers], study.tolerance)
+    _scale_errors(axes, study.stepping, study.tolerance)
     _legend(axes, [*handles, *_marker_legend(study)])
 
 
@@ -161,13 +154,12 @@ def _plot_line(axes: Axes, points: Sequence[ErrorMeasurement], line: dict[str, A
 
 def _marker_legend(study: Study) -> Iterator[Line2D]:
     """Yield the legend handles of the plotted kinds of markers."""
-    points: list[ErrorMeasurement] = [*study.stepping, *study.peers]
     yield Line2D([], [], **TOLERANCE_LINE, label="tolerance")
     if study.best_stepping is not None:
         yield Line2D([], [], **RECOMMENDED_MARKER | {"ms": 8}, label="recommended")
-    if any(point.known and is_mostly_rounding(point) for point in points):
+    if any(point.known and is_mostly_rounding(point) for point in study.stepping):
         yield Line2D([], [], **LEGEND_MARKER | ROUNDING_MARKER, label="mostly rounding")
-    if any(_drawable(point.error) and not point.known for point in points):
+    if any(_drawable(point.error) and not point.known for point in study.stepping):
         yield Line2D([], [], **LEGEND_MARKER | BOUND_MARKER, label="at most this error")
     if any(point.error is None for point in study.stepping):
         yield Line2D([], [], **LEGEND_MARKER | {"marker": "x"}, label="diverged")
@@ -220,25 +212,6 @@ def _plot_meshes(axes: Axes, study: Study) -> None:
         handles.append(Line2D([], [], color=ORANGE, marker="o", linestyle="none", label="estimated by run"))
     _scale_errors(axes, meshes, study.mesh_tolerance, [mesh.estimate or 0.0 for mesh in meshes])
     _legend(axes, [*handles, Line2D([], [], **TOLERANCE_LINE, label="tolerance")])
-
-
-def _plot_terms(axes: Axes, study: Study) -> None:
-    scale, name = time_unit(study.terms[0].seconds.median)
-    rows = range(len(study.terms))
-    times = [scale * term.seconds.median for term in study.terms]
-    below = [scale * (term.seconds.median - term.seconds.fastest) for term in study.terms]
-    above = [scale * (term.seconds.slowest - term.seconds.median) for term in study.terms]
-    colours = [SKY if term.without else SILVER for term in study.terms]
-    error_line = {"linewidth": 0.8, "ecolor": INK}
-    bars = axes.barh(rows, times, height=0.6, color=colours, xerr=(below, above), error_kw=error_line)
-    axes.bar_label(bars, [format_number(time) for time in times], padding=3, size=7, color=GREY)
-    axes.axvline(times[0], **TOLERANCE_LINE, zorder=0)
-    axes.set_yticks(rows, [f"without {term.without}" if term.without else "whole step" for term in study.terms])
-    axes.set(title="Terms", xlabel=f"time of a step [{name.replace('us', 'µs')}]")
-    axes.margins(x=0.12)
-    axes.invert_yaxis()
-    axes.grid(visible=False, axis="y")
-    axes.tick_params(axis="y", length=0)
 
 
 def _plot_spread(

@@ -92,23 +92,6 @@ class SteppingMeasurement(Measurement):
 
 
 @dataclass
-class PeerMeasurement(Measurement):
-    """Measurement of SciPy's DOP853 on the same equations, for the whole scene.
-
-    Attributes:
-        rtol: relative tolerance; the absolute one is rtol x the largest displacement / 10.
-        error: as in `SteppingMeasurement`.
-        known: as in `SteppingMeasurement`.
-        evaluations: number of evaluations of the forces.
-    """
-
-    rtol: float
-    error: float
-    known: bool
-    evaluations: int
-
-
-@dataclass
 class DrawingMeasurement(Measurement):
     """Measurement of drawing the most deformed frame.
 
@@ -152,17 +135,6 @@ class MeshMeasurement(Measurement):
 
 
 @dataclass
-class TermMeasurement(Measurement):
-    """Measurement of a step without one term of the model.
-
-    Attributes:
-        without: key of the term; empty for the full model.
-    """
-
-    without: str
-
-
-@dataclass
 class Study:
     """Results of a study: speed against error of a scene on a machine.
 
@@ -175,10 +147,8 @@ class Study:
         reference: reference solution; None if the study was interrupted before it was computed.
         stepping: measurements of stepping, by method and then by decreasing step.
         orders: of convergence, as returned by `observed_orders`.
-        peers: measurements of DOP853.
         drawing: measurements of drawing, by supersampling and refinement; empty without a picture.
         points: measurements of meshes, from coarse to fine; empty for springs.
-        terms: measurements without single terms; the first is of the full model.
         notes: remarks for the reader, such as omitted parts and the reason.
     """
 
@@ -190,10 +160,8 @@ class Study:
     reference: Reference | None = None
     stepping: list[SteppingMeasurement] = field(default_factory=list)
     orders: dict[str, float | None] = field(default_factory=dict)
-    peers: list[PeerMeasurement] = field(default_factory=list)
     drawing: list[DrawingMeasurement] = field(default_factory=list)
     points: list[MeshMeasurement] = field(default_factory=list)
-    terms: list[TermMeasurement] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
     def finish(self) -> None:
@@ -205,7 +173,6 @@ class Study:
         self.orders = observed_orders(self.stepping)
         self.drawing = [drawing for drawing in self.drawing if drawing.samples]
         self.points = [mesh for mesh in self.points if mesh.samples]
-        self.terms = [term for term in self.terms if term.samples]
 
     @property
     def has_contact(self) -> bool:

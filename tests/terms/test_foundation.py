@@ -14,15 +14,12 @@ from PIL import Image
 from taichi_msm.accuracy.mesh import coarser_plan
 from taichi_msm.errors import SceneError
 from taichi_msm.load.scene_file import load_scene
-from taichi_msm.model.loads import average_loads
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.runs.run import run
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Foundation
-from taichi_msm.solver.planning import plan_variant
 from taichi_msm.solver.state import RunProgress, largest_displacement
-from taichi_msm.study.measurements import acceleration_function, scene_variants
 from taichi_msm.system.runtime import Device
 from taichi_msm.terms.foundation import FoundationTerm
 from tests import reference
@@ -129,21 +126,6 @@ def test_the_energy_that_it_gives_is_explained(tmp_path: Path, device: Device) -
         held = 400 * 1e4 / 2 * 0.1**2 * 0.02**2
         # With the factor 1, and a swing of 4, a hundredth would be explained.
         assert held / 10 < simulation.progress.peak < 1.1 * held
-
-
-def test_the_peer_and_the_terms_of_a_study_know_it(image: str, device: Device) -> None:
-    made = mapped(image, "none", damping=0, map={"image": image, "range": [1, 2]})
-    plan = plan_of(made)
-    u = 1e-3 * np.random.default_rng(0).normal(size=(*made.sheet.points, 3))
-    loads = average_loads(plan, plan.grid.steps, 1)
-    expected = reference.force(made, u, loads, 0) / reference.sheet(made).mass[..., None]
-    found = acceleration_function(plan)(u, 0 * u, loads)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
-    without = dict(scene_variants(made))
-    assert list(without) == ["", "tissue.foundation", "tissue.map", "tissue.foundation_map", "probes.0"]
-    unmapped, unheld = (plan_variant(plan, without[f"tissue.{name}"]) for name in ("foundation_map", "foundation"))
-    assert FoundationTerm.from_plan(unmapped) == FoundationTerm(by_area=True, mapped=False)
-    assert FoundationTerm.from_plan(unheld) is None
 
 
 SCENE = """\
