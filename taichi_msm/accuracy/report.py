@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.accuracy.companions import NEGLIGIBLE_ERROR, QUASISTATIC_REASON, CompanionRuns
 from taichi_msm.accuracy.contact_warnings import tool_contact_warnings
-from taichi_msm.accuracy.energy_growth import energy_growth_warnings
+from taichi_msm.accuracy.divergence import energy_growth_warnings
 from taichi_msm.accuracy.mesh import (
     LARGE_STEP_ERROR,
     MAX_DIFFERENCE,
