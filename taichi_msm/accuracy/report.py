@@ -59,31 +59,19 @@ REMEDY_THRESHOLD = 0.01
 
 
 class ForceEstimate(NamedTuple):
-    """Estimated error of the forces of position-controlled tools.
+    """Estimated error of the forces of position-controlled tools."""
 
-    Attributes:
-        error: Largest error of any tool at any frame, as a fraction of the greatest force; None if unknown.
-        doubt: Why the error is unknown.
-    """
-
-    error: float | None
-    doubt: str = ""
+    error: float | None  # largest of any tool at any frame, as a fraction of the greatest force; None if unknown
+    doubt: str = ""  # why the error is unknown
 
 
 class RunErrorEstimates(NamedTuple):
-    """Estimated errors of a run.
+    """Estimated errors of a run."""
 
-    Attributes:
-        estimate: Error of the time step and of rounding; None if not estimated.
-        reason: Why it was not estimated.
-        mesh: Discretisation error of the mesh; None if not estimated.
-        force: Error of the forces of position-controlled tools; None without such tools.
-    """
-
-    estimate: TimeStepEstimate | None = None
-    reason: str = ""
-    mesh: MeshEstimate | None = None
-    force: ForceEstimate | None = None
+    estimate: TimeStepEstimate | None = None  # error of the time step and of rounding; None if not estimated
+    reason: str = ""  # why it was not estimated
+    mesh: MeshEstimate | None = None  # discretisation error of the mesh; None if not estimated
+    force: ForceEstimate | None = None  # error of the forces of position-controlled tools; None without such tools
 
 
 class RunErrorEstimator:
@@ -225,10 +213,7 @@ def run_warnings(
     plan: Plan,
     probes: Sequence[ProbeRecord],
     progress: RunProgress,
-    estimate: TimeStepEstimate | None,
-    reason: str = "",
-    mesh: MeshEstimate | None = None,
-    force: ForceEstimate | None = None,
+    errors: RunErrorEstimates,
     affords: Callable[[Plan], bool] = lambda plan: True,
     scale: float | None = None,
 ) -> Iterator[str]:
@@ -238,10 +223,7 @@ def run_warnings(
         plan: Plan of the run.
         probes: Records of the probes' forces.
         progress: Progress of the run.
-        estimate: Error of the time step; this and the next three as in `RunErrorEstimates`.
-        reason: Why it was not estimated.
-        mesh: Discretisation error of the mesh.
-        force: Error of the forces.
+        errors: Estimated errors of the run.
         affords: Function that returns whether a plan can be run within an hour.
         scale: Pixels per metre at the middle of the sheet; None without a picture.
 
@@ -249,8 +231,9 @@ def run_warnings(
         Lines of text.
     """
     scene, grid = plan.scene, plan.grid
+    estimate, reason, mesh, force = errors
     if estimate is not None or mesh is not None:
-        yield error_line(estimate, mesh, progress.max_displacement, scale) + (
+        yield _error_line(estimate, mesh, progress.max_displacement, scale) + (
             "; mesh error unknown: another number of points is another sheet" if scene.tissue is None else ""
         )
     if estimate is not None:
@@ -308,20 +291,10 @@ def run_warnings(
         )
 
 
-def error_line(
-    estimate: TimeStepEstimate | None,
-    mesh: MeshEstimate | None = None,
-    max_displacement: float = 0.0,
-    scale: float | None = None,
+def _error_line(
+    estimate: TimeStepEstimate | None, mesh: MeshEstimate | None, max_displacement: float, scale: float | None
 ) -> str:
-    """Format the errors of a run in a line.
-
-    Args:
-        estimate: Error of the time step and of rounding; None if not estimated.
-        mesh: Discretisation error of the mesh; None if not estimated.
-        max_displacement: Largest displacement of the run [m].
-        scale: Pixels per metre; None without a picture.
-    """
+    """Format the errors of a run; arguments as for `run_warnings`."""
     if estimate is not None and estimate.error == math.inf:
         return "error not known: a companion run diverged, or steps do not resolve the damping"
     parts, errors = [], [mesh.error] if mesh is not None and mesh.error < math.inf else []
@@ -343,6 +316,11 @@ def error_line(
     return f"error: {', '.join(parts)}{of}{unknown}" if parts else f"error{unknown}".replace("error; ", "")
 
 
+def _bound_words(at_most: bool, at_least: bool) -> str:
+    """Return the words before an error that may be smaller, larger or both."""
+    return ("roughly " if at_least else "at most about ") if at_most else "at least " if at_least else ""
+
+
 def _percent(share: float, digits: int) -> str:
     return _digits(100 * share, digits)
 
@@ -361,11 +339,6 @@ def _mesh_remedy(plan: Plan, mesh: MeshEstimate, affords: Callable[[Plan], bool]
     if allowed and affords(plan_variant(plan, with_points(scene, (rows, cols)))):
         return f"try sheet.points: {[rows, cols]}"
     return "tissue.bending, tissue.pretension or a wider tip help more than points do"
-
-
-def _bound_words(at_most: bool, at_least: bool) -> str:
-    """Return the words before an error that may be smaller, larger or both."""
-    return ("roughly " if at_least else "at most about ") if at_most else "at least " if at_least else ""
 
 
 def _step_remedy(plan: Plan, estimate: TimeStepEstimate, affords: Callable[[Plan], bool]) -> str:

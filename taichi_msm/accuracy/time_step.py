@@ -79,13 +79,6 @@ class TimeStepEstimate:
     at_most: bool = False
 
 
-def estimate_error(
-    plan: Plan, device: Device, progress: ProgressCallback = lambda done, total: None
-) -> TimeStepEstimate:
-    """Estimate the time-step error of a run by repeating it with a companion run."""
-    return TimeStepTrials(plan, device).estimate(plan.grid.steps_per_frame, progress)
-
-
 def choose_step(
     plan: Plan, device: Device, progress: ProgressCallback = lambda done, total: None
 ) -> tuple[Plan, TimeStepEstimate]:
@@ -242,7 +235,7 @@ class TimeStepTrials:
         self._companion = TimeStepCompanion(plan, fine_steps(plan), device)
         self._dynamics = Dynamics(plan, device)
 
-    def estimate(self, steps: int, progress: ProgressCallback) -> TimeStepEstimate:
+    def estimate(self, steps: int, progress: ProgressCallback = lambda done, total: None) -> TimeStepEstimate:
         """Run the scene with a number of steps per frame and estimate its error."""
         plan = self._plan.with_grid(steps_per_frame=steps)
         fine, frames = fine_steps(plan), plan.grid.frames

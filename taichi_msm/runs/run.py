@@ -472,7 +472,7 @@ def _run_entries(
         "longest_spring": progress.longest_spring,
         "probes": probes,
         "notes": [
-            *run_warnings(plan, probes, progress, *estimates, _is_affordable, _pixels_per_metre(scene)),
+            *run_warnings(plan, probes, progress, estimates, _is_affordable, _pixels_per_metre(scene)),
             *path_dependence,
             *drawing_warnings(scene),
         ],

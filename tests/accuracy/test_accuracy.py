@@ -18,7 +18,6 @@ from taichi_msm.accuracy.time_step import (
     TimeStepEstimate,
     TimeStepTrials,
     choose_step,
-    estimate_error,
     max_norm,
 )
 from taichi_msm.errors import SceneError
@@ -30,7 +29,7 @@ from taichi_msm.solver.planning import with_time
 from taichi_msm.solver.state import RunProgress
 from taichi_msm.system.runtime import Device
 from tests.golden import Messages
-from tests.motion import frames, notes_of, true_error
+from tests.motion import estimate_error, frames, notes_of, true_error
 from tests.scenes import PRESS, SHEET, SPRINGS, plan_of, scene, with_steps
 
 # Of a run in which something moved.
@@ -73,7 +72,7 @@ def test_the_step_chosen_is_right_and_the_largest(kind: str, precision: str, tol
     assert estimate.steps_per_frame == steps >= own
     if steps > own:
         # Half as many steps would not have done.
-        assert TimeStepTrials(plan, device).estimate(steps // 2, lambda done, total: None).error > tolerance
+        assert TimeStepTrials(plan, device).estimate(steps // 2).error > tolerance
 
 
 # Beside these scenes: a load that is there at once, with which damping within a step, g h = 7 and 47, makes velocities
@@ -203,7 +202,7 @@ def test_progress_may_interrupt(device: Device) -> None:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        estimate_error(plan_of(scene()), device, stop)
+        TimeStepTrials(plan_of(scene()), device).estimate(20, stop)
 
 
 # 25 frames a second in steps of 0.01 s.

@@ -19,7 +19,6 @@ from taichi_msm.accuracy.time_step import (
     TimeStepEstimate,
     choose_step,
     combine_estimates,
-    estimate_error,
     max_norm,
 )
 from taichi_msm.model.plan import Plan
@@ -32,7 +31,7 @@ from taichi_msm.solver.planning import plan_variant
 from taichi_msm.system.runtime import Device
 from tests.accuracy.test_accuracy import MOVED, Falling
 from tests.golden import Messages
-from tests.motion import frames_on, notes_of, true_error
+from tests.motion import estimate_error, frames_on, notes_of, true_error
 from tests.scenes import plan_of, random_contact
 from tests.terms.test_contact import HELD, PRESSED, RUBBED, moved, touching
 
