@@ -98,17 +98,11 @@ WRINKLING = "tissue without bending is pressed together, and with more points wr
 
 @dataclass(frozen=True)
 class MeshEstimate:
-    """Estimated discretisation error of the mesh.
+    """Estimated discretisation error of the mesh."""
 
-    Attributes:
-        error: Largest error, as a fraction of the largest displacement; infinite if unknown.
-        doubt: Why the error may be larger, or is unknown; empty if the estimate is reliable.
-        at_most: Whether the error may be much smaller, because of contact.
-    """
-
-    error: float
-    doubt: str = ""
-    at_most: bool = False
+    error: float  # largest error, as a fraction of the largest displacement; infinite if unknown
+    doubt: str = ""  # why the error may be larger, or is unknown; empty if the estimate is reliable
+    at_most: bool = False  # whether the error may be much smaller, because of contact
 
 
 def coarser_plan(plan: Plan, ratio: float = 0.5) -> Plan | None:

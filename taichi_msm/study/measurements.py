@@ -19,13 +19,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from taichi_msm.accuracy.divergence import displacement_bound
-from taichi_msm.accuracy.mesh import (
-    MIN_POINTS_PER_SIDE,
-    CubicInterpolation,
-    MeshCompanion,
-    mesh_companion_plan,
-    with_points,
-)
+from taichi_msm.accuracy.mesh import MIN_POINTS_PER_SIDE, CubicInterpolation, with_points
 from taichi_msm.accuracy.time_step import max_norm
 from taichi_msm.errors import ProgressCallback
 from taichi_msm.load import cost
@@ -216,7 +210,7 @@ class MeshStudy:
         self._done = 0
 
     def run(self) -> None:
-        """Compute the estimates and the errors, then measure the times.
+        """Compute the errors, then measure the times.
 
         Sheets of springs are skipped, as their stiffness depends on the mesh.
         """
@@ -245,23 +239,15 @@ class MeshStudy:
                     sheet.measurement.samples.append(self._step_through(sheet))
 
     def _measure_mesh(self, plan: Plan, opened: ExitStack) -> float:
-        """Simulate a mesh with its automatic step and companion runs; return the time of its steps [s]."""
+        """Add a mesh; return the time of its automatic steps [s]."""
         dynamics = opened.enter_context(closing(Dynamics(plan, self._device)))
         sheet = _MeshRun(plan, dynamics, MeshMeasurement(*plan.scene.sheet.points, plan.grid.steps_per_frame))
-        coarse = mesh_companion_plan(plan)
-        assert coarse is not None
         self._sheets.append(sheet)
         self._study.points.append(sheet.measurement)
         self._tick()
         dynamics.compile()
-        companion = MeshCompanion(plan, coarse, self._device)
-        companion.compile()
-        first = self._step_through(sheet, companion)
         # The minimum of two runs is less sensitive to other load on the machine.
-        seconds = min(first, self._step_through(sheet, companion.build_second_run(plan, self._device)))
-        estimate = companion.estimate.error
-        sheet.measurement.estimate = estimate if estimate < math.inf else None
-        return seconds
+        return min(self._step_through(sheet) for _ in range(2))
 
     def _finer_plan(self, plan: Plan, seconds: float, longest_run: float) -> Plan | None:
         """Plan the next finer mesh than one that took `seconds`; return None beyond the limits of time or memory."""
@@ -308,7 +294,7 @@ class MeshStudy:
             share = error / largest if largest > 0 else 0.0
             measurement.error = share if share < math.inf else None
 
-    def _step_through(self, sheet: _MeshRun, companion: MeshCompanion | None = None) -> float:
+    def _step_through(self, sheet: _MeshRun) -> float:
         """Simulate the scene with the automatic step; return the time of the steps alone [s]."""
         plan, dynamics, _ = sheet
         dynamics.restart(plan)
@@ -318,14 +304,11 @@ class MeshStudy:
             start = time.perf_counter()
             dynamics.advance(plan.grid.steps_per_frame)
             seconds += time.perf_counter() - start
-            displacement = dynamics.displacement()
-            if companion is not None:
-                companion.compare_frame(displacement, self._tick)
         self._done += 1
         return seconds
 
     def _tick(self) -> None:
-        # Two runs of every mesh with its companions and the timed runs; the comparison of all meshes counts as one.
+        # Two first runs of every mesh and the timed ones; the comparison of all meshes counts as one.
         self._progress(self._done, 1 + (2 + ROUNDS) * len(self._sheets))
 
 

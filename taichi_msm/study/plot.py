@@ -205,12 +205,7 @@ def _plot_meshes(axes: Axes, study: Study) -> None:
         handles.append(_plot_line(axes, [mesh], line, f"{mesh.name}{role}{bound}"))
         if (mesh.rows, mesh.cols) == study.recommended_points:
             axes.plot([mesh.error or 0.0], [mesh.seconds.median], **RECOMMENDED_MARKER)
-        if _drawable(mesh.estimate):
-            axes.plot([mesh.error or 0.0, mesh.estimate or 0.0], [mesh.seconds.median] * 2, color=ORANGE, linewidth=0.7)
-            axes.plot([mesh.estimate or 0.0], [mesh.seconds.median], color=ORANGE, marker=marker)
-    if any(_drawable(mesh.estimate) for mesh in meshes):
-        handles.append(Line2D([], [], color=ORANGE, marker="o", linestyle="none", label="estimated by run"))
-    _scale_errors(axes, meshes, study.mesh_tolerance, [mesh.estimate or 0.0 for mesh in meshes])
+    _scale_errors(axes, meshes, study.mesh_tolerance)
     _legend(axes, [*handles, Line2D([], [], **TOLERANCE_LINE, label="tolerance")])
 
 
@@ -232,10 +227,10 @@ def _extremes(points: Iterable[ErrorMeasurement | DrawingMeasurement]) -> Iterat
         yield from (point.seconds.fastest, point.seconds.slowest)
 
 
-def _scale_errors(axes: Axes, points: Sequence[ErrorMeasurement], tolerance: float, more: Iterable[float] = ()) -> None:
+def _scale_errors(axes: Axes, points: Sequence[ErrorMeasurement], tolerance: float) -> None:
     """Scale the axes to times and errors, and mark the tolerance."""
     axes.axvline(tolerance, **TOLERANCE_LINE)
-    _scale(axes, "x", [*(point.error or 0.0 for point in points), *more, tolerance], 2)
+    _scale(axes, "x", [*(point.error or 0.0 for point in points), tolerance], 2)
     _scale(axes, "y", _extremes(points), 1)
 
 

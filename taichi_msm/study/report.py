@@ -129,7 +129,6 @@ MESH_COLUMNS: Columns = {
     "points": lambda mesh: mesh.name,
     "steps/frame": lambda mesh: str(mesh.steps_per_frame),
     "error": format_error,
-    "estimate": lambda mesh: "not known" if mesh.estimate is None else format_number(mesh.estimate),
     "time of the scene": lambda mesh: format_timing(mesh.seconds),
 }
 
@@ -259,9 +258,8 @@ def _meshes(study: Study) -> Iterator[str]:
     yield (
         "The error is that made by the number of points, at the points and between them, where the displacement is "
         "interpolated by cubics: the largest anywhere at any frame, as a fraction of the largest displacement. The "
-        f"reference is {reference}. All are stepped in f64 with the same "
-        "step. The estimate is that of `run`, by a companion run with half the cells per side. "
-        "Times are those of each sheet's automatic step."
+        f"reference is {reference}. All are stepped in f64 with the same step. Times are those of each sheet's "
+        "automatic step."
     )
     yield _meshes_table(study)
     yield from _bounds(study.points)

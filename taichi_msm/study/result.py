@@ -118,7 +118,6 @@ class MeshMeasurement(Measurement):
         steps_per_frame: of the automatic step on this mesh.
         error: discretisation error of the mesh, at the mass points and between them, as in `SteppingMeasurement`.
         known: as in `SteppingMeasurement`.
-        estimate: of this error by the companion run of `run`; None if unknown.
     """
 
     rows: int
@@ -126,7 +125,6 @@ class MeshMeasurement(Measurement):
     steps_per_frame: int
     error: float | None = None
     known: bool = False
-    estimate: float | None = None
 
     @property
     def name(self) -> str:

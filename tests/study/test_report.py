@@ -101,11 +101,11 @@ def of_tissue() -> Study:
     found = realistic()
     found.settings["sheet"]["points"] = [31, 31]
     found.points = [
-        MeshMeasurement(5, 5, 40, None, False, None, samples=spread(0.002)),
-        MeshMeasurement(9, 9, 58, 0.191, True, 0.0511, samples=spread(0.00227)),
-        MeshMeasurement(16, 16, 88, 0.0836, True, None, samples=spread(0.00293)),
-        MeshMeasurement(31, 31, 162, 0.0209, True, 0.0217, samples=spread(0.0112)),
-        MeshMeasurement(61, 61, 317, 0.0105, False, 0.0114, samples=spread(0.0484)),
+        MeshMeasurement(5, 5, 40, None, False, samples=spread(0.002)),
+        MeshMeasurement(9, 9, 58, 0.191, True, samples=spread(0.00227)),
+        MeshMeasurement(16, 16, 88, 0.0836, True, samples=spread(0.00293)),
+        MeshMeasurement(31, 31, 162, 0.0209, True, samples=spread(0.0112)),
+        MeshMeasurement(61, 61, 317, 0.0105, False, samples=spread(0.0484)),
     ]
     return found
 
@@ -332,7 +332,7 @@ def with_points(tolerance: float, *errors: float, own: int = 31) -> Study:
     found = replace(realistic(), tolerance=tolerance)
     found.settings["sheet"]["points"] = [own, own]
     found.points = [
-        MeshMeasurement(count, count, 100, error, True, None, samples=spread(0.01))
+        MeshMeasurement(count, count, 100, error, True, samples=spread(0.01))
         for count, error in zip((16, 31, 61, 121), errors, strict=False)
     ]
     return found

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,6 @@ from taichi_msm.accuracy.mesh import with_points
 from taichi_msm.accuracy.time_step import max_norm
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.runs.run import run
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.planning import with_time
 from taichi_msm.study import measurements
@@ -212,15 +210,6 @@ def test_the_error_of_points_is_that_against_many_more(points: Study, device: De
         assert apart <= (found.error or 0.0) < 1.6 * apart
 
 
-def test_the_estimate_beside_it_is_that_of_a_run(points: Study, device: Device, tmp_path: Path) -> None:
-    found = points.points[1]
-    record = run(tissue((17, 17)), tmp_path / "out", threads=device.threads, estimate_error=True)
-    estimate = record["error_estimate"]
-    assert estimate is not None
-    # The run compares sheets with half as many steps, whose own errors differ by less than this with the points.
-    assert estimate["mesh_error"] == pytest.approx(found.estimate, rel=0.01)
-
-
 def test_without_time_for_more_points_the_error_of_the_finest_is_a_bound(
     points: Study, device: Device, message: Messages
 ) -> None:
@@ -265,7 +254,7 @@ def test_an_interruption_leaves_the_points_that_were_timed(device: Device) -> No
     made = study_of(tissue((13, 13)))
 
     def stop(done: int, total: int) -> None:
-        # The estimates and the errors of three are done, and one was timed once.
+        # The first runs and the errors of three are done, and one was timed once.
         if done == 2 * 3 + 1 + 1:
             raise KeyboardInterrupt
 
