@@ -50,11 +50,25 @@ PRECISION_LINES: dict[str, dict[str, Any]] = {
     "f64": {"linestyle": (0, (3.5, 1.8)), "marker": "s"},
 }
 TOLERANCE_LINE: dict[str, Any] = {"color": GREY, "linewidth": 0.8, "linestyle": (0, (6, 3))}
-RECOMMENDED_MARKER: dict[str, Any] = {"ls": "none", "marker": "o", "ms": 11, "mfc": "none", "mec": INK, "zorder": 5}
+RECOMMENDED_MARKER: dict[str, Any] = {
+    "ls": "none",
+    "marker": "o",
+    "ms": 11,
+    "mfc": "none",
+    "mec": INK,
+    "zorder": 5,
+}
 BOUND_MARKER: dict[str, Any] = {"mfc": "white"}
 ROUNDING_MARKER: dict[str, Any] = {"fillstyle": "bottom", "markerfacecoloralt": "white"}
 LEGEND_MARKER: dict[str, Any] = {"linestyle": "none", "marker": "o", "color": GREY}
-SUPERSAMPLE_COLOURS = (SKY, BLUE, GREEN, ORANGE, PURPLE, VERMILION)
+SUPERSAMPLE_COLOURS = (
+    SKY,
+    BLUE,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    VERMILION,
+)
 MARKERS = "osD^vPX"
 
 # Mosaic by the number of panels.
@@ -94,7 +108,10 @@ def _drawable(value: float | None) -> bool:
 def _figure(study: Study) -> Figure:
     study_panels = list(panels(study))
     layout = PANEL_MOSAICS[len(study_panels)]
-    size = (TWO_COLUMN_WIDTH if len(study_panels) > 1 else ONE_COLUMN_WIDTH, 4.2 * (layout.count(";") + 1) + 0.5)
+    size = (
+        TWO_COLUMN_WIDTH if len(study_panels) > 1 else ONE_COLUMN_WIDTH,
+        4.2 * (layout.count(";") + 1) + 0.5,
+    )
     figure = Figure(figsize=size, dpi=DPI, layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1, wspace=0.05))
     FigureCanvasAgg(figure)
     versions = study.machine["versions"]
@@ -140,15 +157,12 @@ def _plot_stepping(axes: Axes, study: Study) -> None:
 def _plot_line(axes: Axes, points: Sequence[ErrorMeasurement], line: dict[str, Any], label: str) -> Line2D:
     """Plot a line through measurements; return its legend handle."""
     points = [point for point in points if _drawable(point.error)]
-    errors = [point.error or 0.0 for point in points]
-    axes.plot(errors, [point.seconds.median for point in points], **line, zorder=3)
-    _plot_spread(axes, errors, points, line["color"])
-    for point, error in zip(points, errors, strict=True):
+    _plot_times(axes, [point.error or 0.0 for point in points], points, line)
+    for point in points:
         # Markers are hollow for upper bounds, and half filled where rounding dominates.
         if not point.known or is_mostly_rounding(point):
-            axes.plot(
-                [error], [point.seconds.median], **line | (ROUNDING_MARKER if point.known else BOUND_MARKER), zorder=4
-            )
+            marker = ROUNDING_MARKER if point.known else BOUND_MARKER
+            axes.plot([point.error or 0.0], [point.seconds.median], **line | marker, zorder=4)
     return Line2D([], [], **line, label=label)
 
 
@@ -173,11 +187,11 @@ def _plot_drawing(axes: Axes, study: Study) -> None:
     markers = dict(zip(sorted({drawing.refine for drawing in drawings}), cycle(MARKERS)))
     for supersample, colour in colours.items():
         series = [drawing for drawing in drawings if drawing.supersample == supersample]
-        axes.plot(*zip(*map(_coordinates, series), strict=True), color=colour, linewidth=0.8)
-        _plot_spread(axes, [drawing.psnr or 0.0 for drawing in series], series, colour, 1e3)
+        line = {"color": colour, "linewidth": 0.8}
+        _plot_times(axes, [drawing.psnr or 0.0 for drawing in series], series, line, 1e3)
     for drawing in drawings:
-        colour, marker = colours[drawing.supersample], markers[drawing.refine]
-        axes.plot(*_coordinates(drawing), color=colour, marker=marker, **BOUND_MARKER, zorder=3)
+        marker = {"color": colours[drawing.supersample], "marker": markers[drawing.refine], **BOUND_MARKER}
+        axes.plot(*_coordinates(drawing), **marker, zorder=3)
     best = study.best_drawing
     if best is not None and _drawable(best.psnr):
         axes.plot(*_coordinates(best), **RECOMMENDED_MARKER)
@@ -209,17 +223,18 @@ def _plot_meshes(axes: Axes, study: Study) -> None:
     _legend(axes, [*handles, Line2D([], [], **TOLERANCE_LINE, label="tolerance")])
 
 
-def _plot_spread(
+def _plot_times(
     axes: Axes,
     x: Sequence[float],
     points: Sequence[ErrorMeasurement | DrawingMeasurement],
-    colour: str,
+    line: dict[str, Any],
     scale: float = 1,
 ) -> None:
-    """Plot the range of the times of every measurement as a thin line."""
-    fastest = [scale * point.seconds.fastest for point in points]
-    slowest = [scale * point.seconds.slowest for point in points]
-    axes.vlines(x, fastest, slowest, color=colour, linewidth=0.7, alpha=0.6)
+    """Plot a line through the medians of the times, with thin bars from the fastest to the slowest."""
+    times = [point.seconds for point in points]
+    axes.plot(x, [scale * each.median for each in times], **line, zorder=3)
+    fastest, slowest = [scale * each.fastest for each in times], [scale * each.slowest for each in times]
+    axes.vlines(x, fastest, slowest, color=line["color"], linewidth=0.7, alpha=0.6)
 
 
 def _extremes(points: Iterable[ErrorMeasurement | DrawingMeasurement]) -> Iterator[float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -177,7 +177,8 @@ def format_summary(study: Study) -> str:
         names = "method", "step", "error", "time of the scene"
         blocks.append(_methods_table(study, fastest, {name: STEPPING_COLUMNS[name] for name in names}))
     if study.drawing:
-        blocks.append(_drawings_table(study, list(_drawings(study))))
+        best_drawings = map(study.best_refinement, sorted({drawing.supersample for drawing in study.drawing}))
+        blocks.append(_drawings_table(study, [drawing for drawing in best_drawings if drawing]))
     if study.points:
         blocks.append(_meshes_table(study))
     notes = [f"note: {printable(note)}" for note in study.notes]
@@ -284,15 +285,6 @@ def _drawings_table(study: Study, drawings: Sequence[DrawingMeasurement]) -> str
 def _meshes_table(study: Study) -> str:
     roles = {tuple(study.settings["sheet"]["points"]): "of the scene", study.recommended_points: "recommended"}
     return format_table(study.points, MESH_COLUMNS, lambda mesh: roles.get((mesh.rows, mesh.cols), ""))
-
-
-def _drawings(study: Study) -> Iterator[DrawingMeasurement]:
-    """Yield the best refinement for every supersampling."""
-    for supersample in sorted({drawing.supersample for drawing in study.drawing}):
-        render = {**study.settings["render"], "supersample": supersample}
-        best = replace(study, settings={**study.settings, "render": render}).best_drawing
-        if best is not None:
-            yield best
 
 
 def _best(points: Sequence[SteppingMeasurement], tolerance: float) -> SteppingMeasurement | None:
