@@ -56,7 +56,7 @@ class TimeStepEstimate:
     """Estimated error of the time step and of rounding, as fractions of the largest displacement."""
 
     steps_per_frame: int  # of the run
-    # Largest error; infinite if it is unknown because a companion run diverged or the step does not resolve the damping.
+    # Largest error; infinite if it is unknown: a companion run diverged, or the step does not resolve the damping.
     error: float
     rounding: float  # part of the error that comes from f32, including positions in the trajectory; 0 in f64
     in_f64: float  # error of the same step in f64

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from taichi_msm.accuracy.divergence import displacement_bound
-from taichi_msm.accuracy.mesh import MIN_POINTS_PER_SIDE, CubicInterpolation, with_points
+from taichi_msm.accuracy.mesh import MIN_POINTS_PER_SIDE, interpolate, with_points
 from taichi_msm.accuracy.time_step import max_norm
 from taichi_msm.errors import ProgressCallback
 from taichi_msm.load import cost
@@ -277,10 +277,10 @@ class MeshStudy:
                 fields = [sheet.displacement() for sheet in sheets]
                 with np.errstate(all="ignore"):
                     exact, bound = _reference(fields, extrapolate=not finest.tools)
-                    frame_errors = [max_norm(_sampled(field, exact) - exact) for field in fields[:-1]]
+                    frame_errors = [max_norm(interpolate(field, exact) - exact) for field in fields[:-1]]
                     # The error of the finest mesh is unknown between its mass points. But at an order of at least 1,
                     # it is at most the distance from a mesh with half the cells per side.
-                    frame_errors.append(max_norm(_sampled(fields[-2], fields[-1]) - fields[-1]))
+                    frame_errors.append(max_norm(interpolate(fields[-2], fields[-1]) - fields[-1]))
                 errors = [max(pair) for pair in zip(errors, frame_errors, strict=True)]
                 reference_error, largest = max(reference_error, bound), max(largest, max_norm(exact))
             self._done += 1
@@ -338,13 +338,13 @@ def _reference(fields: list[Array], *, extrapolate: bool) -> tuple[Array, float]
     # next coarser pair, or from u if there are only two fields. With contact, of order 1, u is not extrapolated; its
     # error is at most about its distance from u_r.
     if not extrapolate:
-        return fields[-1], max_norm(_sampled(fields[-1], fields[-2]) - fields[-2])
-    exact = fields[-1] + _sampled(_correction(fields[-1], fields[-2]), fields[-1])
+        return fields[-1], max_norm(interpolate(fields[-1], fields[-2]) - fields[-2])
+    exact = fields[-1] + interpolate(_correction(fields[-1], fields[-2]), fields[-1])
     if len(fields) > 2:
-        before = fields[-2] + _sampled(_correction(fields[-2], fields[-3]), fields[-2])
+        before = fields[-2] + interpolate(_correction(fields[-2], fields[-3]), fields[-2])
     else:
-        before = _sampled(fields[-1], fields[-2])
-    return exact, max_norm(_sampled(exact, before) - before)
+        before = interpolate(fields[-1], fields[-2])
+    return exact, max_norm(interpolate(exact, before) - before)
 
 
 def _correction(fine: Array, coarse: Array) -> Array:
@@ -353,14 +353,8 @@ def _correction(fine: Array, coarse: Array) -> Array:
         (fine_count - 1) / (coarse_count - 1)
         for fine_count, coarse_count in zip(fine.shape[:2], coarse.shape[:2], strict=True)
     )
-    correction: Array = (_sampled(fine, coarse) - coarse) / (ratio**2 - 1)
+    correction: Array = (interpolate(fine, coarse) - coarse) / (ratio**2 - 1)
     return correction
-
-
-def _sampled(values: Array, target: Array) -> Array:
-    """Interpolate a field at the mass points of another one."""
-    (rows, cols), (target_rows, target_cols) = values.shape[:2], target.shape[:2]
-    return CubicInterpolation((rows, cols), (target_rows, target_cols)).evaluate(values)
 
 
 REFINES = (0, 1, 2, 5, 10, 20)

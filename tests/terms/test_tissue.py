@@ -13,11 +13,11 @@ from PIL import Image
 
 from taichi_msm.accuracy.mesh import (
     MIN_POINTS_PER_SIDE,
-    CubicInterpolation,
     MeshCompanion,
     MeshEstimate,
     choose_points,
     coarser_plan,
+    interpolate,
 )
 from taichi_msm.accuracy.time_step import max_norm
 from taichi_msm.cli.console import run_summary
@@ -295,8 +295,7 @@ def test_the_pilot_of_the_points_samples_cubics_exactly() -> None:
         x, y = np.arange(cols) / (cols - 1), np.arange(rows)[:, None] / (rows - 1)
         return np.stack([(x**3 - 2 * x) * y, y**3 + 0 * x, x * x * y * y], axis=-1)
 
-    sampled = CubicInterpolation((5, 8), (9, 13)).evaluate(surface(5, 8))
-    np.testing.assert_allclose(sampled, surface(9, 13), atol=1e-14)
+    np.testing.assert_allclose(interpolate(surface(5, 8), surface(9, 13)), surface(9, 13), atol=1e-14)
 
 
 def test_few_points_and_springs_have_no_mesh_error(load: Any, image: str) -> None:
