@@ -70,7 +70,6 @@ def tables(results: Results) -> dict[str, str]:
     makers: dict[str, tuple[str, Callable[[], str]]] = {
         "stepping_table": ("stepping", lambda: stepping_table(results["stepping"])),
         "ratio_table": ("stepping", lambda: ratio_table(results["stepping"])),
-        "width_table": ("widths", lambda: width_table(results["widths"])),
         "narrow_step_table": ("narrow", lambda: narrow_step_table(results["narrow"])),
         "narrow_picture_table": ("narrow", lambda: narrow_picture_table(results["narrow"])),
         "remap_ratios": ("drawing", lambda: remap_ratios(results["drawing"])),
@@ -163,18 +162,6 @@ def ratio_table(measured: dict[str, list[Entry]]) -> str:
             [entry["name"], *(_ratio(entries[index], entries[0]) for entries in measured.values())]
             for index, entry in enumerate(next(iter(measured.values())))
             if index
-        ],
-    )
-
-
-def width_table(found: dict[str, dict[str, dict[str, int]]]) -> str:
-    """Show how many packed operations of each width the code of every peer has."""
-    return table(
-        ["packed operations in the code of a step", "512 bits", "256 bits", "128 bits"],
-        [
-            [f"{name}, of {bits} bits", *(str(counts[width]) for width in ("512", "256", "128"))]
-            for bits, peers in found.items()
-            for name, counts in peers.items()
         ],
     )
 
