@@ -76,9 +76,9 @@ def tables(results: Results) -> dict[str, str]:
         "lit_table": ("drawing", lambda: drawing_table(results["drawing"]["lit"])),
         "flat_table": ("drawing", lambda: drawing_table(results["drawing"]["flat"])),
         "whole_run_table": ("whole_run", lambda: whole_run_table(results["whole_run"])),
-        "terms_table": ("terms", lambda: terms_table(results["terms"])),
+        "terms_table": ("terms", lambda: relative_table("a step", results["terms"], terms.SPRINGS)),
         "gradient_table": ("gradient", lambda: gradient_table(results["gradient"])),
-        "looks_table": ("looks", lambda: looks_table(results["looks"]["pictures"])),
+        "looks_table": ("looks", lambda: relative_table("a picture", pictures(results), looks.HEADLIGHT)),
         "lens_ratios": ("looks", lambda: lens_ratios(results["looks"]["pictures"])),
         "rates_table": ("looks", lambda: rates_table(results["looks"]["rates"])),
         "compilers_table": ("compilers", lambda: compilers_table(results["compilers"])),
@@ -234,15 +234,14 @@ def compilers_table(measured: dict[str, dict[str, list[float]]]) -> str:
     return table(["time", *(COMPILERS[name].title for name in names), "ratio"], rows)
 
 
-def terms_table(measured: dict[str, dict[str, list[float]]]) -> str:
-    """Show the time of a step of every kind of sheet, and how many times that of one in springs it is."""
+def relative_table(head: str, measured: dict[str, dict[str, list[float]]], base: str) -> str:
+    """Show times at every size, and how many times that of one of them each is."""
     medians = {size: {name: Timing.of(times).median for name, times in own.items()} for size, own in measured.items()}
-    names = next(iter(medians.values()))
     rows = [
-        [name, *(f"{format_duration(own[name])} ({own[name] / own[terms.SPRINGS]:.2f})" for own in medians.values())]
-        for name in names
+        [name, *(f"{format_duration(own[name])} ({own[name] / own[base]:.2f})" for own in medians.values())]
+        for name in next(iter(medians.values()))
     ]
-    return table(["a step", *medians], rows)
+    return table([head, *medians], rows)
 
 
 def gradient_table(measured: dict[str, dict[str, dict[str, list[float]]]]) -> str:
@@ -256,15 +255,9 @@ def gradient_table(measured: dict[str, dict[str, dict[str, list[float]]]]) -> st
     return table(["a gradient", "forward run", "value and gradient", "in forward runs of taichi_msm"], rows)
 
 
-def looks_table(measured: dict[str, dict[str, list[float]]]) -> str:
-    """Show the time of a picture of every kind, and how many times that of one with the headlight it is."""
-    medians = {size: {name: Timing.of(times).median for name, times in own.items()} for size, own in measured.items()}
-    names = next(iter(medians.values()))
-    rows = [
-        [name, *(f"{format_duration(own[name])} ({own[name] / own[looks.HEADLIGHT]:.2f})" for own in medians.values())]
-        for name in names
-    ]
-    return table(["a picture", *(f"{size} × {size}" for size in medians)], rows)
+def pictures(results: Results) -> dict[str, dict[str, list[float]]]:
+    """Return the times of all kinds of pictures, by their size."""
+    return {f"{size} × {size}": own for size, own in results["looks"]["pictures"].items()}
 
 
 def lens_ratios(measured: dict[str, dict[str, list[float]]]) -> str:
