@@ -53,11 +53,6 @@ def format_error(measurement: ErrorMeasurement) -> str:
     return f"{'' if measurement.known else '< '}{format_number(error)}" if error < math.inf else "diverged"
 
 
-def is_mostly_rounding(measurement: ErrorMeasurement) -> bool:
-    """Return whether rounding in f32 dominates the error."""
-    return isinstance(measurement, SteppingMeasurement) and (measurement.rounding or 0) > (measurement.error or 0) / 2
-
-
 def machine_summary(study: Study) -> str:
     """Describe the machine of a study in a line."""
     threads = study.machine["threads"]

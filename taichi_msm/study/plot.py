@@ -34,12 +34,7 @@ from taichi_msm.plot_style import (
     TWO_COLUMN_WIDTH,
     VERMILION,
 )
-from taichi_msm.study.format import (
-    ErrorMeasurement,
-    format_number,
-    is_mostly_rounding,
-    machine_summary,
-)
+from taichi_msm.study.format import ErrorMeasurement, format_number, machine_summary
 from taichi_msm.study.result import DrawingMeasurement, Study
 from taichi_msm.system.compiler import compiler_label
 
@@ -59,7 +54,6 @@ RECOMMENDED_MARKER: dict[str, Any] = {
     "zorder": 5,
 }
 BOUND_MARKER: dict[str, Any] = {"mfc": "white"}
-ROUNDING_MARKER: dict[str, Any] = {"fillstyle": "bottom", "markerfacecoloralt": "white"}
 LEGEND_MARKER: dict[str, Any] = {"linestyle": "none", "marker": "o", "color": GREY}
 SUPERSAMPLE_COLOURS = (
     SKY,
@@ -159,10 +153,8 @@ def _plot_line(axes: Axes, points: Sequence[ErrorMeasurement], line: dict[str, A
     points = [point for point in points if _drawable(point.error)]
     _plot_times(axes, [point.error or 0.0 for point in points], points, line)
     for point in points:
-        # Markers are hollow for upper bounds, and half filled where rounding dominates.
-        if not point.known or is_mostly_rounding(point):
-            marker = ROUNDING_MARKER if point.known else BOUND_MARKER
-            axes.plot([point.error or 0.0], [point.seconds.median], **line | marker, zorder=4)
+        if not point.known:
+            axes.plot([point.error or 0.0], [point.seconds.median], **line | BOUND_MARKER, zorder=4)
     return Line2D([], [], **line, label=label)
 
 
@@ -171,8 +163,6 @@ def _marker_legend(study: Study) -> Iterator[Line2D]:
     yield Line2D([], [], **TOLERANCE_LINE, label="tolerance")
     if study.best_stepping is not None:
         yield Line2D([], [], **RECOMMENDED_MARKER | {"ms": 8}, label="recommended")
-    if any(point.known and is_mostly_rounding(point) for point in study.stepping):
-        yield Line2D([], [], **LEGEND_MARKER | ROUNDING_MARKER, label="mostly rounding")
     if any(_drawable(point.error) and not point.known for point in study.stepping):
         yield Line2D([], [], **LEGEND_MARKER | BOUND_MARKER, label="at most this error")
     if any(point.error is None for point in study.stepping):
