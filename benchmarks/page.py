@@ -26,7 +26,7 @@ TEMPLATE = ROOT / "docs" / "performance.template"
 NOT_MEASURED = "(not measured yet)"
 
 # Whose versions the page names, where they are installed.
-PACKAGES = ("numba", "jax", "warp-lang", "opencv-python-headless", "moderngl", "vtk", "scikit-image")
+PACKAGES = ("numba", "jax", "opencv-python-headless", "moderngl", "vtk", "scikit-image")
 
 Results = dict[str, Any]
 Entry = dict[str, Any]
