@@ -241,9 +241,10 @@ def test_a_scene_that_is_all_right_has_no_notes(message: Messages) -> None:
 @pytest.mark.parametrize("error", [0.015, 0.04, 2000.0])
 def test_points_are_advised_where_they_can_help(error: float, message: Messages) -> None:
     steps = TimeStepEstimate(40, error, 0.0, error, 2)
-    for more in ({}, {"affords": lambda plan: False}):
-        message(notes_of(scene(), MOVED, None, mesh=MeshEstimate(error), **more)[-1], "for a smaller error of the mesh")
-        message(notes_of(scene(), MOVED, steps, **more)[1], "for a smaller error of the time step, ")
+    for affords in (lambda plan: True, lambda plan: False):
+        of_mesh = notes_of(scene(), MOVED, None, MeshEstimate(error), affords)
+        message(of_mesh[-1], "for a smaller error of the mesh")
+        message(notes_of(scene(), MOVED, steps, affords=affords)[1], "for a smaller error of the time step, ")
 
 
 def test_positions_written_in_f32_have_the_digits_of_the_sheet(device: Device) -> None:
