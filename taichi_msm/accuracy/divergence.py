@@ -12,7 +12,7 @@ from taichi_msm.accuracy.contact_warnings import first_piercing_probe
 from taichi_msm.errors import Pause
 from taichi_msm.model.loads import LoadBounds
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.sheet import axes, spacing
+from taichi_msm.model.sheet import axes
 from taichi_msm.model.surface import to_positions
 from taichi_msm.model.tool_force import control_points, probe_force
 from taichi_msm.solver.dynamics import ForceRecorder
@@ -88,7 +88,6 @@ class DivergenceMonitor:
         self._oscillation = ENERGY_OSCILLATION / max(1e-9, 1 - (plan.grid.step / plan.stable_step) ** 2)
         self._relaxing = sum(share for share, _ in material.relaxation)
         self._oscillation /= 1 - self._relaxing
-        self._underflow = _underflow_energy(plan)
         # Stiffness of virtual springs that are active after the last load, too [N/m].
         lasting = material.always_active and material.virtual > 0
         self._lasting_stiffness = material.virtual * point_shares(plan) if lasting else np.zeros((1, 1))
@@ -183,7 +182,7 @@ class DivergenceMonitor:
             root = math.sqrt(root * root + virtual * reach * reach)
             reach += (end - begin) * root * math.sqrt(2 / mass)
         # Rounding may add 1e-9 of the largest energy so far.
-        return self._oscillation * root * root + 1e-9 * progress.peak + self._underflow
+        return self._oscillation * root * root + 1e-9 * progress.peak
 
 
 def format_message(time: float, step: int, fault: str, *, exact: bool) -> str:
@@ -206,16 +205,6 @@ def _tool_energy_bound(plan: Plan) -> float:
         distance, speed = tool.path_length + tool.radius, tool.max_stride(step)[0] / step
         energy += (stiffness * distance * distance + material.mass * speed * speed) / 2
     return plan.fixed.size * energy
-
-
-def _underflow_energy(plan: Plan) -> float:
-    """Return the energy below which its squared terms may underflow [J]."""
-    tiny = float(np.finfo(np.float32 if plan.grid.precision == "f32" else np.float64).tiny)
-    (dx, dy), material = spacing(plan.scene.sheet), plan.material
-    inertia = material.mass / plan.grid.step**2
-    # The sums contain squares with and without a factor of stiffness.
-    springs = max(1.0, sum(term.stiffness_bound(material, plan.scene.sheet) for term in TERMS)) * (dx**2 + dy**2)
-    return math.prod(plan.scene.sheet.points) * tiny * (inertia + springs)
 
 
 def _release_time(plan: Plan) -> float:
