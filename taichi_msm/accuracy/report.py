@@ -28,7 +28,6 @@ from taichi_msm.accuracy.time_step import TimeStepCompanion, TimeStepEstimate, c
 from taichi_msm.errors import Pause, ProgressCallback
 from taichi_msm.model import tool_force
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.sheet import has_fixed_border, held_points
 from taichi_msm.model.tool_force import ProbeRecord
 from taichi_msm.model.tools import COARSE_TIP_PHRASE, MAX_REFINEMENT, Clamp, path_warnings
 from taichi_msm.scene.section import MAX_POINTS
@@ -348,11 +347,6 @@ def _step_remedy(plan: Plan, estimate: TimeStepEstimate, affords: Callable[[Plan
     remedies = []
     if estimate.rounding > REMEDY_THRESHOLD / 2:
         remedies.append("time.precision: f64")
-        if max(plan.material.across, plan.material.down, plan.material.shear) > 0:
-            is_closed = has_fixed_border(held_points(plan.scene, plan.fixed))
-            of_tissue = "tissue.pretension or bending" if is_closed else "tissue.foundation"
-            support = "springs.virtual" if plan.scene.tissue is None else of_tissue
-            remedies.append(f"more {support}, where the sheet buckles")
     if estimate.in_f64 > REMEDY_THRESHOLD / 2:
         steps = plan.grid.steps_per_frame * (estimate.in_f64 / (REMEDY_THRESHOLD / 2)) ** (1 / estimate.order)
         finer = replace(plan.grid, steps_per_frame=math.ceil(steps))
