@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from benchmarks import child, dop853, page, process, race
-from benchmarks.drawing.measure import psnr
 from benchmarks.stepping import PEERS, measure, numpy_
 from benchmarks.stepping.problem import Array, Problem
 from taichi_msm import load_scene
@@ -113,12 +112,6 @@ def test_the_page_shows_times_and_words(message: Messages) -> None:
     rows = [" ".join(line.split()) for line in text.splitlines() if line.startswith("| ") and "--" not in line]
     message(rows, "taichi_msm", "Numba", hide="[^|]*(?=: time)")
     assert page.NOT_MEASURED in " ".join(text.split())
-
-
-def test_psnr_of_a_step_of_grey() -> None:
-    picture = np.zeros((4, 4, 3), np.uint8)
-    assert psnr(picture, picture) == np.inf
-    assert psnr(picture + np.uint8(1), picture) == pytest.approx(48.13, abs=0.01)
 
 
 @pytest.mark.slow
