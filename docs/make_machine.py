@@ -22,7 +22,7 @@ import numpy as np
 
 from taichi_msm import FitResult, SceneError, Simulation, fit, load_scene
 from taichi_msm.fitting.machine_tables import read_machine_test
-from taichi_msm.fitting.table_grids import read_workbook
+from taichi_msm.fitting.tables import read_workbook
 from taichi_msm.plot_style import BLUE, DPI, STYLE, VERMILION
 
 DOCS = Path(__file__).parent

@@ -456,7 +456,7 @@ def put(cell: str, value: object) -> Callable[[Any], None]:
 
 SHEET_FAULTS: dict[str, tuple[list[list[Any]], Callable[[Any], object], list[str]]] = {
     "empty sheet": ([], lambda book: None, ["FF2", "empty"]),
-    "chart sheet": ([], leave_chart_sheet, ["Chart"]),
+    "chart sheet": ([], leave_chart_sheet, ["none"]),
     "several sheets without a table": ([], lambda book: book.create_sheet("FF3"), ["FF2, FF3"]),
     "merged names": (SHEET, lambda book: book["FF2"].merge_cells("B2:C2"), ["FF2!B2", "merged"]),
     "names merged with an unnamed column": (SHEET, lambda book: book["FF2"].merge_cells("C2:D2"), ["FF2!C2", "merged"]),
