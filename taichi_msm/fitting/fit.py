@@ -20,7 +20,7 @@ from taichi_msm.errors import SceneError, StageProgressCallback, writing
 from taichi_msm.fitting import rejection
 from taichi_msm.fitting import result as result_module
 from taichi_msm.fitting.archive import read_observations
-from taichi_msm.fitting.checks import faults, faults_at_solution, faults_at_start, unit_faults
+from taichi_msm.fitting.checks import faults, faults_at_start, opposed, unit_faults
 from taichi_msm.fitting.force_table import read_forces
 from taichi_msm.fitting.least_squares import (
     MAX_RELATIVE_ERROR,
@@ -215,7 +215,9 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
         if machine:
             search.remember(start, first)
         solution = search.best(start)
-    if found := list(faults_at_solution(observations, scene, first, solution.predicted)):
+    # Signs and units that contradict both the initial and the fitted scene.
+    both = first, solution.predicted
+    if found := [*opposed(observations, scene, *both), *unit_faults(observations, *both)]:
         raise SceneError(found)
     uncertainties = uncertainty(misfit, solution, search.jacobian(solution), error_correlation)
     if isinstance(runs, CurveRuns):

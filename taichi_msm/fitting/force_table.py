@@ -41,15 +41,15 @@ def read_forces(path: str | Path, sigma: float, probes: int) -> ToolForces:
         found = [{*re.findall(r"\w+", " ".join(row).lower())} & {*COLUMNS} for row in grid.rows]
         missing = [key for key in COLUMNS if key not in max(found, key=len)]
         raise SceneError([f"{name}: no row names {', '.join(missing)}; {EXPECTED}"])
-    names, units = zip(*_titles(grid.rows[header]), strict=True)
+    names, units = map(list, zip(*_titles(grid.rows[header]), strict=True))
     if repeated := [key for key in COLUMNS if names.count(key) > 1]:
         fault = f"{repeated[0]}: {names.count(repeated[0])} columns of this name; leave one"
         raise SceneError([f"{grid.place(header)}: {fault}"])
     columns = [names.index(key) for key in COLUMNS]
     _require_units(grid.place(header), [units[column] for column in columns])
     rows = [n for n in range(header + 1, len(grid.rows)) if grid.has_content(n)]
-    first = grid.rows[rows[0]] if rows else []
-    units = [first[column].strip("[]() ") if column < len(first) else "" for column in columns]
+    below = grid.rows[rows[0]] if rows else []
+    units = [below[column].strip("[]() ") if column < len(below) else "" for column in columns]
     if units[0].isalpha() and units[0].lower() != "nan":
         _require_units(grid.place(rows.pop(0)), units)
     for n in rows:
@@ -67,9 +67,8 @@ def read_forces(path: str | Path, sigma: float, probes: int) -> ToolForces:
         raise SceneError([f"{name}: {fault}; {EXPECTED}, and numbers in them"])
     if unknown := [index for index in probe.tolist() if index not in range(probes)]:
         raise SceneError([f"{name}: probe: {unknown[0]:g}; the scene has {probes}, numbered from 0"])
-    _, first = np.unique(table[:, :2], axis=0, return_index=True)
-    if len(repeated := np.setdiff1d(np.arange(len(rows)), first)):
-        n = repeated[0]
+    _, kept = np.unique(table[:, :2], axis=0, return_index=True)
+    for n in set(range(len(rows))) - set(kept.tolist()):
         raise SceneError([f"{grid.place(rows[n])}: a second row of {time[n]:g} s and probe {probe[n]:g}; leave one"])
     return ToolForces(name, time, force, sigma, probe.astype(np.intp))
 

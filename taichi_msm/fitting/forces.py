@@ -9,17 +9,13 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.fitting import conventions
-from taichi_msm.fitting.observation import (
-    MAX_RESIDUAL_SHARE,
-    MAX_RESIDUAL_SIGMAS,
-    Array,
-    Observation,
-    ObservationModel,
-    time_weights,
-)
+from taichi_msm.fitting import observation
+from taichi_msm.fitting.observation import Array, Observation, ObservationModel
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
+
+# Units of force per newton, and the largest deviation of a ratio from them, as a factor.
+UNITS_PER_NEWTON, MAX_UNIT_FACTOR = {"mN": 1000.0, "gf": 101.97, "kN": 0.001}, 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,14 +26,16 @@ class Forces(Observation):
     unit: ClassVar[str] = "N"
     is_independent: ClassVar[bool] = True
 
+    sigma: float | Array
+
     def signal(self, scene: Scene) -> float:
         """Return the root mean square of the forces."""
         return float(np.sqrt(np.nanmean(self.values**2)))
 
     def fits_well(self, residuals: Array, deviation: float, signal: float) -> bool:
-        """Return whether the residuals are small, in sigma or as a share of the forces; see `Observation.fits_well`."""
-        assert self.sigma is not None
-        limit = max((MAX_RESIDUAL_SHARE * signal) ** 2, MAX_RESIDUAL_SIGMAS**2 * np.mean(np.square(self.sigma)))
+        """Return whether the residuals are small, in sigma or as a share of the forces."""
+        limit = (observation.MAX_RESIDUAL_SHARE * signal) ** 2
+        limit = max(limit, observation.MAX_RESIDUAL_SIGMAS**2 * np.mean(np.square(self.sigma)))
         return float(np.mean(residuals**2)) <= limit
 
     def summary(self, residuals: Array, sigma: float | Array) -> dict[str, Any]:
@@ -55,7 +53,7 @@ class ForceModel(ObservationModel):
     """Map from a run to the forces of its tools at the measured times."""
 
     def __init__(self, scene: Scene, observed: ToolForces, frames: int) -> None:
-        self._probe, self._shares = observed.probe, time_weights(scene, observed.time, frames)
+        self._probe, self._shares = observed.probe, observation.time_weights(scene, observed.time, frames)
 
     def record(self, simulation: Simulation) -> Array:
         """Return the force of every probe in the current frame [N], shape (probes, 3)."""
@@ -79,14 +77,26 @@ class ToolForces(Forces):
 
     def opposed(self, scene: Scene, *predictions: Array) -> Iterator[str]:
         """Yield components that all predictions have with the other sign."""
-        for axis in conventions.opposed_axes(self.values, predictions, self.sigma):
+        for axis in observation.opposed_axes(self.values, predictions, self.sigma):
             fault = "is it the force on the tool? give the force on the sheet, of the other sign"
             yield f"{self.name}: force_{'xyz'[axis]}: acts against the scene's; {fault}"
 
     def unit_faults(self, *predictions: Array) -> Iterator[str]:
         """Yield the unit of force that explains the ratio of measured to predicted forces, for all predictions."""
-        if found := conventions.unit_of_force(self.values, predictions, self.sigma):
-            unit, per_newton, ratio = found
-            fault = f"{ratio:.3g} times those of the scene where the search begins; are they in {unit}?"
-            remedy = f"divide them by {per_newton:g}" if per_newton > 1 else f"multiply them by {1 / per_newton:g}"
-            yield f"{self.name}: forces: {fault} {remedy}, or start nearer by --set"
+        ratios = [self._ratio(predicted) for predicted in predictions]
+        for unit, per_newton in UNITS_PER_NEWTON.items():
+            if all(1 / MAX_UNIT_FACTOR < ratio / per_newton < MAX_UNIT_FACTOR for ratio in ratios):
+                fault = f"{ratios[0]:.3g} times those of the scene where the search begins; are they in {unit}?"
+                remedy = f"divide them by {per_newton:g}" if per_newton > 1 else f"multiply them by {1 / per_newton:g}"
+                yield f"{self.name}: forces: {fault} {remedy}, or start nearer by --set"
+                return
+
+    def _ratio(self, predictions: Array) -> float:
+        """Return the ratio of measured to predicted forces; 0: insignificant, or not parallel."""
+        measured, predicted = self.values[self.known], predictions[self.known]
+        lengths = float(np.linalg.norm(measured)), float(np.linalg.norm(predicted))
+        is_small = max(lengths) < observation.MIN_SIGMAS * self.sigma * np.sqrt(len(measured))
+        if len(measured) < observation.MIN_COUNT or is_small:
+            return 0.0
+        is_parallel = measured @ predicted > -observation.MAX_COSINE * lengths[0] * lengths[1] > 0
+        return lengths[0] / lengths[1] if is_parallel else 0.0

@@ -227,7 +227,7 @@ def _faults(observations: PointObservation, scene: Scene, settings: MapSettings)
 
 def _initial_points(position: Array, model: PointModel, observations: PointObservation, scene: Scene) -> Array:
     """Return the observed points in the initial run [m], shape (N, T, 3); SceneError: implausible observations."""
-    at_frames = np.array([model.points_on_sheet(frame) for frame in position])
+    at_frames = model.on_sheet(position)
     points = model.interpolate(at_frames)
     prediction = Prediction((model.observe(points),), 0, model.motion(at_frames))
     if invalid := list(faults_at_start([observations], scene, prediction)):
