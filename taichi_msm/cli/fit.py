@@ -80,7 +80,7 @@ def fit(
     OBSERVED: positions or pixels of points, an .npz; or one or more tables of a testing machine, .csv, .tsv, .txt or
     .xlsx, with time, depth and force.
     """
-    from taichi_msm.fitting.machine_fit import is_table
+    from taichi_msm.fitting.machine_model import is_table
     from taichi_msm.load.scene_file import load_scene
 
     # Both options accept several words, of which click assigns all but the first to `more`; so does OBSERVED.

@@ -35,15 +35,8 @@ from taichi_msm.fitting.least_squares import (
     unseen,
 )
 from taichi_msm.fitting.machine_curve import CurveRuns, has_curve, search_by_curve
-from taichi_msm.fitting.machine_fit import (
-    TABLE_OPTIONS,
-    explanations,
-    fitted_tests,
-    read_machine_problem,
-    table_paths,
-    unknown_notes,
-)
-from taichi_msm.fitting.machine_model import MachineProblem
+from taichi_msm.fitting.machine_fit import explanations, fitted_tests, unknown_notes
+from taichi_msm.fitting.machine_model import TABLE_OPTIONS, MachineProblem, read_machine_problem, table_paths
 from taichi_msm.fitting.observation import ErrorCorrelation, Observation
 from taichi_msm.fitting.parameters import (
     Bounds,
@@ -273,7 +266,7 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
         ],
         scene=Scene(**runs.job.fitted_data(as_data(scene), fitted_values)),
         other_scenes=[
-            Scene(**machine.place(as_data(scene), fitted_values, n))
+            Scene(**machine.fitted_data(as_data(scene), fitted_values, n))
             for n in range(1, len(tests))
             if machine is not None
         ],

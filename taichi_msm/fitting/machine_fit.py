@@ -1,31 +1,17 @@
-"""Fit of machine tests: options, tables, and explanations of a rejected model."""
+"""Fitted machine tests, and explanations of a rejected model."""
 
 from __future__ import annotations
 
-import secrets
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from taichi_msm.errors import SceneError
-from taichi_msm.fitting.machine_model import MachineProblem, contact_keys, machine_parameters, observe_tests
-from taichi_msm.fitting.machine_tables import cut_window, read_machine_test
-from taichi_msm.fitting.machine_test import Loading, build_loading, find_approach, late_contact_note
-from taichi_msm.fitting.parameters import Bounds, Method, as_data, rounded
-from taichi_msm.fitting.predict import without_outputs
-from taichi_msm.scene.scene import Scene
-
-Array = NDArray[np.float64]
-
-TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".xlsx")
-TABLE_OPTIONS = ("columns", "sheet", "block", "window", "rate", "contact")
-
-# Options of observed points.
-POINT_OPTIONS = ("sigma", "correlation", "drift", "resolution")
+from taichi_msm.fitting.machine_model import MachineProblem
+from taichi_msm.fitting.machine_test import Loading
+from taichi_msm.fitting.observation import Array
+from taichi_msm.fitting.parameters import rounded
 
 # The tool is held while the depth differs by at most this share of the travel.
 HELD_SHARE = 0.02
@@ -58,91 +44,22 @@ class FittedTest:
     def as_json(self) -> dict[str, Any]:
         """Return JSON data, as in fit.json."""
         loading = self.loading
-        numbers = {"contact": self.contact, "noise": loading.noise, "peak": loading.peak}
         return {
             "name": loading.test.name,
-            **numbers,
+            "contact": self.contact,
+            "noise": loading.noise,
+            "peak": loading.peak,
             "residual_force": self.residual,
             "frames": len(loading.force),
         }
 
 
-def is_table(path: object) -> bool:
-    """Return whether a path is that of a table of a testing machine, by its suffix."""
-    return isinstance(path, (str, Path)) and str(path).lower().endswith(TABLE_SUFFIXES)
-
-
-def table_paths(observed: Any) -> list[str]:
-    """Return the paths of tables; an empty list for other observations; SceneError: both are given."""
-    paths = [observed] if isinstance(observed, (str, Path)) or not isinstance(observed, Sequence) else list(observed)
-    others = [path for path in paths if not is_table(path)]
-    if len(others) == len(paths) == 1:
-        return []
-    if others or not paths:
-        fault = "of several files, each must be a table of a testing machine"
-        raise SceneError([f"{others[0] if others else 'observed'}: {fault}, {', '.join(TABLE_SUFFIXES)}"])
-    return [str(path) for path in paths]
-
-
-def read_machine_problem(
-    paths: Sequence[str],
-    scene: Scene,
-    free: Sequence[str],
-    bounds: Mapping[str, Bounds],
-    forces: object,
-    method: Method,
-) -> MachineProblem:
-    """Read tables of a testing machine, and build the fit.
-
-    Args:
-        paths: the tables.
-        scene: the scene with its initial values.
-        free: keys of the parameters.
-        bounds: smallest and largest values by key.
-        forces: forces of another file, which are refused.
-        method: options of the fit.
-
-    Raises:
-        SceneError: when a table, the scene or an option is invalid.
-    """
-    if forces is not None:
-        raise SceneError([f"--forces: {paths[0]} has the forces; leave the option out"])
-    if unused := [name for name in POINT_OPTIONS if method.get(name) is not None]:
-        raise SceneError([f"--{unused[0]}: is of observed points, and {paths[0]} has none; leave the option out"])
-    rate, contacts = method.get("rate"), list(method.get("contact") or ())
-    if rate is not None and not 0 < rate < np.inf:
-        raise SceneError([f"--rate {rate:g}: take a number of frames per second, above 0"])
-    if len(contacts) not in (0, 1, len(paths)):
-        raise SceneError([f"--contact: {len(contacts)} depths of {len(paths)} tables; give one, or one per table"])
-    approach = find_approach(scene)
-    tests = []
-    for n, path in enumerate(paths):
-        test = read_machine_test(path, method.get("columns") or (), method.get("sheet"), method.get("block"))
-        if (window := method.get("window")) is not None:
-            test = cut_window(test, *window)
-        contact = contacts[n if len(contacts) > 1 else 0] if contacts else None
-        loading = build_loading(test, scene, rate, contact, is_clamp=approach.is_clamp)
-        key = contact_keys(len(paths))[n]
-        is_found = contact is None and not approach.is_clamp and key not in free
-        if is_found and (note := late_contact_note(loading, key)):
-            loading = replace(loading, test=replace(loading.test, notes=(*loading.test.notes, note)))
-        tests.append(loading)
-    parameters = machine_parameters(scene, tests, free, bounds, approach.probe)
-    placed = Scene(**tests[0].place(as_data(without_outputs(scene)), approach))
-    observations = observe_tests(tests, approach)
-    if (count := sum(len(loading.force) for loading in tests)) <= len(parameters):
-        fault = f"{count} frames, too few for {len(parameters)} parameters; raise --rate"
-        raise SceneError([f"{observations.name}: {fault}"])
-    return MachineProblem(secrets.token_hex(8), placed, parameters, (observations,), tuple(tests), approach)
-
-
 def fitted_tests(job: MachineProblem, values: Mapping[str, float], forces: Array) -> tuple[FittedTest, ...]:
     """Split fitted forces, shape (frames of all tests, 1), by test; `values`: fitted values by key."""
     ends = np.cumsum([len(loading.force) for loading in job.tests])[:-1]
-    keys = contact_keys(len(job.tests))
     return tuple(
         FittedTest(loading, values.get(key, loading.contact), force)
-        for loading, key, force in zip(job.tests, keys, np.split(forces[:, 0], ends), strict=True)
+        for loading, key, force in zip(job.tests, job.contact_keys, np.split(forces[:, 0], ends), strict=True)
     )
 
 
@@ -177,8 +94,7 @@ def explanations(tests: Sequence[FittedTest], *, fits_contact: bool) -> Iterator
         fits_contact: whether the depths of contact are parameters.
     """
     for fitted in tests:
-        for reason in _explain(fitted, fits_contact=fits_contact):
-            yield f"{fitted.loading.test.name}: {reason}"
+        yield from (f"{fitted.loading.test.name}: {reason}" for reason in _explain(fitted, fits_contact=fits_contact))
 
 
 def _explain(fitted: FittedTest, *, fits_contact: bool) -> Iterator[str]:

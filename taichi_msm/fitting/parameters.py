@@ -183,15 +183,15 @@ def as_data(scene: Scene) -> dict[str, Any]:
     return scene.model_dump(mode="json", exclude_none=True)
 
 
-def with_values(data: dict[str, Any], parameters: Sequence[Parameter], values: Sequence[float]) -> dict[str, Any]:
-    """Return a copy of a scene's data with the values of parameters."""
+def with_values(data: dict[str, Any], parameters: Sequence[Parameter], values: Mapping[str, float]) -> dict[str, Any]:
+    """Return a copy of a scene's data with the values of parameters, by key."""
     changed = deepcopy(data)
-    for parameter, value in zip(parameters, values, strict=True):
+    for parameter in parameters:
         container: Any = changed
         for part in parameter.path[:-1]:
             container = container[part if isinstance(container, list) else str(part)]
         last = parameter.path[-1]
-        container[last if isinstance(container, list) else str(last)] = value
+        container[last if isinstance(container, list) else str(last)] = values[parameter.key]
     return changed
 
 

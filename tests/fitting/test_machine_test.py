@@ -213,10 +213,10 @@ def test_a_tool_starts_where_it_touches_the_sheet(shaft: list[float], tip: str) 
     if tip == "radius":
         assert approach.start[2] == pytest.approx(RADIUS, rel=1e-8)
     np.testing.assert_allclose(approach.direction, np.array([0.004, 0.002, -0.006]) / np.sqrt(56e-6), rtol=1e-9)
-    path = approach.keyframes(np.array([0.0, 1.0]), np.array([0.0, 1e-3]))
+    data = approach.place(data, np.array([0.0, 1e-3]), rate=1.0)
+    path = data["probes"][0]["path"]
     # The gap of a tilted plate is approximate, but the scene is not refused.
     assert path[0][3] == pytest.approx(0, abs=1e-8 if tip == "radius" else 5e-6)
-    data["probes"][0]["path"] = path
     check_scene(data)
     lengths = (np.array(path[1][1:]) - path[0][1:]) * [0.02, 0.02, 1]
     assert np.linalg.norm(lengths) == pytest.approx(1e-3)
