@@ -60,8 +60,9 @@ STIFFNESSES = ("young", "foundation", "structural")
 
 def has_curve(job: object) -> bool:
     """Return whether the tests of a fit are quasi-static, and of a scene with one tool, which grips nothing."""
-    is_rest = isinstance(job, MachineProblem) and job.scene.time.at_rest
-    return is_rest and len(job.scene.probes) == 1 and not job.scene.probes[0].grip
+    if not isinstance(job, MachineProblem):
+        return False
+    return job.scene.time.at_rest and len(job.scene.probes) == 1 and not job.scene.probes[0].grip
 
 
 def relax(elastic: Array, branches: Sequence[tuple[float, float]], h: float) -> Array:
