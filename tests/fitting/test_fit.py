@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import io
 import json
-import os
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from taichi_msm.model.surface import surface_positions
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
+from tests.fitting.conftest import with_keys
 from tests.golden import Messages
 
 Array = NDArray[np.float64]
@@ -57,15 +58,8 @@ PLACES = np.stack([axis.ravel() for axis in np.meshgrid(GRID, GRID)], axis=1)
 
 
 def changed(**keys: Any) -> Scene:
-    """The truth with other values, by their dotted paths with __ for the dots."""
-    data = json.loads(json.dumps(TRUTH))
-    for key, value in keys.items():
-        *sections, name = key.split("__")
-        holder = data
-        for section in sections:
-            holder = holder[int(section) if section.isdigit() else section]
-        holder[name] = value
-    return Scene.model_validate(data)
+    """The truth with other values."""
+    return Scene.model_validate(with_keys(TRUTH, **keys))
 
 
 def positions_in(made: Scene, device: Device) -> Array:
@@ -243,19 +237,23 @@ def test_a_number_that_can_change_to_one_side_only_is_found(tracks: dict[str, Ar
     assert values(found) == pytest.approx([0.2], abs=1e-4)
 
 
-def test_what_a_mask_hides_is_not_seen(tracks: dict[str, Array]) -> None:
-    pixel = np.ma.masked_equal(tracks["pixel"].copy(), 5000)
-    pixel[3] = np.ma.masked
-    seen = read_observations({**tracks, "pixel": pixel}, 25)
-    np.testing.assert_array_equal(np.flatnonzero(~seen.is_observed.any(axis=1)), [3])
-
-
-def test_an_occluded_track_is_not_used() -> None:
+def test_an_occluded_track_is_not_used(tracks: dict[str, Array], message: Messages) -> None:
     points, occluded = np.zeros((2, 3, 2), np.float32), np.zeros((2, 3), np.bool_)
     occluded[1, 2] = True
     seen = read_observations({"coordinates": [[0.5, 0.5], [0.2, 0.7]], "points": points, "occluded": occluded}, 25)
     assert seen.time.tolist() == [0, 0.04, 0.08]
     assert (seen.is_observed != occluded).all()
+    # Nor one that is masked, or not visible.
+    visible = np.random.default_rng(0).random(tracks["pixel"].shape[:2]) < 0.5
+    masked = np.ma.masked_array(tracks["pixel"], np.repeat(~visible[..., None], 2, axis=2))
+    for seen in (
+        read_observations({**tracks, "pixel": masked}, 25),
+        read_observations(tracks | {"visible": visible}, 25),
+    ):
+        np.testing.assert_array_equal(seen.is_observed, visible)
+    for name, array in (("visible", 0.9 * visible), ("validity", visible)):
+        with message.raises(SceneError, name):
+            read_observations({**tracks, name: array}, 25)
 
 
 def test_a_number_that_nothing_shows_is_not_identifiable(motion: Array) -> None:
@@ -310,12 +308,11 @@ def test_a_robust_fit_of_good_tracks_is_nearly_the_same(tracks: dict[str, Array]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("robust", [False, True])
-def test_tracks_that_are_far_apart_for_their_errors_are_independent(tracks: dict[str, Array], robust: bool) -> None:
+def test_tracks_that_are_far_apart_for_their_errors_are_independent(tracks: dict[str, Array]) -> None:
     errors = []
     for correlation in (None, 1e-6):
         given, free = noisy(tracks, 0.1, sigma=0.1), ["tissue.young", "tissue.foundation"]
-        found = fit(changed(), given, free, robust=robust, correlation=correlation, workers=1)
+        found = fit(changed(), given, free, robust=True, correlation=correlation, workers=1)
         errors.append([one.standard_error for one in found.parameters.values()])
     np.testing.assert_allclose(errors[0], errors[1], rtol=1e-9)
 
@@ -470,19 +467,6 @@ def test_motion_of_many_tracks_is_seen_though_it_is_smaller_than_their_errors(tr
         assert bool(list(faults([seen], changed(), 1))) != moving
 
 
-def test_values_that_make_no_scene_give_no_run(device: Device, tracks: dict[str, Array]) -> None:
-    scene = changed(tissue__damping=0)
-    free = ["tissue.damping", "tissue.young"]
-    parameters = make_parameters(scene, free, {"tissue.damping": (-100, 100)})
-    job = FitProblem("token", without_outputs(scene), parameters, (read_observations(tracks, 25),))
-    predictor = ForwardModel(job, device.threads)
-    # Less than no damping; springs without length, as a tenth of young does not bear the pretension.
-    assert predictor.try_predict(np.array([-0.1, 0.0])) is None
-    assert predictor.try_predict(np.array([0.0, -np.log(10)])) is None
-    assert predictor.try_predict(np.array([0.0, 0.0])) is not None
-    predictor.close()
-
-
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -513,9 +497,18 @@ def test_wrong_arguments_are_answered_in_a_line(
     assert not (small / "output").exists()
 
 
-@pytest.mark.parametrize("text", [b"", b"nothing", b"PK\x05\x06" + bytes(18)], ids=["empty", "text", "no arrays"])
-def test_a_file_that_is_none_is_refused(tmp_path: Path, text: bytes, message: Messages) -> None:
-    (tmp_path / "seen.npz").write_bytes(text)
+def saved(array: Array) -> bytes:
+    file = io.BytesIO()
+    np.save(file, array)
+    return file.getvalue()
+
+
+FILES = {"empty": b"", "text": b"nothing", "no arrays": b"PK\x05\x06" + bytes(18), "single array": saved(np.ones(3))}
+
+
+@pytest.mark.parametrize("case", FILES)
+def test_a_file_that_is_none_is_refused(tmp_path: Path, case: str, message: Messages) -> None:
+    (tmp_path / "seen.npz").write_bytes(FILES[case])
     with message.raises(SceneError, "seen.npz: "):
         fit(changed(), tmp_path / "seen.npz", ["tissue.young"])
 
@@ -525,18 +518,14 @@ UNREADABLE: dict[str, str | bytes] = {
     "empty": "",
     "no row": FORCES,
     "no force": f"{FORCES}0.1,0,,,\n",
-    "only empty cells": f"{FORCES},,,,\n",
     "no time": f"{FORCES},0,0,0,1\n",
     "no force_z": "time,probe,force_x,force_y\n0,0,0,0\n",
-    "unit in a cell": f"{ZEROS}0.1,0,0,0,-0.5 N\n",
     "word": f"{ZEROS}0.1,0,n/a,0,0\n",
-    "infinite": f"{ZEROS}0.1,0,0,inf,0\n",
     "huge": f"{ZEROS}0.1,0,0,1e308,0\n",
     "twice": f"{ZEROS}0,0,0,0,1\n",
     "decimal commas": f"{ZEROS}0,1,0,0,0,0,0,-0,5\n",
     # A German -1.234 is a thousand times as much.
     "both decimal marks": FORCES.replace(",", ";") + "0,2;0;0;0;-1.234\n",
-    "workbook": b"PK\x03\x04",
     "millinewtons": f"{FORCES}s,-,mN,mN,mN\n0,0,0,0,1\n",
     "column twice": f"{FORCES.strip()},force_z [N]\n0,0,0,0,1,2\n",
 }
@@ -553,40 +542,18 @@ def test_a_table_of_forces_that_cannot_be_read_is_refused(tmp_path: Path, case: 
 @pytest.mark.parametrize(
     "data",
     [
-        ("\ufeff" + FORCES + "0.1,0,,nan,-0.5\n").encode(),
-        (FORCES + "0.1,0,,,-0.5\n").encode("utf-16"),
-        FORCES.encode() + b'"0,1",0,,,"-0,5"\n',
-        (FORCES + "0.1,0,,,\u22120.5\n").encode(),
         b'# a rig\n"time","probe","force_x","force_y","force_z"\ns,-,N,N,N\n# it begins\n"0.1","0","","","-0.5"\n',
         b"time [s];probe;force_x [N];force_y [N];force_z [N]\n0,1;0;;;-0,5\n",
         b"# time,probe,force_x,force_y,force_z\n0.1,0,,,-0.5\n",
         b"sep=;\nA rig; of a lab\nTime;Probe;Force_X;Force_Y;Force_Z\n[s];[-];[N];[N];[N]\n0,1;0;;;-0,5\n% end\n;;;;\n",
     ],
-    ids=[
-        "mark",
-        "utf-16",
-        "quoted decimal commas",
-        "minus",
-        "quotes, units, comments",
-        "decimal commas",
-        "commented header",
-        "titles",
-    ],
+    ids=["quotes, units, comments", "decimal commas", "commented header", "titles"],
 )
 def test_tables_of_other_programs_are_understood(tmp_path: Path, data: bytes) -> None:
     (tmp_path / "forces.csv").write_bytes(data)
     read = read_forces(tmp_path / "forces.csv", 0.1, 1)
     assert (read.time.tolist(), read.probe.tolist()) == ([0.1], [0])
     np.testing.assert_array_equal(read.values, [[np.nan, np.nan, -0.5]])
-
-
-def test_forces_of_a_pipe_or_a_huge_file_are_refused(tmp_path: Path, message: Messages) -> None:
-    os.mkfifo(tmp_path / "pipe")
-    with (tmp_path / "huge").open("wb") as file:
-        file.truncate(20 * 10**9)
-    for name in ("pipe", "huge"):
-        with message.raises(SceneError, name):
-            read_forces(tmp_path / name, 0.1, 1)
 
 
 def test_arrays_that_are_not_needed_are_left_unread(
@@ -606,13 +573,11 @@ HEADER = b"\x93NUMPY\x01\x00"
     ("data", "method", "changes"),
     [
         (HEADER + bytes(200), zipfile.ZIP_DEFLATED, {38: 0xFF}),
-        (HEADER + bytes(200), zipfile.ZIP_LZMA, {48: 0xFF}),
         (HEADER + bytes(200), zipfile.ZIP_STORED, {6: 1, -22 - 54 + 8: 1}),
         (HEADER + b"\x04\x00((\n(", zipfile.ZIP_STORED, {}),
-        (b"raw", zipfile.ZIP_STORED, {}),
         (HEADER + b"\x40\x1f" + b"-" * 8000, zipfile.ZIP_STORED, {}),
     ],
-    ids=["deflate", "lzma", "encrypted", "tokens", "raw", "deep"],
+    ids=["deflate", "encrypted", "tokens", "deep"],
 )
 def test_an_array_that_cannot_be_read_is_named(
     tmp_path: Path, data: bytes, method: int, changes: dict[int, int], message: Messages
@@ -627,14 +592,6 @@ def test_an_array_that_cannot_be_read_is_named(
         read_observations(tmp_path / "seen.npz", 25)
     assert "\n" not in str(caught.value)
     assert "ZipInfo" not in str(caught.value)
-
-
-def test_what_is_visible_is_seen(tracks: dict[str, Array], message: Messages) -> None:
-    visible = np.random.default_rng(0).random(tracks["pixel"].shape[:2]) < 0.5
-    np.testing.assert_array_equal(read_observations({**tracks, "visible": visible}, 25).is_observed, visible)
-    for name, array in (("visible", 0.9 * visible), ("validity", visible)):
-        with message.raises(SceneError, name):
-            read_observations({**tracks, name: array}, 25)
 
 
 def test_conventions_of_other_programs_are_asked_about(tracks: dict[str, Array], message: Messages) -> None:
@@ -761,26 +718,14 @@ def test_a_number_of_a_named_camera_is_found(tracks: dict[str, Array]) -> None:
     np.testing.assert_allclose(values(found), [0], atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["seen.npy", "seen.npz"])
-def test_a_single_array_is_refused(tracks: dict[str, Array], tmp_path: Path, name: str, message: Messages) -> None:
-    np.save(tmp_path / "seen.npy", tracks["pixel"])
-    (tmp_path / "seen.npy").rename(tmp_path / name)
-    with message.raises(SceneError, name):
-        fit(changed(), tmp_path / name, ["tissue.young"])
-
-
 WRONG_TYPES: dict[str, dict[str, Any]] = {
     "free, text": {"free": "tissue.young"},
-    "free, numbers": {"free": [0]},
     "observed": {"observed": 5},
     "scene": {"scene": 5},
     "bounds, list": {"bounds": [("tissue.young", 1, 2)]},
-    "bounds, text": {"bounds": {"tissue.young": ("1", 2)}},
     "forces": {"forces": "forces.csv"},
-    "directory": {"directory": 5},
     "workers": {"workers": 0},
     "sigma": {"sigma": "0.5"},
-    "resolution": {"resolution": 4.0},
     "robust": {"robust": "yes"},
     "unknown": {"profiles": True},
 }
@@ -815,28 +760,16 @@ def test_tracks_that_drift_widen_the_intervals(tracks: dict[str, Array]) -> None
     assert 1.2 < widening < 11**0.5
 
 
-def test_a_scene_that_cannot_move_as_was_seen_is_rejected_first_of_all(
-    tracks: dict[str, Array], message: Messages
-) -> None:
-    """With another damping, and none that is free."""
-    seen = noisy(tracks, 0.05, sigma=0.05)
+@pytest.mark.parametrize("case", ["sigma", "no sigma", "two times"])
+def test_a_wrong_scene_is_rejected_first_of_all(tracks: dict[str, Array], case: str, message: Messages) -> None:
+    """By another damping; without sigma by the pattern of what is left, also at two times."""
+    seen = noisy(tracks, 0.05, sigma=0.05) if case == "sigma" else noisy(tracks, 0.02)
+    if case == "two times":
+        seen |= {"time": seen["time"][5:7], "pixel": seen["pixel"][:, 5:7]}
     wrong, right = (fit(changed(tissue__damping=g), seen, ["tissue.foundation"], workers=1) for g in (600, 200))
     assert (wrong.as_json()["model_rejected"], right.as_json()["model_rejected"]) == (True, False)
     message(wrong.summary()[0], "the model is rejected: ", hide=r"\d[\d.]*")
     assert "rejected" not in right.summary()[0]
-
-
-@pytest.mark.parametrize("few", [False, True])
-def test_a_wrong_scene_is_rejected_by_what_is_left_alone(
-    tracks: dict[str, Array], few: bool, message: Messages
-) -> None:
-    """By a wrong damping, also where two times tell nothing of time."""
-    seen = noisy(tracks, 0.02)
-    if few:
-        seen |= {"time": seen["time"][5:7], "pixel": seen["pixel"][:, 5:7]}
-    wrong = fit(changed(tissue__damping=600), seen, ["tissue.foundation"], workers=1)
-    message(wrong.summary()[0], "the model is rejected: ", hide=r"\d[\d.]*")
-    assert not fit(changed(), seen, ["tissue.foundation"], workers=1).model_rejected
 
 
 def test_what_is_far_off_counts_in_full_for_the_rejection_of_a_robust_fit(

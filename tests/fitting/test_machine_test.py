@@ -28,6 +28,7 @@ from taichi_msm.load.check import check_scene
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
+from tests.fitting.conftest import with_keys
 from tests.golden import Messages
 
 Array = NDArray[np.float64]
@@ -55,15 +56,7 @@ def scene(**tissue: Any) -> Scene:
 
 
 def changed(initial: Scene, **keys: Any) -> dict[str, Any]:
-    """The data of a scene with other values, by their dotted paths with __ for the dots."""
-    data = json.loads(initial.model_dump_json(exclude_none=True))
-    for key, value in keys.items():
-        *sections, name = key.split("__")
-        holder = data
-        for section in sections:
-            holder = holder[int(section) if section.isdigit() else section]
-        holder[name] = value
-    return data
+    return with_keys(initial.model_dump(mode="json", exclude_none=True), **keys)
 
 
 def ramp() -> tuple[Array, Array]:
@@ -112,18 +105,13 @@ def test_frames_are_means_of_the_rows_near_them_and_the_last_row_is_held() -> No
     np.testing.assert_allclose([loading.depth[0], loading.depth[-1]], [0.025, 2.25], atol=1e-12)
 
 
-def test_frames_between_few_rows_are_interpolated() -> None:
-    time = np.arange(0, 12.5, 0.5)
-    loading = build_loading(machine_test(time, time, np.maximum(time - 6, 0)), scene(relaxation=[BRANCH]), rate=4)
+def test_frames_between_few_rows_are_interpolated_and_200_unless_a_rate_is_given() -> None:
+    time, relaxing = np.arange(0, 12.5, 0.5), scene(relaxation=[BRANCH])
+    loading = build_loading(machine_test(time, time, np.maximum(time - 6, 0)), relaxing, rate=4)
     np.testing.assert_allclose(loading.depth, np.arange(49) / 4, atol=1e-12)
-
-
-def test_long_tests_have_200_frames_unless_a_rate_is_given() -> None:
     time = np.arange(0, 400.0, 0.5)
     test = machine_test(time, time, np.maximum(time - 100, 0))
-    relaxing = scene(relaxation=[BRANCH])
-    assert len(build_loading(test, relaxing).depth) == MAX_FRAMES + 1
-    assert len(build_loading(test, relaxing, rate=1).depth) == 401
+    assert [len(build_loading(test, relaxing, rate).depth) for rate in (None, 1)] == [MAX_FRAMES + 1, 401]
 
 
 def test_frames_without_relaxation_are_even_in_depth_up_to_the_deepest_row() -> None:
@@ -157,14 +145,9 @@ def test_contact_is_the_last_row_without_a_force_before_the_peak() -> None:
     falling = np.r_[50.0 - np.arange(10), np.arange(100, 200)]
     at_once = build_loading(machine_test(time[:110], time[:110], falling, 0.1), scene())
     assert at_once.contact == time[9]
-
-
-def test_a_contact_is_found_with_the_noise_of_the_table() -> None:
-    """Also where the noise is far below the accuracy of predicted forces."""
-    time = np.linspace(0, 10, 1001)
-    loading = build_loading(machine_test(time, time, np.maximum(time - 5, 0) ** 3, 1e-9), scene())
-    assert loading.noise == 1e-9
-    assert loading.contact == pytest.approx(5)
+    # The noise of the table counts, also far below the accuracy of predicted forces.
+    quiet = build_loading(machine_test(time, time, np.maximum(time - 5, 0) ** 3, 1e-9), scene())
+    assert (quiet.noise, quiet.contact) == (1e-9, pytest.approx(5))
 
 
 def test_a_force_that_rises_in_the_rows_of_the_noise_is_noted(message: Messages) -> None:
@@ -378,12 +361,9 @@ def test_a_window_is_two_numbers(message: Messages) -> None:
         parse_window("0.5")
 
 
-def test_several_files_that_are_not_tables_are_refused(message: Messages) -> None:
+def test_tables_and_points_are_not_mixed(message: Messages) -> None:
     with message.raises(SceneError, "tracks.npz"):
         fit(scene(), ["tracks.npz", "press.csv"], ["tissue.young"])
-
-
-def test_options_of_tables_are_refused_for_points(message: Messages) -> None:
     observed = {"time": [0.0], "coordinates": [[0.5, 0.5]], "position": [[[0.0, 0.0, 0.0]]]}
     with message.raises(SceneError, "rate"):
         fit(scene(), observed, ["tissue.young"], rate=5.0)
