@@ -203,7 +203,7 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
     uncertainties = uncertainty(misfit, solution, search.jacobian(solution), error_correlation)
     if isinstance(runs, CurveRuns):
         runs.by_tangent = False
-    profiles = Profiler(parameters, misfit, solution, uncertainties).profiles(runs) if method.get("profile") else None
+    profiles = Profiler(runs, misfit, solution, uncertainties).profiles() if method.get("profile") else None
     mesh, shifts = _mesh(runs, misfit, solution, uncertainties)
     estimates = {
         parameter.key: _estimate(parameter, float(solution.x[n]), n, uncertainties, profiles, shifts)

@@ -139,8 +139,7 @@ class Search:
     def __init__(self, runs: Runs, misfit: Misfit, limits: tuple[Array, Array] | None = None) -> None:
         self._runs, self._misfit = runs, misfit
         self._delta = difference_step(runs.job.scene)
-        low, high = np.array([parameter.limits for parameter in runs.job.parameters]).T
-        self._limits = limits or (low, high)
+        self._limits = limits or runs.job.limits
         self._known: dict[bytes, Prediction | None] = {}
         self._neighbours: dict[bytes, Prediction | None] = {}
 
@@ -394,16 +393,14 @@ class Profile(NamedTuple):
 class Profiler:
     """Profile likelihood of a solution's parameters."""
 
-    def __init__(
-        self, parameters: Sequence[Parameter], misfit: Misfit, solution: Solution, uncertainties: Uncertainty
-    ) -> None:
-        self._misfit, self._solution, self._uncertainties = misfit, solution, uncertainties
+    def __init__(self, runs: Runs, misfit: Misfit, solution: Solution, uncertainties: Uncertainty) -> None:
+        self._runs, self._misfit, self._solution, self._uncertainties = runs, misfit, solution, uncertainties
         self._min_cost = misfit.cost(uncertainties.residuals)
-        self._low, self._high = np.array([parameter.limits for parameter in parameters]).T
+        self._low, self._high = runs.job.limits
 
-    def profiles(self, runs: Runs) -> list[Profile]:
+    def profiles(self) -> list[Profile]:
         """Compute the profiles of all parameters, with both sides of each in parallel."""
-        count = len(self._low)
+        count, runs = len(self._low), self._runs
         sides = {(n, sign): self._side(n, sign) for n in range(count) for sign in (-1, 1)}
         points: dict[tuple[int, int], list[ProfilePoint]] = {side_key: [] for side_key in sides}
         requests = {side_key: x for side_key, side in sides.items() if (x := next(side, None)) is not None}

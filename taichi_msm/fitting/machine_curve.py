@@ -284,8 +284,7 @@ def _scaled(runs: CurveRuns, misfit: Misfit, x: Array, initial: Prediction) -> A
     measured = predicted - misfit.of(initial)
     ratio = np.linalg.norm(measured) / max(float(np.linalg.norm(predicted)), 1e-300)
     is_stiffness = [parameter.is_log and parameter.path[-1] in STIFFNESSES for parameter in runs.job.parameters]
-    low, high = np.array([parameter.limits for parameter in runs.job.parameters]).T
-    return np.clip(np.where(is_stiffness, x + np.log(ratio), x), low, high)
+    return np.clip(np.where(is_stiffness, x + np.log(ratio), x), *runs.job.limits)
 
 
 def _descend(runs: CurveRuns, misfit: Misfit, start: Array, *, by_tests: bool) -> Solution:
@@ -326,7 +325,7 @@ def _descend(runs: CurveRuns, misfit: Misfit, start: Array, *, by_tests: bool) -
 
 def _limits(runs: CurveRuns, x: Array, region: Array) -> tuple[Array, Array]:
     """Return the bounds of x within the trust region, and of depths of contact within the reach of the curve."""
-    low, high = np.array([parameter.limits for parameter in runs.job.parameters]).T
+    low, high = runs.job.limits
     margin = np.array([CONTACT_MARGIN * runs.reach / (parameter.scale or 1) for parameter in runs.job.parameters])
     below = np.where(runs.of_contact, np.minimum(region, margin), region)
     return np.maximum(low, x - below), np.minimum(high, x + region)

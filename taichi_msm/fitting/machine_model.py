@@ -29,30 +29,23 @@ TABLE_OPTIONS = ("columns", "sheet", "block", "window", "rate", "contact")
 POINT_OPTIONS = ("sigma", "correlation", "drift", "resolution")
 
 
-class MachineForceModel(ObservationModel):
-    """Map from the run of a machine test to the forces at its frames."""
-
-    def __init__(self, approach: Approach) -> None:
-        self._approach = approach
-
-    def record(self, simulation: Simulation) -> Array:
-        """Return the force of the tool in the current frame [N], shape (3,)."""
-        return np.array(simulation.forces()[self._approach.probe].force)
-
-    def predict(self, recorded: Array) -> Array:
-        """Return the forces along the direction of the tool at all frames [N], shape (frames, 1)."""
-        return np.asarray(recorded @ self._approach.direction[:, None])
-
-
 @dataclass(frozen=True, eq=False)
-class MachineForces(Forces):
+class MachineForces(Forces, ObservationModel):
     """Forces at the frames of all tests along the direction of the tool, of shape (frames, 1)."""
 
     approach: Approach
 
-    def build_model(self, scene: Scene, frames: int) -> MachineForceModel:
-        """Build the map from the run of a test."""
-        return MachineForceModel(self.approach)
+    def build_model(self, scene: Scene, frames: int) -> MachineForces:
+        """Return the map from the run of a test, which is the same for all."""
+        return self
+
+    def record(self, simulation: Simulation) -> Array:
+        """Return the force of the tool in the current frame [N], shape (3,)."""
+        return np.array(simulation.forces()[self.approach.probe].force)
+
+    def predict(self, recorded: Array) -> Array:
+        """Return the forces along the direction of the tool at all frames of a test [N], shape (frames, 1)."""
+        return np.asarray(recorded @ self.approach.direction[:, None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,8 +109,10 @@ class MachineModel(ForwardModel):
 
     def forces(self, simulation: Simulation, plan: Plan, pause: Pause) -> Array:
         """Run a simulation to its end; return the forces along the tool's direction [N], shape (frames, 1)."""
-        model = MachineForceModel(self.job.approach)
-        (recorded,) = self.record([model], simulation, plan.grid.frames + 1, pause)
+        (observed,) = self.job.observations
+        frames = plan.grid.frames + 1
+        model = observed.build_model(plan.scene, frames)
+        (recorded,) = self.record([model], simulation, frames, pause)
         return model.predict(recorded)
 
 

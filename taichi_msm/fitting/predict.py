@@ -50,6 +50,12 @@ class FitProblem:
     observations: tuple[Observation, ...]
     signs: ClassVar[tuple[int, ...]] = (1, -1)  # of the finite differences at the solution
 
+    @property
+    def limits(self) -> tuple[Array, Array]:
+        """Smallest and largest coordinates of the parameters, each of shape (n,)."""
+        low, high = np.array([parameter.limits for parameter in self.parameters]).T
+        return low, high
+
     def build_model(self, threads: int | None) -> ForwardModel:
         """Build the forward model on a number of threads; None: all cores."""
         return ForwardModel(self, threads)

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from taichi_msm.errors import NotInstalledError, SceneError
-from taichi_msm.fitting.machine_tables import WORDS, MachineTest, cut_window, read_machine_test
+from taichi_msm.fitting.machine_tables import MachineTest, cut_window, read_machine_test
 from tests.golden import Messages
 
 COUNT = 12
@@ -171,9 +171,10 @@ def test_units_are_converted(quantity: str, unit: str, read: Read) -> None:
             np.testing.assert_allclose(getattr(test, name), numbers * scales[name], rtol=1e-14, atol=1e-16)
 
 
+DEPTHS = "Displacement indentation Extension Elongation Allongement Stroke Position Travel Distance Weg Standardweg"
 NAMES = {
     "Time": ["temps d'essai", "ZEIT", "Prüfzeit", "Test time"],
-    "Depth": [*sorted(WORDS["depth"]), "Standardweg", "Position (z)", "Compressive extension", "INDENTATION"],
+    "Depth": [*DEPTHS.split(), "Position (z)", "Compressive extension"],
     "Force": ["force", "Load", "Fz", "Kraft", "Force standard", "Standardkraft", "Indentation force"],
 }
 
