@@ -19,15 +19,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from taichi_msm.errors import DivergedError, SceneError
+from taichi_msm.errors import DivergedError, SceneError, StageProgressCallback
 from taichi_msm.fitting.least_squares import Misfit, Search, Solution
 from taichi_msm.fitting.machine_model import MachineModel, MachineProblem
 from taichi_msm.fitting.observation import Array
-from taichi_msm.fitting.predict import Prediction, Runs, difference_step, mesh_error
+from taichi_msm.fitting.predict import FitProblem, Prediction, Runs, difference_step, mesh_error
 from taichi_msm.load.check import check_scene
 from taichi_msm.model.plan import Plan
 from taichi_msm.scene.scene import Scene
@@ -104,8 +104,8 @@ class CurveRuns(Runs):
     _predictor: MachineModel
     _tangent: _Tangent
 
-    def __init__(self, *arguments: Any) -> None:
-        super().__init__(*arguments)
+    def __init__(self, job: FitProblem, workers: int | None, progress: StageProgressCallback) -> None:
+        super().__init__(job, 1, progress)
         self._curves: dict[tuple[object, ...], Array] = {}
         self._correction: Array | float = 0.0
         self.by_tangent = True  # whether predictions are by the tangent
@@ -132,10 +132,6 @@ class CurveRuns(Runs):
         distance = x - tangent.x
         distance = np.where(self._of_lock, -np.expm1(-distance), distance)
         return self._predict(values, tangent.reach, tangent.forces * np.exp(distance @ tangent.slopes))
-
-    def predict_many(self, coordinates: Sequence[Array], steps: int | None = None) -> list[Prediction | None]:
-        """Predict at several x as `predict_one` does."""
-        return [self.predict_one(x, steps) for x in coordinates]
 
     def predict_coarse(self, x: Array, halvings: int) -> Prediction | None:
         """Predict by a curve with the cells per side halved `halvings` times; None if that fails."""
@@ -168,10 +164,9 @@ class CurveRuns(Runs):
     def with_valid_shares(self, x: Array) -> Array:
         """Return x with free shares reduced, if the sum of all shares is too large."""
         values = self._predictor.values(x)
-        branches = enumerate(self._predictor.data.get("tissue", {}).get("relaxation", ()))
-        shares = {f"tissue.relaxation.{n}.share": float(branch["share"]) for n, branch in branches}
-        free = [key for key in shares if key in values]
-        total = sum((shares | {key: values[key] for key in free}).values())
+        branches = self._branches(values)
+        free = [key for n in range(len(branches)) if (key := f"tissue.relaxation.{n}.share") in values]
+        total = sum(share for share, _ in branches)
         if total <= MAX_SHARES or not free:
             return x
         of_free = sum(values[key] for key in free)
@@ -198,17 +193,25 @@ class CurveRuns(Runs):
         return self._tangent.reach
 
     def _reach(self, values: dict[str, float]) -> float:
-        return self.job.reach(values) * (1 + CONTACT_MARGIN * self.of_contact.any())
+        """Return the greatest travel of a curve [m]; SceneError: no test has any."""
+        if not (reach := self.job.reach(values)):
+            raise SceneError(["contact: no test goes deeper; take a smaller depth"])
+        return reach * (1 + CONTACT_MARGIN * self.of_contact.any())
+
+    def _branches(self, values: dict[str, float]) -> list[tuple[float, float]]:
+        """Return share and time [s] of every branch of relaxation."""
+        branches = []
+        for n, branch in enumerate(self._predictor.data.get("tissue", {}).get("relaxation", ())):
+            key = f"tissue.relaxation.{n}"
+            branches.append((values.get(f"{key}.share", branch["share"]), values.get(f"{key}.time", branch["time"])))
+        return branches
 
     def _predict(self, values: dict[str, float], reach: float, forces: Array) -> Prediction:
         """Predict the tests by a curve."""
         from scipy.interpolate import PchipInterpolator
 
         curve = PchipInterpolator(np.linspace(0, reach, TRAVELS + 1), forces)
-        branches = [
-            tuple(values.get(f"tissue.relaxation.{n}.{key}", branch[key]) for key in ("share", "time"))
-            for n, branch in enumerate(self._predictor.data.get("tissue", {}).get("relaxation", ()))
-        ]
+        branches = self._branches(values)
         # Larger shares are scaled, as the search would not leave a wall there.
         scale = min(1.0, MAX_SHARES / max(sum(share for share, _ in branches), NO_SHARE))
         branches = [(scale * share, time) for share, time in branches]

@@ -23,7 +23,7 @@ def with_keys(data: dict[str, Any], **keys: Any) -> dict[str, Any]:
     data = json.loads(json.dumps(data))
     for key, value in keys.items():
         *sections, name = key.split("__")
-        holder = data
+        holder: Any = data
         for section in sections:
             holder = holder[int(section) if section.isdigit() else section]
         holder[name] = value

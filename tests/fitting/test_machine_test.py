@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from taichi_msm import SceneError, Simulation, fit, load_scene
 from taichi_msm.cli.fit import parse_window
-from taichi_msm.fitting.machine_curve import relax
+from taichi_msm.fitting.machine_curve import CurveRuns, relax
 from taichi_msm.fitting.machine_fit import FittedTest, explanations, unknown_notes
+from taichi_msm.fitting.machine_model import read_machine_problem
 from taichi_msm.fitting.machine_tables import MachineTest
 from taichi_msm.fitting.machine_test import (
     CONTACT_NOISES,
@@ -147,7 +148,8 @@ def test_contact_is_the_last_row_without_a_force_before_the_peak() -> None:
     assert at_once.contact == time[9]
     # The noise of the table counts, also far below the accuracy of predicted forces.
     quiet = build_loading(machine_test(time, time, np.maximum(time - 5, 0) ** 3, 1e-9), scene())
-    assert (quiet.noise, quiet.contact) == (1e-9, pytest.approx(5))
+    assert quiet.noise == 1e-9
+    assert quiet.contact == pytest.approx(5)
 
 
 def test_a_force_that_rises_in_the_rows_of_the_noise_is_noted(message: Messages) -> None:
@@ -258,6 +260,13 @@ def test_the_depth_of_contact_is_found_within_bounds(pressed: str) -> None:
     contact = result.parameters["contact"]
     assert contact.value == pytest.approx(CONTACT, abs=4 * contact.standard_error + 1e-6)
     assert result.tests[0].contact == contact.value
+
+
+def test_a_contact_at_the_greatest_depth_gives_no_run(pressed: str) -> None:
+    """As in a profile, which goes to the bounds."""
+    problem = read_machine_problem([pressed], scene(), ["contact"], {}, None, {"contact": [CONTACT]})
+    with CurveRuns(problem, 1, lambda stage, done, total: None) as runs:
+        assert runs.predict_coarse(problem.limits[1], 0) is None
 
 
 @pytest.mark.slow
