@@ -88,10 +88,8 @@ EXPORTS: dict[str, tuple[str, list[str], float]] = {
     "spaces": (TABLE.replace(";", " "), [], 1),
     "aligned": ("# Temps d'essai (s)   Weg (mm)  Kraft (N)\n" + rows("    "), [], 1),
     "commented names": ("# Time(s) Depth(mm) Force(N)\n" + rows(" "), [], 1),
-    "aligned commas": ("Time, s   Position (z), mm   Fz, N\n" + rows("   "), [], 1),
     "aligned decimal commas": ("Time, s   Position (z), mm   Fz, N\n" + comma(rows("   ")), [], 1),
     "commas and spaces": ("Time (s),  Depth (mm),  Force (N)\n" + rows(",  "), [], 1),
-    "commas in names": ("Time, s;Depth, mm;Force, N\n" + comma(rows()), [], 1),
     "decimal commas": (TABLE.splitlines()[0] + "\n" + comma(rows()), [], 1),
     "quoted decimal commas": (
         '"Time, s","Depth, mm","Force, N"\n' + comma(rows(";", '"{t:.1f}"{s}"{d:.2f}"{s}"{f:.3f}"')).replace(";", ","),

@@ -253,15 +253,6 @@ def test_the_parameters_of_a_tissue_that_relaxes_come_back_and_its_scene_runs_al
     )
 
 
-@pytest.mark.slow
-def test_the_depth_of_contact_is_found_within_bounds(pressed: str) -> None:
-    true = scene(relaxation=[BRANCH])
-    result = fit(true, pressed, ["contact"], rate=RATE, contact=[1.3e-3], bounds={"contact": (0.8e-3, 2e-3)}, workers=1)
-    contact = result.parameters["contact"]
-    assert contact.value == pytest.approx(CONTACT, abs=4 * contact.standard_error + 1e-6)
-    assert result.tests[0].contact == contact.value
-
-
 def test_a_contact_at_the_greatest_depth_gives_no_run(pressed: str) -> None:
     """As in a profile, which goes to the bounds."""
     problem = read_machine_problem([pressed], scene(), ["contact"], {}, None, {"contact": [CONTACT]})
