@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from taichi_msm.fitting.observation import Array, Observation
+from taichi_msm.fitting.parameters import Parameter
 from taichi_msm.fitting.points import ROUNDING_SHARE
 from taichi_msm.fitting.predict import Prediction
 from taichi_msm.scene.scene import Scene
@@ -30,12 +31,7 @@ def faults(observations: Sequence[Observation], scene: Scene, parameters: int) -
 
 
 def faults_at_start(
-    observations: Sequence[Observation],
-    scene: Scene,
-    first: Prediction,
-    *,
-    same_camera: bool = True,
-    same_signs: bool = True,
+    observations: Sequence[Observation], scene: Scene, first: Prediction, parameters: Sequence[Parameter] = ()
 ) -> Iterator[str]:
     """Yield the faults that a run of the scene shows: times that miss the motion, other cameras and conventions.
 
@@ -43,8 +39,7 @@ def faults_at_start(
         observations: the observations.
         scene: the scene with its initial values.
         first: prediction of the scene up to its end.
-        same_camera: whether the camera is not fitted.
-        same_signs: whether the parameters cannot change the signs of forces and motion.
+        parameters: of the fit, which may move the camera, or change the signs of forces and motion.
     """
     rate, motion, name = scene.time.frames_per_second, float(first.motion.max()), observations[0].name
     if motion <= ROUNDING_SHARE * max(scene.sheet.size):
@@ -60,13 +55,14 @@ def faults_at_start(
             f"observe between {moving[0]:g} and {moving[-1]:g} s too"
         )
         return
+    same_camera = not any(parameter.key.startswith("render.") for parameter in parameters)
     found = [
         fault
         for observed, predicted in zip(observations, first.values, strict=True)
         for fault in observed.faults_at_start(scene, predicted, same_camera=same_camera)
     ]
     yield from found
-    if same_signs and not found:
+    if not found and all(parameter.is_log for parameter in parameters):
         yield from opposed(observations, scene, first)
 
 

@@ -148,11 +148,8 @@ def _read_problem(
     if unused := [name for name in TABLE_OPTIONS if method.get(name)]:
         raise SceneError([f"--{unused[0]}: is of tables of a testing machine; leave it out"])
     settings = map_settings(initial, free, bounds, method.get("resolution"))
-    number_options = {
-        "forces": forces,
-        **{name: method.get(name) for name in ("robust", "profile", "correlation", "drift")},
-    }
-    if settings is not None and (conflicting := [name for name, value in number_options.items() if value]):
+    options = {"forces": forces, **{name: method.get(name) for name in ("robust", "profile", "correlation", "drift")}}
+    if settings is not None and (conflicting := [name for name, value in options.items() if value]):
         raise SceneError([f"--free {KEY}: --{conflicting[0]} is of fits of numbers; leave it out"])
     parameters = () if settings is not None else make_parameters(initial, free, bounds)
     if forces is not None:
@@ -176,12 +173,10 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
     start = np.zeros(len(parameters))
     runs.expected = 8 * len(start) + 4
     first = runs.first(start)
-    same_camera = not any(parameter.key.startswith("render.") for parameter in parameters)
-    same_signs = all(parameter.is_log for parameter in parameters)
     machine = runs.job if isinstance(runs.job, MachineProblem) else None
     found: list[str] = []
     if machine is None:
-        found += faults_at_start(observations, scene, first, same_camera=same_camera, same_signs=same_signs)
+        found += faults_at_start(observations, scene, first, parameters)
     if not any(probe.moved for probe in scene.probes):
         # The forces of force-controlled tools do not depend on the tissue.
         found += unit_faults(observations, first)

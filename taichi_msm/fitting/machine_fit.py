@@ -64,12 +64,7 @@ def fitted_tests(job: MachineProblem, values: Mapping[str, float], forces: Array
 
 
 def unknown_notes(tests: Sequence[FittedTest], values: Mapping[str, float]) -> Iterator[str]:
-    """Yield the reasons for parameters that the tests do not identify, one per line.
-
-    Args:
-        tests: the fitted tests.
-        values: values of these parameters, by key.
-    """
+    """Yield the reasons for parameters that the tests do not identify, with their values by key."""
     for key, value in values.items():
         if key.startswith("tissue.relaxation.") and key.endswith(".time"):
             shortest = min(fitted.rise for fitted in tests)
@@ -87,21 +82,17 @@ def unknown_notes(tests: Sequence[FittedTest], values: Mapping[str, float]) -> I
 
 
 def explanations(tests: Sequence[FittedTest], *, fits_contact: bool) -> Iterator[str]:
-    """Yield reasons that a table shows for the rejection of a model, one per line.
-
-    Args:
-        tests: the fitted tests.
-        fits_contact: whether the depths of contact are parameters.
-    """
+    """Yield reasons that a table shows for the rejection of a model, where depths of contact are parameters or not."""
     for fitted in tests:
-        yield from (f"{fitted.loading.test.name}: {reason}" for reason in _explain(fitted, fits_contact=fits_contact))
+        if reason := _explain(fitted, fits_contact=fits_contact):
+            yield f"{fitted.loading.test.name}: {reason}"
 
 
-def _explain(fitted: FittedTest, *, fits_contact: bool) -> Iterator[str]:
+def _explain(fitted: FittedTest, *, fits_contact: bool) -> str:
+    """Return the reason that a table shows, or an empty text."""
     loading, predicted = fitted.loading, fitted.force
     if float(predicted @ loading.force) < 0:
-        yield "the measured force acts against the model's: is the sign of the path, or of a column, wrong?"
-        return
+        return "the measured force acts against the model's: is the sign of the path, or of a column, wrong?"
     test, travel = loading.test, loading.travel(fitted.contact)
     peak = int(test.force.argmax())
     reach = float(travel.max())
@@ -111,11 +102,10 @@ def _explain(fitted: FittedTest, *, fits_contact: bool) -> Iterator[str]:
     at_ends = np.interp(test.time[[peak, last]], loading.time, predicted)
     model_fall = 1 - float(at_ends[1] / at_ends[0]) if last > peak and at_ends[0] > 0 else 0.0
     if fall > MIN_FALL_SHARE and model_fall < 0.5 * fall:
-        yield (
+        return (
             f"the force falls by {100 * fall:.0f} % while the tool is held, and the model's by "
             f"{100 * max(model_fall, 0.0):.0f} %: relaxation? Free the shares and times of tissue.relaxation"
         )
-        return
     at_peak = float(travel[loading.force.argmax()])
     rising = slice(0, int(np.argmax(travel >= (1 - HELD_SHARE) * at_peak)) + 1)
     depth, measured, model = travel[rising], loading.force[rising], predicted[rising]
@@ -127,19 +117,19 @@ def _explain(fitted: FittedTest, *, fits_contact: bool) -> Iterator[str]:
     (shift, *_), by_contact = _explained(residual, slope)
     _, by_curvature = _explained(residual, model, model * depth / reach)
     if not fits_contact and abs(shift) > MIN_CONTACT_SHARE * reach and by_contact > max(0.7, by_curvature - 0.05):
-        yield (
+        return (
             f"a contact at {fitted.contact + shift:.4g} m of the table, not {fitted.contact:.4g} m, would explain "
             f"{rounded(100 * by_contact)} % of the residual: give --contact, or --free contact"
         )
-        return
     halves = [float(np.interp(0.5 * depth[-1], np.maximum.accumulate(depth), force)) for force in (measured, model)]
     shares = [100 * half / float(force[-1]) for half, force in zip(halves, (measured, model), strict=True)]
-    if abs(shares[0] - shares[1]) > 100 * MIN_CURVATURE_SHARE:
-        way = "more" if shares[0] < shares[1] else "less"
-        yield (
-            f"at half the depth the force is {rounded(shares[0])} % of that at the peak, and the model's "
-            f"{rounded(shares[1])} %: the tissue stiffens {way} with the depth: lock? Free or change it"
-        )
+    if abs(shares[0] - shares[1]) <= 100 * MIN_CURVATURE_SHARE:
+        return ""
+    way = "more" if shares[0] < shares[1] else "less"
+    return (
+        f"at half the depth the force is {rounded(shares[0])} % of that at the peak, and the model's "
+        f"{rounded(shares[1])} %: the tissue stiffens {way} with the depth: lock? Free or change it"
+    )
 
 
 def _explained(residual: Array, *columns: Array) -> tuple[Array, float]:

@@ -286,14 +286,7 @@ def _read_block(grid: Grid, block: _Block, chosen: dict[str, str]) -> MachineTes
 
 
 def _select_columns(grid: Grid, block: _Block, chosen: dict[str, str]) -> tuple[list[_Column], list[str]]:
-    """Select the columns of time, depth and force; of two candidates the one nearest 0 in the first row.
-
-    Returns:
-        The columns, and notes about the selection.
-
-    Raises:
-        SceneError: when a column has no unit, or a name that another one has, or is merged with another.
-    """
+    """Select the columns of time, depth and force, of two candidates the one nearest 0 in the first row; and notes."""
     header, titles = block.header, grid.rows[block.header]
     units = grid.rows[block.units] if block.units is not None else []
     first = grid.rows[block.rows[0]] if block.rows else []

@@ -207,12 +207,7 @@ def _contact_row(test: MachineTest, noise: float, peak: int) -> int:
 
 
 def late_contact_note(loading: Loading, key: str) -> str | None:
-    """Return a note about a contact that is found late, as the force rises in the rows of the noise, or None.
-
-    Args:
-        loading: the test.
-        key: parameter of its depth of contact.
-    """
+    """Return a note about a contact found late, as the force rises in the rows of the noise; `key`: its parameter."""
     from scipy.stats import kendalltau
 
     test, count = loading.test, _noise_rows(loading.test)
