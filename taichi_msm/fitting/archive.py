@@ -159,8 +159,8 @@ def _read_members(name: str, archive: zipfile.ZipFile) -> tuple[Arrays, list[str
     _require_understood(name, list(infos))
     members = {key: info for key, info in infos.items() if key in MEMBERS}
     if (size := sum(info.file_size for info in members.values())) > (limit := available_memory() // 4):
-        fault = f"{size / 1e9:.1f} GB of arrays, and there is memory for {limit / 1e9:.1f} GB"
-        raise SceneError([f"{name}: {fault}; leave points or times out"])
+        fault = f"{size / 1e9:.1f} GB of arrays, and there is memory for {limit / 1e9:.1f} GB; leave some points out"
+        raise SceneError([f"{name}: {fault}"])
     arrays = {}
     for key, info in members.items():
         try:

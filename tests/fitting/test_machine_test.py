@@ -253,11 +253,13 @@ def test_the_parameters_of_a_tissue_that_relaxes_come_back_and_its_scene_runs_al
     )
 
 
-def test_a_contact_at_the_greatest_depth_gives_no_run(pressed: str) -> None:
+def test_a_contact_at_the_greatest_depth_gives_no_run(pressed: str, message: Messages) -> None:
     """As in a profile, which goes to the bounds."""
     problem = read_machine_problem([pressed], scene(), ["contact"], {}, None, {"contact": [CONTACT]})
     with CurveRuns(problem, 1, lambda stage, done, total: None) as runs:
         assert runs.predict_coarse(problem.limits[1], 0) is None
+        with message.raises(SceneError, "contact"):
+            runs.run_curve(problem.limits[1])
 
 
 @pytest.mark.slow
