@@ -19,7 +19,7 @@ from taichi_msm.errors import SceneError, StageProgressCallback, writing
 from taichi_msm.fitting import rejection
 from taichi_msm.fitting.archive import read_observations
 from taichi_msm.fitting.checks import faults, faults_at_start, opposed, unit_faults
-from taichi_msm.fitting.force_table import read_forces
+from taichi_msm.fitting.forces import read_forces
 from taichi_msm.fitting.least_squares import (
     MAX_RELATIVE_ERROR,
     Misfit,

@@ -17,7 +17,7 @@ from scipy.stats import t as student
 from taichi_msm import ArgumentError, SceneError, Simulation, fit, load_scene, run
 from taichi_msm.fitting.archive import read_observations
 from taichi_msm.fitting.checks import faults
-from taichi_msm.fitting.force_table import read_forces
+from taichi_msm.fitting.forces import read_forces
 from taichi_msm.fitting.observation import ErrorCorrelation
 from taichi_msm.fitting.parameters import Method, make_parameters
 from taichi_msm.fitting.points import MIN_MOTION_SIGMAS, Pixels
