@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from typing_extensions import Self
 
 from taichi_msm.accuracy.mesh import coarser_plan, estimate_mesh_error
 from taichi_msm.errors import DivergedError, ExecutorError, Pause, SceneError, StageProgressCallback
-from taichi_msm.fitting.observation import Observation, ObservationModel, time_in_frames
+from taichi_msm.fitting.observation import Array, Observation, ObservationModel, time_in_frames
 from taichi_msm.fitting.parameters import Parameter, as_data, with_values
 from taichi_msm.load import cost
 from taichi_msm.load.check import check_scene
@@ -28,8 +28,6 @@ from taichi_msm.sweeps.pool import DiedError, Pool
 from taichi_msm.sweeps.tables import PROCESS_BYTES
 from taichi_msm.system import runtime
 from taichi_msm.system.process import available_memory, available_threads
-
-Array = NDArray[np.float64]
 
 
 class Prediction(NamedTuple):
@@ -281,7 +279,7 @@ class Runs:
     def _report_progress(self) -> None:
         self._progress("fit", self.count, max(self.expected, self.count + 1))
 
-    def __enter__(self) -> Runs:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: object, *_: object) -> None:
