@@ -11,13 +11,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.render import uniforms as uni
-from taichi_msm.render.config import INFINITY, Band, Bytes, DrawingConfig, Floats, Integers, clear_tile
-from taichi_msm.render.coverage import NORMAL_STRIDE, DrawnSheet, cover_cell, cover_instruments, store_normal
-from taichi_msm.render.geometry import NODE_STRIDE, SCREEN, may_cover_rows, project
+from taichi_msm.render.config import (
+    INFINITY,
+    Bytes,
+    DrawingConfig,
+    Floats,
+    Integers,
+    Output,
+    clear_tile,
+    read_arguments,
+)
+from taichi_msm.render.coverage import cover_cell, cover_instruments, store_normal
+from taichi_msm.render.geometry import (
+    DISTORTED,
+    DISTORTED_STRIDE,
+    NODE_STRIDE,
+    POINT_STRIDE,
+    SCREEN,
+    cell_outline,
+    is_invertible,
+    may_cover_rows,
+    project,
+)
 from taichi_msm.render.labels import label_offsets
-from taichi_msm.render.lens_kernels import DISTORTED_STRIDE, store_distorted
+from taichi_msm.render.lens_kernels import store_distorted
 from taichi_msm.render.lens_table import bounds, tiled_map
-from taichi_msm.render.shading import Appearance, PixelArrays, resolve
+from taichi_msm.render.shading import resolve
 from taichi_msm.system.runtime import (
     ITERATIONS_PER_THREAD,
     Memory,
@@ -26,10 +45,6 @@ from taichi_msm.system.runtime import (
     ti,
     write_vectors,
 )
-
-# Numbers per mass point without the distorted ones. After the numbers of all mass points, two numbers per row follow:
-# the first and the last row of the picture that it reaches, without distortion.
-UNDISTORTED_STRIDE = NODE_STRIDE + NORMAL_STRIDE
 
 
 class Bands:
@@ -50,13 +65,12 @@ class Bands:
         (rows, cols), (width, height) = shape, size
         self._workers = min(-(-height // config.band_rows), current_device().threads)
         self._memory = memory = Memory()
-        self._nodes = memory.array(
-            "f32", 0, rows * (cols * (UNDISTORTED_STRIDE + DISTORTED_STRIDE * config.has_distortion) + 2)
-        )
-        band_vectors = config.band_lines * config.tiles_across(width) * config.planes
-        # With lens distortion the undistortion map comes before the bands.
-        self._table = -(-height // config.band_rows) * _map_vectors(config, width)
-        self._samples = memory.array("f32", config.lanes, self._table + self._workers * band_vectors)
+        # After the numbers of the mass points, two per row: the first and last row of the picture without distortion.
+        self._nodes = memory.array("f32", 0, rows * (cols * POINT_STRIDE + 2))
+        tiles_of_band = config.band_lines * config.tiles_across(width)
+        # With lens distortion the undistortion map comes before the bands; after each of its bands their bounds.
+        map_vectors = -(-height // config.band_rows) * (tiles_of_band * config.map_planes + config.has_distortion)
+        self._samples = memory.array("f32", config.lanes, map_vectors + self._workers * tiles_of_band * config.planes)
 
     def set_undistortion_map(self, table: NDArray[np.float32]) -> None:
         """Set the undistortion map of the following pictures, as returned by `undistortion_map`."""
@@ -97,89 +111,81 @@ class Bands:
         return picture[:, :width], labels
 
 
-def _map_vectors(config: DrawingConfig, width: int) -> int:
-    """Return the vectors per band of the undistortion map and its bounds, for a picture of this width [px]."""
-    return config.band_map_vectors * config.tiles_across(width) + 1 if config.lens else 0
-
-
 @ti.func
-def project_row(
-    position: ti.template(), i, rows, cols, config: ti.template(), uniforms: ti.template(), nodes: ti.template()
-):
+def project_row(position: ti.template(), i, band: ti.template()):
     """Project a row of mass points, and store the first and last row of the picture that it overlaps."""
+    config, cols, nodes = ti.static((band.config, band.cols, band.nodes))
     first_row, last_row = INFINITY, -INFINITY
     for j in range(cols):
-        project(position, i, j, cols, uniforms, nodes, False)
-        store_normal(position, i, j, rows, cols, config, uniforms, nodes)
+        project(position, i, j, cols, band.uniforms, nodes, False)
+        store_normal(position, i, j, band)
         entry = (i * cols + j) * NODE_STRIDE
         if ti.static(config.has_distortion):
-            distorted_entry = rows * cols * UNDISTORTED_STRIDE + (i * cols + j) * DISTORTED_STRIDE
-            store_distorted(distorted_entry, entry, uniforms, nodes, config.lens)
-        if nodes[entry + 2] > uniforms[uni.NEAR]:
+            distorted_entry = band.rows * cols * DISTORTED + (i * cols + j) * DISTORTED_STRIDE
+            store_distorted(distorted_entry, entry, band.uniforms, nodes, config.lens)
+        if nodes[entry + 2] > band.near:
             first_row = ti.min(first_row, nodes[entry + SCREEN + 1])
             last_row = ti.max(last_row, nodes[entry + SCREEN + 1])
         else:
             first_row, last_row = -INFINITY, INFINITY
-    row_entry = rows * cols * (UNDISTORTED_STRIDE + DISTORTED_STRIDE * config.has_distortion) + 2 * i
+    row_entry = band.rows * cols * POINT_STRIDE + 2 * i
     nodes[row_entry] = first_row
     nodes[row_entry + 1] = last_row
 
 
 @ti.func
-def project_all(
-    position: ti.template(), rows, cols, config: ti.template(), uniforms: ti.template(), sizes: ti.template(),
-    nodes: ti.template(),
-):  # fmt: skip
+def project_all(position: ti.template(), band: ti.template()):
     """Project all mass points, row by row, shared among the workers; return when every row is finished.
 
     A worker waits only for rows that a running worker has taken, so a worker that starts late does not delay others.
     """
+    sizes = ti.static(band.sizes)
     has_row = True
     while has_row:
         i = ti.atomic_add(sizes[uni.ROWS_TAKEN], 1)
-        has_row = i < rows
+        has_row = i < band.rows
         if has_row:
-            project_row(position, i, rows, cols, config, uniforms, nodes)
+            project_row(position, i, band)
             ti.atomic_add(sizes[uni.ROWS_PROJECTED], 1)
     finished = ti.atomic_add(sizes[uni.ROWS_PROJECTED], 0)
-    while finished < rows:
+    while finished < band.rows:
         finished = ti.atomic_add(sizes[uni.ROWS_PROJECTED], 0)
 
 
 @ti.func
-def cover_band(sheet: ti.template(), band: ti.template()):
+def cover_band(band: ti.template()):
     """Cover the samples of a band with the sheet."""
-    config, nodes = ti.static((band.config, sheet.nodes))
+    config, cols, nodes = ti.static((band.config, band.cols, band.nodes))
     lines = (band.bottom - band.top + config.tile_height - 1) // config.tile_height
     for tile in range(lines * band.tiles_across):
         clear_tile(band.first + tile * config.planes, band)
-    rows_start = sheet.rows * sheet.cols * (UNDISTORTED_STRIDE + DISTORTED_STRIDE * config.has_distortion)
     # Undistorted rows of the samples of the band.
     top, bottom = ti.cast(band.top, ti.f32), ti.cast(band.bottom, ti.f32)
     if ti.static(config.has_distortion):
-        box = band.samples[band.map_start + config.band_map_vectors * band.tiles_across]
+        box = band.samples[band.map_start + config.band_lines * config.map_planes * band.tiles_across]
         top, bottom = box[2] - 1.0, box[3] + 1.0
-    for i in range(sheet.rows - 1):
-        row_entry = rows_start + 2 * i
+    subdivisions = ti.cast(band.subdivisions, ti.i32)
+    for i in range(band.rows - 1):
+        row_entry = band.rows * cols * POINT_STRIDE + 2 * i
         first_row = ti.min(nodes[row_entry], nodes[row_entry + 2])
         last_row = ti.max(nodes[row_entry + 1], nodes[row_entry + 3])
         if first_row < bottom and last_row > top:
-            for j in range(sheet.cols - 1):
+            for j in range(cols - 1):
+                corner, overlaps = (i * cols + j) * NODE_STRIDE, True
                 if ti.static(config.has_distortion):
-                    cell = i * sheet.cols + j
-                    distorted_entry = sheet.distorted_start + cell * DISTORTED_STRIDE
-                    if may_cover_rows(
-                        cell * NODE_STRIDE, distorted_entry, sheet.cols, band.top, band.bottom, band.uniforms, nodes
-                    ):
-                        cover_cell(i, j, (), sheet, band)
-                else:
-                    cover_cell(i, j, (), sheet, band)
+                    distorted_entry = band.rows * cols * DISTORTED + (i * cols + j) * DISTORTED_STRIDE
+                    overlaps = may_cover_rows(
+                        corner, distorted_entry, cols, band.top, band.bottom, band.uniforms, nodes
+                    )
+                if overlaps:
+                    outline = ti.static(cell_outline(corner, cols, band.near, nodes))
+                    invertible = is_invertible(outline)
+                    pieces = ti.select(invertible, 1, 2 * subdivisions * subdivisions)
+                    cover_cell(i, j, invertible, 0, pieces, outline, band)
 
 
 @cache
 def _kernel(config: DrawingConfig) -> Callable[..., None]:
-    factor = config.supersample
-
     @ti.kernel
     def draw(
         position: ti.types.ndarray(dtype=ti.f32, ndim=3), texels: Floats, uniforms: Floats, workers: ti.i32,
@@ -188,32 +194,14 @@ def _kernel(config: DrawingConfig) -> Callable[..., None]:
     ):  # fmt: skip
         for index in range(workers * ITERATIONS_PER_THREAD):
             if index % ITERATIONS_PER_THREAD == 0:
-                rows, cols = sizes[uni.ROWS], sizes[uni.COLS]
-                width, height = sizes[uni.WIDTH], sizes[uni.HEIGHT]
+                picture = ti.static(read_arguments(uniforms, sizes, nodes, samples, config))
                 # Starting a separate parallel loop takes longer than projecting a sheet of usual size.
-                project_all(position, rows, cols, config, uniforms, sizes, nodes)
-                texture_width, texture_height = sizes[uni.LEVELS + 1], sizes[uni.LEVELS + 2]
-                instrument_count, subdivisions, near = (
-                    sizes[uni.INSTRUMENT_COUNT],
-                    uniforms[uni.SUBDIVISIONS],
-                    uniforms[uni.NEAR],
-                )
-                tiles_across = (width * factor + config.tile_width - 1) // config.tile_width
-                first = index // ITERATIONS_PER_THREAD * tiles_across * (config.band_lines * config.planes)
-                map_vectors = 0
-                if ti.static(config.has_distortion):
-                    map_vectors = tiles_across * config.band_map_vectors + 1
-                    first += (height + config.band_rows - 1) // config.band_rows * map_vectors
-                distorted_start = rows * cols * UNDISTORTED_STRIDE
-                sheet = ti.static(
-                    DrawnSheet(nodes, rows, cols, subdivisions, texture_width, texture_height, distorted_start)
-                )
-                appearance = ti.static(
-                    Appearance(config, texels, sizes, texture_width, texture_height, uniforms, instrument_count)
-                )
-                pixels = width * height
-                output = ti.static(PixelArrays(colours, labels, pixels))
-                samples_width, samples_height = width * factor, height * factor
+                project_all(position, picture)
+                height = sizes[uni.HEIGHT]
+                tiles_of_band = picture.tiles_across * config.band_lines
+                map_vectors = tiles_of_band * config.map_planes + int(config.has_distortion)
+                map_end = (height + config.band_rows - 1) // config.band_rows * map_vectors
+                first = map_end + index // ITERATIONS_PER_THREAD * tiles_of_band * config.planes
                 # Bands are taken one by one, so that others take those of a delayed worker.
                 has_band = True
                 while has_band:
@@ -221,19 +209,17 @@ def _kernel(config: DrawingConfig) -> Callable[..., None]:
                     has_band = row < height
                     if has_band:
                         end_row = ti.min(row + config.band_rows, height)
-                        top, bottom = row * factor, end_row * factor
+                        top, bottom = row * config.supersample, end_row * config.supersample
                         map_start = row // config.band_rows * map_vectors
                         band = ti.static(
-                            Band(
-                                config, samples, first, tiles_across, 0.0, samples_width, top, bottom,
-                                samples_width, samples_height, near, uniforms, map_start,
+                            picture._replace(
+                                first=first, map_start=map_start, right=picture.width, top=top, bottom=bottom
                             )
-                        )  # fmt: skip
-                        cover_band(sheet, band)
-                        if ti.static(len(config.shapes) > 0):
-                            cover_instruments(instrument_count, band)
-                        resolve(
-                            first, row, end_row, 0, width, tiles_across, width, map_start, samples, appearance, output
                         )
+                        cover_band(band)
+                        if ti.static(len(config.shapes) > 0):
+                            cover_instruments(band)
+                        output = ti.static(Output(texels, colours, labels))
+                        resolve(row, end_row, 0, sizes[uni.WIDTH], output, band)
 
     return draw
