@@ -28,7 +28,6 @@ from taichi_msm.render.config import (
     tile_range,
     undistorted_centres,
 )
-from taichi_msm.render.geometry import DISTORTED, DISTORTED_STRIDE, NORMAL_STRIDE, NORMALS, line_of_sight, w_at
 from taichi_msm.render.lens_table import INVALID_COORDINATE
 from taichi_msm.shapes import SHAPES
 from taichi_msm.system.runtime import ti
@@ -114,9 +113,9 @@ def cover_cell(i, j, invertible, first, end, outline: ti.template(), band: ti.te
         first, end: otherwise, the first of its triangles, and the triangle after the last one.
     """
     config, float_vector = ti.static((band.config, band.config.float_vector))
-    corner = (i * band.cols + j) * geometry.NODE_STRIDE
+    corner, normal_entry, distorted_entry = geometry.point_entries(i * band.cols + j, band)
     patch = ti.static(geometry.cell_patch(corner, band.cols, outline.facing, invertible, band.nodes, False))
-    cell = ti.static(cell_at(i, j, patch, band))
+    cell = ti.static(cell_at(i, j, normal_entry, patch, band))
     subdivisions = ti.cast(band.subdivisions, ti.i32)
     for piece in range(first, end):
         # Two triangles per sub-quad.
@@ -132,7 +131,6 @@ def cover_cell(i, j, invertible, first, end, outline: ti.template(), band: ti.te
                 patch, band.uniforms, config.lens,
             )  # fmt: skip
         elif ti.static(config.has_distortion):
-            distorted_entry = band.rows * band.cols * DISTORTED + (i * band.cols + j) * DISTORTED_STRIDE
             low_x, high_x, low_y, high_y = geometry.distorted_cell_bounds(
                 distorted_entry, band.cols, outline, band.uniforms, band.nodes
             )
@@ -210,8 +208,8 @@ def intersect_instrument(x, y, index, uniforms: ti.template(), shapes: ti.templa
     tip, axis = base + uni.TIP, base + uni.AXIS
     # The line of sight is P = O + D t, with t relative to the depth of the tip and the origin at the tip.
     start = uniforms[tip + 2] * (-1.0)
-    across, up = line_of_sight(x, y, uniforms)
-    w = w_at(start, uniforms)
+    across, up = geometry.line_of_sight(x, y, uniforms)
+    w = geometry.w_at(start, uniforms)
     o_x, o_y = across * w - uniforms[tip], up * w - uniforms[tip + 1]
     d_x, d_y = across * uniforms[uni.PINHOLE], up * uniforms[uni.PINHOLE]
     a_x, a_y, a_z = uniforms[axis], uniforms[axis + 1], uniforms[axis + 2]
@@ -238,7 +236,7 @@ def cover_tile_with_instrument(entry, x, y, index, band: ti.template()):
     """Cover a tile of samples with an instrument."""
     plane, samples = ti.static((band.config.plane, band.samples))
     depth, n_x, n_y, n_z = intersect_instrument(x, y, index, band.uniforms, band.config.shapes)
-    visible = (w_at(depth, band.uniforms) > band.near) & (depth < samples[entry + plane.depth])
+    visible = (geometry.w_at(depth, band.uniforms) > band.near) & (depth < samples[entry + plane.depth])
     if ti.static(band.config.has_distortion):
         visible = visible & (x < INVALID_COORDINATE)
     store_visible(entry + plane.depth, visible, depth, samples)
@@ -283,7 +281,7 @@ def cover_instruments(band: ti.template()):
 
 
 @ti.func
-def cell_at(i, j, patch: ti.template(), band: ti.template()):
+def cell_at(i, j, normal_entry, patch: ti.template(), band: ti.template()):
     """Return the cell with a mass point as its upper left corner."""
     rows, cols = band.rows - 1, band.cols - 1
     texture_width, texture_height = band.sizes[uni.LEVELS + 1], band.sizes[uni.LEVELS + 2]
@@ -296,11 +294,10 @@ def cell_at(i, j, patch: ti.template(), band: ti.template()):
     texels_across, texels_down = ti.cast(texture_width, ti.f32) / cols, ti.cast(texture_height, ti.f32) / rows
     row, column = ti.cast(i, ti.f32), ti.cast(j, ti.f32)
     cell_rows, cell_cols = ti.cast(rows, ti.f32), ti.cast(cols, ti.f32)
-    normal = band.rows * band.cols * NORMALS + (i * band.cols + j) * NORMAL_STRIDE
     return ti.static(
         Cell(
             patch, row, column, cell_rows, cell_cols, first_x, first_y, fraction_x, fraction_y,
-            texels_across, texels_down, normal,
+            texels_across, texels_down, normal_entry,
         )
     )  # fmt: skip
 
@@ -321,7 +318,7 @@ def store_normal(position: ti.template(), i, j, band: ti.template()):
         ]
         length = ti.sqrt(cross[0] * cross[0] + cross[1] * cross[1] + cross[2] * cross[2])
         normal = [cross[n] / ti.max(length, 1e-30) for n in ti.static(range(3))]
-        normal_entry = band.rows * band.cols * NORMALS + (i * band.cols + j) * NORMAL_STRIDE
+        _, normal_entry, _ = geometry.point_entries(i * band.cols + j, band)
         for n in ti.static(range(3)):
             axis = uni.AXES + 3 * n
             band.nodes[normal_entry + n] = (
@@ -334,7 +331,7 @@ def store_normal(position: ti.template(), i, j, band: ti.template()):
 @ti.func
 def normal_at(across, along, cell: ti.template(), band: ti.template()):
     """Interpolate the normals of the mass points bilinearly; not normalised."""
-    corners = ti.static(geometry.corner_entries(cell.normal, band.cols, NORMAL_STRIDE))
+    corners = ti.static(geometry.corner_entries(cell.normal, band.cols, geometry.NORMAL_STRIDE))
     a, b, c, d = [[band.nodes[entry + n] for n in ti.static(range(3))] for entry in corners]
     return [
         a[n] + (b[n] - a[n]) * across + (c[n] - a[n] + (d[n] - b[n] - (c[n] - a[n])) * across) * along

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.render import geometry
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.config import (
     INFINITY,
@@ -22,17 +23,6 @@ from taichi_msm.render.config import (
     read_arguments,
 )
 from taichi_msm.render.coverage import cover_cell, cover_instruments, store_normal
-from taichi_msm.render.geometry import (
-    DISTORTED,
-    DISTORTED_STRIDE,
-    NODE_STRIDE,
-    POINT_STRIDE,
-    SCREEN,
-    cell_outline,
-    is_invertible,
-    may_cover_rows,
-    project,
-)
 from taichi_msm.render.labels import label_offsets
 from taichi_msm.render.lens_kernels import store_distorted
 from taichi_msm.render.lens_table import bounds, tiled_map
@@ -66,7 +56,7 @@ class Bands:
         self._workers = min(-(-height // config.band_rows), current_device().threads)
         self._memory = memory = Memory()
         # After the numbers of the mass points, two per row: the first and last row of the picture without distortion.
-        self._nodes = memory.array("f32", 0, rows * (cols * POINT_STRIDE + 2))
+        self._nodes = memory.array("f32", 0, rows * (cols * geometry.POINT_STRIDE + 2))
         tiles_of_band = config.band_lines * config.tiles_across(width)
         # With lens distortion the undistortion map comes before the bands; after each of its bands their bounds.
         map_vectors = -(-height // config.band_rows) * (tiles_of_band * config.map_planes + config.has_distortion)
@@ -117,18 +107,17 @@ def project_row(position: ti.template(), i, band: ti.template()):
     config, cols, nodes = ti.static((band.config, band.cols, band.nodes))
     first_row, last_row = INFINITY, -INFINITY
     for j in range(cols):
-        project(position, i, j, cols, band.uniforms, nodes, False)
+        geometry.project(position, i, j, cols, band.uniforms, nodes, False)
         store_normal(position, i, j, band)
-        entry = (i * cols + j) * NODE_STRIDE
+        entry, _, distorted_entry = geometry.point_entries(i * cols + j, band)
         if ti.static(config.has_distortion):
-            distorted_entry = band.rows * cols * DISTORTED + (i * cols + j) * DISTORTED_STRIDE
             store_distorted(distorted_entry, entry, band.uniforms, nodes, config.lens)
         if nodes[entry + 2] > band.near:
-            first_row = ti.min(first_row, nodes[entry + SCREEN + 1])
-            last_row = ti.max(last_row, nodes[entry + SCREEN + 1])
+            first_row = ti.min(first_row, nodes[entry + geometry.SCREEN + 1])
+            last_row = ti.max(last_row, nodes[entry + geometry.SCREEN + 1])
         else:
             first_row, last_row = -INFINITY, INFINITY
-    row_entry = band.rows * cols * POINT_STRIDE + 2 * i
+    row_entry = band.rows * cols * geometry.POINT_STRIDE + 2 * i
     nodes[row_entry] = first_row
     nodes[row_entry + 1] = last_row
 
@@ -166,20 +155,20 @@ def cover_band(band: ti.template()):
         top, bottom = box[2] - 1.0, box[3] + 1.0
     subdivisions = ti.cast(band.subdivisions, ti.i32)
     for i in range(band.rows - 1):
-        row_entry = band.rows * cols * POINT_STRIDE + 2 * i
+        row_entry = band.rows * cols * geometry.POINT_STRIDE + 2 * i
         first_row = ti.min(nodes[row_entry], nodes[row_entry + 2])
         last_row = ti.max(nodes[row_entry + 1], nodes[row_entry + 3])
         if first_row < bottom and last_row > top:
             for j in range(cols - 1):
-                corner, overlaps = (i * cols + j) * NODE_STRIDE, True
+                overlaps = True
+                corner, _, distorted_entry = geometry.point_entries(i * cols + j, band)
                 if ti.static(config.has_distortion):
-                    distorted_entry = band.rows * cols * DISTORTED + (i * cols + j) * DISTORTED_STRIDE
-                    overlaps = may_cover_rows(
+                    overlaps = geometry.may_cover_rows(
                         corner, distorted_entry, cols, band.top, band.bottom, band.uniforms, nodes
                     )
                 if overlaps:
-                    outline = ti.static(cell_outline(corner, cols, band.near, nodes))
-                    invertible = is_invertible(outline)
+                    outline = ti.static(geometry.cell_outline(corner, cols, band.near, nodes))
+                    invertible = geometry.is_invertible(outline)
                     pieces = ti.select(invertible, 1, 2 * subdivisions * subdivisions)
                     cover_cell(i, j, invertible, 0, pieces, outline, band)
 

@@ -17,14 +17,10 @@ from taichi_msm.render import uniforms as uni
 from taichi_msm.render.config import INFINITY
 from taichi_msm.system.runtime import ti
 
-# Numbers per mass point: X, Y, w, depth, and at SCREEN its x and y in the picture [samples]. After those of all mass
-# points, `nodes` holds the normals, and then the distorted mass points.
+# Numbers per mass point: X, Y, w, depth, and at SCREEN its x and y in the picture [samples]. In kernel 2, `nodes` holds
+# the normals after them, and then the distorted mass points.
 SCREEN, NODE_STRIDE, NORMAL_STRIDE, DISTORTED_STRIDE = uni.SCREEN, 6, 3, lens_kernels.DISTORTED_STRIDE
-NORMALS, DISTORTED, POINT_STRIDE = (
-    NODE_STRIDE,
-    NODE_STRIDE + NORMAL_STRIDE,
-    NODE_STRIDE + NORMAL_STRIDE + DISTORTED_STRIDE,
-)
+POINT_STRIDE = NODE_STRIDE + NORMAL_STRIDE + DISTORTED_STRIDE
 
 # Triangles of cells that are not inverted are enlarged to close gaps between them: by this fraction of their side, and
 # by this fraction of the picture's side, the resolution of f32.
@@ -94,6 +90,17 @@ def w_at(depth, uniforms: ti.template()):
 def line_of_sight(x, y, uniforms: ti.template()):
     """Return the offsets of lines of sight from the optical axis at w = 1, to the right and up [m]."""
     return (x - uniforms[uni.CENTRE_X]) * uniforms[uni.SPREAD_X], (uniforms[uni.CENTRE_Y] - y) * uniforms[uni.SPREAD_Y]
+
+
+@ti.func
+def point_entries(point, band: ti.template()):
+    """Return the first entries of a mass point, of its normal and of the distorted mass point in `nodes`."""
+    points = band.rows * band.cols
+    return (
+        point * NODE_STRIDE,
+        points * NODE_STRIDE + point * NORMAL_STRIDE,
+        points * (NODE_STRIDE + NORMAL_STRIDE) + point * DISTORTED_STRIDE,
+    )
 
 
 @ti.func

@@ -12,6 +12,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.render import geometry
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.bins import BOUNDS_STRIDE, SEARCH_ROUNDS, build_bins, is_in_bounds, owner_of, store_bounds
 from taichi_msm.render.config import (
@@ -25,19 +26,6 @@ from taichi_msm.render.config import (
     read_arguments,
 )
 from taichi_msm.render.coverage import cover_cell, cover_instruments, store_normal
-from taichi_msm.render.geometry import (
-    DISTORTED,
-    DISTORTED_STRIDE,
-    NODE_STRIDE,
-    POINT_STRIDE,
-    cell_outline,
-    cell_patch,
-    corner_entry,
-    distorted_cell_bounds,
-    is_invertible,
-    project,
-    triangle_bounds,
-)
 from taichi_msm.render.labels import label_offsets
 from taichi_msm.render.lens_kernels import store_distorted
 from taichi_msm.render.shading import resolve
@@ -67,7 +55,7 @@ class Threads:
         # Rows of pixels in a strip.
         self._rows = min(max(1, VULKAN_THREADS // (samples_across * config.supersample)), height)
         self._texels = launches.upload(texels)
-        self._nodes = launches.array(np.float32, rows * cols * POINT_STRIDE)
+        self._nodes = launches.array(np.float32, rows * cols * geometry.POINT_STRIDE)
         self._pieces = launches.array(np.int32, self._cells)
         strip = self._rows * config.supersample * samples_across * config.planes
         # With lens distortion the undistortion map comes before the strip.
@@ -152,17 +140,18 @@ def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable
         for index in range(sizes[uni.ROWS] * sizes[uni.COLS]):
             picture = ti.static(read_arguments(uniforms, sizes, nodes, (), config))
             cols = picture.cols
-            project(position, index // cols, index % cols, cols, uniforms, nodes, False)
+            geometry.project(position, index // cols, index % cols, cols, uniforms, nodes, False)
             store_normal(position, index // cols, index % cols, picture)
             if ti.static(config.has_distortion):
-                distorted_entry = picture.rows * cols * DISTORTED + index * DISTORTED_STRIDE
-                store_distorted(distorted_entry, index * NODE_STRIDE, uniforms, nodes, config.lens)
+                entry, _, distorted_entry = geometry.point_entries(index, picture)
+                store_distorted(distorted_entry, entry, uniforms, nodes, config.lens)
 
         for cell in range((sizes[uni.ROWS] - 1) * (sizes[uni.COLS] - 1)):
             cols, subdivisions = sizes[uni.COLS], ti.cast(uniforms[uni.SUBDIVISIONS], ti.i32)
-            outline = ti.static(cell_outline(corner_entry(cell, cols), cols, uniforms[uni.NEAR], nodes))
+            corner = geometry.corner_entry(cell, cols)
+            outline = ti.static(geometry.cell_outline(corner, cols, uniforms[uni.NEAR], nodes))
             pieces[cell] = ti.select(
-                outline.behind, 0, ti.select(is_invertible(outline), 1, 2 * subdivisions * subdivisions)
+                outline.behind, 0, ti.select(geometry.is_invertible(outline), 1, 2 * subdivisions * subdivisions)
             )
 
     @ti.kernel
@@ -186,19 +175,21 @@ def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable
             parts_of_cell = ti.max((pieces[cell] + pieces_per_part - 1) // pieces_per_part, 1)
             piece = (item - ends[cell] + parts_of_cell) * pieces_per_part
             owners[2 * item], owners[2 * item + 1] = cell, piece
-            corner = corner_entry(cell, cols)
-            outline = ti.static(cell_outline(corner, cols, picture.near, nodes))
+            corner = geometry.corner_entry(cell, cols)
+            outline = ti.static(geometry.cell_outline(corner, cols, picture.near, nodes))
             left, right, top, bottom = outline.left, outline.right, outline.top, outline.bottom
             if ti.static(config.has_distortion):
-                distorted_entry = picture.rows * cols * DISTORTED + corner // NODE_STRIDE * DISTORTED_STRIDE
-                left, right, top, bottom = distorted_cell_bounds(distorted_entry, cols, outline, uniforms, nodes)
+                _, _, distorted_entry = geometry.point_entries(corner // geometry.NODE_STRIDE, picture)
+                left, right, top, bottom = geometry.distorted_cell_bounds(
+                    distorted_entry, cols, outline, uniforms, nodes
+                )
             if pieces[cell] != 1:
                 left, right, top, bottom = INFINITY, -INFINITY, INFINITY, -INFINITY
-                patch = ti.static(cell_patch(corner, cols, outline.facing, False, nodes, False))
+                patch = ti.static(geometry.cell_patch(corner, cols, outline.facing, False, nodes, False))
                 subdivisions = ti.cast(picture.subdivisions, ti.i32)
                 for triangle in range(piece, ti.min(piece + pieces_per_part, pieces[cell])):
                     s, t = ti.cast(triangle // 2 % subdivisions, ti.f32), ti.cast(triangle // 2 // subdivisions, ti.f32)
-                    low_x, high_x, low_y, high_y, _ = triangle_bounds(
+                    low_x, high_x, low_y, high_y, _ = geometry.triangle_bounds(
                         s, t, triangle % 2 == 0, 1.0 / picture.subdivisions, picture.near, width, height,
                         patch, uniforms, config.lens,
                     )  # fmt: skip
@@ -260,7 +251,8 @@ def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callab
                 if is_in_bounds(entries[n], x, y, bounds):
                     cell, piece = owners[2 * entries[n]], owners[2 * entries[n] + 1]
                     end_piece = ti.min(piece + pieces_per_part, pieces[cell])
-                    outline = ti.static(cell_outline(corner_entry(cell, band.cols), band.cols, band.near, nodes))
+                    corner = geometry.corner_entry(cell, band.cols)
+                    outline = ti.static(geometry.cell_outline(corner, band.cols, band.near, nodes))
                     i, j = cell // (band.cols - 1), cell % (band.cols - 1)
                     cover_cell(i, j, pieces[cell] == 1, piece, end_piece, outline, band)
             end_thread(ended)
