@@ -17,14 +17,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from taichi_msm.lenses.model import (
-    MAX_RADIUS,
-    MIN_COEFFICIENT,
-    Coefficient,
-    LensModel,
-    Operations,
-    positive_roots,
-)
+from taichi_msm.lenses.model import MAX_RADIUS, MIN_COEFFICIENT, Coefficient, LensModel, Operations, positive_roots
 
 # The determinant is evaluated at this radius instead of at smaller ones.
 MIN_RADIUS = 1e-8

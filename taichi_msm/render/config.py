@@ -219,6 +219,24 @@ def read_arguments(
 
 
 @ti.func
+def triple(array: ti.template(), first):
+    """Return three numbers of an array as a list."""
+    return [array[first + n] for n in ti.static(range(3))]
+
+
+@ti.func
+def dot(a: ti.template(), b: ti.template()):
+    """Return the scalar product of lists of three components."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@ti.func
+def cross(a: ti.template(), b: ti.template()):
+    """Return the vector product of lists of three components."""
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+
+@ti.func
 def clip(low_x, high_x, low_y, high_y, band: ti.template()):
     """Return first and end column, first and end row of the samples of a band within a rectangle [samples]."""
     return (
@@ -306,6 +324,6 @@ def store_visible(entry, visible, value, samples: ti.template()):
 @ti.func
 def store_visible_unit(entry, visible, vector: ti.template(), samples: ti.template()):
     """Store normalised vectors in the three planes from `entry` on, for the visible samples of a tile."""
-    length = ti.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
+    length = ti.sqrt(dot(vector, vector))
     for n in ti.static(range(3)):
         store_visible(entry + n, visible, vector[n] / length, samples)

@@ -20,12 +20,15 @@ from taichi_msm.render import uniforms as uni
 from taichi_msm.render.config import (
     INFINITY,
     clip,
+    cross,
+    dot,
     map_steps,
     sample_centres,
     store_visible,
     store_visible_unit,
     tile_box,
     tile_range,
+    triple,
     undistorted_centres,
 )
 from taichi_msm.render.lens_table import INVALID_COORDINATE
@@ -212,7 +215,7 @@ def intersect_instrument(x, y, index, uniforms: ti.template(), shapes: ti.templa
     w = geometry.w_at(start, uniforms)
     o_x, o_y = across * w - uniforms[tip], up * w - uniforms[tip + 1]
     d_x, d_y = across * uniforms[uni.PINHOLE], up * uniforms[uni.PINHOLE]
-    a_x, a_y, a_z = uniforms[axis], uniforms[axis + 1], uniforms[axis + 2]
+    a_x, a_y, a_z = triple(uniforms, axis)
     length, radius = uniforms[base + uni.LENGTH], uniforms[base + uni.RADIUS]
     d_d, d_a = d_x * d_x + d_y * d_y + 1.0, d_x * a_x + d_y * a_y - a_z
     o_a, o_d, o_o = o_x * a_x + o_y * a_y, o_x * d_x + o_y * d_y, o_x * o_x + o_y * o_y
@@ -305,34 +308,27 @@ def cell_at(i, j, normal_entry, patch: ti.template(), band: ti.template()):
 @ti.func
 def store_normal(position: ti.template(), i, j, band: ti.template()):
     """Store the normal of the sheet at a mass point in `nodes`, if the shading uses it; for tissue in camera axes."""
-    config, uniforms = ti.static((band.config, band.uniforms))
+    config = ti.static(band.config)
     if ti.static(config.headlit or config.tissue):
         i0, i1 = ti.max(i - 1, 0), ti.min(i + 1, band.rows - 1)
         j0, j1 = ti.max(j - 1, 0), ti.min(j + 1, band.cols - 1)
         right = [position[i, j1, n] - position[i, j0, n] for n in ti.static(range(3))]
         up = [position[i0, j, n] - position[i1, j, n] for n in ti.static(range(3))]
-        cross = [
-            right[1] * up[2] - right[2] * up[1],
-            right[2] * up[0] - right[0] * up[2],
-            right[0] * up[1] - right[1] * up[0],
-        ]
-        length = ti.sqrt(cross[0] * cross[0] + cross[1] * cross[1] + cross[2] * cross[2])
-        normal = [cross[n] / ti.max(length, 1e-30) for n in ti.static(range(3))]
+        area = cross(right, up)
+        length = ti.sqrt(dot(area, area))
+        normal = [area[n] / ti.max(length, 1e-30) for n in ti.static(range(3))]
         _, normal_entry, _ = geometry.point_entries(i * band.cols + j, band)
         for n in ti.static(range(3)):
-            axis = uni.AXES + 3 * n
-            band.nodes[normal_entry + n] = (
-                uniforms[axis] * normal[0] + uniforms[axis + 1] * normal[1] + uniforms[axis + 2] * normal[2]
-                if ti.static(config.tissue)
-                else normal[n]
-            )
+            band.nodes[normal_entry + n] = normal[n]
+            if ti.static(config.tissue):
+                band.nodes[normal_entry + n] = dot(triple(band.uniforms, uni.AXES + 3 * n), normal)
 
 
 @ti.func
 def normal_at(across, along, cell: ti.template(), band: ti.template()):
     """Interpolate the normals of the mass points bilinearly; not normalised."""
     corners = ti.static(geometry.corner_entries(cell.normal, band.cols, geometry.NORMAL_STRIDE))
-    a, b, c, d = [[band.nodes[entry + n] for n in ti.static(range(3))] for entry in corners]
+    a, b, c, d = [triple(band.nodes, entry) for entry in corners]
     return [
         a[n] + (b[n] - a[n]) * across + (c[n] - a[n] + (d[n] - b[n] - (c[n] - a[n])) * across) * along
         for n in ti.static(range(3))
@@ -348,10 +344,7 @@ def absolute(values):
 @ti.func
 def headlight(normal: ti.template(), uniforms: ti.template()):
     """Return the reflected share of the headlight: the absolute cosine between normal and direction to the light."""
-    length = ti.sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2])
-    light = uni.HEADLIGHT
-    cosine = absolute(normal[0] * uniforms[light] + normal[1] * uniforms[light + 1] + normal[2] * uniforms[light + 2])
-    cosine = cosine / ti.max(length, 1e-30)
+    cosine = absolute(dot(normal, triple(uniforms, uni.HEADLIGHT))) / ti.max(ti.sqrt(dot(normal, normal)), 1e-30)
     # The normal of an infinite or NaN point is NaN; the limits remove it.
     return ti.max(ti.min(cosine, 1.0), 0.0)
 

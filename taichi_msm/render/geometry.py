@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from taichi_msm.render import lens_kernels
 from taichi_msm.render import uniforms as uni
-from taichi_msm.render.config import INFINITY
+from taichi_msm.render.config import INFINITY, cross
 from taichi_msm.system.runtime import ti
 
 # Numbers per mass point: X, Y, w, depth, and at SCREEN its x and y in the picture [samples]. In kernel 2, `nodes` holds
@@ -275,7 +275,7 @@ def facet(x, y, triangle: ti.template(), uniforms: ti.template()):
         for k in ti.static((triangle.r, triangle.d))
     ]
     r, d = ti.static(sides)
-    normal = [r[1] * d[2] - r[2] * d[1], r[2] * d[0] - r[0] * d[2], r[0] * d[1] - r[1] * d[0]]
+    normal = cross(r, d)
     right, up = line_of_sight(x, y, uniforms)
     cosine = (normal[0] * right - normal[1] * up) * uniforms[uni.PINHOLE] + normal[2]
     sign = ti.select(cosine > 0.0, -1.0, 1.0)

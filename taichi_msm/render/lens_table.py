@@ -29,17 +29,11 @@ class VisibleRegion(NamedTuple):
 
     A line of length L is distorted into a curve whose distance from its chord is at most `sagitta_factor` L^2, because
     its second derivatives are at most 8 `sagitta_factor`. The length of the curve is at most 2 `stretch_factor` L.
-
-    Attributes:
-        radius: largest distance from the optical axis.
-        box: left, right, top and bottom without distortion [px].
-        sagitta_factor: bound of the sagitta, divided by L^2 [1/px].
-        stretch_factor: half the bound of the length, divided by L.
     """
 
-    radius: float
-    box: tuple[float, float, float, float]
-    sagitta_factor: float
+    radius: float  # largest distance from the optical axis
+    box: tuple[float, float, float, float]  # left, right, top and bottom without distortion [px]
+    sagitta_factor: float  # [1/px]
     stretch_factor: float
 
 
@@ -132,12 +126,7 @@ def bounds(coordinates: NDArray[np.float32]) -> Array:
 def tiled_map(table: NDArray[np.float32], config: DrawingConfig) -> NDArray[np.float32]:
     """Rearrange an undistortion map into the bands and tiles of kernel 2, and add the bounding box of each tile.
 
-    Args:
-        table: undistortion map, shape (rows, columns, 2 or 6).
-        config: compile-time configuration.
-
-    Returns:
-        The map, shape (bands, vectors per band, lanes).
+    The result has the shape (bands, vectors per band, lanes).
     """
     rows, columns, planes = table.shape
     band_height, lines = config.band_rows * config.supersample, config.band_lines

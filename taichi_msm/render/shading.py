@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.render import uniforms as uni
-from taichi_msm.render.config import INFINITY, sample_centres, undistorted_centres
+from taichi_msm.render.config import INFINITY, dot, sample_centres, triple, undistorted_centres
 from taichi_msm.render.geometry import line_of_sight, w_at
 from taichi_msm.render.labels import label_channels
 from taichi_msm.system.runtime import ti
@@ -146,30 +146,24 @@ def resolve(row, end_row, left, right, output: ti.template(), band: ti.template(
 @ti.func
 def illuminate(x, y, depth, normal: ti.template(), uniforms: ti.template()):
     """Return N L; M V; d0 / d; and the upward component of the direction of ideal reflection of V."""
-    n_x, n_y, n_z = ti.static((normal[0], normal[1], normal[2]))
     offset_x, offset_y = line_of_sight(x, y, uniforms)
     w = w_at(depth, uniforms)
     right, up = offset_x * w, offset_y * w
-    l_x, l_y, l_z = uniforms[uni.LIGHT_X] - right, uniforms[uni.LIGHT_Y] - up, uniforms[uni.LIGHT_Z] + depth
-    v_x, v_y, v_z = right * (uniforms[uni.PINHOLE] * (-1.0)), up * (uniforms[uni.PINHOLE] * (-1.0)), w
+    light = [uniforms[uni.LIGHT_X] - right, uniforms[uni.LIGHT_Y] - up, uniforms[uni.LIGHT_Z] + depth]
+    eye = [right * (uniforms[uni.PINHOLE] * (-1.0)), up * (uniforms[uni.PINHOLE] * (-1.0)), w]
     # Scalar products before normalisation.
-    n_l = n_x * l_x + n_y * l_y + n_z * l_z
-    n_v = n_x * v_x + n_y * v_y + n_z * v_z
-    l_v = l_x * v_x + l_y * v_y + l_z * v_z
-    n_n = ti.max(n_x * n_x + n_y * n_y + n_z * n_z, 1e-30)
-    l_l = ti.max(l_x * l_x + l_y * l_y + l_z * l_z, 1e-30)
-    v_v = ti.max(v_x * v_x + v_y * v_y + v_z * v_z, 1e-30)
+    n_l, n_v, l_v = dot(normal, light), dot(normal, eye), dot(light, eye)
+    n_n, l_l, v_v = [ti.max(dot(vector, vector), 1e-30) for vector in ti.static((normal, light, eye))]
     to_n = 1.0 / n_n
     # One division for both roots.
     root_l, root_v = ti.sqrt(l_l), ti.sqrt(v_v)
     to_both = 1.0 / (root_l * root_v)
     to_l, to_v = to_both * root_v, to_both * root_l
-    cosine = n_l * ti.sqrt(to_n) * to_l
     return (
-        cosine,
+        n_l * ti.sqrt(to_n) * to_l,
         (2.0 * n_l * n_v * to_n - l_v) * to_both,
         ti.min(uniforms[uni.LIGHT_DISTANCE] * to_l, 4.0),
-        (2.0 * n_v * n_y * to_n - v_y) * to_v,
+        (2.0 * n_v * normal[1] * to_n - eye[1]) * to_v,
     )
 
 
@@ -192,28 +186,23 @@ def light_transmission(x, y, depth, band: ti.template()):
     transmission = band.config.float_vector(1)
     for index in range(band.instrument_count):
         base = uni.INSTRUMENTS + index * uni.INSTRUMENT_STRIDE
-        tip, axis = base + uni.TIP, base + uni.AXIS
-        p_x, p_y, p_z = right - uniforms[tip], up - uniforms[tip + 1], depth * (-1.0) - uniforms[tip + 2]
-        u_x, u_y, u_z = uniforms[axis], uniforms[axis + 1], uniforms[axis + 2]
-        foot = ti.max(ti.min(p_x * u_x + p_y * u_y + p_z * u_z, uniforms[base + uni.LENGTH]), 0.0)
-        f_x, f_y, f_z = p_x - u_x * foot, p_y - u_y * foot, p_z - u_z * foot
+        tip, axis = triple(uniforms, base + uni.TIP), triple(uniforms, base + uni.AXIS)
+        point = [right - tip[0], up - tip[1], depth * (-1.0) - tip[2]]
+        foot = ti.max(ti.min(dot(point, axis), uniforms[base + uni.LENGTH]), 0.0)
+        away = [point[n] - axis[n] * foot for n in ti.static(range(3))]
         square = uniforms[base + uni.RADIUS] * uniforms[base + uni.RADIUS]
-        transmission *= 1.0 - uni.SHADE * square / ti.max(f_x * f_x + f_y * f_y + f_z * f_z, square)
+        transmission *= 1.0 - uni.SHADE * square / ti.max(dot(away, away), square)
     return transmission
 
 
 @ti.func
 def apply_relief(normal: ti.template(), slope_x, slope_y, uniforms: ti.template()):
     """Tilt normals by the relief, in place, against the gradient of the grey level."""
-    n_x, n_y, n_z = ti.static((normal[0], normal[1], normal[2]))
-    length = 1.0 / ti.max(ti.sqrt(n_x * n_x + n_y * n_y + n_z * n_z), 1e-30)
-    a = [uniforms[uni.ACROSS + k] for k in ti.static(range(3))]
-    b = [uniforms[uni.UP + k] for k in ti.static(range(3))]
-    n = [n_x * length, n_y * length, n_z * length]
+    length = 1.0 / ti.max(ti.sqrt(dot(normal, normal)), 1e-30)
+    a, b = triple(uniforms, uni.ACROSS), triple(uniforms, uni.UP)
+    n = [normal[k] * length for k in ti.static(range(3))]
     relief_x, relief_y = slope_x * uniforms[uni.SLOPE_X], slope_y * uniforms[uni.SLOPE_Y]
-    projection = relief_x * (a[0] * n[0] + a[1] * n[1] + a[2] * n[2]) + relief_y * (
-        b[0] * n[0] + b[1] * n[1] + b[2] * n[2]
-    )
+    projection = relief_x * dot(a, n) + relief_y * dot(b, n)
     for k in ti.static(range(3)):
         normal[k] = n[k] * (projection + 1.0) - relief_x * a[k] - relief_y * b[k]
 
