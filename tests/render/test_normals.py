@@ -117,27 +117,6 @@ def test_a_rod_has_the_normals_of_its_side_and_of_its_round_tip(camera: str, dev
     assert apart(found.normals[seen], facing).max() < 1e-4
 
 
-@EVERY_CAMERA
-def test_normals_are_across_the_gradient_of_depth(camera: str, device: Device) -> None:
-    made = with_instruments(drawable((4, 5), camera=CAMERAS[camera], refine=1))
-    position = rest_positions(made.sheet)
-    position[..., 2] = 2 * position[..., 0] ** 2 - position[..., 0] * position[..., 1] + 0.5 * position[..., 1]
-    found = look(made, position)
-    # Where a pixel and its four neighbours show one triangle.
-    place = found.coordinates * np.array([8.0, 6.0])
-    corner = np.floor(place)
-    triangle = corner @ [2.0, 100.0] + (np.diff(place - corner)[..., 0] > 0)
-    middle, around = np.s_[1:-1, 1:-1], [np.s_[1:-1, 2:], np.s_[1:-1, :-2], np.s_[2:, 1:-1], np.s_[:-2, 1:-1]]
-    one = np.all([triangle[middle] == triangle[side] for side in around], axis=0)
-    right, left, below, above = (points(made, found.depth)[side] for side in around)
-    across = np.cross(below - above, right - left)[one]
-    across /= np.linalg.norm(across, axis=-1, keepdims=True)
-    assert one.mean() > 0.2
-    assert len(np.unique(triangle[middle][one])) > 20
-    # 2^-24 of the depth, over the width of two pixels there.
-    assert apart(found.normals[middle][one], across).max() < 1e-4
-
-
 @pytest.mark.slow
 def test_other_labels_keep_their_bits(device: Device) -> None:
     made = with_instruments(drawable(camera=CAMERAS["endoscope"]))
