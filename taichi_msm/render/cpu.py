@@ -25,16 +25,10 @@ from taichi_msm.render.config import (
 from taichi_msm.render.coverage import cover_cell, cover_instruments, store_normal
 from taichi_msm.render.labels import label_offsets
 from taichi_msm.render.lens_kernels import store_distorted
-from taichi_msm.render.lens_table import bounds, tiled_map
+from taichi_msm.render.lens_table import INVALID_COORDINATE
 from taichi_msm.render.shading import resolve
-from taichi_msm.system.runtime import (
-    ITERATIONS_PER_THREAD,
-    Memory,
-    compilation_options,
-    current_device,
-    ti,
-    write_vectors,
-)
+from taichi_msm.system import runtime
+from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, ti
 
 
 class Bands:
@@ -53,8 +47,8 @@ class Bands:
         self._config, self._size, self._texels = config, size, texels
         self._draw = _kernel(config)
         (rows, cols), (width, height) = shape, size
-        self._workers = min(-(-height // config.band_rows), current_device().threads)
-        self._memory = memory = Memory()
+        self._workers = min(-(-height // config.band_rows), runtime.current_device().threads)
+        self._memory = memory = runtime.Memory()
         # After the numbers of the mass points, two per row: the first and last row of the picture without distortion.
         self._nodes = memory.array("f32", 0, rows * (cols * geometry.POINT_STRIDE + 2))
         tiles_of_band = config.band_lines * config.tiles_across(width)
@@ -64,12 +58,7 @@ class Bands:
 
     def set_undistortion_map(self, table: NDArray[np.float32]) -> None:
         """Set the undistortion map of the following pictures, as returned by `undistortion_map`."""
-        config, tiles = self._config, tiled_map(table, self._config)
-        rows = config.band_rows * config.supersample
-        boxes = [bounds(table[first : first + rows, :, :2]) for first in range(0, len(table), rows)]
-        padded_boxes = np.pad(boxes, ((0, 0), (0, config.lanes - len(boxes[0]))))
-        bands = np.concatenate([tiles, padded_boxes[:, None].astype(np.float32)], axis=1)
-        write_vectors(self._samples, bands.reshape(-1, config.lanes))
+        runtime.write_vectors(self._samples, _tiled_map(table, self._config))
 
     def draw(
         self, position: NDArray[np.float32], uniforms: NDArray[np.float32], sizes: NDArray[np.int32]
@@ -93,12 +82,36 @@ class Bands:
         if config.labels:
             labels = np.zeros(label_offsets(config.labels)[""] * width * height, np.float32)
         sizes[[uni.ROWS_TAKEN, uni.ROWS_PROJECTED, uni.BANDS_TAKEN]] = 0
-        with compilation_options(optimised=False):
+        with runtime.compilation_options(optimised=False):
             self._draw(
                 position, self._texels, uniforms, self._workers, sizes, self._nodes, self._samples,
                 picture.ravel().view(np.int32) if config.writes_words else picture.ravel(), labels,
             )  # fmt: skip
         return picture[:, :width], labels
+
+
+def _tiled_map(table: NDArray[np.float32], config: DrawingConfig) -> NDArray[np.float32]:
+    """Rearrange an undistortion map into bands and tiles, and add the bounding box of each tile and each band."""
+    rows, columns, planes = table.shape
+    band_height, lines = config.band_rows * config.supersample, config.band_lines
+    tile_height, tile_width = config.tile_height, config.tile_width
+    bands, tiles_across = -(-rows // band_height), -(-columns // tile_width)
+    padding = (0, bands * band_height - rows), (0, tiles_across * tile_width - columns), (0, 0)
+    padded = np.pad(table, padding, constant_values=INVALID_COORDINATE).reshape(bands, band_height, -1, planes)
+    padding_of_lines = (0, 0), (0, lines * tile_height - band_height), (0, 0), (0, 0)
+    padded = np.pad(padded, padding_of_lines, constant_values=INVALID_COORDINATE)
+    tiles = padded.reshape(bands, lines, tile_height, tiles_across, tile_width, planes).transpose(0, 1, 3, 5, 2, 4)
+    tiles = tiles.reshape(bands, lines, tiles_across, planes, config.lanes)
+    positions = tiles[..., :2, :]
+    low, high = positions.min(axis=-1), np.where(positions < INVALID_COORDINATE, positions, -np.inf).max(axis=-1)
+    # A tile without valid coordinates has an invalid box.
+    boxes = np.stack([low, np.maximum(low, high)], axis=-1).reshape(bands, lines, tiles_across, 1, 4)
+    band_boxes = np.stack([low.min(axis=(1, 2)), high.max(axis=(1, 2))], axis=-1).reshape(bands, 1, 4)
+    boxes, band_boxes = (
+        np.pad(box, [*[(0, 0)] * (box.ndim - 1), (0, config.lanes - 4)]) for box in (boxes, band_boxes)
+    )
+    vectors = np.concatenate([tiles, boxes], axis=3).reshape(bands, -1, config.lanes)
+    return np.concatenate([vectors, band_boxes], axis=1).reshape(-1, config.lanes)
 
 
 @ti.func
