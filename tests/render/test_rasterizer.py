@@ -162,11 +162,8 @@ def test_launches_do_not_change_the_bits(parts: int, device: Device, monkeypatch
     made = with_instruments(drawable((9, 11), size=[60, 50], refine=2, camera="top", supersample=2))
     rng = np.random.default_rng(6)
     position = rest_positions(made.sheet) + rng.normal(0, 0.03, (9, 11, 3)) * [1, 1, 0]
-    placed, texture, config = (
-        place_instruments(made, position, 0),
-        speckle(30, 20),
-        drawing_config(made)._replace(lanes=1),
-    )
+    placed, texture = place_instruments(made, position, 0), speckle(30, 20)
+    config = drawing_config(made)._replace(lanes=1)
     begun: list[int] = []
     launch = launches.Launches.launch
 
@@ -259,11 +256,8 @@ def test_tissue_is_as_bright_as_its_faces_at_a_fold(device: Device) -> None:
     position[..., 2] = 0.03 * np.sin(position[..., 1] * 100)
     picture = draw(made, position, np.full((4, 4, 3), 255, np.uint8))[..., 0].astype(int)
     inner = picture[1:-1, 1:-1]
-    around = np.array(
-        [picture[1 + i : 149 + i, 1 + j : 199 + j] for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
-    )
-    specks = (inner > 0) & (inner < 0.5 * around.min(axis=0))
-    assert not specks.any(), "no dark pixel in a bright face"
+    around = [picture[1 + i : 149 + i, 1 + j : 199 + j] for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
+    assert not ((inner > 0) & (inner < 0.5 * np.min(around, axis=0))).any(), "no dark pixel in a bright face"
 
 
 def test_tissue_is_nowhere_black(device: Device) -> None:
@@ -271,9 +265,7 @@ def test_tissue_is_nowhere_black(device: Device) -> None:
     position = rest_positions(made.sheet)
     position[..., 2] = position[..., 0] * np.tan(np.radians(85))  # away from the light
     picture = draw(made, position, np.full((4, 4, 3), 200, np.uint8))
-    assert picture.max() > 0
-    lit = picture[picture.any(axis=-1)]
-    assert lit.min() >= 0.2 * 200 - 1, "the ambient share is left"
+    assert picture[picture.any(axis=-1)].min() >= 0.2 * 200 - 1, "the ambient share is left"
 
 
 @pytest.mark.parametrize("lanes", [8, *(pytest.param(lanes, marks=pytest.mark.slow) for lanes in (4, 16))])
@@ -349,39 +341,12 @@ def test_a_sheet_that_passes_through_the_eye_is_seen_in_part(device: Device) -> 
         assert (apart > 1).mean() < 0.002, y
 
 
-def test_of_a_folded_sheet_the_upper_layer_is_seen(device: Device) -> None:
-    # The right half is folded over the left one, once above it and once below; the sides have their own colours.
-    texture = np.zeros((10, 20, 3), np.uint8)
-    texture[:, :10] = [250, 0, 0]
-    texture[:, 10:] = [0, 0, 250]
-    made = drawable((3, 21), shading="none", refine=1)
-    for height, colour in ((0.01, [0, 0, 250]), (-0.01, [250, 0, 0])):
-        position = rest_positions(made.sheet)
-        right = position[..., 0] > 0.01
-        position[right, 0] *= -1
-        position[right, 2] = height
-        picture = draw(made, position, texture)
-        assert (picture[10:50, 5:35] == colour).all()
-        assert not picture[:, 50:].any(), "nothing is left on the right but the background"
-
-
 def test_oblique_shows_the_whole_sheet(device: Device) -> None:
     for size in ([80, 60], [40, 90], [200, 30]):
         made = drawable(size=size, camera="oblique")
         corners = rest_positions(made.sheet)[[0, 0, -1, -1], [0, -1, 0, -1]]
         x, y, w, _ = view(made).matrix @ np.c_[corners, np.ones(4)].T
         assert ((x / w > 0) & (x / w < size[0]) & (y / w > 0) & (y / w < size[1])).all()
-
-
-def test_perspective_is_correct(device: Device) -> None:
-    # Two triangles in steep perspective: without the division by w the texture would bend at the diagonal.
-    made = drawable((2, 2), refine=0, camera={"eye": [0, -0.35, 0.12], "fov": 60}, shading="none")
-    fine = drawable((2, 2), refine=30, camera={"eye": [0, -0.35, 0.12], "fov": 60}, shading="none")
-    ramp = np.linspace(0, 255, 64).astype(np.uint8)
-    texture = np.stack([np.tile(ramp, (64, 1)), np.tile(ramp[:, None], (1, 64)), np.zeros((64, 64), np.uint8)], -1)
-    position = rest_positions(made.sheet)
-    apart = difference(draw(made, position, texture), draw(fine, position, texture))
-    assert (apart > 1).mean() < 0.005
 
 
 def test_wireframe_draws_the_mass_point_mesh(device: Device) -> None:

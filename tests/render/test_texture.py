@@ -15,6 +15,7 @@ from taichi_msm.errors import SceneError
 from taichi_msm.images import read_grey
 from taichi_msm.render.texture import image_problems, image_size, load_texture
 from taichi_msm.scene.scene import Scene
+from tests import scenes
 from tests.golden import Messages
 from tests.scenes import speckle
 
@@ -37,17 +38,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def scene(image: str | None, **keys: Any) -> Scene:
-    return Scene.model_validate(
-        {
-            "image": image,
-            "sheet": {"points": [2, 2], "size": [1, 1], "mass": 1},
-            "springs": {},
-            "time": {"duration": 1},
-            "render": {"background": BACKGROUND},
-            "output": [],
-            **keys,
-        }
-    )
+    return scenes.scene(image=image, render={"background": BACKGROUND}, **keys)
 
 
 def faults(image: str | None, **keys: Any) -> list[str]:
