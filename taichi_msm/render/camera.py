@@ -25,17 +25,8 @@ Array = NDArray[np.float64]
 OBLIQUE_DIRECTION = np.array([0.0, -0.64, 0.77])
 OBLIQUE_FOV = 32.0
 
-# Margin of the preset fit on every side, as a fraction of the picture's width or height.
-FIT_MARGIN = 0.02
-
-# Kernels multiply the matrix by the samples along a side of a pixel, in f32.
-MAX_MATRIX_ENTRY = float(np.finfo(np.float32).max) / MAX_SUPERSAMPLE
-
 # Maximum baseline of a stereo pair, in units of the sheet's larger side.
 MAX_BASELINE_RATIO = 1e6
-
-# Maximum time between the first two poses [s]; for more than two poses also in units of the scene's duration.
-MAX_GAP_S, MAX_GAP_RATIO = 1e5, 5
 
 # Signs that convert the axes right, up, toward the camera to OpenCV's right, down, forward.
 OPENCV_SIGNS = np.array([[1.0], [-1.0], [-1.0]])
@@ -306,7 +297,8 @@ def _extrinsics_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
         begin, end, duration = camera.poses[0][0], camera.poses[-1][0], scene.time.duration
         tolerance = FRAME_TOLERANCE / scene.time.frames_per_second
         gap = camera.poses[min(1, len(camera.poses) - 1)][0] - max(begin, 0.0)
-        if gap > MAX_GAP_S or (len(camera.poses) > 2 and gap > MAX_GAP_RATIO * duration):
+        # Longer gaps are those of times in other units than seconds.
+        if gap > 1e5 or (len(camera.poses) > 2 and gap > 5 * duration):
             message = f"its first poses are {gap:.6g} s apart, and the scene lasts {duration:g} s"
             yield Problem(place, f"{message}; set poses_time, the unit of its times: ms, us or ns")
         if begin > tolerance or end < duration - tolerance:
@@ -330,7 +322,8 @@ def _extrinsics_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
                 yield Problem(place, f"{eye} is also the target{when}; move one of them")
             if not np.linalg.norm(np.cross(toward, normalised(np.array(up)))) > 1e-9:
                 yield Problem(("up",), f"{up} is zero or along the line of sight{when}; take a direction across it")
-        if np.abs(_pinhole(camera, scene, time).matrix).max() > MAX_MATRIX_ENTRY:
+        # Kernels multiply the matrix by the samples along a side of a pixel, in f32.
+        if np.abs(_pinhole(camera, scene, time).matrix).max() > float(np.finfo(np.float32).max) / MAX_SUPERSAMPLE:
             message = f"is too far away for its focal length{when}; move it nearer"
             if camera.eye is not None and camera.intrinsics is None:
                 message = f"{eye} is too far away for {camera.fov:g} degrees{when}; move it nearer or widen fov"
@@ -461,7 +454,7 @@ def _preset(name: str, scene: Scene) -> Camera:
 
 
 def _fit(scene: Scene) -> Camera:
-    """Return the fit preset, for which the sheet at rest fills the picture up to a margin.
+    """Return the fit preset, for which the sheet at rest fills the picture up to a margin of 2 %.
 
     The eye is d from the plane across the line of sight through the sheet's centre. The corners are a above and below
     that line, and b behind and before the plane. With the eye a b / d below the line, they are projected to a / d above
@@ -470,7 +463,7 @@ def _fit(scene: Scene) -> Camera:
     (height, width), (columns, lines) = scene.sheet.size, scene.render.size
     axes = look_at_axes(OBLIQUE_DIRECTION.tolist(), (0, 0, 0), (0, 1, 0))
     a, b = height / 2 * axes[1, 1], -height / 2 * axes[2, 1]
-    half_height = (1 - 2 * FIT_MARGIN) * math.tan(math.radians(OBLIQUE_FOV) / 2)
+    half_height = (1 - 2 * 0.02) * math.tan(math.radians(OBLIQUE_FOV) / 2)
     distance = max(a / half_height, width / 2 / (half_height * columns / lines) + b)
     eye = distance * axes[2] - a * b / distance * axes[1]
     target = eye - eye[2] / axes[2, 2] * axes[2]

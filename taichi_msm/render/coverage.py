@@ -31,12 +31,10 @@ from taichi_msm.render.config import (
     triple,
     undistorted_centres,
 )
+from taichi_msm.render.lens_kernels import store_distorted
 from taichi_msm.render.lens_table import INVALID_COORDINATE
 from taichi_msm.shapes import SHAPES
 from taichi_msm.system.runtime import ti
-
-# Maximum footprint, above that of any texture.
-MAX_FOOTPRINT = 1e12
 
 
 class Cell(NamedTuple):
@@ -306,9 +304,13 @@ def cell_at(i, j, normal_entry, patch: ti.template(), band: ti.template()):
 
 
 @ti.func
-def store_normal(position: ti.template(), i, j, band: ti.template()):
-    """Store the normal of the sheet at a mass point in `nodes`, if the shading uses it; for tissue in camera axes."""
+def store_point(position: ti.template(), i, j, band: ti.template()):
+    """Project a mass point; if used, also distort it and compute its normal, for tissue in camera axes."""
     config = ti.static(band.config)
+    geometry.project(position, i, j, band.cols, band.uniforms, band.nodes, False)
+    entry, normal_entry, distorted_entry = geometry.point_entries(i * band.cols + j, band)
+    if ti.static(config.has_distortion):
+        store_distorted(distorted_entry, entry, band.uniforms, band.nodes, config.lens)
     if ti.static(config.headlit or config.tissue):
         i0, i1 = ti.max(i - 1, 0), ti.min(i + 1, band.rows - 1)
         j0, j1 = ti.max(j - 1, 0), ti.min(j + 1, band.cols - 1)
@@ -317,7 +319,6 @@ def store_normal(position: ti.template(), i, j, band: ti.template()):
         area = cross(right, up)
         length = ti.sqrt(dot(area, area))
         normal = [area[n] / ti.max(length, 1e-30) for n in ti.static(range(3))]
-        _, normal_entry, _ = geometry.point_entries(i * band.cols + j, band)
         for n in ti.static(range(3)):
             band.nodes[normal_entry + n] = normal[n]
             if ti.static(config.tissue):
@@ -372,7 +373,8 @@ def footprint(entry, x, y, s, t, texels_x, texels_y, triangle: ti.template(), ba
     across_1, across_2, down_1, down_2 = d_1 * texels_x, d_2 * texels_x, r_1 * texels_y, r_2 * texels_y
     largest = ti.max(across_1 * across_1 + down_1 * down_1, across_2 * across_2 + down_2 * down_2)
     square = largest * (scale * scale) * (1.0 / (uni.SHARP * uni.SHARP))
-    return ti.min(square, MAX_FOOTPRINT), ti.select(scale < 0.0, -1.0, 1.0)
+    # The limit is above the footprint on any texture.
+    return ti.min(square, 1e12), ti.select(scale < 0.0, -1.0, 1.0)
 
 
 @ti.func

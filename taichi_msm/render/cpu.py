@@ -22,9 +22,8 @@ from taichi_msm.render.config import (
     clear_tile,
     read_arguments,
 )
-from taichi_msm.render.coverage import cover_cell, cover_instruments, store_normal
+from taichi_msm.render.coverage import cover_cell, cover_instruments, store_point
 from taichi_msm.render.labels import label_offsets
-from taichi_msm.render.lens_kernels import store_distorted
 from taichi_msm.render.lens_table import INVALID_COORDINATE
 from taichi_msm.render.shading import resolve
 from taichi_msm.system import runtime
@@ -117,14 +116,11 @@ def _tiled_map(table: NDArray[np.float32], config: DrawingConfig) -> NDArray[np.
 @ti.func
 def project_row(position: ti.template(), i, band: ti.template()):
     """Project a row of mass points, and store the first and last row of the picture that it overlaps."""
-    config, cols, nodes = ti.static((band.config, band.cols, band.nodes))
+    cols, nodes = ti.static((band.cols, band.nodes))
     first_row, last_row = INFINITY, -INFINITY
     for j in range(cols):
-        geometry.project(position, i, j, cols, band.uniforms, nodes, False)
-        store_normal(position, i, j, band)
-        entry, _, distorted_entry = geometry.point_entries(i * cols + j, band)
-        if ti.static(config.has_distortion):
-            store_distorted(distorted_entry, entry, band.uniforms, nodes, config.lens)
+        store_point(position, i, j, band)
+        entry = (i * cols + j) * geometry.NODE_STRIDE
         if nodes[entry + 2] > band.near:
             first_row = ti.min(first_row, nodes[entry + geometry.SCREEN + 1])
             last_row = ti.max(last_row, nodes[entry + geometry.SCREEN + 1])

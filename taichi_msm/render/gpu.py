@@ -25,9 +25,8 @@ from taichi_msm.render.config import (
     clear_tile,
     read_arguments,
 )
-from taichi_msm.render.coverage import cover_cell, cover_instruments, store_normal
+from taichi_msm.render.coverage import cover_cell, cover_instruments, store_point
 from taichi_msm.render.labels import label_offsets
-from taichi_msm.render.lens_kernels import store_distorted
 from taichi_msm.render.shading import resolve
 from taichi_msm.system.launches import VULKAN_THREADS, Launches, end_thread
 from taichi_msm.system.runtime import compilation_options, ti, write_vectors
@@ -139,12 +138,7 @@ def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable
         """
         for index in range(sizes[uni.ROWS] * sizes[uni.COLS]):
             picture = ti.static(read_arguments(uniforms, sizes, nodes, (), config))
-            cols = picture.cols
-            geometry.project(position, index // cols, index % cols, cols, uniforms, nodes, False)
-            store_normal(position, index // cols, index % cols, picture)
-            if ti.static(config.has_distortion):
-                entry, _, distorted_entry = geometry.point_entries(index, picture)
-                store_distorted(distorted_entry, entry, uniforms, nodes, config.lens)
+            store_point(position, index // picture.cols, index % picture.cols, picture)
 
         for cell in range((sizes[uni.ROWS] - 1) * (sizes[uni.COLS] - 1)):
             cols, subdivisions = sizes[uni.COLS], ti.cast(uniforms[uni.SUBDIVISIONS], ti.i32)
