@@ -24,6 +24,8 @@ Arguments that the functions of kernel 2 share, and that their docstrings omit:
     across, along         coordinates in a cell, to the right and down, from 0 to 1
     normal                list of three components, of any length
     samples               G-buffer; with lens distortion also the undistortion map
+    texels                levels of the texture, as returned by `pyramid`
+    colours, labels       colours of all pixels, as words or bytes; labels of all pixels, one label after the other
     entry                 first entry of a tile in the G-buffer
     visible, inside       masks of the samples of a tile
     colour                list of red, green and blue, 0 to 255
@@ -191,14 +193,6 @@ class Band(NamedTuple):
     right: Any = 0.0  # column after the last one
     top: Any = 0
     bottom: Any = 0
-
-
-class Output(NamedTuple):
-    """Texture, and the arrays that are written."""
-
-    texels: Any  # levels of the texture, as returned by `pyramid`
-    colours: Any  # of the pixels, as words or bytes
-    labels: Any  # of all pixels, one label after the other (labels.py)
 
 
 @ti.func

@@ -12,16 +12,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.render import geometry
 from taichi_msm.render import uniforms as uni
-from taichi_msm.render.config import (
-    INFINITY,
-    Bytes,
-    DrawingConfig,
-    Floats,
-    Integers,
-    Output,
-    clear_tile,
-    read_arguments,
-)
+from taichi_msm.render.config import INFINITY, Bytes, DrawingConfig, Floats, Integers, clear_tile, read_arguments
 from taichi_msm.render.coverage import cover_cell, cover_instruments, store_point
 from taichi_msm.render.labels import label_offsets
 from taichi_msm.render.lens_table import INVALID_COORDINATE
@@ -217,7 +208,6 @@ def _kernel(config: DrawingConfig) -> Callable[..., None]:
                         cover_band(band)
                         if ti.static(len(config.shapes) > 0):
                             cover_instruments(band)
-                        output = ti.static(Output(texels, colours, labels))
-                        resolve(row, end_row, 0, sizes[uni.WIDTH], output, band)
+                        resolve(row, end_row, 0, sizes[uni.WIDTH], texels, colours, labels, band)
 
     return draw

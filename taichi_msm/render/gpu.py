@@ -15,16 +15,7 @@ from numpy.typing import NDArray
 from taichi_msm.render import geometry
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.bins import BOUNDS_STRIDE, SEARCH_ROUNDS, build_bins, is_in_bounds, owner_of, store_bounds
-from taichi_msm.render.config import (
-    INFINITY,
-    Bytes,
-    DrawingConfig,
-    Floats,
-    Integers,
-    Output,
-    clear_tile,
-    read_arguments,
-)
+from taichi_msm.render.config import INFINITY, Bytes, DrawingConfig, Floats, Integers, clear_tile, read_arguments
 from taichi_msm.render.coverage import cover_cell, cover_instruments, store_point
 from taichi_msm.render.labels import label_offsets
 from taichi_msm.render.shading import resolve
@@ -263,8 +254,7 @@ def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callab
             band = ti.static(place(x * factor, y * factor, factor, row * factor, picture))
             if ti.static(len(config.shapes) > 0):
                 cover_instruments(band)
-            output = ti.static(Output(texels, colours, labels))
-            resolve(y, y + 1, x, x + 1, output, band)
+            resolve(y, y + 1, x, x + 1, texels, colours, labels, band)
             end_thread(ended)
 
     return cover_samples, resolve_pixels

@@ -121,7 +121,9 @@ def write_labels(entry, left, row, end_row, labels: ti.template(), band: ti.temp
 
 
 @ti.func
-def resolve(row, end_row, left, right, output: ti.template(), band: ti.template()):
+def resolve(
+    row, end_row, left, right, texels: ti.template(), colours: ti.template(), labels: ti.template(), band: ti.template()
+):
     """Shade the samples of the pixels in columns `left` to `right` of a band, and write the pixels."""
     config = ti.static(band.config)
     factor, tile_width, tile_height = ti.static((config.supersample, config.tile_width, config.tile_height))
@@ -131,16 +133,16 @@ def resolve(row, end_row, left, right, output: ti.template(), band: ti.template(
             entry = band.first + (tile_row * band.tiles_across + tile) * config.planes
             column, top = tile * tile_width, tile_row * tile_height
             if ti.static(len(config.labels) > 0):
-                write_labels(entry, column, row + top, end_row, output.labels, band)
+                write_labels(entry, column, row + top, end_row, labels, band)
             if ti.static(config.picture):
-                colour = shade(entry, column, row * factor + top, output.texels, band)
+                colour = shade(entry, column, row * factor + top, texels, band)
                 if ti.static(factor == 1):
-                    write_colours(colour, row + top, end_row, tile, output.colours, band)
+                    write_colours(colour, row + top, end_row, tile, colours, band)
                 else:
                     for n in ti.static(range(3)):
                         band.samples[entry + config.plane.red + n] = colour[n]
     if ti.static(config.picture and factor > 1):
-        write_means(row, end_row, left, right, output.colours, band)
+        write_means(row, end_row, left, right, colours, band)
 
 
 @ti.func
