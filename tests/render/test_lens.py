@@ -17,7 +17,6 @@ from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.surface import place_instruments
 from taichi_msm.render import tracking, uniforms
 from taichi_msm.render.camera import calibration, view
-from taichi_msm.render.labels import track_grid
 from taichi_msm.render.lens import Lens
 from taichi_msm.render.picking import pick
 from taichi_msm.render.rasterizer import Rasterizer, drawing_config
@@ -282,9 +281,10 @@ def test_labels_are_on_the_ray_of_each_pixel(lens: str, shape: Any, device: Devi
     assert (still.occlusion > 0).sum() <= 3
     for x, y in [(40, 30), (15, 20), (66, 44), (30, 50), (2, 2)]:
         place, label = pick(position, made.render.refine, view(made), (x, y)), found.coordinates[y, x]
-        if seen[y, x]:
+        # An instrument may be in front of the sheet.
+        assert (place is not None) == seen[y, x] or found.instrument[y, x]
+        if place is not None and seen[y, x]:
             np.testing.assert_allclose(place, label, atol=1e-5)
-        assert seen[y, x] or place is None or found.instrument[y, x]
 
 
 @cases(
@@ -325,18 +325,6 @@ def test_what_is_beyond_the_limit_is_outside_the_picture(device: Device) -> None
     found = locate_points(made, np.array([[0.5, 0.5], [0.99, 0.5]]), position, view(made))
     np.testing.assert_array_equal(np.isnan(found.pixels[:, 0]), [False, True])
     np.testing.assert_array_equal(found.hidden, [False, True])
-
-
-def test_what_tangential_distortion_folds_back_is_outside_the_picture(device: Device) -> None:
-    # From 3 mm above the sheet, much of it is farther from the axis than the fold.
-    camera = {"eye": [0, 0, 0.003], "target": [0, 0.03, 0.003], "up": [0, 0, -1], "intrinsics": INTRINSICS}
-    made = drawable((9, 9), camera={**camera, "distortion": {"p1": 0.05}})
-    places, (height, width) = track_grid(100), made.sheet.size
-    points = np.stack([(places[:, 0] - 0.5) * width, (0.5 - places[:, 1]) * height, np.zeros(len(places))], axis=-1)
-    away = (view(made)._replace(lens=None).pixels(points) - [37.5, 31.5]) / [60, 62]
-    found = locate_points(made, places, rest_positions(made.sheet), view(made))
-    np.testing.assert_array_equal(np.isnan(found.pixels[:, 0]), ~(np.linalg.norm(away, axis=-1) < 1 / 0.3))
-    assert 0.1 < np.isnan(found.pixels).mean() < 0.9
 
 
 def test_a_lens_without_coefficients_has_the_bits_of_none(device: Device) -> None:

@@ -357,17 +357,6 @@ def test_oblique_shows_the_whole_sheet(device: Device) -> None:
         assert ((x / w > 0) & (x / w < size[0]) & (y / w > 0) & (y / w < size[1])).all()
 
 
-def test_wireframe_draws_the_mass_point_mesh(device: Device) -> None:
-    made = drawable((3, 5), size=[80, 60], shading="none", wireframe=True)
-    picture = draw(made, rest_positions(made.sheet), np.zeros((4, 4, 3), np.uint8))[..., 0]
-    # Lines at x = 0, 20, 40, 60, 80 and y = 0, 30, 60: both pixels beside a line carry half of it.
-    lines = picture > 0
-    expected = np.zeros((60, 80), bool)
-    expected[:, [0, 19, 20, 39, 40, 59, 60, 79]] = True
-    expected[[0, 29, 30, 59]] = True
-    np.testing.assert_array_equal(lines, expected)
-
-
 def test_only_what_the_picture_needs_is_compiled(device: Device) -> None:
     assert drawing_config(drawable(shading="none")).plane._fields == ("depth", "texel_x", "texel_y")
     assert drawing_config(drawable()) == drawing_config(

@@ -154,17 +154,6 @@ def test_exif_orientation(name: str, orientation: int, upright: NDArray[np.uint8
     assert_texture(name, upright[1:, 1:], region=[1, 1, width - 1, height - 1])
 
 
-def test_exif_orientation_of_a_jpeg_turns_its_size() -> None:
-    exif = Image.Exif()
-    exif[ORIENTATION] = 6
-    Image.new("RGB", (16, 8), (200, 100, 50)).save("a.jpg", quality=100, subsampling=0, exif=exif)
-    texture = load_texture(scene("a.jpg"))
-    assert image_size(scene("a.jpg")) == (8, 16)
-    assert texture.shape == (16, 8, 3)
-    # Rounding to whole Y, Cb, Cr and back is within 2 of each colour.
-    assert np.abs(texture.astype(int) - [200, 100, 50]).max() <= 2
-
-
 def test_the_first_of_several_pictures() -> None:
     first, second = Image.fromarray(COLOURS), Image.fromarray(COLOURS[::-1])
     for name in ("a.png", "a.tif", "a.webp"):
