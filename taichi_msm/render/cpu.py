@@ -14,7 +14,7 @@ from taichi_msm.render import geometry
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.config import INFINITY, Bytes, DrawingConfig, Floats, Integers, clear_tile, read_arguments
 from taichi_msm.render.coverage import cover_cell, cover_instruments, store_point
-from taichi_msm.render.labels import label_offsets
+from taichi_msm.render.labels import values_per_pixel
 from taichi_msm.render.lens_table import INVALID_COORDINATE
 from taichi_msm.render.shading import resolve
 from taichi_msm.system import runtime
@@ -70,7 +70,7 @@ class Bands:
         # Without labels the argument is unused; passing a Taichi array takes half the time of a NumPy array.
         labels: Any = self._nodes
         if config.labels:
-            labels = np.zeros(label_offsets(config.labels)[""] * width * height, np.float32)
+            labels = np.zeros(values_per_pixel(config.labels) * width * height, np.float32)
         sizes[[uni.ROWS_TAKEN, uni.ROWS_PROJECTED, uni.BANDS_TAKEN]] = 0
         with runtime.compilation_options(optimised=False):
             self._draw(

@@ -17,7 +17,7 @@ from taichi_msm.render import uniforms as uni
 from taichi_msm.render.bins import BOUNDS_STRIDE, SEARCH_ROUNDS, build_bins, is_in_bounds, owner_of, store_bounds
 from taichi_msm.render.config import INFINITY, Bytes, DrawingConfig, Floats, Integers, clear_tile, read_arguments
 from taichi_msm.render.coverage import cover_cell, cover_instruments, store_point
-from taichi_msm.render.labels import label_offsets
+from taichi_msm.render.labels import values_per_pixel
 from taichi_msm.render.shading import resolve
 from taichi_msm.system.launches import VULKAN_THREADS, Launches, end_thread
 from taichi_msm.system.runtime import compilation_options, ti, write_vectors
@@ -53,8 +53,7 @@ class Threads:
             config.float_vector, height * config.supersample * samples_across * config.map_planes + strip
         )
         self._colours = launches.array(np.uint8, 3 * width * height if config.picture else 1)
-        label_count = label_offsets(config.labels)[""]
-        self._labels = launches.array(np.float32, max(label_count * width * height, 1))
+        self._labels = launches.array(np.float32, max(values_per_pixel(config.labels) * width * height, 1))
 
     def set_undistortion_map(self, table: NDArray[np.float32]) -> None:
         """Set the undistortion map of the following pictures, as returned by `undistortion_map`."""

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
-from itertools import accumulate
+from collections.abc import Collection, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -59,11 +58,18 @@ def requested_labels(outputs: Collection[str]) -> frozenset[str]:
     return frozenset(name for name, label in LABELS.items() if name in outputs or not label.is_optional)
 
 
-def label_offsets(names: Collection[str]) -> dict[str, int]:
-    """Return the number of values per pixel before each label, and under "" that of all."""
-    chosen = [name for name in LABELS if name in names]
-    counts = accumulate((len(LABELS[name].planes) for name in chosen), initial=0)
-    return dict(zip([*chosen, ""], counts, strict=True))
+def label_offsets(names: Collection[str]) -> Iterator[tuple[str, Label, int]]:
+    """List the labels of these names with the number of values per pixel before each."""
+    offset = 0
+    for name, label in LABELS.items():
+        if name in names:
+            yield name, label, offset
+            offset += len(label.planes)
+
+
+def values_per_pixel(names: Collection[str]) -> int:
+    """Return the number of values per pixel of labels."""
+    return sum(len(LABELS[name].planes) for name in names)
 
 
 def label_channels(plane: Any, names: Collection[str]) -> list[tuple[int, int, int, int, Label]]:
@@ -78,10 +84,9 @@ def label_channels(plane: Any, names: Collection[str]) -> list[tuple[int, int, i
         their number, and the label.
     """
     return [
-        (getattr(plane, plane_name), offset, n, len(LABELS[name].planes), LABELS[name])
-        for name, offset in label_offsets(names).items()
-        if name
-        for n, plane_name in enumerate(LABELS[name].planes)
+        (getattr(plane, plane_name), offset, n, len(label.planes), label)
+        for _, label, offset in label_offsets(names)
+        for n, plane_name in enumerate(label.planes)
         if hasattr(plane, plane_name)
     ]
 
@@ -89,11 +94,10 @@ def label_channels(plane: Any, names: Collection[str]) -> list[tuple[int, int, i
 def labels_of(numbers: NDArray[np.float32], size: tuple[int, int], names: Collection[str]) -> Labels:
     """Convert the output of kernel 2, one label after the other, to labels of a picture of a size [px]."""
     (width, height), arrays = size, {}
-    for name, offset in label_offsets(names).items():
-        if name:
-            label, count = LABELS[name], len(LABELS[name].planes)
-            values = numbers.reshape(-1, width * height)[offset : offset + count]
-            arrays[name] = values.reshape((height, width, count)[: 2 + (count > 1)]).astype(label.dtype, copy=False)
+    for name, label, offset in label_offsets(names):
+        count = len(label.planes)
+        values = numbers.reshape(-1, width * height)[offset : offset + count]
+        arrays[name] = values.reshape((height, width, count)[: 2 + (count > 1)]).astype(label.dtype, copy=False)
     # Rounding may move coordinates beyond the sheet's edge.
     arrays["coordinates"] = arrays["coordinates"].clip(0, 1)
     return Labels(**arrays)
