@@ -174,16 +174,12 @@ def edges(x, y, facing, outline: ti.template()):
 
 
 @ti.func
-def turn(p_x, p_y, q_x, q_y, r_x, r_y):
-    """Return twice the signed area of a triangle p, q, r; positive if its vertices are clockwise in the picture."""
-    return (q_x - p_x) * (r_y - q_y) - (q_y - p_y) * (r_x - q_x)
-
-
-@ti.func
 def facing_of(x: ti.template(), y: ti.template()):
     """Return `facing` of a cell from lists of its corners' x and y; 0 if it is folded and both sides are visible."""
+    # Twice the signed areas of the triangles of three corners, positive if clockwise in the picture.
     turns = [
-        turn(x[n], y[n], x[m], y[m], x[k], y[k]) for n, m, k in ti.static(((0, 1, 3), (1, 3, 2), (3, 2, 0), (2, 0, 1)))
+        (x[m] - x[n]) * (y[k] - y[m]) - (y[m] - y[n]) * (x[k] - x[m])
+        for n, m, k in ti.static(((0, 1, 3), (1, 3, 2), (3, 2, 0), (2, 0, 1)))
     ]
     return ti.select(ti.min(*turns) > 0, 1.0, ti.select(ti.max(*turns) < 0, -1.0, 0.0))
 
