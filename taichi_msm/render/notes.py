@@ -118,13 +118,10 @@ def _stretched_picture(scene: Scene) -> Iterator[str]:
         settings += f' --set "sheet.points=[{rows},{cols}]"'
     warning = (
         f"the picture of {width} x {height} pixels is stretched onto a sheet {sheet_width:g} m wide and "
-        f"{sheet_height:g} m high; "
-        f"{settings} makes the sheet like the picture"
+        f"{sheet_height:g} m high; {settings} makes the sheet like the picture"
     )
-    cut_width, cut_height = (
-        min(width, round(height * sheet_width / sheet_height)),
-        min(height, round(width * sheet_height / sheet_width)),
-    )
+    cut_width = min(width, round(height * sheet_width / sheet_height))
+    cut_height = min(height, round(width * sheet_height / sheet_width))
     # In a picture of few pixels even the best region may be stretched.
     if cut_width and cut_height and _nearly_equal(sheet_width * cut_height, sheet_height * cut_width):
         region = left + (width - cut_width) // 2, top + (height - cut_height) // 2, cut_width, cut_height

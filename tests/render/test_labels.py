@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.model.surface import place_instruments
+from taichi_msm.model.surface import Solid, place_instruments
 from taichi_msm.render import tracking
 from taichi_msm.render.camera import view
 from taichi_msm.render.labels import Labels, requested_labels
@@ -26,9 +27,12 @@ Array = NDArray[np.float64]
 CAMERAS = pytest.mark.parametrize("camera", ["top", "oblique", NEAR], ids=["top", "oblique", "near"])
 
 
-def look(made: Scene, position: Array) -> Labels:
-    config = drawing_config(made, picture=False, labels=requested_labels(()))
-    placed = place_instruments(made, position, 0)
+def look(
+    made: Scene, position: Array, names: Collection[str] = requested_labels(()), rods: Sequence[Solid] | None = None
+) -> Labels:
+    """Labels of these names, with the instruments of the scene by default."""
+    config = drawing_config(made, picture=False, labels=names)
+    placed = place_instruments(made, position, 0) if rods is None else rods
     found = Rasterizer(made, np.zeros((1, 1, 3), np.uint8), config).look(position, rods=placed).labels
     assert found is not None
     return found
