@@ -144,7 +144,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     from taichi_msm.model import tool_force
     from taichi_msm.model.tool_force import describe_forces, probe_records
     from taichi_msm.model.tools import path_warnings
-    from taichi_msm.render.notes import describe_calibrations, drawing_warnings
+    from taichi_msm.render.notes import describe_cameras, drawing_warnings
     from taichi_msm.render.texture import load_texture
 
     plan = load_plan(scene, overrides, image)
@@ -202,7 +202,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         f"about {budget.memory_bytes / 2**20:.0f} MiB of memory, at most {budget.disk_bytes / 2**20:.1f} MiB on disk, "
         f"{budget.working_bytes / 2**20:.1f} MiB more while it runs"
     )
-    for line in describe_calibrations(loaded):
+    for line in describe_cameras(loaded):
         click.echo(line)
     for index, probe in enumerate(report["probes"]):
         if description := describe_forces(probe):

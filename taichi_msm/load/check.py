@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-from taichi_msm.errors import ArgumentError, Problem, SceneError
+from taichi_msm.errors import ArgumentError, Key, Problem, SceneError
 from taichi_msm.load import cost
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import Maps
@@ -52,10 +52,25 @@ def validate(data: dict[str, Any]) -> tuple[Plan | None, list[Problem]]:
             plan, new_problems = _check_combinations(scene)
             # The speed of a tool depends on the step, which a replaced section would change.
             replaced = {problem.path[0] for problem in problems} & {"sheet", "tissue", "springs", "time"}
-            problems += [problem for problem in new_problems if not (replaced and "path" in problem.path)]
+            problems += [
+                _with_file(problem, data) for problem in new_problems if not (replaced and "path" in problem.path)
+            ]
             break
         data = _replace_faulty(data, new_problems)
     return (None if problems else plan), problems
+
+
+def value_at(data: Any, key: Key) -> Any:
+    """Return the value of a key of plain data, or None if it is missing."""
+    for part in key:
+        data = data.get(part) if isinstance(data, dict) else None
+    return data
+
+
+def _with_file(problem: Problem, data: dict[str, Any]) -> Problem:
+    """Name the trajectory file that a problem is about."""
+    path = value_at(data, problem.path) if problem.path[-1:] == ("poses",) else None
+    return Problem(problem.path, f"{path}: {problem.message}") if isinstance(path, str) else problem
 
 
 def _check_combinations(

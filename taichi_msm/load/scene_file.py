@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from taichi_msm.errors import ArgumentError, Key, Problem, SceneError, truncate
 from taichi_msm.images import PICTURE_SUFFIXES, file_sha256, irregular_kind
-from taichi_msm.load.check import validate
+from taichi_msm.load.check import validate, value_at
 from taichi_msm.load.yaml_reader import MAX_DEPTH, Document, Mark, UnreadableError, mark_at, read_yaml
 from taichi_msm.model.plan import Plan
 from taichi_msm.scene.scene import Scene
@@ -166,14 +166,7 @@ def camera_files(data: Mapping[str, Any]) -> list[tuple[Key, str]]:
         for pattern in CAMERA_FILE_KEYS
         for name in (names if ANY_CAMERA in pattern else [ANY_CAMERA])
     ]
-    return [(key, path) for key in keys if isinstance(path := _value(data, key), str)]
-
-
-def _value(data: Any, key: Key) -> Any:
-    """Return the value of a key, or None if it is missing."""
-    for part in key:
-        data = data.get(part) if isinstance(data, dict) else None
-    return data
+    return [(key, path) for key in keys if isinstance(path := value_at(data, key), str)]
 
 
 def schema() -> dict[str, Any]:
@@ -281,7 +274,7 @@ class Draft:
             key: key of the path; other values than paths are ignored.
             folder: folder to which the path is relative.
         """
-        section, path = _value(self.data, key[:-1]), _value(self.data, key)
+        section, path = value_at(self.data, key[:-1]), value_at(self.data, key)
         if not (isinstance(path, str) and 0 < len(path) <= MAX_PATH):
             return
         section[key[-1]] = str(folder / path)
@@ -293,6 +286,15 @@ class Draft:
             message = f"{path} is not below the scene's folder; put {noun} there{remedy}"
             self.problems.append((self._origin(key), Problem(key, message)))
             del section[key[-1]]
+        elif key not in PICTURE_KEYS:
+            # Validation stops at the first file of the cameras that is missing.
+            try:
+                (folder / path).stat()
+            except OSError as error:
+                message = f"{folder / path}: {(error.strerror or str(error)).lower()}"
+                self.problems.append((self._origin(key), Problem(key, message)))
+            except ValueError:
+                pass  # Validation refuses the path.
 
     def report(self, problems: Iterable[Problem]) -> None:
         """Add problems with their origins, except those of keys that already have a problem."""
@@ -385,7 +387,9 @@ def _read_text(name: str, kind: FileKind) -> str:
     except ValueError:
         raise SceneError([f"{name}: not a path; name a {kind.name} file"]) from None
     except OSError as error:
-        raise SceneError([f"{name}: {(error.strerror or str(error)).lower()}"]) from None
+        similar = (other for other in path.parent.glob("*.y*ml") if isinstance(error, FileNotFoundError))
+        hint = next((f"; did you mean '{other}'?" for other in similar if other.stem == path.stem), "")
+        raise SceneError([f"{name}: {(error.strerror or str(error)).lower()}{hint}"]) from None
     if len(raw) > MAX_BYTES:
         raise SceneError([f"{name}: larger than {MAX_BYTES // 2**20} MiB; a {kind.name} is smaller"])
     try:

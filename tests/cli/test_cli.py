@@ -478,6 +478,18 @@ def test_check_decodes_the_picture_as_run_does(
     assert call(capsys, "run", "small.yaml", "--quiet") == (2, "", said)
 
 
+def test_check_prints_the_baseline_of_a_stereo_pair(
+    small: Path, capsys: pytest.CaptureFixture[str], message: Messages
+) -> None:
+    pose = "rotation: [[1, 0, 0], [0, 1, 0], [0, 0, 1]], translation: [-0.003, 0.004, 0]"
+    lens = "intrinsics: {fx: 20, fy: 15, cx: 19.5, cy: 14.5}"
+    cameras = (
+        f"{{left: {{eye: [0, 0, 1]}}, a: {{beside: left, baseline: -0.004}}, b: {{beside: left, {pose}, {lens}}}}}"
+    )
+    out = call(capsys, "check", "small.yaml", "--set", f"render.cameras={cameras}")[1]
+    message((line for line in out.splitlines() if line.startswith("render.")), "0.004 m", "0.005 m")
+
+
 def test_check_without_springs_has_no_limit(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, out, _ = call(capsys, "check", "small.yaml", "--json", "--set", "springs={}")
     assert (code, json.loads(out)["stable_step"]) == (0, None)

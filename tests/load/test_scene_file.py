@@ -365,6 +365,31 @@ def test_files_that_cannot_be_opened(name: str, message: Messages) -> None:
         load_scene(name)
 
 
+@pytest.mark.parametrize("name", ["scene.yml", "scene"])
+def test_a_scene_of_another_suffix_is_suggested(name: str, tmp_path: Path, message: Messages) -> None:
+    (tmp_path / "scene.yaml").touch()
+    with message.raises(SceneError, "/scene.yaml"):
+        load_scene(tmp_path / name)
+
+
+def test_all_files_of_a_scene_that_are_missing_are_named_at_once(load: Load, message: Messages) -> None:
+    map_ = "map: {image: map.png, range: [1, 2]}"
+    cameras = "cameras: {left: {calibration: left.yml, poses: left.txt}, right: {beside: left, calibration: right.yml}}"
+    text = GOOD.replace("shear: 20", map_) + f"image: none.png\nrender: {{{cameras}}}\n"
+    with message.raises(SceneError) as caught:
+        load(text)
+    for line, name in zip(
+        caught.value.lines, ("map.png", "none.png", "left.yml", "left.txt", "right.yml"), strict=True
+    ):
+        assert f": {name}: no such file" in line
+
+
+def test_a_trajectory_that_is_shorter_than_the_run_is_named(load: Load, message: Messages) -> None:
+    Path("poses.txt").write_text("0 0 0 1 0 0 0 1\n0.3 0 0 1 0 0 0 1\n")
+    with message.raises(SceneError, "s.yaml:12:12: render.camera.poses: poses.txt: covers"):
+        load(GOOD + "render:\n  camera: {poses: poses.txt}\n")
+
+
 def test_overrides(load: Load) -> None:
     scene = load(
         GOOD + PROBE,
