@@ -15,17 +15,11 @@ from taichi_msm.system.runtime import Device
 
 
 class ResolvedPlan(NamedTuple):
-    """Plan with all settings chosen.
+    """Plan with all settings chosen."""
 
-    Attributes:
-        plan: plan whose scene contains the chosen numbers of mass points, time step and precision.
-        estimate: estimate of the time-step error; None without `time.tolerance`.
-        mesh: estimate of the discretisation error (mesh); None without `sheet.tolerance`.
-    """
-
-    plan: Plan
-    estimate: TimeStepEstimate | None
-    mesh: MeshEstimate | None
+    plan: Plan  # its scene contains the chosen numbers of mass points, time step and precision
+    estimate: TimeStepEstimate | None  # of the time-step error; None without `time.tolerance`
+    mesh: MeshEstimate | None  # of the discretisation error; None without `sheet.tolerance`
 
 
 def resolve(plan: Plan, device: Device, progress: ProgressCallback = lambda done, total: None) -> ResolvedPlan:

@@ -43,28 +43,17 @@ MAX_LINES = 100
 
 
 class FileKind(NamedTuple):
-    """Kind of a YAML file.
-
-    Attributes:
-        name: name of the kind, for messages.
-        needs: required keys, for messages.
-    """
+    """Kind of a YAML file: its name and its required keys, for messages."""
 
     name: str
     needs: str
 
 
 class ParsedFile(NamedTuple):
-    """Parsed YAML file, whose keys are not validated.
+    """Parsed YAML file, a mapping, whose keys are not validated."""
 
-    Attributes:
-        name: path of the file, for messages.
-        folder: folder of the file, to which its paths are relative.
-        document: content, a mapping.
-    """
-
-    name: str
-    folder: Path
+    name: str  # path of the file, for messages
+    folder: Path  # to which paths in the file are relative
     document: Document
 
 
@@ -103,13 +92,7 @@ def load_scene(
 def load_plan(
     path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = (), image: str | Path | None = None
 ) -> Plan:
-    """Read and validate a scene file, as `load_scene`, and plan the scene for a CPU.
-
-    Raises:
-        ArgumentError: when the path is a mapping, or the overrides are neither a sequence of texts nor a mapping from
-            texts.
-        SceneError: when the scene is invalid.
-    """
+    """Read and validate a scene file, as `load_scene`, and plan the scene for a CPU."""
     if isinstance(path, Mapping):
         raise ArgumentError("path: a mapping; Scene(**mapping) is its scene, and load_scene reads a file")
     return plan_file(read_file(str(path), SCENE_KIND), overrides, image)
@@ -118,12 +101,7 @@ def load_plan(
 def plan_file(
     file: ParsedFile, overrides: Sequence[str] | Mapping[str, Any] = (), image: str | Path | None = None
 ) -> Plan:
-    """Validate a parsed scene file, with overrides and image as in `load_scene`, and plan the scene for a CPU.
-
-    Raises:
-        ArgumentError: when the overrides are neither a sequence of texts nor a mapping from texts.
-        SceneError: when the scene is invalid.
-    """
+    """Validate a parsed scene file, with overrides and image as in `load_scene`, and plan the scene for a CPU."""
     if isinstance(overrides, str) or not (
         isinstance(overrides, (Sequence, Mapping)) and all(isinstance(item, str) for item in overrides)
     ):
@@ -175,19 +153,12 @@ def schema() -> dict[str, Any]:
 
 
 class Override(NamedTuple):
-    """A value that replaces one of the file.
+    """A value that replaces one of the file."""
 
-    Attributes:
-        name: the override as in messages.
-        path: path to the key.
-        value: new value.
-        problems: problems of the override; with any, it is not applied.
-    """
-
-    name: str
+    name: str  # as in messages
     path: Key
     value: Any = None
-    problems: Sequence[Problem] = ()
+    problems: Sequence[Problem] = ()  # with any, the override is not applied
 
 
 def parse_override(text: str) -> Override:
@@ -227,26 +198,15 @@ def parse_key(key: str) -> Key:
 
 
 class _Origin(NamedTuple):
-    """Location of a key in the file or the overrides, sortable in the order of reading.
+    """Location of a key in the file or the overrides, sortable in the order of reading."""
 
-    Attributes:
-        source: 0 for the file, or the number of the override.
-        mark: line and column in the file.
-        name: location as in messages, such as press.yaml:7:3.
-    """
-
-    source: int
+    source: int  # 0 for the file, or the number of the override
     mark: Mark
-    name: str
+    name: str  # as in messages, such as press.yaml:7:3
 
 
 class Draft:
-    """Content of a parsed file with overrides, before validation.
-
-    Attributes:
-        data: content with the overrides that were applied.
-        problems: problems, each with its origin.
-    """
+    """Content of a parsed file with overrides, before validation, and problems, each with its origin."""
 
     def __init__(self, file: ParsedFile) -> None:
         document = file.document
@@ -266,13 +226,9 @@ class Draft:
             self.problems.append((origin, problem))
 
     def resolve_path(self, key: Key, folder: Path) -> None:
-        """Make the path of a file relative to the current directory.
+        """Make the path of a file, relative to a folder, relative to the current directory.
 
-        A path that is neither in the folder nor in an override is a problem.
-
-        Args:
-            key: key of the path; other values than paths are ignored.
-            folder: folder to which the path is relative.
+        A path that is neither in the folder nor in an override is a problem, and so is a camera's file that is missing.
         """
         section, path = value_at(self.data, key[:-1]), value_at(self.data, key)
         if not (isinstance(path, str) and 0 < len(path) <= MAX_PATH):

@@ -48,37 +48,22 @@ _WORDS: dict[str, bool | None] = {
 
 
 class Mark(NamedTuple):
-    """Position in a text.
-
-    Attributes:
-        line: number of the line, from 1.
-        column: number of the column, from 1.
-    """
+    """Position in a text, counted from 1."""
 
     line: int
     column: int
 
 
 class Document(NamedTuple):
-    """Content of a YAML document.
+    """Content of a YAML document."""
 
-    Attributes:
-        data: None, bool, int, float, str, and lists and dicts of these; None for an empty text.
-        marks: positions of all keys and of all items of lists.
-        faults: the first MAX_FAULTS faults that did not stop parsing, with their positions.
-    """
-
-    data: Any
-    marks: dict[Key, Mark]
-    faults: list[tuple[Mark, Problem]]
+    data: Any  # None, bool, int, float, str, and lists and dicts of these; None for an empty text
+    marks: dict[Key, Mark]  # positions of all keys and of all items of lists
+    faults: list[tuple[Mark, Problem]]  # the first MAX_FAULTS that did not stop parsing, with their positions
 
 
 class UnreadableError(Exception):
-    """The text is not YAML, or has too many values or too deep nesting.
-
-    Attributes:
-        mark: position of the fault.
-    """
+    """The text is not YAML, or has too many values or too deep nesting."""
 
     def __init__(self, mark: Mark, message: str) -> None:
         super().__init__(message)
@@ -101,12 +86,7 @@ def read_yaml(text: str) -> Document:
 
 
 def mark_at(text: str, index: int) -> Mark:
-    """Return the line and column of a character.
-
-    Args:
-        text: text whose lines end with line feeds.
-        index: index of the character.
-    """
+    """Return the position of the character at an index."""
     before = text[:index]
     return Mark(before.count("\n") + 1, index - before.rfind("\n"))
 
@@ -132,8 +112,8 @@ def _mark(mark: Any) -> Mark:
     return Mark(mark.line + 1, mark.column + 1)
 
 
-def _resolve(text: str) -> Any:
-    """Convert a plain scalar to its value."""
+def _plain_value(text: str) -> Any:
+    """Convert a plain scalar."""
     if text in _WORDS:
         return _WORDS[text]
     if text[0] in "+-.0123456789" and len(text) <= MAX_NUMBER_LENGTH:
@@ -144,12 +124,7 @@ def _resolve(text: str) -> Any:
 
 
 class _DocumentBuilder:
-    """Builder of data from the events of a parser.
-
-    Attributes:
-        marks: positions of the keys and items so far.
-        faults: faults so far, with their positions.
-    """
+    """Builder of data, positions and faults from the events of a parser."""
 
     def __init__(self, events: Iterator[Any]) -> None:
         self.marks: dict[Key, Mark] = {(): Mark(1, 1)}
@@ -174,7 +149,7 @@ class _DocumentBuilder:
         if isinstance(event, yaml.AliasEvent):
             return None
         if isinstance(event, yaml.ScalarEvent):
-            return _resolve(event.value) if event.implicit[0] else event.value
+            return _plain_value(event.value) if event.implicit[0] else event.value
         if isinstance(event, yaml.SequenceStartEvent):
             return self._items(path)
         return self._mapping(path)

@@ -40,29 +40,18 @@ FORCES_HEADER = ("time", "probe", "tip_x", "tip_y", "tip_z", "force_x", "force_y
 
 
 class Output(NamedTuple):
-    """An output of a run, which an entry of a scene's `output` selects.
+    """An output of a run, which an entry of a scene's `output` selects."""
 
-    Attributes:
-        name: name of the output. Of the sources labels, flow and stereo, also the field of `Labels`, `Flow` or
-            `Stereo` that is written, in the format of the file's suffix.
-        file: path of the file, or that of the first frame of a series.
-        source: origin of the values: a field of `FrameOutputs`, positions or forces.
-        description: content of the file, for users.
-        pixel_bytes: upper bound of the file's size per pixel [bytes], reached by a picture of noise; 0 if the size
-            does not depend on the pixels.
-        needs_camera: whether the values are meaningful only with the camera's matrices.
-        needs_stereo_pair: whether only the reference camera of a stereo pair has this output.
-        entry: entry of `output` that selects it; empty if it is the name.
-    """
-
+    # Of the sources labels, flow and stereo, also the field of `Labels`, `Flow` or `Stereo` that is written, in the
+    # format of the file's suffix.
     name: str
-    file: str
+    file: str  # path, or that of the first frame of a series
     source: Literal["picture", "labels", "flow", "stereo", "tracks", "positions", "forces"]
-    description: str
-    pixel_bytes: float = 0
-    needs_camera: bool = False
-    needs_stereo_pair: bool = False
-    entry: str = ""
+    description: str  # for users
+    pixel_bytes: float = 0  # upper bound of the file's size per pixel, of a picture of noise; 0 if independent of them
+    needs_camera: bool = False  # whether the values are meaningful only with the camera's matrices
+    needs_stereo_pair: bool = False  # whether only the reference camera of a stereo pair has it
+    entry: str = ""  # entry of `output` that selects it; empty if it is the name
 
     @property
     def result(self) -> str:
