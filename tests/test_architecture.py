@@ -120,7 +120,7 @@ def test_functions_are_short_and_take_few_arguments() -> None:
                 most = MOST_ARGUMENTS_OF_TAICHI if in_kernels else MOST_ARGUMENTS
                 count = len(node.args.posonlyargs + node.args.args + node.args.kwonlyargs)
                 # A command has an argument for every option.
-                assert count <= most or "program.command()" in decorators, f"{path}: {node.name}: {count}"
+                assert count <= most or "options.program.command()" in decorators, f"{path}: {node.name}: {count}"
                 lines = (node.end_lineno or 0) - node.lineno + 1
                 assert lines <= MOST_LINES, f"{path}: {node.name}: {lines} lines"
 

@@ -8,30 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from taichi_msm.cli import START_TIME
-from taichi_msm.cli.options import (
-    arch_option,
-    image_option,
-    json_option,
-    program,
-    quality_option,
-    require_no_settings,
-    scene_argument,
-    set_option,
-    threads_option,
-)
-from taichi_msm.cli.session import (
-    DONE,
-    EXIT_CODES,
-    add_resume_hint,
-    interruptible_progress,
-    plan_repetition,
-    prefix_errors,
-    print_json,
-    report_interruption,
-    result_directory,
-    resume_hint,
-)
+from taichi_msm.cli import START_TIME, options, session
 from taichi_msm.system.process import Interruption, write_stderr
 
 if TYPE_CHECKING:
@@ -42,27 +19,27 @@ RESUME_OPTIONS = ("resume", "threads", "quiet", "as_json")
 REPEAT_OPTIONS = ("again", "out", "arch", "threads", "estimate_error", "quiet", "as_json")
 
 
-@program.command()
+@options.program.command()
 @click.argument("scene", metavar="SCENE", required=False)
 @click.option(
     "--out",
     metavar="DIR",
     help="Directory for the results.  [default: output/<name of the scene file>; with --again, its DIR]",
 )
-@image_option
-@set_option
-@arch_option
-@threads_option
+@options.image_option
+@options.set_option
+@options.arch_option
+@options.threads_option
 @click.option(
     "--estimate-error/--no-estimate",
     default=None,
     help="Always or never estimate the error.  [default: if that takes at most two fifths of the run]",
 )
-@quality_option
+@options.quality_option
 @click.option("--resume", metavar="DIR", help="Continue the unfinished run in DIR, instead of running SCENE.")
 @click.option("--again", metavar="DIR", help="Repeat the run of DIR/run.json instead of running SCENE.")
 @click.option("--quiet", is_flag=True, help="Print no progress and no summary.")
-@json_option
+@options.json_option
 @click.pass_context
 def run(
     context: click.Context,
@@ -83,61 +60,63 @@ def run(
     overrides += () if quality is None else (f"render.quality={quality}",)
     typed = [*overrides, *([f"image={image}"] if image is not None else [])]
     if resume is not None:
-        require_no_settings(context, "--resume continues", RESUME_OPTIONS)
-        directory = result_directory(resume, option="--resume")
-        if not resume_hint(directory):
+        options.require_no_settings(context, "--resume continues", RESUME_OPTIONS)
+        directory = session.result_directory(resume, option="--resume")
+        if not session.resume_hint(directory):
             raise click.BadParameter(f"there is no unfinished run in {resume}", param_hint="--resume")
     elif again is not None:
-        require_no_settings(context, "--again repeats", REPEAT_OPTIONS)
-        directory = result_directory(again, option="--again") if out is None else result_directory(out)
-        plan, typed = plan_repetition(again)
+        options.require_no_settings(context, "--again repeats", REPEAT_OPTIONS)
+        directory = session.result_directory(again, option="--again") if out is None else session.result_directory(out)
+        plan, typed = session.plan_repetition(again)
     elif scene is None:
         raise click.MissingParameter(param_hint="'SCENE'", param_type="argument")
     else:
         from taichi_msm.load.scene_file import load_plan
 
         plan = load_plan(scene, overrides, image)
-        directory = result_directory(out, Path(scene).stem)
+        directory = session.result_directory(out, Path(scene).stem)
 
-    from taichi_msm.cli.console import ProgressDisplay, run_summary
+    from taichi_msm.cli.console import run_summary
     from taichi_msm.runs import run as run_module
 
     interruption, name = Interruption(), str(scene or resume or again)
-    try:
-        with ProgressDisplay(quiet=quiet or as_json) as bar, add_resume_hint(directory), prefix_errors(name):
-            progress = interruptible_progress(bar, interruption)
-            if resume is not None:
-                record = run_module.resume(directory, threads=threads, started=START_TIME, progress=progress)
-            else:
-                record = run_module.run(
-                    plan,
-                    directory,
-                    arch=arch,
-                    threads=threads,
-                    overrides=typed,
-                    estimate_error=estimate_error,
-                    started=START_TIME,
-                    progress=progress,
-                )
-    except KeyboardInterrupt:
-        return report_interruption(interruption, as_json, f"interrupted; nothing was written{resume_hint(directory)}")
+    rest = lambda: f"; nothing was written{session.resume_hint(directory)}"  # noqa: E731
+    with (
+        session.report_interruption(interruption, as_json, rest),
+        session.show_progress(interruption, quiet or as_json) as progress,
+        session.add_resume_hint(directory),
+        session.prefix_errors(name),
+    ):
+        if resume is not None:
+            record = run_module.resume(directory, threads=threads, started=START_TIME, progress=progress)
+        else:
+            record = run_module.run(
+                plan,
+                directory,
+                arch=arch,
+                threads=threads,
+                overrides=typed,
+                estimate_error=estimate_error,
+                started=START_TIME,
+                progress=progress,
+            )
     if as_json:
-        print_json({"directory": str(directory), **record})
+        session.print_json({"directory": str(directory), **record})
     if record["status"] != "complete":
         message = f"{name}: {record.get('error', 'interrupted')}; frames in {directory}: {record['frames']}"
-        remedy = f"; last good state: {record['dump']}" if record.get("dump") else resume_hint(directory)
+        remedy = f"; last good state: {record['dump']}" if record.get("dump") else session.resume_hint(directory)
         write_stderr([message + remedy])
     elif not quiet and not as_json:
         click.echo(run_summary(record, directory))
-    return EXIT_CODES.get(record["status"], interruption.code)
+    return session.EXIT_CODES.get(record["status"], interruption.code)
 
 
-@program.command()
-@scene_argument
-@image_option
-@set_option
-@json_option
-def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bool) -> int:
+@options.program.command()
+@options.scene_argument
+@options.image_option
+@options.set_option
+@options.json_option
+def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bool) -> None:
     """Validate SCENE and print the steps, time, memory and disk space it needs; compute nothing."""
     from taichi_msm.load import cost as cost_module
     from taichi_msm.load.scene_file import load_plan
@@ -148,7 +127,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     from taichi_msm.render.texture import load_texture
 
     plan = load_plan(scene, overrides, image)
-    with prefix_errors(scene):
+    with session.prefix_errors(scene):
         cost_module.require_disk(plan, Path("output"))
         if plan.scene.draws:
             load_texture(plan.scene)
@@ -179,8 +158,8 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         ],
     }
     if as_json:
-        print_json(report)
-        return DONE
+        session.print_json(report)
+        return
     import yaml
 
     from taichi_msm.load.cost import format_rough_time
@@ -209,7 +188,6 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
             click.echo(f"probes.{index}: {description}")
     for note in report["notes"]:
         click.echo(note)
-    return DONE
 
 
 def _lock_cost(plan: Plan) -> str:
@@ -223,10 +201,9 @@ def _lock_cost(plan: Plan) -> str:
     return f", {ratio:.2g} times shorter than without lock" if ratio > 1.01 else ""
 
 
-@program.command()
-def schema() -> int:
+@options.program.command()
+def schema() -> None:
     """Print the JSON Schema of a scene, for editors."""
     from taichi_msm.load.scene_file import schema
 
-    print_json(schema())
-    return DONE
+    session.print_json(schema())
