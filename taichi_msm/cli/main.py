@@ -10,14 +10,7 @@ from pathlib import Path
 import click
 
 from taichi_msm.cli import example, export, fit, options, run, session, study, sweep  # noqa: F401  # each registers its commands
-from taichi_msm.errors import (
-    ArgumentError,
-    DeviceError,
-    ExecutorError,
-    FilesError,
-    NotInstalledError,
-    SceneError,
-)
+from taichi_msm.errors import DivergedError, FilesError, MsmError, SceneError
 from taichi_msm.system.process import discard_buffer, write_stderr
 
 
@@ -59,10 +52,12 @@ def _run(words: list[str]) -> tuple[int, Sequence[str]]:
         raise BrokenPipeError from None
     except SceneError as error:
         return session.INVALID_INPUT, error.lines
-    except (ArgumentError, DeviceError, ExecutorError, NotInstalledError) as error:
-        return session.INVALID_INPUT, [str(error)]
     except FilesError as error:
         return session.FILES, [str(error)]
+    except DivergedError as error:
+        return session.DIVERGED, [str(error)]
+    except MsmError as error:
+        return session.INVALID_INPUT, [str(error)]
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message())
         return session.INVALID_INPUT, ()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,10 +14,6 @@ from taichi_msm.system.process import Interruption, write_stderr
 
 if TYPE_CHECKING:
     from taichi_msm.model.plan import Plan
-
-# Parameters that are allowed with --resume and --again.
-RESUME_OPTIONS = ("resume", "threads", "quiet", "as_json")
-REPEAT_OPTIONS = ("again", "out", "arch", "threads", "estimate_error", "quiet", "as_json")
 
 
 @options.program.command()
@@ -60,12 +57,13 @@ def run(
     overrides += () if quality is None else (f"render.quality={quality}",)
     typed = [*overrides, *([f"image={image}"] if image is not None else [])]
     if resume is not None:
-        options.require_no_settings(context, "--resume continues", RESUME_OPTIONS)
+        _require_no_settings(context, "--resume continues", ("resume", "threads", "quiet", "as_json"))
         directory = session.result_directory(resume, option="--resume")
         if not session.resume_hint(directory):
             raise click.BadParameter(f"there is no unfinished run in {resume}", param_hint="--resume")
     elif again is not None:
-        options.require_no_settings(context, "--again repeats", REPEAT_OPTIONS)
+        allowed = ("again", "out", "arch", "threads", "estimate_error", "quiet", "as_json")
+        _require_no_settings(context, "--again repeats", allowed)
         directory = session.result_directory(again, option="--again") if out is None else session.result_directory(out)
         plan, typed = session.plan_repetition(again)
     elif scene is None:
@@ -111,6 +109,15 @@ def run(
     return session.EXIT_CODES.get(record["status"], interruption.code)
 
 
+def _require_no_settings(context: click.Context, action: str, allowed: Sequence[str]) -> None:
+    """Reject other options than the allowed ones next to one that reuses the settings of an earlier run."""
+    for option in context.command.params:
+        is_given = context.get_parameter_source(str(option.name)) is click.core.ParameterSource.COMMANDLINE
+        if is_given and option.name not in allowed:
+            name = option.opts[0] if isinstance(option, click.Option) else "SCENE"
+            raise click.UsageError(f"{action} a run with its own settings; leave out {name}")
+
+
 @options.program.command()
 @options.scene_argument
 @options.image_option
@@ -118,17 +125,16 @@ def run(
 @options.json_option
 def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bool) -> None:
     """Validate SCENE and print the steps, time, memory and disk space it needs; compute nothing."""
-    from taichi_msm.load import cost as cost_module
+    from taichi_msm.load import cost
     from taichi_msm.load.scene_file import load_plan
-    from taichi_msm.model import tool_force
-    from taichi_msm.model.tool_force import describe_forces, probe_records
+    from taichi_msm.model.tool_force import describe_forces, force_warnings, probe_records
     from taichi_msm.model.tools import path_warnings
     from taichi_msm.render.notes import describe_cameras, drawing_warnings
     from taichi_msm.render.texture import load_texture
 
     plan = load_plan(scene, overrides, image)
     with session.prefix_errors(scene):
-        cost_module.require_disk(plan, Path("output"))
+        cost.require_disk(plan, Path("output"))
         if plan.scene.draws:
             load_texture(plan.scene)
     loaded, grid, stable_step = plan.scene, plan.grid, plan.stable_step
@@ -141,7 +147,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     }
     if loaded.time.at_rest:
         steps |= dict.fromkeys(("step", "stable_step", "steps_per_frame", "steps"))
-    budget, duration = cost_module.estimate_budget(plan), cost_module.estimate_duration(plan)
+    budget, duration = cost.estimate_budget(plan), cost.estimate_duration(plan)
     report: dict[str, Any] = {
         "scene": loaded.model_dump(mode="json"),
         **steps,
@@ -152,7 +158,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         "disk_while_running": budget.disk_bytes + budget.working_bytes,
         "probes": (records := probe_records(loaded)),
         "notes": [
-            *tool_force.force_warnings(loaded, records),
+            *force_warnings(loaded, records),
             *path_warnings(loaded, plan.tools),
             *drawing_warnings(loaded),
         ],
@@ -161,8 +167,6 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         session.print_json(report)
         return
     import yaml
-
-    from taichi_msm.load.cost import format_rough_time
 
     tolerances = [f"{name}.tolerance" for name in ("sheet", "time") if getattr(loaded, name).tolerance is not None]
     # Companion runs may refine a scene with a tolerance.
@@ -177,17 +181,14 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     )
     click.echo(
         f"\n{budget.points} points, {budget.frames} frames, {stepping}\n"
-        f"about {format_rough_time(duration.seconds)} to run{longer} (estimated from its work)\n"
+        f"about {cost.format_rough_time(duration.seconds)} to run{longer} (estimated from its work)\n"
         f"about {budget.memory_bytes / 2**20:.0f} MiB of memory, at most {budget.disk_bytes / 2**20:.1f} MiB on disk, "
         f"{budget.working_bytes / 2**20:.1f} MiB more while it runs"
     )
-    for line in describe_cameras(loaded):
+    forces = enumerate(map(describe_forces, records))
+    lines = [f"probes.{index}: {description}" for index, description in forces if description]
+    for line in (*describe_cameras(loaded), *lines, *report["notes"]):
         click.echo(line)
-    for index, probe in enumerate(report["probes"]):
-        if description := describe_forces(probe):
-            click.echo(f"probes.{index}: {description}")
-    for note in report["notes"]:
-        click.echo(note)
 
 
 def _lock_cost(plan: Plan) -> str:

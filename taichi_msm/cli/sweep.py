@@ -25,7 +25,7 @@ MAX_UNCONFIRMED_RUNS = 10_000
 @options.workers_option(help="Processes that take the runs.  [default: one for each core, as far as memory goes]")
 @click.option("--dask", metavar="ADDRESS", help="Let the workers of a dask scheduler take the runs.")
 @click.option(
-    "--shard", type=options.ShardType(), metavar="I/N", help="Take only part I of N of the runs; write no table."
+    "--shard", type=options.parse_shard, metavar="I/N", help="Take only part I of N of the runs; write no table."
 )
 @click.option("--dry-run", is_flag=True, help="Print the values of all runs and their cost; run nothing.")
 @click.option("--yes", is_flag=True, help=f"Take more than {MAX_UNCONFIRMED_RUNS} runs, or longer than a day.")
@@ -53,7 +53,8 @@ def sweep(
     cost = estimate_cost(loaded)
     chosen = choose_worker_count(cost, loaded.runs, workers)
     if dry_run:
-        return print_dry_run(loaded, cost, shard or (1, 1), workers, as_json)
+        print_dry_run(loaded, cost, shard or (1, 1), workers, as_json)
+        return session.DONE
     if not yes and (loaded.runs > MAX_UNCONFIRMED_RUNS or cost.seconds > 86400):
         raise click.UsageError(f"{cost_line(loaded.runs, cost, chosen)}; add --yes if that is meant")
     state = begin_sweep(loaded, directory, shard or (1, 1))
@@ -90,16 +91,8 @@ def sweep(
     return session.DONE
 
 
-def print_dry_run(loaded: Sweep, cost: SweepCost, shard: tuple[int, int], workers: int | None, as_json: bool) -> int:
-    """Print the values of the runs of a shard, and their cost; return the exit code.
-
-    Args:
-        loaded: the sweep.
-        cost: of the whole sweep.
-        shard: part I of N as (I, N).
-        workers: number of processes chosen by the user, or None.
-        as_json: whether to print a JSON object instead of a table.
-    """
+def print_dry_run(loaded: Sweep, cost: SweepCost, shard: tuple[int, int], workers: int | None, as_json: bool) -> None:
+    """Print the values of the runs of a shard, and their part of the cost of the sweep, as a table or as JSON."""
     from taichi_msm.sweeps.spec import format_override
     from taichi_msm.sweeps.tables import choose_worker_count, cost_line, csv_line
 
@@ -110,12 +103,11 @@ def print_dry_run(loaded: Sweep, cost: SweepCost, shard: tuple[int, int], worker
     if as_json:
         rows = {"keys": loaded.keys, "runs": list(runs), "values": [values[run] for run in runs]}
         session.print_json({**rows, **cost._asdict(), "workers": chosen.number})
-        return session.DONE
+        return
     click.echo(csv_line(["run", *loaded.keys]))
     for run in runs:
         click.echo(printable(csv_line([run, *map(format_override, values[run])])))
     click.echo(cost_line(len(runs), cost, chosen))
-    return session.DONE
 
 
 def progress_message(done: int, total: int) -> str:
