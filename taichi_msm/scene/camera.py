@@ -3,21 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from itertools import pairwise
+from collections.abc import Collection, Iterable
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    Field,
-    SerializerFunctionWrapHandler,
-    StrictBool,
-    ValidationError,
-    ValidationInfo,
-    create_model,
-    field_validator,
-    model_serializer,
-    model_validator,
-)
+from pydantic import Field, StrictBool, ValidationError, ValidationInfo, create_model, field_validator, model_validator
 from typing_extensions import Self
 
 from taichi_msm.camera_files.calibration import Calibration
@@ -37,6 +26,7 @@ from taichi_msm.scene.section import (
     Section,
     Vector,
     key,
+    require_increasing,
     scene_fault,
 )
 
@@ -99,10 +89,8 @@ class Distortion(_Coefficients):  # type: ignore[misc]
         name = MODELS[self.model].focal_length
         return getattr(self, name) if name else None
 
-    @model_serializer(mode="wrap")
-    def _dump_own_keys(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        own = MODELS[self.model].coefficients
-        return {name: value for name, value in dump(self).items() if name == "model" or name in own}
+    def _unused_keys(self) -> Collection[str]:
+        return type(self).model_fields.keys() - {"model", *MODELS[self.model].coefficients}
 
     @model_validator(mode="after")
     def _check_coefficients_of_model(self) -> Self:
@@ -274,12 +262,8 @@ class Camera(Section):
     def _check_order(cls, keyframes: Any, info: ValidationInfo) -> Any:
         if info.field_name == "eye" and keyframes is None and not {"beside", "pose", "poses"} & _given(info):
             raise scene_fault("missing; expected " + cls.model_fields["eye"].json_schema_extra["expects"])  # type: ignore
-        if keyframes is None or not isinstance(keyframes[0], tuple):
-            return keyframes  # A constant vector.
-        for n, ((previous, *_), (time, *_)) in enumerate(pairwise(keyframes), 1):
-            if time <= previous:
-                times = f"is at {time:g} s, and the key before it at {previous:g} s"
-                raise scene_fault(f"{times}; sort the keys, each later than the last", n)
+        if keyframes is not None and isinstance(keyframes[0], tuple):
+            require_increasing(keyframes)
         return keyframes
 
     @model_validator(mode="after")
@@ -344,16 +328,14 @@ class Camera(Section):
                 fault = f"{focal:g} is not the focal length of the lens, a0 = {lens_focal:g}"
                 raise scene_fault(f"{fault}; remove fx and fy", "intrinsics", name)
 
-    @model_serializer(mode="wrap")
-    def _dump_used_keys(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Omit keys that others replace, because their defaults would be invalid when the scene is read again."""
+    def _unused_keys(self) -> Collection[str]:
         needed = {"eye", "target", "up"} if self.eye is not None else {"pose", "poses"} & self.model_fields_set
         if self.beside is not None:
             needed = {"beside", "baseline"} if self.baseline is not None else {"beside", "rotation", "translation"}
         if self.beside is None or self.has_own_lens:
             needed |= {"intrinsics"} if self.intrinsics is not None else {"fov"}
         needed |= {name for name in ("distortion", "outside") if name in self.model_fields_set}
-        return {name: value for name, value in dump(self).items() if name in needed}
+        return type(self).model_fields.keys() - needed
 
     def with_poses(self) -> Self:
         """Return a copy with the rows of the trajectory file, if there is one.

@@ -3,18 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    Field,
-    SerializerFunctionWrapHandler,
-    StrictBool,
-    ValidationInfo,
-    field_validator,
-    model_serializer,
-    model_validator,
-)
+from pydantic import Field, StrictBool, ValidationInfo, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 from typing_extensions import Self
 
@@ -145,11 +137,8 @@ class Render(Section):
             raise scene_fault("is given together with cameras; remove one of them, or set it to null", "camera")
         return self
 
-    @model_serializer(mode="wrap")
-    def _dump_used_key(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Omit `cameras` if it is missing, or else `camera`."""
-        unused = "cameras" if self.cameras is None else "camera"
-        return {name: value for name, value in dump(self).items() if name != unused}
+    def _unused_keys(self) -> Collection[str]:
+        return ("cameras",) if self.cameras is None else ("camera",)
 
     @property
     def all_cameras(self) -> dict[str, AnyCamera]:

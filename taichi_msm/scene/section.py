@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import islice
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from itertools import islice, pairwise
 from types import UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, ValidationError, model_serializer
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, PydanticCustomError
 from typing_extensions import Self
@@ -36,6 +36,14 @@ def scene_fault(message: str, *below: str | int) -> PydanticCustomError:
         below: keys and indices from the validated value to the value at fault.
     """
     return PydanticCustomError(SCENE_FAULT, message, {"below": below})
+
+
+def require_increasing(keyframes: Iterable[Sequence[float]]) -> None:
+    """Refuse keyframes whose times, their first numbers, do not increase."""
+    for n, ((previous, *_), (time, *_)) in enumerate(pairwise(keyframes), 1):
+        if time <= previous:
+            times = f"is at {time:g} s, and the key before it at {previous:g} s"
+            raise scene_fault(f"{times}; sort the keys, each later than the last", n)
 
 
 def format_value(value: Any) -> str:
@@ -261,20 +269,20 @@ class Section(BaseModel, metaclass=_SectionMeta):
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """Return a copy of the section with some keys replaced.
-
-        Args:
-            update: new values by keys.
-            deep: ignored, as the values are immutable.
-
-        Raises:
-            ArgumentError: when `update` is not a mapping from texts.
-            SceneError: when a key is unknown or a value is invalid.
-        """
+        """Return a copy of the section with some keys replaced; `deep` is ignored, as the values are immutable."""
         del deep
         if not (update is None or (isinstance(update, Mapping) and all(isinstance(name, str) for name in update))):
             raise ArgumentError(f"update: {update!r}; take a mapping from keys to values")
         return type(self)(**{**{name: getattr(self, name) for name in self.model_fields_set}, **(update or {})})
+
+    def _unused_keys(self) -> Collection[str]:
+        """Return the keys that a dump omits, as they would be invalid when the scene is read again."""
+        return ()
+
+    @model_serializer(mode="wrap")
+    def _dump_used_keys(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        unused = self._unused_keys()
+        return {name: value for name, value in dump(self).items() if name not in unused}
 
     def __setattr__(self, name: str, value: object) -> None:
         raise SceneError([f"{name}: a scene cannot be changed; use model_copy(update={{{name!r}: ...}})"])
