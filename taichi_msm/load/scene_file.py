@@ -32,11 +32,8 @@ MAP_KEYS: tuple[Key, ...] = (
 )
 PICTURE_KEYS = (IMAGE_KEY, *MAP_KEYS)
 
-# Keys whose values are paths of other files; ANY_CAMERA stands for the name of any camera.
-ANY_CAMERA = "*"
-CAMERA_FILE_KEYS: tuple[Key, ...] = tuple(
-    ("render", *camera, key) for camera in (("camera",), ("cameras", ANY_CAMERA)) for key in ("calibration", "poses")
-)
+# Keys of a camera whose values are paths of files.
+CAMERA_FILE_KEYS = ("calibration", "poses")
 
 # Limit of the lines of an error, as a broken file may have tens of thousands of problems.
 MAX_LINES = 100
@@ -127,23 +124,16 @@ def plan_file(
 
 def names_file(key: Key) -> bool:
     """Return whether the value of a key, if it is a text, is the path of a file."""
-    return any(
-        len(key) == len(pattern)
-        and all(expected in (str(part), ANY_CAMERA) for part, expected in zip(key, pattern, strict=True))
-        for pattern in (*PICTURE_KEYS, *CAMERA_FILE_KEYS)
-    )
+    is_camera = key[:-1] == ("render", "camera") or (key[:2] == ("render", "cameras") and len(key) == 4)
+    return key in PICTURE_KEYS or (is_camera and key[-1] in CAMERA_FILE_KEYS)
 
 
 def camera_files(data: Mapping[str, Any]) -> list[tuple[Key, str]]:
     """List the keys of cameras whose values are paths of files, with these paths."""
-    render = data.get("render")
-    cameras = render.get("cameras") if isinstance(render, dict) else None
-    names = list(cameras) if isinstance(cameras, dict) else []
-    keys = [
-        tuple(name if part == ANY_CAMERA else part for part in pattern)
-        for pattern in CAMERA_FILE_KEYS
-        for name in (names if ANY_CAMERA in pattern else [ANY_CAMERA])
-    ]
+    cameras = value_at(data, ("render", "cameras"))
+    sections: list[Key] = [("render", "camera")]
+    sections += [("render", "cameras", name) for name in (cameras if isinstance(cameras, dict) else ())]
+    keys = [(*section, name) for name in CAMERA_FILE_KEYS for section in sections]
     return [(key, path) for key in keys if isinstance(path := value_at(data, key), str)]
 
 
