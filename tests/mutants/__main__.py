@@ -34,14 +34,7 @@ class NoVerdictError(Exception):
 
 
 def first_failure(files: Iterable[str], mutant: Mutant | None = None) -> str | None:
-    """Run files of tests in a copy of the project, with one mistake or none.
-
-    Returns:
-        The test that failed; None where all passed.
-
-    Raises:
-        NoVerdictError: when the tests cannot be run to an end.
-    """
+    """Return the test that fails in a copy of the project with one mistake or none; None where all pass."""
     with TemporaryDirectory() as directory:
         # Resolved, as pytest tells its root: a temporary directory may be behind a link.
         copy = Path(directory).resolve()
