@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import math
 import os
 import shutil
@@ -10,15 +11,18 @@ from typing import Any
 import pytest
 from PIL import Image
 
+from taichi_msm.accuracy.companions import choose_companion_runs
 from taichi_msm.errors import SceneError
 from taichi_msm.load import cost
-from taichi_msm.load.cost import FORCE_ROW_BYTES, Budget, require_disk, size_problems
+from taichi_msm.load.cost import CALIBRATION_S, FORCE_ROW_BYTES, WORK_UNIT_S, Budget, require_disk, size_problems
 from taichi_msm.runs.run import run
 from taichi_msm.scene.outputs import ENTRIES
 from taichi_msm.scene.scene import Scene
+from taichi_msm.solver.planning import START_WORK, count_work
 from taichi_msm.system import process
 from taichi_msm.system.process import available_memory, available_threads
 from taichi_msm.system.runtime import Device
+from tests.conftest import Program
 from tests.golden import Messages
 from tests.scenes import plan_of, speckle
 
@@ -31,16 +35,9 @@ PNG, GIF = 3.01 * 50 * 60 + 60 + 1024, 1.51 * 50 * 60 + 60 + 1024
 
 def scene(**keys: Any) -> Scene:
     """20 frames of 4 steps of a small sheet that draws nothing, unless the keys say otherwise."""
-    return Scene.model_validate(
-        {
-            "image": "none.png",
-            "sheet": {"points": [30, 40], "size": [1, 1], "mass": 1},
-            "springs": {},
-            "output": [],
-            **keys,
-            "time": {**TIME, **keys.get("time", {})},
-        }
-    )
+    sheet = {"points": [30, 40], "size": [1, 1], "mass": 1}
+    own = {"image": "none.png", "sheet": sheet, "springs": {}, "output": []}
+    return Scene.model_validate({**own, **keys, "time": {**TIME, **keys.get("time", {})}})
 
 
 def estimate(scene: Scene) -> Budget:
@@ -179,10 +176,6 @@ def test_too_many_steps(message: Messages) -> None:
     message(faults(scene(springs={"structural": 1e14}, time=time)), "time.duration", "2.83e+13 steps")
 
 
-def test_available_memory() -> None:
-    assert 2**20 < available_memory() <= sys.maxsize
-
-
 def test_free_memory(tmp_path: Path) -> None:
     (tmp_path / "meminfo").write_text("MemTotal:  900 kB\nMemFree:  1 kB\nMemAvailable:  300 kB\n")
     assert process._free_memory(tmp_path / "meminfo") == 300 * 1024
@@ -275,3 +268,31 @@ def test_results_that_do_not_fit_on_the_disk_are_refused(
         require_disk(plan_of(made), below)
     with message.raises(SceneError, "render.size", "500 x 600"):
         require_disk(plan_of(scene(render={"size": [500, 600]}, output=["png"])), below)
+
+
+def test_the_calibration_is_soon_done() -> None:
+    cost._calibrate.cache_clear()
+    assert 0 < cost._calibrate() < 1
+
+
+@pytest.mark.parametrize("cores", [1, 64])
+def test_the_estimate_is_the_work_at_the_speed_of_the_machine(cores: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cost, "_calibrate", lambda: 2 * CALIBRATION_S)
+    monkeypatch.setattr(process, "available_threads", lambda: cores)
+    plan = plan_of(scene(image="none.png", output=["gif"]))
+    parts = count_work(plan, choose_companion_runs(plan).cost)
+    assert min(parts) > 0
+    assert cost.estimate_duration(plan) == pytest.approx((2 * WORK_UNIT_S * sum(parts), 2 * WORK_UNIT_S * START_WORK))
+
+
+def test_check_estimates_the_duration_of_a_run(small: Path, program: Program, message: Messages) -> None:
+    def line(*options: str) -> str:
+        (found,) = (line for line in program("check", "small.yaml", *options).stdout.splitlines() if " to run" in line)
+        return found
+
+    message(line(), hide=r"^\D*[\d.]+ \w+")
+    message(line("--set", "time.step=auto", "--set", "time.tolerance=0.01"), "time.tolerance", hide=r"^\D*[\d.]+ \w+")
+    before = program("check", "small.yaml", "--json").stdout
+    assert program("run", "small.yaml", "--quiet").returncode == 0
+    after = program("check", "small.yaml", "--json").stdout
+    assert json.loads(after)["estimated_seconds"] == json.loads(before)["estimated_seconds"], "nothing is learnt"
