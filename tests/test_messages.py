@@ -100,7 +100,6 @@ NOT_PROVOKED = {
     "is not a writable directory",
     "lost the scheduler at",
     "no record of itself",
-    "not valid YAML: invalid Unicode escape",
     "pieces), so pictures and labels would be wrong; take --arch cpu",
     "sheet.points: too few to take half of them",
     "the pool was shut down",

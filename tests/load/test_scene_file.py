@@ -3,7 +3,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import random
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -11,16 +10,13 @@ from typing import Any
 
 import jsonschema
 import pytest
-import yaml
 from PIL import Image
 
 from taichi_msm.errors import SceneError, printable
-from taichi_msm.load import yaml_reader
 from taichi_msm.load.scene_file import MAX_LINES, load_scene, parse_override, schema
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_PROBES
 from tests.golden import Messages
-from tests.mutation import damaged_text
 from tests.scenes import random_contact, random_scene, random_tissue
 
 GOOD = """\
@@ -252,9 +248,8 @@ def test_a_large_wrong_file_is_answered_soon_and_in_short(load: Load, text: str)
     before = time.process_time()
     with pytest.raises(SceneError) as caught:
         load(text)
-    # 0.3 to 0.7 s on the machine that the limits were chosen on, and up to 4 s where PyYAML lacks its C parser; the
-    # rest is for slower machines.
-    assert time.process_time() - before < (3 if yaml.__with_libyaml__ else 20)
+    # 0.3 to 0.7 s on the machine that the limits were chosen on; the rest is for slower machines.
+    assert time.process_time() - before < 3
     assert len(caught.value.lines) == MAX_LINES + 1
     assert caught.value.lines[-1] == "and more"
 
@@ -486,29 +481,10 @@ def test_a_region_of_the_image(load: Load, message: Messages) -> None:
         load(text + "[1, 0, 40, 30]")
 
 
-@pytest.mark.parametrize("parser", ["CSafeLoader", "SafeLoader"])
 @pytest.mark.parametrize("escape", ["\\ud800", "\\U00110000"], ids=["surrogate", "large"])
-def test_escapes_of_what_is_no_character(
-    load: Load, monkeypatch: pytest.MonkeyPatch, parser: str, escape: str, message: Messages
-) -> None:
-    monkeypatch.setattr(yaml_reader, "_LOADER", getattr(yaml, parser, yaml.SafeLoader))
-    with message.raises(SceneError, hide=rf"{OF_PYYAML}|(?<=s\.yaml:)\d+:\d+"):
+def test_escapes_of_what_is_no_character(load: Load, escape: str, message: Messages) -> None:
+    with message.raises(SceneError, "s.yaml:11:", hide=OF_PYYAML):
         load(f'{GOOD}"{escape}": 1\n')
-
-
-@pytest.mark.parametrize("parser", ["CSafeLoader", "SafeLoader"])
-def test_no_text_brings_up_any_other_error(load: Load, monkeypatch: pytest.MonkeyPatch, parser: str) -> None:
-    monkeypatch.setattr(yaml_reader, "_LOADER", getattr(yaml, parser, yaml.SafeLoader))
-    rng = random.Random(1)
-    whole = GOOD + PROBE + "render: {camera: {eye: [0, 0, 1]}, size: [64, 64]}\nimage: a.png\n"
-    outcomes: set[str] = set()
-    for _ in range(200):
-        try:
-            load(damaged_text(rng, whole.encode()))
-        except SceneError as error:
-            outcomes.update(error.lines)
-    assert len(outcomes) > 100
-    assert all(line.isprintable() for line in outcomes)
 
 
 @pytest.mark.parametrize("value", ["1e30", "1e-30", "-1e30", "0"])
