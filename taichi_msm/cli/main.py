@@ -15,14 +15,9 @@ from taichi_msm.system.process import discard_buffer, write_stderr
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line.
+    """Run a command, by default that of sys.argv, and return its exit code.
 
-    Args:
-        arguments: words of the command line; None: sys.argv.
-
-    Returns:
-        Exit code: 0 done, 1 bug, 2 invalid scene or arguments, 3 diverged, 4 files cannot be read or written, 130
-        Ctrl-C, 143 SIGTERM.
+    The codes are those of session.py, 130 after Ctrl-C and 143 after SIGTERM.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:

@@ -18,6 +18,7 @@ from taichi_msm.system.process import Interruption, write_stderr
 if TYPE_CHECKING:
     from taichi_msm.model.plan import Plan
 
+# Exit codes; FILES: files cannot be read or written.
 DONE, BUG, INVALID_INPUT, DIVERGED, FILES = 0, 1, 2, 3, 4
 
 EXIT_CODES = {"complete": DONE, "diverged": DIVERGED}

@@ -33,13 +33,9 @@ _REPLACEMENTS: dict[str, Any] = {
 
 
 def validate(data: dict[str, Any]) -> tuple[Plan | None, list[Problem]]:
-    """Validate the keys of a scene separately, then combinations of keys.
+    """Validate the keys of a scene separately, then combinations of keys; return the plan or None, and all problems.
 
-    Faulty sections are replaced by valid ones before combinations are checked, so that all problems are reported at
-    once.
-
-    Returns:
-        The plan, or None if there are problems; the problems.
+    Faulty sections are replaced by valid ones before combinations are checked, so that all problems come at once.
     """
     problems: list[Problem] = []
     plan = None
@@ -134,11 +130,7 @@ def _replace_faulty(data: dict[str, Any], problems: list[Problem]) -> dict[str, 
 
 
 def parse_model(model: type[Model], data: dict[str, Any]) -> tuple[Model | None, list[Problem]]:
-    """Validate the keys of a section separately.
-
-    Returns:
-        The section, or None if there are problems; the problems.
-    """
+    """Validate the keys of a section separately; return it, or None if there are problems, and the problems."""
     try:
         return model.model_validate(data), []
     except ValidationError as error:

@@ -23,12 +23,7 @@ class ResolvedPlan(NamedTuple):
 
 
 def resolve(plan: Plan, device: Device, progress: ProgressCallback = lambda done, total: None) -> ResolvedPlan:
-    """Choose the settings that a valid scene leaves open, by trial runs if it has tolerances.
-
-    Args:
-        plan: plan of the scene.
-        device: device of the run and of the trial runs.
-        progress: callback with the progress of the trial runs.
+    """Choose the settings that a valid scene leaves open, by trial runs on the device if it has tolerances.
 
     Raises:
         SceneError: when a tolerance cannot be met, or the precision of the device does not suffice.

@@ -338,11 +338,7 @@ class Camera(Section):
         return type(self).model_fields.keys() - needed
 
     def with_poses(self) -> Self:
-        """Return a copy with the rows of the trajectory file, if there is one.
-
-        Raises:
-            PydanticCustomError: when the file cannot be used.
-        """
+        """Return a copy with the rows of the trajectory file, if there is one."""
         if not isinstance(self.poses, str):
             return self
         try:
@@ -353,14 +349,7 @@ class Camera(Section):
         return self.model_validate(kept | {"poses": rows})
 
     def calibrated(self, size: tuple[int, int]) -> Self:
-        """Return a copy with the intrinsics and the distortion of the calibration file, if there is one.
-
-        Args:
-            size: width and height of the pictures [px].
-
-        Raises:
-            PydanticCustomError: when the file cannot be used, or its size differs from `size` without `scale`.
-        """
+        """Return a copy with the intrinsics and distortion of the calibration file for pictures of a size [px]."""
         if self.calibration is None:
             return self
         # Only a stereo pair uses the distance of the cameras.

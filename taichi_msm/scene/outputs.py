@@ -197,13 +197,10 @@ RESULT_PATTERNS = (
 
 
 def result_names(folders: Mapping[str, Collection[str]]) -> list[str]:
-    """List the results of a run, as in `outputs` of run.json.
+    """List the results of a run, as in `outputs` of run.json: folders of series, files, matrices of cameras, record.
 
     Args:
         folders: names of the outputs, by the folders of the cameras; "" is the folder of the run.
-
-    Returns:
-        The folders of series, then the files, the matrices of the cameras and the record.
     """
     selected = [(folder, output) for output in OUTPUTS.values() for folder in folders if output.name in folders[folder]]
     selected.sort(key=lambda item: not item[1].is_series)
@@ -226,13 +223,7 @@ def file_names(results: Iterable[str], frames: int) -> list[str]:
 
 
 def is_result(results: Collection[str], frames: int, name: str) -> bool:
-    """Return whether a path is in `file_names`, without listing them.
-
-    Args:
-        results: names of the results, from `result_names`.
-        frames: number of frames.
-        name: path relative to the folder of the run.
-    """
+    """Return whether a path is in `file_names`, without listing them."""
     folder, _, file = name.rpartition("/")
     output, number = SERIES_FOLDERS.get(folder.rpartition("/")[2]), file.partition(".")[0]
     if output is None or not number.isdecimal():

@@ -29,12 +29,7 @@ SCENE_FAULT = "refused"
 
 
 def scene_fault(message: str, *below: str | int) -> PydanticCustomError:
-    """Return the error that a validator raises for a fault of its value.
-
-    Args:
-        message: message for the user, without the key.
-        below: keys and indices from the validated value to the value at fault.
-    """
+    """Return the error that a validator raises for a fault of its value, or of the value at the keys `below` it."""
     return PydanticCustomError(SCENE_FAULT, message, {"below": below})
 
 
@@ -52,13 +47,7 @@ def format_value(value: Any) -> str:
 
 
 def key_problems(error: ValidationError, section: type[BaseModel], data: Any) -> list[Problem]:
-    """Translate pydantic's errors to problems at the keys of a scene.
-
-    Args:
-        error: error of the validation.
-        section: model that the data was validated against.
-        data: plain data, as passed to the validation.
-    """
+    """Translate errors of the validation of plain data against a section to problems at its keys."""
     # A broken file of the largest size could have tens of thousands of faults.
     errors = error.errors(include_url=False, include_input=False)[:1000]
     faults = [_fault(details, section) for details in errors]
