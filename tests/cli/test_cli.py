@@ -118,14 +118,6 @@ def test_a_tolerance_out_of_reach_is_refused_and_keeps_earlier_results(
     assert (small / "kept" / "run.json").read_text() == "earlier"
 
 
-def test_springs_that_are_pressed_together_are_told_of(small: Path, program: Program) -> None:
-    settings = ["--set", "output=[]", "--set", "probes.0.force=[40000,0,0]", "--set", "time.duration=0.1"]
-    done = program("run", "small.yaml", *settings, "--out", "here")
-    record = json.loads((small / "here" / "run.json").read_text())
-    assert record["shortest_spring"] < 0.5
-    assert f"a spring was pressed to {record['shortest_spring']:.2g} of its rest length" in done.stdout
-
-
 @pytest.mark.slow
 def test_a_study_ends_in_lines_that_the_scene_takes(small: Path, program: Program) -> None:
     """And a run of it is as right as they promise."""
