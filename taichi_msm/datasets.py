@@ -79,14 +79,7 @@ class _Split:
         return len(self.runs) * self._items
 
     def loader(self, **options: Any) -> Any:
-        """Return a `torch.utils.data.DataLoader` of this data set.
-
-        Args:
-            **options: arguments of the loader, such as batch_size, shuffle and num_workers.
-
-        Raises:
-            NotInstalledError: when PyTorch is not installed.
-        """
+        """Return a `torch.utils.data.DataLoader` of this data set, with its options, such as batch_size and shuffle."""
         try:
             from torch.utils.data import DataLoader
         except ImportError:
@@ -133,17 +126,7 @@ class Pairs(_Split):
 
 
 class Clips(_Split):
-    """Successive clips of a split of a data set.
-
-    Args:
-        directory: as for `Pairs`.
-        split: as for `Pairs`.
-        frames: number of frames of a clip.
-        camera: as for `Pairs`.
-
-    Raises:
-        ArgumentError, FilesError: as for `Pairs`.
-    """
+    """Successive clips of a number of frames of a split of a data set; other arguments and errors as for `Pairs`."""
 
     outputs = ("png", "tracks")
 

@@ -106,11 +106,9 @@ def fit(
 
 def parse_bounds(text: str) -> tuple[str, tuple[float, float]]:
     """Parse KEY=LOW,HIGH; a missing bound is infinite."""
-    key, _, interval = text.partition("=")
-    low, comma, high = interval.partition(",")
     try:
-        if not comma:
-            raise ValueError
+        key, interval = text.split("=", 1)
+        low, high = interval.split(",", 1)
         return key.strip(), (float(low or "-inf"), float(high or "inf"))
     except ValueError:
         message = f"{text}: expected KEY=LOW,HIGH, such as tissue.young=5e3,1e5"
@@ -119,10 +117,8 @@ def parse_bounds(text: str) -> tuple[str, tuple[float, float]]:
 
 def parse_forces(text: str) -> tuple[str, float]:
     """Parse FILE,SIGMA."""
-    name, _, sigma = text.rpartition(",")
     try:
-        if not name:
-            raise ValueError
+        name, sigma = text.rsplit(",", 1)
         return name, float(sigma)
     except ValueError:
         message = f"{text}: expected FILE,SIGMA, such as forces.csv,0.01"
@@ -131,8 +127,8 @@ def parse_forces(text: str) -> tuple[str, float]:
 
 def parse_window(text: str) -> tuple[float, float]:
     """Parse T0,T1."""
-    first, _, last = text.partition(",")
     try:
+        first, last = text.split(",", 1)
         return float(first), float(last)
     except ValueError:
         raise click.BadParameter(f"{text}: expected T0,T1, such as 0.5,12", param_hint="--window") from None
