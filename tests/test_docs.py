@@ -64,10 +64,10 @@ def blocks(path: Path, language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", read(path), flags=re.DOTALL)
 
 
-def table(path: Path, name: str) -> list[str]:
-    """Give the first cells of a marked table."""
+def table(path: Path, name: str, cells: int = 1) -> list[str]:
+    """Give the first cells of the rows of a marked table."""
     lines = read(path).split(f"<!-- {name}: ")[1].split("\n\n")[0].splitlines()[3:]
-    return [line.strip("|").split(" | ")[0].strip() for line in lines if line[0] == "|"]
+    return [" | ".join(line.strip("| ").split(" | ")[:cells]) for line in lines if line[0] == "|"]
 
 
 def words(cells: list[str]) -> list[str]:
@@ -189,8 +189,9 @@ def test_all_parts_of_a_scene_are_exported() -> None:
 
 
 def test_everything_has_its_row() -> None:
-    results, labels = table(DOCS / "files.md", "outputs"), table(DOCS / "labels.md", "labels")
-    assert words(results) + words(labels) == [output.entry for output in OUTPUTS.values()]
+    results, labels = table(DOCS / "files.md", "outputs", 2), table(DOCS / "labels.md", "labels", 2)
+    expected = [f"`{output.entry}` | `{output.file}`" for output in OUTPUTS.values()]
+    assert results + labels == expected
     assert sorted(words(table(DOCS / "files.md", "record"))) == sorted(get_type_hints(RunRecord))
     assert words(table(DOCS / "error.md", "estimate")) == list(get_type_hints(ErrorRecord))
     assert sorted(words(table(DOCS / "export.md", "formats"))) == sorted(FORMATS)
