@@ -48,7 +48,7 @@ def first_failure(files: Iterable[str], mutant: Mutant | None = None) -> str | N
             (copy / mutant.definition().file).write_text(mutant.source(), encoding="utf-8")
         try:
             done = subprocess.run(
-                [*PYTEST, "-p", "tests.mutants.own_package", *(f"tests/{file}" for file in files)],
+                [*PYTEST, *(f"tests/{file}" for file in files)],
                 cwd=copy,
                 # Also for processes that a test starts elsewhere.
                 env={**os.environ, "PYTHONPATH": str(copy)},
