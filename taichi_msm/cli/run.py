@@ -78,9 +78,10 @@ def run(
     from taichi_msm.runs import run as run_module
 
     interruption, name = Interruption(), str(scene or resume or again)
-    rest = lambda: f"; nothing was written{session.resume_hint(directory)}"  # noqa: E731
     with (
-        session.report_interruption(interruption, as_json, rest),
+        session.report_interruption(
+            interruption, as_json, lambda: f"; nothing was written{session.resume_hint(directory)}"
+        ),
         session.show_progress(interruption, quiet or as_json) as progress,
         session.add_resume_hint(directory),
         session.prefix_errors(name),
