@@ -9,7 +9,6 @@ import click
 from taichi_msm.cli import options, session
 from taichi_msm.errors import printable
 from taichi_msm.exports.formats import FORMATS
-from taichi_msm.system.process import Interruption
 
 
 @options.program.command()
@@ -39,11 +38,7 @@ def export(
 
     from taichi_msm.exports import export as export_module
 
-    interruption = Interruption()
-    with (
-        session.report_interruption(interruption, as_json),
-        session.show_progress(interruption, quiet or as_json) as progress,
-    ):
+    with session.interruptible(as_json, quiet) as progress:
         exported = export_module.export(runs, name, folder, partial(progress, "export"), camera)
     if as_json:
         session.print_json(

@@ -9,7 +9,6 @@ import click
 
 from taichi_msm.cli import options, session
 from taichi_msm.errors import DivergedError, printable
-from taichi_msm.system.process import Interruption
 
 
 @options.program.command()
@@ -77,12 +76,8 @@ def fit(
 
     from taichi_msm.fitting.fit import fit as fit_scene
 
-    interruption = Interruption()
     try:
-        with (
-            session.report_interruption(interruption, as_json),
-            session.show_progress(interruption, quiet=as_json) as progress,
-        ):
+        with session.interruptible(as_json) as progress:
             result = fit_scene(
                 loaded,
                 tables if len(tables) > 1 else observed,

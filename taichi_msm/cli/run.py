@@ -79,10 +79,9 @@ def run(
 
     interruption, name = Interruption(), str(scene or resume or again)
     with (
-        session.report_interruption(
-            interruption, as_json, lambda: f"; nothing was written{session.resume_hint(directory)}"
-        ),
-        session.show_progress(interruption, quiet or as_json) as progress,
+        session.interruptible(
+            as_json, quiet, interruption, lambda: f"; nothing was written{session.resume_hint(directory)}"
+        ) as progress,
         session.add_resume_hint(directory),
         session.prefix_errors(name),
     ):

@@ -90,15 +90,26 @@ def show_progress(interruption: Interruption, quiet: bool) -> Iterator[Callable[
 
 
 @contextmanager
-def report_interruption(
-    interruption: Interruption, as_json: bool, rest: Callable[[], str] = lambda: "; nothing was written"
-) -> Iterator[None]:
+def report_interruption(interruption: Interruption, as_json: bool, rest: Callable[[], str]) -> Iterator[None]:
     """Report an interruption of the block, and exit; `rest` returns the end of the message."""
     try:
         yield
     except KeyboardInterrupt:
         report_failure("interrupted", [f"interrupted{rest()}"], as_json)
         raise click.exceptions.Exit(interruption.code) from None
+
+
+@contextmanager
+def interruptible(
+    as_json: bool,
+    quiet: bool = False,
+    interruption: Interruption | None = None,
+    rest: Callable[[], str] = lambda: "; nothing was written",
+) -> Iterator[Callable[[str, int, int], None]]:
+    """Show the progress of the block by a callback; report an interruption, and exit."""
+    interruption = interruption or Interruption()
+    with report_interruption(interruption, as_json, rest), show_progress(interruption, quiet or as_json) as progress:
+        yield progress
 
 
 def print_json(value: Any) -> None:

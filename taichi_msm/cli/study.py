@@ -62,11 +62,7 @@ def study(
 
     require_writable(directory)
     interruption = Interruption()
-    with (
-        session.report_interruption(interruption, as_json),
-        session.show_progress(interruption, quiet=as_json) as progress,
-        session.prefix_errors(scene),
-    ):
+    with session.interruptible(as_json, interruption=interruption) as progress, session.prefix_errors(scene):
         results = run_study(
             loaded,
             Path(scene).stem,

@@ -9,7 +9,7 @@ import click
 
 from taichi_msm.cli import options, session
 from taichi_msm.errors import LostExecutorError, printable
-from taichi_msm.system.process import Interruption, write_stderr
+from taichi_msm.system.process import write_stderr
 
 if TYPE_CHECKING:
     from taichi_msm.sweeps.spec import Sweep
@@ -64,13 +64,11 @@ def sweep(
         write_stderr([f"{len(outcomes)} of {total} runs have ended before"] if outcomes else [])
         local_workers = chosen if dask is None else None
         write_stderr([cost_line(missing, cost.scaled(missing / loaded.runs), local_workers)] if missing else [])
-    interruption = Interruption()
     files: list[str] = []
     notes: list[str] = []
     try:
         with (
-            session.report_interruption(interruption, as_json, lambda: f"; {progress_message(len(outcomes), total)}"),
-            session.show_progress(interruption, quiet=as_json) as progress,
+            session.interruptible(as_json, rest=lambda: f"; {progress_message(len(outcomes), total)}") as progress,
             # Only runs need a cluster.
             open_executor(dask if missing else None, chosen.number, state, progress) as executor,
         ):
