@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -41,11 +41,9 @@ def study(
     out: str | None,
     image: str | None,
     overrides: tuple[str, ...],
-    arch: str,
-    threads: int | None,
     tolerance: float | None,
-    quick: bool,
     as_json: bool,
+    **settings: Any,
 ) -> int:
     """Measure the speed and error of every setting of SCENE, and recommend one."""
     from taichi_msm.load.scene_file import load_scene
@@ -63,15 +61,7 @@ def study(
     require_writable(directory)
     interruption = Interruption()
     with session.interruptible(as_json, interruption=interruption) as progress, session.prefix_errors(scene):
-        results = run_study(
-            loaded,
-            Path(scene).stem,
-            tolerance=tolerance,
-            quick=quick,
-            arch=arch,
-            threads=threads,
-            progress=progress,
-        )
+        results = run_study(loaded, Path(scene).stem, tolerance=tolerance, progress=progress, **settings)
         if not results.stepping:
             raise KeyboardInterrupt
     if results.status == "interrupted" and (directory / RECORD_FILE).exists():
