@@ -64,8 +64,14 @@ def run(
     elif again is not None:
         allowed = ("again", "out", "arch", "threads", "estimate_error", "quiet", "as_json")
         _require_no_settings(context, "--again repeats", allowed)
-        directory = session.result_directory(again, option="--again") if out is None else session.result_directory(out)
-        plan, typed = session.plan_repetition(again)
+        from taichi_msm.load.check import check_scene
+        from taichi_msm.runs.finished import read_run
+
+        directory = session.result_directory(again, option="--again")
+        earlier = read_run(directory)
+        earlier.require_same_pictures(drawn=earlier.scene.draws or "image" in earlier.sha256)
+        plan, typed = check_scene(earlier.scene), earlier.overrides
+        directory = directory if out is None else session.result_directory(out)
     elif scene is None:
         raise click.MissingParameter(param_hint="'SCENE'", param_type="argument")
     else:

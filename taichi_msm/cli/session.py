@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -15,23 +15,10 @@ from taichi_msm.errors import FilesError, SceneError
 from taichi_msm.runs.directory import require_no_link
 from taichi_msm.system.process import Interruption, write_stderr
 
-if TYPE_CHECKING:
-    from taichi_msm.model.plan import Plan
-
 # Exit codes; FILES: files cannot be read or written.
 DONE, BUG, INVALID_INPUT, DIVERGED, FILES = 0, 1, 2, 3, 4
 
 EXIT_CODES = {"complete": DONE, "diverged": DIVERGED}
-
-
-def plan_repetition(directory: str) -> tuple[Plan, list[str]]:
-    """Return the plan and overrides of an earlier run, after checking that its pictures are unchanged."""
-    from taichi_msm.load.check import check_scene
-    from taichi_msm.runs.finished import read_run
-
-    earlier = read_run(result_directory(directory, option="--again"))
-    earlier.require_same_pictures(drawn=earlier.scene.draws or "image" in earlier.sha256)
-    return check_scene(earlier.scene), earlier.overrides
 
 
 def result_directory(out: str | None, default: str = "", option: str = "--out") -> Path:
