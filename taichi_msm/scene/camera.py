@@ -18,7 +18,6 @@ from taichi_msm.camera_files.trajectory import pose_fault
 from taichi_msm.lenses import MODELS
 from taichi_msm.lenses.model import MAX_COEFFICIENT
 from taichi_msm.scene.section import (
-    MIN_FOV,
     MIN_MAGNITUDE,
     FilePath,
     Number,
@@ -223,10 +222,11 @@ class Camera(Section):
         "direction that is up in the picture, or its keyframes",
         "three numbers: [x, y, z]," + _OR_KEYFRAMES,
     )
-    fov: Annotated[Number, Field(ge=MIN_FOV, lt=180)] = key(
+    # In f32, directions are resolved to 2^-24, 3.4e-6 degrees; below the minimum, about 300 rows would be distinct.
+    fov: Annotated[Number, Field(ge=0.001, lt=180)] = key(
         40.0,
         "vertical field of view, without distortion [degrees]",
-        f"a number from {MIN_FOV:g} to below 180, in degrees",
+        "a number from 0.001 to below 180, in degrees",
     )
 
     @property

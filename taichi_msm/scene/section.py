@@ -170,14 +170,7 @@ def _message(fault: _Fault, data: Any) -> str:
 MAX_POINTS = 4096  # rows or columns of mass points
 MAX_PROBES = 16
 MAX_PIXELS = 8192  # width or height of a frame
-MAX_REFINE = 64
-MAX_TRACKS = 256
-MAX_RELIEF = 10  # [%]
 MAX_SUPERSAMPLE = 4
-
-# Minimum field of view [degrees]. In f32, directions are resolved to 2^-24, which is 3.4e-6 degrees; a narrower picture
-# would have fewer than about 300 distinct rows.
-MIN_FOV = 1e-3
 
 # Approximate limit of operating systems for the length of a path.
 MAX_PATH = 4096
