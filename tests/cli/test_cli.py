@@ -79,17 +79,6 @@ def test_json_is_all_there_is_on_stdout(small: Path, program: Program) -> None:
     assert sorted(path.name for path in (small / "here").iterdir()) == ["run.json"]
 
 
-def test_another_picture_on_the_same_sheet(small: Path, program: Program) -> None:
-    (small / "elsewhere").mkdir()
-    Image.new("RGB", (8, 6), (10, 200, 30)).save(small / "elsewhere" / "green.png")
-    settings = ["--set", "output=[png]", "--set", "render.shading=none", "--set", "render.background=[10,200,30]"]
-    done = program("run", "small.yaml", "--image", "elsewhere/green.png", *settings, "--out", "green")
-    assert done.returncode == 0, done.stderr
-    assert (np.array(Image.open(small / "green" / "frames" / "0002.png")) == [10, 200, 30]).all()
-    record = json.loads((small / "green" / "run.json").read_text())
-    assert record["overrides"][-1] == "image=elsewhere/green.png"
-
-
 def test_a_tolerance_chooses_the_step_and_is_reported(small: Path, program: Program) -> None:
     done = program("run", "small.yaml", "--set", "output=[]", "--set", "time.tolerance=1e-4", "--out", "here")
     assert (done.returncode, done.stderr) == (0, "")
@@ -285,13 +274,6 @@ def test_a_stale_lock_does_not_cost_the_cache(small: Path) -> None:
         done = own_process("run", "small.yaml", *bare, "--out", "here", env=environment)
         assert done.returncode == 0, done.stderr
         assert bool(kernels()) == kept, "someone else's lock is respected, a dead one's is not"
-
-
-@pytest.mark.slow
-def test_more_threads_than_cores_are_no_harm(small: Path) -> None:
-    settings = ["--set", "sheet.points=[200,200]", "--set", "time.duration=0.1", "--set", "output=[]", "--out", "many"]
-    done = own_process("run", "small.yaml", "--threads", "16", "--quiet", *settings, timeout=300)
-    assert (done.returncode, done.stderr) == (0, "")
 
 
 Call = Callable[..., tuple[int, str, str]]

@@ -96,23 +96,9 @@ def test_a_run_takes_no_more_disk_than_was_said(size: tuple[int, int], device: D
     assert pictures > 2 * 11 * width * height, "noise is hard to compress"
 
 
-def test_tracks() -> None:
-    # Of 10 x 10 points in 21 frames: two coordinates in f32, and whether it is hidden.
-    assert estimate(scene(render={"tracks": 10}, output=["tracks"])).track_bytes == 100 * (21 * 21 + 16) + 1024
-
-
 def test_forces() -> None:
     # A row has a number of a probe, and seven others of up to 24 characters.
-    longest = ",".join([repr(-math.pi * 1e-100)] * 7 + ["15"])
-    assert len(longest) < FORCE_ROW_BYTES
-    alone = estimate(scene(probes=[PROBE, PROBE], output=["gif"]))
-    tool = {"path": [[0, 0, 0, 1]], "instrument": {"radius": 1, "shaft": [0, 0, 1], "length": 1}, "grip": [[0, 1]]}
-    pushed = estimate(scene(probes=[PROBE, tool], output=["gif"]))
-    assert pushed.simulation_bytes == alone.simulation_bytes + 1200 * (4 + 8 + 8) * 6
-
-
-def test_an_ordinary_scene_has_no_problems() -> None:
-    assert faults(scene(output=["png", "gif", "trajectory"])) == []
+    assert len(",".join([repr(-math.pi * 1e-100)] * 7 + ["15"])) < FORCE_ROW_BYTES
 
 
 @pytest.mark.parametrize(

@@ -350,17 +350,14 @@ def test_overrides(load: Load) -> None:
     scene = load(GOOD + PROBE, overrides)
     assert (scene.sheet.points, scene.sheet.size, scene.damping) == ((6, 7), (0.3, 0.4), 0.01)
     assert (scene.probes[0].load, scene.probes[0].force) == (((0, 100),), (0, 0, 9))
+    scene = load(GOOD, {"sheet.points": (6, 7), "probes": [{"force": [0, 0, 1]}], "probes.0.falloff": 3})
+    assert (scene.sheet.points, scene.probes[0].falloff) == ((6, 7), 3)
 
 
-def test_the_last_override_of_a_key_holds(load: Load) -> None:
+def test_the_last_override_of_a_key_holds_and_may_mend_the_file(load: Load) -> None:
     assert load(GOOD, ["damping=1", "damping=2"]).damping == 2
     assert load(GOOD, ["render.camera.eye=[0, 0, 1]", "render={camera: top}"]).render.camera == "top"
-
-
-def test_overrides_from_python(load: Load) -> None:
-    scene = load(GOOD, {"sheet.points": (6, 7), "probes": [{"force": [0, 0, 1]}], "probes.0.falloff": 3})
-    assert scene.sheet.points == (6, 7)
-    assert scene.probes[0].falloff == 3
+    assert load(GOOD.replace("1.0e-3", "0"), ["sheet.mass=1"]).sheet.mass == 1
 
 
 @pytest.mark.parametrize(
@@ -377,10 +374,6 @@ def test_a_long_override_is_named_in_short(
     with message.raises(SceneError) as caught:
         load(GOOD, overrides, image=image)
     assert len(str(caught.value)) < 400
-
-
-def test_an_override_mends_a_fault_of_the_file(load: Load) -> None:
-    assert load(GOOD.replace("1.0e-3", "0"), ["sheet.mass=1"]).sheet.mass == 1
 
 
 @pytest.mark.parametrize(
