@@ -22,7 +22,7 @@ ROLES = (
     *(rf"{_POSITION}[^a-z]*{axis}" for axis in "xyz"),
     *(rf"{_ROTATION}[^a-z]*{axis}" for axis in "xyzw"),
 )
-UNIT = re.compile(r"\s*[\[(]([^\])]*)[\])]|[^a-z](m?u?n?s|nsecs?)$")
+UNIT = re.compile(r"\s*[\[(]([^\])]*)[\])]|[^a-z](m?u?n?s|nsecs?|mm?)$")
 TIME_UNITS = {
     **dict.fromkeys(("s", "sec", "seconds"), "s"),
     **dict.fromkeys(("ms", "milliseconds"), "ms"),
@@ -104,9 +104,11 @@ def _columns(file: CameraFile, line: int, names: Sequence[str]) -> _Columns:
         raise file.fault(f"{fault}; name them {', '.join(COLUMNS)}", line)
     indices = tuple(columns[0] for columns in matches)
     time, *lengths = [(match[1] or match[2] or "") if (match := UNIT.search(names[n])) else "" for n in indices[:4]]
-    if time not in {"", *TIME_UNITS} or {*lengths} - {""} not in (set(), *({unit} for unit in LENGTH_UNITS)):
+    units = {*lengths} - {""}
+    if time not in {"", *TIME_UNITS} or len(units) > 1 or not units <= LENGTH_UNITS.keys():
         fault = f"{', '.join(names[n] for n in indices[:4])}: units that are not understood"
-        raise file.fault(f"{fault}; write [s], [ms], [us] or [ns] for t, and [m] or [mm] for the others", line)
+        remedy = "write [s], [ms], [us] or [ns] for t, and [m] for the others, or [mm] for all of them"
+        raise file.fault(f"{fault}; {remedy}", line)
     return _Columns(indices, len(names), TIME_UNITS.get(time), max(lengths) or None)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import errno
 import os
@@ -26,6 +27,9 @@ from taichi_msm.system.files import private_folder
 from taichi_msm.system.process import discarded_output
 
 ti = active_compiler().load()
+
+# The destructor of arrays that exist at exit would raise, as Taichi's modules are gone; their memory ends anyway.
+atexit.register(setattr, ti.lang._ndarray.ScalarNdarray, "__del__", lambda array: None)
 
 _core: Any = getattr(np, "_core", None) or np.core  # NumPy 2, or 1
 _features: dict[str, bool] = _core._multiarray_umath.__cpu_features__

@@ -506,6 +506,14 @@ def test_check_prints_what_was_read(small: Path, capsys: pytest.CaptureFixture[s
     message(lines, "render.cameras.left: pinhole, 40 x 30 px", "k1 -0.3")
 
 
+def test_a_field_of_view_beyond_the_limit_is_that_of_the_lens(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The left and right edges are 104 degrees from the axis, the upper and lower ones 78."""
+    Path("camera.yml").write_text("K: [11, 0, 19.5, 0, 11, 14.5, 0, 0, 1]\nD: [0, 0, 0, 0]\nfisheye: true\n")
+    camera = READ.replace("FILE", "camera.yml, outside: background")
+    assert not main(["check", "small.yaml", "--set", camera, "--set", "output=[]"])
+    assert "40 x 30 px, fov (the lens's) x 156.3 degrees" in capsys.readouterr().out
+
+
 def test_files_are_in_the_folder_of_the_scene(small: Path, message: Messages) -> None:
     write_opencv("camera.yml")
     Path("inner").mkdir()
