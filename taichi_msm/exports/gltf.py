@@ -7,24 +7,28 @@ interpolation. Like this package, glTF uses metres, y up, and texture coordinate
 Browsers store each target in a layer of a texture, and WebGL 2 guarantees 256 layers. Runs that exceed this, or the
 size limit, are reduced to keyframes, and the largest interpolation error is reported.
 
-Source: the glTF 2.0 specification of Khronos, sections 3.7.2.2 (morph targets) and 3.11 (animations).
+A tool is a mesh of its instrument, which moves with the tip. glTF's cameras look along -z with y up, and have neither
+lens distortion nor another principal point than the centre.
+
+Source: the glTF 2.0 specification of Khronos, sections 3.7.2.2 (morph targets), 3.10 (cameras) and 3.11 (animations).
 """
 
 from __future__ import annotations
 
-import heapq
+import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from taichi_msm.errors import ProgressCallback
 from taichi_msm.exports.formats import one_folder_per_run
-from taichi_msm.exports.glb import GL_ARRAY_BUFFER, GL_ELEMENT_ARRAY_BUFFER, BinaryChunk
-from taichi_msm.exports.gltf_nodes import add_cameras, add_tools
-from taichi_msm.exports.inputs import EXPORT_REFINE, picture_png, unit_normals
-from taichi_msm.model.surface import refine_surface
+from taichi_msm.exports.glb import GL_ARRAY_BUFFER, Glb
+from taichi_msm.exports.inputs import EXPORT_REFINE, instrument_mesh, picture_png, unit_normals
+from taichi_msm.model.surface import place_instruments, refine_surface
+from taichi_msm.render.camera import is_moving, view_at
 from taichi_msm.runs.directory import create_file
 from taichi_msm.runs.finished import FinishedRun
 from taichi_msm.version import __version__
@@ -37,6 +41,11 @@ TARGET_VERTEX_BYTES = 2 * 3 * 4  # differences of position and normal, float32
 # Constants of OpenGL for texture filtering and wrapping.
 GL_LINEAR, GL_LINEAR_MIPMAP_LINEAR, GL_CLAMP_TO_EDGE = 9729, 9987, 33071
 
+# Near plane of a perspective camera, as a fraction of the distance of its target.
+NEAR_RATIO = 1e-3
+
+Array = NDArray[np.floating]
+
 
 @one_folder_per_run
 def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
@@ -46,100 +55,108 @@ def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[st
         FilesError: as for `FinishedRun.positions`.
         SceneError: as for `picture_png`.
     """
-    positions, picture, binary = run.positions(), picture_png(run), BinaryChunk()
+    positions, picture = run.positions(), picture_png(run)
     max_targets = max(1, min(MAX_TARGETS, MAX_TARGETS_BYTES // (TARGET_VERTEX_BYTES * positions[0, ..., 0].size)))
     keys = key_frames(positions, 1 + max_targets, progress)
-    primitive = _surface(positions[0], picture is not None, binary)
+    asset = {"version": "2.0", "generator": f"taichi_msm {__version__}"}
+    nodes = [{"mesh": 0, "name": "sheet"}]
+    glb = Glb({"asset": asset, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": nodes})
+    _add_sheet(glb, positions, picture, run.time, keys, progress)
+    _add_tools(glb, run, positions)
+    notes = _add_cameras(glb, run)
+    with create_file(folder / "surface.glb") as file:
+        file.writelines(glb.content())
+    if len(keys.frames) < run.frames:
+        notes.append(
+            f"{len(keys.frames)} of {run.frames} frames are key frames; between them no point is farther than "
+            f"{keys.error:.2g} m from where it was"
+        )
+    return notes
+
+
+def _add_sheet(
+    glb: Glb, positions: Array, picture: bytes | None, time: Array, keys: KeyFrames, progress: ProgressCallback
+) -> None:
+    """Add the mesh of the first frame, its matte material, and its morph targets and their animation."""
+    first, normals = refine_surface(positions[0], EXPORT_REFINE), unit_normals(positions[0])
+    attributes = glb.attributes(first.vertices, normals)
+    if picture is not None:
+        attributes["TEXCOORD_0"] = glb.accessor(first.texture_coordinates, GL_ARRAY_BUFFER)
+    primitive: dict[str, Any] = {"attributes": attributes, "indices": glb.indices(first.triangles), "material": 0}
     targets = []
     for count, frame in enumerate(keys.frames[1:]):
         progress(count, len(keys.frames))
-        targets.append(_target(positions[0], positions[frame], binary))
-    document: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": f"taichi_msm {__version__}"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": "sheet"}],
-        "materials": [_material(picture is not None)],
-        **(_texture(picture, binary) if picture is not None else {}),
-    }
-    mesh: dict[str, Any] = {"name": "sheet", "primitives": [{**primitive, "material": 0}]}
+        displacement = (positions[frame].astype(np.float64) - positions[0]).reshape(-1, 3)
+        targets.append(glb.attributes(displacement, unit_normals(positions[frame]) - normals))
+    colour = {} if picture is None else {"baseColorTexture": {"index": 0}}
+    rough = {**colour, "metallicFactor": 0.0, "roughnessFactor": 1.0}
+    glb.add("materials", {"name": "sheet", "doubleSided": True, "pbrMetallicRoughness": rough})
+    if picture is not None:
+        glb.add("textures", {"source": 0, "sampler": 0})
+        glb.add("images", {"name": "picture", "mimeType": "image/png", "bufferView": glb.view(picture)})
+        filters = {"magFilter": GL_LINEAR, "minFilter": GL_LINEAR_MIPMAP_LINEAR}
+        glb.add("samplers", {**filters, "wrapS": GL_CLAMP_TO_EDGE, "wrapT": GL_CLAMP_TO_EDGE})
+    mesh: dict[str, Any] = {"name": "sheet", "primitives": [primitive]}
     if targets:
-        times = run.time[keys.frames]
-        mesh["primitives"][0]["targets"] = targets
+        times = time[keys.frames]
+        primitive["targets"] = targets
         mesh["weights"] = [0.0] * len(targets)
         mesh["extras"] = {"targetNames": [f"{time:g} s" for time in times[1:]], "error": keys.error}
-        document["animations"] = [_animation(times.astype(np.float32), binary)]
-    document["meshes"] = [mesh]
-    add_tools(document, run, positions, binary)
-    notes = add_cameras(document, run, binary)
-    with create_file(folder / "surface.glb") as file:
-        file.writelines(binary.container(document))
-    if len(keys.frames) == run.frames:
-        return notes
-    return [
-        *notes,
-        f"{len(keys.frames)} of {run.frames} frames are key frames; between them no point is farther than "
-        f"{keys.error:.2g} m from where it was",
-    ]
+        # The first frame has no target.
+        glb.animate(0, "weights", times, np.eye(len(times))[:, 1:].reshape(-1))
+    glb.add("meshes", mesh)
 
 
-def _surface(position: NDArray[np.floating], has_picture: bool, binary: BinaryChunk) -> dict[str, Any]:
-    """Build the mesh of the first frame, with texture coordinates if there is a picture."""
-    first = refine_surface(position, EXPORT_REFINE)
-    attributes = {
-        "POSITION": binary.accessor(first.vertices.astype(np.float32), GL_ARRAY_BUFFER, bounds=True),
-        "NORMAL": binary.accessor(unit_normals(position).astype(np.float32), GL_ARRAY_BUFFER),
-    }
-    if has_picture:
-        attributes["TEXCOORD_0"] = binary.accessor(first.texture_coordinates.astype(np.float32), GL_ARRAY_BUFFER)
-    indices = first.triangles.reshape(-1).astype(np.uint32)
-    return {"attributes": attributes, "indices": binary.accessor(indices, GL_ELEMENT_ARRAY_BUFFER)}
+def _add_tools(glb: Glb, run: FinishedRun, positions: Array) -> None:
+    """Add a mesh for every probe with an instrument, and its motion."""
+    pairs = zip(positions, run.time.tolist(), strict=True)
+    placed = [place_instruments(run.scene, position, time) for position, time in pairs]
+    if not placed[0]:
+        return
+    metal = {"baseColorFactor": [0.6, 0.6, 0.62, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.5}
+    material = glb.add("materials", {"name": "instrument", "pbrMetallicRoughness": metal})
+    names = [f"probes.{index}" for index, probe in enumerate(run.scene.probes) if probe.instrument is not None]
+    for name, *solids in zip(names, *placed, strict=True):
+        vertices, normals, triangles = instrument_mesh(solids[0])
+        primitive = {"attributes": glb.attributes(vertices, normals), "indices": glb.indices(triangles)}
+        mesh = glb.add("meshes", {"name": name, "primitives": [{**primitive, "material": material}]})
+        tips = np.array([solid.tip for solid in solids])
+        _add_node(glb, {"name": name, "mesh": mesh}, {"translation": tips}, run.time)
 
 
-def _target(first: NDArray[np.floating], position: NDArray[np.floating], binary: BinaryChunk) -> dict[str, int]:
-    displacement = (position.astype(np.float64) - first).reshape(-1, 3).astype(np.float32)
-    normal_change = (unit_normals(position) - unit_normals(first)).astype(np.float32)
-    return {
-        "POSITION": binary.accessor(displacement, GL_ARRAY_BUFFER, bounds=True),
-        "NORMAL": binary.accessor(normal_change, GL_ARRAY_BUFFER),
-    }
+def _add_cameras(glb: Glb, run: FinishedRun) -> list[str]:
+    """Add the cameras of the scene, with their motion; return warnings about what glTF cannot describe."""
+    notes = []
+    for name in run.scene.render.all_cameras:
+        times = run.time.tolist() if is_moving(run.scene, name) else [0.0]
+        views = [view_at(run.scene, time, name) for time in times]
+        view, title = views[0], name or "camera"
+        width, height = (view.size / view.scale).tolist()
+        if view.pinhole:
+            field = {"yfov": 2 * math.atan(height / 2), "aspectRatio": width / height}
+            optics = {"type": "perspective", "perspective": {**field, "znear": NEAR_RATIO * view.distance}}
+        else:
+            field = {"xmag": width / 2, "ymag": height / 2, "znear": 0.0, "zfar": 2 * view.distance}
+            optics = {"type": "orthographic", "orthographic": field}
+        if view.lens is not None or not np.allclose(view.centre, view.size / 2):
+            notes.append(f"{title}: without its distortion and its principal point, which a camera of glTF cannot have")
+        camera = glb.add("cameras", {"name": title, **optics})
+        pose = {
+            "translation": np.array([view.eye for view in views]),
+            "rotation": Rotation.from_matrix([view.axes.T for view in views]).as_quat(),
+        }
+        _add_node(glb, {"name": title, "camera": camera}, pose, run.time)
+    return notes
 
 
-def _animation(times: NDArray[np.float32], binary: BinaryChunk) -> dict[str, Any]:
-    # The first frame has no target.
-    weights = np.eye(len(times), dtype=np.float32)[:, 1:].reshape(-1)
-    sampler = {
-        "input": binary.accessor(times, bounds=True),
-        "interpolation": "LINEAR",
-        "output": binary.accessor(weights),
-    }
-    return {
-        "name": "motion",
-        "samplers": [sampler],
-        "channels": [{"sampler": 0, "target": {"node": 0, "path": "weights"}}],
-    }
-
-
-def _material(has_picture: bool) -> dict[str, Any]:
-    """Build a matte material."""
-    colour = {"baseColorTexture": {"index": 0}} if has_picture else {}
-    rough = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
-    return {"name": "sheet", "doubleSided": True, "pbrMetallicRoughness": {**colour, **rough}}
-
-
-def _texture(picture: bytes, binary: BinaryChunk) -> dict[str, Any]:
-    return {
-        "textures": [{"source": 0, "sampler": 0}],
-        "images": [{"name": "picture", "mimeType": "image/png", "bufferView": binary.view(picture)}],
-        "samplers": [
-            {
-                "magFilter": GL_LINEAR,
-                "minFilter": GL_LINEAR_MIPMAP_LINEAR,
-                "wrapS": GL_CLAMP_TO_EDGE,
-                "wrapT": GL_CLAMP_TO_EDGE,
-            }
-        ],
-    }
+def _add_node(glb: Glb, node: dict[str, Any], pose: dict[str, Array], time: Array) -> None:
+    """Add a node, with an animation of the parts of its pose that change."""
+    index = glb.add("nodes", node)
+    glb.document["scenes"][0]["nodes"].append(index)
+    for path, values in pose.items():
+        node[path] = values[0].tolist()
+        if (values != values[0]).any():
+            glb.animate(index, path, time, values)
 
 
 class KeyFrames(NamedTuple):
@@ -149,9 +166,7 @@ class KeyFrames(NamedTuple):
     error: float  # largest interpolation error of any mass point in any frame [m]
 
 
-def key_frames(
-    position: NDArray[np.floating], limit: int, progress: ProgressCallback = lambda done, total: None
-) -> KeyFrames:
+def key_frames(position: Array, limit: int, progress: ProgressCallback = lambda done, total: None) -> KeyFrames:
     """Choose the keyframes of a motion: all frames if possible, otherwise by a greedy selection.
 
     The selection starts with the first and last frame, and repeatedly adds the frame with the largest interpolation
@@ -169,13 +184,12 @@ def key_frames(
         return KeyFrames(list(range(count)), 0.0)
     chosen = [0, count - 1]
     spans = [_worst_frame(position, 0, count - 1)]
-    while len(chosen) < limit and -spans[0].error > 0:
+    while len(chosen) < limit and (worst := min(spans)).error < 0:
         progress(len(chosen), limit)
-        span = heapq.heappop(spans)
-        chosen.append(span.frame)
-        heapq.heappush(spans, _worst_frame(position, span.first, span.frame))
-        heapq.heappush(spans, _worst_frame(position, span.frame, span.last))
-    return KeyFrames(sorted(chosen), -spans[0].error)
+        spans.remove(worst)
+        chosen.append(worst.frame)
+        spans += [_worst_frame(position, worst.first, worst.frame), _worst_frame(position, worst.frame, worst.last)]
+    return KeyFrames(sorted(chosen), -min(spans).error)
 
 
 class _Span(NamedTuple):
@@ -187,7 +201,7 @@ class _Span(NamedTuple):
     last: int  # keyframe at the end
 
 
-def _worst_frame(position: NDArray[np.floating], first: int, last: int) -> _Span:
+def _worst_frame(position: Array, first: int, last: int) -> _Span:
     """Find the frame with the largest interpolation error between two keyframes."""
     start, end = position[first].astype(np.float64), position[last].astype(np.float64)
     worst = _Span(0.0, first, first, last)

@@ -239,7 +239,6 @@ def secret(results: Path) -> str:
 def test_a_record_that_names_a_picture_elsewhere_gets_nothing_of_it(
     name: str, results: Path, message: Messages
 ) -> None:
-    pytest.importorskip("vtkmodules" if name == "vtk" else "numpy")
     change_scene(results, image=secret(results))
     for digests in ({"image": "0" * 64}, {}):
         change(results, sha256=digests)
@@ -249,7 +248,6 @@ def test_a_record_that_names_a_picture_elsewhere_gets_nothing_of_it(
 
 
 def test_a_record_that_names_a_map_elsewhere_gets_nothing_of_it_for_vtk(results: Path, message: Messages) -> None:
-    pytest.importorskip("vtkmodules")
     change_scene(results, springs={"map": {"image": secret(results), "range": [1.0, 2.0]}})
     with message.raises(FilesError, "springs.map.image", "secret.png"):
         export(results, "vtk")
@@ -267,7 +265,6 @@ def test_results_that_are_links_get_nothing_of_what_they_lead_to(name: str, resu
 
 @pytest.mark.parametrize("name", ["gltf", "obj", "vtk"])
 def test_positions_that_no_run_reaches_are_damage(name: str, results: Path, message: Messages) -> None:
-    pytest.importorskip("vtkmodules" if name == "vtk" else "numpy")
     rewrite(results, edit=lambda position: position * np.array([1, 1, 1e300, 1e300, 1])[:, None, None, None])
     with message.raises(FilesError, "trajectory.npz"):
         export(results, name)
@@ -334,7 +331,6 @@ def test_an_export_that_fails_leaves_the_earlier_one(
 
 @pytest.mark.parametrize("name", ["gltf", "obj", "vtk"])
 def test_an_interrupted_export_changes_nothing(name: str, results: Path) -> None:
-    pytest.importorskip("vtkmodules" if name == "vtk" else "numpy")
     out = results / "here"
     export(results, name, out)
     before, calls = files(out), []
