@@ -41,8 +41,13 @@ def picture_png(run: FinishedRun) -> bytes | None:
     """
     if run.scene.image is None:
         return None
+    return encode_picture(load_texture(run.scene, run.sha256.get("image", "")), "PNG")
+
+
+def encode_picture(picture: NDArray[np.uint8] | NDArray[np.uint16], format: str, **options: int) -> bytes:  # noqa: A002
+    """Encode a picture in a format of Pillow, with its options."""
     file = io.BytesIO()
-    Image.fromarray(load_texture(run.scene, run.sha256.get("image", ""))).save(file, "PNG")
+    Image.fromarray(picture).save(file, format, **options)
     return file.getvalue()
 
 
@@ -150,6 +155,11 @@ class Pinhole(NamedTuple):
     focal: Array  # focal lengths along x and y [px], shape (2,)
     centre: Array  # principal point, counted from the picture's upper left corner [px], shape (2,)
     poses: Array  # world-to-camera transform of every frame [m], shape (frames, 3, 4)
+
+    @property
+    def matrices(self) -> Array:
+        """The poses as matrices, shape (frames, 4, 4)."""
+        return np.concatenate([self.poses, np.tile([[[0.0, 0.0, 0.0, 1.0]]], (len(self.poses), 1, 1))], axis=1)
 
 
 def read_pinhole(run: FinishedRun, name: str) -> Pinhole:

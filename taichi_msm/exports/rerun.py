@@ -14,7 +14,6 @@ Source: Rerun's documentation of archetypes.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import NotInstalledError, ProgressCallback
-from taichi_msm.exports.formats import FORMATS, ExportSource
+from taichi_msm.exports.formats import FORMATS, one_path_per_run
 from taichi_msm.exports.inputs import (
     EXPORT_REFINE,
     instrument_mesh,
@@ -39,14 +38,15 @@ from taichi_msm.render.labels import NO_FLOW
 from taichi_msm.render.texture import load_texture
 from taichi_msm.runs.arrays import read_flo
 from taichi_msm.runs.finished import FinishedRun, reading
-from taichi_msm.scene.outputs import OUTPUTS, zero_padded
+from taichi_msm.scene.outputs import OUTPUTS
 
 # Fraction of a turn between the hues of successive points.
 GOLDEN_RATIO = 0.618
 
 
-def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
-    """Write a recording per run; arguments as for `FormatWriter`.
+@one_path_per_run(".rrd")
+def write(run: FinishedRun, path: Path, progress: ProgressCallback) -> list[str]:
+    """Write a recording of a run; arguments as for `one_path_per_run`.
 
     Raises:
         FilesError: as for `FinishedRun.positions` and the readers of `inputs`.
@@ -59,19 +59,23 @@ def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
         raise NotInstalledError(
             "--format rerun: needs rerun-sdk, which is not installed; pip install rerun-sdk"
         ) from None
-    for run, name, progress in sources:
-        # The viewer merges recordings with the same identity.
-        identity = uuid5(NAMESPACE_URL, run.directory.resolve().as_uri())
-        with rerun.RecordingStream("taichi_msm", recording_id=identity) as recording:
-            recording.save(folder / f"{name or zero_padded(0)}.rrd")
-            recording.send_recording_name(run.directory.name)
-            # Without the timelines of the export itself.
-            recording.set_log_time_enabled(False)
-            recording.set_log_tick_enabled(False)
-            _log_run(run, recording, progress)
-            recording.flush()
-            recording.disconnect()
-        yield _notes(run)
+    # The viewer merges recordings with the same identity.
+    identity = uuid5(NAMESPACE_URL, run.directory.resolve().as_uri())
+    with rerun.RecordingStream("taichi_msm", recording_id=identity) as recording:
+        recording.save(path)
+        recording.send_recording_name(run.directory.name)
+        # Without the timelines of the export itself.
+        recording.set_log_time_enabled(False)
+        recording.set_log_tick_enabled(False)
+        _log_run(run, recording, progress)
+        recording.flush()
+        recording.disconnect()
+    views = _views(run).values()
+    missing = [key for key in FORMATS["rerun"].optional_outputs if not any(each.has_output(key) for each in views)]
+    notes = [f"without {key}, which is not among the results; {run.remedy(key)}" for key in missing]
+    if any(view_at(run.scene, 0.0, each.camera).lens is not None for each in views):
+        notes.append("Rerun has no lens distortion, so that points in space are off in the pictures of a lens")
+    return notes
 
 
 def _views(run: FinishedRun) -> dict[str, FinishedRun]:
@@ -79,15 +83,6 @@ def _views(run: FinishedRun) -> dict[str, FinishedRun]:
     names = run.camera_names()
     entities = {f"world/cameras/{name}": name for name in names} if names else {"world/camera": ""}
     return {entity: replace(run, camera=name) for entity, name in entities.items()}
-
-
-def _notes(run: FinishedRun) -> list[str]:
-    views = _views(run).values()
-    missing = [key for key in FORMATS["rerun"].optional_outputs if not any(each.has_output(key) for each in views)]
-    notes = [f"without {key}, which is not among the results; {run.remedy(key)}" for key in missing]
-    if any(view_at(run.scene, 0.0, each.camera).lens is not None for each in views):
-        notes.append("Rerun has no lens distortion, so that points in space are off in the pictures of a lens")
-    return notes
 
 
 def _log_run(run: FinishedRun, recording: Any, progress: ProgressCallback) -> None:
