@@ -76,6 +76,6 @@ class CalibrationReader(ABC):
     def read(self, keys: Keys) -> Calibration:
         """Read a camera."""
 
-    @abstractmethod
-    def pose(self, keys: Keys) -> StereoPose | None:
-        """Read the pose of the right camera, in the unit of the file, from the keys of this camera."""
+    def pose(self, keys: Keys) -> StereoPose | None:  # noqa: ARG002
+        """Read the pose of the right camera, in the unit of the file, from the keys of this camera; None without."""
+        return None

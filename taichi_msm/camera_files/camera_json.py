@@ -35,6 +35,3 @@ class CameraJson(CalibrationReader):
         values = keys.require("distortion", len(names), "distortion")
         focal = None if model == "scaramuzza" else (fx, fy)
         return Calibration(focal, (cx, cy), (round(width), round(height)), model, dict(zip(names, values, strict=True)))
-
-    def pose(self, keys: Keys) -> None:
-        """Return None, as there is one camera."""

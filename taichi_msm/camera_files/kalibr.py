@@ -6,11 +6,11 @@ The sensor.yaml of EuRoC has the keys of a section.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from taichi_msm.camera_files.calibration import Calibration, StereoPose
-from taichi_msm.camera_files.keys import Keys, flat
+from taichi_msm.camera_files.calibration import StereoPose
+from taichi_msm.camera_files.keys import Keys, flat, listed
 from taichi_msm.camera_files.opencv import OpenCV
 from taichi_msm.camera_files.text import CameraFile
 from taichi_msm.errors import truncate
@@ -28,24 +28,9 @@ class Kalibr(OpenCV):
     def cameras(self, file: CameraFile) -> Sequence[Keys]:
         """Return the sections of the cameras by their numbers."""
         if _is_camera(file.data):
-            return [Keys(file, file.data)]
+            return [_camera(file, "", file.data)]
         names = [name for name, section in file.data.items() if _is_camera(section)]
-        return [Keys(file, file.data[name]) for name in sorted(names, key=_number)]
-
-    def read(self, keys: Keys) -> Calibration:
-        """Read a section, with a matrix in place of the intrinsics, which of `omni` begin with xi."""
-        section, numbers = keys.data, flat(keys.data["intrinsics"])
-        prefix = next((f"{name}: " for name, value in keys.file.data.items() if value is section), "")
-        model = str(section["camera_model"]).lower()
-        if model not in INTRINSICS:
-            fault = f"{prefix}camera_model: {truncate(model)} is not known; found {keys}"
-            raise keys.file.fault(f"{fault}; expected one of: {', '.join(INTRINSICS)}")
-        if len(numbers) != INTRINSICS[model]:
-            fault = f"{prefix}intrinsics: {len(numbers)} numbers, where {INTRINSICS[model]} belong to {model}"
-            raise keys.file.fault(f"{fault}; write what belongs there")
-        *xi, fx, fy, cx, cy = numbers
-        matrix = [fx, 0, cx, 0, fy, cy, 0, 0, 1]
-        return super().read(Keys(keys.file, {**section, "intrinsics": matrix, **({"xi": xi} if xi else {})}))
+        return [_camera(file, f"{name}: ", file.data[name]) for name in sorted(names, key=_number)]
 
     def pose(self, keys: Keys) -> StereoPose | None:
         """Read T_cn_cnm1, four rows [R, t]."""
@@ -60,6 +45,19 @@ def _is_camera(section: Any) -> bool:
     return (
         isinstance(section, dict) and "camera_model" in section and len(flat(section.get("intrinsics"))) not in (1, 9)
     )
+
+
+def _camera(file: CameraFile, prefix: str, section: Mapping[str, Any]) -> Keys:
+    """Return a section with a matrix in place of the intrinsics, which of `omni` begin with xi."""
+    numbers, model = flat(section["intrinsics"]), str(section["camera_model"]).lower()
+    if model not in INTRINSICS:
+        fault = f"{prefix}camera_model: {truncate(model)} is not known; found {listed(section)}"
+        raise file.fault(f"{fault}; expected one of: {', '.join(INTRINSICS)}")
+    if len(numbers) != INTRINSICS[model]:
+        fault = f"{prefix}intrinsics: {len(numbers)} numbers, where {INTRINSICS[model]} belong to {model}"
+        raise file.fault(f"{fault}; write what belongs there")
+    *xi, fx, fy, cx, cy = numbers
+    return Keys(file, {**section, "intrinsics": [fx, 0, cx, 0, fy, cy, 0, 0, 1], **({"xi": xi} if xi else {})})
 
 
 def _number(name: object) -> tuple[int, str]:

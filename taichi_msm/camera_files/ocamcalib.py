@@ -44,6 +44,3 @@ class OCamCalib(CalibrationReader):
         values = [-c * a0, *(-a / c**n for n, a in enumerate(powers, 1)), 1 / c, e / c, d / c]
         lens = dict(zip(MODELS["scaramuzza"].coefficients, values, strict=True))
         return Calibration(None, (column, row), (round(width), round(height)), "scaramuzza", lens)
-
-    def pose(self, keys: Keys) -> None:
-        """Return None, as there is one camera."""

@@ -13,7 +13,8 @@ from typing import Any
 import yaml
 
 from taichi_msm.errors import truncate
-from taichi_msm.images import actual_path, irregular_kind
+from taichi_msm.images import actual_path
+from taichi_msm.system.files import read_regular
 
 # Units of lengths [m].
 LENGTH_UNITS = {"m": 1.0, "mm": 1e-3}
@@ -42,15 +43,7 @@ class CameraFileError(Exception):
 
 
 class CameraFile:
-    """A text file of a camera.
-
-    Attributes:
-        path: path of the file, for messages.
-        text: content.
-
-    Raises:
-        CameraFileError: when the file cannot be read.
-    """
+    """A text file of a camera; CameraFileError: it cannot be read."""
 
     def __init__(self, path: str, max_bytes: int) -> None:
         self.path = path
@@ -85,20 +78,13 @@ class CameraFile:
 
 
 def _read(name: str, max_bytes: int) -> str:
-    path = actual_path(name)
     try:
-        if kind := irregular_kind(path):
-            raise CameraFileError(f"{name}: {kind}; name a file")
-        with path.open("rb") as file:
-            raw = file.read(max_bytes + 1)
-        if len(raw) > max_bytes:
-            raise CameraFileError(f"{name}: larger than {max_bytes >> 20} MiB; name a calibration or a trajectory")
-        return raw.decode("utf-8-sig")
+        return read_regular(actual_path(name), max_bytes).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise CameraFileError(f"{name}: not UTF-8; name a text file") from None
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else "not a path"
-        raise CameraFileError(f"{name}: {reason.lower()}") from None
+        raise CameraFileError(f"{name}: {reason.lower()}; name a calibration or a trajectory") from None
 
 
 def _parse(text: str) -> Any:

@@ -132,7 +132,7 @@ cam1:
   resolution: [40, 30]
   rostopic: /cam1/image_raw
 """
-OMNI_KALIBR = KALIBR.replace("pinhole", "omni").replace("radtan", "equidistant").replace("[61", "[1.25, 61")
+OMNI_KALIBR = KALIBR.replace("pinhole", "omni").replace("intrinsics: [", "intrinsics: [1.25, ")
 _SECTION = """\
 [Stereo{}]
 res_x = 40
@@ -276,8 +276,7 @@ def test_an_omnidirectional_calibration_is_read(small: Path) -> None:
     storage.write("xi", np.array([[1.25]]))
     storage.write("image_size", np.array([[40, 30]]))
     storage.release()
-    kalibr = KALIBR.replace("pinhole", "omni").replace("[61.5", "[1.25, 61.5")
-    Path("chain.yml").write_text(kalibr)
+    Path("chain.yml").write_text(OMNI_KALIBR)
     expected = dict(zip(("xi", "k1", "k2", "p1", "p2"), [1.25, *COEFFICIENTS], strict=False))
     for path in ("omni.yml", "chain.yml"):
         calibration = read_calibration(path)
@@ -394,10 +393,7 @@ D = "D: [-0.3, 0.1, 0.001, -0.002, 0.03]\n"
         pytest.param(K + "D: [0, 0, 0, 0]\nxi: -1", id="coefficient out of range"),
         pytest.param(K + "D: [0, 0, 0, 0]\nmodel: omnidir", id="omnidirectional without xi"),
         pytest.param(K + "D: [0, 0, 0, 0]\nfisheye: 1\nxi: 1", id="omnidirectional and fisheye"),
-        pytest.param(
-            KALIBR.replace("pinhole", "omni").replace("radtan", "equidistant").replace("[61", "[1.25, 61"),
-            id="omnidirectional of Kalibr",
-        ),
+        pytest.param(OMNI_KALIBR.replace("radtan", "equidistant"), id="omnidirectional of Kalibr"),
         pytest.param(OCAMCALIB.replace("-1.2e+02 0.0", "-1.2e+02 1.0"), id="OCamCalib"),
         pytest.param(K + D + "radial_distortion: [0.1]\nrms: 0.2", id="other distortion"),
         pytest.param(K + D + "image_shape: [30, 40]", id="size of unknown order"),
