@@ -195,8 +195,7 @@ def record_film(
     upcoming = next(events, None)
     failures: list[FilesError] = []
     notice = ""
-    rate, subframes = session.frame_rate / session.subframes, session.subframes
-    with closing(Film(path.parent, session.scene.render, rate, subframes, 0, OPTION, path.suffix)) as film:
+    with closing(Film(path, OPTION, session.scene.render, session.frame_rate, session.subframes, 0)) as film:
         for frame in range(frames + 1):
             progress(frame, frames)
             while upcoming is not None and upcoming[0] <= frame:
@@ -208,7 +207,7 @@ def record_film(
                     notify(f"{frame / session.frame_rate:g} s: {session.notice}")
                 notice = session.notice
                 upcoming = next(events, None)
-            if frame % subframes == 0:
+            if frame % session.subframes == 0:
                 film.add_frame(session.picture(), frame, partial(progress, frame, frames))
             if frame < frames:
                 session.advance()

@@ -29,9 +29,8 @@ from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from taichi_msm.errors import DeviceError, FilesError, Pause
 from taichi_msm.runs.media import Picture
-from taichi_msm.view.events import COMPILING, KEYS, POINTER, QUIT, STRENGTH_STEP, SWITCH_TOOL, Event, Release
+from taichi_msm.view import events
 from taichi_msm.view.material import MATERIAL, MAX_FACTOR
-from taichi_msm.view.messages import MAX_BYTES, parse_message
 from taichi_msm.view.pacing import Pacing
 from taichi_msm.view.session import Session
 from taichi_msm.view.tools import PositionControlledTool
@@ -106,7 +105,7 @@ class Server:
         self._port, self._token = listener.getsockname()[1], secrets.token_urlsafe(24)
         self.url = f"http://{ADDRESS}:{self._port}/{self._token}/"
         self.pages: list[_Connection] = []
-        self._events: deque[Event] = deque()
+        self._events: deque[events.Event] = deque()
         self._handled = 0
         # The last picture, as it was drawn and as it was sent.
         self._picture: Picture | None = None
@@ -122,10 +121,10 @@ class Server:
         application = Application(
             handlers,
             log_function=lambda handler: None,
-            websocket_max_message_size=MAX_BYTES,
+            websocket_max_message_size=events.MAX_BYTES,
             websocket_ping_interval=20,
         )
-        http = HTTPServer(application, max_body_size=MAX_BYTES)
+        http = HTTPServer(application, max_body_size=events.MAX_BYTES)
         http.add_socket(self._listener)
         try:
             await self._run(pause)
@@ -164,23 +163,23 @@ class Server:
         description = {
             "title": self._title,
             "size": session.viewport.render.size,
-            "strength_step": STRENGTH_STEP,
+            "strength_step": events.STRENGTH_STEP,
             "material": material,
             "max_factor": MAX_FACTOR,
-            "keys": POINTER | KEYS,
+            "keys": events.POINTER | events.KEYS,
         }
         page.send(json.dumps(description))
 
     def disconnect(self, page: _Connection) -> None:
         """Remove a page; if it steered, the tool lets go, and the next page steers."""
         if page is self.pages[0]:
-            self._events.append(Release())
+            self._events.append(events.Release())
         self.pages.remove(page)
 
     def receive(self, page: _Connection, message: str | bytes) -> None:
         """Process a message of a page; describe the fault of a message that is not valid to it."""
         try:
-            event = parse_message(message)
+            event = events.parse_message(message)
         except (ValueError, RecursionError) as error:
             page.send(json.dumps({"error": str(error)}))
             return
@@ -200,10 +199,10 @@ class Server:
             await asyncio.sleep(max(MIN_WAIT_S, pacing.delay_s()) if self.pages else IDLE_WAIT_S)
             while self._events:
                 event = self._events.popleft()
-                if event == QUIT:
+                if event == events.QUIT:
                     return
-                if event == SWITCH_TOOL:
-                    await self._announce(COMPILING)
+                if event == events.SWITCH_TOOL:
+                    await self._announce(events.COMPILING)
                 try:
                     session.handle(event)
                 except FilesError as error:
@@ -215,7 +214,7 @@ class Server:
             for _ in pacing.due_frames():
                 self._advance()
             if not session.viewport.is_compiled:
-                await self._announce(COMPILING)
+                await self._announce(events.COMPILING)
             self._show(pacing.status())
 
     def _advance(self) -> None:

@@ -68,7 +68,7 @@ class Session:
     instrument. The first of these probes determines which one is the initial tool. Clamps always hold the sheet.
 
     Args:
-        scene: the scene.
+        scene: the scene; the attribute has the frames and the time step of the session.
         captures: receives saved files.
         arch: cpu, cuda or vulkan.
         threads: number of CPU threads; None: one per core.
@@ -80,13 +80,8 @@ class Session:
         DeviceError: when the arch is not available.
 
     Attributes:
-        scene: the scene, with the frames and the time step of the session.
-        tool: the current tool.
-        viewport: camera, light and mesh display.
         subframes: frames of the session per frame of the given scene.
-        paused: whether the simulation is paused.
         divergence_error: message of a divergence, which stops the simulation; otherwise empty.
-        frame_time_s: moving average of the time to simulate a frame [s].
     """
 
     def __init__(
@@ -125,7 +120,8 @@ class Session:
         self._elapsed = 0
         self._notice, self._notice_until = "", 0
         self.divergence_error = ""
-        self.frame_time_s = 0.0
+        # Moving average of the time to simulate a frame [s].
+        self._frame_time_s = 0.0
         # Since the last reset [N].
         self._max_felt_force = 0.0
         progress("compile")
@@ -210,7 +206,7 @@ class Session:
             case events.Strength(percent):
                 self.tool.set_strength(percent)
             case events.StrengthChange(percent):
-                self.handle(events.Strength(self.tool.strength + percent))
+                self.tool.set_strength(self.tool.strength + percent)
             case events.Key(name):
                 self._handle_key(name)
             case events.Material(key, value):
@@ -237,8 +233,8 @@ class Session:
             self.divergence_error = str(error)
         duration = time.perf_counter() - start
         # Exponential moving average over about 20 frames.
-        weight = 1 / 20 if self.frame_time_s else 1.0
-        self.frame_time_s += weight * (duration - self.frame_time_s)
+        weight = 1 / 20 if self._frame_time_s else 1.0
+        self._frame_time_s += weight * (duration - self._frame_time_s)
 
     @property
     def filming(self) -> bool:
@@ -254,11 +250,8 @@ class Session:
         Raises:
             FilesError: when it cannot be written.
         """
-        folder, option, suffix = (
-            (self._captures.folder, "--out", ".gif") if path is None else (path.parent, "--record", path.suffix)
-        )
-        rate = self.frame_rate / self.subframes
-        self._film = Film(folder, self.scene.render, rate, self.subframes, self._elapsed, option, suffix)
+        place, option = (self._captures.folder / "film.gif", "--out") if path is None else (path, "--record")
+        self._film = Film(place, option, self.scene.render, self.frame_rate, self.subframes, self._elapsed)
         self._film_path = path
         if path is not None:
             # A session that ends at once has a film, too.
@@ -458,7 +451,7 @@ class Session:
         self._simulation.restart(plan)
         self._simulation.compile()
         self.tool = tool
-        self.frame_time_s = 0.0
+        self._frame_time_s = 0.0
         self._reset_figures()
         session_tools = [tool for tool in plan.tools if tool.probe == len(self._scene_probes)]
         self.show_notice("; ".join(path_warnings(plan.scene, session_tools)))
@@ -513,7 +506,7 @@ class Session:
         )
 
     def _figure_lines(self) -> list[str]:
-        speed = f"steps {1 / self.frame_rate / self.frame_time_s:.2g} x real time" if self.frame_time_s > 0 else ""
+        speed = f"steps {1 / self.frame_rate / self._frame_time_s:.2g} x real time" if self._frame_time_s > 0 else ""
         state = [speed, "paused" if self.paused else "", "film" if self.filming else ""]
         return ["  ·  ".join(filter(None, line)) for line in (self._tool_figures(), state)]
 
