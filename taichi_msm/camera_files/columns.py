@@ -40,19 +40,12 @@ EUROC_COLUMNS = 17
 
 
 class _Columns(NamedTuple):
-    """Columns of a trajectory file.
+    """Columns of a trajectory file."""
 
-    Attributes:
-        indices: columns of t, tx, ty, tz, qx, qy, qz, qw.
-        column_count: number of all columns.
-        time_unit: unit of t, if the header has one.
-        length_unit: unit of the position, if the header has one.
-    """
-
-    indices: tuple[int, ...]
-    column_count: int
-    time_unit: str | None = None
-    length_unit: str | None = None
+    indices: tuple[int, ...]  # columns of t, tx, ty, tz, qx, qy, qz, qw
+    column_count: int  # number of all columns
+    time_unit: str | None = None  # unit of t, if the header has one
+    length_unit: str | None = None  # unit of the position, if the header has one
 
 
 TUM = _Columns(tuple(range(8)), 8)

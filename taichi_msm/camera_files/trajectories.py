@@ -25,19 +25,13 @@ MAX_TIME_S = 1e11
 
 
 class PoseKeys(NamedTuple):
-    """Keys of a camera that describe its trajectory file.
+    """Keys of a camera that describe its trajectory file."""
 
-    Attributes:
-        poses_unit: unit of lengths, m or mm.
-        poses_time: unit of times, s, ms, us or ns.
-        poses_start: time of the scene's beginning: of the file, or, before its first pose, after that one [s].
-        poses_rate: poses per second of a file without times.
-    """
-
-    poses_unit: str | None = None
-    poses_time: str | None = None
+    poses_unit: str | None = None  # unit of lengths, m or mm
+    poses_time: str | None = None  # unit of times, s, ms, us or ns
+    # Time of the scene's beginning: of the file, or, before its first pose, after that one [s].
     poses_start: float | None = None
-    poses_rate: float | None = None
+    poses_rate: float | None = None  # poses per second of a file without times
 
 
 def read_poses(path: str, keys: PoseKeys = PoseKeys()) -> tuple[tuple[float, ...], ...]:  # noqa: B008

@@ -28,11 +28,7 @@ TRACKS_HEADER = ("time", "point", "across", "down", "x", "y", "occluded", "posit
 
 
 def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
-    """Write the forces and tracks of runs; arguments as for `FormatWriter`.
-
-    Raises:
-        FilesError: when a run has neither forces nor tracks.
-    """
+    """Write the forces and tracks of runs; arguments as for `FormatWriter`."""
     writers = {"forces": (FORCES_HEADER, _write_forces), "tracks": (TRACKS_HEADER, _write_tracks)}
     with ExitStack() as opened:
         tables: dict[str, TextIO] = {}

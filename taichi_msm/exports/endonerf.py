@@ -47,12 +47,7 @@ AXIS_SIGNS = np.array([1.0, -1.0, -1.0])
 
 @one_folder_per_run
 def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    """Write the frames, depths, masks and poses of a run; arguments as for `one_folder_per_run`.
-
-    Raises:
-        FilesError: as for `read_pinhole` and `read_depth`, and when a frame shows nothing.
-        ArgumentError: as for `read_pinhole`, and when the loaders cannot describe the camera.
-    """
+    """Write the frames, depths, masks and poses of a run; arguments as for `one_folder_per_run`."""
     camera, size = read_pinhole(run, FORMAT_NAME), run.scene.render.size
     _require_central(camera, size, run)
     for name in ("images", "depth", "masks"):

@@ -113,7 +113,9 @@ class ExportSource(NamedTuple):
 
 
 # Generator that writes all runs to an empty folder: yields the warnings about each run in turn, and finally writes the
-# files that combine runs.
+# files that combine runs. It raises a FilesError for results that are missing or damaged or do not suit the format, a
+# SceneError for a picture that has changed since the run, an ArgumentError for a camera that the format cannot
+# describe, and a NotInstalledError for a missing package.
 FormatWriter = Callable[[Sequence[ExportSource], Path], Iterator[list[str]]]
 
 

@@ -49,12 +49,7 @@ Array = NDArray[np.floating]
 
 @one_folder_per_run
 def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    """Write the animated surface of a run with its picture, tools and cameras; arguments as for `one_folder_per_run`.
-
-    Raises:
-        FilesError: as for `FinishedRun.positions`.
-        SceneError: as for `picture_png`.
-    """
+    """Write the animated surface with its picture, the tools and cameras; arguments as for `one_folder_per_run`."""
     positions, picture = run.positions(), picture_png(run)
     max_targets = max(1, min(MAX_TARGETS, MAX_TARGETS_BYTES // (TARGET_VERTEX_BYTES * positions[0, ..., 0].size)))
     keys = key_frames(positions, 1 + max_targets, progress)

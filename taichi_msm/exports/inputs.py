@@ -1,6 +1,7 @@
 """Inputs shared by the export formats: picture, surface normals, tracks and camera of a run.
 
-Files are validated, as they may come from an untrusted source.
+Files are validated, as they may come from an untrusted source; all readers raise a FilesError for missing or damaged
+results.
 """
 
 from __future__ import annotations
@@ -75,9 +76,6 @@ def read_tracks(run: FinishedRun) -> tuple[NDArray[np.float32], NDArray[np.bool_
     Returns:
         Positions in the picture [px], shape (tracks, frames, 2), NaN behind the camera; and whether the track is
         occluded, shape (tracks, frames), True behind the camera.
-
-    Raises:
-        FilesError: when the tracks are missing or damaged.
     """
     path = run.result_path("tracks")
     with reading(path), zipfile.ZipFile(path) as archive:
@@ -95,9 +93,6 @@ def read_track_positions(run: FinishedRun) -> tuple[NDArray[np.float32], NDArray
     Returns:
         Coordinates on the sheet as fractions of its width and height, shape (tracks, 2); and positions [m], shape
         (tracks, frames, 3).
-
-    Raises:
-        FilesError: when the tracks are missing or damaged.
     """
     path = run.result_path("tracks")
     with reading(path), zipfile.ZipFile(path) as archive:
@@ -110,14 +105,7 @@ def read_track_positions(run: FinishedRun) -> tuple[NDArray[np.float32], NDArray
 
 
 def read_depth(run: FinishedRun, frame: int) -> NDArray[np.float32]:
-    """Read the depth of a frame.
-
-    Returns:
-        Depth along the optical axis [m], shape (height, width); 0: background.
-
-    Raises:
-        FilesError: when the file is missing or damaged.
-    """
+    """Read the depth of a frame along the optical axis [m], shape (height, width); 0: background."""
     path = run.result_path("depth", frame)
     with reading(path), Image.open(path, formats=["TIFF"]) as image:
         # Before any pixel is decoded.
@@ -130,13 +118,7 @@ def read_depth(run: FinishedRun, frame: int) -> NDArray[np.float32]:
 
 
 def read_picture_file(run: FinishedRun, key: str, frame: int) -> bytes:
-    """Read the file of a picture of a run, and validate it by decoding it.
-
-    Args:
-        run: the run.
-        key: entry of `output` that wrote the picture, such as "png".
-        frame: index of the frame.
-    """
+    """Read the file of a picture of an entry of `output`, such as "png", and validate it by decoding it."""
     run.read_picture(key, frame)
     path = run.result_path(key, frame)
     with reading(path):
@@ -170,7 +152,6 @@ def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
         name: name of the format, for messages.
 
     Raises:
-        FilesError: when the file is missing or damaged.
         ArgumentError: when the camera is orthographic or has lens distortion.
     """
     path = run.directory / run.camera / CAMERA_FILE

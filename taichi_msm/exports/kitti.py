@@ -40,11 +40,7 @@ SOURCE_OUTPUTS = {"flow_occ": "flow", "flow_noc": "occlusion", "image_2": "png"}
 
 
 def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
-    """Write the flow of runs, with pictures and occlusion if available; arguments as for `FormatWriter`.
-
-    Raises:
-        FilesError: when a run has a single frame.
-    """
+    """Write the flow of runs, with pictures and occlusion if available; arguments as for `FormatWriter`."""
     training, first = folder / "training", 0
     for name in SOURCE_OUTPUTS:
         (training / name).mkdir(parents=True)

@@ -27,12 +27,7 @@ MATERIAL_FILE = "surface.mtl"
 
 @one_folder_per_run
 def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    """Write the surface of every frame, the material and the picture; arguments as for `one_folder_per_run`.
-
-    Raises:
-        FilesError: as for `FinishedRun.positions`.
-        SceneError: as for `picture_png`.
-    """
+    """Write the surface of every frame, the material and the picture; arguments as for `one_folder_per_run`."""
     positions, picture = run.positions(), picture_png(run)
     if picture is not None:
         write_new_file(folder / PICTURE_FILE, picture)

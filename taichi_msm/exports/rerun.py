@@ -46,13 +46,7 @@ GOLDEN_RATIO = 0.618
 
 @one_path_per_run(".rrd")
 def write(run: FinishedRun, path: Path, progress: ProgressCallback) -> list[str]:
-    """Write a recording of a run; arguments as for `one_path_per_run`.
-
-    Raises:
-        FilesError: as for `FinishedRun.positions` and the readers of `inputs`.
-        SceneError: as for `load_texture`.
-        NotInstalledError: when rerun-sdk is not installed.
-    """
+    """Write a recording of a run; arguments as for `one_path_per_run`."""
     try:
         import rerun
     except ImportError:

@@ -53,13 +53,7 @@ Pixels = NDArray[np.int64]
 
 @one_path_per_run()
 def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    """Write the videos, marked tracks and cameras of a run; arguments as for `one_path_per_run`.
-
-    Raises:
-        FilesError: as for `read_pinhole`, and when the cameras are not a rectified stereo pair.
-        ArgumentError: as for `read_pinhole`.
-        NotInstalledError: when PyAV is not installed.
-    """
+    """Write the videos, marked tracks and cameras of a run; arguments as for `one_path_per_run`."""
     if not outputs.is_pyav_installed():
         raise NotInstalledError(f"--format {outputs.PYAV_NOT_INSTALLED.replace('mp4', FORMAT_NAME, 1)}")
     runs = [replace(run, camera=side) for side in CAMERAS]

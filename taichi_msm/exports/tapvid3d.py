@@ -33,12 +33,7 @@ from taichi_msm.runs.finished import FinishedRun
 
 @one_path_per_run(".npz")
 def write(run: FinishedRun, path: Path, progress: ProgressCallback) -> list[str]:
-    """Write the tracks and frames of a run; arguments as for `one_path_per_run`.
-
-    Raises:
-        FilesError: as for `read_pinhole` and `read_tracks`.
-        ArgumentError: as for `read_pinhole`.
-    """
+    """Write the tracks and frames of a run; arguments as for `one_path_per_run`."""
     camera, (pixels, occluded), (_, position) = (
         read_pinhole(run, "tapvid3d"),
         read_tracks(run),

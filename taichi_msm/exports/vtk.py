@@ -43,12 +43,7 @@ Array = NDArray[np.floating]
 
 @one_folder_per_run
 def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    """Write the surface of every frame, the collection and the picture; arguments as for `one_folder_per_run`.
-
-    Raises:
-        FilesError: as for `FinishedRun.positions`, and when a map has changed since the run.
-        SceneError: as for `picture_png`.
-    """
+    """Write the surface of every frame, the collection and the picture; arguments as for `one_folder_per_run`."""
     positions, picture = run.positions(), picture_png(run)
     run.require_same_pictures(drawn=False)
     plan, rest = make_plan(run.scene), rest_positions(run.scene.sheet)

@@ -51,17 +51,11 @@ ITERATIONS_PER_THREAD = 512
 
 @dataclass(frozen=True)
 class Device:
-    """Device on which kernels run.
+    """Device on which kernels run."""
 
-    Attributes:
-        arch: cpu, cuda or vulkan.
-        threads: number of CPU threads.
-        name: name of the processor or the GPU; empty if unknown.
-    """
-
-    arch: str
-    threads: int
-    name: str = field(default="", compare=False)
+    arch: str  # cpu, cuda or vulkan
+    threads: int  # number of CPU threads
+    name: str = field(default="", compare=False)  # name of the processor or the GPU; empty if unknown
 
 
 class Memory:
@@ -269,17 +263,12 @@ def _require_address_space() -> None:
 
 
 def _threads() -> list[int]:
-    """Return the ids of the threads of this process, mostly in the order of their start; empty if unknown."""
-    with contextlib.suppress(OSError):
-        return sorted(int(task.name) for task in Path("/proc/self/task").iterdir())
-    return []
+    """Return the ids of the threads of this process, mostly in the order of their start; empty without /proc."""
+    return sorted(int(task.name) for task in Path("/proc/self/task").glob("*"))
 
 
 def _pin(pool: list[int]) -> None:
-    """Pin every thread of Taichi's pool to a core, if the pool has one thread per available core.
-
-    Without pinning, two threads may share a core for about 10 ms, while one of them spins and waits for the other.
-    """
+    """Pin the threads of Taichi's pool to a core each, if it has one per core; shared ones spin and wait for 10 ms."""
     if hasattr(os, "sched_setaffinity") and len(pool) == len(os.sched_getaffinity(0)):
         for thread, core in zip(pool, sorted(os.sched_getaffinity(0)), strict=True):
             with contextlib.suppress(OSError):

@@ -44,11 +44,12 @@ class Film:
         self.pictures = 0
         self._format = path.suffix.lower().removeprefix(".")
         self._subframes, self._begin, self._location = subframes, begin, (path.parent, option)
-        formats = {"png": False, "gif": self._format == "gif", "mp4": self._format == "mp4"}
+        is_gif = self._format == "gif"
         with writing(*self._location), ExitStack() as opened:
             self._hidden = opened.enter_context(hidden_folder(path.parent))
-            colours = {"background": render.background, "quality": render.quality}
-            self._encoder = Encoder(EncodingJob((self._hidden,), render.size, rate / subframes, **formats, **colours))
+            folders, background = (self._hidden,), render.background
+            job = EncodingJob(folders, render.size, rate / subframes, png=False, gif=is_gif, background=background)
+            self._encoder = Encoder(job._replace(mp4=not is_gif, quality=render.quality))
             opened.callback(self._encoder.abort)
             self._opened = opened.pop_all()
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import runpy
 from collections.abc import Iterator
 from dataclasses import replace
 from importlib.util import find_spec
@@ -171,34 +170,6 @@ def test_replacements_are_in_place_for_a_while(device: runtime.Device) -> None:
     with pytest.raises(KeyboardInterrupt):
         interrupted()
     assert parts() == before
-
-
-# Annotations of kernels must be values.
-CLASSES = """
-from taichi_msm.system.compiler import active_compiler
-ti = active_compiler().load()
-
-@ti.data_oriented
-class Doubled:
-    @ti.func
-    def twice(self, x):
-        return 2 * x
-
-    @ti.kernel
-    def double(self, x: ti.i32) -> ti.i32:
-        return self.twice(x)
-
-@ti.kernel
-def triple(x: ti.i32) -> ti.i32:
-    return 3 * x
-"""
-
-
-def test_kernels_in_classes_work_as_without_this_package(device: runtime.Device, tmp_path: Path) -> None:
-    """The line around a decorator decides whether a function is in a class."""
-    (tmp_path / "classes.py").write_text(CLASSES)
-    found = runpy.run_path(str(tmp_path / "classes.py"))
-    assert (found["Doubled"]().double(4), found["triple"](4)) == (8, 12)
 
 
 def test_nothing_is_replaced_in_a_version_that_was_not_tested() -> None:
