@@ -19,7 +19,6 @@ from taichi_msm.cli import console
 from taichi_msm.errors import FilesError, ForeignError
 from taichi_msm.exports import obj
 from taichi_msm.exports.export import export
-from taichi_msm.runs import directory
 from taichi_msm.runs.finished import read_run
 from taichi_msm.runs.run import run
 from taichi_msm.system.runtime import Device
@@ -175,28 +174,6 @@ def test_a_record_that_was_made_up_takes_no_file_of_the_user(results: Path, mess
         (out / "export.json").write_text(record)
         with message.raises(ForeignError, "export.json"):
             exported(results, out)
-
-
-def test_many_files_are_compared_in_time_proportional_to_their_number(
-    results: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out, count = results / "here", 300
-    names = [f"{number:04}.obj" for number in range(count)]
-    out.mkdir()
-    for name in names:
-        (out / name).write_text("of an earlier export")
-    (out / "export.json").write_text(json.dumps({"files": names}))
-    calls: list[str] = []
-    kind = directory.entry_kind
-
-    def counted(path: Path) -> str | None:
-        calls.append(path.name)
-        return kind(path)
-
-    monkeypatch.setattr(directory, "entry_kind", counted)
-    assert len(exported(results, out)) == 8
-    # A name is looked up some times, and never beside each of the others.
-    assert count < len(calls) < 10 * count < count**2
 
 
 @pytest.mark.parametrize("moment", [0, 2])
