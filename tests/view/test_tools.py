@@ -114,27 +114,6 @@ def test_what_it_is_asked_for_last_is_its_goal() -> None:
     assert hand.target == (0.8, 0.2)
 
 
-def test_the_control_point_stays_on_the_sheet() -> None:
-    hand = tool()
-    hand.press((-0.5, 1.5), 1)
-    hand.advance(0)
-    assert hand.position == (0.0, 1.0)
-
-
-def test_it_moves_along_a_line_within_a_frame() -> None:
-    hand = tool()
-    hand.press((0.2, 0.2), 1)
-    hand.advance(0)
-    hand.move((0.4, 0.2))
-    probe = hand.advance(1)
-    assert probe is not None
-    points = loads(probe, 1).point[:, 0, 0]
-    width = 0.4
-    assert points[0] == pytest.approx((0.2 - 0.5) * width)
-    assert (np.diff(points) > 0).all()
-    assert points[-1] < (0.4 - 0.5) * width
-
-
 def test_what_was_asked_for_is_forgotten_at_rest() -> None:
     hand = tool()
     hand.press((0.2, 0.2), 1)
