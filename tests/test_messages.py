@@ -90,7 +90,6 @@ NOT_PROVOKED = {
     ": take a number above 0, the standard deviation in newtons",
     ": time: holds NaN or infinity; give the time of every column in seconds",
     "MB unpacked; save the sheet as CSV",
-    "MiB; name a calibration or a trajectory",
     "a file that has other names",
     "a run of the fit ended early:",
     "another command for the same folder has ended meanwhile",
