@@ -89,7 +89,6 @@ def _header(text: str, *, is_comment: bool) -> list[str]:
 
 
 def _columns(file: CameraFile, line: int, names: Sequence[str]) -> _Columns:
-    """Identify the columns of a header."""
     bare = [UNIT.sub("", name) for name in names]
     matches = [[n for n, name in enumerate(bare) if re.fullmatch(role, name)] for role in ROLES]
     if any(len(columns) != 1 for columns in matches):

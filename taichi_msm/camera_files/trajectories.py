@@ -63,7 +63,6 @@ def read_poses(path: str, keys: PoseKeys = PoseKeys()) -> tuple[tuple[float, ...
 
 
 def _times(file: CameraFile, trajectory: Trajectory, keys: PoseKeys) -> list[float]:
-    """Return the times of the poses in the scene [s]."""
     numbers = [row[0] for row in trajectory.rows]
     if not trajectory.has_times:
         if keys.poses_time is not None:

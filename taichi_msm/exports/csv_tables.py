@@ -48,7 +48,6 @@ def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
 
 
 def _write_forces(run: FinishedRun, number: str, file: TextIO) -> None:
-    """Validate and copy the rows of a run."""
     path = run.result_path("forces")
     with reading(path), path.open(encoding="ascii", newline="") as source:
         # The limit bounds the memory for a foreign file; lines of a run are shorter.

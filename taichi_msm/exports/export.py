@@ -200,12 +200,10 @@ def _name_run_in_errors(run: FinishedRun, name: str) -> Iterator[None]:
 
 
 def _name_runs(note: str, runs: Sequence[Path]) -> str:
-    """Prefix a warning with the runs to which it applies."""
     return f"{runs[0]}{f' and {len(runs) - 1} more' if len(runs) > 1 else ''}: {note}"
 
 
 def _write_index(runs: Sequence[FinishedRun], pairs: bool, path: Path) -> None:
-    """Write the table of runs, or of pairs of frames, by number."""
     rows: list[tuple[str | int, ...]] = []
     for run in runs:
         name = run.directory.as_posix()

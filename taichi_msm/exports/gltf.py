@@ -10,12 +10,16 @@ size limit, are reduced to keyframes, and the largest interpolation error is rep
 A tool is a mesh of its instrument, which moves with the tip. glTF's cameras look along -z with y up, and have neither
 lens distortion nor another principal point than the centre.
 
-Source: the glTF 2.0 specification of Khronos, sections 3.7.2.2 (morph targets), 3.10 (cameras) and 3.11 (animations).
+Source: the glTF 2.0 specification of Khronos, sections 3.6 (accessors), 3.7.2.2 (morph targets), 3.10 (cameras), 3.11
+(animations) and 4.4 (GLB). The container is too simple to justify a dependency on pygltflib.
 """
 
 from __future__ import annotations
 
+import json
 import math
+import struct
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,7 +29,6 @@ from scipy.spatial.transform import Rotation
 
 from taichi_msm.errors import ProgressCallback
 from taichi_msm.exports.formats import one_folder_per_run
-from taichi_msm.exports.glb import GL_ARRAY_BUFFER, Glb
 from taichi_msm.exports.inputs import EXPORT_REFINE, instrument_mesh, picture_png, unit_normals
 from taichi_msm.model.surface import place_instruments, refine_surface
 from taichi_msm.render.camera import is_moving, view_at
@@ -38,6 +41,12 @@ MAX_TARGETS = 256
 MAX_TARGETS_BYTES = 1 << 28
 TARGET_VERTEX_BYTES = 2 * 3 * 4  # differences of position and normal, float32
 
+COMPONENT_TYPES = {"f": 5126, "u": 5125}  # float32, uint32
+ACCESSOR_TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+
+# Constants of OpenGL for buffers of vertices and of vertex indices.
+GL_ARRAY_BUFFER, GL_ELEMENT_ARRAY_BUFFER = 34962, 34963
+
 # Constants of OpenGL for texture filtering and wrapping.
 GL_LINEAR, GL_LINEAR_MIPMAP_LINEAR, GL_CLAMP_TO_EDGE = 9729, 9987, 33071
 
@@ -45,6 +54,7 @@ GL_LINEAR, GL_LINEAR_MIPMAP_LINEAR, GL_CLAMP_TO_EDGE = 9729, 9987, 33071
 NEAR_RATIO = 1e-3
 
 Array = NDArray[np.floating]
+Numbers = NDArray[Any]
 
 
 @one_folder_per_run
@@ -145,7 +155,6 @@ def _add_cameras(glb: Glb, run: FinishedRun) -> list[str]:
 
 
 def _add_node(glb: Glb, node: dict[str, Any], pose: dict[str, Array], time: Array) -> None:
-    """Add a node, with an animation of the parts of its pose that change."""
     index = glb.add("nodes", node)
     glb.document["scenes"][0]["nodes"].append(index)
     for path, values in pose.items():
@@ -205,3 +214,105 @@ def _worst_frame(position: Array, first: int, last: int) -> _Span:
         error = position[frame] - (start + fraction * (end - start))
         worst = min(worst, _Span(-float(np.linalg.norm(error, axis=-1).max()), frame, first, last))
     return worst
+
+
+class Glb:
+    """Content of a .glb file with a scene.
+
+    Attributes:
+        document: the JSON document, without its buffers.
+    """
+
+    def __init__(self, document: dict[str, Any]) -> None:
+        self.document = document
+        self._views: list[dict[str, Any]] = []
+        self._accessors: list[dict[str, Any]] = []
+        self._parts: list[bytes | memoryview] = []
+        self._length = 0
+
+    def view(self, data: bytes | memoryview, target: int | None = None) -> int:
+        """Append bytes.
+
+        Args:
+            data: content of the view.
+            target: GL_ARRAY_BUFFER or GL_ELEMENT_ARRAY_BUFFER; None for other data.
+
+        Returns:
+            Index of the buffer view.
+        """
+        view = {"buffer": 0, "byteOffset": self._length, "byteLength": len(data)}
+        self._views.append(view if target is None else {**view, "target": target})
+        padding = _padding(len(data), b"\0")
+        self._parts += [data, padding]
+        self._length += len(data) + len(padding)
+        return len(self._views) - 1
+
+    def accessor(self, values: Numbers, target: int | None = None, *, bounds: bool = False) -> int:
+        """Append numbers.
+
+        Args:
+            values: floats, stored as float32, or integers, as uint32, shape (n,) or (n, k), k = 1 to 4.
+            target: as for `view`.
+            bounds: whether to store the minimum and maximum.
+
+        Returns:
+            Index of the accessor.
+        """
+        kind = np.float32 if values.dtype.kind == "f" else np.uint32
+        rows = np.ascontiguousarray(values, kind).reshape(len(values), -1)
+        accessor = {
+            "bufferView": self.view(rows.data.cast("B"), target),
+            "componentType": COMPONENT_TYPES[rows.dtype.kind],
+            "count": len(rows),
+            "type": ACCESSOR_TYPES[rows.shape[1]],
+        }
+        if bounds:
+            accessor |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
+        self._accessors.append(accessor)
+        return len(self._accessors) - 1
+
+    def attributes(self, positions: Numbers, normals: Numbers) -> dict[str, int]:
+        """Append the vertices of a mesh, or their changes, both of shape (vertices, 3)."""
+        return {
+            "POSITION": self.accessor(positions, GL_ARRAY_BUFFER, bounds=True),
+            "NORMAL": self.accessor(normals, GL_ARRAY_BUFFER),
+        }
+
+    def indices(self, triangles: Numbers) -> int:
+        """Append the vertices of triangles, shape (triangles, 3)."""
+        return self.accessor(triangles.reshape(-1), GL_ELEMENT_ARRAY_BUFFER)
+
+    def add(self, kind: str, entry: dict[str, Any]) -> int:
+        """Append an entry to a list of the document, such as "nodes"; return its index."""
+        self.document.setdefault(kind, []).append(entry)
+        return len(self.document[kind]) - 1
+
+    def animate(self, node: int, path: str, times: Numbers, values: Numbers) -> None:
+        """Append the values of a property of a node at times [s], with linear interpolation."""
+        if "animations" not in self.document:
+            self.add("animations", {"name": "motion", "samplers": [], "channels": []})
+        (animation,) = self.document["animations"]
+        sampler = {
+            "input": self.accessor(times, bounds=True),
+            "interpolation": "LINEAR",
+            "output": self.accessor(values),
+        }
+        target = {"node": node, "path": path}
+        animation["channels"].append({"sampler": len(animation["samplers"]), "target": target})
+        animation["samplers"].append(sampler)
+
+    def content(self) -> Iterator[bytes | memoryview]:
+        """Yield the parts of the file."""
+        buffers = {"accessors": self._accessors, "bufferViews": self._views, "buffers": [{"byteLength": self._length}]}
+        text = json.dumps({**self.document, **buffers}, separators=(",", ":"), allow_nan=False).encode()
+        text += _padding(len(text), b" ")
+        yield struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + self._length)
+        yield struct.pack("<I4s", len(text), b"JSON")
+        yield text
+        yield struct.pack("<I4s", self._length, b"BIN\0")
+        yield from self._parts
+
+
+def _padding(length: int, filler: bytes) -> bytes:
+    """Return the filler that aligns a chunk or a buffer view to 4 bytes."""
+    return filler * (-length % 4)

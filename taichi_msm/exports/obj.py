@@ -48,7 +48,6 @@ def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[st
 
 
 def _lines(key: str, rows: NDArray[np.floating]) -> str:
-    """Format one line per row of numbers."""
     line = " ".join([key, *[FLOAT32_FORMAT] * rows.shape[1]]) + "\n"
     return (line * len(rows)) % tuple(rows.ravel().tolist())
 

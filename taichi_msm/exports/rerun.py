@@ -80,7 +80,6 @@ def _views(run: FinishedRun) -> dict[str, FinishedRun]:
 
 
 def _log_run(run: FinishedRun, recording: Any, progress: ProgressCallback) -> None:
-    """Log all frames."""
     import rerun
 
     positions, views = run.positions(), _views(run)
@@ -124,7 +123,6 @@ def _mesh(run: FinishedRun, position: NDArray[np.floating], *, is_first: bool) -
 
 
 def _colours(count: int) -> NDArray[np.uint8]:
-    """Return distinct colours, shape (count, 3)."""
     phase = np.arange(count)[:, None] * GOLDEN_RATIO + np.array([0, 1 / 3, 2 / 3])
     return (127.5 + 127.5 * np.cos(2 * np.pi * phase)).astype(np.uint8)
 
@@ -139,7 +137,6 @@ def _pinhole(view: View) -> tuple[Any, Any]:
 
 
 def _log_pictures(run: FinishedRun, frame: int, entity: str, recording: Any) -> None:
-    """Log the outputs of a camera that the run has."""
     import rerun
 
     if run.has_output("png"):

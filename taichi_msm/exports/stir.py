@@ -88,7 +88,6 @@ def _baseline(run: FinishedRun, left: Pinhole, right: Pinhole) -> float:
 
 
 def _calibration(left: Pinhole, right: Pinhole, baseline: float) -> dict[str, Any]:
-    """Build the content of calib.json."""
     matrices: dict[str, Any] = {}
     for side, camera in zip(CAMERAS, (left, right), strict=True):
         (across, down), (x, y) = camera.focal.tolist(), (camera.centre - FIRST_PIXEL_CENTRE).tolist()
@@ -130,7 +129,6 @@ def _discs(pixels: Pixels, size: tuple[int, int], radius: int) -> NDArray[np.uin
 
 
 def _write_frames(run: FinishedRun, folder: Path, progress: ProgressCallback) -> None:
-    """Write the video of a camera, and its first and last frame."""
     render = run.scene.render
     end = round(1000 * run.time[-1])
     (folder / "frames").mkdir()
@@ -145,7 +143,6 @@ def _write_frames(run: FinishedRun, folder: Path, progress: ProgressCallback) ->
 
 
 def _notes(size: tuple[int, int], pixels: Pixels, tracks: int, baseline: float) -> list[str]:
-    """Return warnings about omitted tracks and limits of STIR's loader."""
     notes, marked = [], pixels.shape[2]
     if marked < tracks:
         notes.append(

@@ -212,7 +212,6 @@ def compilation_options(*, optimised: bool = True) -> contextlib.AbstractContext
 
 @contextlib.contextmanager
 def _patched(patches: Patches) -> Iterator[None]:
-    """Patch attributes of objects within the block."""
     originals = [(owner, name, getattr(owner, name)) for owner, name, _ in patches]
     for owner, name, value in patches:
         setattr(owner, name, value)
@@ -224,7 +223,6 @@ def _patched(patches: Patches) -> Iterator[None]:
 
 
 def _cache() -> dict[str, Any]:
-    """Return Taichi's options for the cache of compiled kernels."""
     try:
         folder = active_compiler().folder()
         folder.mkdir(parents=True, exist_ok=True)
@@ -249,7 +247,6 @@ def _cache() -> dict[str, Any]:
 
 
 def _require_address_space() -> None:
-    """Check that the limit on address space permits the start of Taichi."""
     try:
         import resource
     except ImportError:  # Windows

@@ -132,5 +132,4 @@ def _bar(size: int, filled: int, end: str) -> NDArray[np.uint8]:
 
 
 def _letter_size(picture: Picture) -> int:
-    """Return the height of letters [px] for the size of the picture."""
     return int(min(22, max(11, picture.shape[0] * (1 / 36))))

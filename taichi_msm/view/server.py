@@ -15,7 +15,7 @@ import secrets
 import socket
 import time
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Iterator
 from importlib.resources import files
 from typing import Any
 from urllib.parse import urlsplit
@@ -31,7 +31,6 @@ from taichi_msm.errors import DeviceError, FilesError, Pause
 from taichi_msm.runs.media import Picture
 from taichi_msm.view import events
 from taichi_msm.view.material import MATERIAL, MAX_FACTOR
-from taichi_msm.view.pacing import Pacing
 from taichi_msm.view.session import Session
 from taichi_msm.view.tools import PositionControlledTool
 
@@ -69,6 +68,12 @@ MAX_READINGS = 1000
 # Shortest wait for events between two pictures, and wait while no page is open [s].
 MIN_WAIT_S = 0.001
 IDLE_WAIT_S = 0.05
+
+# Longer delays are not caught up [s].
+MAX_DELAY_S = 0.1
+
+# After this time of stepping the next picture follows, although frames are due [s].
+MAX_STEPPING_S = 0.03
 
 
 def listen(port: int) -> socket.socket:
@@ -246,7 +251,6 @@ class Server:
             page.readings.clear()
 
     def _state(self, pacing: str) -> dict[str, Any]:
-        """Return the state of the session for a page."""
         session, tool = self._session, self._session.tool
         return {
             "handled": self._handled,
@@ -268,6 +272,50 @@ class Server:
         for page in self.pages:
             page.send(json.dumps({"notice": notice}))
         await asyncio.sleep(MIN_WAIT_S)
+
+
+class Pacing:
+    """Scheduler that synchronises simulated with real time.
+
+    Args:
+        rate: frames per second of the session.
+        clock: returns the current time [s].
+    """
+
+    def __init__(self, rate: float, clock: Callable[[], float]) -> None:
+        self._rate = rate
+        self._clock = clock
+        self._next = clock()
+        # Start [s] and number of simulated frames of each recent picture.
+        self._pictures: deque[tuple[float, int]] = deque()
+
+    def delay_s(self) -> float:
+        """Return the time until the next frame is due [s]."""
+        return max(0.0, self._next - self._clock())
+
+    def due_frames(self) -> Iterator[int]:
+        """Yield the number of each due frame, until none is due or they took `MAX_STEPPING_S`."""
+        start = self._clock()
+        self._next = max(self._next, start - MAX_DELAY_S)
+        count = 0
+        while self._next <= self._clock() and (count == 0 or self._clock() < start + MAX_STEPPING_S):
+            self._next += 1 / self._rate
+            yield count
+            count += 1
+        self._pictures.append((start, count))
+        # The speed is averaged over 1 s.
+        while start - self._pictures[0][0] > 1.0:
+            self._pictures.popleft()
+
+    def status(self) -> str:
+        """Format the pictures per second, and the speed relative to real time if it is below 95 %."""
+        if len(self._pictures) < 2:
+            return ""
+        seconds = self._pictures[-1][0] - self._pictures[0][0]
+        rate = f"{(len(self._pictures) - 1) / seconds:.0f} pictures/s"
+        # The last picture is excluded, as its duration is not known yet.
+        speed = sum(count for _, count in list(self._pictures)[:-1]) / self._rate / seconds
+        return rate if speed >= 0.95 else f"{rate}  ·  too slow: {speed:.2f} x real time"
 
 
 def encode_jpeg(picture: Picture) -> bytes:

@@ -322,7 +322,6 @@ class Session:
         return self.viewport.draw(positions, instruments)
 
     def _rest_point(self, position: SheetPosition) -> NDArray[np.float64]:
-        """Return x and y of a position on the sheet at rest [m]."""
         (across, down), (height, width) = position, self.scene.sheet.size
         return np.array([(across - 0.5) * width, (0.5 - down) * height])
 
@@ -435,7 +434,6 @@ class Session:
         return plan
 
     def _switch(self) -> None:
-        """Switch to the other tool, and reset the tissue."""
         tool = self._position_tool if isinstance(self.tool, ForceControlledTool) else self._force_tool
         if tool is None:
             needs = "an instrument" if isinstance(self.tool, ForceControlledTool) else "a force"
@@ -482,7 +480,6 @@ class Session:
         self._max_felt_force, self.divergence_error = 0.0, ""
 
     def _end_film(self) -> None:
-        """End a running film, and save it if it has a picture."""
         film, self._film = self._film, None
         if film is None:
             return
@@ -493,7 +490,6 @@ class Session:
             self.show_notice("no film was saved: it had no picture yet")
 
     def _is_nearly_too_long(self) -> bool:
-        """Return whether the recorded scene has reached three quarters of the size limit."""
         return count_probe_values(self.recorded_scene()) > 0.75 * MAX_NODES
 
     @property

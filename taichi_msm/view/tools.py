@@ -129,13 +129,11 @@ class ForceControlledTool:
         return self._as_probe(self._load, self._at, frame / self._frame_rate)
 
     def _approach(self, target: float) -> float:
-        """Return the percentage after a frame of rising towards a target."""
         limit = 100 / (RISE_TIME_S * self._frame_rate)
         change = target - self.percent
         return target if abs(change) <= limit else self.percent + math.copysign(limit, change)
 
     def _move_to_target(self, time: float) -> None:
-        """Add a keyframe at the target."""
         self.position = self._target
         if self._at[-1][0] == time:
             self._at.pop()

@@ -15,8 +15,8 @@ from taichi_msm import load_scene
 from taichi_msm.cli.main import main
 from taichi_msm.errors import SceneError
 from taichi_msm.view.events import Drag, Key, Press, Release, Strength, Turn
-from taichi_msm.view.pacing import MAX_DELAY_S, Pacing
 from taichi_msm.view.script import load_script, schedule_events
+from taichi_msm.view.server import MAX_DELAY_S, Pacing
 from tests.conftest import Program
 from tests.golden import Messages
 from tests.outputs import duration
