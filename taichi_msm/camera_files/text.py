@@ -55,11 +55,7 @@ class CameraFile:
 
     @cached_property
     def data(self) -> Mapping[str, Any]:
-        """Keys and values of YAML, JSON, XML or an ini file.
-
-        Raises:
-            CameraFileError: when the file has another format.
-        """
+        """Keys and values of YAML, JSON, XML or an ini file; CameraFileError: it has another format."""
         try:
             data = _parse(self.text)
         except RepeatedError as error:

@@ -49,15 +49,7 @@ def parse_numbers(words: Sequence[str]) -> list[float] | None:
 
 
 def pose_fault(row: Sequence[float], previous: Sequence[float] | None) -> str:
-    """Check a row of a trajectory.
-
-    Args:
-        row: time [s], position [m] and quaternion.
-        previous: previous row; None for the first.
-
-    Returns:
-        The fault and its remedy, or an empty text.
-    """
+    """Return the fault of a row (time [s], position [m], quaternion) after the previous one, and its remedy."""
     if previous is not None and row[0] <= previous[0]:
         times = f"is at {row[0]:.15g} s, the pose before it at {previous[0]:.15g} s"
         return f"{times}; sort them, each later than the last"

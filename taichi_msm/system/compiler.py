@@ -62,11 +62,7 @@ class Compiler:
         return f"{self.prefix}_OFFLINE_CACHE_FILE_PATH"
 
     def folder(self) -> Path:
-        """Return the directory of compiled kernels.
-
-        Raises:
-            RuntimeError: when there is no home directory.
-        """
+        """Return the directory of compiled kernels."""
         return Path(os.environ.get(self.folder_variable) or Path.home() / self.cache)
 
     def load(self) -> Any:

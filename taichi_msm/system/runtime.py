@@ -86,12 +86,7 @@ class Memory:
 
 
 def write_vectors(array: Any, values: NDArray[Any]) -> None:
-    """Write the first entries of an array of vectors, and set the remaining entries to zero.
-
-    Args:
-        array: vectors with `lanes` components.
-        values: shape (entries, lanes).
-    """
+    """Write vectors, shape (entries, lanes), to the first entries of an array, and zeros to the remaining ones."""
     real = np.float32 if array.dtype == ti.f32 else np.float64
     array.from_numpy(np.pad(values.astype(real), ((0, array.shape[0] - len(values)), (0, 0))))
 
@@ -274,10 +269,7 @@ def _pin(pool: list[int]) -> None:
 
 @contextlib.contextmanager
 def _isolated_environment() -> Iterator[None]:
-    """Hide environment variables that override arguments of `ti.init`, and suppress its line on stdout.
-
-    stdout itself is not redirected, because other threads may print meanwhile.
-    """
+    """Hide environment variables that override arguments of `ti.init`, and its line on stdout, not other threads'."""
     prefix, namespace = f"{active_compiler().prefix}_", vars(ti.lang.misc)
     hidden = {name: os.environ.pop(name) for name in list(os.environ) if _overrides(name.removeprefix(prefix), name)}
     namespace["print"] = lambda *_: None

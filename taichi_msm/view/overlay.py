@@ -45,10 +45,10 @@ def write_text(
 
     Args:
         picture: shape (height, width, 3).
-        above: lines in the upper left corner.
+        above: lines in the upper left corner, above the bar and the two columns of the table.
         below: text at the bottom, which is wrapped.
-        table: two columns, below the lines and the bar.
-        bar: below the lines.
+        table: names and their meanings.
+        bar: a value.
     """
     height, width = picture.shape[:2]
     size = _letter_size(picture)
@@ -66,13 +66,7 @@ def write_text(
 
 
 def mark_tool(picture: Picture, pixel: tuple[float, float], *, pulls: bool) -> None:
-    """Draw a ring around the tool, in place.
-
-    Args:
-        picture: shape (height, width, 3).
-        pixel: position of the tool (x, y).
-        pulls: whether to use the colour of a pulling tool.
-    """
+    """Draw a ring around the pixel (x, y) of a tool into a picture, shape (height, width, 3)."""
     radius = picture.shape[0] * (1 / 50)
     reach = int(radius) + 4
     left, top = max(0, int(pixel[0]) - reach), max(0, int(pixel[1]) - reach)

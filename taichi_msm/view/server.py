@@ -99,10 +99,6 @@ class Server:
         listener: see `listen`.
         title: of the page.
         origins: of pages behind a proxy, in addition to the loopback interface's own.
-
-    Attributes:
-        url: address of the page, with a random token.
-        pages: connected pages, in the order of their connection.
     """
 
     def __init__(self, session: Session, listener: socket.socket, title: str, origins: Collection[str] = ()) -> None:

@@ -44,9 +44,7 @@ def divide_frames(plan: Plan) -> tuple[Plan, int]:
     """Divide the frames of a scene into equal subframes, at most `MAX_FRAME_RATE` per second.
 
     With `precision: auto` they are in f32, which takes half the time: a session steps all the time, unlike a run.
-
-    Returns:
-        The plan with subframes as frames, and the number of subframes per frame of the scene.
+    Returns the plan with subframes as frames, and their number per frame of the scene.
     """
     scene = plan.scene
     subframes = max(1, int(MAX_FRAME_RATE / scene.time.frames_per_second * (1 + 1e-9)))
@@ -242,10 +240,7 @@ class Session:
         return self._film is not None
 
     def start_film(self, path: Path | None = None) -> None:
-        """Start a film.
-
-        Args:
-            path: where it is saved at its end, replacing an earlier file; None: a free name in the folder of captures.
+        """Start a film, which is saved at its end under a path, or a free name in the folder of captures.
 
         Raises:
             FilesError: when it cannot be written.
@@ -258,11 +253,7 @@ class Session:
             self._film.add_frame(self._draw(), self._elapsed)
 
     def picture(self) -> Picture:
-        """Draw the tissue and the overlay; append the picture without text to a running film.
-
-        Returns:
-            The picture, shape (height, width, 3).
-        """
+        """Draw the tissue and the overlay, shape (height, width, 3); a running film has the picture without text."""
         picture = self.bare_picture()
         above = self._figure_lines() if self._show_figures else ["paused"] if self.paused else []
         keys, bar = (events.POINTER | events.KEYS if self._show_keys else None), None
@@ -273,11 +264,7 @@ class Session:
         return picture
 
     def bare_picture(self) -> Picture:
-        """Draw the tissue, with a mark at a tool without an instrument; append the picture to a running film.
-
-        Returns:
-            The picture, shape (height, width, 3).
-        """
+        """Draw the tissue, with a mark at a tool without an instrument, also for a running film."""
         picture = self._draw()
         tool = self.tool
         hidden = isinstance(tool, PositionControlledTool) or tool.percent == 0 or tool.probe.instrument is not None

@@ -35,8 +35,6 @@ class ForceControlledTool:
     Attributes:
         strength: force of a press [% of the full force].
         percent: current force [% of the full force]; negative when pulling.
-        position: current control point.
-        probe: the given probe.
     """
 
     def __init__(self, probe: Probe, frame_rate: float) -> None:
@@ -73,12 +71,7 @@ class ForceControlledTool:
         self.strength = min(100.0, max(0.0, strength))
 
     def press(self, position: SheetPosition, direction: int) -> None:
-        """Press or pull; an engaged tool is released first.
-
-        Args:
-            position: where to press.
-            direction: 1 to press, -1 to pull.
-        """
+        """Press in direction 1, or pull in direction -1; an engaged tool is released first."""
         if len(self._pending) > 1 and self._pending[-1] is None:
             # Discard an earlier click without effect yet, such as in a paused session.
             self._pending.pop()
@@ -100,11 +93,7 @@ class ForceControlledTool:
         self._pending.append(None)
 
     def advance(self, frame: int) -> Probe | None:
-        """Apply the pending action in the frame interval that begins at `frame`.
-
-        Returns:
-            The probe with the keyframes of this interval; None if it has not changed.
-        """
+        """Apply the pending action in the interval from a frame to the next; return the probe if it has changed."""
         begin, end = frame / self._frame_rate, (frame + 1) / self._frame_rate
         if self._pending:
             if (press := self._pending.popleft()) is None:
@@ -189,9 +178,6 @@ class PositionControlledTool:
     Attributes:
         strength: depth of a press [% of the largest depth]; negative to lift a grip.
         height: current height of the lowest point of the tip above the sheet at rest [m].
-        position: current position of the tip.
-        target: position to which the tip moves.
-        engaged: whether the tool presses or grips.
         grid: of the session; a change of the material changes its step.
     """
 
@@ -241,12 +227,7 @@ class PositionControlledTool:
         self.strength = min(100.0, max(-100.0 if self._grip_requested else 0.0, strength))
 
     def press(self, position: SheetPosition, direction: int) -> None:
-        """Press or grip.
-
-        Args:
-            position: where to press.
-            direction: 1 to press, -1 to grip.
-        """
+        """Press in direction 1, or grip in direction -1."""
         self.release()
         self.engaged, self._grip_requested, self._press_strength = True, direction < 0, self.strength
         self.move(position)

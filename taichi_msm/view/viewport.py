@@ -23,10 +23,6 @@ class Viewport:
     Args:
         renderer: has the initial settings in its scene.
         play: whether to follow a moving camera of the scene; otherwise it stays at its initial pose.
-
-    Attributes:
-        render: current drawing settings.
-        view: current camera.
     """
 
     def __init__(self, renderer: Renderer, *, play: bool = False) -> None:
@@ -65,12 +61,7 @@ class Viewport:
         return self.render
 
     def turn(self, right: float, down: float) -> None:
-        """Orbit the camera as if the near side of the tissue were dragged.
-
-        Args:
-            right: horizontal drag [px]; the height of the picture is half a turn.
-            down: vertical drag [px].
-        """
+        """Orbit the camera as if the near side of the tissue were dragged [px]; the height is half a turn."""
         angle = math.pi / self.render.size[1]
         scene = self._renderer.scene.model_copy(update={"render": self.render})
         self.set_camera(orbit_camera(pinhole(scene, self._time), -right * angle, down * angle))
@@ -86,15 +77,7 @@ class Viewport:
         self._change(wireframe=not self.render.wireframe)
 
     def draw(self, positions: NDArray[Any], instruments: Sequence[Solid] = ()) -> Picture:
-        """Draw the sheet and instruments.
-
-        Args:
-            positions: of the mass points [m], shape (rows, cols, 3).
-            instruments: the instruments.
-
-        Returns:
-            The picture, shape (height, width, 3).
-        """
+        """Draw the sheet at positions [m], shape (rows, cols, 3), and instruments, shape (height, width, 3)."""
         return self._renderer.draw(Shot(positions, self.view, instruments), self.render)
 
     def project(self, point: NDArray[np.floating]) -> tuple[float, float] | None:
