@@ -221,8 +221,7 @@ class Session:
             self.show_notice("this session will soon be too long for a scene: save it now (w), then reset it (r)")
         start = time.perf_counter()
         try:
-            if probe := self.tool.advance(self.frame):
-                self._simulation.steer((*self._scene_probes, probe))
+            self._simulation.steer((*self._scene_probes, self.tool.advance(self.frame)))
             self._simulation.advance()
             self._max_felt_force = max(self._max_felt_force, self.felt_force())
             if self.viewport.set_time(self._simulation.time):

@@ -51,8 +51,6 @@ class ForceControlledTool:
         self._direction = 0
         # Presses, with position and direction (1 to push, -1 to pull), and releases (None).
         self._pending: deque[tuple[SheetPosition, int] | None] = deque()
-        # Percentage and position of the last probe.
-        self._last_returned: tuple[float, SheetPosition] | None = None
         self._load: list[tuple[float, float]] = [(0.0, 0.0)]
         self._at: list[tuple[float, float, float]] = [(0.0, *self.position)]
 
@@ -92,8 +90,8 @@ class ForceControlledTool:
         """Release the tissue."""
         self._pending.append(None)
 
-    def advance(self, frame: int) -> Probe | None:
-        """Apply the pending action in the interval from a frame to the next; return the probe if it has changed."""
+    def advance(self, frame: int) -> Probe:
+        """Apply the pending action in the frame interval that begins at `frame`; return its probe for `steer`."""
         begin, end = frame / self._frame_rate, (frame + 1) / self._frame_rate
         if self._pending:
             if (press := self._pending.popleft()) is None:
@@ -105,22 +103,17 @@ class ForceControlledTool:
             self.percent = 0.0
             self._load.append((begin, 0.0))
         if self._direction != 0:
-            self.percent = self._approach(self._direction * self.strength)
+            limit = 100 / (RISE_TIME_S * self._frame_rate)
+            target = self._direction * self.strength
+            change = target - self.percent
+            self.percent = target if abs(change) <= limit else self.percent + math.copysign(limit, change)
             self._move_to_target(end)
         extend(self._load, (end, self.percent))
-        if self._last_returned == (self.percent, self.position):
-            return None
-        self._last_returned = self.percent, self.position
         return self._as_probe(self._load[-ACTIVE_KEYFRAMES:], self._at[-ACTIVE_KEYFRAMES:], end)
 
     def recorded_probe(self, frame: int) -> Probe:
         """Return the probe with all keyframes up to a frame."""
         return self._as_probe(self._load, self._at, frame / self._frame_rate)
-
-    def _approach(self, target: float) -> float:
-        limit = 100 / (RISE_TIME_S * self._frame_rate)
-        change = target - self.percent
-        return target if abs(change) <= limit else self.percent + math.copysign(limit, change)
 
     def _move_to_target(self, time: float) -> None:
         self.position = self._target

@@ -55,7 +55,7 @@ def test_every_frame_has_the_loads_of_the_record(seed: int) -> None:
                 hand.strength = float(rng.integers(0, 101))
             else:
                 hand.move(place)
-        seen.append(hand.advance(frame) or seen[-1])
+        seen.append(hand.advance(frame))
     record = hand.recorded_probe(frames)
     for frame, probe in enumerate(seen):
         now, then = loads(probe, frame), loads(record, frame)
@@ -122,14 +122,3 @@ def test_what_was_asked_for_is_forgotten_at_rest() -> None:
     assert not hand.engaged
     assert percents(hand, 0, 2) == [0, 0]
     assert hand.recorded_probe(2).load == ((0.0, 0.0), (2 / RATE, 0.0))
-
-
-def test_what_stays_as_it_is_is_not_told_again() -> None:
-    hand = tool()
-    assert hand.advance(0) is not None, "the one who is told may have an older probe"
-    assert hand.advance(1) is None
-    hand.press((0.2, 0.2), 1)
-    told = [hand.advance(frame) is not None for frame in range(2, 20)]
-    assert told == [True] * 10 + [False] * 8
-    hand.reset()
-    assert hand.advance(0) is not None
