@@ -39,7 +39,8 @@ class Stereo(OpenCV):
         data = _without_sections(file.data)
         for marks in MARKS:
             eyes = [_marked(data, mark) for mark in marks]
-            if all(any(_is_matrix(name, data[key]) for key, name in eye.items()) for eye in eyes):
+            matrices = [[key for key, name in eye.items() if re.fullmatch(MATRIX, name)] for eye in eyes]
+            if all(any(len(flat(data[key])) == 9 for key in keys) for keys in matrices):
                 shared = {key: fold(key) for key in data if not any(key in eye for eye in eyes)}
                 folded = [{**shared, **eye} for eye in eyes]
                 return [Keys(file, {key: data[key] for key in names}, names) for names in folded]
@@ -59,7 +60,3 @@ def _marked(keys: Iterable[str], mark: str) -> dict[str, str]:
     """Return the keys that have a mark, each with its folded name without it."""
     matches = {key: re.fullmatch(mark, str(key)) for key in keys}
     return {key: fold("".join(filter(None, match.groups()))) for key, match in matches.items() if match}
-
-
-def _is_matrix(name: str, value: Any) -> bool:
-    return bool(re.fullmatch(MATRIX, name)) and len(flat(value)) == 9

@@ -99,10 +99,6 @@ class _Loader(_BaseLoader):  # type: ignore[misc]
     """YAML loader that reads OpenCV's matrices as mappings, and rejects repeated keys."""
 
 
-def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict[Any, Any]:
-    return _distinct([loader.construct_object(item, deep=True) for item in pair] for pair in node.value)
-
-
 def _distinct(pairs: Iterable[Sequence[Any]]) -> dict[Any, Any]:
     """Build a mapping; raise a RepeatedError for a repeated key."""
     mapping: dict[Any, Any] = {}
@@ -113,14 +109,14 @@ def _distinct(pairs: Iterable[Sequence[Any]]) -> dict[Any, Any]:
     return mapping
 
 
-def _sequence(loader: _Loader, node: yaml.SequenceNode) -> list[Any]:
-    return loader.construct_sequence(node, deep=True)
+def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict[Any, Any]:
+    return _distinct([loader.construct_object(item, deep=True) for item in pair] for pair in node.value)
 
 
 for _kind in ("opencv-matrix", "opencv-nd-matrix", "map"):
     _Loader.add_constructor(f"tag:yaml.org,2002:{_kind}", _mapping)
 # PyYAML's own tag of tuples.
-_Loader.add_constructor("tag:yaml.org,2002:python/tuple", _sequence)
+_Loader.add_constructor("tag:yaml.org,2002:python/tuple", lambda loader, node: loader.construct_sequence(node, True))
 
 
 def _yaml(text: str) -> Any:

@@ -40,9 +40,6 @@ from taichi_msm.runs.arrays import read_flo
 from taichi_msm.runs.finished import FinishedRun, reading
 from taichi_msm.scene.outputs import OUTPUTS
 
-# Fraction of a turn between the hues of successive points.
-GOLDEN_RATIO = 0.618
-
 
 @one_path_per_run(".rrd")
 def write(run: FinishedRun, path: Path, progress: ProgressCallback) -> list[str]:
@@ -84,6 +81,9 @@ def _log_run(run: FinishedRun, recording: Any, progress: ProgressCallback) -> No
 
     positions, views = run.positions(), _views(run)
     tracks = next((read_track_positions(each)[1] for each in views.values() if each.has_output("tracks")), None)
+    # Distinct colours; the hues of successive points are 0.618 turns apart.
+    phase = np.arange(0 if tracks is None else len(tracks))[:, None] * 0.618 + np.array([0, 1 / 3, 2 / 3])
+    colours = (127.5 + 127.5 * np.cos(2 * np.pi * phase)).astype(np.uint8)
     instruments = [number for number, probe in enumerate(run.scene.probes) if probe.instrument is not None]
     recording.log("world", rerun.ViewCoordinates.RIGHT_HAND_Y_UP, static=True)
     for frame, position in enumerate(positions):
@@ -99,7 +99,7 @@ def _log_run(run: FinishedRun, recording: Any, progress: ProgressCallback) -> No
                 recording.log(f"world/tools/{number}", mesh, static=True)
             recording.log(f"world/tools/{number}", rerun.Transform3D(translation=solid.tip))
         if tracks is not None:
-            recording.log("world/tracks", rerun.Points3D(tracks[:, frame], colors=_colours(len(tracks))))
+            recording.log("world/tracks", rerun.Points3D(tracks[:, frame], colors=colours))
         for entity, each in views.items():
             view = view_at(run.scene, time, each.camera)
             if view.pinhole and (frame == 0 or is_moving(run.scene, each.camera)):
@@ -120,11 +120,6 @@ def _mesh(run: FinishedRun, position: NDArray[np.floating], *, is_first: bool) -
         return rerun.Mesh3D(**vertices)
     picture = load_texture(run.scene, run.sha256.get("image", ""))
     return rerun.Mesh3D(**vertices, vertex_texcoords=surface.texture_coordinates, albedo_texture=picture)
-
-
-def _colours(count: int) -> NDArray[np.uint8]:
-    phase = np.arange(count)[:, None] * GOLDEN_RATIO + np.array([0, 1 / 3, 2 / 3])
-    return (127.5 + 127.5 * np.cos(2 * np.pi * phase)).astype(np.uint8)
 
 
 def _pinhole(view: View) -> tuple[Any, Any]:

@@ -136,6 +136,7 @@ def start(arch: str = "cpu", threads: int | None = None) -> Device:
         DeviceError: when the arch is not supported or not available, or Taichi already runs on another device.
         MsmError: as `require_start_thread`.
     """
+    global _device, _start_thread
     if threads is not None and not (type(threads) is int and 1 <= threads <= MAX_THREADS):
         raise ArgumentError(f"threads: {threads!r}; take a whole number, 1 to {MAX_THREADS}, or None for every core")
     if arch not in ARCHS:
@@ -143,21 +144,15 @@ def start(arch: str = "cpu", threads: int | None = None) -> Device:
         raise DeviceError(f"--arch {arch}: not supported; take one of: {', '.join(ARCHS)}{near}")
     wanted = Device(arch, process_module.available_threads() if threads is None else threads)
     with _starting:
-        return _start(wanted)
-
-
-def _start(wanted: Device) -> Device:
-    global _device, _start_thread
-    if _device is None:
-        _device = replace(wanted, name=_initialise(wanted))
-        _start_thread = os.getpid(), threading.get_ident()
-    require_start_thread()
-    if wanted != _device:
-        raise DeviceError(
-            f"{active_compiler().title} already runs on {_device.arch} with {_device.threads} threads in this process; "
-            f"start another process for {wanted.arch} with {wanted.threads}"
-        )
-    return _device
+        if _device is None:
+            _device = replace(wanted, name=_initialise(wanted))
+            _start_thread = os.getpid(), threading.get_ident()
+        require_start_thread()
+        if wanted != _device:
+            running = f"already runs on {_device.arch} with {_device.threads} threads in this process"
+            remedy = f"start another process for {wanted.arch} with {wanted.threads}"
+            raise DeviceError(f"{active_compiler().title} {running}; {remedy}")
+        return _device
 
 
 def stop() -> None:
@@ -271,19 +266,16 @@ def _pin(pool: list[int]) -> None:
 def _isolated_environment() -> Iterator[None]:
     """Hide environment variables that override arguments of `ti.init`, and its line on stdout, not other threads'."""
     prefix, namespace = f"{active_compiler().prefix}_", vars(ti.lang.misc)
-    hidden = {name: os.environ.pop(name) for name in list(os.environ) if _overrides(name.removeprefix(prefix), name)}
+    # Directories and the choice of a GPU are no arguments.
+    kept = tuple(prefix + name for name in ("OFFLINE_CACHE_FILE_PATH", "VISIBLE_DEVICE", "LIB_DIR", "SKIP_"))
+    names = [name for name in os.environ if name.startswith(prefix) and not name.startswith(kept)]
+    hidden = {name: os.environ.pop(name) for name in names}
     namespace["print"] = lambda *_: None
     try:
         yield
     finally:
         del namespace["print"]
         os.environ.update(hidden)
-
-
-def _overrides(setting: str, name: str) -> bool:
-    """Return whether an environment variable overrides an argument of `ti.init`; directories and the GPU do not."""
-    kept = "OFFLINE_CACHE_FILE_PATH", "VISIBLE_DEVICE", "LIB_DIR", "SKIP_"
-    return setting != name and not setting.startswith(kept)
 
 
 def _initialise(device: Device) -> str:

@@ -51,7 +51,8 @@ def write_text(
         bar: a value.
     """
     height, width = picture.shape[:2]
-    size = _letter_size(picture)
+    # Height of letters [px].
+    size = int(min(22, max(11, height * (1 / 36))))
     top = edge = size // 2
     bar_panel = (
         _bar(size, round(BAR_LENGTH_LETTERS * size * bar.value / bar.end), f"{bar.end:g} {bar.unit}") if bar else None
@@ -123,7 +124,3 @@ def _bar(size: int, filled: int, end: str) -> NDArray[np.uint8]:
     panel[top + 1 : top + height - 1, edge + 1 : edge + width - 1] = 0
     panel[top : top + height, edge : edge + min(filled, width)] = 255
     return panel
-
-
-def _letter_size(picture: Picture) -> int:
-    return int(min(22, max(11, picture.shape[0] * (1 / 36))))

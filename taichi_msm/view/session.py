@@ -216,9 +216,11 @@ class Session:
         if (self.paused and not self._single_step) or self.divergence_error:
             return
         self._single_step = False
-        if self.frame % 200 == 0 and not self._has_warned_of_length and self._is_nearly_too_long():
-            self._has_warned_of_length = True
-            self.show_notice("this session will soon be too long for a scene: save it now (w), then reset it (r)")
+        # At three quarters of the limit.
+        if self.frame % 200 == 0 and not self._has_warned_of_length:
+            self._has_warned_of_length = count_probe_values(self.recorded_scene()) > 0.75 * MAX_NODES
+            if self._has_warned_of_length:
+                self.show_notice("this session will soon be too long for a scene: save it now (w), then reset it (r)")
         start = time.perf_counter()
         try:
             self._simulation.steer((*self._scene_probes, self.tool.advance(self.frame)))
@@ -474,9 +476,6 @@ class Session:
         else:
             film.close()
             self.show_notice("no film was saved: it had no picture yet")
-
-    def _is_nearly_too_long(self) -> bool:
-        return count_probe_values(self.recorded_scene()) > 0.75 * MAX_NODES
 
     @property
     def _pulls(self) -> bool:

@@ -70,11 +70,12 @@ class Viewport:
         """Toggle the shading of the scene, or a headlight if the scene has none."""
         scene_shading = self._renderer.scene.render.shading
         shading = scene_shading if scene_shading != "none" else "headlight"
-        self._change(shading="none" if self.render.shading != "none" else shading)
+        update = {"shading": "none" if self.render.shading != "none" else shading}
+        self.render = self.render.model_copy(update=update)
 
     def toggle_mesh(self) -> None:
         """Show or hide the mesh."""
-        self._change(wireframe=not self.render.wireframe)
+        self.render = self.render.model_copy(update={"wireframe": not self.render.wireframe})
 
     def draw(self, positions: NDArray[Any], instruments: Sequence[Solid] = ()) -> Picture:
         """Draw the sheet at positions [m], shape (rows, cols, 3), and instruments, shape (height, width, 3)."""
@@ -84,6 +85,3 @@ class Viewport:
         """Project a point [m], shape (3,), to a pixel (x, y); None behind the camera."""
         x, y = self.view.pixels(point.astype(float)).tolist()
         return (x, y) if math.isfinite(x) else None
-
-    def _change(self, **changes: Any) -> None:
-        self.render = self.render.model_copy(update=changes)
