@@ -27,9 +27,6 @@ MAX_BYTES = 2**22
 # Cameras of a stereo pair in their order.
 EYES = ("left", "right")
 
-# Largest deviation of products of the rows of a rotation.
-MAX_DEVIATION = 1e-3
-
 # Larger distances of the cameras of a pair are probably millimetres [m].
 MAX_BASELINE_M = 0.5
 
@@ -61,7 +58,7 @@ def read_calibration(
         listed = ", ".join(f"{number:g}" for number in pose.translation)
         raise file.fault(f"the cameras are [{listed}] m apart; set calibration_unit: mm, or m if that is right")
     rotation = np.array(pose.rotation)
-    if not ((deviation := np.abs(rotation @ rotation.T - np.eye(3)).max()) <= MAX_DEVIATION):
+    if not ((deviation := np.abs(rotation @ rotation.T - np.eye(3)).max()) <= 1e-3):
         raise file.fault(f"R: is no rotation, products of its rows are off by {deviation:.2g}; write its 3 x 3 numbers")
     scale = LENGTH_UNITS[unit] if unit is not None else reader.unit or 1.0
     translation = tuple(scale * number for number in pose.translation)

@@ -11,9 +11,6 @@ from taichi_msm.camera_files.text import LENGTH_UNITS, CameraFile
 from taichi_msm.camera_files.trajectory import COLUMNS, MAX_NUMBER, Trajectory, TrajectoryReader, parse_numbers
 from taichi_msm.errors import truncate
 
-# Limits of the lengths of a header and of a name in it.
-MAX_HEADER_LENGTH, MAX_NAME_LENGTH = 2000, 80
-
 # Lower-case spellings of the names of columns, and of their units.
 _POSITION = r"(t|p|pos|(.*[^a-z])?position|trans|translation|[tp][^a-z].*[^a-z])?"
 _ROTATION = r"(q|quat|quaternion|(.*[^a-z])?orientation|rot|rotation|q[^a-z].*)"
@@ -35,8 +32,6 @@ OTHER_CONVENTION = re.compile(
     r"\bw[\s,]*x[\s,]*y[\s,]*z\b|scalar[\s-]*first|\bq_?0\b|world[\s-]*(to|2)[\s-]*cam\w*|\bw2c\b|\bT_?cw\b",
     re.IGNORECASE,
 )
-
-EUROC_COLUMNS = 17
 
 
 class _Columns(NamedTuple):
@@ -79,7 +74,7 @@ def _header(text: str, *, is_comment: bool) -> list[str]:
     """Split a header into the names of columns; return an empty list for other lines."""
     text = text.rpartition(":")[2].lower()
     names = [name.strip() for name in text.split(",")] if "," in text else re.sub(r"\s+(?=[\[(])", "", text).split()
-    if len(text) > MAX_HEADER_LENGTH or max(map(len, names), default=0) > MAX_NAME_LENGTH:
+    if len(text) > 2000 or max(map(len, names), default=0) > 80:
         return []
     bare = [UNIT.sub("", name) for name in names]
     rotations = sum(bool(re.fullmatch(rf"(.*[^a-z])?{_ROTATION}[^a-z]*[wxyz]", name)) for name in bare)
@@ -115,7 +110,7 @@ def _row(
         if expected.column_count != TUM.column_count:
             needed = f"{expected.column_count} numbers up to {MAX_NUMBER:g}, one a column of the header"
         origin = ""
-        if columns is None and len(words) == EUROC_COLUMNS:
+        if columns is None and len(words) == 17:
             origin = ", but 17 numbers, as EuRoC's; keep their header"
         elif columns is None and separated:
             origin = "; numbers with decimal commas need ; between them"

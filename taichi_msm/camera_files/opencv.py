@@ -55,8 +55,8 @@ FLAGS = {
     **dict.fromkeys(("0", "false", "no", "off"), "pinhole"),
 }
 
-# Numbers of coefficients that OpenCV writes. Those after the first 8 are not supported and must be 0.
-COEFFICIENT_COUNTS, SUPPORTED_COEFFICIENTS = (0, 4, 5, 8, 12, 14), 8
+# Coefficients after these are not supported and must be 0.
+SUPPORTED_COEFFICIENTS = 8
 
 # Smallest focal length [px].
 MIN_FOCAL_LENGTH_PX = 1e-3
@@ -155,7 +155,7 @@ def _model(keys: Keys, values: Sequence[float], *, has_xi: bool) -> str:
 def _coefficients(file: CameraFile, model: str, values: Sequence[float]) -> dict[str, float]:
     """Return the coefficients of a lens model by their names; trailing ones may be missing."""
     names = tuple(MODELS[model].coefficients)
-    if len(values) not in (COEFFICIENT_COUNTS if model == "pinhole" else (len(names),)):
+    if len(values) not in ((0, 4, 5, 8, 12, 14) if model == "pinhole" else (len(names),)):
         expected = "4, 5, 8, 12 or 14: k1, k2, p1, p2, k3, ..." if model == "pinhole" else f"those of {model}: "
         expected += "" if model == "pinhole" else ", ".join(names)
         raise file.fault(f"{len(values)} distortion coefficients; expected {expected}")

@@ -37,13 +37,6 @@ MIN_UNIT_M, MAX_VALUE = 1e-5, 65535
 # Size of the pictures that EndoGaussian's loader takes for granted [px].
 LOADER_SIZE = (640, 512)
 
-# Largest relative difference of the focal lengths; and distance of the axis from the middle [px]: the loaders take it
-# through the middle of the pixel right and below of the picture's middle.
-FOCAL_TOLERANCE, CENTRE_TOLERANCE_PX = 1e-6, 0.5 + 1e-6
-
-# Signs that convert OpenCV's axes, right, down and forward, to right, up and backward.
-AXIS_SIGNS = np.array([1.0, -1.0, -1.0])
-
 
 @one_folder_per_run
 def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
@@ -85,9 +78,10 @@ def _require_central(camera: Pinhole, size: tuple[int, int], run: FinishedRun) -
     across, down = camera.focal.tolist()
     x, y = (camera.centre - np.array(size) / 2).tolist()
     faults = []
-    if abs(across / down - 1) > FOCAL_TOLERANCE:
+    if abs(across / down - 1) > 1e-6:
         faults.append(f"its focal lengths are {across:g} and {down:g} px")
-    if max(abs(x), abs(y)) > CENTRE_TOLERANCE_PX:
+    # The loaders take the axis through the middle of the pixel right and below of the picture's middle.
+    if max(abs(x), abs(y)) > 0.5 + 1e-6:
         faults.append(f"its axis is {x:g} px to the right and {y:g} px below the middle")
     if faults:
         fault = f"{FORMAT_NAME} has one focal length and an axis through the middle, but {' and '.join(faults)}"
@@ -109,7 +103,8 @@ def _depth_bounds(run: FinishedRun, frame: int) -> tuple[float, float]:
 def _poses(camera: Pinhole, size: tuple[int, int], unit: float) -> NDArray[np.float64]:
     """Return the matrices of poses_bounds.npy, shape (frames, 3, 5)."""
     poses = camera.matrices
-    signs = np.append(AXIS_SIGNS, 1.0)
+    # From OpenCV's axes, right, down and forward, to right, up and backward.
+    signs = np.array([1.0, -1.0, -1.0, 1.0])
     # From each camera to the first one, exactly the identity for a camera that does not move.
     to_first = signs[:, None] * (poses[0] @ np.linalg.inv(poses)) * signs
     to_first[(poses == poses[0]).all(axis=(1, 2))] = np.eye(4)

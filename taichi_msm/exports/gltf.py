@@ -39,7 +39,6 @@ from taichi_msm.version import __version__
 # Limits of the morph targets: MAX_ARRAY_TEXTURE_LAYERS of WebGL 2, and a size that browsers load quickly.
 MAX_TARGETS = 256
 MAX_TARGETS_BYTES = 1 << 28
-TARGET_VERTEX_BYTES = 2 * 3 * 4  # differences of position and normal, float32
 
 COMPONENT_TYPES = {"f": 5126, "u": 5125}  # float32, uint32
 ACCESSOR_TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
@@ -50,9 +49,6 @@ GL_ARRAY_BUFFER, GL_ELEMENT_ARRAY_BUFFER = 34962, 34963
 # Constants of OpenGL for texture filtering and wrapping.
 GL_LINEAR, GL_LINEAR_MIPMAP_LINEAR, GL_CLAMP_TO_EDGE = 9729, 9987, 33071
 
-# Near plane of a perspective camera, as a fraction of the distance of its target.
-NEAR_RATIO = 1e-3
-
 Array = NDArray[np.floating]
 Numbers = NDArray[Any]
 
@@ -61,7 +57,9 @@ Numbers = NDArray[Any]
 def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
     """Write the animated surface with its picture, the tools and cameras; arguments as for `one_folder_per_run`."""
     positions, picture = run.positions(), picture_png(run)
-    max_targets = max(1, min(MAX_TARGETS, MAX_TARGETS_BYTES // (TARGET_VERTEX_BYTES * positions[0, ..., 0].size)))
+    # Differences of position and normal, float32.
+    target_bytes = 2 * 3 * 4 * positions[0, ..., 0].size
+    max_targets = max(1, min(MAX_TARGETS, MAX_TARGETS_BYTES // target_bytes))
     keys = key_frames(positions, 1 + max_targets, progress)
     asset = {"version": "2.0", "generator": f"taichi_msm {__version__}"}
     nodes = [{"mesh": 0, "name": "sheet"}]
@@ -139,7 +137,7 @@ def _add_cameras(glb: Glb, run: FinishedRun) -> list[str]:
         width, height = (view.size / view.scale).tolist()
         if view.pinhole:
             field = {"yfov": 2 * math.atan(height / 2), "aspectRatio": width / height}
-            optics = {"type": "perspective", "perspective": {**field, "znear": NEAR_RATIO * view.distance}}
+            optics = {"type": "perspective", "perspective": {**field, "znear": 1e-3 * view.distance}}
         else:
             field = {"xmag": width / 2, "ymag": height / 2, "znear": 0.0, "zfar": 2 * view.distance}
             optics = {"type": "orthographic", "orthographic": field}

@@ -179,10 +179,6 @@ def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
     return Pinhole(focal, centre, poses)
 
 
-# Segments of the mesh of an instrument around its axis.
-SEGMENTS = 32
-
-
 def instrument_mesh(
     solid: Solid,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int32]]:
@@ -194,7 +190,7 @@ def instrument_mesh(
     axis = solid.axis
     across = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     across /= np.linalg.norm(across)
-    around = np.linspace(0, 2 * np.pi, SEGMENTS + 1)
+    around = np.linspace(0, 2 * np.pi, 32 + 1)  # 32 segments
     radial = np.cos(around)[:, None] * across + np.sin(around)[:, None] * np.cross(axis, across)
     along, outward, *normal = solid.shape.profile(solid.length, solid.radius).T[..., None, None]
     surface = refine_surface(outward * radial + along * axis, 0)

@@ -42,9 +42,6 @@ MAX_THREADS = 1024
 # Address space that Taichi needs: it reserves 1 GiB, and its libraries need nearly the same amount.
 MIN_ADDRESS_SPACE_BYTES = 1900 << 20
 
-# The name of the GPU in Taichi's log.
-GPU_NAME_PATTERN = re.compile(r'Vulkan Device "(.+)" supports|CUDA device \[id=\d+\]: (.+)')
-
 # Smallest number of iterations of a parallel loop in a CPU thread, from make_cpu_multithreaded_range_for.cpp.
 ITERATIONS_PER_THREAD = 512
 
@@ -298,7 +295,7 @@ def _initialise(device: Device) -> str:
                     log_level=ti.ERROR if on_cpu else ti.TRACE,
                 )
                 ti.set_logging_level(ti.ERROR)
-            gpu_name = GPU_NAME_PATTERN.search(log.read())
+            gpu_name = re.search(r'Vulkan Device "(.+)" supports|CUDA device \[id=\d+\]: (.+)', log.read())
     except Exception as error:
         remedy = f"{active_compiler().title} says: {' '.join(str(error).split())}" if on_cpu else "take --arch cpu"
         raise DeviceError(f"--arch {device.arch}: not available on this machine; {remedy}") from error

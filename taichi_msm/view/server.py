@@ -35,7 +35,6 @@ from taichi_msm.view.session import Session
 from taichi_msm.view.tools import PositionControlledTool
 
 ADDRESS = "127.0.0.1"
-LOOPBACK_NAMES = {ADDRESS, "localhost", "::1"}
 
 # The files of the page, by their path below the token, and their types.
 PAGE = {
@@ -53,21 +52,16 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
 }
 
-# Quality of the JPEGs; at 85, 512 x 512 pixels of tissue take 2 ms and 33 kB.
-JPEG_QUALITY = 85
-
 # Number of pictures on the way to a page, so that a slow connection lags by no more than these.
 MAX_UNREAD_PICTURES = 3
 
 MAX_PAGES = 16
 
-# Number of events that the page that steers may send within a frame, and of readings kept for a page.
+# Number of events that the page that steers may send within a frame.
 MAX_EVENTS = 500
-MAX_READINGS = 1000
 
-# Shortest wait for events between two pictures, and wait while no page is open [s].
+# Shortest wait for events between two pictures [s].
 MIN_WAIT_S = 0.001
-IDLE_WAIT_S = 0.05
 
 # Longer delays are not caught up [s].
 MAX_DELAY_S = 0.1
@@ -149,7 +143,7 @@ class Server:
         try:
             parts, forwarded = urlsplit(origin), urlsplit(f"//{host}").port
             own = f"{parts.scheme}://{parts.netloc}" == origin and parts.scheme == "http"
-            return own and parts.hostname in LOOPBACK_NAMES and parts.port in (self._port, forwarded)
+            return own and parts.hostname in {ADDRESS, "localhost", "::1"} and parts.port in (self._port, forwarded)
         except ValueError:
             return False
 
@@ -197,7 +191,7 @@ class Server:
         pacing = Pacing(session.frame_rate, time.perf_counter)
         while True:
             pause()
-            await asyncio.sleep(max(MIN_WAIT_S, pacing.delay_s()) if self.pages else IDLE_WAIT_S)
+            await asyncio.sleep(max(MIN_WAIT_S, pacing.delay_s()) if self.pages else 0.05)
             while self._events:
                 event = self._events.popleft()
                 if event == events.QUIT:
@@ -317,7 +311,8 @@ class Pacing:
 def encode_jpeg(picture: Picture) -> bytes:
     """Encode a picture, shape (height, width, 3), as JPEG."""
     file = io.BytesIO()
-    Image.fromarray(picture).save(file, "JPEG", quality=JPEG_QUALITY)
+    # 512 x 512 pixels of tissue take 2 ms and 33 kB.
+    Image.fromarray(picture).save(file, "JPEG", quality=85)
     return file.getvalue()
 
 
@@ -362,7 +357,7 @@ class _Connection(_Guarded, WebSocketHandler):
 
     def open(self) -> None:
         self.unread = 0
-        self.readings: deque[list[float]] = deque(maxlen=MAX_READINGS)
+        self.readings: deque[list[float]] = deque(maxlen=1000)
         self.jpeg = b""
         self.set_nodelay(True)
         if len(self.server.pages) < MAX_PAGES:

@@ -155,8 +155,6 @@ DEFAULT_FRICTION = 0.5
 # Interval before the start, without effect, for which the kernel is compiled with grips.
 NO_GRIP = (-2.0, -1.0)
 
-PathKey = tuple[float, float, float, float]
-
 
 class PositionControlledTool:
     """A tool whose tip follows the pointer, above the sheet or at a given depth while it presses.
@@ -198,7 +196,7 @@ class PositionControlledTool:
         # Start of the current grip, and intervals of earlier grips [s].
         self._grip_start: float | None = None
         self._grips: list[tuple[float, float]] = []
-        self._path: list[PathKey] = [(0.0, *self.position, self.height)]
+        self._path: list[tuple[float, float, float, float]] = [(0.0, *self.position, self.height)]
 
     @property
     def depth(self) -> float:
