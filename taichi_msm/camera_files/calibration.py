@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from typing import ClassVar, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 from taichi_msm.camera_files.keys import Keys
 from taichi_msm.camera_files.text import CameraFile
@@ -41,21 +40,13 @@ class Calibration(NamedTuple):
         return self._replace(focal=focal, centre=centre, coefficients=lens)
 
 
-class CalibrationReader(ABC):
+class CalibrationReader(NamedTuple):
     """Reader of a format of calibrations."""
 
-    name: ClassVar[str]  # name of the format, for users
-    recognised_by: ClassVar[str]  # content by which a file is recognised, for users
-    unit: ClassVar[float | None] = 1.0  # unit of lengths in the file [m]; None where it depends on who wrote the file
-
-    @abstractmethod
-    def cameras(self, file: CameraFile) -> Sequence[Keys]:
-        """Return the keys of each camera, the left one first; none if the file has another format."""
-
-    @abstractmethod
-    def read(self, keys: Keys) -> Calibration:
-        """Read a camera."""
-
-    def pose(self, keys: Keys) -> StereoPose | None:  # noqa: ARG002
-        """Read the pose of the right camera, in the unit of the file, from the keys of this camera; None without."""
-        return None
+    name: str  # name of the format, for users
+    recognised_by: str  # content by which a file is recognised, for users
+    cameras: Callable[[CameraFile], Sequence[Keys]]  # keys of each camera, the left one first; none in other formats
+    read: Callable[[Keys], Calibration]
+    # Pose of the right camera, in the unit of the file, from the keys of this camera.
+    pose: Callable[[Keys], StereoPose | None] = lambda keys: None
+    unit: float | None = 1.0  # unit of lengths in the file [m]; None where it depends on who wrote the file

@@ -6,20 +6,18 @@ from typing import Literal
 
 import numpy as np
 
-from taichi_msm.camera_files.calibration import Calibration, CalibrationReader
-from taichi_msm.camera_files.camera_json import CameraJson
-from taichi_msm.camera_files.colmap import ColmapCameras
-from taichi_msm.camera_files.kalibr import Kalibr
-from taichi_msm.camera_files.ocamcalib import OCamCalib
-from taichi_msm.camera_files.opencv import OpenCV
-from taichi_msm.camera_files.stereo import Stereo
-from taichi_msm.camera_files.stereomis import StereoMIS
+from taichi_msm.camera_files.calibration import Calibration
+from taichi_msm.camera_files.camera_json import CAMERA_JSON
+from taichi_msm.camera_files.colmap import COLMAP_CAMERAS
+from taichi_msm.camera_files.kalibr import KALIBR
+from taichi_msm.camera_files.ocamcalib import OCAMCALIB
+from taichi_msm.camera_files.opencv import OPENCV
+from taichi_msm.camera_files.stereo import STEREO
+from taichi_msm.camera_files.stereomis import STEREOMIS
 from taichi_msm.camera_files.text import LENGTH_UNITS, CameraFile
 
 # The first one that recognises a file reads it.
-READERS: tuple[CalibrationReader, ...] = (
-    *(OCamCalib(), ColmapCameras(), StereoMIS(), Kalibr(), CameraJson(), Stereo(), OpenCV()),
-)
+READERS = (OCAMCALIB, COLMAP_CAMERAS, STEREOMIS, KALIBR, CAMERA_JSON, STEREO, OPENCV)
 
 # Limit of the size of a file.
 MAX_BYTES = 2**22
