@@ -20,7 +20,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import pickle
 import shutil
 from pathlib import Path
 from typing import Any
@@ -84,15 +83,6 @@ def test_a_choice_that_is_none_is_told_of(stereo: Path, program: Program, messag
     for folder, name in ((alone(stereo, "left"), "tapvid"), (stereo, "gltf"), (stereo, "stir")):
         with message.raises(ArgumentError, "camera"):
             export(folder, name, camera="left")
-
-
-def test_of_runs_with_one_camera_that_is_taken(stereo: Path, single: Path) -> None:
-    """A choice concerns only those that have several."""
-    done = export([single, stereo], "tapvid", camera="left")
-    videos = pickle.loads((done.directory / "tapvid.pkl").read_bytes())
-    assert len(videos) == 2
-    points = [video["points"] for video in videos.values()]
-    np.testing.assert_array_equal(*points)
 
 
 def test_what_a_camera_lacks_is_named(stereo: Path, message: Messages) -> None:

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from taichi_msm.cli import console
 from taichi_msm.errors import FilesError, ForeignError
 from taichi_msm.exports import obj
 from taichi_msm.exports.export import export
@@ -336,9 +335,3 @@ def test_the_command_says_that_it_was_interrupted(
     assert done.returncode == 130
     message(done.stderr)
     assert json.loads(done.stdout)["status"] == "interrupted"
-
-
-def test_a_long_export_says_how_far_it_is(results: Path, program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(console, "LINE_INTERVAL_S", 0.0)
-    assert "exporting: 3 of 5 done, about " in program("export", str(results), "--format", "obj").stderr
-    assert program("export", str(results), "--format", "obj", "--quiet").stderr == ""

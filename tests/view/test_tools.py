@@ -112,13 +112,3 @@ def test_what_it_is_asked_for_last_is_its_goal() -> None:
     assert hand.target == (0.7, 0.2)
     hand.move((0.8, 0.2))
     assert hand.target == (0.8, 0.2)
-
-
-def test_what_was_asked_for_is_forgotten_at_rest() -> None:
-    hand = tool()
-    hand.press((0.2, 0.2), 1)
-    hand.advance(0)
-    hand.reset()
-    assert not hand.engaged
-    assert percents(hand, 0, 2) == [0, 0]
-    assert hand.recorded_probe(2).load == ((0.0, 0.0), (2 / RATE, 0.0))
