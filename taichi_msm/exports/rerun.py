@@ -40,16 +40,15 @@ from taichi_msm.runs.arrays import read_flo
 from taichi_msm.runs.finished import FinishedRun, reading
 from taichi_msm.scene.outputs import OUTPUTS
 
+try:
+    import rerun
+except ImportError:
+    raise NotInstalledError("--format rerun: needs rerun-sdk, which is not installed; pip install rerun-sdk") from None
+
 
 @one_path_per_run(".rrd")
 def write(run: FinishedRun, path: Path, progress: ProgressCallback) -> list[str]:
     """Write a recording of a run; arguments as for `one_path_per_run`."""
-    try:
-        import rerun
-    except ImportError:
-        raise NotInstalledError(
-            "--format rerun: needs rerun-sdk, which is not installed; pip install rerun-sdk"
-        ) from None
     # The viewer merges recordings with the same identity.
     identity = uuid5(NAMESPACE_URL, run.directory.resolve().as_uri())
     with rerun.RecordingStream("taichi_msm", recording_id=identity) as recording:
@@ -77,8 +76,6 @@ def _views(run: FinishedRun) -> dict[str, FinishedRun]:
 
 
 def _log_run(run: FinishedRun, recording: Any, progress: ProgressCallback) -> None:
-    import rerun
-
     positions, views = run.positions(), _views(run)
     tracks = next((read_track_positions(each)[1] for each in views.values() if each.has_output("tracks")), None)
     # Distinct colours; the hues of successive points are 0.618 turns apart.
@@ -109,8 +106,6 @@ def _log_run(run: FinishedRun, recording: Any, progress: ProgressCallback) -> No
 
 def _mesh(run: FinishedRun, position: NDArray[np.floating], *, is_first: bool) -> Any:
     """Build the mesh of the first frame, or the vertices of a later one, for which the viewer keeps the rest."""
-    import rerun
-
     vertices: dict[str, Any] = {"vertex_positions": position.reshape(-1, 3), "vertex_normals": unit_normals(position)}
     if not is_first:
         return rerun.Mesh3D.from_fields(**vertices)
@@ -124,16 +119,12 @@ def _mesh(run: FinishedRun, position: NDArray[np.floating], *, is_first: bool) -
 
 def _pinhole(view: View) -> tuple[Any, Any]:
     """Build pose and projection of a camera, in OpenCV's axes."""
-    import rerun
-
     pose = rerun.Transform3D(translation=view.eye, mat3x3=(view.axes * OPENCV_SIGNS).T)
     matrix, size = calibration(view)["intrinsics"], view.size.tolist()
     return pose, rerun.Pinhole(image_from_camera=matrix, resolution=size, camera_xyz=rerun.ViewCoordinates.RDF)
 
 
 def _log_pictures(run: FinishedRun, frame: int, entity: str, recording: Any) -> None:
-    import rerun
-
     if run.has_output("png"):
         picture = rerun.EncodedImage(contents=read_picture_file(run, "png", frame), media_type="image/png")
         recording.log(f"{entity}/picture", picture)
