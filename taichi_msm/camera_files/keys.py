@@ -50,7 +50,7 @@ class Keys:
         return numbers
 
     def require(self, spelling: str, count: int, name: str) -> list[float]:
-        """Return a count of numbers of a required key, which messages call `name`."""
+        """Return the numbers of a required key, of which there must be `count`; `name` is for messages."""
         numbers = self.numbers(spelling)
         if numbers is None or len(numbers) != count:
             fault = f"has no {name}" if numbers is None else f"{name}: {len(numbers)} numbers, where {count} belong"

@@ -261,7 +261,10 @@ def _pin(pool: list[int]) -> None:
 
 @contextlib.contextmanager
 def _isolated_environment() -> Iterator[None]:
-    """Hide environment variables that override arguments of `ti.init`, and its line on stdout, not other threads'."""
+    """Hide environment variables that override arguments of `ti.init`, and suppress its line on stdout.
+
+    stdout itself is not redirected, because other threads may print meanwhile.
+    """
     prefix, namespace = f"{active_compiler().prefix}_", vars(ti.lang.misc)
     # Directories and the choice of a GPU are no arguments.
     kept = tuple(prefix + name for name in ("OFFLINE_CACHE_FILE_PATH", "VISIBLE_DEVICE", "LIB_DIR", "SKIP_"))

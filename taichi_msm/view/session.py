@@ -44,7 +44,9 @@ def divide_frames(plan: Plan) -> tuple[Plan, int]:
     """Divide the frames of a scene into equal subframes, at most `MAX_FRAME_RATE` per second.
 
     With `precision: auto` they are in f32, which takes half the time: a session steps all the time, unlike a run.
-    Returns the plan with subframes as frames, and their number per frame of the scene.
+
+    Returns:
+        The plan with subframes as frames, and the number of subframes per frame of the scene.
     """
     scene = plan.scene
     subframes = max(1, int(MAX_FRAME_RATE / scene.time.frames_per_second * (1 + 1e-9)))

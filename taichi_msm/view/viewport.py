@@ -78,7 +78,7 @@ class Viewport:
         self.render = self.render.model_copy(update={"wireframe": not self.render.wireframe})
 
     def draw(self, positions: NDArray[Any], instruments: Sequence[Solid] = ()) -> Picture:
-        """Draw the sheet at positions [m], shape (rows, cols, 3), and instruments, shape (height, width, 3)."""
+        """Return the picture of the sheet at positions [m], shape (rows, cols, 3), and of instruments."""
         return self._renderer.draw(Shot(positions, self.view, instruments), self.render)
 
     def project(self, point: NDArray[np.floating]) -> tuple[float, float] | None:
