@@ -221,7 +221,7 @@ class MotionAdjoint:
 
     def _sweep_block(self, first: int, end: int, by_frame: Array, loads: LoadGradient, pause: Pause) -> Array:
         """Sweep backward over a block of segments; return the work of the loads on p after step 0 and in step 0."""
-        table, h = self._forward.sheet.step_table(first, end - first), self.plan.grid.step
+        table, h = self._forward.step_table(first, end - first), self.plan.grid.step
         by_slot = np.zeros((end - first, len(self.plan.slots), LOAD_DERIVATIVES))
         at = end
         for begin in reversed(range(first, end, self._segment)):
@@ -242,7 +242,7 @@ class MotionAdjoint:
         return np.array([work[int(first == 0) :].sum(), work[: int(first == 0)].sum()])
 
     def _store_checkpoint(self, segment: int) -> None:
-        arrays, sheet, first = self._arrays, self._forward.sheet.kernel.arrays, segment * self._shape_entries
+        arrays, sheet, first = self._arrays, self._forward.kernel.arrays, segment * self._shape_entries
         self._copy_shape(0, first, sheet.u, arrays.checkpoints)
         self._copy_shape(0, first, sheet.d, arrays.checkpoint_differences)
 
@@ -312,7 +312,7 @@ class MotionAdjoint:
     @property
     def _sheet_arrays(self) -> tuple[Any, ...]:
         """Read-only arrays of the sheet."""
-        arrays = self._forward.sheet.kernel.arrays
+        arrays = self._forward.kernel.arrays
         return arrays.constants, arrays.by_column, arrays.stiffness, arrays.fields
 
     def _max_launch_steps(self) -> int:

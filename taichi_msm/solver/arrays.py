@@ -20,15 +20,16 @@ results for such vectors. Unary minus, `-=`, abs, any and all are therefore not 
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.solver.state import State
-from taichi_msm.system.runtime import Memory, ti, write_vectors
+from taichi_msm.system.runtime import Memory, compilation_options, ti, write_vectors
 from taichi_msm.terms.base import AREA_SHARE, GAIN, MOBILITY, SQUARED_MOTION, KernelConfig, KernelSheet
 
 NUMBER_BYTES = {"f32": 4, "f64": 8}
@@ -159,26 +160,31 @@ class SheetArrays:
         return self._memory.array(self._layout.config.precision, self._layout.config.lanes, count * self._layout.width)
 
 
-class SheetKernel(Protocol):
+class SheetKernel:
     """A sheet in the memory of a device, with the kernel that reads it."""
 
     arrays: SheetArrays
+    _layout: SheetLayout
+    _read: Callable[..., None]  # built by `build_read`
+    _top_row = 0  # row of u that contains the first row of the sheet
 
     def read(self, differences: bool, values: NDArray[Any], measures: NDArray[Any]) -> None:
-        """Read displacements or last differences, and measure every row.
+        """Read displacements or last differences (at rest, forces), and measure every row.
 
         Args:
             differences: whether to read last differences instead of displacements.
-            values: output [m], shape (rows, cols, 3).
+            values: output [m], at rest of forces [N], shape (rows, cols, 3).
             measures: output, shape (rows, measures).
         """
+        layout = self._layout
+        with compilation_options():
+            self._read(self._top_row, layout.rows, layout.cols, differences, values, measures, *self.arrays.all)
 
 
-class StepKernel(SheetKernel, Protocol):
+class StepKernel(SheetKernel, ABC):
     """A sheet in the memory of a device, with the kernels that step and read it."""
 
-    def __init__(self, layout: SheetLayout, start: InitialData) -> None: ...
-
+    @abstractmethod
     def advance(self, count: int, table: NDArray[Any]) -> None:
         """Advance the sheet by a number of steps.
 
@@ -187,6 +193,7 @@ class StepKernel(SheetKernel, Protocol):
             table: rows of the load table, shape (count, columns).
         """
 
+    @abstractmethod
     def compile(self, table: NDArray[Any]) -> None:
         """Compile all kernels without taking a step."""
 

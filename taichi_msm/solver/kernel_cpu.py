@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.solver.arrays import NUMBER_BYTES, InitialData, SheetArrays, SheetLayout, build_read
+from taichi_msm.solver.arrays import NUMBER_BYTES, InitialData, SheetArrays, SheetLayout, StepKernel, build_read
 from taichi_msm.solver.backoff import Backoff
 from taichi_msm.solver.bands import (
     COUNTER_STRIDE,
@@ -37,8 +37,8 @@ PAGE = 4096
 MAX_CHECKS = round(1.32e-3 / active_compiler().poll_s)
 
 
-class ScatterKernel:
-    """A `StepKernel` in the memory of a CPU."""
+class ScatterKernel(StepKernel):
+    """A sheet in the memory of a CPU."""
 
     def __init__(self, layout: SheetLayout, start: InitialData) -> None:
         self._layout = layout
@@ -59,7 +59,7 @@ class ScatterKernel:
         self._progress = np.zeros(layout.workers * WORKER_STRIDE, np.int64)
 
     def advance(self, count: int, table: NDArray[Any]) -> None:
-        """Advance the sheet by a number of steps, see `StepKernel.advance`."""
+        """Advance the sheet by a number of steps."""
         if self._layout.workers == 1:
             self._advance_alone(0, count, table)
             return
@@ -76,11 +76,6 @@ class ScatterKernel:
         if self._layout.workers > 1:
             self._launch_together(0, 0, table)
             self._copy_borders()
-
-    def read(self, differences: bool, values: NDArray[Any], measures: NDArray[Any]) -> None:
-        """Read displacements or last differences, and measure every row, see `StepKernel.read`."""
-        with compilation_options():
-            self._read(0, self._layout.rows, self._layout.cols, differences, values, measures, *self.arrays.all)
 
     def _advance_alone(self, first: int, end: int, table: NDArray[Any]) -> None:
         """Advance with a single worker from step `first` to step `end`."""

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.solver.arrays import InitialData, SheetArrays, SheetLayout, build_point_step, build_read
+from taichi_msm.solver.arrays import InitialData, SheetArrays, SheetLayout, StepKernel, build_point_step, build_read
 from taichi_msm.system.runtime import compilation_options, ti
 from taichi_msm.terms.base import DX, DY, HAS_LEFT, HAS_RIGHT, Entry, KernelConfig, KernelRow, KernelSheet
 from taichi_msm.terms.bending import BendingTerm
@@ -23,33 +23,28 @@ from taichi_msm.terms.springs import SpringTerm
 STEPS_PER_LAUNCH = 8
 
 
-class GatherKernel:
-    """A `StepKernel` in the memory of a GPU."""
+class GatherKernel(StepKernel):
+    """A sheet in the memory of a GPU."""
 
     def __init__(self, layout: SheetLayout, start: InitialData) -> None:
         self._layout = layout
         self._advance, self._read = _kernels(layout.config)
         # Index of the buffer of u_n. Each buffer has a halo of one row above and below.
-        self._now = 0
+        self._now, self._top_row = 0, 1
         buffer = np.pad(np.arange(layout.rows, dtype=np.int32), 1, constant_values=-1)
         moments = np.full(0 if layout.config.get(BendingTerm) is None else layout.rows + 2, -1, np.int32)
         self.arrays = SheetArrays(layout, np.concatenate([buffer, buffer, moments]), start)
 
     def advance(self, count: int, table: NDArray[Any]) -> None:
-        """Advance the sheet by at most STEPS_PER_LAUNCH steps, see `StepKernel.advance`."""
+        """Advance the sheet by at most STEPS_PER_LAUNCH steps."""
         with compilation_options():
             self._advance(self._now, count, self._layout.rows, self._layout.cols, table, *self.arrays.all)
         self._now = (self._now + count) % 2
+        self._top_row = self._now * (self._layout.rows + 2) + 1
 
     def compile(self, table: NDArray[Any]) -> None:
         """Compile all kernels without taking a step."""
         self.advance(0, table)
-
-    def read(self, differences: bool, values: NDArray[Any], measures: NDArray[Any]) -> None:
-        """Read displacements or last differences, and measure every row, see `StepKernel.read`."""
-        first, layout = self._now * (self._layout.rows + 2) + 1, self._layout
-        with compilation_options():
-            self._read(first, layout.rows, layout.cols, differences, values, measures, *self.arrays.all)
 
 
 @cache

@@ -27,7 +27,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.solver.arrays import InitialData, SheetArrays, SheetLayout, build_read, point_forces, to_lanes
+from taichi_msm.solver.arrays import (
+    InitialData,
+    SheetArrays,
+    SheetKernel,
+    SheetLayout,
+    build_read,
+    point_forces,
+    to_lanes,
+)
 from taichi_msm.solver.bands import MOMENT_ROWS, RowBand, build_join_strips, build_step_row
 from taichi_msm.system.runtime import compilation_options, ti, write_vectors
 from taichi_msm.terms.base import MOBILITY, Entry, KernelConfig, KernelRow, KernelSheet, RestCorrection
@@ -69,7 +77,7 @@ class RestSheet(NamedTuple):
     work: Any  # 1 / M of every mass point [m/N], followed by SUMS rows of reductions
 
 
-class Relaxation:
+class Relaxation(SheetKernel):
     """A sheet in the memory of a CPU, and the kernels that find its equilibrium.
 
     Args:
@@ -129,17 +137,6 @@ class Relaxation:
         with compilation_options():
             self._scale_kernel(self._layout.rows, self._layout.width, largest, row, *self.arrays.all)
         return float(np.sqrt(largest[0]))
-
-    def read(self, differences: bool, values: NDArray[Any], measures: NDArray[Any]) -> None:
-        """Read displacements or forces, and measure every row.
-
-        Args:
-            differences: whether to read forces [N] instead of displacements [m].
-            values: output, shape (rows, cols, 3).
-            measures: output, shape (rows, measures).
-        """
-        with compilation_options():
-            self._read(0, self._layout.rows, self._layout.cols, differences, values, measures, *self.arrays.all)
 
 
 @cache

@@ -26,16 +26,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import DivergedError, MsmError, Pause
+from taichi_msm.errors import DivergedError, Pause
 from taichi_msm.model.loads import evaluate_frame_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.tools import Clamp
 from taichi_msm.scene.section import MIN_MAGNITUDE
 from taichi_msm.solver.arrays import InitialData, SheetLayout
-from taichi_msm.solver.dynamics import Dynamics, choose_layout
+from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.solver.kernel_rest import Relaxation
-from taichi_msm.solver.planned_sheet import PlannedSheet
 from taichi_msm.solver.sheet_solver import SheetSolver
 from taichi_msm.solver.state import Reading, State, largest_displacement
 from taichi_msm.system.runtime import Device
@@ -60,46 +59,25 @@ EVALUATIONS_PER_LAUNCH, POINT_EVALUATIONS_PER_LAUNCH = 64, 40_000_000
 Array = NDArray[np.float64]
 
 
-class QuasiStatics:
-    """The sheet in quasi-static motion, a `SheetSolver`; a frame counts as a step.
-
-    Args:
-        plan: the plan.
-        device: the device.
-        layout: replaces the layout chosen by `choose_layout`, for tests.
-        cores: largest number of CPU cores; by default all available cores.
+class QuasiStatics(SheetSolver[Relaxation]):
+    """The sheet in quasi-static motion; a frame counts as a step.
 
     Attributes:
-        layout: the memory layout, and the configuration of the kernels.
-        steps_done: number of the last frame found.
         evaluations: number of evaluations of the forces for the last frame.
-        residual: largest residual force of the last frame, relative to the largest force.
+        residual: of the last frame, relative to the largest force.
     """
 
-    def __init__(self, plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> None:
-        self._device, self._given_layout, self._cores = device, layout, cores
-        self._sheet: PlannedSheet[Relaxation] | None = None
-        self.restart(plan)
-
     def restart(self, plan: Plan, state: State | None = None) -> None:
-        """Restart with the same or another plan.
-
-        Args:
-            plan: the plan.
-            state: state to continue from; by default the first call of `advance` also finds the first frame.
-        """
+        """Restart with the same or another plan, see `SheetSolver.restart`."""
         self.evaluations, self.residual = 0, 0.0
+        # Without a state the first call of `advance` also finds the first frame.
         self._last_frame, self._interrupted = state, False
-        self.layout = self._given_layout or choose_layout(plan, self._device, self._cores)
-        self.steps_done = 0 if state is None else state.steps
         # A mass point without stiffness would have mass 0.
         self._masses = np.maximum(fictitious_masses(plan), MIN_MAGNITUDE)
-        self._sheet = None  # Frees its memory before the new sheet is allocated.
-        self._sheet = PlannedSheet(plan, self.layout, self._build_kernel, state)
+        super().restart(plan, state)
 
-    def steer(self, plan: Plan) -> None:
-        """Continue with a plan that differs in its probes only, see `PlannedSheet.steer`."""
-        self.sheet.steer(plan)
+    def _build_kernel(self, start: InitialData) -> Relaxation:
+        return Relaxation(self.layout, start, self._masses)
 
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
         """Find the equilibria of the next frames, and of the first frame if it is still missing.
@@ -116,19 +94,15 @@ class QuasiStatics:
             frame = self.steps_done + (self._last_frame is not None)
             self._settle(frame, pause)
             self.steps_done = frame
-            displacement = self.sheet.read_arrays(differences=False)[0]
-            self._last_frame = State(frame, displacement, np.zeros_like(displacement), self.sheet.read_memory())
+            displacement = self._read_arrays(differences=False)[0]
+            self._last_frame = State(frame, displacement, np.zeros_like(displacement), self._read_memory())
 
     def compile(self) -> None:
         """Compile all kernels without moving a mass point."""
-        row = self.sheet.load_table(evaluate_frame_loads(self.plan, 0), 0)
-        self._relaxation.relax(0, 0.0, row)
-        self._relaxation.scale(row)
+        row = self.load_table(evaluate_frame_loads(self.plan, 0), 0)
+        self.kernel.relax(0, 0.0, row)
+        self.kernel.scale(row)
         self.displacement()
-
-    def displacement(self) -> Array:
-        """Read the displacements x - X [m], shape (rows, cols, 3)."""
-        return self.read().displacement
 
     def state(self) -> State:
         """Return the state of the last frame found, on which the next frames depend."""
@@ -136,7 +110,7 @@ class QuasiStatics:
 
     def read(self) -> Reading:
         """Read the displacements and measure the sheet; its energy is that of springs and bending."""
-        reading = self.sheet.read(self.steps_done, moving=False)
+        reading = self._measure(moving=False)
         return reading._replace(residual=self.residual, evaluations=self.evaluations)
 
     def tool_forces(self) -> Array:
@@ -144,7 +118,7 @@ class QuasiStatics:
 
         It is opposite to the sum of all other forces on the mass points that the tool touches or holds.
         """
-        touched, force = self._touched().astype(float), self.sheet.read_arrays(differences=True)[0]
+        touched, force = self._touched().astype(float), self._read_arrays(differences=True)[0]
         # Subtraction from 0 avoids -0.
         return 0.0 - np.einsum("tij,ijk->tk", touched, force)
 
@@ -164,39 +138,11 @@ class QuasiStatics:
 
     def _read_contact(self) -> Array:
         """Read the memory of contact, shape (numbers, rows, cols)."""
-        return self.sheet.read_memory()[self._contact]
+        return self._read_memory()[self._contact]
 
     def _write_contact(self, memory: Array) -> None:
         """Write the memory of contact, shape (numbers, rows, cols)."""
-        self._relaxation.arrays.set_fields(self.layout.config.first_field(ContactTerm), memory)
-
-    def close(self) -> None:
-        """Release the memory."""
-        self._sheet = None
-
-    @property
-    def sheet(self) -> PlannedSheet[Relaxation]:
-        """The sheet in memory."""
-        if self._sheet is None:
-            raise MsmError("interrupted while the sheet was restarted; restart the scene")
-        return self._sheet
-
-    @property
-    def plan(self) -> Plan:
-        """The current plan."""
-        return self.sheet.plan
-
-    @property
-    def inconsistent(self) -> bool:
-        """Whether an exception interrupted `restart`."""
-        return self._sheet is None
-
-    def _build_kernel(self, layout: SheetLayout, start: InitialData) -> Relaxation:
-        return Relaxation(layout, start, self._masses)
-
-    @property
-    def _relaxation(self) -> Relaxation:
-        return self.sheet.kernel
+        self.kernel.arrays.set_fields(self.layout.config.first_field(ContactTerm), memory)
 
     @property
     def _last_state(self) -> State:
@@ -210,7 +156,7 @@ class QuasiStatics:
     def _settle(self, frame: int, pause: Pause) -> None:
         """Find the equilibrium of a frame."""
         self.evaluations = 0
-        relaxation, before, loads = self._relaxation, self._last_state, evaluate_frame_loads(self.plan, frame)
+        relaxation, before, loads = self.kernel, self._last_state, evaluate_frame_loads(self.plan, frame)
         tools, contact_before = self.plan.tools, before.memory[self._contact]
         contact = memory_after_grips(self.plan, frame, before.displacement, contact_before)
         held_before, held = grips(tools, contact_before), grips(tools, contact)
@@ -221,7 +167,7 @@ class QuasiStatics:
         self._interrupted, residual, rough = True, 0.0, any(tool.rough for tool in tools)
         *_, end = times = self._shape_times(frame)
         for start, time in pairwise(times):
-            row = self.sheet.load_table(loads, frame)
+            row = self.load_table(loads, frame)
             set_tools(self.plan, frame, time, row[0, self._contact_column :])
             # After a release the flat shape is tried even if a tool is in the way.
             free = not (loads.strength.any() or held or self._is_clamp_displaced(time))
@@ -242,16 +188,16 @@ class QuasiStatics:
         config = self.layout.config
         changing = [term for term in config.terms if term.mark_update(row[0, config.first_column(type(term)) :])]
         if changing:
-            self._relaxation.relax(1, math.inf, row)
+            self.kernel.relax(1, math.inf, row)
 
     def _stick(self, frame: int, times: tuple[float, float], row: NDArray[Any], pause: Pause) -> None:
         """Let the mass points stick that rough tools reach between the current shape and the next one."""
-        plan, memory, start = self.plan, self._read_contact(), self.sheet.read_arrays(differences=False)[0]
+        plan, memory, start = self.plan, self._read_contact(), self._read_arrays(differences=False)[0]
         after = stick(plan, memory, start, start, times)
         if stuck_points(plan, memory).any() and (after != memory).any():
             # To second order, mass points move as on a sheet that no further tool touches until they stick.
             self._relax(frame, without_rough_tools(plan, row, self._contact_column), PERTURBATION_TOLERANCE, pause)
-            after = stick(plan, memory, start, self.sheet.read_arrays(differences=False)[0], times)
+            after = stick(plan, memory, start, self._read_arrays(differences=False)[0], times)
         self._write_contact(after)
 
     def _balance(self, frame: int, row: NDArray[Any], tolerance: float, pause: Pause, *, free: bool) -> float:
@@ -263,16 +209,16 @@ class QuasiStatics:
     def _release(self, time: float, row: NDArray[Any], tolerance: float) -> float:
         """Release mass points on which rough tools pull by more than a tolerance; return the largest relative pull."""
         memory = self._read_contact()
-        shape, force = (self.sheet.read_arrays(differences=forces)[0] for forces in (False, True))
+        shape, force = (self._read_arrays(differences=forces)[0] for forces in (False, True))
         pulls = compute_pulls(self.plan, memory, shape, force, time)
-        largest = float(pulls.max()) / max(MIN_FORCE_N, self._relaxation.scale(row))
+        largest = float(pulls.max()) / max(MIN_FORCE_N, self.kernel.scale(row))
         if largest > tolerance:
             self._write_contact(release(self.plan, memory, pulls))
         return largest
 
     def _meets_tool(self, time: float) -> bool:
         """Return whether a tool at a time [s] touches the current sheet."""
-        position = rest_positions(self.plan.scene.sheet) + self.sheet.read_arrays(differences=False)[0]
+        position = rest_positions(self.plan.scene.sheet) + self._read_arrays(differences=False)[0]
         return any(tool.touches(position[~self.plan.fixed], time) for tool in self.plan.tools)
 
     def _is_clamp_displaced(self, time: float) -> bool:
@@ -282,7 +228,7 @@ class QuasiStatics:
 
     def _try_flat(self, row: NDArray[Any]) -> bool:
         """Return whether the flat shape is an equilibrium; if so, keep it."""
-        relaxation, shape = self._relaxation, self.sheet.read_arrays(differences=False)[0]
+        relaxation, shape = self.kernel, self._read_arrays(differences=False)[0]
         relaxation.place(np.zeros_like(shape))
         count, force = relaxation.relax(1, 0.0, row)
         self.evaluations += count
@@ -299,7 +245,7 @@ class QuasiStatics:
 
     def _relax(self, frame: int, row: NDArray[Any], tolerance: float, pause: Pause) -> float:
         """Iterate until the residual, relative to the largest force, is below a tolerance; return it."""
-        relaxation, longer = self._relaxation, max(self.layout.rows, self.layout.cols)
+        relaxation, longer = self.kernel, max(self.layout.rows, self.layout.cols)
         relaxation.stop()
         points = self.layout.rows * self.layout.cols
         per_launch = max(1, min(EVALUATIONS_PER_LAUNCH, POINT_EVALUATIONS_PER_LAUNCH // points))
@@ -346,12 +292,12 @@ class QuasiStatics:
         # This generator returns the same numbers in every version of NumPy.
         noise = 2 * np.random.RandomState(0).random_sample((rows, cols, 3)) - 1
         moves = (~self.plan.fixed / self._masses)[..., None]
-        self._relaxation.place(self.sheet.read_arrays(differences=False)[0] + force * noise * moves)
+        self.kernel.place(self._read_arrays(differences=False)[0] + force * noise * moves)
 
     def _diverged(self, frame: int, residual: float, evaluations: int) -> DivergedError:
         """Build the error of an iteration that did not converge."""
         plan, time = self.plan, frame / self.plan.grid.frames_per_second
-        row, column, *_ = largest_displacement(self.sheet.read_arrays(differences=True)[0])
+        row, column, *_ = largest_displacement(self._read_arrays(differences=True)[0])
         remedy = (
             "the sheet may hang slack, fold or wrinkle; give it a foundation, pretension or bending, or take less load"
         )
@@ -369,6 +315,6 @@ class QuasiStatics:
 
 def build_dynamics(
     plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None
-) -> SheetSolver:
+) -> SheetSolver[Any]:
     """Build the dynamic or quasi-static solver of a plan, with the arguments of `Dynamics`."""
     return (QuasiStatics if plan.scene.time.at_rest else Dynamics)(plan, device, layout, cores)

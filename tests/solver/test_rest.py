@@ -18,8 +18,9 @@ from taichi_msm.model.tools import path_warnings
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.arrays import SheetLayout
-from taichi_msm.solver.dynamics import Dynamics, choose_layout
+from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.solver.rest import FORCE_TOLERANCE, QuasiStatics
+from taichi_msm.solver.sheet_solver import choose_layout
 from taichi_msm.system.runtime import Device
 from tests import reference
 from tests.golden import Messages

@@ -20,9 +20,9 @@ from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.surface import place_instruments
 from taichi_msm.model.tools import Clamp, overlap, path_warnings
 from taichi_msm.scene.scene import Scene
-from taichi_msm.solver.dynamics import choose_layout
 from taichi_msm.solver.planning import try_plan
 from taichi_msm.solver.rest import QuasiStatics
+from taichi_msm.solver.sheet_solver import choose_layout
 from taichi_msm.solver.state import State
 from taichi_msm.system.runtime import Device
 from tests import reference

@@ -17,8 +17,8 @@ from taichi_msm.runs.run import resume, run
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.tools import Probe
-from taichi_msm.solver.dynamics import choose_layout
 from taichi_msm.solver.rest import FORCE_TOLERANCE, QuasiStatics
+from taichi_msm.solver.sheet_solver import choose_layout
 from taichi_msm.solver.state import RunProgress
 from taichi_msm.system.runtime import Device
 from taichi_msm.terms.locking import make_stiffening
