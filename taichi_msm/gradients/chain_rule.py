@@ -91,16 +91,7 @@ class Derivatives:
 
 
 def scene_derivatives(plan: Plan, gradient: SheetGradient, loads: LoadGradient) -> Derivatives:
-    """Apply the chain rule.
-
-    Args:
-        plan: plan of the scene.
-        gradient: derivatives with respect to the coefficients of the sheet.
-        loads: derivatives with respect to the loads.
-
-    Returns:
-        Derivatives with respect to the numbers of the scene.
-    """
+    """Apply the chain rule to derivatives with respect to the coefficients of a sheet and to its loads."""
     material, kind = plan.material, plan.scene.kind
     assert material.factors is not None
     by_coefficient = _coefficient_gradient(plan, gradient)
@@ -126,11 +117,7 @@ def _sheet_coefficients(plan: Plan, scene: Scene) -> NDArray[Any]:
 
 
 def _coefficient_gradient(plan: Plan, gradient: SheetGradient) -> Array:
-    """Return the derivatives with respect to the coefficients of a sheet.
-
-    They are across, down, shear, tension, virtual, bending, lock and factor of the springs and of the foundation, keep
-    and both gains.
-    """
+    """Return the derivatives with respect to the coefficients of a sheet, in the order of `_sheet_coefficients`."""
     material = plan.material
     assert material.factors is not None
     unit = spring_stiffness(replace(material, across=1.0, down=1.0, shear=1.0), material.factors)
@@ -207,11 +194,7 @@ def _with_value(section: Any, path: tuple[str, ...], value: complex) -> Any:
 
 
 class LoadGradient:
-    """Derivatives of a loss with respect to the loads of the probes, accumulated over blocks of steps.
-
-    Attributes:
-        by_key: derivatives by key, as in `Derivatives`.
-    """
+    """Derivatives with respect to the loads, accumulated over blocks of steps; `by_key` is as in `Derivatives`."""
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan

@@ -155,17 +155,7 @@ Loss = Callable[[Array], tuple[float, Array]]
 
 @dataclass(frozen=True)
 class Gradient(Derivatives):
-    """Value of a loss, and its derivatives with respect to the numbers of a scene.
-
-    Attributes:
-        numbers: derivatives by key: material numbers other than 0, such as tissue.young; the components of a force,
-            such as probes.0.total, shape (3,); the percents of a load, such as probes.0.load, shape (keyframes,); and
-            across and down of a control point, such as probes.0.at, shape (2,), or (keyframes, 2) for a moving one.
-        maps: derivatives with respect to the factors of maps: tissue.map or springs.map, of cells, shape (rows - 1,
-            cols - 1); with a foundation also tissue.foundation_map, of mass points, shape (rows, cols). A scene without
-            such a map has the factor 1 everywhere.
-        value: value of the loss.
-    """
+    """Value of a loss, and its derivatives with respect to the numbers of a scene, see `Derivatives`."""
 
     value: float
 

@@ -115,13 +115,7 @@ class LoadTables(NamedTuple):
 def adjoint_kernels(code: KernelConfig, *, parallel: bool) -> tuple[Callable[..., None], Callable[..., None]]:
     """Build the kernel that steps forward and stores all displacements, and the one that sweeps backward.
 
-    Args:
-        code: compile-time configuration of the steps.
-        parallel: whether the workers run in parallel.
-
-    Returns:
-        Both kernels. They share the arguments `sizes` (int64, shape (11,), at the indices from `COUNT` on) and
-        `progress` (int64, `STRIDE` per worker).
+    They share the arguments `sizes` (int64, indices from `COUNT` on) and `progress` (int64, `STRIDE` per worker).
     """
     return _build_store(code, parallel=parallel), _build_sweep(code, parallel=parallel)
 

@@ -66,9 +66,7 @@ Array = NDArray[np.float64]
 def segment_steps(steps: int, shape_bytes: int) -> int:
     """Return the length of a segment [steps]. Its displacements and all checkpoints need about equal memory.
 
-    Args:
-        steps: number of steps of the run.
-        shape_bytes: memory of the displacements of a step [bytes], half of that of a checkpoint.
+    `shape_bytes` is the memory of the displacements of a step, half of that of a checkpoint.
     """
     return min(steps, max(math.ceil(math.sqrt(2 * steps)), SEGMENT_BYTES // shape_bytes))
 
@@ -103,14 +101,7 @@ class _Arrays(NamedTuple):
 
 
 class MotionAdjoint:
-    """Dynamic sheet and its adjoint.
-
-    Args:
-        plan: the plan, in f64 and with a stiffness map.
-        device: a CPU.
-        layout: replaces the layout chosen by `choose_layout`, for tests.
-        cores: number of CPU cores; None for all.
-    """
+    """Dynamic sheet and its adjoint, of a plan in f64 with a stiffness map; for `layout` see `SheetSolver`."""
 
     def __init__(self, plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> None:
         self._forward, self._backoff = Dynamics(plan, device, layout, cores), Backoff()
@@ -166,11 +157,7 @@ class MotionAdjoint:
     def run(self, pause: Pause = lambda: None) -> Array:
         """Run all steps and store the checkpoints.
 
-        Args:
-            pause: called several times a second; an exception from it ends the run.
-
-        Returns:
-            Displacements at every frame [m], shape (F + 1, rows, cols, 3).
+        Returns the displacements at every frame [m], shape (F + 1, rows, cols, 3).
 
         Raises:
             DivergedError: when the sheet diverges.
@@ -192,16 +179,7 @@ class MotionAdjoint:
         return frames
 
     def backward(self, by_frame: Array, pause: Pause = lambda: None) -> tuple[SheetGradient, LoadGradient]:
-        """Sweep the adjoint of the last `run` backward in time.
-
-        Args:
-            by_frame: derivative of the loss with respect to the displacements at every frame, shape (F + 1, rows, cols,
-                3).
-            pause: called several times a second; an exception from it ends the sweep.
-
-        Returns:
-            Derivatives with respect to the coefficients of the sheet, and to its loads.
-        """
+        """Sweep the adjoint of the last `run` backward in time, see `Adjoint.backward`."""
         grid, layout, arrays = self.plan.grid, self.layout, self._arrays
         _, gain, _ = coefficients(self.plan)
         shares = area_shares(self.plan.scene.sheet) if layout.config.by_area else np.ones((layout.rows, layout.cols))

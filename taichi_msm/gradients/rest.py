@@ -48,13 +48,7 @@ class RestAdjoint:
         self._sheet.restart(plan)
 
     def run(self, pause: Pause) -> Array:
-        """Solve all frames.
-
-        Args:
-            pause: called several times a second; an exception from it ends the run.
-
-        Returns:
-            Displacements at every frame [m], shape (F + 1, rows, cols, 3).
+        """Solve all frames; return the displacements at every frame [m], shape (F + 1, rows, cols, 3).
 
         Raises:
             DivergedError: when a frame has no equilibrium.
@@ -68,15 +62,7 @@ class RestAdjoint:
         return self._displacements.copy()
 
     def backward(self, by_frame: Array, pause: Pause) -> tuple[SheetGradient, LoadGradient]:
-        """Differentiate a loss at the last `run`.
-
-        Args:
-            by_frame: derivative of the loss with respect to the displacements at every frame, shape (F + 1, rows, cols,
-                3).
-            pause: called several times a second; an exception from it ends the differentiation.
-
-        Returns:
-            Derivatives with respect to the coefficients of the sheet, and to its loads.
+        """Differentiate a loss at the last `run`, see `Adjoint.backward`.
 
         Raises:
             MsmError: when the tangent stiffness is singular.

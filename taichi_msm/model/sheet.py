@@ -95,7 +95,7 @@ Maps = Mapping[str, MapImage]
 
 
 class LockNumbers(NamedTuple):
-    """Numbers of a law that locks, see `terms.locking`."""
+    """Numbers of a law that locks, see `terms.law`."""
 
     lock: float  # m: strain of a spring; of the foundation a depth [m]
     factor: float  # largest tangent stiffness, relative to the initial one

@@ -69,14 +69,9 @@ class InitialData(NamedTuple):
 
 
 def to_lanes(layout: SheetLayout, values: NDArray[Any]) -> NDArray[Any]:
-    """Arrange rows of values in lanes with halo, in the precision of the kernels.
+    """Arrange rows of values, shape (..., cols), in lanes with halo, in the precision of the kernels.
 
-    Args:
-        layout: layout of the sheet.
-        values: shape (..., cols); values too large for the precision become infinite.
-
-    Returns:
-        Entries, shape (entries, lanes); 0 where an entry has no column.
+    Values too large for the precision become infinite. Entries without a column are 0; shape (entries, lanes).
     """
     column = np.arange(layout.config.lanes) * layout.strip + np.arange(-1, layout.strip + 1)[:, None]
     inside = (column >= 0) & (column < layout.cols)
@@ -87,16 +82,7 @@ def to_lanes(layout: SheetLayout, values: NDArray[Any]) -> NDArray[Any]:
 
 
 def from_lanes(layout: SheetLayout, entries: NDArray[Any], rows: int) -> NDArray[Any]:
-    """Arrange entries in rows, the inverse of `to_lanes`.
-
-    Args:
-        layout: layout of the sheet.
-        entries: shape (entries, lanes).
-        rows: number of rows to return.
-
-    Returns:
-        Values, shape (rows, cols).
-    """
+    """Arrange entries, shape (entries, lanes), in a number of rows, shape (rows, cols): the inverse of `to_lanes`."""
     laid = entries[: rows * layout.width].reshape(rows, layout.width, layout.config.lanes)
     return laid[:, 1:-1].transpose(0, 2, 1).reshape(rows, -1)[:, : layout.cols]
 
@@ -186,12 +172,7 @@ class StepKernel(SheetKernel, ABC):
 
     @abstractmethod
     def advance(self, count: int, table: NDArray[Any]) -> None:
-        """Advance the sheet by a number of steps.
-
-        Args:
-            count: number of steps.
-            table: rows of the load table, shape (count, columns).
-        """
+        """Advance the sheet by `count` steps, with rows of the load table, shape (count, columns)."""
 
     @abstractmethod
     def compile(self, table: NDArray[Any]) -> None:
@@ -255,12 +236,9 @@ def build_measure(config: KernelConfig) -> Callable[..., Any]:
 
 
 def build_read(config: KernelConfig, *, parallel: bool, iterations: int) -> Callable[..., None]:
-    """Build the kernel that reads and measures a sheet.
+    """Build the kernel that reads and measures a sheet, parallel over rows or not.
 
-    Args:
-        config: compile-time configuration.
-        parallel: whether the rows are distributed over threads.
-        iterations: number of loop iterations per row, of which only the first does work.
+    Of the `iterations` loop iterations per row only the first does work.
     """
     real, vector, vectors, lanes = config.real, config.vector, config.vectors, config.lanes
     count = config.first_constant(None)

@@ -79,11 +79,8 @@ def build_step_row(
 ) -> Callable[..., Any]:
     """Build the Taichi function that steps a row of a band, as soon as the neighbours' rows are available.
 
-    Args:
-        config: compile-time configuration.
-        move: function that steps an entry, as for `build_pass_row`.
-        corrects: whether the corrections of terms are applied after the step.
-        parallel: whether the band has neighbours.
+    For `move` see `build_pass_row`; `corrects`: whether the corrections of terms are applied after the step;
+    `parallel`: whether the band has neighbours.
     """
     vector, bending, copied = config.vector, config.get(BendingTerm), config.reach
     join_strips = build_join_strips(config)
@@ -198,12 +195,7 @@ def build_step_row(
 
 
 def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None]:
-    """Build the kernel that takes steps.
-
-    Args:
-        config: compile-time configuration.
-        parallel: whether several workers step at the same time.
-    """
+    """Build the kernel that takes steps, with several workers at the same time if `parallel`."""
     real, vector, vectors, lanes = config.real, config.vector, config.vectors, config.lanes
     constant_count = config.first_constant(None)
     step_row = build_step_row(config, build_point_step(config), corrects=True, parallel=parallel)

@@ -48,7 +48,6 @@ class Dynamics(SheetSolver[StepKernel]):
     launches = 0
 
     def restart(self, plan: Plan, state: State | None = None) -> None:
-        """Restart with the same or another plan, see `SheetSolver.restart`."""
         self._first_tabled, self._loads = 0, np.empty((0, 0))
         super().restart(plan, state)
 
@@ -56,21 +55,12 @@ class Dynamics(SheetSolver[StepKernel]):
         return (ScatterKernel if self.layout.workers else GatherKernel)(self.layout, start)
 
     def steer(self, plan: Plan) -> None:
-        """Continue with other probes, see `SheetSolver.steer`."""
         super().steer(plan)
         # A caller that steers usually steers again at the next frame, so the table has only the steps of one frame.
         self._tabulate(plan.grid.steps_per_frame)
 
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
-        """Advance the sheet by a number of steps. A call at a frame resets the sums of contact corrections.
-
-        Args:
-            steps: number of steps.
-            pause: function called after every launch. If it raises, another call of `advance` continues.
-
-        Raises:
-            MsmError: when the sheet is inconsistent.
-        """
+        """Advance, see `SheetSolver.advance`. A call at a frame resets the sums of contact corrections."""
         points = self.layout.rows * self.layout.cols
         max_steps, depth = max(1, min(MAX_STEPS_PER_LAUNCH, POINT_STEPS_PER_LAUNCH // points)), self.layout.depth
         # A launch takes whole passes; a single pass may exceed the limit up to four times.
@@ -91,29 +81,23 @@ class Dynamics(SheetSolver[StepKernel]):
             pause()
 
     def compile(self) -> None:
-        """Compile all kernels without taking a step."""
         self.kernel.compile(self._next_loads(1))
         self.displacement()
         self.tool_forces()
 
     def state(self) -> State:
-        """Read the state on which the next steps depend."""
         self._require_consistent()
         u, d = (self._read_arrays(differences=differences)[0] for differences in (False, True))
         return State(self.steps_done, u, d, self._read_memory())
 
     def read(self) -> Reading:
-        """Read the displacements and measure the sheet, in the scene's precision."""
         self._require_consistent()
         return self._measure(moving=True)
 
     def tool_forces(self) -> NDArray[np.float64]:
-        """Compute at a frame the mean force of each position-controlled tool since the previous frame.
+        """Compute the mean force of each position-controlled tool since the previous frame [N], shape (tools, 3).
 
-        It is the force with the effect of the contact corrections (`verlet.mean_force`), summed over mass points.
-
-        Returns:
-            Forces on the sheet [N], shape (tools, 3).
+        It has the effect of the contact corrections (`verlet.mean_force`), summed over mass points.
         """
         sums = sum_corrections(self.layout, self.kernel.arrays, clear=False)
         return mean_force(self.plan, sums, self.plan.grid.steps_per_frame)

@@ -59,7 +59,6 @@ class ScatterKernel(StepKernel):
         self._progress = np.zeros(layout.workers * WORKER_STRIDE, np.int64)
 
     def advance(self, count: int, table: NDArray[Any]) -> None:
-        """Advance the sheet by a number of steps."""
         if self._layout.workers == 1:
             self._advance_alone(0, count, table)
             return
@@ -71,7 +70,6 @@ class ScatterKernel(StepKernel):
                 first = self._advance_together(first, count, table)
 
     def compile(self, table: NDArray[Any]) -> None:
-        """Compile all kernels without taking a step."""
         self._advance_alone(0, 0, table)
         if self._layout.workers > 1:
             self._launch_together(0, 0, table)

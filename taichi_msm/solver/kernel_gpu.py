@@ -43,7 +43,6 @@ class GatherKernel(StepKernel):
         self._top_row = self._now * (self._layout.rows + 2) + 1
 
     def compile(self, table: NDArray[Any]) -> None:
-        """Compile all kernels without taking a step."""
         self.advance(0, table)
 
 

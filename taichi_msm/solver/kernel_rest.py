@@ -11,7 +11,7 @@ The norms are taken over all mass points and weighted with M. M bounds the stiff
 frequency exceeds 1, and the largest step dt = 1 is stable. The kernel stores the momentum q = M v.
 
 Contact forces of position-controlled tools are removed from the forces, and mass points are projected out of the tools
-(`terms.contact_rest`). Before the projection a mass point that presses on a tool moves by F / M into it, so that it
+(`terms.contact`). Before the projection a mass point that presses on a tool moves by F / M into it, so that it
 stays in contact.
 
 An evaluation of the forces passes over the rows like a step; a second loop moves the mass points. Sums over mass points
@@ -80,10 +80,7 @@ class RestSheet(NamedTuple):
 class Relaxation(SheetKernel):
     """A sheet in the memory of a CPU, and the kernels that find its equilibrium.
 
-    Args:
-        layout: layout of the sheet.
-        start: initial values.
-        masses: M of every mass point [N/m], shape (rows, cols).
+    `masses` contains M of every mass point [N/m], shape (rows, cols).
     """
 
     def __init__(self, layout: SheetLayout, start: InitialData, masses: NDArray[Any]) -> None:
@@ -114,15 +111,9 @@ class Relaxation(SheetKernel):
             write_vectors(self.arrays.u[c], to_lanes(self._layout, np.where(held, displacement[self._stored, :, c], 0)))
 
     def relax(self, count: int, tolerance: float, row: NDArray[Any]) -> tuple[int, float]:
-        """Evaluate the forces and move the mass points, repeatedly, until all forces are small.
+        """Evaluate the forces and move the mass points, at most `count` times, until no force exceeds a tolerance [N].
 
-        Args:
-            count: largest number of evaluations.
-            tolerance: largest force on a mass point at convergence [N].
-            row: row of the load table, shape (1, columns).
-
-        Returns:
-            The number of evaluations, and the largest force of the last one [N], infinite if any force is NaN.
+        Returns the number of evaluations, and the largest force of the last one [N], infinite if any force is NaN.
         """
         fire = self._fire
         fire[[COUNT, SQUARED_TOLERANCE]] = count, tolerance * tolerance

@@ -78,12 +78,7 @@ class Work(NamedTuple):
 
 
 def count_work(plan: Plan, companions: float) -> Work:
-    """Estimate the work of a run.
-
-    Args:
-        plan: the plan.
-        companions: work of the companion runs [f64 steps of the whole sheet per step of the run].
-    """
+    """Estimate the work of a run; `companions` is that of companion runs [f64 steps of the sheet per step]."""
     steps = _stepping_work(plan)
     stepping = F64_WORK * steps if plan.grid.precision == "f64" else steps
     return Work(START_WORK, stepping, F64_WORK * companions * steps, _other_work(plan.scene) - START_WORK)
@@ -95,12 +90,7 @@ def is_f64_cheap(plan: Plan) -> bool:
 
 
 def affords_companions(plan: Plan, companions: float) -> bool:
-    """Return whether companion runs take at most MAX_COMPANION_SHARE of the work of a run.
-
-    Args:
-        plan: the plan.
-        companions: work of the companion runs [f64 steps of the whole sheet per step of the run].
-    """
+    """Return whether `companions`, as for `count_work`, take at most MAX_COMPANION_SHARE of the work of a run."""
     work = count_work(plan, companions)
     return work.companions <= MAX_COMPANION_SHARE * sum(work)
 
@@ -197,16 +187,7 @@ def choose_precision(plan: Plan, arch: str) -> Plan:
 
 
 def stable_step(material: Material, sheet: Sheet, difference: str) -> float:
-    """Compute the largest stable step of a sheet, see `verlet.stability_limit`.
-
-    Args:
-        material: coefficients of the sheet.
-        sheet: the sheet.
-        difference: "central" or "backward".
-
-    Returns:
-        The step [s]; infinite without stiffness and damping.
-    """
+    """Compute the largest stable step of a sheet [s], see `verlet.stability_limit`."""
     return stability_limit(highest_frequency(material, sheet), material.drag, difference)
 
 
@@ -216,17 +197,10 @@ def stable_steps(plan: Plan) -> int:
 
 
 def steps_per_frame(time: Time, limit: float) -> int:
-    """Compute the number of steps per frame.
+    """Compute the number of steps per frame, for the largest stable step `limit` [s]; 1 in quasi-static scenes.
 
-    With `auto`, it is the smallest number whose step is at most half the stability limit. A given step is rounded to a
-    fraction of a frame. `accuracy.time_step` increases the number for a tolerance.
-
-    Args:
-        time: time keys of the scene.
-        limit: the largest stable step [s].
-
-    Returns:
-        The number of steps; 1 in quasi-static scenes.
+    With `auto`, it is the smallest number whose step is at most half the limit. A given step is rounded to a fraction
+    of a frame. `accuracy.time_step` increases the number for a tolerance.
     """
     if time.at_rest:
         return 1
@@ -342,18 +316,9 @@ def _fill_omitted_keys(before: Probe, given: Probe | Mapping[str, Any] | None) -
 
 
 class _PathChange:
-    """A new path of a position-controlled tool from the current time on.
+    """A new path of a position-controlled tool, with only keyframes after `now` [s].
 
-    Args:
-        plan: the current plan.
-        index: index of the probe.
-        before: the current probe.
-        given: the new probe; its path contains only keyframes after `now`.
-        now: the current time [s].
-
-    Attributes:
-        index: index of its probe.
-        probe: the probe with the new path, including those past keyframes on which later steps depend.
+    Its `probe` also has those past keyframes on which later steps depend.
     """
 
     def __init__(self, plan: Plan, index: int, before: Probe, given: Probe, now: float) -> None:

@@ -38,10 +38,8 @@ from taichi_msm.solver.kernel_rest import Relaxation
 from taichi_msm.solver.sheet_solver import SheetSolver
 from taichi_msm.solver.state import Reading, State, largest_displacement
 from taichi_msm.system.runtime import Device
-from taichi_msm.terms import fictitious_masses
+from taichi_msm.terms import contact_rest, fictitious_masses
 from taichi_msm.terms.contact import ContactTerm
-from taichi_msm.terms.contact_rest import grips, memory_after_grips, set_tools, touched_points
-from taichi_msm.terms.rough import compute_pulls, release, stick, stuck_points, without_rough_tools
 
 # Residual forces, relative to the largest force: at convergence, at the perturbation, and at convergence of a sheet
 # that can be unstable.
@@ -68,7 +66,6 @@ class QuasiStatics(SheetSolver[Relaxation]):
     """
 
     def restart(self, plan: Plan, state: State | None = None) -> None:
-        """Restart with the same or another plan, see `SheetSolver.restart`."""
         self.evaluations, self.residual = 0, 0.0
         # Without a state the first call of `advance` also finds the first frame.
         self._last_frame, self._interrupted = state, False
@@ -82,9 +79,7 @@ class QuasiStatics(SheetSolver[Relaxation]):
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
         """Find the equilibria of the next frames, and of the first frame if it is still missing.
 
-        Args:
-            steps: number of frames.
-            pause: function called after every launch. If it raises, another call continues from the last frame found.
+        After an exception from `pause` another call continues from the last frame found.
 
         Raises:
             DivergedError: when the iteration does not converge.
@@ -98,33 +93,27 @@ class QuasiStatics(SheetSolver[Relaxation]):
             self._last_frame = State(frame, displacement, np.zeros_like(displacement), self._read_memory())
 
     def compile(self) -> None:
-        """Compile all kernels without moving a mass point."""
         row = self.load_table(evaluate_frame_loads(self.plan, 0), 0)
         self.kernel.relax(0, 0.0, row)
         self.kernel.scale(row)
         self.displacement()
 
     def state(self) -> State:
-        """Return the state of the last frame found, on which the next frames depend."""
         return self._last_state
 
     def read(self) -> Reading:
-        """Read the displacements and measure the sheet; its energy is that of springs and bending."""
         reading = self._measure(moving=False)
         return reading._replace(residual=self.residual, evaluations=self.evaluations)
 
     def tool_forces(self) -> Array:
-        """Compute the force of each position-controlled tool on the sheet [N], shape (tools, 3).
-
-        It is opposite to the sum of all other forces on the mass points that the tool touches or holds.
-        """
+        """Return the opposite of the sum of all other forces on the mass points that each tool touches or holds."""
         touched, force = self._touched().astype(float), self._read_arrays(differences=True)[0]
         # Subtraction from 0 avoids -0.
         return 0.0 - np.einsum("tij,ijk->tk", touched, force)
 
     def _touched(self) -> NDArray[np.bool_]:
         """Return whether each tool touches or holds each mass point, shape (tools, rows, cols)."""
-        return touched_points(len(self.plan.tools), self._read_contact())
+        return contact_rest.touched_points(len(self.plan.tools), self._read_contact())
 
     @property
     def _contact(self) -> slice:
@@ -158,8 +147,8 @@ class QuasiStatics(SheetSolver[Relaxation]):
         self.evaluations = 0
         relaxation, before, loads = self.kernel, self._last_state, evaluate_frame_loads(self.plan, frame)
         tools, contact_before = self.plan.tools, before.memory[self._contact]
-        contact = memory_after_grips(self.plan, frame, before.displacement, contact_before)
-        held_before, held = grips(tools, contact_before), grips(tools, contact)
+        contact = contact_rest.memory_after_grips(self.plan, frame, before.displacement, contact_before)
+        held_before, held = contact_rest.is_gripping(tools, contact_before), contact_rest.is_gripping(tools, contact)
         if tools:
             self._write_contact(contact)
         if self._interrupted:
@@ -168,7 +157,7 @@ class QuasiStatics(SheetSolver[Relaxation]):
         *_, end = times = self._shape_times(frame)
         for start, time in pairwise(times):
             row = self.load_table(loads, frame)
-            set_tools(self.plan, frame, time, row[0, self._contact_column :])
+            contact_rest.set_tools(self.plan, frame, time, row[0, self._contact_column :])
             # After a release the flat shape is tried even if a tool is in the way.
             free = not (loads.strength.any() or held or self._is_clamp_displaced(time))
             free = free and (held_before or not self._meets_tool(time))
@@ -193,16 +182,17 @@ class QuasiStatics(SheetSolver[Relaxation]):
     def _stick(self, frame: int, times: tuple[float, float], row: NDArray[Any], pause: Pause) -> None:
         """Let the mass points stick that rough tools reach between the current shape and the next one."""
         plan, memory, start = self.plan, self._read_contact(), self._read_arrays(differences=False)[0]
-        after = stick(plan, memory, start, start, times)
-        if stuck_points(plan, memory).any() and (after != memory).any():
+        after = contact_rest.stick(plan, memory, start, start, times)
+        if contact_rest.stuck_points(plan, memory).any() and (after != memory).any():
             # To second order, mass points move as on a sheet that no further tool touches until they stick.
-            self._relax(frame, without_rough_tools(plan, row, self._contact_column), PERTURBATION_TOLERANCE, pause)
-            after = stick(plan, memory, start, self._read_arrays(differences=False)[0], times)
+            smooth = contact_rest.without_rough_tools(plan, row, self._contact_column)
+            self._relax(frame, smooth, PERTURBATION_TOLERANCE, pause)
+            after = contact_rest.stick(plan, memory, start, self._read_arrays(differences=False)[0], times)
         self._write_contact(after)
 
     def _balance(self, frame: int, row: NDArray[Any], tolerance: float, pause: Pause, *, free: bool) -> float:
         """Find the shape in which all forces balance, the flat one if `free`; return the relative residual."""
-        if free and not stuck_points(self.plan, self._read_contact()).any() and self._try_flat(row):
+        if free and not contact_rest.stuck_points(self.plan, self._read_contact()).any() and self._try_flat(row):
             return 0.0
         return self._relax(frame, row, tolerance, pause)
 
@@ -210,10 +200,10 @@ class QuasiStatics(SheetSolver[Relaxation]):
         """Release mass points on which rough tools pull by more than a tolerance; return the largest relative pull."""
         memory = self._read_contact()
         shape, force = (self._read_arrays(differences=forces)[0] for forces in (False, True))
-        pulls = compute_pulls(self.plan, memory, shape, force, time)
+        pulls = contact_rest.compute_pulls(self.plan, memory, shape, force, time)
         largest = float(pulls.max()) / max(MIN_FORCE_N, self.kernel.scale(row))
         if largest > tolerance:
-            self._write_contact(release(self.plan, memory, pulls))
+            self._write_contact(contact_rest.release(self.plan, memory, pulls))
         return largest
 
     def _meets_tool(self, time: float) -> bool:

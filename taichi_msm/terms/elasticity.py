@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from taichi_msm.arithmetic import NUMPY
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import area_shares, spacing
-from taichi_msm.terms.law import LawFunctions
-from taichi_msm.terms.locking import law_numbers
+from taichi_msm.terms.law import LawFunctions, law_numbers
 from taichi_msm.terms.springs import MIN_SQUARED_LENGTH, spring_law, spring_stiffness
 
 Array = NDArray[np.float64]
@@ -112,15 +111,7 @@ def spring_families(plan: Plan) -> Iterator[SpringFamily]:
 
 
 def elastic_force(families: Sequence[SpringFamily], displacement: Array) -> Array:
-    """Sum the forces of the springs of every mass point (eq. 2), without the tension at rest.
-
-    Args:
-        families: all springs, from `spring_families`.
-        displacement: x - X [m], shape (rows, cols, 3).
-
-    Returns:
-        Force on every mass point [N], shape (rows, cols, 3).
-    """
+    """Sum the forces of the springs (eq. 2), without the tension at rest [N], shape (rows, cols, 3)."""
     force = np.zeros_like(displacement)
     for family in families:
         forward = family.force(displacement)

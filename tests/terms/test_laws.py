@@ -26,7 +26,7 @@ from taichi_msm.solver.planning import make_plan
 from taichi_msm.solver.state import State
 from taichi_msm.system.runtime import Device
 from taichi_msm.terms.elasticity import energy_density
-from taichi_msm.terms.locking import LockingLaw, build_locking
+from taichi_msm.terms.law import LockingLaw, build_locking
 from tests import reference
 from tests.conftest import Program
 from tests.golden import Messages

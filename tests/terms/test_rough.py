@@ -21,7 +21,7 @@ from taichi_msm.solver.rest import FORCE_TOLERANCE, QuasiStatics
 from taichi_msm.solver.sheet_solver import choose_layout
 from taichi_msm.solver.state import RunProgress
 from taichi_msm.system.runtime import Device
-from taichi_msm.terms.locking import make_stiffening
+from taichi_msm.terms.law import make_stiffening
 from tests.golden import Messages
 from tests.reference.rough import rough_frames
 from tests.scenes import plan_of
