@@ -37,7 +37,7 @@ from taichi_msm.terms.springs import ALONG_COLUMN, ALONG_ROW, DIAGONAL, SpringTe
 # where the forces carried to the next row begin; rows of carried forces per worker; number of times that a worker
 # checks its neighbour before it gives up; buffer that contains p, 0 or 1; whether the last step adds the derivative of
 # the loss.
-COUNT, WORKERS, ROWS, STRIP, SHAPE, MOMENT_ROW, CARRY, CARRIED_ROWS, MAX_CHECKS, BUFFER, WITH_LOSS, SIZES = range(12)
+COUNT, WORKERS, ROWS, STRIP, SHAPE, MOMENT_ROW, CARRY, CARRIED_ROWS, MAX_CHECKS, BUFFER, WITH_LOSS = range(11)
 
 # Integers per worker in the array `progress`; the first is the number of its finished steps, the others are padding.
 STRIDE = 16
@@ -60,48 +60,32 @@ LOAD_DERIVATIVES = 5
 
 
 class AdjointSheet(NamedTuple):
-    """Arrays of a `KernelSheet`, extended for the adjoint.
+    """Arrays of a `KernelSheet`, extended for the adjoint."""
 
-    Attributes:
-        u: p, q and the derivative of the loss; with bending also the moments of p.
-        by_column, stiffness, fields, constants, rows, width: as in `KernelSheet`.
-        shapes: displacements at the steps of a segment, three arrays.
-        derivatives: accumulated derivatives.
-    """
-
-    u: Any
+    u: Any  # p, q and the derivative of the loss; with bending also the moments of p
     by_column: Any
     stiffness: Any
     fields: Any
     constants: Any
     rows: Any
     width: Any
-    shapes: Any
-    derivatives: Any
+    shapes: Any  # displacements at the steps of a segment, three arrays
+    derivatives: Any  # accumulated derivatives
 
 
 class AdjointBand(NamedTuple):
-    """A worker's band of rows at a step, within a kernel.
+    """A worker's band of rows at a step, within a kernel."""
 
-    Attributes:
-        low, high: first row, and the row after the last one.
-        source, target: rows where the buffers begin that are read and written.
-        shape: row where the displacements begin.
-        carry: row of the forces that are carried to the next row.
-        moments: row where the moments begin.
-        n: index of the step in the table of loads.
-        with_loss: whether the derivative of the loss is added.
-    """
-
-    low: Any
-    high: Any
+    low: Any  # first row
+    high: Any  # row after the last
+    # source, target: rows where the buffers begin that are read and written
     source: Any
     target: Any
-    shape: Any
-    carry: Any
-    moments: Any
-    n: Any
-    with_loss: Any
+    shape: Any  # row where the displacements begin
+    carry: Any  # row of the forces that are carried to the next row
+    moments: Any  # row where the moments begin
+    n: Any  # index of the step in the table of loads
+    with_loss: Any  # whether the derivative of the loss is added
 
 
 class LoadTables(NamedTuple):
@@ -194,7 +178,7 @@ def _build_clear(code: KernelConfig) -> Callable[..., None]:
 
 def _build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
     """Build the kernel that steps forward and stores all displacements."""
-    real, vector, vectors = code.real, code.vector, code.vectors
+    real, vectors = code.real, code.vectors
     count_of_numbers, join_strips, step = code.first_constant(None), build_join_strips(code), build_point_step(code)
     clear, storing = _build_clear(code), _build_store_moments(code)
 
@@ -233,13 +217,11 @@ def _build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
 
     @ti.kernel
     def store(
-        sizes: ti.types.ndarray(dtype=ti.i64, ndim=1),
-        progress: ti.types.ndarray(dtype=ti.i64, ndim=1),
+        sizes: ti.types.ndarray(dtype=ti.i64, ndim=1), progress: ti.types.ndarray(dtype=ti.i64, ndim=1),
         loads: ti.types.ndarray(dtype=real, ndim=2),
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
-        constants_of: ti.types.ndarray(dtype=vector, ndim=1),
-        by_column: vectors, stiffness: vectors, fields: vectors,
+        constants_of: vectors, by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
         ti.loop_config(serialize=not parallel)
         for index in range(ti.cast(sizes[WORKERS], ti.i32) * ITERATIONS_PER_THREAD):
@@ -257,19 +239,14 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
     """Build the function that sweeps a row of the adjoint by a step."""
     vector, columns, springs = code.vector, code.first_column(None), code.require(SpringTerm)
     structural, shear, tension = springs.structural, springs.shear, springs.tense
-    differentiate, (*_, row_stiffness, column_stiffness, diagonal_stiffness) = (
-        springs.build_spring_tangent(code),
-        springs.build_spring_forces(code),
-    )
+    differentiate = springs.build_spring_tangent(code)
+    *_, row_stiffness, column_stiffness, diagonal_stiffness = springs.build_spring_forces(code)
     tangents = [add for term in code.terms for add in term.build_tangents(code)]
     reducing = [reduce for term in code.terms for reduce in term.build_damping(code)]
     probes, foundation_term = code.require(ProbeTerm), code.get(FoundationTerm)
     laplacians = [] if code.get(BendingTerm) is None else [build_laplacian(code)]
-    add_load_derivatives, slots, standing = (
-        probes.build_load_adjoint(code, SUM_PARTS),
-        len(probes.moves),
-        probes.moves.count(False),
-    )
+    add_load_derivatives = probes.build_load_adjoint(code, SUM_PARTS)
+    slots, standing = len(probes.moves), probes.moves.count(False)
     foundation = code.first_column(FoundationTerm) if foundation_term else 0
     foundation_derivatives = [foundation_term.build_derivatives(code)] if foundation_term else []
     shares = [foundation_term.build_share(code)] if foundation_term and foundation_term.locks else []
@@ -305,10 +282,8 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
         for b in range(width - 1):
             # The cell to the right of the entry: the spring along its upper edge, and its diagonals.
             right = [vector(0) for _ in ti.static(range(results))]
-            falling, rising = (
-                [vector(0) for _ in ti.static(range(results))],
-                [vector(0) for _ in ti.static(range(results))],
-            )
+            falling = [vector(0) for _ in ti.static(range(results))]
+            rising = [vector(0) for _ in ti.static(range(results))]
             if ti.static(structural):
                 k = row_stiffness(sheet, i, kind, b)
                 spring = spring_tangent(
@@ -407,12 +382,8 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
 
 def _build_sweep(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
     """Build the kernel that sweeps the adjoint, from the last step to the first."""
-    real, vector, vectors = code.real, code.vector, code.vectors
-    count_of_numbers, join_strips, storing = (
-        code.first_constant(None),
-        build_join_strips(code),
-        _build_store_moments(code),
-    )
+    real, vectors, count_of_numbers = code.real, code.vectors, code.first_constant(None)
+    join_strips, storing = build_join_strips(code), _build_store_moments(code)
     clear, sweep_row = _build_clear(code), _build_sweep_row(code)
 
     @ti.func
@@ -442,14 +413,11 @@ def _build_sweep(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
 
     @ti.kernel
     def sweep(
-        sizes: ti.types.ndarray(dtype=ti.i64, ndim=1),
-        progress: ti.types.ndarray(dtype=ti.i64, ndim=1),
-        loads: ti.types.ndarray(dtype=real, ndim=2),
-        by_load: ti.types.ndarray(dtype=real, ndim=3),
+        sizes: ti.types.ndarray(dtype=ti.i64, ndim=1), progress: ti.types.ndarray(dtype=ti.i64, ndim=1),
+        loads: ti.types.ndarray(dtype=real, ndim=2), by_load: ti.types.ndarray(dtype=real, ndim=3),
         p_x: vectors, p_y: vectors, p_z: vectors,
         u_x: vectors, u_y: vectors, u_z: vectors,
-        constants_of: ti.types.ndarray(dtype=vector, ndim=1),
-        by_column: vectors, stiffness: vectors, fields: vectors, derivatives: vectors,
+        constants_of: vectors, by_column: vectors, stiffness: vectors, fields: vectors, derivatives: vectors,
     ):  # fmt: skip
         ti.loop_config(serialize=not parallel)
         for index in range(ti.cast(sizes[WORKERS], ti.i32) * ITERATIONS_PER_THREAD):
@@ -471,9 +439,7 @@ def copy_kernel(code: KernelConfig) -> Callable[..., None]:
 
     @ti.kernel
     def copy(
-        entries: ti.i32,
-        source: ti.i32,
-        target: ti.i32,
+        entries: ti.i32, source: ti.i32, target: ti.i32,
         from_x: vectors, from_y: vectors, from_z: vectors,
         to_x: vectors, to_y: vectors, to_z: vectors,
     ):  # fmt: skip

@@ -8,7 +8,7 @@ adjoint is swept over them (`kernel_motion`).
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,25 +16,8 @@ from numpy.typing import NDArray
 from taichi_msm.accuracy import divergence
 from taichi_msm.accuracy.divergence import DivergenceMonitor
 from taichi_msm.errors import DivergedError, Pause
+from taichi_msm.gradients import kernel_motion as kernels
 from taichi_msm.gradients.chain_rule import LoadGradient, SheetGradient
-from taichi_msm.gradients.kernel_motion import (
-    ADJOINT_PARTS,
-    BENDING_SUM,
-    BUFFERS,
-    FOUNDATION_LOCK_SUMS,
-    FOUNDATION_PART,
-    KEEP_SUM,
-    LOAD_DERIVATIVES,
-    LOCK_SUMS,
-    LOSS,
-    ROW_SUMS,
-    SPRING_PARTS,
-    STRIDE,
-    SUM_PARTS,
-    TENSION_SUMS,
-    adjoint_kernels,
-    copy_kernel,
-)
 from taichi_msm.model.loads import average_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import area_shares
@@ -75,29 +58,7 @@ def motion_bytes(plan: Plan) -> int:
     """Estimate the memory of the adjoint of a dynamic sheet, without the positions at the frames [bytes]."""
     steps, shape_bytes = plan.grid.steps, 3 * 8 * math.prod(plan.scene.sheet.points)
     segment = segment_steps(steps, shape_bytes)
-    return shape_bytes * (segment + 2 * -(-steps // segment) + ADJOINT_PARTS + SUM_PARTS)
-
-
-class _Arrays(NamedTuple):
-    """Arrays of the adjoint; each list contains three arrays, for x, y and z.
-
-    Attributes:
-        checkpoints: displacements at the beginning of every segment.
-        checkpoint_differences: differences d at the beginning of every segment.
-        shapes: displacements at every step of a segment.
-        differences: difference d at the current step of a segment.
-        adjoint: adjoint state, see `kernel_motion`.
-        loss: derivative of the loss with respect to the displacements of a frame.
-        derivatives: accumulated derivatives, see `kernel_motion`.
-    """
-
-    checkpoints: list[Any]
-    checkpoint_differences: list[Any]
-    shapes: list[Any]
-    differences: list[Any]
-    adjoint: list[Any]
-    loss: list[Any]
-    derivatives: Any
+    return shape_bytes * (segment + 2 * -(-steps // segment) + kernels.ADJOINT_PARTS + kernels.SUM_PARTS)
 
 
 class MotionAdjoint:
@@ -137,7 +98,7 @@ class MotionAdjoint:
         # The carried forces of two workers never share a page.
         self._carried_rows = 1 - (-PAGE // row_bytes)
         self._worker_rows = (MOMENT_ROWS + self._carried_rows) * layout.workers
-        row_sums = -(-ROW_SUMS * layout.rows // layout.width)
+        row_sums = -(-kernels.ROW_SUMS * layout.rows // layout.width)
 
         def scalar(rows: int) -> Any:
             return memory.array("f64", layout.config.lanes, rows * layout.width)
@@ -147,12 +108,16 @@ class MotionAdjoint:
 
         checkpoint_rows = -(-plan.grid.steps // self._segment) * layout.rows
         self._memory = memory
-        self._arrays = _Arrays(
-            vector(checkpoint_rows), vector(checkpoint_rows),
-            vector(self._segment * layout.rows + self._worker_rows), vector(layout.rows),
-            vector(ADJOINT_PARTS * layout.rows + self._worker_rows), vector(layout.rows),
-            scalar((SUM_PARTS + self._decay_parts) * layout.rows + row_sums),
-        )  # fmt: skip
+        # Displacements and differences d at the beginning of every segment; each list has three arrays, for x, y and z.
+        self._checkpoints, self._checkpoint_differences = vector(checkpoint_rows), vector(checkpoint_rows)
+        # Displacements at every step of a segment, and differences at its current step.
+        self._shapes = vector(self._segment * layout.rows + self._worker_rows)
+        self._differences = vector(layout.rows)
+        # Adjoint state, and accumulated derivatives, see `kernel_motion`.
+        self._adjoint = vector(kernels.ADJOINT_PARTS * layout.rows + self._worker_rows)
+        self._derivatives = scalar((kernels.SUM_PARTS + self._decay_parts) * layout.rows + row_sums)
+        # Derivative of the loss with respect to the displacements of a frame.
+        self._loss = vector(layout.rows)
 
     def run(self, pause: Pause = lambda: None) -> Array:
         """Run all steps and store the checkpoints.
@@ -180,18 +145,18 @@ class MotionAdjoint:
 
     def backward(self, by_frame: Array, pause: Pause = lambda: None) -> tuple[SheetGradient, LoadGradient]:
         """Sweep the adjoint of the last `run` backward in time, see `Adjoint.backward`."""
-        grid, layout, arrays = self.plan.grid, self.layout, self._arrays
+        grid, layout = self.plan.grid, self.layout
         _, gain, _ = coefficients(self.plan)
         shares = area_shares(self.plan.scene.sheet) if layout.config.by_area else np.ones((layout.rows, layout.cols))
         start = gain * (~self.plan.fixed / shares)[..., None] * by_frame[-1]
         for c in range(3):
             # p, an empty buffer, and q.
             parts = start[..., c], 0 * start[..., c], start[..., c]
-            write_vectors(arrays.adjoint[c], to_lanes(layout, np.concatenate(parts)))
-        zeros = np.zeros((SUM_PARTS * layout.rows, layout.cols))
+            write_vectors(self._adjoint[c], to_lanes(layout, np.concatenate(parts)))
+        zeros = np.zeros((kernels.SUM_PARTS * layout.rows, layout.cols))
         decay_gradients = layout.config.require(ProbeTerm).decay_gradients(self.plan).reshape(-1, layout.cols)
-        write_vectors(arrays.derivatives, to_lanes(layout, np.concatenate([zeros, decay_gradients])))
-        loads, self._buffer, work = LoadGradient(self.plan), BUFFERS, np.zeros(2)
+        write_vectors(self._derivatives, to_lanes(layout, np.concatenate([zeros, decay_gradients])))
+        loads, self._buffer, work = LoadGradient(self.plan), kernels.BUFFERS, np.zeros(2)
         block = max(1, STEPS_PER_TABLE // self._segment) * self._segment
         for first in reversed(range(0, grid.steps, block)):
             work += self._sweep_block(first, min(first + block, grid.steps), by_frame, loads, pause)
@@ -200,7 +165,7 @@ class MotionAdjoint:
     def _sweep_block(self, first: int, end: int, by_frame: Array, loads: LoadGradient, pause: Pause) -> Array:
         """Sweep backward over a block of segments; return the work of the loads on p after step 0 and in step 0."""
         table, h = self._forward.step_table(first, end - first), self.plan.grid.step
-        by_slot = np.zeros((end - first, len(self.plan.slots), LOAD_DERIVATIVES))
+        by_slot = np.zeros((end - first, len(self.plan.slots), kernels.LOAD_DERIVATIVES))
         at = end
         for begin in reversed(range(first, end, self._segment)):
             self._store_shapes(begin, table[begin - first : at - first], pause)
@@ -220,9 +185,9 @@ class MotionAdjoint:
         return np.array([work[int(first == 0) :].sum(), work[: int(first == 0)].sum()])
 
     def _store_checkpoint(self, segment: int) -> None:
-        arrays, sheet, first = self._arrays, self._forward.kernel.arrays, segment * self._shape_entries
-        self._copy_shape(0, first, sheet.u, arrays.checkpoints)
-        self._copy_shape(0, first, sheet.d, arrays.checkpoint_differences)
+        sheet, first = self._forward.kernel.arrays, segment * self._shape_entries
+        self._copy_shape(0, first, sheet.u, self._checkpoints)
+        self._copy_shape(0, first, sheet.d, self._checkpoint_differences)
 
     @property
     def _shape_entries(self) -> int:
@@ -230,19 +195,19 @@ class MotionAdjoint:
 
     def _copy_shape(self, from_entry: int, to_entry: int, source: list[Any], target: list[Any]) -> None:
         with compilation_options():
-            copy_kernel(self.layout.config)(self._shape_entries, from_entry, to_entry, *source, *target)
+            kernels.copy_kernel(self.layout.config)(self._shape_entries, from_entry, to_entry, *source, *target)
 
     def _store_shapes(self, first: int, table: Array, pause: Pause) -> None:
         """Repeat a segment from its checkpoint with a table of loads, and store the displacements of all steps."""
-        layout, arrays, count = self.layout, self._arrays, len(table) - 1
+        layout, count = self.layout, len(table) - 1
         checkpoint = first // self._segment * self._shape_entries
-        self._copy_shape(checkpoint, 0, arrays.checkpoints, arrays.shapes)
-        self._copy_shape(checkpoint, 0, arrays.checkpoint_differences, arrays.differences)
+        self._copy_shape(checkpoint, 0, self._checkpoints, self._shapes)
+        self._copy_shape(checkpoint, 0, self._checkpoint_differences, self._differences)
         max_steps = self._max_launch_steps()
         for done in range(0, count, max_steps):
             steps = min(max_steps, count - done)
             sizes = self._sizes(steps, done, self._segment * layout.rows)
-            self._launch(0, sizes, table[done : done + steps], *arrays.shapes, *arrays.differences, *self._sheet_arrays)
+            self._launch(0, sizes, table[done : done + steps], *self._shapes, *self._differences, *self._sheet_arrays)
             pause()
 
     def _launch_begin(self, first: int, end: int) -> int:
@@ -252,37 +217,39 @@ class MotionAdjoint:
 
     def _sweep(self, first: int, end: int, by_frame: Array, table: Array) -> Array:
         """Sweep backward from step `end` of a segment; return the derivatives by load, shape (steps, slots, 5)."""
-        layout, arrays, grid, count = self.layout, self._arrays, self.plan.grid, len(table)
+        layout, grid, count = self.layout, self.plan.grid, len(table)
         frame, steps_after_frame = divmod(end - count, grid.steps_per_frame)
         if not steps_after_frame:
             self._write_loss(by_frame[frame])
-        sizes = self._sizes(count, end - first - 1, ADJOINT_PARTS * layout.rows, not steps_after_frame)
-        columns = LOAD_DERIVATIVES * len(self.plan.slots)
+        sizes = self._sizes(count, end - first - 1, kernels.ADJOINT_PARTS * layout.rows, not steps_after_frame)
+        columns = kernels.LOAD_DERIVATIVES * len(self.plan.slots)
         by_row = np.zeros((count, layout.rows, max(1, columns)))
-        self._launch(1, sizes, table, by_row, *arrays.adjoint, *arrays.shapes, *self._sheet_arrays, arrays.derivatives)
+        self._launch(1, sizes, table, by_row, *self._adjoint, *self._shapes, *self._sheet_arrays, self._derivatives)
         self._buffer = (self._buffer + count) % 2
-        return by_row[..., :columns].sum(axis=1).reshape(count, -1, LOAD_DERIVATIVES)
+        return by_row[..., :columns].sum(axis=1).reshape(count, -1, kernels.LOAD_DERIVATIVES)
 
     def _write_loss(self, by_displacement: Array) -> None:
         """Copy the derivative with respect to the displacements of a frame to the device."""
         for c in range(3):
-            write_vectors(self._arrays.loss[c], to_lanes(self.layout, by_displacement[..., c]))
-        self._copy_shape(0, LOSS * self._shape_entries, self._arrays.loss, self._arrays.adjoint)
+            write_vectors(self._loss[c], to_lanes(self.layout, by_displacement[..., c]))
+        self._copy_shape(0, kernels.LOSS * self._shape_entries, self._loss, self._adjoint)
 
     def _sheet_gradient(self, gain: float, work: Array) -> SheetGradient:
         """Read and sum the accumulated derivatives."""
         layout = self.layout
-        rows, cols, derivatives = layout.rows, layout.cols, self._arrays.derivatives.to_numpy()
-        parts = from_lanes(layout, derivatives, SUM_PARTS * rows).reshape(SUM_PARTS, rows, cols)
-        first = (SUM_PARTS + self._decay_parts) * rows * layout.width
+        rows, cols, derivatives = layout.rows, layout.cols, self._derivatives.to_numpy()
+        parts = from_lanes(layout, derivatives, kernels.SUM_PARTS * rows).reshape(kernels.SUM_PARTS, rows, cols)
+        first = (kernels.SUM_PARTS + self._decay_parts) * rows * layout.width
         # The sums of a row are added lane by lane, and then row by row.
-        row_sums = derivatives[first : first + ROW_SUMS * rows].reshape(rows, ROW_SUMS, -1)
+        row_sums = derivatives[first : first + kernels.ROW_SUMS * rows].reshape(rows, kernels.ROW_SUMS, -1)
         sums = row_sums.sum(axis=2).sum(axis=0)
-        springs = parts[SPRING_PARTS][:, :-1], parts[SPRING_PARTS + 1][:-1], parts[SPRING_PARTS + 2][:-1, :-1]
-        foundation, keep = parts[FOUNDATION_PART] * point_shares(self.plan), float(sums[KEEP_SUM]) / gain
-        tensions, bending = sums[TENSION_SUMS:BENDING_SUM], float(sums[BENDING_SUM])
-        stiffening, foundation_stiffening = sums[LOCK_SUMS:FOUNDATION_LOCK_SUMS], sums[FOUNDATION_LOCK_SUMS:]
-        gradient = SheetGradient(springs, tensions, foundation, bending, stiffening, foundation_stiffening, keep=keep)
+        # In the order of the constants in `kernel_motion`.
+        along_rows, along_columns, diagonals, foundation = parts
+        springs = along_rows[:, :-1], along_columns[:-1], diagonals[:-1, :-1]
+        ends = kernels.TENSION_SUMS, kernels.BENDING_SUM, kernels.LOCK_SUMS, kernels.FOUNDATION_LOCK_SUMS
+        (keep,), tensions, (bending,), *laws = np.split(sums, ends)
+        foundation, keep = foundation * point_shares(self.plan), float(keep) / gain
+        gradient = SheetGradient(springs, tensions, foundation, float(bending), *laws, keep=keep)
         gradient.gain = gradient.work(self.plan) + float(work[0])
         gradient.first_gain = float(work[1])
         return gradient
@@ -302,17 +269,17 @@ class MotionAdjoint:
         carry = moment_row + MOMENT_ROWS * layout.workers
         return np.array([
             count, layout.workers, layout.rows, layout.strip, shape, moment_row, carry, self._carried_rows,
-            MAX_WAIT_CHECKS, self._buffer if moment_row == ADJOINT_PARTS * layout.rows else 0, with_loss,
+            MAX_WAIT_CHECKS, self._buffer if moment_row == kernels.ADJOINT_PARTS * layout.rows else 0, with_loss,
         ])  # fmt: skip
 
     def _launch(self, kernel: int, sizes: NDArray[np.int64], *arguments: Any) -> None:
         """Launch a kernel of `adjoint_kernels`; if a worker times out, a single worker finishes the launch."""
         config, workers = self.layout.config, self.layout.workers
-        progress = np.zeros(STRIDE * workers, np.int64)
+        progress = np.zeros(kernels.STRIDE * workers, np.int64)
         with compilation_options():
             if workers > 1 and not self._backoff.is_active:
                 self._backoff.start_launch()
-                adjoint_kernels(config, parallel=True)[kernel](sizes, progress, *arguments)
-                self._backoff.end_launch(timed_out=bool((progress[::STRIDE] < sizes[0]).any()))
-            if (progress[::STRIDE] < sizes[0]).any():
-                adjoint_kernels(config, parallel=False)[kernel](sizes, progress, *arguments)
+                kernels.adjoint_kernels(config, parallel=True)[kernel](sizes, progress, *arguments)
+                self._backoff.end_launch(timed_out=bool((progress[:: kernels.STRIDE] < sizes[0]).any()))
+            if (progress[:: kernels.STRIDE] < sizes[0]).any():
+                kernels.adjoint_kernels(config, parallel=False)[kernel](sizes, progress, *arguments)

@@ -247,16 +247,11 @@ def build_read(config: KernelConfig, *, parallel: bool, iterations: int) -> Call
 
     @ti.kernel
     def read(
-        first: ti.i32,
-        rows: ti.i32,
-        cols: ti.i32,
-        differences: ti.i32,
-        values: ti.types.ndarray(dtype=real, ndim=3),
-        measures: ti.types.ndarray(dtype=real, ndim=2),
+        first: ti.i32, rows: ti.i32, cols: ti.i32, differences: ti.i32,
+        values: ti.types.ndarray(dtype=real, ndim=3), measures: ti.types.ndarray(dtype=real, ndim=2),
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
-        constants_of: ti.types.ndarray(dtype=vector, ndim=1),
-        by_column: vectors, stiffness: vectors, fields: vectors,
+        constants_of: vectors, by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
         ti.loop_config(serialize=not parallel)
         for index in range(rows * iterations):

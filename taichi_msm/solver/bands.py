@@ -30,7 +30,7 @@ from taichi_msm.terms.bending import BendingTerm
 # Integer arguments of a launch: steps taken before it; steps to take; workers; steps of a pass; rows of `carried` per
 # worker; rows of the sheet; columns of a strip; the first row that is not fixed, and the row after the last; the first
 # row of moments in u; the number of checks after which a waiting worker ends.
-FIRST, COUNT, WORKERS, DEPTH, CARRIED_ROWS, ROWS, STRIP, FIRST_ROW, END_ROW, MOMENT_ROW, MAX_CHECKS, SIZES = range(12)
+FIRST, COUNT, WORKERS, DEPTH, CARRIED_ROWS, ROWS, STRIP, FIRST_ROW, END_ROW, MOMENT_ROW, MAX_CHECKS = range(11)
 
 # The borders of a band at which its worker begins and ends.
 BEGIN, END = 0, 1
@@ -39,7 +39,7 @@ BEGIN, END = 0, 1
 # the border. The first of these lines also contains the worker's pass, round, and step of the round.
 COUNTER_STRIDE = 16
 WORKER_STRIDE = 2 * COUNTER_STRIDE
-PASS_INDEX, ROUND, STEP, PLACE_END = 1, 2, 3, 4
+PASS_INDEX, ROUND, STEP = 1, 2, 3
 
 # Rows of moments per worker.
 MOMENT_ROWS = 3
@@ -239,14 +239,12 @@ def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None
 
     @ti.kernel
     def advance(
-        sizes: ti.types.ndarray(dtype=ti.i64, ndim=1),
-        progress: ti.types.ndarray(dtype=ti.i64, ndim=1),
+        sizes: ti.types.ndarray(dtype=ti.i64, ndim=1), progress: ti.types.ndarray(dtype=ti.i64, ndim=1),
         loads: ti.types.ndarray(dtype=real, ndim=2),
         carried_x: vectors, carried_y: vectors, carried_z: vectors,
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
-        constants_of: ti.types.ndarray(dtype=vector, ndim=1),
-        by_column: vectors, stiffness: vectors, fields: vectors,
+        constants_of: vectors, by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
         ti.loop_config(serialize=not parallel)
         for index in range(ti.cast(sizes[WORKERS], ti.i32) * ITERATIONS_PER_THREAD):
@@ -254,9 +252,8 @@ def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None
             if index % ITERATIONS_PER_THREAD == 0:
                 rows, width = ti.cast(sizes[ROWS], ti.i32), ti.cast(sizes[STRIP], ti.i32) + 2
                 constants = [constants_of[n][0] for n in ti.static(range(constant_count))]
-                sheet = ti.static(
-                    KernelSheet((u_x, u_y, u_z), (d_x, d_y, d_z), by_column, stiffness, fields, constants, rows, width)
-                )
+                u, d = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z))
+                sheet = ti.static(KernelSheet(u, d, by_column, stiffness, fields, constants, rows, width))
                 worker, workers = index // ITERATIONS_PER_THREAD, ti.cast(sizes[WORKERS], ti.i32)
                 first_row, end_row = ti.cast(sizes[FIRST_ROW], ti.i32), ti.cast(sizes[END_ROW], ti.i32)
                 low = first_row + (end_row - first_row) * worker // workers

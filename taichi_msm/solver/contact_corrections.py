@@ -38,13 +38,9 @@ def _build_sum(config: KernelConfig) -> Callable[..., None]:
 
     @ti.kernel
     def add_up(
-        rows: ti.i32,
-        cols: ti.i32,
-        clear: ti.i32,
-        by_column: vectors,
-        fields: vectors,
-        sums: ti.types.ndarray(dtype=ti.f64, ndim=2),
-    ):
+        rows: ti.i32, cols: ti.i32, clear: ti.i32,
+        by_column: vectors, fields: vectors, sums: ti.types.ndarray(dtype=ti.f64, ndim=2),
+    ):  # fmt: skip
         share_of, corrections = ti.static(by_column, fields)
         ti.loop_config(serialize=serial)
         for i in range(rows):

@@ -123,21 +123,16 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
 
 def _build_advance(config: KernelConfig) -> Callable[..., None]:
     """Build the kernel that takes steps."""
-    real, vector, vectors, constant_count = config.real, config.vector, config.vectors, config.first_constant(None)
+    real, vectors, constant_count = config.real, config.vectors, config.first_constant(None)
     step, bending = _build_step(config), config.get(BendingTerm)
     storing = [bending.build_store_moment(config)] if bending else []
 
     @ti.kernel
     def advance(
-        now: ti.i32,
-        count: ti.i32,
-        rows: ti.i32,
-        cols: ti.i32,
-        loads: ti.types.ndarray(dtype=real, ndim=2),
+        now: ti.i32, count: ti.i32, rows: ti.i32, cols: ti.i32, loads: ti.types.ndarray(dtype=real, ndim=2),
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
-        constants_of: ti.types.ndarray(dtype=vector, ndim=1),
-        by_column: vectors, stiffness: vectors, fields: vectors,
+        constants_of: vectors, by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
         for n in ti.static(range(STEPS_PER_LAUNCH)):
             for store_moment in ti.static(storing):

@@ -63,10 +63,10 @@ LARGEST_STEP, SMALLEST_STEP = 1.0, 0.02
 
 
 class RestSheet(NamedTuple):
-    """A `KernelSheet` with the additional arrays of FIRE."""
+    """A `KernelSheet` with the additional arrays of FIRE; d contains the forces without those of contact."""
 
     u: Any
-    d: Any  # forces without those of contact, instead of last differences
+    d: Any
     by_column: Any
     stiffness: Any
     fields: Any
@@ -233,14 +233,11 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
 
     @ti.kernel
     def relax(
-        fire: ti.types.ndarray(dtype=real, ndim=1),
-        row: ti.types.ndarray(dtype=real, ndim=2),
-        q_x: vectors, q_y: vectors, q_z: vectors,
-        work: vectors,
+        fire: ti.types.ndarray(dtype=real, ndim=1), row: ti.types.ndarray(dtype=real, ndim=2),
+        q_x: vectors, q_y: vectors, q_z: vectors, work: vectors,
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
-        constants_of: ti.types.ndarray(dtype=vector, ndim=1),
-        by_column: vectors, stiffness: vectors, fields: vectors,
+        constants_of: vectors, by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
         ti.loop_config(serialize=True)
         for _ in range(1):
@@ -305,14 +302,11 @@ def _build_scale(config: KernelConfig) -> Callable[..., None]:
 
     @ti.kernel
     def compute_scale(
-        rows: ti.i32,
-        width: ti.i32,
-        result: ti.types.ndarray(dtype=real, ndim=1),
-        row: ti.types.ndarray(dtype=real, ndim=2),
+        rows: ti.i32, width: ti.i32,
+        result: ti.types.ndarray(dtype=real, ndim=1), row: ti.types.ndarray(dtype=real, ndim=2),
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
-        constants_of: ti.types.ndarray(dtype=vector, ndim=1),
-        by_column: vectors, stiffness: vectors, fields: vectors,
+        constants_of: vectors, by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
         ti.loop_config(serialize=True)
         for _ in range(1):

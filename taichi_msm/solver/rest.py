@@ -99,7 +99,12 @@ class QuasiStatics(SheetSolver[Relaxation]):
         self.displacement()
 
     def state(self) -> State:
-        return self._last_state
+        """Return the state of the last frame found; before the first one, the flat sheet."""
+        if self._last_frame is not None:
+            return self._last_frame
+        shape = self.layout.rows, self.layout.cols
+        memory = np.zeros((len(self.layout.config.memory_fields), *shape))
+        return State(0, np.zeros((*shape, 3)), np.zeros((*shape, 3)), memory)
 
     def read(self) -> Reading:
         reading = self._measure(moving=False)
@@ -116,37 +121,23 @@ class QuasiStatics(SheetSolver[Relaxation]):
         return contact_rest.touched_points(len(self.plan.tools), self._read_contact())
 
     @property
-    def _contact(self) -> slice:
-        """The part of the memory that belongs to contact."""
-        return self.layout.config.memory_slice(ContactTerm)
-
-    @property
     def _contact_column(self) -> int:
         """The first column of the load table that belongs to contact."""
         return self.layout.config.first_column(ContactTerm)
 
     def _read_contact(self) -> Array:
         """Read the memory of contact, shape (numbers, rows, cols)."""
-        return self._read_memory()[self._contact]
+        return self._read_memory()[self.layout.config.memory_slice(ContactTerm)]
 
     def _write_contact(self, memory: Array) -> None:
         """Write the memory of contact, shape (numbers, rows, cols)."""
         self.kernel.arrays.set_fields(self.layout.config.first_field(ContactTerm), memory)
 
-    @property
-    def _last_state(self) -> State:
-        """The state of the last frame found; before the first one, the flat sheet."""
-        if self._last_frame is not None:
-            return self._last_frame
-        shape = self.layout.rows, self.layout.cols
-        memory = np.zeros((len(self.layout.config.memory_fields), *shape))
-        return State(0, np.zeros((*shape, 3)), np.zeros((*shape, 3)), memory)
-
     def _settle(self, frame: int, pause: Pause) -> None:
         """Find the equilibrium of a frame."""
         self.evaluations = 0
-        relaxation, before, loads = self.kernel, self._last_state, evaluate_frame_loads(self.plan, frame)
-        tools, contact_before = self.plan.tools, before.memory[self._contact]
+        relaxation, before, loads = self.kernel, self.state(), evaluate_frame_loads(self.plan, frame)
+        tools, contact_before = self.plan.tools, before.memory[self.layout.config.memory_slice(ContactTerm)]
         contact = contact_rest.memory_after_grips(self.plan, frame, before.displacement, contact_before)
         held_before, held = contact_rest.is_gripping(tools, contact_before), contact_rest.is_gripping(tools, contact)
         if tools:
