@@ -17,7 +17,7 @@ from pydantic import BaseModel
 
 from taichi_msm import Scene, Simulation, gradient
 from taichi_msm.errors import ArgumentError, MsmError, SceneError
-from taichi_msm.gradients import motion, rest
+from taichi_msm.gradients import kernel_motion, motion, rest
 from taichi_msm.gradients.chain_rule import Derivatives
 from taichi_msm.gradients.gradient import Adjoint, with_stiffness_map
 from taichi_msm.gradients.kernel_motion import adjoint_kernels
@@ -291,7 +291,7 @@ def test_the_bits_depend_neither_on_workers_nor_on_segments(
         launches.append(parallel)
         return adjoint_kernels(config, parallel=parallel)
 
-    monkeypatch.setattr(motion, "adjoint_kernels", counted)
+    monkeypatch.setattr(kernel_motion, "adjoint_kernels", counted)
     assert bits(3) == alone
     assert not any(launches[launches.index(False) :])
 
