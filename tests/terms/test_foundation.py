@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,13 +27,11 @@ from taichi_msm.terms.foundation import FoundationTerm
 from tests import reference
 from tests.conftest import Program
 from tests.golden import Messages
-from tests.motion import frames, notes_of, structure_of
+from tests.motion import frames, notes_of
 from tests.outputs import results
 from tests.scenes import plan_of, speckle
-from tests.solver.test_dynamics import as_on_a_gpu, short_launches, simulate, with_lanes
+from tests.solver.test_dynamics import simulate
 from tests.solver.test_tissue_physics import EVERYWHERE, tissue, weight
-
-__all__ = ["short_launches"]
 
 TOOL = {"at": [0.4, 0.6], "total": [0.3, 0.2, -2], "radius": 0.01, "falloff": 100, "load": [[0, 0], [0.05, 100]]}
 
@@ -62,25 +59,6 @@ def test_it_is_like_the_twin(fixed: Any, active: str, precision: str, image: str
     twin = reference.simulate(made) - rest_positions(made.sheet)
     rounding = {"f64": 1e-12, "f32": 2e-4}[precision] * np.abs(twin).max()
     np.testing.assert_allclose(simulate(made, device), twin, rtol=0, atol=rounding)
-
-
-@pytest.mark.usefixtures("short_launches")
-@pytest.mark.parametrize("precision", ["f32", pytest.param("f64", marks=pytest.mark.fuzz)])
-def test_both_forms_bands_and_lanes_give_the_same_bits(precision: str, image: str, device: Device) -> None:
-    made = mapped(image, "none", time={"duration": 0.04, "precision": precision})
-    whole = structure_of(made, device)
-    plain = simulate(made, device, whole).tobytes()
-    for layout in (as_on_a_gpu(whole), replace(with_lanes(whole, 2), workers=2, depth=3)):
-        assert simulate(made, device, layout).tobytes() == plain, layout
-
-
-def test_it_is_compiled_in_only_with_a_map(image: str, device: Device) -> None:
-    def term(made: Scene) -> FoundationTerm | None:
-        return structure_of(made, device).config.get(FoundationTerm)
-
-    assert term(mapped(image)) == FoundationTerm(by_area=False, mapped=True)
-    assert term(tissue((13, 15), foundation=2e6, fixed="none", probes=[TOOL])) == FoundationTerm(True, False)
-    assert term(mapped(image, probes=[])) is None, "loaded, but nothing ever loads"
 
 
 def test_where_nothing_else_holds_every_point_sinks_by_the_pressure_over_its_stiffness(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +28,6 @@ from taichi_msm.model.sheet import Maps, rest_positions
 from taichi_msm.runs.run import resume, run
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
-from taichi_msm.solver import kernel_gpu
 from taichi_msm.solver.state import RunProgress
 from taichi_msm.system.runtime import Device
 from taichi_msm.terms.bending import BendingTerm
@@ -42,7 +40,7 @@ from tests.golden import Messages
 from tests.motion import dynamics_of, frames, notes_of, structure_of
 from tests.outputs import results
 from tests.scenes import plan_of, random_scene, random_tissue
-from tests.solver.test_dynamics import as_on_a_gpu, simulate
+from tests.solver.test_dynamics import simulate
 
 SCENE = """\
 sheet: {points: [13, 15], size: [0.1, 0.1]}
@@ -122,34 +120,6 @@ def test_the_random_tissues_have_every_term(image: str, device: Device) -> None:
         assert {getattr(term, flag) for term in springs} == {False, True}, flag
     assert {moves for term in probes for moves in term.moves} == {False, True}
     assert {by_area for term in probes for by_area in term.by_area} == {False, True}
-
-
-@pytest.mark.parametrize(
-    "seed", [1, 5, pytest.param(10, marks=pytest.mark.fuzz), pytest.param(4, marks=pytest.mark.fuzz)]
-)
-def test_bands_do_not_change_the_bits(seed: int, image: str, device: Device) -> None:
-    made = random_tissue(seed, image)
-    layout = structure_of(made, device)
-    assert layout.config.require(SpringTerm).mapped or layout.config.get(BendingTerm)
-    plain = simulate(made, device)
-    assert simulate(made, device, replace(layout, workers=2)).tobytes() == plain.tobytes()
-    dynamics = dynamics_of(made, device, replace(layout, workers=3))
-    for _ in range(plan_of(made).grid.steps):
-        dynamics.advance(1)
-    assert dynamics.displacement().tobytes() == plain[-1].tobytes()
-
-
-@pytest.mark.parametrize("seed", [1, 5, pytest.param(0, marks=pytest.mark.fuzz)])
-def test_the_form_of_a_gpu_gives_the_same_bits(
-    seed: int, image: str, device: Device, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for module in ("kernel_gpu", "dynamics"):
-        monkeypatch.setattr(f"taichi_msm.solver.{module}.STEPS_PER_LAUNCH", 2)
-    kernel_gpu._kernels.cache_clear()
-    made = random_tissue(seed, image)
-    layout = structure_of(made, device)
-    assert simulate(made, device, as_on_a_gpu(layout)).tobytes() == simulate(made, device).tobytes()
-    kernel_gpu._kernels.cache_clear()
 
 
 def test_a_map_of_springs_is_like_the_twin(load: Any, device: Device) -> None:
