@@ -229,9 +229,8 @@ def test_a_map_of_the_stiffness_has_its_slope_wherever_it_is(kind: str, image: s
     # Without factors it is the scene's own again.
     own = Adjoint(plan, device)
     assert (adjoint.run() == own.run()).all()
-    assert (
-        adjoint.backward(slope).maps[f"{plan.scene.kind}.map"] == own.backward(slope).maps[f"{plan.scene.kind}.map"]
-    ).all()
+    maps = [each.backward(slope).maps[f"{plan.scene.kind}.map"] for each in (adjoint, own)]
+    assert (maps[0] == maps[1]).all()
 
 
 @pytest.mark.parametrize("steps", [1, 2, 3, 10_000])
@@ -241,11 +240,8 @@ def test_any_number_of_steps(steps: int, image: str, device: Device) -> None:
     adjoint = Adjoint(plan_of(Scene.model_validate(made)), device)
     known, slope = loss(adjoint.run())
     found = adjoint.backward(slope)
-    for name, index, step in (
-        ("probes.0.total", (2,), 0.2),
-        ("tissue.thickness", (), 4e-4),
-        ("probes.0.load", (3,), 5.0),
-    ):
+    numbers = ("probes.0.total", (2,), 0.2), ("tissue.thickness", (), 4e-4), ("probes.0.load", (3,), 5.0)
+    for name, index, step in numbers:
 
         def changed(by: float, name: str = name, index: tuple[int, ...] = index) -> float:
             other = Scene.model_validate(put_in(made, name.split("."), index, by))
@@ -315,14 +311,8 @@ def test_positions_are_those_of_a_simulation(image: str, device: Device) -> None
 
 REST = {
     "sheet": {"points": [6, 7], "size": [0.1, 0.12]},
-    "tissue": {
-        "young": 3e4,
-        "thickness": 3e-3,
-        "foundation": 1e5,
-        "foundation_active": "always",
-        "pretension": 15,
-        "bending": 1e-3,
-    },
+    "tissue": {"young": 3e4, "thickness": 3e-3, "foundation": 1e5, "foundation_active": "always"}
+    | {"pretension": 15, "bending": 1e-3},
     "probes": [
         {"at": [0.43, 0.52], "total": [0.1, 0.2, -1], "radius": 0.01, "falloff": 200, "load": [[0, 0], [2, 100]]},
         {"at": [[0, 0.31, 0.3], [2, 0.6, 0.35]], "total": [0, 0, 0.3], "falloff": 60, "load": [[1, 60]]},

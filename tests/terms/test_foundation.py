@@ -139,6 +139,12 @@ output: [trajectory]
 """
 
 
+REFUSED = [
+    "foundation={young: 1e4}", "foundation.depth=0", "foundation.depht=1", "foundation=-1", "foundation=soft",
+    "foundation=0", "foundation_map={image: no.png, range: [1, 2]}", "foundation_map.image=deep.png",
+]  # fmt: skip
+
+
 @pytest.fixture
 def here(tmp_path: Path, image: str, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A directory to work in, with a scene and two maps."""
@@ -195,19 +201,7 @@ def test_a_run_tells_how_deep_it_went(device: Device) -> None:
 
 
 @pytest.mark.usefixtures("here")
-@pytest.mark.parametrize(
-    "override",
-    [
-        "foundation={young: 1e4}",
-        "foundation.depth=0",
-        "foundation.depht=1",
-        "foundation=-1",
-        "foundation=soft",
-        "foundation=0",
-        "foundation_map={image: no.png, range: [1, 2]}",
-        "foundation_map.image=deep.png",
-    ],
-)
+@pytest.mark.parametrize("override", REFUSED)
 def test_what_cannot_be_is_refused_with_the_remedy(override: str, message: Messages) -> None:
     more = ["tissue.foundation_map={image: deep.png, range: [1, 2]}"] if override == "foundation=0" else []
     with message.raises(SceneError, "tissue.foundation"):
