@@ -133,7 +133,6 @@ class Adjoint:
         return scene_derivatives(plan, *self._sheet.backward(np.asarray(by_position, float), pause))
 
     def _with_factors(self, factors: Array) -> Plan:
-        """Replace the stiffness map."""
         plan, factors = self._plan, as_array(factors, "factors")
         assert plan.material.factors is not None
         shape, lower_bound = plan.material.factors.shape, plan.material.tension

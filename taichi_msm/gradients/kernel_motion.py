@@ -95,15 +95,6 @@ class LoadTables(NamedTuple):
     by_load: Any
 
 
-@cache
-def adjoint_kernels(code: KernelConfig, *, parallel: bool) -> tuple[Callable[..., None], Callable[..., None]]:
-    """Build the kernel that steps forward and stores all displacements, and the one that sweeps backward.
-
-    They share the arguments `sizes` (int64, indices from `COUNT` on) and `progress` (int64, `STRIDE` per worker).
-    """
-    return _build_store(code, parallel=parallel), _build_sweep(code, parallel=parallel)
-
-
 def _build_run_worker(step_band: Callable[..., None], *, parallel: bool) -> Callable[..., None]:
     """Build the function that runs the steps of a launch: of one worker if parallel, otherwise of all workers."""
 
@@ -164,7 +155,6 @@ def _build_store_moments(code: KernelConfig) -> list[Callable[..., None]]:
 
 
 def _build_clear(code: KernelConfig) -> Callable[..., None]:
-    """Build the function that sets a row of u to 0."""
     vector = code.vector
 
     @ti.func
@@ -176,9 +166,14 @@ def _build_clear(code: KernelConfig) -> Callable[..., None]:
     return clear
 
 
-def _build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
-    """Build the kernel that steps forward and stores all displacements."""
-    real, vectors = code.real, code.vectors
+@cache
+def build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
+    """Build the kernel that steps forward and stores all displacements.
+
+    Its arguments `sizes` (int64, indices from `COUNT` on) and `progress` (int64, `STRIDE` per worker) are also those of
+    `build_sweep`.
+    """
+    real, vector, vectors = code.real, code.vector, code.vectors
     count_of_numbers, join_strips, step = code.first_constant(None), build_join_strips(code), build_point_step(code)
     clear, storing = _build_clear(code), _build_store_moments(code)
 
@@ -190,7 +185,6 @@ def _build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
 
     @ti.func
     def step_band(sheet: ti.template(), loads: ti.template(), sizes: ti.template(), worker, k):
-        """Run step k of the launch for a band."""
         workers = ti.cast(sizes[WORKERS], ti.i32)
         low, high = sheet.rows * worker // workers, sheet.rows * (worker + 1) // workers
         shape = (ti.cast(sizes[SHAPE], ti.i32) + k) * sheet.rows
@@ -221,7 +215,7 @@ def _build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
         loads: ti.types.ndarray(dtype=real, ndim=2),
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
-        constants_of: vectors, by_column: vectors, stiffness: vectors, fields: vectors,
+        constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
         ti.loop_config(serialize=not parallel)
         for index in range(ti.cast(sizes[WORKERS], ti.i32) * ITERATIONS_PER_THREAD):
@@ -236,7 +230,6 @@ def _build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
 
 
 def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
-    """Build the function that sweeps a row of the adjoint by a step."""
     vector, columns, springs = code.vector, code.first_column(None), code.require(SpringTerm)
     structural, shear, tension = springs.structural, springs.shear, springs.tense
     differentiate = springs.build_spring_tangent(code)
@@ -380,15 +373,15 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
     return sweep_row
 
 
-def _build_sweep(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
+@cache
+def build_sweep(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
     """Build the kernel that sweeps the adjoint, from the last step to the first."""
-    real, vectors, count_of_numbers = code.real, code.vectors, code.first_constant(None)
+    real, vector, vectors, count_of_numbers = code.real, code.vector, code.vectors, code.first_constant(None)
     join_strips, storing = build_join_strips(code), _build_store_moments(code)
     clear, sweep_row = _build_clear(code), _build_sweep_row(code)
 
     @ti.func
     def step_band(sheet: ti.template(), tables: ti.template(), sizes: ti.template(), worker, k):
-        """Run the k-th step of the launch for a band."""
         workers = ti.cast(sizes[WORKERS], ti.i32)
         low, high = sheet.rows * worker // workers, sheet.rows * (worker + 1) // workers
         n = ti.cast(sizes[COUNT], ti.i32) - 1 - k
@@ -417,7 +410,8 @@ def _build_sweep(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
         loads: ti.types.ndarray(dtype=real, ndim=2), by_load: ti.types.ndarray(dtype=real, ndim=3),
         p_x: vectors, p_y: vectors, p_z: vectors,
         u_x: vectors, u_y: vectors, u_z: vectors,
-        constants_of: vectors, by_column: vectors, stiffness: vectors, fields: vectors, derivatives: vectors,
+        constants_of: ti.types.ndarray(dtype=vector, ndim=1),
+        by_column: vectors, stiffness: vectors, fields: vectors, derivatives: vectors,
     ):  # fmt: skip
         ti.loop_config(serialize=not parallel)
         for index in range(ti.cast(sizes[WORKERS], ti.i32) * ITERATIONS_PER_THREAD):

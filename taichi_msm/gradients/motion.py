@@ -8,6 +8,7 @@ adjoint is swept over them (`kernel_motion`).
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -27,8 +28,8 @@ from taichi_msm.solver.backoff import Backoff
 from taichi_msm.solver.bands import MOMENT_ROWS
 from taichi_msm.solver.dynamics import STEPS_PER_TABLE, Dynamics
 from taichi_msm.solver.kernel_cpu import MAX_CHECKS, PAGE
-from taichi_msm.solver.state import largest_displacement
-from taichi_msm.system.runtime import Device, Memory, compilation_options, write_vectors
+from taichi_msm.solver.state import State, largest_displacement
+from taichi_msm.system.runtime import Memory, compilation_options, write_vectors
 from taichi_msm.terms.base import GAIN
 from taichi_msm.terms.foundation import point_shares
 from taichi_msm.terms.loads import ProbeTerm
@@ -61,29 +62,18 @@ def motion_bytes(plan: Plan) -> int:
     return shape_bytes * (segment + 2 * -(-steps // segment) + kernels.ADJOINT_PARTS + kernels.SUM_PARTS)
 
 
-class MotionAdjoint:
-    """Dynamic sheet and its adjoint, of a plan in f64 with a stiffness map; for `layout` see `SheetSolver`."""
+class MotionAdjoint(Dynamics):
+    """Dynamic sheet, of a plan in f64 with a stiffness map, and its adjoint."""
 
-    def __init__(self, plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> None:
-        self._forward, self._backoff = Dynamics(plan, device, layout, cores), Backoff()
-        self._allocate()
+    _allocated_for: tuple[SheetLayout, int] | None = None  # layout and number of steps
 
-    def restart(self, plan: Plan) -> None:
-        """Restart with the same scene or another."""
-        before = self.layout, self.plan.grid.steps
-        self._forward.restart(plan)
-        if (self.layout, plan.grid.steps) != before:
+    def restart(self, plan: Plan, state: State | None = None) -> None:
+        """Restart with the same scene or another, see `SheetSolver.restart`."""
+        super().restart(plan, state)
+        if self._allocated_for != (self.layout, plan.grid.steps):
             self._allocate()
-
-    @property
-    def plan(self) -> Plan:
-        """The current plan."""
-        return self._forward.plan
-
-    @property
-    def layout(self) -> SheetLayout:
-        """The memory layout, and the configuration of the kernels."""
-        return self._forward.layout
+            self._allocated_for = self.layout, plan.grid.steps
+            self._backoff = Backoff()
 
     @property
     def _decay_parts(self) -> int:
@@ -131,11 +121,11 @@ class MotionAdjoint:
         monitor, frames = DivergenceMonitor(plan), np.zeros((grid.frames + 1, *plan.scene.sheet.points, 3))
         stops = {*range(0, grid.steps + 1, grid.steps_per_frame), *range(0, grid.steps, self._segment)}
         for n in sorted(stops):
-            self._forward.advance(n - self._forward.steps_done, pause)
+            self.advance(n - self.steps_done, pause)
             if n % self._segment == 0 and n < grid.steps:
                 self._store_checkpoint(n // self._segment)
             if n and n % grid.steps_per_frame == 0:
-                reading = self._forward.read()
+                reading = self.read()
                 fault = monitor.check_frame(reading)
                 if fault:
                     message = divergence.format_message(grid.time(n), n, fault, exact=False)
@@ -164,7 +154,7 @@ class MotionAdjoint:
 
     def _sweep_block(self, first: int, end: int, by_frame: Array, loads: LoadGradient, pause: Pause) -> Array:
         """Sweep backward over a block of segments; return the work of the loads on p after step 0 and in step 0."""
-        table, h = self._forward.step_table(first, end - first), self.plan.grid.step
+        table, h = self.step_table(first, end - first), self.plan.grid.step
         by_slot = np.zeros((end - first, len(self.plan.slots), kernels.LOAD_DERIVATIVES))
         at = end
         for begin in reversed(range(first, end, self._segment)):
@@ -185,7 +175,7 @@ class MotionAdjoint:
         return np.array([work[int(first == 0) :].sum(), work[: int(first == 0)].sum()])
 
     def _store_checkpoint(self, segment: int) -> None:
-        sheet, first = self._forward.kernel.arrays, segment * self._shape_entries
+        sheet, first = self.kernel.arrays, segment * self._shape_entries
         self._copy_shape(0, first, sheet.u, self._checkpoints)
         self._copy_shape(0, first, sheet.d, self._checkpoint_differences)
 
@@ -207,7 +197,14 @@ class MotionAdjoint:
         for done in range(0, count, max_steps):
             steps = min(max_steps, count - done)
             sizes = self._sizes(steps, done, self._segment * layout.rows)
-            self._launch(0, sizes, table[done : done + steps], *self._shapes, *self._differences, *self._sheet_arrays)
+            self._launch(
+                kernels.build_store,
+                sizes,
+                table[done : done + steps],
+                *self._shapes,
+                *self._differences,
+                *self._sheet_arrays,
+            )
             pause()
 
     def _launch_begin(self, first: int, end: int) -> int:
@@ -224,18 +221,25 @@ class MotionAdjoint:
         sizes = self._sizes(count, end - first - 1, kernels.ADJOINT_PARTS * layout.rows, not steps_after_frame)
         columns = kernels.LOAD_DERIVATIVES * len(self.plan.slots)
         by_row = np.zeros((count, layout.rows, max(1, columns)))
-        self._launch(1, sizes, table, by_row, *self._adjoint, *self._shapes, *self._sheet_arrays, self._derivatives)
+        self._launch(
+            kernels.build_sweep,
+            sizes,
+            table,
+            by_row,
+            *self._adjoint,
+            *self._shapes,
+            *self._sheet_arrays,
+            self._derivatives,
+        )
         self._buffer = (self._buffer + count) % 2
         return by_row[..., :columns].sum(axis=1).reshape(count, -1, kernels.LOAD_DERIVATIVES)
 
     def _write_loss(self, by_displacement: Array) -> None:
-        """Copy the derivative with respect to the displacements of a frame to the device."""
         for c in range(3):
             write_vectors(self._loss[c], to_lanes(self.layout, by_displacement[..., c]))
         self._copy_shape(0, kernels.LOSS * self._shape_entries, self._loss, self._adjoint)
 
     def _sheet_gradient(self, gain: float, work: Array) -> SheetGradient:
-        """Read and sum the accumulated derivatives."""
         layout = self.layout
         rows, cols, derivatives = layout.rows, layout.cols, self._derivatives.to_numpy()
         parts = from_lanes(layout, derivatives, kernels.SUM_PARTS * rows).reshape(kernels.SUM_PARTS, rows, cols)
@@ -247,24 +251,23 @@ class MotionAdjoint:
         along_rows, along_columns, diagonals, foundation = parts
         springs = along_rows[:, :-1], along_columns[:-1], diagonals[:-1, :-1]
         ends = kernels.TENSION_SUMS, kernels.BENDING_SUM, kernels.LOCK_SUMS, kernels.FOUNDATION_LOCK_SUMS
-        (keep,), tensions, (bending,), *laws = np.split(sums, ends)
-        foundation, keep = foundation * point_shares(self.plan), float(keep) / gain
-        gradient = SheetGradient(springs, tensions, foundation, float(bending), *laws, keep=keep)
+        keep, tensions, bending, stiffening, foundation_stiffening = np.split(sums, ends)
+        foundation = foundation * point_shares(self.plan)
+        gradient = SheetGradient(springs, tensions, foundation, float(bending[0]), stiffening, foundation_stiffening)
+        gradient.keep = float(keep[0]) / gain
         gradient.gain = gradient.work(self.plan) + float(work[0])
         gradient.first_gain = float(work[1])
         return gradient
 
     @property
     def _sheet_arrays(self) -> tuple[Any, ...]:
-        """Read-only arrays of the sheet."""
-        arrays = self._forward.kernel.arrays
+        arrays = self.kernel.arrays
         return arrays.constants, arrays.by_column, arrays.stiffness, arrays.fields
 
     def _max_launch_steps(self) -> int:
         return max(1, NODE_STEPS_PER_LAUNCH // (self.layout.rows * self.layout.cols))
 
     def _sizes(self, count: int, shape: int, moment_row: int, with_loss: bool = False) -> NDArray[np.int64]:
-        """Return the sizes of a launch in the order of `kernel_motion`."""
         layout = self.layout
         carry = moment_row + MOMENT_ROWS * layout.workers
         return np.array([
@@ -272,14 +275,14 @@ class MotionAdjoint:
             MAX_WAIT_CHECKS, self._buffer if moment_row == kernels.ADJOINT_PARTS * layout.rows else 0, with_loss,
         ])  # fmt: skip
 
-    def _launch(self, kernel: int, sizes: NDArray[np.int64], *arguments: Any) -> None:
-        """Launch a kernel of `adjoint_kernels`; if a worker times out, a single worker finishes the launch."""
+    def _launch(self, build: Callable[..., Callable[..., None]], sizes: NDArray[np.int64], *arguments: Any) -> None:
+        """Launch a kernel; if a worker times out, a single worker finishes the launch."""
         config, workers = self.layout.config, self.layout.workers
         progress = np.zeros(kernels.STRIDE * workers, np.int64)
         with compilation_options():
             if workers > 1 and not self._backoff.is_active:
                 self._backoff.start_launch()
-                kernels.adjoint_kernels(config, parallel=True)[kernel](sizes, progress, *arguments)
+                build(config, parallel=True)(sizes, progress, *arguments)
                 self._backoff.end_launch(timed_out=bool((progress[:: kernels.STRIDE] < sizes[0]).any()))
             if (progress[:: kernels.STRIDE] < sizes[0]).any():
-                kernels.adjoint_kernels(config, parallel=False)[kernel](sizes, progress, *arguments)
+                build(config, parallel=False)(sizes, progress, *arguments)

@@ -270,7 +270,6 @@ def _control_point(segment: ProbeSegment, t: Array) -> Array:
 
 
 def _load(probe: Probe) -> _PiecewiseLinear:
-    """Return the percent of a probe's force as a function of time."""
     return _PiecewiseLinear(*np.array(probe.load, dtype=float).T)
 
 

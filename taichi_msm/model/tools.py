@@ -210,7 +210,6 @@ def friction_problem(tool: Tool, *, at_rest: bool) -> str:
 
 
 def _clamp_problems(clamp: Clamp, scene: Scene) -> Iterator[Problem]:
-    """Report a clamp of fixed mass points, or of none, and a path that does not begin at rest."""
     key, begin = ("probes", clamp.probe), [float(clamp.times[0]), *clamp.tip_centres[0].tolist()]
     if clamp.side in fixed_sides(scene.sheet):
         yield Problem((*key, "clamp"), f"{clamp.side} is in sheet.fixed; remove it there, or clamp another side")

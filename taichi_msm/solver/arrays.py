@@ -23,6 +23,7 @@ results for such vectors. Unary minus, `-=`, abs, any and all are therefore not 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -235,6 +236,7 @@ def build_measure(config: KernelConfig) -> Callable[..., Any]:
     return measure
 
 
+@cache
 def build_read(config: KernelConfig, *, parallel: bool, iterations: int) -> Callable[..., None]:
     """Build the kernel that reads and measures a sheet, parallel over rows or not.
 
@@ -251,7 +253,7 @@ def build_read(config: KernelConfig, *, parallel: bool, iterations: int) -> Call
         values: ti.types.ndarray(dtype=real, ndim=3), measures: ti.types.ndarray(dtype=real, ndim=2),
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
-        constants_of: vectors, by_column: vectors, stiffness: vectors, fields: vectors,
+        constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
         ti.loop_config(serialize=not parallel)
         for index in range(rows * iterations):

@@ -19,6 +19,7 @@ after a limited number of checks the worker records its progress and ends. Furth
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any, NamedTuple
 
 from taichi_msm.solver.arrays import build_point_step
@@ -194,6 +195,7 @@ def build_step_row(
     return step_row
 
 
+@cache
 def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None]:
     """Build the kernel that takes steps, with several workers at the same time if `parallel`."""
     real, vector, vectors, lanes = config.real, config.vector, config.vectors, config.lanes
@@ -244,7 +246,7 @@ def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None
         carried_x: vectors, carried_y: vectors, carried_z: vectors,
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
-        constants_of: vectors, by_column: vectors, stiffness: vectors, fields: vectors,
+        constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
         ti.loop_config(serialize=not parallel)
         for index in range(ti.cast(sizes[WORKERS], ti.i32) * ITERATIONS_PER_THREAD):

@@ -121,7 +121,6 @@ class Dynamics(SheetSolver[StepKernel]):
         return self._loads[done : done + count]
 
     def _tabulate(self, count: int) -> None:
-        """Compute the load table of the next steps."""
         self._first_tabled, self._loads = self.steps_done, self.step_table(self.steps_done, count)
 
 
@@ -178,7 +177,6 @@ class ForceRecorder:
         return tuple(forces)
 
     def _decay_sum(self, index: int, at: Array) -> float:
-        """Sum the decay factors of a probe over the mass points that are not fixed."""
         probe, sheet = self._plan.scene.probes[index], self._plan.scene.sheet
         if self._loads[index].moves:
             return float(decay(probe, sheet, at)[~self._plan.fixed].sum())

@@ -33,8 +33,11 @@ class ScatterKernel(StepKernel):
 
     def __init__(self, layout: SheetLayout, start: InitialData) -> None:
         self._layout = layout
-        self._parallel_kernel, self._read = _kernels(layout.config, parallel=layout.workers > 1)
-        self._serial_kernel, _ = _kernels(layout.config, parallel=False)
+        parallel = layout.workers > 1
+        iterations = ITERATIONS_PER_THREAD if parallel else 1
+        self._read = build_read(layout.config, parallel=parallel, iterations=iterations)
+        self._parallel_kernel = bands.build_advance(layout.config, parallel=parallel)
+        self._serial_kernel = bands.build_advance(layout.config, parallel=False)
         self._steps, self._backoff = 0, Backoff()
         self._first_row, self._end_row = int(layout.fixed_rows[0]), layout.rows - int(layout.fixed_rows[1])
         # The sheet's rows, two copies for every border of every worker, and moments.
@@ -109,7 +112,6 @@ class ScatterKernel(StepKernel):
         self._progress[:: bands.COUNTER_STRIDE] = self._steps
 
     def _start_pass(self) -> None:
-        """Reset all workers to the first row of the first pass."""
         self._places[:, [bands.PASS_INDEX, bands.ROUND, bands.STEP]] = 0, -1, 0
 
     def _launch(self, kernel: Callable[..., None], workers: int, count: int, table: NDArray[Any]) -> None:
@@ -135,13 +137,6 @@ class ScatterKernel(StepKernel):
             for border in ((begin_row, begin_row + inward), (end_row, end_row - inward)):
                 rows += [*border[: self._layout.config.reach]] * 2
         return np.array(rows, np.int32)
-
-
-@cache
-def _kernels(config: KernelConfig, *, parallel: bool) -> tuple[Callable[..., None], Callable[..., None]]:
-    """Build the kernels of a configuration, which are compiled at their first launch."""
-    iterations = ITERATIONS_PER_THREAD if parallel else 1
-    return bands.build_advance(config, parallel=parallel), build_read(config, parallel=parallel, iterations=iterations)
 
 
 @cache

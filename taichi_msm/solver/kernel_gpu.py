@@ -28,7 +28,8 @@ class GatherKernel(StepKernel):
 
     def __init__(self, layout: SheetLayout, start: InitialData) -> None:
         self._layout = layout
-        self._advance, self._read = _kernels(layout.config)
+        self._advance = _build_advance(layout.config)
+        self._read = build_read(layout.config, parallel=True, iterations=1)
         # Index of the buffer of u_n. Each buffer has a halo of one row above and below.
         self._now, self._top_row = 0, 1
         buffer = np.pad(np.arange(layout.rows, dtype=np.int32), 1, constant_values=-1)
@@ -46,14 +47,7 @@ class GatherKernel(StepKernel):
         self.advance(0, table)
 
 
-@cache
-def _kernels(config: KernelConfig) -> tuple[Callable[..., None], Callable[..., None]]:
-    """Build the kernels of a configuration, which are compiled at their first launch."""
-    return _build_advance(config), build_read(config, parallel=True, iterations=1)
-
-
 def _build_step(config: KernelConfig) -> Callable[..., None]:
-    """Build the Taichi function that steps a mass point."""
     real, vector, columns, springs = config.real, config.vector, config.first_column(None), config.require(SpringTerm)
     structural, shear = springs.structural, springs.shear
     masks_edges = springs.masks_edges
@@ -85,7 +79,6 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
 
     @ti.func
     def by_right(sheet: ti.template(), p, i, kind, b):
-        """Return the force of entry b of row p on its right neighbour."""
         exists, here = vector(1), p * sheet.width + b
         if ti.static(masks_edges):
             exists = sheet.by_column[HAS_RIGHT * sheet.width + b]
@@ -121,9 +114,10 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
     return step
 
 
+@cache
 def _build_advance(config: KernelConfig) -> Callable[..., None]:
     """Build the kernel that takes steps."""
-    real, vectors, constant_count = config.real, config.vectors, config.first_constant(None)
+    real, vector, vectors, constant_count = config.real, config.vector, config.vectors, config.first_constant(None)
     step, bending = _build_step(config), config.get(BendingTerm)
     storing = [bending.build_store_moment(config)] if bending else []
 
@@ -132,7 +126,7 @@ def _build_advance(config: KernelConfig) -> Callable[..., None]:
         now: ti.i32, count: ti.i32, rows: ti.i32, cols: ti.i32, loads: ti.types.ndarray(dtype=real, ndim=2),
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
-        constants_of: vectors, by_column: vectors, stiffness: vectors, fields: vectors,
+        constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
         for n in ti.static(range(STEPS_PER_LAUNCH)):
             for store_moment in ti.static(storing):

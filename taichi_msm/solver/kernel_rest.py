@@ -85,7 +85,8 @@ class Relaxation(SheetKernel):
 
     def __init__(self, layout: SheetLayout, start: InitialData, masses: NDArray[Any]) -> None:
         self._layout = layout
-        self._relax, self._scale_kernel, self._read = _kernels(layout.config)
+        self._relax, self._scale_kernel = _build_relax(layout.config), _build_scale(layout.config)
+        self._read = build_read(layout.config, parallel=False, iterations=1)
         moments = 0 if layout.config.get(BendingTerm) is None else MOMENT_ROWS
         # The sheet's rows, moments, and the forces carried to the next row.
         self._stored = np.concatenate([np.arange(layout.rows, dtype=np.int32), np.full(moments + 1, -1, np.int32)])
@@ -130,14 +131,7 @@ class Relaxation(SheetKernel):
         return float(np.sqrt(largest[0]))
 
 
-@cache
-def _kernels(config: KernelConfig) -> tuple[Callable[..., None], Callable[..., None], Callable[..., None]]:
-    """Build the kernels of a configuration, which are compiled at their first launch."""
-    return _build_relax(config), _build_scale(config), build_read(config, parallel=False, iterations=1)
-
-
 def _corrections(config: KernelConfig) -> list[RestCorrection]:
-    """Build the corrections of all terms."""
     return [correction for term in config.terms if (correction := term.build_rest_correction(config)) is not None]
 
 
@@ -174,6 +168,7 @@ def _build_store(config: KernelConfig) -> Callable[..., None]:
     return store
 
 
+@cache
 def _build_relax(config: KernelConfig) -> Callable[..., None]:
     """Build the kernel that evaluates forces and moves mass points."""
     real, vector, vectors, lanes = config.real, config.vector, config.vectors, config.lanes
@@ -185,7 +180,6 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
 
     @ti.func
     def add_up(sheet: ti.template(), n: ti.template()):
-        """Sum row n of the reductions, column by column."""
         total = ti.cast(0, real)
         for lane in ti.static(range(lanes)):
             for b in range(1, sheet.width - 1):
@@ -194,7 +188,6 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
 
     @ti.func
     def evaluate(sheet: ti.template(), row: ti.template(), band: ti.template()):
-        """Evaluate the forces at the current displacements."""
         for n in range(sheet.rows * sheet.width, (sheet.rows + SUMS) * sheet.width):
             sheet.work[n] = vector(0)
         for line in range(-1, band.high - band.low):
@@ -237,7 +230,7 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
         q_x: vectors, q_y: vectors, q_z: vectors, work: vectors,
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
-        constants_of: vectors, by_column: vectors, stiffness: vectors, fields: vectors,
+        constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
         ti.loop_config(serialize=True)
         for _ in range(1):
@@ -291,6 +284,7 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
     return relax
 
 
+@cache
 def _build_scale(config: KernelConfig) -> Callable[..., None]:
     """Build the kernel that squares the largest force of a spring, a load or the foundation on a mass point."""
     real, vector, vectors, columns = config.real, config.vector, config.vectors, config.first_column(None)
@@ -306,7 +300,7 @@ def _build_scale(config: KernelConfig) -> Callable[..., None]:
         result: ti.types.ndarray(dtype=real, ndim=1), row: ti.types.ndarray(dtype=real, ndim=2),
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
-        constants_of: vectors, by_column: vectors, stiffness: vectors, fields: vectors,
+        constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
         ti.loop_config(serialize=True)
         for _ in range(1):

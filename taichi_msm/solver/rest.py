@@ -111,30 +111,24 @@ class QuasiStatics(SheetSolver[Relaxation]):
         return reading._replace(residual=self.residual, evaluations=self.evaluations)
 
     def tool_forces(self) -> Array:
-        """Return the opposite of the sum of all other forces on the mass points that each tool touches or holds."""
         touched, force = self._touched().astype(float), self._read_arrays(differences=True)[0]
         # Subtraction from 0 avoids -0.
         return 0.0 - np.einsum("tij,ijk->tk", touched, force)
 
     def _touched(self) -> NDArray[np.bool_]:
-        """Return whether each tool touches or holds each mass point, shape (tools, rows, cols)."""
         return contact_rest.touched_points(len(self.plan.tools), self._read_contact())
 
     @property
     def _contact_column(self) -> int:
-        """The first column of the load table that belongs to contact."""
         return self.layout.config.first_column(ContactTerm)
 
     def _read_contact(self) -> Array:
-        """Read the memory of contact, shape (numbers, rows, cols)."""
         return self._read_memory()[self.layout.config.memory_slice(ContactTerm)]
 
     def _write_contact(self, memory: Array) -> None:
-        """Write the memory of contact, shape (numbers, rows, cols)."""
         self.kernel.arrays.set_fields(self.layout.config.first_field(ContactTerm), memory)
 
     def _settle(self, frame: int, pause: Pause) -> None:
-        """Find the equilibrium of a frame."""
         self.evaluations = 0
         relaxation, before, loads = self.kernel, self.state(), evaluate_frame_loads(self.plan, frame)
         tools, contact_before = self.plan.tools, before.memory[self.layout.config.memory_slice(ContactTerm)]
@@ -198,12 +192,10 @@ class QuasiStatics(SheetSolver[Relaxation]):
         return largest
 
     def _meets_tool(self, time: float) -> bool:
-        """Return whether a tool at a time [s] touches the current sheet."""
         position = rest_positions(self.plan.scene.sheet) + self._read_arrays(differences=False)[0]
         return any(tool.touches(position[~self.plan.fixed], time) for tool in self.plan.tools)
 
     def _is_clamp_displaced(self, time: float) -> bool:
-        """Return whether any clamp is displaced at a time [s]."""
         clamps = [tool for tool in self.plan.tools if isinstance(tool, Clamp)]
         return any(clamp.tip_centre(np.array([time])).any() for clamp in clamps)
 
@@ -276,7 +268,6 @@ class QuasiStatics(SheetSolver[Relaxation]):
         self.kernel.place(self._read_arrays(differences=False)[0] + force * noise * moves)
 
     def _diverged(self, frame: int, residual: float, evaluations: int) -> DivergedError:
-        """Build the error of an iteration that did not converge."""
         plan, time = self.plan, frame / self.plan.grid.frames_per_second
         row, column, *_ = largest_displacement(self._read_arrays(differences=True)[0])
         remedy = (

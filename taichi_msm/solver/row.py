@@ -134,7 +134,6 @@ def build_correct_row(config: KernelConfig, correction: Correction) -> Callable[
 
     @ti.func
     def correct_row(sheet: ti.template(), i, kind, loads: ti.template(), n):
-        """Correct row i after step n of the launch."""
         now = [loads[n, c] for c in ti.static(range(columns))]
         at = i * sheet.width
         # Smallest and largest displacements along y and z.

@@ -208,7 +208,6 @@ class SheetSolver(ABC, Generic[Kernel]):
 
 
 def _initial_data(plan: Plan, layout: SheetLayout, state: State | None) -> InitialData:
-    """Compute the initial values of the arrays of a sheet."""
     sheet = plan.scene.sheet
     moves, column, areas = ~plan.fixed, np.arange(layout.cols), area_shares(sheet)
     # One row of each kind: first, middle, last.

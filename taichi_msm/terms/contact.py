@@ -148,7 +148,6 @@ class ContactTerm(Term):
         return field, field + CORRECTIONS * tools, [column + TOOL_COLUMNS * tool for tool in range(tools)]
 
     def _build_reaches(self, config: KernelConfig) -> Callable[..., Any]:
-        """Build the function that returns whether a tool may touch or hold mass points of a row, see `Correction`."""
         ti, real, vector, tools, grips = config.ti, config.real, config.vector, len(self.shapes), self.grips
         max_lane = build_max_lane(config)
         _, grip_field, bases = self._places(config)
@@ -187,7 +186,6 @@ class ContactTerm(Term):
         return reaches
 
     def _build_resolve(self, config: KernelConfig) -> Callable[..., None]:
-        """Build the function that corrects an entry after the step of its row, see `Correction`."""
         ti, vector, tools, has_friction = config.ti, config.vector, len(self.shapes), self.has_friction
         (first_field, grip_field, base), grips = self._places(config), self.grips
         weight, max_lane = config.first_column(ContactTerm) + WEIGHT, build_max_lane(config)
@@ -268,7 +266,6 @@ class ContactTerm(Term):
         return resolve
 
     def _build_remove(self, config: KernelConfig) -> Callable[..., None]:
-        """Build the function that removes contact forces at an entry, see `RestCorrection`."""
         ti, vector, tools, grips = config.ti, config.vector, len(self.shapes), self.grips
         first_field, grip_field, _ = self._places(config)
         holding, iterations = grip_field + HOLDER, self._iterations
@@ -343,7 +340,6 @@ class ContactTerm(Term):
 
     @property
     def _iterations(self) -> int:
-        """Number of Gauss-Seidel iterations."""
         return 8 if len(self.shapes) > 1 else 1
 
 

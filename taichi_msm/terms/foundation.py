@@ -108,7 +108,6 @@ class FoundationTerm(Term):
         return (self._build_add(config, ratio),)
 
     def _build_add(self, config: KernelConfig, ratio: Callable[..., Any]) -> Callable[..., Any]:
-        """Build the Taichi function that adds -K u, along z times ratio(sheet, entry) if the foundation locks."""
         ti, locks, column, share = config.ti, self.locks, config.first_column(FoundationTerm), self.build_share(config)
 
         @ti.func

@@ -20,7 +20,7 @@ from taichi_msm.errors import ArgumentError, MsmError, SceneError
 from taichi_msm.gradients import kernel_motion, motion, rest
 from taichi_msm.gradients.chain_rule import Derivatives
 from taichi_msm.gradients.gradient import Adjoint, with_stiffness_map
-from taichi_msm.gradients.kernel_motion import adjoint_kernels
+from taichi_msm.gradients.kernel_motion import build_sweep
 from taichi_msm.gradients.motion import MotionAdjoint
 from taichi_msm.model.loads import average_loads
 from taichi_msm.model.plan import Plan
@@ -285,9 +285,9 @@ def test_the_bits_depend_neither_on_workers_nor_on_segments(
 
     def counted(config: KernelConfig, *, parallel: bool) -> Any:
         launches.append(parallel)
-        return adjoint_kernels(config, parallel=parallel)
+        return build_sweep(config, parallel=parallel)
 
-    monkeypatch.setattr(kernel_motion, "adjoint_kernels", counted)
+    monkeypatch.setattr(kernel_motion, "build_sweep", counted)
     assert bits(3) == alone
     assert not any(launches[launches.index(False) :])
 

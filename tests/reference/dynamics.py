@@ -146,7 +146,10 @@ def surgical_force(scene: Scene, loads: Schedule, n: int) -> Array:
 
 def force(scene: Scene, displacement: Array, loads: Schedule, n: int, made: Sheet | None = None) -> Array:
     """Add up all forces except the damping at one step (eq. 1), row n of the schedule; as `elastic_force`."""
-    return internal_force(scene, displacement, loads, n, made or sheet(scene)) + surgical_force(scene, loads, n)
+    made = made or sheet(scene)
+    springs = elastic_force(scene, displacement, made) + bending_force(scene, displacement, made)
+    # In this order small sheets stay within the roundings of their steps.
+    return springs + surgical_force(scene, loads, n) + loads.active[n] * foundation_force(scene, displacement, made)
 
 
 def internal_force(scene: Scene, displacement: Array, loads: Schedule, n: int, made: Sheet) -> Array:
@@ -212,6 +215,8 @@ def steps(plan: Plan, made: Sheet | None = None) -> Iterator[tuple[Array, Contac
     loads, relaxation = average_loads(plan, 0, plan.grid.steps), Relaxation(scene, h)
 
     def acceleration(u: Array, n: int) -> Array:
+        if scene.tissue is None or not scene.tissue.relaxation:
+            return np.asarray(force(scene, u, loads, n, made) / m)
         elastic = internal_force(scene, u, loads, n, made)
         return np.asarray((relaxation.step(elastic) + surgical_force(scene, loads, n)) / m)
 

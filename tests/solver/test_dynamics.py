@@ -91,11 +91,11 @@ def test_small_sheets_and_fixed_sides(points: list[int], fixed: Any, device: Dev
 @pytest.fixture
 def short_launches(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Few steps a launch on a GPU, as each of them is compiled."""
-    kernel_gpu._kernels.cache_clear()
+    kernel_gpu._build_advance.cache_clear()
     for module in ("kernel_gpu", "dynamics"):
         monkeypatch.setattr(f"taichi_msm.solver.{module}.STEPS_PER_LAUNCH", 3)
     yield
-    kernel_gpu._kernels.cache_clear()
+    kernel_gpu._build_advance.cache_clear()
 
 
 @pytest.mark.parametrize("fixed", [pytest.param("border", marks=pytest.mark.slow), ["top"]])
