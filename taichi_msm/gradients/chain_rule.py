@@ -36,30 +36,17 @@ COMPLEX_STEP = 1e-60
 
 @dataclass
 class SheetGradient:
-    """Derivatives of a loss with respect to the coefficients of a sheet.
+    """Derivatives of a loss with respect to the coefficients of a sheet."""
 
-    Attributes:
-        springs: with respect to k - tau of every spring along rows, along columns, and of both diagonals of a cell,
-            with shapes as in `springs.stiffness`.
-        tensions: with respect to tau of each family at constant k - tau, shape (3,).
-        foundation: with respect to log K, the foundation stiffness of every mass point, shape (rows, cols).
-        bending: with respect to the logarithm of the bending stiffness.
-        stiffening: with respect to log(lock) and to the factor of the springs, shape (2,).
-        foundation_stiffening: with respect to log(lock) and to the factor of the foundation, shape (2,).
-        keep: with respect to the factor `keep` of the steps.
-        gain: with respect to the logarithm of the gain of all steps but step 0.
-        first_gain: with respect to the logarithm of the gain of step 0.
-    """
-
-    springs: tuple[Array, Array, Array]
-    tensions: Array
-    foundation: Array
-    bending: float
-    stiffening: Array
-    foundation_stiffening: Array
-    keep: float = 0.0
-    gain: float = 0.0
-    first_gain: float = 0.0
+    springs: tuple[Array, Array, Array]  # k - tau of every spring, with shapes as of `springs.spring_stiffness`
+    tensions: Array  # tau of each family at constant k - tau, shape (3,)
+    foundation: Array  # log K, the foundation stiffness of every mass point, shape (rows, cols)
+    bending: float  # logarithm of the bending stiffness
+    stiffening: Array  # log(lock) and factor of the springs, shape (2,)
+    foundation_stiffening: Array  # log(lock) and factor of the foundation, shape (2,)
+    keep: float = 0.0  # factor `keep` of the steps
+    gain: float = 0.0  # logarithm of the gain of all steps but step 0
+    first_gain: float = 0.0  # logarithm of the gain of step 0
 
     def work(self, plan: Plan) -> float:
         """Return the derivative with respect to the logarithm of a common factor of all internal forces."""
@@ -210,12 +197,10 @@ class LoadGradient:
             self.by_key[f"probes.{index}.at"] = np.zeros((*np.shape(probe.at)[:-1], 2))
 
     def add(self, schedule_of: Callable[[Plan], Schedule], by_slot: Array, times: tuple[float, float]) -> None:
-        """Add the derivatives of a block of steps.
+        """Add the derivatives of a block of steps, whose loads are in an interval of times [s].
 
-        Args:
-            schedule_of: returns the schedule of these steps for a plan with other loads.
-            by_slot: derivatives with respect to the force and the control point of every slot, shape (steps, slots, 5).
-            times: interval that contains all loads of these steps [s].
+        `schedule_of` returns the schedule of these steps for a plan with other loads. `by_slot` are the derivatives
+        with respect to the force and the control point of every slot, shape (steps, slots, 5).
         """
         height, width = self._plan.scene.sheet.size
         for index, slots in self._slots.items():

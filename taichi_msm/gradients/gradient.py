@@ -61,12 +61,7 @@ def _require_memory(plan: Plan) -> None:
 
 
 class Adjoint:
-    """Differentiable simulation in f64, compiled once for repeated runs, also with another stiffness map.
-
-    Args:
-        plan: plan of the scene.
-        device: a CPU.
-        cores: number of CPU cores; None for all.
+    """Differentiable simulation in f64 on a CPU, compiled once for repeated runs, also with another stiffness map.
 
     Raises:
         SceneError: when a probe has a path, or the memory does not suffice.

@@ -19,7 +19,6 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.model.plan import Plan
@@ -40,12 +39,6 @@ def coefficients(plan: Plan) -> Coefficients:
     if plan.scene.time.damping_difference == "central":
         return Coefficients((1 - g * h / 2) / (1 + g * h / 2), undamped / (1 + g * h / 2), undamped / 2)
     return Coefficients(1 - g * h, undamped, undamped / 2)
-
-
-def step_gains(plan: Plan, first: int, count: int) -> NDArray[np.float64]:
-    """Return the gains of steps first, ..., first + count - 1 [m/N], shape (count,)."""
-    _, gain, first_gain = coefficients(plan)
-    return np.where(first + np.arange(count) == 0, first_gain, gain)
 
 
 def mean_force(plan: Plan, displacement: NDArray[Any], steps: int) -> NDArray[Any]:

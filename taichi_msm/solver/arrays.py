@@ -214,28 +214,6 @@ def build_point_step(config: KernelConfig) -> Callable[..., None]:
     return move
 
 
-def build_measure(config: KernelConfig) -> Callable[..., Any]:
-    """Build the Taichi function that adds the measures of an entry, motion first, to a list of vectors."""
-    vector = config.vector
-    measuring_terms = [measure for term in config.terms for measure in term.build_measures(config)]
-
-    @ti.func
-    def measure(measures: ti.template(), sheet: ti.template(), p, i, b):
-        """Measure entry b of row i of the sheet, stored in row p of u; the row below is stored in row p + 1."""
-        kind = ti.select(i == sheet.rows - 1, 2, ti.select(i == 0, 0, 1))
-        motion = vector(0)
-        for c in ti.static(range(3)):
-            change = sheet.d[c][i * sheet.width + b]
-            motion += change * change
-        if ti.static(config.by_area):
-            motion *= sheet.by_column[(AREA_SHARE + kind) * sheet.width + b]
-        measures[SQUARED_MOTION] += motion
-        for measure_term in ti.static(measuring_terms):
-            measure_term(measures, sheet, p, i, kind, b)
-
-    return measure
-
-
 @cache
 def build_read(config: KernelConfig, *, parallel: bool, iterations: int) -> Callable[..., None]:
     """Build the kernel that reads and measures a sheet, parallel over rows or not.
@@ -244,7 +222,7 @@ def build_read(config: KernelConfig, *, parallel: bool, iterations: int) -> Call
     """
     real, vector, vectors, lanes = config.real, config.vector, config.vectors, config.lanes
     count = config.first_constant(None)
-    measure = build_measure(config)
+    measuring = [measure for term in config.terms for measure in term.build_measures(config)]
     reductions = ["sum", *(reduction for term in config.terms for reduction in term.reductions)]
 
     @ti.kernel
@@ -263,9 +241,18 @@ def build_read(config: KernelConfig, *, parallel: bool, iterations: int) -> Call
                 constants = [constants_of[n][0] for n in ti.static(range(count))]
                 u, d = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z))
                 sheet = ti.static(KernelSheet(u, d, by_column, stiffness, fields, constants, rows, width))
+                kind = ti.select(i == rows - 1, 2, ti.select(i == 0, 0, 1))
                 sums = [vector(0) for _ in ti.static(reductions)]
                 for b in range(1, strip + 1):
-                    measure(sums, sheet, p, i, b)
+                    motion = vector(0)
+                    for c in ti.static(range(3)):
+                        change = d[c][i * width + b]
+                        motion += change * change
+                    if ti.static(config.by_area):
+                        motion *= by_column[(AREA_SHARE + kind) * width + b]
+                    sums[SQUARED_MOTION] += motion
+                    for measure in ti.static(measuring):
+                        measure(sums, sheet, p, i, kind, b)
                     for c in ti.static(range(3)):
                         value = ti.select(differences, d[c][i * width + b], u[c][p * width + b])
                         for lane in ti.static(range(lanes)):

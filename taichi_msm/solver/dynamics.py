@@ -17,7 +17,7 @@ from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.surface import surface_point
 from taichi_msm.model.tool_force import probe_force
-from taichi_msm.model.verlet import mean_force, step_gains
+from taichi_msm.model.verlet import coefficients, mean_force
 from taichi_msm.solver.arrays import InitialData, StepKernel
 from taichi_msm.solver.contact_corrections import sum_corrections
 from taichi_msm.solver.kernel_cpu import ScatterKernel
@@ -105,7 +105,9 @@ class Dynamics(SheetSolver[StepKernel]):
     def step_table(self, first: int, count: int) -> NDArray[Any]:
         """Compute the load table of steps first, ..., first + count - 1, shape (count, columns)."""
         table = self.load_table(average_loads(self.plan, first, count), first)
-        table[:, GAIN] = step_gains(self.plan, first, count)
+        _, table[:, GAIN], first_gain = coefficients(self.plan)
+        if first == 0:
+            table[0, GAIN] = first_gain
         return table
 
     def _require_consistent(self) -> None:
@@ -150,11 +152,8 @@ class ForceRecorder:
     def follow(self, before: ProbeForces, frame: int, position: NDArray[Any], tools: Array) -> ProbeForces:
         """Compute the forces at a frame and their maxima up to it.
 
-        Args:
-            before: forces at the previous frame.
-            frame: number of the frame.
-            position: positions of the mass points [m], shape (rows, cols, 3).
-            tools: forces of the position-controlled tools [N], shape (tools, 3).
+        They follow from the forces at the frame before, the positions [m], and the forces of position-controlled tools
+        [N].
         """
         forces, time = self._forces(frame, position, tools), frame / self._plan.grid.frames_per_second
         peaks = zip(before.greatest, (PeakForce(time, tip.force) for tip in forces), strict=True)

@@ -49,8 +49,7 @@ class GatherKernel(StepKernel):
 
 def _build_step(config: KernelConfig) -> Callable[..., None]:
     real, vector, columns, springs = config.real, config.vector, config.first_column(None), config.require(SpringTerm)
-    structural, shear = springs.structural, springs.shear
-    masks_edges = springs.masks_edges
+    structural, shear, open_edges = springs.structural, springs.shear, springs.open_edges
     share_of_row, share_of_column = springs.build_shares(config)
     along, to_other_row, of_row, of_column, of_diagonal = springs.build_spring_forces(config)
     move, corrections = build_point_step(config), [term.build_correction(config) for term in config.terms]
@@ -70,7 +69,7 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
                 else:
                     k *= of_diagonal(sheet, lower, b + ti.static(min(right, 0)))
                     length = ti.sqrt(dx * dx + up * up)
-                if ti.static(right != 0 and masks_edges):
+                if ti.static(right != 0 and open_edges):
                     exists = sheet.by_column[ti.static(HAS_LEFT if right < 0 else HAS_RIGHT) * sheet.width + b]
                 pull = to_other_row(sheet, q * sheet.width + b + right, right, u, up, length, k, exists * row_exists)
                 for c in ti.static(range(3)):
@@ -80,7 +79,7 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
     @ti.func
     def by_right(sheet: ti.template(), p, i, kind, b):
         exists, here = vector(1), p * sheet.width + b
-        if ti.static(masks_edges):
+        if ti.static(open_edges):
             exists = sheet.by_column[HAS_RIGHT * sheet.width + b]
         k, u = of_row(sheet, i, kind, b) * vector(1), [sheet.u[c][here] for c in ti.static(range(3))]
         return along(sheet, here + 1, u, k, share_of_row(exists, kind))

@@ -36,11 +36,6 @@ CACHE_BYTES = 3 << 17
 def choose_layout(plan: Plan, device: Device, cores: int | None = None) -> SheetLayout:
     """Choose the memory layout of a sheet, its division among workers, and the configuration of its kernels.
 
-    Args:
-        plan: the plan.
-        device: the device.
-        cores: largest number of CPU cores; by default all available cores.
-
     Raises:
         DeviceError: when the device does not support the scene.
     """

@@ -70,14 +70,7 @@ def set_tools(plan: Plan, frame: int, time: float, columns: Array) -> None:
 
 
 def memory_after_grips(plan: Plan, frame: int, displacement: Array, before: Array) -> Array:
-    """Return the memory at the start of a frame, after grips have ended and begun.
-
-    Args:
-        plan: the plan.
-        frame: number of the frame.
-        displacement: at the frame before.
-        before: memory at the frame before.
-    """
+    """Return the memory at a frame, after grips ended and began, from memory and displacements at the frame before."""
     tools, memory = plan.tools, before.copy()
     if len(memory) == CORRECTIONS * len(tools):
         return memory
@@ -113,14 +106,9 @@ def _centre_at_grip(plan: Plan, tool: Tool, frame: int) -> Array:
 
 
 def stick(plan: Plan, memory: Array, start: Array, end: Array, times: tuple[float, float]) -> Array:
-    """Return the memory after rough tools have taken the mass points that they reach between two shapes.
+    """Return the memory after rough tools have taken the mass points that they reach between two times [s].
 
-    Args:
-        plan: the plan.
-        memory: memory before.
-        start: displacements at the first time.
-        end: displacements at the second time without further contact.
-        times: the two times [s].
+    `start` and `end` are the displacements at these times, `end` without further contact.
     """
     tools, memory, rest = plan.tools, memory.copy(), rest_positions(plan.scene.sheet)
     fields = memory[CORRECTIONS * len(tools) :]
@@ -156,12 +144,7 @@ def without_rough_tools(plan: Plan, row: Array, first_column: int) -> Array:
 def compute_pulls(plan: Plan, memory: Array, displacement: Array, force: Array, time: float) -> Array:
     """Compute the pull of rough tools on the mass points that stick to them, 0 where they push [N], shape (rows, cols).
 
-    Args:
-        plan: the plan.
-        memory: memory of the term.
-        displacement: displacements.
-        force: sum of all forces but those of tools.
-        time: of the tools [s].
+    `force` is the sum of all forces but those of tools, and `time` that of the tools [s].
     """
     tools, position = plan.tools, rest_positions(plan.scene.sheet) + displacement
     holder, pulls = memory[CORRECTIONS * len(tools) + HOLDER], np.zeros(plan.fixed.shape)

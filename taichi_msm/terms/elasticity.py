@@ -121,17 +121,10 @@ def elastic_force(families: Sequence[SpringFamily], displacement: Array) -> Arra
 
 
 def energy_density(plan: Plan, displacement: Array) -> Array:
-    """Compute the energy density of the springs relative to the state at rest, without bending and foundation.
+    """Compute the energy density of the springs, without bending and foundation [J/m2], shape (rows, cols).
 
     Each end of a spring has half of its energy. The sum of density times `area_shares` times the area of a cell is
-    therefore the energy of all springs.
-
-    Args:
-        plan: the plan.
-        displacement: x - X [m], shape (rows, cols, 3).
-
-    Returns:
-        Energy per area at rest [J/m2], shape (rows, cols).
+    therefore the energy of all springs, relative to the state at rest.
     """
     by_point, (dx, dy) = np.zeros(displacement.shape[:2]), spacing(plan.scene.sheet)
     for family in spring_families(plan):

@@ -90,32 +90,21 @@ class FoundationTerm(Term):
         return law_numbers(plan.material.virtual_stiffening, 1.0)
 
     def build_forces(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
-        ti, (secant, _) = config.ti, self._build_law(config)
-
-        @ti.func
-        def ratio(sheet: ti.template(), entry: ti.template()):
-            return secant(sheet, entry.u[2])
-
-        return (self._build_add(config, ratio),)
+        return (self._build_add(config, tangent=False),)
 
     def build_tangents(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
-        ti, (_, tangent) = config.ti, self._build_law(config)
+        return (self._build_add(config, tangent=True),)
 
-        @ti.func
-        def ratio(sheet: ti.template(), entry: ti.template()):
-            return tangent(sheet, entry.shape[2])
-
-        return (self._build_add(config, ratio),)
-
-    def _build_add(self, config: KernelConfig, ratio: Callable[..., Any]) -> Callable[..., Any]:
+    def _build_add(self, config: KernelConfig, *, tangent: bool) -> Callable[..., Any]:
         ti, locks, column, share = config.ti, self.locks, config.first_column(FoundationTerm), self.build_share(config)
+        ratio = self._build_law(config)[tangent]
 
         @ti.func
         def add(force: ti.template(), sheet: ti.template(), entry: ti.template(), now: ti.template()):
-            k = share(sheet, entry, now[column])
+            k, shape = share(sheet, entry, now[column]), ti.static(entry.shape if tangent else entry.u)
             for c in ti.static(range(3)):
                 if ti.static(locks and c == 2):
-                    force[c] = force[c] - k * (entry.u[c] * ratio(sheet, entry))
+                    force[c] = force[c] - k * (entry.u[c] * ratio(sheet, shape[2]))
                 else:
                     force[c] = force[c] - k * entry.u[c]
 
@@ -161,17 +150,17 @@ class FoundationTerm(Term):
     def _build_law(self, config: KernelConfig) -> tuple[Callable[..., Any], Callable[..., Any]]:
         """Build the Taichi functions secant(sheet, u_z) and tangent(sheet, u_z) of a foundation that locks."""
         ti, first, law = config.ti, config.first_constant(FoundationTerm), build_locking(config.operations)
-        secant_of, tangent_of = ti.func(law.secant), ti.func(law.tangent)
 
-        @ti.func
-        def secant(sheet: ti.template(), u):
-            return secant_of(0 - u * sheet.constants[first], sheet.constants[first + 1])
+        def of_depth(function: Callable[..., Any]) -> Callable[..., Any]:
+            law_function = ti.func(function)
 
-        @ti.func
-        def tangent(sheet: ti.template(), u):
-            return tangent_of(0 - u * sheet.constants[first], sheet.constants[first + 1])
+            @ti.func
+            def at(sheet: ti.template(), u):
+                return law_function(0 - u * sheet.constants[first], sheet.constants[first + 1])
 
-        return secant, tangent
+            return at
+
+        return of_depth(law.secant), of_depth(law.tangent)
 
 
 def _steepest(material: Material) -> float:

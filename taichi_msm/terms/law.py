@@ -71,12 +71,7 @@ class Law(ABC):
 
     @abstractmethod
     def build(self, operations: Operations, *, tense: bool = True) -> LawFunctions:
-        """Build the functions of the law.
-
-        Args:
-            operations: of NumPy or Taichi.
-            tense: whether any tau is not 0; otherwise `pull` ignores it.
-        """
+        """Build the functions of the law for NumPy or Taichi; if not `tense`, `pull` ignores tau, because it is 0."""
 
 
 @dataclass(frozen=True)
@@ -111,17 +106,11 @@ LINEAR = LinearLaw()
 
 
 class LockingFunctions(NamedTuple):
-    """Functions of x = e / m and x0.
+    """Functions of x = e / m and x0."""
 
-    Attributes:
-        secant: f(e) / e.
-        tangent: f'(e).
-        energy: twice the integral of f, divided by m^2.
-    """
-
-    secant: Callable[..., Any]
-    tangent: Callable[..., Any]
-    energy: Callable[..., Any]
+    secant: Callable[..., Any]  # f(e) / e
+    tangent: Callable[..., Any]  # f'(e)
+    energy: Callable[..., Any]  # twice the integral of f, divided by m^2
 
 
 def build_locking(operations: Operations) -> LockingFunctions:

@@ -108,13 +108,9 @@ class ProbeTerm(Term):
     def build_load_adjoint(self, config: KernelConfig, first_slope: int) -> Callable[..., None]:
         """Build the function add_adjoint(sums, sheet, entry, now), the adjoint of the loads.
 
-        It differentiates the product of the force of each slot and `entry.u`, by the force (3) and by the control
-        point (2), and adds these derivatives to the list `sums`.
-
-        Args:
-            config: compile-time configuration.
-            first_slope: index of the first array of `decay_gradients` in `sheet.derivatives`, counted in arrays of the
-                sheet.
+        It differentiates the product of the force of each slot and `entry.u`, by the force (3) and by the control point
+        (2), and adds these derivatives to the list `sums`. `first_slope` is the index of the first array of
+        `decay_gradients` in `sheet.derivatives`, counted in arrays of the sheet.
         """
         ti = config.ti
         moves, by_area, first = self.moves, self.by_area, config.first_column(ProbeTerm)

@@ -69,11 +69,6 @@ class SpringTerm(Term):
         return self.tense and self.open_edges
 
     @property
-    def masks_edges(self) -> bool:
-        """Whether the forces of springs need to know which springs exist."""
-        return self.open_edges and (self.tense or not self.mapped)
-
-    @property
     def constant_count(self) -> int:  # type: ignore[override]
         return FIRST_NUMBER + 3 * self.law.number_count
 
@@ -194,7 +189,7 @@ class SpringTerm(Term):
         """
         ti = config.ti
         tense, mapped, by_area = self.tense, self.mapped, self.by_area and not self.mapped
-        masks_edges, real, first = self.masks_edges, config.real, config.first_constant(SpringTerm)
+        open_edges, real, first = self.open_edges, config.real, config.first_constant(SpringTerm)
         tense_edges, vector = self.tense_edges, config.vector
         first_tension, numbers_of = first + FIRST_TENSION, self.build_numbers(config)
         pull = config.compile_law(self.law, tense=self.tense).pull
@@ -203,7 +198,7 @@ class SpringTerm(Term):
         def masked(k, exists):
             if ti.static(tense_edges):
                 return ti.select(exists > 0, k, vector(0))
-            elif ti.static(masks_edges):  # noqa: RET505
+            elif ti.static(open_edges):  # noqa: RET505
                 return k * exists
             else:
                 return k
