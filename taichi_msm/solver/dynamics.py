@@ -40,12 +40,7 @@ class Dynamics(SheetSolver[StepKernel]):
 
     An exception such as KeyboardInterrupt during a launch leaves the sheet inconsistent, because the number of steps
     taken is then unknown.
-
-    Attributes:
-        launches: number of launches, each followed by a call of `pause`.
     """
-
-    launches = 0
 
     def restart(self, plan: Plan, state: State | None = None) -> None:
         self._first_tabled, self._loads = 0, np.empty((0, 0))
@@ -77,7 +72,6 @@ class Dynamics(SheetSolver[StepKernel]):
             self.kernel.advance(count, self._next_loads(count))
             self.steps_done += count
             self.inconsistent = False
-            self.launches += 1
             pause()
 
     def compile(self) -> None:

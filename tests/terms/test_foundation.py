@@ -14,7 +14,6 @@ from taichi_msm.accuracy.mesh import coarser_plan
 from taichi_msm.errors import SceneError
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.model.loads import average_loads
-from taichi_msm.model.sheet import rest_positions
 from taichi_msm.runs.run import run
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
@@ -30,7 +29,6 @@ from tests.golden import Messages
 from tests.motion import frames, notes_of
 from tests.outputs import results
 from tests.scenes import plan_of, speckle
-from tests.solver.test_dynamics import simulate
 from tests.solver.test_tissue_physics import EVERYWHERE, tissue, weight
 
 TOOL = {"at": [0.4, 0.6], "total": [0.3, 0.2, -2], "radius": 0.01, "falloff": 100, "load": [[0, 0], [0.05, 100]]}
@@ -47,18 +45,6 @@ def mapped(image: str, fixed: Any = "border", **more: Any) -> Scene:
     """Tissue on a foundation that is up to ten times as stiff in one place as in another."""
     terms: dict[str, Any] = {"foundation": 2e6, "foundation_map": {"image": image, "range": [0.5, 5]}}
     return tissue((13, 15), fixed=fixed, **terms | {"damping": 40, "probes": [TOOL], "time": {"duration": 0.08}} | more)
-
-
-@pytest.mark.parametrize(
-    ("fixed", "active", "precision"),
-    [("none", "loaded", "f64"), (["left"], "always", "f32"), ("border", "always", "f64")],
-)
-def test_it_is_like_the_twin(fixed: Any, active: str, precision: str, image: str, device: Device) -> None:
-    time = {"duration": 0.08, "precision": precision}
-    made = mapped(image, fixed, foundation_active=active, time=time)
-    twin = reference.simulate(made) - rest_positions(made.sheet)
-    rounding = {"f64": 1e-12, "f32": 2e-4}[precision] * np.abs(twin).max()
-    np.testing.assert_allclose(simulate(made, device), twin, rtol=0, atol=rounding)
 
 
 def test_where_nothing_else_holds_every_point_sinks_by_the_pressure_over_its_stiffness(

@@ -138,23 +138,6 @@ def test_a_map_of_springs_is_like_the_twin(load: Any, device: Device) -> None:
     np.testing.assert_allclose(diagonal, 10 * factor, rtol=1e-15)
 
 
-def test_a_map_is_read_once_for_a_run(load: Any, tmp_path: Path, device: Device) -> None:
-    """Also for the pilots with fewer points, whatever happens to its file meanwhile."""
-    made = load("tissue.map={image: map.png, range: [1, 2]}", "output=[trajectory]")
-    plan = plan_of(made)
-    before = run(plan, tmp_path / "before", threads=device.threads, estimate_error=True)
-    Image.new("L", (3, 3), 51).save(tmp_path / "map.png")
-    assert run(plan, tmp_path / "after", threads=device.threads, estimate_error=True)["sha256"] == before["sha256"]
-    (tmp_path / "map.png").rename(tmp_path / "other.png")
-    gone = run(plan, tmp_path / "gone", threads=device.threads, estimate_error=True)
-    assert gone["max_displacement"] == before["max_displacement"]
-    assert gone["error_estimate"] == before["error_estimate"]
-    (tmp_path / "other.png").rename(tmp_path / "map.png")
-    factors: Any = plan_of(made).material.factors
-    np.testing.assert_allclose(factors, 1.2)
-    assert plan_of(made).stable_step > plan.stable_step
-
-
 def test_where_the_tool_lets_go_a_tense_sheet_comes_back(load: Any, device: Device) -> None:
     soft = ("tissue.foundation=0", "tissue.young=3000", "time.duration=2", "probes.0.total=[0, 0, -0.2]")
 
