@@ -154,18 +154,6 @@ def _build_store_moments(code: KernelConfig) -> list[Callable[..., None]]:
     return [store_moments]
 
 
-def _build_clear(code: KernelConfig) -> Callable[..., None]:
-    vector = code.vector
-
-    @ti.func
-    def clear(sheet: ti.template(), row):
-        for b in range(1, sheet.width - 1):
-            for c in ti.static(range(3)):
-                sheet.u[c][row * sheet.width + b] = vector(0)
-
-    return clear
-
-
 @cache
 def build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
     """Build the kernel that steps forward and stores all displacements.
@@ -175,7 +163,7 @@ def build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
     """
     real, vector, vectors = code.real, code.vector, code.vectors
     count_of_numbers, join_strips, step = code.first_constant(None), build_join_strips(code), build_point_step(code)
-    clear, storing = _build_clear(code), _build_store_moments(code)
+    storing = _build_store_moments(code)
 
     @ti.func
     def move(sheet: ti.template(), entry: ti.template(), target, force: ti.template(), now: ti.template()):
@@ -192,7 +180,9 @@ def build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
         moments = ti.cast(sizes[MOMENT_ROW], ti.i32) + MOMENT_ROWS * worker
         band = ti.static(AdjointBand(low, high, shape, shape, shape, carry, moments, k, 0))
         if low == 0:
-            clear(sheet, carry)
+            for b in range(1, sheet.width - 1):
+                for c in ti.static(range(3)):
+                    sheet.u[c][carry * sheet.width + b] = vector(0)
         for i in range(ti.max(low - 1, 0), high):
             for store_moments in ti.static(storing):
                 if i >= low:
@@ -378,7 +368,7 @@ def build_sweep(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
     """Build the kernel that sweeps the adjoint, from the last step to the first."""
     real, vector, vectors, count_of_numbers = code.real, code.vector, code.vectors, code.first_constant(None)
     join_strips, storing = build_join_strips(code), _build_store_moments(code)
-    clear, sweep_row = _build_clear(code), _build_sweep_row(code)
+    sweep_row = _build_sweep_row(code)
 
     @ti.func
     def step_band(sheet: ti.template(), tables: ti.template(), sizes: ti.template(), worker, k):
@@ -393,7 +383,9 @@ def build_sweep(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
         source, target = buffer * sheet.rows, (1 - buffer) * sheet.rows
         band = ti.static(AdjointBand(low, high, source, target, shape, carry, moments, n, with_loss))
         if low == 0:
-            clear(sheet, carry)
+            for b in range(1, sheet.width - 1):
+                for c in ti.static(range(3)):
+                    sheet.u[c][carry * sheet.width + b] = vector(0)
         for i in range(ti.max(low - 1, 0), high):
             for store_moments in ti.static(storing):
                 if i >= low:

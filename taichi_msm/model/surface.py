@@ -99,18 +99,11 @@ def _cell_coordinates(coordinates: Array, points: tuple[int, int], refine: int) 
 
 
 class Surface(NamedTuple):
-    """Textured triangles.
+    """Textured triangles, with vertices row by row from the top left."""
 
-    Attributes:
-        vertices: positions [m], shape (vertices, 3), row by row from the top left.
-        triangles: indices of vertices, shape (triangles, 3), counter-clockwise as seen from above.
-        texture_coordinates: fractions of the texture's width from its left and of its height from its top, shape
-            (vertices, 2).
-    """
-
-    vertices: NDArray[np.floating]
-    triangles: NDArray[np.int32]
-    texture_coordinates: NDArray[np.float64]
+    vertices: NDArray[np.floating]  # positions [m], shape (vertices, 3)
+    triangles: NDArray[np.int32]  # indices of vertices, shape (triangles, 3), counter-clockwise as seen from above
+    texture_coordinates: NDArray[np.float64]  # fractions of the texture from left and from top, shape (vertices, 2)
 
 
 class Solid(NamedTuple):

@@ -249,7 +249,7 @@ def build_read(config: KernelConfig, *, parallel: bool, iterations: int) -> Call
                         change = d[c][i * width + b]
                         motion += change * change
                     if ti.static(config.by_area):
-                        motion *= by_column[(AREA_SHARE + kind) * width + b]
+                        motion *= sheet.by_column[(AREA_SHARE + kind) * width + b]
                     sums[SQUARED_MOTION] += motion
                     for measure in ti.static(measuring):
                         measure(sums, sheet, p, i, kind, b)
