@@ -26,7 +26,7 @@ TEMPLATE = ROOT / "docs" / "performance.template"
 NOT_MEASURED = "(not measured yet)"
 
 # Whose versions the page names, where they are installed.
-PACKAGES = ("numba", "jax", "warp-lang", "opencv-python-headless", "moderngl", "vtk", "scikit-image")
+PACKAGES = ("numba", "jax", "opencv-python-headless", "moderngl", "vtk", "scikit-image")
 
 Results = dict[str, Any]
 Entry = dict[str, Any]
@@ -70,16 +70,15 @@ def tables(results: Results) -> dict[str, str]:
     makers: dict[str, tuple[str, Callable[[], str]]] = {
         "stepping_table": ("stepping", lambda: stepping_table(results["stepping"])),
         "ratio_table": ("stepping", lambda: ratio_table(results["stepping"])),
-        "width_table": ("widths", lambda: width_table(results["widths"])),
         "narrow_step_table": ("narrow", lambda: narrow_step_table(results["narrow"])),
         "narrow_picture_table": ("narrow", lambda: narrow_picture_table(results["narrow"])),
         "remap_ratios": ("drawing", lambda: remap_ratios(results["drawing"])),
         "lit_table": ("drawing", lambda: drawing_table(results["drawing"]["lit"])),
         "flat_table": ("drawing", lambda: drawing_table(results["drawing"]["flat"])),
         "whole_run_table": ("whole_run", lambda: whole_run_table(results["whole_run"])),
-        "terms_table": ("terms", lambda: terms_table(results["terms"])),
+        "terms_table": ("terms", lambda: relative_table("a step", results["terms"], terms.SPRINGS)),
         "gradient_table": ("gradient", lambda: gradient_table(results["gradient"])),
-        "looks_table": ("looks", lambda: looks_table(results["looks"]["pictures"])),
+        "looks_table": ("looks", lambda: relative_table("a picture", pictures(results), looks.HEADLIGHT)),
         "lens_ratios": ("looks", lambda: lens_ratios(results["looks"]["pictures"])),
         "rates_table": ("looks", lambda: rates_table(results["looks"]["rates"])),
         "compilers_table": ("compilers", lambda: compilers_table(results["compilers"])),
@@ -167,18 +166,6 @@ def ratio_table(measured: dict[str, list[Entry]]) -> str:
     )
 
 
-def width_table(found: dict[str, dict[str, dict[str, int]]]) -> str:
-    """Show how many packed operations of each width the code of every peer has."""
-    return table(
-        ["packed operations in the code of a step", "512 bits", "256 bits", "128 bits"],
-        [
-            [f"{name}, of {bits} bits", *(str(counts[width]) for width in ("512", "256", "128"))]
-            for bits, peers in found.items()
-            for name, counts in peers.items()
-        ],
-    )
-
-
 def narrow_step_table(found: Results) -> str:
     """Show the time of a step with narrower vectors than the processor has."""
     if not found:
@@ -247,15 +234,14 @@ def compilers_table(measured: dict[str, dict[str, list[float]]]) -> str:
     return table(["time", *(COMPILERS[name].title for name in names), "ratio"], rows)
 
 
-def terms_table(measured: dict[str, dict[str, list[float]]]) -> str:
-    """Show the time of a step of every kind of sheet, and how many times that of one in springs it is."""
+def relative_table(head: str, measured: dict[str, dict[str, list[float]]], base: str) -> str:
+    """Show times at every size, and how many times that of one of them each is."""
     medians = {size: {name: Timing.of(times).median for name, times in own.items()} for size, own in measured.items()}
-    names = next(iter(medians.values()))
     rows = [
-        [name, *(f"{format_duration(own[name])} ({own[name] / own[terms.SPRINGS]:.2f})" for own in medians.values())]
-        for name in names
+        [name, *(f"{format_duration(own[name])} ({own[name] / own[base]:.2f})" for own in medians.values())]
+        for name in next(iter(medians.values()))
     ]
-    return table(["a step", *medians], rows)
+    return table([head, *medians], rows)
 
 
 def gradient_table(measured: dict[str, dict[str, dict[str, list[float]]]]) -> str:
@@ -269,15 +255,9 @@ def gradient_table(measured: dict[str, dict[str, dict[str, list[float]]]]) -> st
     return table(["a gradient", "forward run", "value and gradient", "in forward runs of taichi_msm"], rows)
 
 
-def looks_table(measured: dict[str, dict[str, list[float]]]) -> str:
-    """Show the time of a picture of every kind, and how many times that of one with the headlight it is."""
-    medians = {size: {name: Timing.of(times).median for name, times in own.items()} for size, own in measured.items()}
-    names = next(iter(medians.values()))
-    rows = [
-        [name, *(f"{format_duration(own[name])} ({own[name] / own[looks.HEADLIGHT]:.2f})" for own in medians.values())]
-        for name in names
-    ]
-    return table(["a picture", *(f"{size} × {size}" for size in medians)], rows)
+def pictures(results: Results) -> dict[str, dict[str, list[float]]]:
+    """Return the times of all kinds of pictures, by their size."""
+    return {f"{size} × {size}": own for size, own in results["looks"]["pictures"].items()}
 
 
 def lens_ratios(measured: dict[str, dict[str, list[float]]]) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from benchmarks import bounds, compilers, gradients, instructions, looks, terms, whole_run
+from benchmarks import bounds, compilers, gradients, looks, terms, whole_run
 from benchmarks.drawing import FLAT, LIT
 from benchmarks.race import Progress, race
 from benchmarks.stepping import FASTEST, PEERS
@@ -90,11 +90,6 @@ def narrow(effort: Effort, progress: Progress) -> dict[str, Any]:
 def size(effort: Effort, progress: Progress) -> dict[str, Entries]:
     """Step sheets of every size."""
     return _step(FASTEST, effort.sizes, effort, progress)
-
-
-def widths(progress: Progress) -> dict[str, dict[str, dict[str, int]]]:
-    """Count the vector instructions of the fastest peers."""
-    return instructions.measure(FASTEST, sorted({NARROW, vector_bits()}, reverse=True), progress)
 
 
 def refine(effort: Effort, progress: Progress) -> dict[str, Entries]:
@@ -190,6 +185,5 @@ PARTS: dict[str, Callable[[Effort, Progress], Any]] = {
     "resolution": resolution,
     "threads": threads,
     "narrow": narrow,
-    "widths": lambda effort, progress: widths(progress),
     "bounds": lambda effort, progress: bounds.measure(effort.sizes, effort.rounds, progress),
 }

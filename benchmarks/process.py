@@ -85,7 +85,6 @@ def _environment(threads: int | None, bits: int | None, compiler: str) -> dict[s
         "NUMBA_CACHE_DIR": str(CACHE / "numba"),
         COMPILER_VARIABLE: compiler,
         COMPILERS[compiler].folder_variable: str(CACHE / compiler),
-        "WARP_CACHE_PATH": str(CACHE / "warp"),
     }
     if threads is not None:
         pools = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "LP_NUM_THREADS")

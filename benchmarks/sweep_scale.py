@@ -22,9 +22,9 @@ import psutil
 from distributed import Client
 
 from benchmarks.process import OUTPUT
-from taichi_msm.sweeps.runs import begin_sweep
+from taichi_msm.sweeps.runs import begin_sweep, run_missing
 from taichi_msm.sweeps.spec import Sweep, load_sweep
-from taichi_msm.sweeps.sweep import finish_sweep, open_executor, run_missing
+from taichi_msm.sweeps.sweep import finish_sweep, open_executor
 from taichi_msm.system.process import available_threads
 
 FOLDER = OUTPUT / "sweep_scale"

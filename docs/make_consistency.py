@@ -9,7 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from taichi_msm import run
-from tests.consistency import AGREEMENTS, CAMERAS, measured, scene
+from tests.test_consistency import AGREEMENTS, CAMERAS, measured, scene
 
 PAGE = Path(__file__).parent / "labels.md"
 START, END = "<!-- consistency: made by docs/make_consistency.py -->\n", "<!-- end of consistency -->\n"

@@ -236,7 +236,7 @@ def data_set(runs: int, moment: float, size: int) -> list[Image.Image]:
     """Draw the first runs of the sweep tracking at a moment [s]."""
     described = load_sweep(SCENES / "sweeps" / "tracking.yaml")
     pictures = []
-    for values in described.sample_values(runs):
+    for values in described.values(runs):
         plan = plan_file(described.scene, (*described.overrides(values), f"render.size=[{size},{size}]"))
         with Simulation(plan) as simulation:
             simulation.advance(round(moment * plan.scene.time.frames_per_second))

@@ -21,8 +21,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from taichi_msm import FitResult, SceneError, Simulation, fit, load_scene
-from taichi_msm.fitting.machine_tables import read_machine_test
-from taichi_msm.fitting.table_grids import read_workbook
+from taichi_msm.fitting.machine_tables import EXPECTED, read_machine_test
+from taichi_msm.fitting.tables import read_workbook
 from taichi_msm.plot_style import BLUE, DPI, STYLE, VERMILION
 
 DOCS = Path(__file__).parent
@@ -243,7 +243,7 @@ def main() -> None:
         draw(fit_sheet(options.workbook, options.draw), fit_strip(options.strips[0]))
         return
     record = json.loads(RECORD.read_text(encoding="utf-8")) if RECORD.exists() else {}
-    sheets = options.only or [name for name in read_workbook(options.workbook) if name.startswith("230403-")]
+    sheets = options.only or [name for name in read_workbook(options.workbook, EXPECTED) if name.startswith("230403-")]
     tests = {Path(path).stem: (fit_strip, (path,)) for path in options.strips}
     tests |= {name: (fit_sheet, (options.workbook, name)) for name in sheets}
     for name, (run, arguments) in tests.items():

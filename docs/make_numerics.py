@@ -22,7 +22,7 @@ from scipy.sparse.linalg import eigsh, spsolve
 from scipy.special import k0, k1
 
 from taichi_msm import Scene, load_scene
-from taichi_msm.accuracy.time_step import estimate_error, max_norm
+from taichi_msm.accuracy.time_step import TimeStepTrials, max_norm
 from taichi_msm.model.loads import decay, evaluate_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import fixed_points, rest_positions, spacing
@@ -98,7 +98,7 @@ def silent_table() -> str:
         exact = truth(plan)
         largest = max_norm(exact)
         errors = [max_norm(motion(one) - exact) / largest for one in (plan.with_grid(precision="f32"), plan)]
-        told = estimate_error(plan, runtime.current_device()).error
+        told = TimeStepTrials(plan, runtime.current_device()).estimate(plan.grid.steps_per_frame).error
         rows.append([name, *(f"{error:.2g}" for error in errors), f"{told:.2g}", plan.grid.precision])
     return markdown_table(
         ["run", "error in f32", "error with auto", "error told", "auto takes"], rows, left_columns=(0, 4)

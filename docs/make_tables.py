@@ -1,4 +1,4 @@
-"""Write the tables that come from the program's own words into the pages: keys, outputs, camera files.
+"""Write the tables that come from the program's own words into the pages: keys, camera files.
 
 python docs/make_tables.py
 """
@@ -15,7 +15,6 @@ from taichi_msm.camera_files import calibrations, trajectories
 from taichi_msm.camera_files.calibration import CalibrationReader
 from taichi_msm.camera_files.trajectory import TrajectoryReader
 from taichi_msm.load.scene_file import schema
-from taichi_msm.scene.outputs import OUTPUTS
 from taichi_msm.scene.section import Section
 from taichi_msm.sweeps.spec import Distribution, SweepSettings
 from taichi_msm.view.events import KEYS, POINTER
@@ -57,13 +56,6 @@ def page_keys() -> str:
     return "| | |\n|---|---|\n" + "\n".join(lines) + "\n"
 
 
-def outputs(*sources: str) -> str:
-    """Give the table of the outputs with these sources."""
-    chosen = [output for output in OUTPUTS.values() if output.source in sources]
-    lines = [f"| `{output.entry}` | `{output.file}` | {output.description} |" for output in chosen]
-    return "| `output` | file (that of frame 0) | what it holds |\n|---|---|---|\n" + "\n".join(lines) + "\n"
-
-
 def model_keys(model: type[Section], *titles: str) -> str:
     """Give the table of the keys of a section that has none below it."""
     lines = []
@@ -89,8 +81,6 @@ TABLES: dict[tuple[str, str], Callable[[], str]] = {
     ("sweep", "distributions"): partial(model_keys, Distribution, "way", "how the key varies", "value"),
     ("cameras", "calibrations"): partial(readers, calibrations.READERS),
     ("cameras", "trajectories"): partial(readers, trajectories.READERS),
-    ("files", "outputs"): partial(outputs, "picture", "positions", "forces"),
-    ("labels", "labels"): partial(outputs, "labels", "flow", "stereo", "tracks"),
 }
 
 

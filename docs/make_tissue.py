@@ -28,7 +28,7 @@ from taichi_msm.plot_style import (
     TWO_COLUMN_WIDTH,
     VERMILION,
 )
-from taichi_msm.terms.locking import build_locking
+from taichi_msm.terms.law import build_locking
 
 Floats = NDArray[np.float64]
 

@@ -39,83 +39,41 @@ if TYPE_CHECKING:
     from taichi_msm.sweeps.sweep import sweep
 
 
-# Module of each public name.
-_MODULES = {
-    **dict.fromkeys(
-        ("ArgumentError", "DeviceError", "DivergedError", "FilesError", "MsmError", "NotInstalledError", "SceneError"),
-        "errors",
-    ),
-    "export": "exports.export",
-    "fit": "fitting.fit",
-    **dict.fromkeys(("FitResult", "FittedMap"), "fitting.result"),
-    **dict.fromkeys(("Gradient", "gradient"), "gradients.gradient"),
-    "TipForce": "solver.state",
-    "Playback": "runs.playback",
-    **dict.fromkeys(("Flow", "Labels", "Sight"), "render.labels"),
-    "Surface": "model.surface",
-    **dict.fromkeys(("resume", "run"), "runs.run"),
-    **dict.fromkeys(("Camera", "Distortion", "Intrinsics", "Pose"), "scene.camera"),
-    **dict.fromkeys(("Light", "Render"), "scene.render"),
-    **dict.fromkeys(("Scene", "Time"), "scene.scene"),
-    **dict.fromkeys(
-        ("Foundation", "RelaxationBranch", "Sheet", "Springs", "Stiffening", "StiffnessMap", "Tissue"), "scene.sheet"
-    ),
-    **dict.fromkeys(("Instrument", "Probe"), "scene.tools"),
-    "load_scene": "load.scene_file",
-    "Simulation": "runs.simulation",
-    "Outcome": "sweeps.runs",
-    "sweep": "sweeps.sweep",
+# Public names by their module.
+_NAMES = {
+    "errors": "ArgumentError DeviceError DivergedError FilesError MsmError NotInstalledError SceneError",
+    "exports.export": "export",
+    "fitting.fit": "fit",
+    "fitting.result": "FitResult FittedMap",
+    "gradients.gradient": "Gradient gradient",
+    "load.scene_file": "load_scene",
+    "model.surface": "Surface",
+    "render.labels": "Flow Labels Sight",
+    "runs.playback": "Playback",
+    "runs.run": "resume run",
+    "runs.simulation": "Simulation",
+    "scene.camera": "Camera Distortion Intrinsics Pose",
+    "scene.render": "Light Render",
+    "scene.scene": "Scene Time",
+    "scene.sheet": "Foundation RelaxationBranch Sheet Springs Stiffening StiffnessMap Tissue",
+    "scene.tools": "Instrument Probe",
+    "solver.state": "TipForce",
+    "sweeps.runs": "Outcome",
+    "sweeps.sweep": "sweep",
 }
 
-__all__ = [
-    "ArgumentError",
-    "Camera",
-    "DeviceError",
-    "Distortion",
-    "DivergedError",
-    "FilesError",
-    "FitResult",
-    "FittedMap",
-    "Flow",
-    "Foundation",
-    "Gradient",
-    "Instrument",
-    "Intrinsics",
-    "Labels",
-    "Light",
-    "MsmError",
-    "NotInstalledError",
-    "Outcome",
-    "Playback",
-    "Pose",
-    "Probe",
-    "RelaxationBranch",
-    "Render",
-    "Scene",
-    "SceneError",
-    "Sheet",
-    "Sight",
-    "Simulation",
-    "Springs",
-    "Stiffening",
-    "StiffnessMap",
-    "Surface",
-    "Time",
-    "TipForce",
-    "Tissue",
-    "export",
-    "fit",
-    "gradient",
-    "load_scene",
-    "resume",
-    "run",
-    "sweep",
-]
+__all__ = ["ArgumentError", "DeviceError", "DivergedError", "FilesError", "MsmError", "NotInstalledError", "SceneError"]
+__all__ += ["Camera", "Distortion", "Foundation", "Instrument", "Intrinsics", "Light", "Pose", "Probe"]
+__all__ += ["RelaxationBranch", "Render", "Scene", "Sheet", "Springs", "Stiffening", "StiffnessMap", "Time", "Tissue"]
+__all__ += ["Flow", "Labels", "Outcome", "Playback", "Sight", "Simulation", "Surface", "TipForce"]
+__all__ += ["FitResult", "FittedMap", "Gradient"]
+__all__ += ["export", "fit", "gradient", "load_scene", "resume", "run", "sweep"]
 
 
 def __getattr__(name: str) -> Any:
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
 
-    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+    for module, names in _NAMES.items():
+        if name in names.split():
+            return getattr(import_module(f"{__name__}.{module}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -60,8 +60,8 @@ class _Split:
         try:
             content = json.loads((self.directory / "dataset.json").read_text(encoding="utf-8"))
         except OSError as error:
-            remedy = "name the folder that `taichi-msm sweep` wrote"
-            raise FilesError(f"{self.directory / 'dataset.json'}: {error.strerror}; {remedy}") from None
+            fault = f"{self.directory / 'dataset.json'}: {error.strerror}"
+            raise FilesError(f"{fault}; name the folder that `taichi-msm sweep` wrote") from None
         # Number, folder, split ("part") and varied "values" of each run.
         self.runs: list[dict[str, Any]] = [run for run in content["runs"] if run["part"] == split]
         if not self.runs:
@@ -71,8 +71,7 @@ class _Split:
         if missing := [name for name in self.outputs if Path(camera, OUTPUTS[name].result) not in written]:
             remedy = f"run the sweep with set: {{output: [{', '.join(self.outputs)}]}}"
             raise ArgumentError(f"directory: {self.directory / camera} has no {', '.join(missing)}; {remedy}")
-        self._size = content["size"]
-        self._length, self._stride = length, stride
+        self._size, self._length, self._stride = content["size"], length, stride
         self._items = max(0, (content["frames"] - length) // stride + 1)  # of a run
 
     def __len__(self) -> int:
@@ -136,10 +135,8 @@ class Clips(_Split):
     """Successive clips of a split of a data set.
 
     Args:
-        directory: as for `Pairs`.
-        split: as for `Pairs`.
+        directory, split, camera: as for `Pairs`.
         frames: number of frames of a clip.
-        camera: as for `Pairs`.
 
     Raises:
         ArgumentError, FilesError: as for `Pairs`.

@@ -6,7 +6,7 @@ import hashlib
 import stat
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -134,7 +134,12 @@ def _open(path: str, sha256: str | None = None) -> Iterator[Image.Image]:
         warnings.simplefilter("ignore")
         warnings.simplefilter("error", Image.DecompressionBombWarning)
         try:
-            with _file(path, sha256) as file, Image.open(file, formats=PICTURE_FORMATS) as image:
+            with ExitStack() as opened:
+                file = opened.enter_context(actual_path(path).open("rb"))
+                if sha256 is not None and _sha256(file) != sha256:
+                    raise PictureError(f"{path} is not the file of the run, by its SHA-256; put that one back")
+                file.seek(0)
+                image = opened.enter_context(Image.open(file, formats=PICTURE_FORMATS))
                 if max(image.size) > MAX_SIDE_PX:
                     reason = f"has {image.width} x {image.height} pixels; a side may have at most {MAX_SIDE_PX}, cut it"
                     raise PictureError(f"{path} {reason}")
@@ -159,17 +164,6 @@ def _open(path: str, sha256: str | None = None) -> Iterator[Image.Image]:
             raise PictureError(f"{path} may not be read; change its permissions") from None
         except Exception as error:
             raise PictureError(f"{path} cannot be decoded ({error}); save it again") from None
-
-
-@contextmanager
-def _file(path: str, sha256: str | None) -> Iterator[BinaryIO]:
-    """Open a file, and check its SHA-256 if one is given."""
-    with actual_path(path).open("rb") as file:
-        if sha256 is not None:
-            if _sha256(file) != sha256:
-                raise PictureError(f"{path} is not the file of the run, by its SHA-256; put that one back")
-            file.seek(0)
-        yield file
 
 
 def _sha256(file: BinaryIO) -> str:

@@ -75,11 +75,16 @@ def message(
     return Messages(request.node.nodeid, tmp_path_factory.getbasetemp(), written_messages)
 
 
+def write_small(folder: Path, height: int = 30, width: int = 40) -> None:
+    """Write small.yaml and its picture, of a height and width, into a folder."""
+    Image.fromarray(speckle(height, width)).save(folder / "speckle.png")
+    (folder / "small.yaml").write_text(SMALL)
+
+
 @pytest.fixture
 def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A directory to work in, with small.yaml and its picture."""
-    Image.fromarray(speckle(30, 40)).save(tmp_path / "speckle.png")
-    (tmp_path / "small.yaml").write_text(SMALL)
+    write_small(tmp_path)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -88,8 +93,7 @@ def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def ran(device: runtime.Device, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The results of a run of small.yaml, in `output/small` beside its scene; to be read only."""
     here = tmp_path_factory.mktemp("ran")
-    Image.fromarray(speckle(30, 40)).save(here / "speckle.png")
-    (here / "small.yaml").write_text(SMALL)
+    write_small(here)
     run(load_scene(here / "small.yaml"), here / "output" / "small", threads=device.threads, estimate_error=False)
     return here / "output" / "small"
 
@@ -104,8 +108,7 @@ def results(ran: Path, tmp_path: Path) -> Path:
 def seen_by_two(device: runtime.Device, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run as two cameras beside each other have seen it, in `left` and `right`, to be read only; of 320 x 256 px."""
     here = tmp_path_factory.mktemp("stereo")
-    Image.fromarray(speckle(60, 80)).save(here / "speckle.png")
-    (here / "small.yaml").write_text(SMALL)
+    write_small(here, 60, 80)
     left = "{eye: [-0.004, -0.1, 0.5], target: [-0.004, 0, 0], fov: 38}"
     cameras = f"render.cameras={{left: {left}, right: {{beside: left, baseline: 0.008}}}}"
     overrides = [cameras, "render.size=[320, 256]", "render.tracks=6", "output=[png, trajectory, forces, tracks]"]
@@ -117,8 +120,7 @@ def seen_by_two(device: runtime.Device, tmp_path_factory: pytest.TempPathFactory
 def labelled_in_motion(device: runtime.Device, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with a drawn tool that a moving, centred camera has seen, with its labels; to be read only."""
     here = tmp_path_factory.mktemp("labelled")
-    Image.fromarray(speckle(30, 40)).save(here / "speckle.png")
-    (here / "small.yaml").write_text(SMALL)
+    write_small(here)
     eye = "[[0, 0, -0.1, 0.5], [0.4, 0.02, -0.1, 0.45]]"
     overrides = [
         f"render.camera={{eye: {eye}, intrinsics: {{fx: 45, fy: 45, cx: 20, cy: 16}}}}",

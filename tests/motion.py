@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.accuracy.report import run_warnings
-from taichi_msm.accuracy.time_step import TimeStepEstimate, max_norm
+from taichi_msm.accuracy.mesh import MeshEstimate
+from taichi_msm.accuracy.report import RunErrorEstimates, run_warnings
+from taichi_msm.accuracy.time_step import TimeStepEstimate, TimeStepTrials, max_norm
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.tool_force import probe_records
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.arrays import SheetLayout
-from taichi_msm.solver.dynamics import Dynamics, choose_layout
+from taichi_msm.solver.dynamics import Dynamics
+from taichi_msm.solver.sheet_solver import choose_layout
 from taichi_msm.solver.state import RunProgress
 from taichi_msm.system.runtime import Device
 from tests.scenes import plan_of
@@ -57,6 +60,11 @@ def true_error(plan: Plan, device: Device, fine: int) -> float:
     return max_norm(frames_on(plan, device) - reference) / max_norm(reference)
 
 
+def estimate_error(plan: Plan, device: Device) -> TimeStepEstimate:
+    """The estimate of the error of a plan's steps by a fine companion run."""
+    return TimeStepTrials(plan, device).estimate(plan.grid.steps_per_frame)
+
+
 def assert_steered_like(made: Scene, short: Scene, device: Device) -> None:
     """A scene steered keyframe by keyframe, from its first one, moves to the bit like the scene with the whole path."""
     path: Any = made.probes[0].path
@@ -75,6 +83,13 @@ def assert_steered_like(made: Scene, short: Scene, device: Device) -> None:
             assert len(steered.scene.probes[0].path) < 6
 
 
-def notes_of(made: Scene, progress: RunProgress, estimate: TimeStepEstimate | None, **more: Any) -> list[str]:
+def notes_of(
+    made: Scene,
+    progress: RunProgress,
+    estimate: TimeStepEstimate | None,
+    mesh: MeshEstimate | None = None,
+    affords: Callable[[Plan], bool] = lambda plan: True,
+) -> list[str]:
     """What is noted of a run of a scene."""
-    return list(run_warnings(plan_of(made), probe_records(made), progress, estimate, **more))
+    errors = RunErrorEstimates(estimate, mesh=mesh)
+    return list(run_warnings(plan_of(made), probe_records(made), progress, errors, affords))

@@ -11,7 +11,7 @@ from typing import Any
 # Writes a line when signals are heard, and whenever some work reports its progress; lines that nobody reads are lost.
 PROGRAM = """
 import os, runpy, sys
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from taichi_msm.system import process
 
 pipe = int(sys.argv.pop(1))
@@ -24,18 +24,17 @@ def tell(stage, done):
 def exit_on_signals(original=process.exit_on_signals):
     original()
     tell("heard", 0)
-    from taichi_msm.cli import export, fit, run, session, study, sweep  # as the program does next
+    from taichi_msm.cli import session  # as the program does next
 
-    def interruptible_progress(*arguments, original=session.interruptible_progress):
-        progress = original(*arguments)
-        def telling(stage, done, total):
-            tell(stage, done)
-            progress(stage, done, total)
-        return telling
+    @contextmanager
+    def show_progress(*arguments, original=session.show_progress, **named):
+        with original(*arguments, **named) as progress:
+            def telling(stage, done, total):
+                tell(stage, done)
+                progress(stage, done, total)
+            yield telling
 
-    for module in (export, fit, run, session, study, sweep):
-        if hasattr(module, "interruptible_progress"):
-            module.interruptible_progress = interruptible_progress
+    session.show_progress = show_progress
 
 process.exit_on_signals = exit_on_signals
 runpy.run_module("taichi_msm", run_name="__main__")

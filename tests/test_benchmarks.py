@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import sys
 from dataclasses import asdict
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 
-from benchmarks import child, page, process, race
-from benchmarks.drawing.measure import psnr
+from benchmarks import child, dop853, page, process, race
 from benchmarks.stepping import PEERS, measure, numpy_
 from benchmarks.stepping.problem import Array, Problem
+from taichi_msm import load_scene
+from taichi_msm.accuracy.time_step import max_norm
 from taichi_msm.system.runtime import Device
 from tests.golden import Messages
+from tests.motion import frames_on
+from tests.scenes import plan_of
 
 
 @pytest.fixture(autouse=True)
@@ -110,7 +114,8 @@ def test_the_page_shows_times_and_words(message: Messages) -> None:
     assert page.NOT_MEASURED in " ".join(text.split())
 
 
-def test_psnr_of_a_step_of_grey() -> None:
-    picture = np.zeros((4, 4, 3), np.uint8)
-    assert psnr(picture, picture) == np.inf
-    assert psnr(picture + np.uint8(1), picture) == pytest.approx(48.13, abs=0.01)
+@pytest.mark.slow
+def test_dop853_solves_the_scene(root: Path, device: Device) -> None:
+    plan = plan_of(load_scene(root / "scenes/figure-3.yaml", ["output=[]"])).with_grid(precision="f64")
+    exact = frames_on(plan.with_grid(steps_per_frame=8 * plan.grid.steps_per_frame), device)
+    assert max_norm(dop853.integrate(1e-5) - exact) < 1e-4 * max_norm(exact)

@@ -53,16 +53,12 @@ def data_set(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return directory
 
 
-class StandIn:
+def batches(data: Any, batch_size: int) -> Iterator[dict[str, NDArray[Any]]]:
     """What PyTorch's DataLoader does with a map-style data set in one worker."""
-
-    def __init__(self, data: Any, batch_size: int) -> None:
-        self._data, self._size = pickle.loads(pickle.dumps(data)), batch_size
-
-    def __iter__(self) -> Iterator[dict[str, NDArray[Any]]]:
-        for first in range(0, len(self._data), self._size):
-            items = [self._data[index] for index in range(first, min(first + self._size, len(self._data)))]
-            yield {name: np.stack([item[name] for item in items]) for name in items[0]}
+    data = pickle.loads(pickle.dumps(data))
+    for first in range(0, len(data), batch_size):
+        items = [data[index] for index in range(first, min(first + batch_size, len(data)))]
+        yield {name: np.stack([item[name] for item in items]) for name in items[0]}
 
 
 @pytest.fixture
@@ -71,7 +67,7 @@ def torch(monkeypatch: pytest.MonkeyPatch) -> None:
     if importlib.util.find_spec("torch") is None:
         for name in ("torch", "torch.utils", "torch.utils.data"):
             monkeypatch.setitem(sys.modules, name, ModuleType(name))
-        monkeypatch.setattr(sys.modules["torch.utils.data"], "DataLoader", StandIn, raising=False)
+        monkeypatch.setattr(sys.modules["torch.utils.data"], "DataLoader", batches, raising=False)
 
 
 def test_pairs_are_those_of_the_files(data_set: Path) -> None:

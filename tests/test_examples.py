@@ -51,3 +51,7 @@ def test_four_environments_run_in_spawned_processes(root: Path) -> None:
         [sys.executable, "examples/gym_env.py"], cwd=root, capture_output=True, text=True, check=False
     )
     assert done.stdout.startswith("four fingers feel 0.5"), done.stderr
+    # A process may end with an open simulation.
+    code = "from examples.gym_env import Palpation; made = Palpation(); made.reset(seed=0)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")

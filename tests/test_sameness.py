@@ -6,8 +6,8 @@ import os
 import subprocess
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -43,17 +43,11 @@ ODD = "two \udcff" if sys.platform == "linux" else "two"
 NAMES = ("one é🧠", ODD, "three", "four")
 
 
-@dataclass(frozen=True)
-class Runs:
-    """What four runs did.
+class Runs(NamedTuple):
+    """What four runs did."""
 
-    Attributes:
-        folder: holds `here`, the current directory of the runs, `home`, `temporary`, and `watched`, what they did.
-        printed: what the first two, which ran at the same time, printed.
-    """
-
-    folder: Path
-    printed: Sequence[bytes]
+    folder: Path  # holds `here`, the current directory of the runs, `home`, `temporary`, and `watched`, what they did
+    printed: Sequence[bytes]  # by the first two, which ran at the same time
 
 
 @pytest.fixture(scope="module")
@@ -63,11 +57,8 @@ def runs(tmp_path_factory: pytest.TempPathFactory, root: Path) -> Runs:
     for name in ("here", "home", "temporary", "watch"):
         (folder / name).mkdir()
     (folder / "watch" / "sitecustomize.py").write_text(WATCH)
-    kept = {
-        name: value
-        for name, value in os.environ.items()
-        if not name.startswith(("TI_", "QD_", "PYTHON", "LC_", "XDG_"))
-    }
+    ours = ("TI_", "QD_", "PYTHON", "LC_", "XDG_")
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(ours)}
     kept |= {"HOME": str(folder / "home"), "TMPDIR": str(folder / "temporary"), "WATCH": str(folder / "watched")}
     kept |= {"PYTHONPATH": os.pathsep.join((str(folder / "watch"), str(root))), "PYTHONDONTWRITEBYTECODE": "1"}
     plain = {"PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "LC_ALL": "C"}
@@ -109,17 +100,19 @@ def test_the_same_bytes(name: str, runs: Runs) -> None:
     assert results(runs.folder / "here" / name) == first
 
 
+def run_press(out: Path, settings: Sequence[str], root: Path, debug: str) -> dict[str, bytes]:
+    """The results of a shipped scene, with or without Taichi's debug mode."""
+    overrides = [word for setting in settings for word in ("--set", setting)]
+    command = [sys.executable, "-m", "taichi_msm", "run", str(root / "scenes" / "press.yaml"), *overrides]
+    environment = {**os.environ, f"{active_compiler().prefix}_DEBUG": debug}
+    subprocess.run([*command, "--out", str(out)], env=environment, check=True)
+    return results(out)
+
+
 @pytest.mark.slow
 def test_the_same_bytes_while_bounds_are_checked(runs: Runs, root: Path, tmp_path: Path) -> None:
     """Taichi stops at an access outside a field; what its debug mode cannot compile would show here, too."""
-    overrides = [word for setting in SETTINGS for word in ("--set", setting)]
-    command = [sys.executable, "-m", "taichi_msm", "run", str(root / "scenes" / "press.yaml"), *overrides]
-    subprocess.run(
-        [*command, "--out", str(tmp_path / "out")],
-        env={**os.environ, f"{active_compiler().prefix}_DEBUG": "1"},
-        check=True,
-    )
-    assert results(tmp_path / "out") == results(runs.folder / "here" / NAMES[0])
+    assert run_press(tmp_path / "out", SETTINGS, root, "1") == results(runs.folder / "here" / NAMES[0])
 
 
 @pytest.mark.slow
@@ -130,20 +123,12 @@ def test_tissue_gives_the_same_bytes_while_bounds_are_checked(fixed: str, root: 
         "sheet.points=[33, 35]",
         f"sheet.fixed={fixed}",
         "tissue.map={image: textures/tumour.png, range: [1, 13]}",
-        *(["tissue.bending=plate"] if fixed == "border" else ["tissue.pretension=0"]),
+        "tissue.bending=plate" if fixed == "border" else "tissue.pretension=0",
         "probes.0.at=[[0, 0.1, 0.1], [0.05, 0.9, 0.95]]",
         "time.duration=0.08",
         "output=[trajectory]",
     ]
-    overrides = [word for setting in settings for word in ("--set", setting)]
-    command = [sys.executable, "-m", "taichi_msm", "run", str(root / "scenes" / "press.yaml"), *overrides]
-    for debug in ("0", "1"):
-        subprocess.run(
-            [*command, "--out", str(tmp_path / debug)],
-            env={**os.environ, f"{active_compiler().prefix}_DEBUG": debug},
-            check=True,
-        )
-    assert results(tmp_path / "0") == results(tmp_path / "1")
+    assert run_press(tmp_path / "0", settings, root, "0") == run_press(tmp_path / "1", settings, root, "1")
 
 
 def test_any_name_in_any_locale(runs: Runs) -> None:
@@ -156,12 +141,8 @@ def test_nothing_is_written_elsewhere(runs: Runs) -> None:
     here, home = runs.folder / "here", runs.folder / "home"
     assert sorted(path.name for path in here.iterdir()) == sorted(NAMES)
     for name in NAMES:
-        assert sorted(path.name for path in (here / name).iterdir()) == [
-            "animation.gif",
-            "frames",
-            "run.json",
-            "trajectory.npz",
-        ]
+        names = sorted(path.name for path in (here / name).iterdir())
+        assert names == ["animation.gif", "frames", "run.json", "trajectory.npz"]
     files = [path.relative_to(home).parts for path in home.rglob("*") if path.is_file()]
     assert {parts[:3] for parts in files} == {Path(active_compiler().cache).parts}
     assert list((runs.folder / "temporary").iterdir()) == []

@@ -11,8 +11,9 @@ import numpy as np
 
 from benchmarks.clock import seconds
 from benchmarks.drawing import LIT
-from benchmarks.drawing.problem import Artist, Picture, Problem
+from benchmarks.drawing.problem import Artist, Problem
 from benchmarks.process import CACHE
+from taichi_msm.study.measurements import psnr
 from tests import reference
 
 # PSNR of a right picture [dB]: of this program against its float64 twin, which is too slow for more than the mass
@@ -43,10 +44,10 @@ def check(peer: str, pixels: int, refine: int, lit: bool, threads: int | None = 
         truth = reference.draw(coarse.scene, coarse.position.astype(float), coarse.texture)
     else:
         truth = np.load(kept)
-    near = psnr(picture, truth)
-    wanted = WANTED[lit]
+    answer, wanted = psnr(picture, truth), WANTED[lit]
+    near = math.inf if answer is None else answer
     return {
-        "answer": None if math.isinf(near) else near,
+        "answer": answer,
         "right": near >= wanted,
         "wanted": f"{near:.1f} dB, of at least {wanted:g}",
         "compile": compile_seconds,
@@ -64,11 +65,3 @@ def clock(peer: str, pixels: int, refine: int, lit: bool, threads: int | None = 
             artist.draw(position)
 
     return seconds(draw)
-
-
-def psnr(picture: Picture, truth: Picture) -> float:
-    """Give the peak signal-to-noise ratio of a picture [dB]; infinite where they are equal."""
-    if picture.shape != truth.shape:
-        return -math.inf
-    square = float(np.mean((picture.astype(float) - truth) ** 2))
-    return 10 * math.log10(255**2 / square) if square > 0 else math.inf

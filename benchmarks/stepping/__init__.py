@@ -7,7 +7,6 @@ PEERS = {
     "Numba": "benchmarks.stepping.numba_",
     "plain Taichi": "benchmarks.stepping.plain_taichi",
     "JAX": "benchmarks.stepping.jax_",
-    "Warp": "benchmarks.stepping.warp_",
     "NumPy": "benchmarks.stepping.numpy_",
 }
 

@@ -32,22 +32,14 @@ QUASISTATIC_REASON = "quasistatic"
 
 
 class CompanionRuns(NamedTuple):
-    """The companion runs of a run.
+    """The companion runs of a run."""
 
-    Attributes:
-        concurrent_steps: Steps per frame of the companion run in parallel to the run; 0 without one.
-        subsequent_steps: Steps per frame of the companion run that follows if the first one shows a large error; 0
-            without one.
-        mesh: Whether there are companion runs on coarser meshes.
-        cost: Cost of the parallel companion runs, in steps of the full sheet per step of the run.
-        reason: Why the time-step error is not estimated; empty if it is.
-    """
-
-    concurrent_steps: int = 0
+    concurrent_steps: int = 0  # steps per frame of the companion run in parallel to the run; 0 without one
+    # Steps per frame of the companion run that follows if the first one shows a large error; 0 without one.
     subsequent_steps: int = 0
-    mesh: bool = False
-    cost: float = 0.0
-    reason: str = ""
+    mesh: bool = False  # whether there are companion runs on coarser meshes
+    cost: float = 0.0  # of the parallel companion runs, in steps of the full sheet per step of the run
+    reason: str = ""  # why the time-step error is not estimated; empty if it is
 
     @property
     def planned(self) -> bool:
@@ -61,9 +53,6 @@ def choose_companion_runs(plan: Plan, *, requested: bool = False) -> CompanionRu
     Args:
         plan: Plan of the run.
         requested: Whether the user requested an error estimate, whatever it costs.
-
-    Returns:
-        The companion runs. A quasi-static scene has none for the time step.
     """
     if plan.scene.time.at_rest:
         mesh = plan.scene.tissue is not None and (requested or affords_companions(plan, MESH_COST))
@@ -74,7 +63,8 @@ def choose_companion_runs(plan: Plan, *, requested: bool = False) -> CompanionRu
     fine_cost = fine / steps + (plan.grid.precision == "f32")
     cost = (1 + mesh_cost) * coarse / steps if coarse else fine_cost + mesh_cost
     if coarse and plan.has_contact:
-        cost = coarse / steps + mesh_cost  # With contact the meshes are compared with the run, not with its companion.
+        # The meshes are compared with the run, not with its companion.
+        cost = coarse / steps + mesh_cost
     if not requested and not affords_companions(plan, cost):
         return CompanionRuns(
             reason="it would take more than two fifths of the run; to have it anyway, pass --estimate-error"
@@ -100,8 +90,7 @@ def fine_steps(plan: Plan) -> int:
     If g h / r > 1, with g = C / m, central differences reverse velocities at every step, and the difference between
     runs with steps h and h / r underestimates the error. A coarse companion run overestimates it 2 to 4 times.
 
-    Returns:
-        Steps per frame; 0 if the damping needs more than `MAX_REFINEMENT` times the run's.
+    It is 0 if the damping needs more than `MAX_REFINEMENT` times the run's steps.
     """
     refinement = max(2, math.ceil(plan.material.drag * plan.grid.step))
     return refinement * plan.grid.steps_per_frame if refinement <= MAX_REFINEMENT else 0

@@ -1,19 +1,26 @@
-"""Detection of divergence: NaN, a mass point too far away, or more energy than the load can have supplied."""
+"""Divergence: NaN, a mass point too far away, or more energy than the load can have supplied; and its likely cause."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from taichi_msm.accuracy.contact_warnings import first_piercing_probe
-from taichi_msm.accuracy.energy_growth import EnergyGrowth
+from taichi_msm.errors import Pause
 from taichi_msm.model.loads import LoadBounds
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.sheet import spacing
-from taichi_msm.solver.state import LargestDisplacement, Reading, RunProgress, largest_displacement
+from taichi_msm.model.sheet import axes
+from taichi_msm.model.surface import to_positions
+from taichi_msm.model.tool_force import control_points, probe_force
+from taichi_msm.solver.dynamics import ForceRecorder
+from taichi_msm.solver.sheet_solver import SheetSolver
+from taichi_msm.solver.state import LargestDisplacement, Reading, RunProgress, Snapshot, largest_displacement
 from taichi_msm.terms import TERMS
-from taichi_msm.terms.foundation import FoundationTerm
+from taichi_msm.terms.foundation import FoundationTerm, foundation_energy, point_shares
 from taichi_msm.terms.loads import force_norm, max_free_acceleration
 
 # Largest displacement of a mass point by deformation, in sizes of the sheet. A free sheet may also fly away.
@@ -67,26 +74,29 @@ class DivergenceMonitor:
     added for the current displacements. With G, the sum of the shares, stress relaxation returns at most 4 G of the
     largest E so far, and E exceeds the energy of the sheet by at most 1 / (1 - G).
 
+    After the last load, energy that grows is a sign of steps that are too long for compressed springs, see
+    `energy_growth_warnings`.
+
     Attributes:
         progress: Progress at the last frame without a fault, initially at the first frame.
     """
 
     def __init__(self, plan: Plan, progress: RunProgress | None = None) -> None:
         self.progress = progress or RunProgress()
-        self._plan, self._grid = plan, plan.grid
-        self._loads = LoadBounds(plan)
-        self._acceleration = max_free_acceleration(plan)
-        self._tool_energy = _tool_energy_bound(plan)
+        self._grid, material = plan.grid, plan.material
+        self._acceleration = self._tool_energy = 0.0
         self._load_norms = np.array([force_norm(slot, plan.scene) for slot in plan.slots])
         self._oscillation = ENERGY_OSCILLATION / max(1e-9, 1 - (plan.grid.step / plan.stable_step) ** 2)
-        self._relaxing = sum(share for share, _ in plan.material.relaxation)
+        self._relaxing = sum(share for share, _ in material.relaxation)
         self._oscillation /= 1 - self._relaxing
-        self._underflow, self._growth = _underflow_energy(plan), EnergyGrowth(plan)
+        # Stiffness of virtual springs that are active after the last load, too [N/m].
+        lasting = material.always_active and material.virtual > 0
+        self._lasting_stiffness = material.virtual * point_shares(plan) if lasting else np.zeros((1, 1))
+        self.change_loads(plan)
 
     def change_loads(self, plan: Plan) -> None:
         """Replace the loads from now on; the same control points must move as before."""
-        self._plan, self._growth = plan, EnergyGrowth(plan)
-        self._loads = LoadBounds(plan)
+        self._plan, self._loads = plan, LoadBounds(plan)
         self._acceleration = max(self._acceleration, max_free_acceleration(plan))
         self._tool_energy = max(self._tool_energy, _tool_energy_bound(plan))
 
@@ -95,7 +105,7 @@ class DivergenceMonitor:
         extreme, progress = largest_displacement(reading.displacement), self.progress
         frame, fault = reading.steps // self._grid.steps_per_frame, self._fault(reading, extreme)
         if not fault:
-            least_energy, growth = self._growth.update(progress, reading, frame)
+            least_energy, growth = self._energy_growth(reading, frame)
             pierced_by, pierced_frame = progress.pierced_by, progress.pierced_frame
             if not pierced_by:
                 pierced_by = first_piercing_probe(self._plan, reading.displacement, frame)
@@ -120,6 +130,22 @@ class DivergenceMonitor:
                 pierced_frame=pierced_frame,
             )
         return fault
+
+    def _energy_growth(self, reading: Reading, frame: int) -> tuple[float, float]:
+        """Return the smallest energy of a frame since the last load [J], 0 before, and the largest growth since."""
+        least, growth = self.progress.least_energy, self.progress.energy_growth
+        # Relaxation returns some of the energy.
+        if (
+            self._plan.material.relaxation
+            or frame / self._grid.frames_per_second < _release_time(self._plan) + self._grid.step
+        ):
+            return least, growth
+        displacement = reading.displacement.astype(np.float64)
+        energy = reading.energy + foundation_energy(self._plan.material, self._lasting_stiffness, displacement)
+        # Rounding may add energy; below 1e-3 of the largest energy it does not affect the result.
+        if least > 0 and energy > max(least, 1e-3 * self.progress.peak):
+            growth = max(growth, energy / least)
+        return min(least or energy, energy), growth
 
     def check(self, reading: Reading) -> str:
         """Describe the fault at a step after the last recorded frame; return an empty string without a fault."""
@@ -157,7 +183,7 @@ class DivergenceMonitor:
             root = math.sqrt(root * root + virtual * reach * reach)
             reach += (end - begin) * root * math.sqrt(2 / mass)
         # Rounding may add 1e-9 of the largest energy so far.
-        return self._oscillation * root * root + 1e-9 * progress.peak + self._underflow
+        return self._oscillation * root * root + 1e-9 * progress.peak
 
 
 def format_message(time: float, step: int, fault: str, *, exact: bool) -> str:
@@ -182,11 +208,110 @@ def _tool_energy_bound(plan: Plan) -> float:
     return plan.fixed.size * energy
 
 
-def _underflow_energy(plan: Plan) -> float:
-    """Return the energy below which its squared terms may underflow [J]."""
-    tiny = float(np.finfo(np.float32 if plan.grid.precision == "f32" else np.float64).tiny)
-    (dx, dy), material = spacing(plan.scene.sheet), plan.material
-    inertia = material.mass / plan.grid.step**2
-    # The sums contain squares with and without a factor of stiffness.
-    springs = max(1.0, sum(term.stiffness_bound(material, plan.scene.sheet) for term in TERMS)) * (dx**2 + dy**2)
-    return math.prod(plan.scene.sheet.points) * tiny * (inertia + springs)
+def _release_time(plan: Plan) -> float:
+    """Return the time at which all loads and paths have ended [s], infinite for a load without end."""
+    ends = [tool.times[-1] for tool in plan.tools]
+    for probe in plan.scene.probes:
+        if not probe.moved and any(percent for _, percent in probe.load):
+            ends.append(probe.load[-1][0] if probe.load[-1][1] == 0 else math.inf)
+    return float(max(ends, default=0.0))
+
+
+def energy_growth_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
+    """Warn if the energy grew without a load by more than it oscillates with this time step.
+
+    The energy is measured with the position x_n and the velocity half a step before. For a mode of frequency w it
+    differs from the energy that Verlet's method conserves by a factor between 1 - w h / 2 and 1 + w h / 2, where
+    w h / 2 is at most r = h / h_stable. Hence an energy more than (1 + r) / (1 - r) times an earlier one has grown.
+
+    Source: Hairer, Lubich and Wanner 2003, Acta Numerica 12, 399-450, on the conserved energy.
+    """
+    ratio = plan.grid.step / plan.stable_step
+    if progress.energy_growth * (1 - ratio) > 1 + ratio:
+        yield (
+            f"the energy grew {progress.energy_growth:.3g} times after {_release_time(plan):.6g} s, when no probe was "
+            "active any more: the steps are too long for springs that were pressed together, and the motion from "
+            f"there on is invalid; try time.step: {plan.grid.step / 2:.6g}, press less, or take more damping"
+        )
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Diagnosis of a divergence.
+
+    Attributes:
+        message: Time, step, mass point, likely cause and remedy.
+        last_sound_state: Last state of the run without a fault; None if it is the start.
+    """
+
+    message: str
+    last_sound_state: Snapshot | None
+
+
+def diagnose(dynamics: SheetSolver[Any], start: Snapshot | None, pause: Pause) -> Diagnosis:
+    """Repeat a run to find the step and the mass point of its divergence.
+
+    Args:
+        dynamics: Sheet that diverged; its state afterwards is arbitrary.
+        start: Sound state to repeat the run from; None for the state of rest.
+        pause: Called several times a second; an exception from it ends the diagnosis.
+    """
+    plan, grid, bad_step = dynamics.plan, dynamics.plan.grid, dynamics.steps_done
+    recorder = ForceRecorder(plan)
+    state, progress, forces = (None, RunProgress(), recorder.at_rest()) if start is None else start[:3]
+    monitor = DivergenceMonitor(plan, progress)
+    dynamics.restart(plan, state)
+    sound, fault = dynamics.state(), ""
+    while sound.steps < bad_step:
+        dynamics.advance(min(bad_step, (monitor.progress.frame + 1) * grid.steps_per_frame) - sound.steps, pause)
+        reading = dynamics.read()
+        fault = monitor.check_frame(reading)
+        if fault:
+            break
+        if monitor.progress.frame * grid.steps_per_frame == reading.steps:
+            position = to_positions(reading.displacement, plan.scene.sheet)
+            forces = recorder.follow(forces, monitor.progress.frame, position, dynamics.tool_forces())
+        sound = dynamics.state()
+    if not fault:
+        reason = "but not when it was repeated, so the machine has made an error; continue with --resume"
+        return Diagnosis(format_message(grid.time(bad_step), bad_step, reason, exact=False), start)
+    bad_step = dynamics.steps_done
+    while bad_step - sound.steps > 1:
+        dynamics.restart(plan, sound)
+        dynamics.advance((bad_step - sound.steps) // 2, pause)
+        if monitor.check(dynamics.read()):
+            bad_step = dynamics.steps_done
+        else:
+            sound = dynamics.state()
+    dynamics.restart(plan, sound)
+    dynamics.advance(1)
+    reading = dynamics.read()
+    cause = _likely_cause(plan, largest_displacement(reading.displacement))
+    message = format_message(grid.time(bad_step), bad_step, f"{monitor.check(reading)}; {cause}", exact=True)
+    return Diagnosis(message, Snapshot(sound, monitor.progress, forces, plan.scene.probes))
+
+
+def _likely_cause(plan: Plan, point: LargestDisplacement) -> str:
+    """Describe the force that is largest at a mass point at any time, or the fastest tool, and the remedy."""
+    scene, step = plan.scene, plan.grid.step
+    if not plan.slots:
+        tool = max(plan.tools, key=lambda tool: tool.max_stride(step)[0])
+        return (
+            f"likely cause: probes.{tool.probe}.path, at up to {tool.max_stride(step)[0] / step:.3g} m/s; move the "
+            f"tool more slowly, or less far, or take a time.step below {step:.6g} s"
+        )
+    x, y = axes(scene.sheet)
+    rest = np.array([x[point.column], y[point.row, 0]])
+
+    def force(index: int) -> float:
+        probe = scene.probes[index]
+        distance = np.linalg.norm(control_points(probe, scene.sheet)[1] - rest, axis=1).min()
+        profile, load = probe_force(probe, scene.sheet), max(abs(percent) for _, percent in probe.load) / 100
+        return load * math.hypot(*profile.force) * float(profile.decay(distance))
+
+    strongest = max((index for index, probe in enumerate(scene.probes) if not probe.moved), key=force)
+    name = "force" if scene.probes[strongest].total is None else "total"
+    return (
+        f"likely cause: probes.{strongest}.{name}, which reaches {force(strongest):.3g} N at this point; take less, or "
+        f"a time.step below {step:.6g} s"
+    )

@@ -32,8 +32,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
-from itertools import pairwise, product
+from functools import lru_cache, partial
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -98,17 +98,11 @@ WRINKLING = "tissue without bending is pressed together, and with more points wr
 
 @dataclass(frozen=True)
 class MeshEstimate:
-    """Estimated discretisation error of the mesh.
+    """Estimated discretisation error of the mesh."""
 
-    Attributes:
-        error: Largest error, as a fraction of the largest displacement; infinite if unknown.
-        doubt: Why the error may be larger, or is unknown; empty if the estimate is reliable.
-        at_most: Whether the error may be much smaller, because of contact.
-    """
-
-    error: float
-    doubt: str = ""
-    at_most: bool = False
+    error: float  # largest error, as a fraction of the largest displacement; infinite if unknown
+    doubt: str = ""  # why the error may be larger, or is unknown; empty if the estimate is reliable
+    at_most: bool = False  # whether the error may be much smaller, because of contact
 
 
 def coarser_plan(plan: Plan, ratio: float = 0.5) -> Plan | None:
@@ -200,9 +194,8 @@ class MeshCompanion:
             steps = 1 if plan.scene.time.at_rest else max(math.ceil(steps / 2), stable_steps(sheet), min_steps)
             exact = sheet.with_grid(precision="f64", steps_per_frame=steps)
             self._sheets.append(build_dynamics(exact, device, cores=cores))
-        points = [sheet.scene.sheet.points for sheet in (plan, *plans)]
-        self._interpolations = [CubicInterpolation(coarse, fine) for fine, coarse in pairwise(points)]
-        self._ratio = min((fine - 1) / (coarse - 1) for fine, coarse in zip(*points[:2], strict=True))
+        points = zip(plan.scene.sheet.points, coarse.scene.sheet.points, strict=True)
+        self._ratio = min((count - 1) / (fewer - 1) for count, fewer in points)
         self._differences = [0.0 for _ in plans]
         self._sampling_error = sampling_force_error(plan.scene)
         self._contact = plan.has_contact
@@ -224,7 +217,7 @@ class MeshCompanion:
         """
         self._largest = max(self._largest, max_norm(displacement))
         finer = displacement
-        for n, (sheet, interpolation) in enumerate(zip(self._sheets, self._interpolations, strict=True)):
+        for n, sheet in enumerate(self._sheets):
             try:
                 sheet.advance(sheet.plan.grid.steps_per_frame, pause)
             except DivergedError:  # Without an equilibrium the error is unknown.
@@ -232,7 +225,7 @@ class MeshCompanion:
                 return
             reading = sheet.read()
             with np.errstate(all="ignore"):
-                difference = max_norm(finer - interpolation.evaluate(reading.displacement))
+                difference = max_norm(finer - interpolate(reading.displacement, finer))
                 self._differences[n] = max(self._differences[n], difference)
             finer = reading.displacement
             self._shortest_spring = min(self._shortest_spring, reading.shortest_spring)
@@ -369,25 +362,21 @@ def estimate_mesh_error(plan: Plan, device: Device, progress: ProgressCallback) 
     return first.estimate
 
 
-class CubicInterpolation:
-    """Cubic interpolation from the nodes of one lattice to those of another.
+def interpolate(displacement: NDArray[Any], target: NDArray[Any]) -> NDArray[np.float64]:
+    """Interpolate by cubics at the nodes of another lattice.
 
     Args:
-        source: Rows and columns of the lattice with values, at least 4 x 4.
-        target: Rows and columns of the lattice to interpolate at.
+        displacement: Displacements at the nodes of a lattice of at least 4 x 4 [m], shape (rows, cols, 3).
+        target: Field of the other lattice, shape (rows, cols, 3); its values are not used.
     """
-
-    def __init__(self, source: tuple[int, int], target: tuple[int, int]) -> None:
-        self._axes = [_cubic_weights(of - 1, to - 1) for of, to in zip(source, target, strict=True)]
-
-    def evaluate(self, displacement: NDArray[Any]) -> NDArray[np.float64]:
-        """Interpolate displacements [m], shape (rows, cols, 3)."""
-        for first, weights in self._axes:
-            nodes = (weight[:, None, None] * displacement[first + n] for n, weight in enumerate(weights))
-            displacement = sum(nodes, start=np.zeros(())).swapaxes(0, 1)
-        return displacement
+    for count, target_count in zip(displacement.shape[:2], target.shape[:2], strict=True):
+        first, weights = _cubic_weights(count - 1, target_count - 1)
+        nodes = (weight[:, None, None] * displacement[first + n] for n, weight in enumerate(weights))
+        displacement = sum(nodes, start=np.zeros(())).swapaxes(0, 1)
+    return displacement
 
 
+@lru_cache(maxsize=64)
 def _cubic_weights(source: int, target: int) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """Return the first of four source nodes, and their weights, for every target node; arguments: numbers of cells."""
     position = np.arange(target + 1) * (source / target)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.accuracy.companions import NEGLIGIBLE_ERROR, QUASISTATIC_REASON, CompanionRuns
 from taichi_msm.accuracy.contact_warnings import tool_contact_warnings
-from taichi_msm.accuracy.energy_growth import energy_growth_warnings
+from taichi_msm.accuracy.divergence import energy_growth_warnings
 from taichi_msm.accuracy.mesh import (
     LARGE_STEP_ERROR,
     MAX_DIFFERENCE,
@@ -28,7 +28,6 @@ from taichi_msm.accuracy.time_step import TimeStepCompanion, TimeStepEstimate, c
 from taichi_msm.errors import Pause, ProgressCallback
 from taichi_msm.model import tool_force
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.sheet import has_fixed_border, held_points
 from taichi_msm.model.tool_force import ProbeRecord
 from taichi_msm.model.tools import COARSE_TIP_PHRASE, MAX_REFINEMENT, Clamp, path_warnings
 from taichi_msm.scene.section import MAX_POINTS
@@ -59,31 +58,19 @@ REMEDY_THRESHOLD = 0.01
 
 
 class ForceEstimate(NamedTuple):
-    """Estimated error of the forces of position-controlled tools.
+    """Estimated error of the forces of position-controlled tools."""
 
-    Attributes:
-        error: Largest error of any tool at any frame, as a fraction of the greatest force; None if unknown.
-        doubt: Why the error is unknown.
-    """
-
-    error: float | None
-    doubt: str = ""
+    error: float | None  # largest of any tool at any frame, as a fraction of the greatest force; None if unknown
+    doubt: str = ""  # why the error is unknown
 
 
 class RunErrorEstimates(NamedTuple):
-    """Estimated errors of a run.
+    """Estimated errors of a run."""
 
-    Attributes:
-        estimate: Error of the time step and of rounding; None if not estimated.
-        reason: Why it was not estimated.
-        mesh: Discretisation error of the mesh; None if not estimated.
-        force: Error of the forces of position-controlled tools; None without such tools.
-    """
-
-    estimate: TimeStepEstimate | None = None
-    reason: str = ""
-    mesh: MeshEstimate | None = None
-    force: ForceEstimate | None = None
+    estimate: TimeStepEstimate | None = None  # error of the time step and of rounding; None if not estimated
+    reason: str = ""  # why it was not estimated
+    mesh: MeshEstimate | None = None  # discretisation error of the mesh; None if not estimated
+    force: ForceEstimate | None = None  # error of the forces of position-controlled tools; None without such tools
 
 
 class RunErrorEstimator:
@@ -225,10 +212,7 @@ def run_warnings(
     plan: Plan,
     probes: Sequence[ProbeRecord],
     progress: RunProgress,
-    estimate: TimeStepEstimate | None,
-    reason: str = "",
-    mesh: MeshEstimate | None = None,
-    force: ForceEstimate | None = None,
+    errors: RunErrorEstimates,
     affords: Callable[[Plan], bool] = lambda plan: True,
     scale: float | None = None,
 ) -> Iterator[str]:
@@ -238,10 +222,7 @@ def run_warnings(
         plan: Plan of the run.
         probes: Records of the probes' forces.
         progress: Progress of the run.
-        estimate: Error of the time step; this and the next three as in `RunErrorEstimates`.
-        reason: Why it was not estimated.
-        mesh: Discretisation error of the mesh.
-        force: Error of the forces.
+        errors: Estimated errors of the run.
         affords: Function that returns whether a plan can be run within an hour.
         scale: Pixels per metre at the middle of the sheet; None without a picture.
 
@@ -249,8 +230,9 @@ def run_warnings(
         Lines of text.
     """
     scene, grid = plan.scene, plan.grid
+    estimate, reason, mesh, force = errors
     if estimate is not None or mesh is not None:
-        yield error_line(estimate, mesh, progress.max_displacement, scale) + (
+        yield _error_line(estimate, mesh, progress.max_displacement, scale) + (
             "; mesh error unknown: another number of points is another sheet" if scene.tissue is None else ""
         )
     if estimate is not None:
@@ -308,20 +290,10 @@ def run_warnings(
         )
 
 
-def error_line(
-    estimate: TimeStepEstimate | None,
-    mesh: MeshEstimate | None = None,
-    max_displacement: float = 0.0,
-    scale: float | None = None,
+def _error_line(
+    estimate: TimeStepEstimate | None, mesh: MeshEstimate | None, max_displacement: float, scale: float | None
 ) -> str:
-    """Format the errors of a run in a line.
-
-    Args:
-        estimate: Error of the time step and of rounding; None if not estimated.
-        mesh: Discretisation error of the mesh; None if not estimated.
-        max_displacement: Largest displacement of the run [m].
-        scale: Pixels per metre; None without a picture.
-    """
+    """Format the errors of a run; arguments as for `run_warnings`."""
     if estimate is not None and estimate.error == math.inf:
         return "error not known: a companion run diverged, or steps do not resolve the damping"
     parts, errors = [], [mesh.error] if mesh is not None and mesh.error < math.inf else []
@@ -341,6 +313,11 @@ def error_line(
         of = f" of {_digits(1000 * max_displacement, 2)} mm ({_digits(1000 * distance)} mm{pixels})"
     unknown = f"; mesh error not known: {mesh.doubt}" if mesh is not None and mesh.error == math.inf else ""
     return f"error: {', '.join(parts)}{of}{unknown}" if parts else f"error{unknown}".replace("error; ", "")
+
+
+def _bound_words(at_most: bool, at_least: bool) -> str:
+    """Return the words before an error that may be smaller, larger or both."""
+    return ("roughly " if at_least else "at most about ") if at_most else "at least " if at_least else ""
 
 
 def _percent(share: float, digits: int) -> str:
@@ -363,11 +340,6 @@ def _mesh_remedy(plan: Plan, mesh: MeshEstimate, affords: Callable[[Plan], bool]
     return "tissue.bending, tissue.pretension or a wider tip help more than points do"
 
 
-def _bound_words(at_most: bool, at_least: bool) -> str:
-    """Return the words before an error that may be smaller, larger or both."""
-    return ("roughly " if at_least else "at most about ") if at_most else "at least " if at_least else ""
-
-
 def _step_remedy(plan: Plan, estimate: TimeStepEstimate, affords: Callable[[Plan], bool]) -> str:
     """Suggest a remedy for the error of the time step and of rounding."""
     if not estimate.parted:
@@ -375,11 +347,6 @@ def _step_remedy(plan: Plan, estimate: TimeStepEstimate, affords: Callable[[Plan
     remedies = []
     if estimate.rounding > REMEDY_THRESHOLD / 2:
         remedies.append("time.precision: f64")
-        if max(plan.material.across, plan.material.down, plan.material.shear) > 0:
-            is_closed = has_fixed_border(held_points(plan.scene, plan.fixed))
-            of_tissue = "tissue.pretension or bending" if is_closed else "tissue.foundation"
-            support = "springs.virtual" if plan.scene.tissue is None else of_tissue
-            remedies.append(f"more {support}, where the sheet buckles")
     if estimate.in_f64 > REMEDY_THRESHOLD / 2:
         steps = plan.grid.steps_per_frame * (estimate.in_f64 / (REMEDY_THRESHOLD / 2)) ** (1 / estimate.order)
         finer = replace(plan.grid, steps_per_frame=math.ceil(steps))

@@ -53,37 +53,20 @@ MAX_STEP_REFINEMENT = 8.0
 
 @dataclass(frozen=True)
 class TimeStepEstimate:
-    """Estimated error of the time step and of rounding.
+    """Estimated error of the time step and of rounding, as fractions of the largest displacement."""
 
-    Attributes:
-        steps_per_frame: Number of steps per frame of the run.
-        error: Largest error, as a fraction of the largest displacement; infinite if it is unknown because a companion
-            run diverged or the step does not resolve the damping.
-        rounding: Part of the error that comes from f32, including positions in the trajectory; 0 in f64.
-        in_f64: Error of the same step in f64.
-        order: Order of the method in this scene.
-        parted: Whether the two parts are known separately. After a coarse companion run of a run in f32 they are not,
-            and each is at most the error.
-        at_least: Whether the error may be larger: a coarse companion run shows an error that only a fine one could
-            determine, the error does not decrease with the step in contact, or the error is too large to be estimated.
-        at_most: Whether the error may be much smaller, because of contact.
-    """
-
-    steps_per_frame: int
+    steps_per_frame: int  # of the run
+    # Largest error; infinite if it is unknown: a companion run diverged, or the step does not resolve the damping.
     error: float
-    rounding: float
-    in_f64: float
-    order: int
+    rounding: float  # part of the error that comes from f32, including positions in the trajectory; 0 in f64
+    in_f64: float  # error of the same step in f64
+    order: int  # of the method in this scene
+    # Whether both parts are known separately. After a coarse companion run of a run in f32, each is at most the error.
     parted: bool = True
+    # Whether the error may be larger: a coarse companion run shows an error that only a fine one could determine, the
+    # error does not decrease with the step in contact, or the error is too large to be estimated.
     at_least: bool = False
-    at_most: bool = False
-
-
-def estimate_error(
-    plan: Plan, device: Device, progress: ProgressCallback = lambda done, total: None
-) -> TimeStepEstimate:
-    """Estimate the time-step error of a run by repeating it with a companion run."""
-    return TimeStepTrials(plan, device).estimate(plan.grid.steps_per_frame, progress)
+    at_most: bool = False  # whether the error may be much smaller, because of contact
 
 
 def choose_step(
@@ -242,7 +225,7 @@ class TimeStepTrials:
         self._companion = TimeStepCompanion(plan, fine_steps(plan), device)
         self._dynamics = Dynamics(plan, device)
 
-    def estimate(self, steps: int, progress: ProgressCallback) -> TimeStepEstimate:
+    def estimate(self, steps: int, progress: ProgressCallback = lambda done, total: None) -> TimeStepEstimate:
         """Run the scene with a number of steps per frame and estimate its error."""
         plan = self._plan.with_grid(steps_per_frame=steps)
         fine, frames = fine_steps(plan), plan.grid.frames

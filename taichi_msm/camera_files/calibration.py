@@ -2,44 +2,29 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from typing import ClassVar, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
 from taichi_msm.camera_files.keys import Keys
 from taichi_msm.camera_files.text import CameraFile
 
 
 class StereoPose(NamedTuple):
-    """Pose of the right camera of a stereo pair: X_right = rotation X_left + translation.
+    """Pose of the right camera of a stereo pair: X_right = rotation X_left + translation."""
 
-    Attributes:
-        rotation: rows of the matrix.
-        translation: vector [m].
-    """
-
-    rotation: tuple[tuple[float, ...], ...]
-    translation: tuple[float, ...]
+    rotation: tuple[tuple[float, ...], ...]  # rows of the matrix
+    translation: tuple[float, ...]  # vector [m]
 
 
 class Calibration(NamedTuple):
-    """Calibration of a camera, in OpenCV's pixels: the centre of the first one is at (0, 0).
+    """Calibration of a camera, in OpenCV's pixels: the centre of the first one is at (0, 0)."""
 
-    Attributes:
-        focal: focal lengths fx, fy [px]; None if the lens has its own.
-        centre: principal point cx, cy [px].
-        size: width and height of the pictures [px]; None if the file does not contain them.
-        model: name of the lens model, one of `taichi_msm.lenses.MODELS`.
-        coefficients: coefficients of the lens by their names; missing ones are 0.
-        right: pose of the right camera of a stereo pair, where that was asked for.
-    """
-
-    focal: tuple[float, float] | None
-    centre: tuple[float, float]
-    size: tuple[int, int] | None
-    model: str
-    coefficients: Mapping[str, float]
-    right: StereoPose | None = None
+    focal: tuple[float, float] | None  # focal lengths fx, fy [px]; None if the lens has its own
+    centre: tuple[float, float]  # principal point cx, cy [px]
+    size: tuple[int, int] | None  # width and height of the pictures [px]; None if the file does not contain them
+    model: str  # name of the lens model, one of `taichi_msm.lenses.MODELS`
+    coefficients: Mapping[str, float]  # coefficients of the lens by their names; missing ones are 0
+    right: StereoPose | None = None  # pose of the right camera of a stereo pair, where that was asked for
 
     def scaled(self, scale_x: float, scale_y: float) -> Calibration:
         """Return the calibration for pictures that are scaled by these factors, edges to edges."""
@@ -55,27 +40,13 @@ class Calibration(NamedTuple):
         return self._replace(focal=focal, centre=centre, coefficients=lens)
 
 
-class CalibrationReader(ABC):
-    """Reader of a format of calibrations.
+class CalibrationReader(NamedTuple):
+    """Reader of a format of calibrations."""
 
-    Attributes:
-        name: name of the format, for users.
-        recognised_by: content by which a file is recognised, for users.
-        unit: unit of lengths in the file [m]; None where it depends on who wrote the file.
-    """
-
-    name: ClassVar[str]
-    recognised_by: ClassVar[str]
-    unit: ClassVar[float | None] = 1.0
-
-    @abstractmethod
-    def cameras(self, file: CameraFile) -> Sequence[Keys]:
-        """Return the keys of each camera, the left one first; none if the file has another format."""
-
-    @abstractmethod
-    def read(self, keys: Keys) -> Calibration:
-        """Read a camera."""
-
-    @abstractmethod
-    def pose(self, keys: Keys) -> StereoPose | None:
-        """Read the pose of the right camera, in the unit of the file, from the keys of this camera."""
+    name: str  # name of the format, for users
+    recognised_by: str  # content by which a file is recognised, for users
+    cameras: Callable[[CameraFile], Sequence[Keys]]  # keys of each camera, the left one first; none in other formats
+    read: Callable[[Keys], Calibration]
+    # Pose of the right camera, in the unit of the file, from the keys of this camera.
+    pose: Callable[[Keys], StereoPose | None] = lambda keys: None
+    unit: float | None = 1.0  # unit of lengths in the file [m]; None where it depends on who wrote the file

@@ -6,29 +6,24 @@ from typing import Literal
 
 import numpy as np
 
-from taichi_msm.camera_files.calibration import Calibration, CalibrationReader
-from taichi_msm.camera_files.camera_json import CameraJson
-from taichi_msm.camera_files.colmap import ColmapCameras
-from taichi_msm.camera_files.kalibr import Kalibr
-from taichi_msm.camera_files.ocamcalib import OCamCalib
-from taichi_msm.camera_files.opencv import OpenCV
-from taichi_msm.camera_files.stereo import Stereo
-from taichi_msm.camera_files.stereomis import StereoMIS
+from taichi_msm.camera_files.calibration import Calibration
+from taichi_msm.camera_files.camera_json import CAMERA_JSON
+from taichi_msm.camera_files.colmap import COLMAP_CAMERAS
+from taichi_msm.camera_files.kalibr import KALIBR
+from taichi_msm.camera_files.ocamcalib import OCAMCALIB
+from taichi_msm.camera_files.opencv import OPENCV
+from taichi_msm.camera_files.stereo import STEREO
+from taichi_msm.camera_files.stereomis import STEREOMIS
 from taichi_msm.camera_files.text import LENGTH_UNITS, CameraFile
 
 # The first one that recognises a file reads it.
-READERS: tuple[CalibrationReader, ...] = (
-    *(OCamCalib(), ColmapCameras(), StereoMIS(), Kalibr(), CameraJson(), Stereo(), OpenCV()),
-)
+READERS = (OCAMCALIB, COLMAP_CAMERAS, STEREOMIS, KALIBR, CAMERA_JSON, STEREO, OPENCV)
 
 # Limit of the size of a file.
 MAX_BYTES = 2**22
 
 # Cameras of a stereo pair in their order.
 EYES = ("left", "right")
-
-# Largest deviation of products of the rows of a rotation.
-MAX_DEVIATION = 1e-3
 
 # Larger distances of the cameras of a pair are probably millimetres [m].
 MAX_BASELINE_M = 0.5
@@ -61,7 +56,7 @@ def read_calibration(
         listed = ", ".join(f"{number:g}" for number in pose.translation)
         raise file.fault(f"the cameras are [{listed}] m apart; set calibration_unit: mm, or m if that is right")
     rotation = np.array(pose.rotation)
-    if not ((deviation := np.abs(rotation @ rotation.T - np.eye(3)).max()) <= MAX_DEVIATION):
+    if not ((deviation := np.abs(rotation @ rotation.T - np.eye(3)).max()) <= 1e-3):
         raise file.fault(f"R: is no rotation, products of its rows are off by {deviation:.2g}; write its 3 x 3 numbers")
     scale = LENGTH_UNITS[unit] if unit is not None else reader.unit or 1.0
     translation = tuple(scale * number for number in pose.translation)

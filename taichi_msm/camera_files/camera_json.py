@@ -13,28 +13,28 @@ from taichi_msm.lenses import MODELS
 KEYS = {"size", "projection", "calibration", "model", "distortion"}
 
 
-class CameraJson(CalibrationReader):
-    """Reader of camera.json."""
+def _cameras(file: CameraFile) -> Sequence[Keys]:
+    """Return the only camera."""
+    return [Keys(file, file.data)] if file.data.keys() >= KEYS else []
 
-    name = "camera.json"
-    recognised_by = "a run's camera.json of a pinhole: `projection`, `calibration`, `model`, `distortion`"
 
-    def cameras(self, file: CameraFile) -> Sequence[Keys]:
-        """Return the only camera."""
-        return [Keys(file, file.data)] if file.data.keys() >= KEYS else []
+def _read(keys: Keys) -> Calibration:
+    """Read `calibration`, not `intrinsics`, whose first pixel has its centre at (0.5, 0.5)."""
+    model = keys.data["model"]
+    if model not in MODELS:
+        fault = f"model: {truncate(str(model))} is not known; expected one of: {', '.join(MODELS)}"
+        raise keys.file.fault(fault)
+    names = tuple(MODELS[model].coefficients)
+    fx, _, cx, _, fy, cy, *_ = keys.require("calibration", 9, "calibration")
+    width, height = keys.require("size", 2, "size")
+    values = keys.require("distortion", len(names), "distortion")
+    focal = None if model == "scaramuzza" else (fx, fy)
+    return Calibration(focal, (cx, cy), (round(width), round(height)), model, dict(zip(names, values, strict=True)))
 
-    def read(self, keys: Keys) -> Calibration:
-        """Read `calibration`, not `intrinsics`, whose first pixel has its centre at (0.5, 0.5)."""
-        model = keys.data["model"]
-        if model not in MODELS:
-            fault = f"model: {truncate(str(model))} is not known; expected one of: {', '.join(MODELS)}"
-            raise keys.file.fault(fault)
-        names = tuple(MODELS[model].coefficients)
-        fx, _, cx, _, fy, cy, *_ = keys.require("calibration", 9, "calibration")
-        width, height = keys.require("size", 2, "size")
-        values = keys.require("distortion", len(names), "distortion")
-        focal = None if model == "scaramuzza" else (fx, fy)
-        return Calibration(focal, (cx, cy), (round(width), round(height)), model, dict(zip(names, values, strict=True)))
 
-    def pose(self, keys: Keys) -> None:
-        """Return None, as there is one camera."""
+CAMERA_JSON = CalibrationReader(
+    "camera.json",
+    "a run's camera.json of a pinhole: `projection`, `calibration`, `model`, `distortion`",
+    _cameras,
+    _read,
+)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
+from taichi_msm.camera_files.calibration import CalibrationReader
 from taichi_msm.camera_files.keys import Keys, listed
-from taichi_msm.camera_files.opencv import OpenCV
+from taichi_msm.camera_files.opencv import read_camera
 from taichi_msm.camera_files.text import CameraFile
 from taichi_msm.camera_files.trajectory import Trajectory, TrajectoryReader, parse_numbers, pose_fault
 
@@ -30,18 +31,12 @@ MODELS = {
 }
 
 
-class ColmapCameras(OpenCV):
-    """Reader of cameras.txt."""
-
-    name = "COLMAP"
-    recognised_by = "cameras.txt: a line `CAMERA_ID MODEL WIDTH HEIGHT PARAMS`"
-
-    def cameras(self, file: CameraFile) -> Sequence[Keys]:
-        """Return the only camera, with OpenCV's keys; COLMAP's first pixel has its centre at (0.5, 0.5)."""
-        cameras = CAMERA.findall(file.text)
-        if any(camera[1:] != cameras[0][1:] for camera in cameras):
-            raise file.fault(f"has several cameras, {listed(camera[0] for camera in cameras)}; keep the line of one")
-        return [_camera(file, *camera) for _, *camera in cameras[:1]]
+def _cameras(file: CameraFile) -> Sequence[Keys]:
+    """Return the only camera, with OpenCV's keys; COLMAP's first pixel has its centre at (0.5, 0.5)."""
+    cameras = CAMERA.findall(file.text)
+    if any(camera[1:] != cameras[0][1:] for camera in cameras):
+        raise file.fault(f"has several cameras, {listed(camera[0] for camera in cameras)}; keep the line of one")
+    return [_camera(file, *camera) for _, *camera in cameras[:1]]
 
 
 def _camera(file: CameraFile, name: str, width: str, height: str, parameters: str) -> Keys:
@@ -93,6 +88,9 @@ def _image(line: str) -> re.Match[str] | None:
     return None if parse_numbers(line.split()[-1:]) else IMAGE.match(line)
 
 
+COLMAP_CAMERAS = CalibrationReader(
+    "COLMAP", "cameras.txt: a line `CAMERA_ID MODEL WIDTH HEIGHT PARAMS`", _cameras, read_camera
+)
 COLMAP_IMAGES = TrajectoryReader(
     "COLMAP", "images.txt: lines `IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`; needs `poses_rate`", _read_images
 )

@@ -11,9 +11,6 @@ from taichi_msm.camera_files.text import LENGTH_UNITS, CameraFile
 from taichi_msm.camera_files.trajectory import COLUMNS, MAX_NUMBER, Trajectory, TrajectoryReader, parse_numbers
 from taichi_msm.errors import truncate
 
-# Limits of the lengths of a header and of a name in it.
-MAX_HEADER_LENGTH, MAX_NAME_LENGTH = 2000, 80
-
 # Lower-case spellings of the names of columns, and of their units.
 _POSITION = r"(t|p|pos|(.*[^a-z])?position|trans|translation|[tp][^a-z].*[^a-z])?"
 _ROTATION = r"(q|quat|quaternion|(.*[^a-z])?orientation|rot|rotation|q[^a-z].*)"
@@ -22,7 +19,7 @@ ROLES = (
     *(rf"{_POSITION}[^a-z]*{axis}" for axis in "xyz"),
     *(rf"{_ROTATION}[^a-z]*{axis}" for axis in "xyzw"),
 )
-UNIT = re.compile(r"\s*[\[(]([^\])]*)[\])]|[^a-z](m?u?n?s|nsecs?)$")
+UNIT = re.compile(r"\s*[\[(]([^\])]*)[\])]|[^a-z](m?u?n?s|nsecs?|mm?)$")
 TIME_UNITS = {
     **dict.fromkeys(("s", "sec", "seconds"), "s"),
     **dict.fromkeys(("ms", "milliseconds"), "ms"),
@@ -36,23 +33,14 @@ OTHER_CONVENTION = re.compile(
     re.IGNORECASE,
 )
 
-EUROC_COLUMNS = 17
-
 
 class _Columns(NamedTuple):
-    """Columns of a trajectory file.
+    """Columns of a trajectory file."""
 
-    Attributes:
-        indices: columns of t, tx, ty, tz, qx, qy, qz, qw.
-        column_count: number of all columns.
-        time_unit: unit of t, if the header has one.
-        length_unit: unit of the position, if the header has one.
-    """
-
-    indices: tuple[int, ...]
-    column_count: int
-    time_unit: str | None = None
-    length_unit: str | None = None
+    indices: tuple[int, ...]  # columns of t, tx, ty, tz, qx, qy, qz, qw
+    column_count: int  # number of all columns
+    time_unit: str | None = None  # unit of t, if the header has one
+    length_unit: str | None = None  # unit of the position, if the header has one
 
 
 TUM = _Columns(tuple(range(8)), 8)
@@ -86,7 +74,7 @@ def _header(text: str, *, is_comment: bool) -> list[str]:
     """Split a header into the names of columns; return an empty list for other lines."""
     text = text.rpartition(":")[2].lower()
     names = [name.strip() for name in text.split(",")] if "," in text else re.sub(r"\s+(?=[\[(])", "", text).split()
-    if len(text) > MAX_HEADER_LENGTH or max(map(len, names), default=0) > MAX_NAME_LENGTH:
+    if len(text) > 2000 or max(map(len, names), default=0) > 80:
         return []
     bare = [UNIT.sub("", name) for name in names]
     rotations = sum(bool(re.fullmatch(rf"(.*[^a-z])?{_ROTATION}[^a-z]*[wxyz]", name)) for name in bare)
@@ -96,7 +84,6 @@ def _header(text: str, *, is_comment: bool) -> list[str]:
 
 
 def _columns(file: CameraFile, line: int, names: Sequence[str]) -> _Columns:
-    """Identify the columns of a header."""
     bare = [UNIT.sub("", name) for name in names]
     matches = [[n for n, name in enumerate(bare) if re.fullmatch(role, name)] for role in ROLES]
     if any(len(columns) != 1 for columns in matches):
@@ -104,9 +91,11 @@ def _columns(file: CameraFile, line: int, names: Sequence[str]) -> _Columns:
         raise file.fault(f"{fault}; name them {', '.join(COLUMNS)}", line)
     indices = tuple(columns[0] for columns in matches)
     time, *lengths = [(match[1] or match[2] or "") if (match := UNIT.search(names[n])) else "" for n in indices[:4]]
-    if time not in {"", *TIME_UNITS} or {*lengths} - {""} not in (set(), *({unit} for unit in LENGTH_UNITS)):
+    units = {*lengths} - {""}
+    if time not in {"", *TIME_UNITS} or len(units) > 1 or not units <= LENGTH_UNITS.keys():
         fault = f"{', '.join(names[n] for n in indices[:4])}: units that are not understood"
-        raise file.fault(f"{fault}; write [s], [ms], [us] or [ns] for t, and [m] or [mm] for the others", line)
+        remedy = "write [s], [ms], [us] or [ns] for t, and [m] for the others, or [mm] for all of them"
+        raise file.fault(f"{fault}; {remedy}", line)
     return _Columns(indices, len(names), TIME_UNITS.get(time), max(lengths) or None)
 
 
@@ -121,7 +110,7 @@ def _row(
         if expected.column_count != TUM.column_count:
             needed = f"{expected.column_count} numbers up to {MAX_NUMBER:g}, one a column of the header"
         origin = ""
-        if columns is None and len(words) == EUROC_COLUMNS:
+        if columns is None and len(words) == 17:
             origin = ", but 17 numbers, as EuRoC's; keep their header"
         elif columns is None and separated:
             origin = "; numbers with decimal commas need ; between them"

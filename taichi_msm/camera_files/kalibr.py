@@ -6,12 +6,12 @@ The sensor.yaml of EuRoC has the keys of a section.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from taichi_msm.camera_files.calibration import Calibration, StereoPose
-from taichi_msm.camera_files.keys import Keys, flat
-from taichi_msm.camera_files.opencv import OpenCV
+from taichi_msm.camera_files.calibration import CalibrationReader, StereoPose
+from taichi_msm.camera_files.keys import Keys, flat, listed
+from taichi_msm.camera_files.opencv import read_camera
 from taichi_msm.camera_files.text import CameraFile
 from taichi_msm.errors import truncate
 
@@ -19,40 +19,20 @@ from taichi_msm.errors import truncate
 INTRINSICS = {"pinhole": 4, "omni": 5}
 
 
-class Kalibr(OpenCV):
-    """Reader of a camchain."""
+def _cameras(file: CameraFile) -> Sequence[Keys]:
+    """Return the sections of the cameras by their numbers."""
+    if _is_camera(file.data):
+        return [_camera(file, "", file.data)]
+    names = [name for name, section in file.data.items() if _is_camera(section)]
+    return [_camera(file, f"{name}: ", file.data[name]) for name in sorted(names, key=_number)]
 
-    name = "Kalibr's camchain, EuRoC's sensor.yaml"
-    recognised_by = "`camera_model`, `intrinsics: [fx, fy, cx, cy]`, in `cam0` and `cam1`, whose pose is `T_cn_cnm1`"
 
-    def cameras(self, file: CameraFile) -> Sequence[Keys]:
-        """Return the sections of the cameras by their numbers."""
-        if _is_camera(file.data):
-            return [Keys(file, file.data)]
-        names = [name for name, section in file.data.items() if _is_camera(section)]
-        return [Keys(file, file.data[name]) for name in sorted(names, key=_number)]
-
-    def read(self, keys: Keys) -> Calibration:
-        """Read a section, with a matrix in place of the intrinsics, which of `omni` begin with xi."""
-        section, numbers = keys.data, flat(keys.data["intrinsics"])
-        prefix = next((f"{name}: " for name, value in keys.file.data.items() if value is section), "")
-        model = str(section["camera_model"]).lower()
-        if model not in INTRINSICS:
-            fault = f"{prefix}camera_model: {truncate(model)} is not known; found {keys}"
-            raise keys.file.fault(f"{fault}; expected one of: {', '.join(INTRINSICS)}")
-        if len(numbers) != INTRINSICS[model]:
-            fault = f"{prefix}intrinsics: {len(numbers)} numbers, where {INTRINSICS[model]} belong to {model}"
-            raise keys.file.fault(f"{fault}; write what belongs there")
-        *xi, fx, fy, cx, cy = numbers
-        matrix = [fx, 0, cx, 0, fy, cy, 0, 0, 1]
-        return super().read(Keys(keys.file, {**section, "intrinsics": matrix, **({"xi": xi} if xi else {})}))
-
-    def pose(self, keys: Keys) -> StereoPose | None:
-        """Read T_cn_cnm1, four rows [R, t]."""
-        if "T_cn_cnm1" not in keys.data:
-            return None
-        rows = keys.require("tcncnm1", 16, "T_cn_cnm1")
-        return StereoPose(tuple(tuple(rows[n : n + 3]) for n in (0, 4, 8)), tuple(rows[3:12:4]))
+def _pose(keys: Keys) -> StereoPose | None:
+    """Read T_cn_cnm1, four rows [R, t]."""
+    if "T_cn_cnm1" not in keys.data:
+        return None
+    rows = keys.require("tcncnm1", 16, "T_cn_cnm1")
+    return StereoPose(tuple(tuple(rows[n : n + 3]) for n in (0, 4, 8)), tuple(rows[3:12:4]))
 
 
 def _is_camera(section: Any) -> bool:
@@ -62,6 +42,28 @@ def _is_camera(section: Any) -> bool:
     )
 
 
+def _camera(file: CameraFile, prefix: str, section: Mapping[str, Any]) -> Keys:
+    """Return a section with a matrix in place of the intrinsics, which of `omni` begin with xi."""
+    numbers, model = flat(section["intrinsics"]), str(section["camera_model"]).lower()
+    if model not in INTRINSICS:
+        fault = f"{prefix}camera_model: {truncate(model)} is not known; found {listed(section)}"
+        raise file.fault(f"{fault}; expected one of: {', '.join(INTRINSICS)}")
+    if len(numbers) != INTRINSICS[model]:
+        fault = f"{prefix}intrinsics: {len(numbers)} numbers, where {INTRINSICS[model]} belong to {model}"
+        raise file.fault(f"{fault}; write what belongs there")
+    *xi, fx, fy, cx, cy = numbers
+    return Keys(file, {**section, "intrinsics": [fx, 0, cx, 0, fy, cy, 0, 0, 1], **({"xi": xi} if xi else {})})
+
+
 def _number(name: object) -> tuple[int, str]:
     match = re.search(r"\d+", str(name))
     return int(match[0]) if match else 0, str(name)
+
+
+KALIBR = CalibrationReader(
+    "Kalibr's camchain, EuRoC's sensor.yaml",
+    "`camera_model`, `intrinsics: [fx, fy, cx, cy]`, in `cam0` and `cam1`, whose pose is `T_cn_cnm1`",
+    _cameras,
+    read_camera,
+    _pose,
+)

@@ -19,13 +19,7 @@ ROUNDING_TOLERANCE = 1e-6
 
 
 class Keys:
-    """Keys of a camera in a calibration.
-
-    Attributes:
-        file: the file, for messages.
-        data: values by the names of keys.
-        folded: names reduced to lower-case letters and digits, and without a mark of the camera, by names.
-    """
+    """Values of a camera in a calibration, by names, which may be folded and without a mark of the camera."""
 
     def __init__(self, file: CameraFile, data: Mapping[str, Any], folded: Mapping[str, str] | None = None) -> None:
         self.file = file
@@ -37,15 +31,7 @@ class Keys:
         return listed(self.data)
 
     def values(self, spelling: str, kind: type = object) -> dict[str, Any]:
-        """Return the values of keys, without empty ones.
-
-        Args:
-            spelling: pattern of their folded names.
-            kind: type of their values.
-
-        Returns:
-            The values by names.
-        """
+        """Return the values of a type that are not empty, whose folded names match a spelling, by names."""
         names = [name for name, value in self.data.items() if isinstance(value, kind)]
         matches = {name: self.data[name] for name in names if re.fullmatch(spelling, self.folded[name])}
         self._read_names |= matches.keys()
@@ -64,13 +50,7 @@ class Keys:
         return numbers
 
     def require(self, spelling: str, count: int, name: str) -> list[float]:
-        """Return the numbers of a required key.
-
-        Args:
-            spelling: pattern of the folded name.
-            count: number of numbers.
-            name: description of the key, for the message.
-        """
+        """Return the numbers of a required key, of which there must be `count`; `name` is for messages."""
         numbers = self.numbers(spelling)
         if numbers is None or len(numbers) != count:
             fault = f"has no {name}" if numbers is None else f"{name}: {len(numbers)} numbers, where {count} belong"

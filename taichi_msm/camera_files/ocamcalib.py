@@ -14,36 +14,33 @@ LINES = {"polynomial": None, "inverse": None, "centre": 2, "affine": 3, "size": 
 DEGREE = 4
 
 
-class OCamCalib(CalibrationReader):
-    """Reader of calib_results.txt."""
+def _cameras(file: CameraFile) -> Sequence[Keys]:
+    """Return the only camera, if the file begins with that comment."""
+    if not file.text.lstrip().startswith("#polynomial coefficients"):
+        return ()
+    lines = [line.strip() for line in file.text.splitlines()]
+    return [Keys(file, dict(zip(LINES, (line for line in lines if line and line[0] != "#"), strict=False)))]
 
-    name = "OCamCalib"
-    recognised_by = "calib_results.txt: `#polynomial coefficients for the DIRECT mapping function`"
 
-    def cameras(self, file: CameraFile) -> Sequence[Keys]:
-        """Return the only camera, if the file begins with that comment."""
-        if not file.text.lstrip().startswith("#polynomial coefficients"):
-            return ()
-        lines = [line.strip() for line in file.text.splitlines()]
-        return [Keys(file, dict(zip(LINES, (line for line in lines if line and line[0] != "#"), strict=False)))]
+def _read(keys: Keys) -> Calibration:
+    """Read the lines.
 
-    def read(self, keys: Keys) -> Calibration:
-        """Read the lines.
+    The pixel in row c u + d v and column e u + v from the centre sees along u down, v to the right, f(p) backward.
+    With the axes exchanged, and lengths multiplied by c, this is the formula of the lens.
+    """
+    (row, column), (c, d, e), (height, width) = (keys.require(name, n, name) for name, n in LINES.items() if n)
+    count, *polynomial = keys.numbers("polynomial") or [0.0]
+    a0, a1, *powers = [*polynomial, *[0.0] * DEGREE][: DEGREE + 1]
+    if len(polynomial) != count or a1 or any(polynomial[DEGREE + 1 :]) or a0 >= 0 or c <= 0:
+        fault = f"polynomial: {keys.data.get('polynomial')}"
+        raise keys.file.fault(
+            f"{fault}; expected its length, up to {DEGREE + 1}, a0 below 0, a1 = 0, a2, a3, a4, and c above 0"
+        )
+    values = [-c * a0, *(-a / c**n for n, a in enumerate(powers, 1)), 1 / c, e / c, d / c]
+    lens = dict(zip(MODELS["scaramuzza"].coefficients, values, strict=True))
+    return Calibration(None, (column, row), (round(width), round(height)), "scaramuzza", lens)
 
-        The pixel in row c u + d v and column e u + v from the centre sees along u down, v to the right, f(p) backward.
-        With the axes exchanged, and lengths multiplied by c, this is the formula of the lens.
-        """
-        (row, column), (c, d, e), (height, width) = (keys.require(name, n, name) for name, n in LINES.items() if n)
-        count, *polynomial = keys.numbers("polynomial") or [0.0]
-        a0, a1, *powers = [*polynomial, *[0.0] * DEGREE][: DEGREE + 1]
-        if len(polynomial) != count or a1 or any(polynomial[DEGREE + 1 :]) or a0 >= 0 or c <= 0:
-            fault = f"polynomial: {keys.data.get('polynomial')}"
-            raise keys.file.fault(
-                f"{fault}; expected its length, up to {DEGREE + 1}, a0 below 0, a1 = 0, a2, a3, a4, and c above 0"
-            )
-        values = [-c * a0, *(-a / c**n for n, a in enumerate(powers, 1)), 1 / c, e / c, d / c]
-        lens = dict(zip(MODELS["scaramuzza"].coefficients, values, strict=True))
-        return Calibration(None, (column, row), (round(width), round(height)), "scaramuzza", lens)
 
-    def pose(self, keys: Keys) -> None:
-        """Return None, as there is one camera."""
+OCAMCALIB = CalibrationReader(
+    "OCamCalib", "calib_results.txt: `#polynomial coefficients for the DIRECT mapping function`", _cameras, _read
+)

@@ -55,8 +55,8 @@ FLAGS = {
     **dict.fromkeys(("0", "false", "no", "off"), "pinhole"),
 }
 
-# Numbers of coefficients that OpenCV writes. Those after the first 8 are not supported and must be 0.
-COEFFICIENT_COUNTS, SUPPORTED_COEFFICIENTS = (0, 4, 5, 8, 12, 14), 8
+# Coefficients after these are not supported and must be 0.
+SUPPORTED_COEFFICIENTS = 8
 
 # Smallest focal length [px].
 MIN_FOCAL_LENGTH_PX = 1e-3
@@ -64,49 +64,40 @@ MIN_FOCAL_LENGTH_PX = 1e-3
 _REMEDY = "write camera_matrix: [fx, 0, cx, 0, fy, cy, 0, 0, 1], distortion_coefficients: [k1, k2, p1, p2]"
 
 
-class OpenCV(CalibrationReader):
-    """Reader of the keys of one camera."""
+def read_camera(keys: Keys) -> Calibration:
+    """Read the keys of a camera."""
+    file, matrix, values = keys.file, keys.numbers(MATRIX), keys.numbers(COEFFICIENTS)
+    if matrix is None:
+        raise file.fault(f"has no camera matrix that is known; found {keys}; {_REMEDY}")
+    if len(matrix) != 9 or [matrix[n] for n in (1, 3, 6, 7, 8)] != [0, 0, 0, 0, 1] or min(matrix[::4]) <= 0:
+        raise file.fault("its camera matrix is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]; write it like that")
+    (fx, _, cx), (_, fy, cy) = matrix[:3], matrix[3:6]
+    if (focal := min(fx, fy)) < MIN_FOCAL_LENGTH_PX:
+        raise file.fault(f"its focal length is {focal:g}; write it in pixels, {MIN_FOCAL_LENGTH_PX:g} or more")
+    _require_agreement(keys, (fx, fy), (cx, cy))
+    xi = keys.numbers("xi") or []
+    model = _model(keys, values or (), has_xi=any(xi))
+    if values is None and model != NO_DISTORTION:
+        fault = "has a camera matrix, and no distortion that is known"
+        remedy = "write distortion_coefficients, [0, 0, 0, 0] where there is none"
+        raise file.fault(f"{fault}; found {keys}; {remedy}")
+    size = _size(keys)
+    if names := keys.unread(UNSUPPORTED):
+        fault = f"{listed(names)}: not understood, and may change what the camera sees"
+        raise file.fault(f"{fault}; found {keys}; {_REMEDY}, or remove what does not matter")
+    model, values = ("pinhole", []) if model == NO_DISTORTION else (model, values or [])
+    lens = _coefficients(file, model, [*xi, *values] if model == "omnidir" else values)
+    return Calibration((fx, fy), (cx, cy), size, model, lens)
 
-    name = "OpenCV, ROS"
-    recognised_by = "a matrix `camera_matrix`, `K`, `mtx`, ..., with `distortion_coefficients`, `D`, `dist`, ..."
 
-    def cameras(self, file: CameraFile) -> Sequence[Keys]:
-        """Return all keys as those of the only camera."""
-        return [Keys(file, file.data)]
-
-    def read(self, keys: Keys) -> Calibration:
-        """Read the keys of a camera."""
-        file, matrix, values = keys.file, keys.numbers(MATRIX), keys.numbers(COEFFICIENTS)
-        if matrix is None:
-            raise file.fault(f"has no camera matrix that is known; found {keys}; {_REMEDY}")
-        if len(matrix) != 9 or [matrix[n] for n in (1, 3, 6, 7, 8)] != [0, 0, 0, 0, 1] or min(matrix[::4]) <= 0:
-            raise file.fault("its camera matrix is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]; write it like that")
-        (fx, _, cx), (_, fy, cy) = matrix[:3], matrix[3:6]
-        if (focal := min(fx, fy)) < MIN_FOCAL_LENGTH_PX:
-            raise file.fault(f"its focal length is {focal:g}; write it in pixels, {MIN_FOCAL_LENGTH_PX:g} or more")
-        _require_agreement(keys, (fx, fy), (cx, cy))
-        xi = keys.numbers("xi") or []
-        model = _model(keys, values or (), has_xi=any(xi))
-        if values is None and model != NO_DISTORTION:
-            fault = "has a camera matrix, and no distortion that is known"
-            remedy = "write distortion_coefficients, [0, 0, 0, 0] where there is none"
-            raise file.fault(f"{fault}; found {keys}; {remedy}")
-        size = _size(keys)
-        if names := keys.unread(UNSUPPORTED):
-            fault = f"{listed(names)}: not understood, and may change what the camera sees"
-            raise file.fault(f"{fault}; found {keys}; {_REMEDY}, or remove what does not matter")
-        model, values = ("pinhole", []) if model == NO_DISTORTION else (model, values or [])
-        lens = _coefficients(file, model, [*xi, *values] if model == "omnidir" else values)
-        return Calibration((fx, fy), (cx, cy), size, model, lens)
-
-    def pose(self, keys: Keys) -> StereoPose | None:
-        """Read R and T, which have no mark; R1 and R2 would be rotations of the rectification."""
-        shared = Keys(keys.file, {name: keys.data[name] for name in keys.data if keys.folded[name] == fold(name)})
-        if not shared.values(ROTATION) and not shared.values(TRANSLATION):
-            return None
-        rotation = shared.require(ROTATION, 9, "rotation R")
-        rows = tuple(tuple(rotation[n : n + 3]) for n in (0, 3, 6))
-        return StereoPose(rows, tuple(shared.require(TRANSLATION, 3, "translation T")))
+def read_pose(keys: Keys) -> StereoPose | None:
+    """Read R and T, which have no mark; R1 and R2 would be rotations of the rectification."""
+    shared = Keys(keys.file, {name: keys.data[name] for name in keys.data if keys.folded[name] == fold(name)})
+    if not shared.values(ROTATION) and not shared.values(TRANSLATION):
+        return None
+    rotation = shared.require(ROTATION, 9, "rotation R")
+    rows = tuple(tuple(rotation[n : n + 3]) for n in (0, 3, 6))
+    return StereoPose(rows, tuple(shared.require(TRANSLATION, 3, "translation T")))
 
 
 def _require_agreement(keys: Keys, focal: Sequence[float], centre: Sequence[float]) -> None:
@@ -155,7 +146,7 @@ def _model(keys: Keys, values: Sequence[float], *, has_xi: bool) -> str:
 def _coefficients(file: CameraFile, model: str, values: Sequence[float]) -> dict[str, float]:
     """Return the coefficients of a lens model by their names; trailing ones may be missing."""
     names = tuple(MODELS[model].coefficients)
-    if len(values) not in (COEFFICIENT_COUNTS if model == "pinhole" else (len(names),)):
+    if len(values) not in ((0, 4, 5, 8, 12, 14) if model == "pinhole" else (len(names),)):
         expected = "4, 5, 8, 12 or 14: k1, k2, p1, p2, k3, ..." if model == "pinhole" else f"those of {model}: "
         expected += "" if model == "pinhole" else ", ".join(names)
         raise file.fault(f"{len(values)} distortion coefficients; expected {expected}")
@@ -185,3 +176,12 @@ def _size(keys: Keys) -> tuple[int, int] | None:
         fault = "of pictures that are binned or cut, while its camera matrix is of whole ones"
         raise keys.file.fault(f"{fault}; write that of the pictures, without binning_x, binning_y and roi")
     return size
+
+
+OPENCV = CalibrationReader(
+    "OpenCV, ROS",
+    "a matrix `camera_matrix`, `K`, `mtx`, ..., with `distortion_coefficients`, `D`, `dist`, ...",
+    lambda file: [Keys(file, file.data)],
+    read_camera,
+    read_pose,
+)

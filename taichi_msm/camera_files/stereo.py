@@ -6,9 +6,9 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from taichi_msm.camera_files.calibration import StereoPose
+from taichi_msm.camera_files.calibration import CalibrationReader, StereoPose
 from taichi_msm.camera_files.keys import Keys, flat, fold, listed
-from taichi_msm.camera_files.opencv import MATRIX, OpenCV
+from taichi_msm.camera_files.opencv import MATRIX, read_camera, read_pose
 from taichi_msm.camera_files.text import CameraFile
 
 # Marks of the left and the right camera, around the name of a key or as that of a section.
@@ -20,30 +20,25 @@ MARKS = (
 )
 
 
-class Stereo(OpenCV):
-    """Reader of marked keys, as K1, D1, K2, D2, and of the pose R, T of the right camera."""
+def _cameras(file: CameraFile) -> Sequence[Keys]:
+    """Return the keys of each camera, if both have a matrix, with those that have no mark."""
+    data = _without_sections(file.data)
+    for marks in MARKS:
+        eyes = [_marked(data, mark) for mark in marks]
+        matrices = [[key for key, name in eye.items() if re.fullmatch(MATRIX, name)] for eye in eyes]
+        if all(any(len(flat(data[key])) == 9 for key in keys) for keys in matrices):
+            shared = {key: fold(key) for key in data if not any(key in eye for eye in eyes)}
+            folded = [{**shared, **eye} for eye in eyes]
+            return [Keys(file, {key: data[key] for key in names}, names) for names in folded]
+    return ()
 
-    name = "OpenCV stereo, SCARED, STIR"
-    recognised_by = "`K1`, `D1`, `K2`, `D2` (or `M1`, `cameraMatrix1`, `leftcameramat`, `K_l`, ...), with `R`, `T`"
-    unit = None
 
-    def pose(self, keys: Keys) -> StereoPose | None:
-        """Read R and T, beside which nothing may state another unit or pose."""
-        if names := keys.unread(r"units?|[rt]c?m+|rt|extrinsics?"):
-            fault = f"{listed(names)}: not understood; write R, 3 x 3, and T, 3 numbers"
-            raise keys.file.fault(f"{fault}, in metres, or set calibration_unit: mm, and remove these")
-        return super().pose(keys)
-
-    def cameras(self, file: CameraFile) -> Sequence[Keys]:
-        """Return the keys of each camera, if both have a matrix, with those that have no mark."""
-        data = _without_sections(file.data)
-        for marks in MARKS:
-            eyes = [_marked(data, mark) for mark in marks]
-            if all(any(_is_matrix(name, data[key]) for key, name in eye.items()) for eye in eyes):
-                shared = {key: fold(key) for key in data if not any(key in eye for eye in eyes)}
-                folded = [{**shared, **eye} for eye in eyes]
-                return [Keys(file, {key: data[key] for key in names}, names) for names in folded]
-        return ()
+def _pose(keys: Keys) -> StereoPose | None:
+    """Read R and T, beside which nothing may state another unit or pose."""
+    if names := keys.unread(r"units?|[rt]c?m+|rt|extrinsics?"):
+        fault = f"{listed(names)}: not understood; write R, 3 x 3, and T, 3 numbers"
+        raise keys.file.fault(f"{fault}, in metres, or set calibration_unit: mm, and remove these")
+    return read_pose(keys)
 
 
 def _without_sections(data: Mapping[str, Any]) -> dict[str, Any]:
@@ -61,5 +56,11 @@ def _marked(keys: Iterable[str], mark: str) -> dict[str, str]:
     return {key: fold("".join(filter(None, match.groups()))) for key, match in matches.items() if match}
 
 
-def _is_matrix(name: str, value: Any) -> bool:
-    return bool(re.fullmatch(MATRIX, name)) and len(flat(value)) == 9
+STEREO = CalibrationReader(
+    "OpenCV stereo, SCARED, STIR",
+    "`K1`, `D1`, `K2`, `D2` (or `M1`, `cameraMatrix1`, `leftcameramat`, `K_l`, ...), with `R`, `T`",
+    _cameras,
+    read_camera,
+    _pose,
+    unit=None,
+)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 
+from taichi_msm.camera_files.calibration import CalibrationReader
 from taichi_msm.camera_files.keys import Keys, listed
-from taichi_msm.camera_files.opencv import OpenCV
+from taichi_msm.camera_files.opencv import read_camera, read_pose
 from taichi_msm.camera_files.text import CameraFile
 
 # Keys of a section by those of OpenCV.
@@ -21,20 +22,13 @@ SECTIONS = ("StereoLeft", "StereoRight")
 MORE_COEFFICIENTS = ("kc_4", "kc_5", "kc_6", "kc_7")
 
 
-class StereoMIS(OpenCV):
-    """Reader of the ini file."""
-
-    name = "StereoMIS"
-    recognised_by = "an ini file with `[StereoLeft]`, `[StereoRight]`"
-    unit = 1e-3
-
-    def cameras(self, file: CameraFile) -> Sequence[Keys]:
-        """Return the sections of the cameras, with OpenCV's keys."""
-        if not any(name in file.data for name in SECTIONS):
-            return []
-        if missing := [name for name in SECTIONS if not isinstance(file.data.get(name), dict)]:
-            raise file.fault(f"has no keys in {listed(missing)}; found {listed(file.data)}; write both cameras")
-        return [_camera(file, file.data[name]) for name in SECTIONS]
+def _cameras(file: CameraFile) -> Sequence[Keys]:
+    """Return the sections of the cameras, with OpenCV's keys."""
+    if not any(name in file.data for name in SECTIONS):
+        return []
+    if missing := [name for name in SECTIONS if not isinstance(file.data.get(name), dict)]:
+        raise file.fault(f"has no keys in {listed(missing)}; found {listed(file.data)}; write both cameras")
+    return [_camera(file, file.data[name]) for name in SECTIONS]
 
 
 def _camera(file: CameraFile, section: Mapping[str, str]) -> Keys:
@@ -48,3 +42,8 @@ def _camera(file: CameraFile, section: Mapping[str, str]) -> Keys:
     values["D"] += [section.get(name, "0") for name in MORE_COEFFICIENTS]
     fx, fy, cx, cy = values["intrinsics"]
     return Keys(file, {**values, "intrinsics": [fx, "0", cx, "0", fy, cy, "0", "0", "1"]})
+
+
+STEREOMIS = CalibrationReader(
+    "StereoMIS", "an ini file with `[StereoLeft]`, `[StereoRight]`", _cameras, read_camera, read_pose, unit=1e-3
+)

@@ -13,7 +13,8 @@ from typing import Any
 import yaml
 
 from taichi_msm.errors import truncate
-from taichi_msm.images import actual_path, irregular_kind
+from taichi_msm.images import actual_path
+from taichi_msm.system.files import read_regular
 
 # Units of lengths [m].
 LENGTH_UNITS = {"m": 1.0, "mm": 1e-3}
@@ -42,15 +43,7 @@ class CameraFileError(Exception):
 
 
 class CameraFile:
-    """A text file of a camera.
-
-    Attributes:
-        path: path of the file, for messages.
-        text: content.
-
-    Raises:
-        CameraFileError: when the file cannot be read.
-    """
+    """A text file of a camera; CameraFileError: it cannot be read."""
 
     def __init__(self, path: str, max_bytes: int) -> None:
         self.path = path
@@ -62,11 +55,7 @@ class CameraFile:
 
     @cached_property
     def data(self) -> Mapping[str, Any]:
-        """Keys and values of YAML, JSON, XML or an ini file.
-
-        Raises:
-            CameraFileError: when the file has another format.
-        """
+        """Keys and values of YAML, JSON, XML or an ini file; CameraFileError: it has another format."""
         try:
             data = _parse(self.text)
         except RepeatedError as error:
@@ -85,20 +74,13 @@ class CameraFile:
 
 
 def _read(name: str, max_bytes: int) -> str:
-    path = actual_path(name)
     try:
-        if kind := irregular_kind(path):
-            raise CameraFileError(f"{name}: {kind}; name a file")
-        with path.open("rb") as file:
-            raw = file.read(max_bytes + 1)
-        if len(raw) > max_bytes:
-            raise CameraFileError(f"{name}: larger than {max_bytes >> 20} MiB; name a calibration or a trajectory")
-        return raw.decode("utf-8-sig")
+        return read_regular(actual_path(name), max_bytes).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise CameraFileError(f"{name}: not UTF-8; name a text file") from None
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else "not a path"
-        raise CameraFileError(f"{name}: {reason.lower()}") from None
+        raise CameraFileError(f"{name}: {reason.lower()}; name a calibration or a trajectory") from None
 
 
 def _parse(text: str) -> Any:
@@ -117,10 +99,6 @@ class _Loader(_BaseLoader):  # type: ignore[misc]
     """YAML loader that reads OpenCV's matrices as mappings, and rejects repeated keys."""
 
 
-def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict[Any, Any]:
-    return _distinct([loader.construct_object(item, deep=True) for item in pair] for pair in node.value)
-
-
 def _distinct(pairs: Iterable[Sequence[Any]]) -> dict[Any, Any]:
     """Build a mapping; raise a RepeatedError for a repeated key."""
     mapping: dict[Any, Any] = {}
@@ -131,14 +109,14 @@ def _distinct(pairs: Iterable[Sequence[Any]]) -> dict[Any, Any]:
     return mapping
 
 
-def _sequence(loader: _Loader, node: yaml.SequenceNode) -> list[Any]:
-    return loader.construct_sequence(node, deep=True)
+def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict[Any, Any]:
+    return _distinct([loader.construct_object(item, deep=True) for item in pair] for pair in node.value)
 
 
 for _kind in ("opencv-matrix", "opencv-nd-matrix", "map"):
     _Loader.add_constructor(f"tag:yaml.org,2002:{_kind}", _mapping)
 # PyYAML's own tag of tuples.
-_Loader.add_constructor("tag:yaml.org,2002:python/tuple", _sequence)
+_Loader.add_constructor("tag:yaml.org,2002:python/tuple", lambda loader, node: loader.construct_sequence(node, True))
 
 
 def _yaml(text: str) -> Any:

@@ -20,24 +20,15 @@ MAX_BYTES = 2**27
 # Units of time by their number in a second.
 TIME_UNITS = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 
-# Later times without a unit are probably not seconds [s]: they would be in the year 5138.
-MAX_TIME_S = 1e11
-
 
 class PoseKeys(NamedTuple):
-    """Keys of a camera that describe its trajectory file.
+    """Keys of a camera that describe its trajectory file."""
 
-    Attributes:
-        poses_unit: unit of lengths, m or mm.
-        poses_time: unit of times, s, ms, us or ns.
-        poses_start: time of the scene's beginning: of the file, or, before its first pose, after that one [s].
-        poses_rate: poses per second of a file without times.
-    """
-
-    poses_unit: str | None = None
-    poses_time: str | None = None
+    poses_unit: str | None = None  # unit of lengths, m or mm
+    poses_time: str | None = None  # unit of times, s, ms, us or ns
+    # Time of the scene's beginning: of the file, or, before its first pose, after that one [s].
     poses_start: float | None = None
-    poses_rate: float | None = None
+    poses_rate: float | None = None  # poses per second of a file without times
 
 
 def read_poses(path: str, keys: PoseKeys = PoseKeys()) -> tuple[tuple[float, ...], ...]:  # noqa: B008
@@ -69,7 +60,6 @@ def read_poses(path: str, keys: PoseKeys = PoseKeys()) -> tuple[tuple[float, ...
 
 
 def _times(file: CameraFile, trajectory: Trajectory, keys: PoseKeys) -> list[float]:
-    """Return the times of the poses in the scene [s]."""
     numbers = [row[0] for row in trajectory.rows]
     if not trajectory.has_times:
         if keys.poses_time is not None:
@@ -82,7 +72,8 @@ def _times(file: CameraFile, trajectory: Trajectory, keys: PoseKeys) -> list[flo
         if keys.poses_rate is not None:
             raise file.fault("has times of its own; remove poses_rate")
         unit = _agreed(file, "poses_time", keys.poses_time, trajectory.time_unit)
-        if unit is None and max(map(abs, numbers)) > MAX_TIME_S:
+        # In seconds they would be in the year 5138.
+        if unit is None and max(map(abs, numbers)) > 1e11:
             raise file.fault(f"has the time {numbers[0]:.0f}, hardly in seconds; set poses_time: s, ms, us or ns")
         times = [number / TIME_UNITS[unit or "s"] for number in numbers]
     if (start := keys.poses_start) is None:

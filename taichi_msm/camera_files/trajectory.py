@@ -18,36 +18,24 @@ COLUMNS = ("t", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 
 
 class Trajectory(NamedTuple):
-    """Poses of a camera, in the units of the file.
+    """Poses of a camera, in the units of the file."""
 
-    Attributes:
-        rows: time, position x, y, z and quaternion x, y, z, w, from the camera to the world; without times, the number
-            of the picture in place of the time.
-        lines: numbers of the lines of the rows, for messages.
-        has_times: whether the file contains times.
-        time_unit: unit of the times that the file contains, if it does.
-        length_unit: unit of the lengths that the file contains, if it does.
-    """
-
+    # Time, position x, y, z and quaternion x, y, z, w, from the camera to the world; without times, the number of the
+    # picture in place of the time.
     rows: Sequence[Sequence[float]]
-    lines: Sequence[int]
-    has_times: bool
-    time_unit: str | None = None
-    length_unit: str | None = None
+    lines: Sequence[int]  # numbers of the lines of the rows, for messages
+    has_times: bool  # whether the file contains times
+    time_unit: str | None = None  # unit of the times that the file contains, if it does
+    length_unit: str | None = None  # unit of the lengths that the file contains, if it does
 
 
 class TrajectoryReader(NamedTuple):
-    """Reader of a format of trajectories.
+    """Reader of a format of trajectories."""
 
-    Attributes:
-        name: name of the format, for users.
-        recognised_by: content by which a file is recognised, for users.
-        read: function that returns the trajectory, or None if the file has another format; it raises a CameraFileError
-            with the line of a fault.
-    """
-
-    name: str
-    recognised_by: str
+    name: str  # name of the format, for users
+    recognised_by: str  # content by which a file is recognised, for users
+    # Function that returns the trajectory, or None if the file has another format; it raises a CameraFileError with the
+    # line of a fault.
     read: Callable[[CameraFile], Trajectory | None]
 
 
@@ -61,15 +49,7 @@ def parse_numbers(words: Sequence[str]) -> list[float] | None:
 
 
 def pose_fault(row: Sequence[float], previous: Sequence[float] | None) -> str:
-    """Check a row of a trajectory.
-
-    Args:
-        row: time [s], position [m] and quaternion.
-        previous: previous row; None for the first.
-
-    Returns:
-        The fault and its remedy, or an empty text.
-    """
+    """Return the fault of a row (time [s], position [m], quaternion) after the previous one, and its remedy."""
     if previous is not None and row[0] <= previous[0]:
         times = f"is at {row[0]:.15g} s, the pose before it at {previous[0]:.15g} s"
         return f"{times}; sort them, each later than the last"

@@ -25,10 +25,8 @@ STAGES = {
     "frames": "simulating",
     "diagnosis": "finding out why it diverged",
     "stepping": "measuring the stepping",
-    "dop853": "measuring DOP853",
     "drawing": "measuring the drawing",
     "points": "measuring other numbers of points",
-    "terms": "measuring every term",
     "write": "writing",
     "film": "filming",
     "export": "exporting",
@@ -53,13 +51,7 @@ class ProgressDisplay:
             self._task = self._bar.add_task(STAGES["start"], total=None, left="")
 
     def update(self, stage: str, done: int, total: int) -> None:
-        """Show the progress of a stage, and the remaining time.
-
-        Args:
-            stage: a key of `STAGES`.
-            done: number of finished items.
-            total: number of items; 0: unknown.
-        """
+        """Show the finished and all items of a stage, and its remaining time; a total of 0 is unknown."""
         if self._quiet:
             return
         now = time.monotonic()
@@ -111,12 +103,7 @@ def _bar() -> Bar:
 
 
 def run_summary(record: Mapping[str, Any], directory: Path) -> str:
-    """Summarise a run in a few lines: frames, steps, forces, warnings and timings.
-
-    Args:
-        record: content of run.json.
-        directory: of the results.
-    """
+    """Summarise the record of a run in a few lines: frames, steps, forces, warnings and timings."""
     times, (rows, cols) = record["timings"], record["points"]
     stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in times.items() if stage != "total")
     parallel = times["encode"] > 0 and record["threads"] > 1

@@ -11,21 +11,20 @@ from typing import Any
 
 import click
 
-from taichi_msm.cli.options import program
-from taichi_msm.cli.session import DONE
+from taichi_msm.cli import options
 from taichi_msm.errors import FilesError, did_you_mean, printable, writing
 
 
-@program.command()
+@options.program.command()
 @click.argument("name", metavar="[NAME]", required=False)
 @click.argument("directory", metavar="[DIR]", default=".")
-def example(name: str | None, directory: str) -> int:
+def example(name: str | None, directory: str) -> None:
     """List the shipped scenes, or write scene NAME with its pictures into DIR, by default the current directory."""
     shipped = scenes_folder()
     scenes = {path.stem: path for pattern in ("*.yaml", "sweeps/*.yaml") for path in sorted(shipped.glob(pattern))}
     if name is None:
         click.echo("\n".join(f"{scene:16}{_summary(path)}" for scene, path in scenes.items()))
-        return DONE
+        return
     if name not in scenes:
         message = f"{name} is no shipped scene{did_you_mean(name, scenes)}; `taichi-msm example` lists them"
         raise click.BadParameter(message, param_hint="NAME")
@@ -39,7 +38,6 @@ def example(name: str | None, directory: str) -> int:
         click.echo(printable(str(target)))
     command = "sweep" if "vary" in _content(scenes[name]) else "run"
     click.echo(printable(f"next: taichi-msm {command} {shlex.quote(str(targets[scenes[name]]))}"))
-    return DONE
 
 
 def scenes_folder() -> Path:

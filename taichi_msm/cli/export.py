@@ -6,19 +6,17 @@ from functools import partial
 
 import click
 
-from taichi_msm.cli.options import SuggestingChoice, json_option, program
-from taichi_msm.cli.session import DONE, interruptible_progress, print_json, report_interruption, result_directory
+from taichi_msm.cli import options, session
 from taichi_msm.errors import printable
 from taichi_msm.exports.formats import FORMATS
-from taichi_msm.system.process import Interruption
 
 
-@program.command()
+@options.program.command()
 @click.argument("directories", metavar="DIR ...", nargs=-1, required=True)
 @click.option(
     "--format",
     "name",
-    type=SuggestingChoice(FORMATS),
+    type=options.SuggestingChoice(FORMATS),
     metavar="FORMAT",
     required=True,
     help="; ".join(f"{name}: {row.description}" for name, row in FORMATS.items()) + ".",
@@ -30,27 +28,20 @@ from taichi_msm.system.process import Interruption
 )
 @click.option("--camera", metavar="NAME", help="Of runs with several cameras, the one whose files are taken.")
 @click.option("--quiet", is_flag=True, help="Print no progress and no summary.")
-@json_option
+@options.json_option
 def export(
     directories: tuple[str, ...], name: str, out: str | None, camera: str | None, quiet: bool, as_json: bool
-) -> int:
+) -> None:
     """Convert the results of runs and sweeps, each in a DIR, to the formats of other programs."""
-    runs = [result_directory(directory, option="DIR") for directory in directories]
-    folder = None if out is None else result_directory(out)
+    runs = [session.result_directory(directory, option="DIR") for directory in directories]
+    folder = None if out is None else session.result_directory(out)
 
-    from taichi_msm.cli.console import ProgressDisplay
     from taichi_msm.exports import export as export_module
 
-    interruption = Interruption()
-    try:
-        with ProgressDisplay(quiet=quiet or as_json) as bar:
-            exported = export_module.export(
-                runs, name, folder, partial(interruptible_progress(bar, interruption), "export"), camera
-            )
-    except KeyboardInterrupt:
-        return report_interruption(interruption, as_json)
+    with session.interruptible(as_json, quiet) as progress:
+        exported = export_module.export(runs, name, folder, partial(progress, "export"), camera)
     if as_json:
-        print_json(
+        session.print_json(
             {"directory": str(exported.directory), "format": name, "files": exported.files, "notes": exported.notes}
         )
     elif not quiet:
@@ -58,4 +49,3 @@ def export(
         click.echo(printable(f"{exported.directory}: {files}"))
         for note in exported.notes:
             click.echo(printable(note))
-    return DONE

@@ -3,30 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
-from taichi_msm.cli.options import json_option, program, scene_argument, set_option, workers_option
-from taichi_msm.cli.session import (
-    DIVERGED,
-    DONE,
-    interruptible_progress,
-    print_json,
-    report_failure,
-    report_interruption,
-    result_directory,
-)
+from taichi_msm.cli import options, session
 from taichi_msm.errors import DivergedError, printable
-from taichi_msm.system.process import Interruption
 
 
-@program.command()
-@scene_argument
+@options.program.command()
+@options.scene_argument
 @click.argument("observed", metavar="OBSERVED")
 @click.argument("more", metavar="", nargs=-1)
 @click.option("--free", metavar="KEY ...", multiple=True, help="Numbers of the scene that are fitted, by dotted path.")
 @click.option("--bounds", metavar="KEY=LOW,HIGH ...", multiple=True, help="Smallest and largest value of a number.")
-@set_option
+@options.set_option
 @click.option(
     "--forces",
     metavar="FILE,SIGMA",
@@ -49,8 +40,8 @@ from taichi_msm.system.process import Interruption
     "--contact", type=float, metavar="DEPTH", multiple=True, help="Of tables: depth of contact [m], once or per table."
 )
 @click.option("--out", metavar="DIR", help="Directory for the fit.  [default: output/<name of the scene file>-fit]")
-@workers_option(help="Number of worker processes.  [default: by the duration of the first run]")
-@json_option
+@options.workers_option(help="Number of worker processes.  [default: by the duration of the first run]")
+@options.json_option
 def fit(
     scene: str,
     observed: str,
@@ -59,90 +50,60 @@ def fit(
     bounds: tuple[str, ...],
     overrides: tuple[str, ...],
     forces: str | None,
-    sigma: float | None,
-    robust: bool,
-    correlation: float | None,
-    drift: float | None,
-    profile: bool,
-    resolution: int | None,
-    columns: tuple[str, ...],
-    sheet: str | None,
-    block: int | None,
     window: str | None,
-    rate: float | None,
-    contact: tuple[float, ...],
     out: str | None,
-    workers: int | None,
     as_json: bool,
+    **settings: Any,
 ) -> int:
     """Estimate parameters of SCENE from OBSERVED data, with confidence intervals.
 
     OBSERVED: positions or pixels of points, an .npz; or one or more tables of a testing machine, .csv, .tsv, .txt or
     .xlsx, with time, depth and force.
     """
-    from taichi_msm.fitting.machine_fit import is_table
+    from taichi_msm.fitting.machine_model import is_table
     from taichi_msm.load.scene_file import load_scene
 
     # Both options accept several words, of which click assigns all but the first to `more`; so does OBSERVED.
-    tables = [word for word in more if is_table(word)]
+    tables = [observed, *(word for word in more if is_table(word))]
     more = tuple(word for word in more if not is_table(word))
-    free = (*free, *(word for word in more if "=" not in word))
     limits: dict[str, tuple[float, float]] = {}
     for key, interval in map(parse_bounds, (*bounds, *(word for word in more if "=" in word))):
         if key in limits:
             raise click.BadParameter(f"{key}: given twice; leave one of them out", param_hint="--bounds")
         limits[key] = interval
     loaded = load_scene(scene, overrides)
-    directory = result_directory(out, f"{Path(scene).stem}-fit")
+    directory = session.result_directory(out, f"{Path(scene).stem}-fit")
 
-    from taichi_msm.cli.console import ProgressDisplay
     from taichi_msm.fitting.fit import fit as fit_scene
 
-    interruption = Interruption()
     try:
-        with ProgressDisplay(quiet=as_json) as bar:
+        with session.interruptible(as_json) as progress:
             result = fit_scene(
                 loaded,
-                [observed, *tables] if tables else observed,
-                free,
+                tables if len(tables) > 1 else observed,
+                (*free, *(word for word in more if "=" not in word)),
                 bounds=limits,
                 forces=None if forces is None else parse_forces(forces),
-                directory=directory,
-                workers=workers,
-                progress=interruptible_progress(bar, interruption),
-                sigma=sigma,
-                robust=robust,
-                profile=profile,
-                correlation=correlation,
-                drift=drift,
-                resolution=resolution,
-                columns=columns,
-                sheet=sheet,
-                block=block,
                 window=None if window is None else parse_window(window),
-                rate=rate,
-                contact=contact,
+                directory=directory,
+                progress=progress,
+                **settings,
             )
-    except KeyboardInterrupt:
-        return report_interruption(interruption, as_json)
     except DivergedError as error:
-        report_failure("diverged", [f"{scene}: where the search begins: {error}"], as_json)
-        return DIVERGED
+        session.report_failure("diverged", [f"{scene}: where the search begins: {error}"], as_json)
+        return session.DIVERGED
     if as_json:
-        print_json({"directory": str(directory), **result.as_json()})
+        session.print_json({"directory": str(directory), **result.as_json()})
     else:
-        title = f"{directory}: fit of {', '.join([observed, *tables])}"
-        click.echo("\n".join(map(printable, [title, *result.summary()])))
-    return DONE
+        click.echo("\n".join(map(printable, [f"{directory}: fit of {', '.join(tables)}", *result.summary()])))
+    return session.DONE
 
 
 def parse_bounds(text: str) -> tuple[str, tuple[float, float]]:
     """Parse KEY=LOW,HIGH; a missing bound is infinite."""
-    key, _, interval = text.partition("=")
-    low, comma, high = interval.partition(",")
     try:
-        if not comma:
-            raise ValueError
+        key, interval = text.split("=", 1)
+        low, high = interval.split(",", 1)
         return key.strip(), (float(low or "-inf"), float(high or "inf"))
     except ValueError:
         message = f"{text}: expected KEY=LOW,HIGH, such as tissue.young=5e3,1e5"
@@ -151,10 +112,8 @@ def parse_bounds(text: str) -> tuple[str, tuple[float, float]]:
 
 def parse_forces(text: str) -> tuple[str, float]:
     """Parse FILE,SIGMA."""
-    name, _, sigma = text.rpartition(",")
     try:
-        if not name:
-            raise ValueError
+        name, sigma = text.rsplit(",", 1)
         return name, float(sigma)
     except ValueError:
         message = f"{text}: expected FILE,SIGMA, such as forces.csv,0.01"
@@ -163,8 +122,8 @@ def parse_forces(text: str) -> tuple[str, float]:
 
 def parse_window(text: str) -> tuple[float, float]:
     """Parse T0,T1."""
-    first, _, last = text.partition(",")
     try:
+        first, last = text.split(",", 1)
         return float(first), float(last)
     except ValueError:
         raise click.BadParameter(f"{text}: expected T0,T1, such as 0.5,12", param_hint="--window") from None

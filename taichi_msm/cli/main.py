@@ -9,35 +9,21 @@ from pathlib import Path
 
 import click
 
-from taichi_msm.cli import example, export, fit, run, study, sweep  # noqa: F401  # each registers its commands
-from taichi_msm.cli.options import program
-from taichi_msm.cli.session import BUG, DONE, FILES, INVALID_INPUT, report_failure
-from taichi_msm.errors import (
-    ArgumentError,
-    DeviceError,
-    ExecutorError,
-    FilesError,
-    NotInstalledError,
-    SceneError,
-)
+from taichi_msm.cli import example, export, fit, options, run, session, study, sweep  # noqa: F401  # each registers its commands
+from taichi_msm.errors import DivergedError, FilesError, MsmError, SceneError
 from taichi_msm.system.process import discard_buffer, write_stderr
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line.
+    """Run a command, by default that of sys.argv, and return its exit code.
 
-    Args:
-        arguments: words of the command line; None: sys.argv.
-
-    Returns:
-        Exit code: 0 done, 1 bug, 2 invalid scene or arguments, 3 diverged, 4 files cannot be read or written, 130
-        Ctrl-C, 143 SIGTERM.
+    The codes are those of session.py, 130 after Ctrl-C and 143 after SIGTERM.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
         code, lines = _run(words)
         if lines:
-            report_failure("error", lines, "--json" in words)
+            session.report_failure("error", lines, "--json" in words)
         return code
     except OSError as error:
         # The reader of stdout has exited, or its disk is full.
@@ -45,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not isinstance(error, BrokenPipeError):
             name = f" {error.filename}" if error.filename else ""
             write_stderr([f"taichi-msm: cannot read or write{name}: {error.strerror or error}"])
-        return FILES
+        return session.FILES
 
 
 def _run(words: list[str]) -> tuple[int, Sequence[str]]:
@@ -53,30 +39,32 @@ def _run(words: list[str]) -> tuple[int, Sequence[str]]:
     try:
         Path.cwd()
     except OSError:
-        return FILES, ["taichi-msm: the current folder is gone; change to another"]
+        return session.FILES, ["taichi-msm: the current folder is gone; change to another"]
     try:
-        return int(program.main(words, prog_name="taichi-msm", standalone_mode=False) or DONE), ()
+        return int(options.program.main(words, prog_name="taichi-msm", standalone_mode=False) or session.DONE), ()
     except SystemExit:
         # click exits like this when the reader of stdout has exited.
         raise BrokenPipeError from None
     except SceneError as error:
-        return INVALID_INPUT, error.lines
-    except (ArgumentError, DeviceError, ExecutorError, NotInstalledError) as error:
-        return INVALID_INPUT, [str(error)]
+        return session.INVALID_INPUT, error.lines
     except FilesError as error:
-        return FILES, [str(error)]
+        return session.FILES, [str(error)]
+    except DivergedError as error:
+        return session.DIVERGED, [str(error)]
+    except MsmError as error:
+        return session.INVALID_INPUT, [str(error)]
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message())
-        return INVALID_INPUT, ()
+        return session.INVALID_INPUT, ()
     except click.ClickException as error:
         message = " ".join(error.format_message().split())
         if "--set" in words and "unexpected extra argument" in message:
             message = f'{message.rstrip(".")}; a value with blanks needs quotes: --set "KEY=VALUE"'
-        return INVALID_INPUT, [f"taichi-msm: {message} (see taichi-msm --help)"]
+        return session.INVALID_INPUT, [f"taichi-msm: {message} (see taichi-msm --help)"]
     except OSError:
         raise
     except Exception as error:
         if os.environ.get("TAICHI_MSM_TRACEBACK"):
             raise
         message = f"a bug: {type(error).__name__}: {' '.join(str(error).split())}"
-        return BUG, [f"taichi-msm: {message}; please report it with what TAICHI_MSM_TRACEBACK=1 prints"]
+        return session.BUG, [f"taichi-msm: {message}; please report it with what TAICHI_MSM_TRACEBACK=1 prints"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -17,11 +16,7 @@ class SuggestingChoice(click.Choice):  # type: ignore[type-arg]  # not generic b
     """Option type with a fixed set of words; errors suggest the nearest one."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """Validate a word; arguments as for `click.ParamType.convert`.
-
-        Raises:
-            click.BadParameter: when the word is not allowed.
-        """
+        """Validate a word, as `click.ParamType.convert`."""
         try:
             return str(super().convert(value, param, ctx))
         except click.BadParameter as error:
@@ -29,21 +24,12 @@ class SuggestingChoice(click.Choice):  # type: ignore[type-arg]  # not generic b
             raise click.BadParameter(message, ctx, param) from None
 
 
-class ShardType(click.ParamType):  # type: ignore[type-arg]  # as above
-    """Option type I/N: part I of N, counted from 1."""
-
-    name = "I/N"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
-        """Parse I/N; arguments as for `click.ParamType.convert`.
-
-        Raises:
-            click.BadParameter: when the word is not I/N with 1 <= I <= N.
-        """
-        numbers = re.fullmatch("([0-9]{1,9})/([0-9]{1,9})", value)
-        if numbers is None or not 1 <= int(numbers[1]) <= int(numbers[2]):
-            self.fail(f"{value} is no part; take I/N with 1 <= I <= N, such as 3/8", param, ctx)
-        return int(numbers[1]), int(numbers[2])
+def parse_shard(text: str) -> tuple[int, int]:
+    """Parse I/N, part I of N counted from 1."""
+    numbers = re.fullmatch("([0-9]{1,9})/([0-9]{1,9})", text)
+    if numbers is None or not 1 <= int(numbers[1]) <= int(numbers[2]):
+        raise click.BadParameter(f"{text} is no part; take I/N with 1 <= I <= N, such as 3/8")
+    return int(numbers[1]), int(numbers[2])
 
 
 scene_argument = click.argument("scene", metavar="SCENE")
@@ -87,21 +73,3 @@ def print_version(context: click.Context, _option: click.Parameter, requested: b
 )
 def program() -> None:
     """Deform an image as tissue deforms."""
-
-
-def require_no_settings(context: click.Context, action: str, allowed: Sequence[str]) -> None:
-    """Reject settings next to an option that reuses those of an earlier run.
-
-    Args:
-        context: of the command.
-        action: the option and its verb, for the message.
-        allowed: names of the allowed parameters.
-
-    Raises:
-        click.UsageError: when another parameter was given.
-    """
-    for option in context.command.params:
-        is_given = context.get_parameter_source(str(option.name)) is click.core.ParameterSource.COMMANDLINE
-        if is_given and option.name not in allowed:
-            name = option.opts[0] if isinstance(option, click.Option) else "SCENE"
-            raise click.UsageError(f"{action} a run with its own settings; leave out {name}")

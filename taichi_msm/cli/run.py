@@ -2,67 +2,41 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from taichi_msm.cli import START_TIME
-from taichi_msm.cli.options import (
-    arch_option,
-    image_option,
-    json_option,
-    program,
-    quality_option,
-    require_no_settings,
-    scene_argument,
-    set_option,
-    threads_option,
-)
-from taichi_msm.cli.session import (
-    DONE,
-    EXIT_CODES,
-    add_resume_hint,
-    interruptible_progress,
-    plan_repetition,
-    prefix_errors,
-    print_json,
-    report_interruption,
-    result_directory,
-    resume_hint,
-)
+from taichi_msm.cli import START_TIME, options, session
 from taichi_msm.system.process import Interruption, write_stderr
 
 if TYPE_CHECKING:
     from taichi_msm.model.plan import Plan
 
-# Parameters that are allowed with --resume and --again.
-RESUME_OPTIONS = ("resume", "threads", "quiet", "as_json")
-REPEAT_OPTIONS = ("again", "out", "arch", "threads", "estimate_error", "quiet", "as_json")
 
-
-@program.command()
+@options.program.command()
 @click.argument("scene", metavar="SCENE", required=False)
 @click.option(
     "--out",
     metavar="DIR",
     help="Directory for the results.  [default: output/<name of the scene file>; with --again, its DIR]",
 )
-@image_option
-@set_option
-@arch_option
-@threads_option
+@options.image_option
+@options.set_option
+@options.arch_option
+@options.threads_option
 @click.option(
     "--estimate-error/--no-estimate",
     default=None,
     help="Always or never estimate the error.  [default: if that takes at most two fifths of the run]",
 )
-@quality_option
+@options.quality_option
 @click.option("--resume", metavar="DIR", help="Continue the unfinished run in DIR, instead of running SCENE.")
 @click.option("--again", metavar="DIR", help="Repeat the run of DIR/run.json instead of running SCENE.")
 @click.option("--quiet", is_flag=True, help="Print no progress and no summary.")
-@json_option
+@options.json_option
 @click.pass_context
 def run(
     context: click.Context,
@@ -83,73 +57,90 @@ def run(
     overrides += () if quality is None else (f"render.quality={quality}",)
     typed = [*overrides, *([f"image={image}"] if image is not None else [])]
     if resume is not None:
-        require_no_settings(context, "--resume continues", RESUME_OPTIONS)
-        directory = result_directory(resume, option="--resume")
-        if not resume_hint(directory):
+        _require_no_settings(context, "--resume continues", ("resume", "threads", "quiet", "as_json"))
+        directory = session.result_directory(resume, option="--resume")
+        if not session.resume_hint(directory):
             raise click.BadParameter(f"there is no unfinished run in {resume}", param_hint="--resume")
     elif again is not None:
-        require_no_settings(context, "--again repeats", REPEAT_OPTIONS)
-        directory = result_directory(again, option="--again") if out is None else result_directory(out)
-        plan, typed = plan_repetition(again)
+        allowed = ("again", "out", "arch", "threads", "estimate_error", "quiet", "as_json")
+        _require_no_settings(context, "--again repeats", allowed)
+        from taichi_msm.load.check import check_scene
+        from taichi_msm.runs.finished import read_run
+
+        directory = session.result_directory(again, option="--again")
+        earlier = read_run(directory)
+        earlier.require_same_pictures(drawn=earlier.scene.draws or "image" in earlier.sha256)
+        plan, typed = check_scene(earlier.scene), earlier.overrides
+        directory = directory if out is None else session.result_directory(out)
     elif scene is None:
         raise click.MissingParameter(param_hint="'SCENE'", param_type="argument")
     else:
         from taichi_msm.load.scene_file import load_plan
 
         plan = load_plan(scene, overrides, image)
-        directory = result_directory(out, Path(scene).stem)
+        directory = session.result_directory(out, Path(scene).stem)
 
-    from taichi_msm.cli.console import ProgressDisplay, run_summary
+    from taichi_msm.cli.console import run_summary
     from taichi_msm.runs import run as run_module
 
     interruption, name = Interruption(), str(scene or resume or again)
-    try:
-        with ProgressDisplay(quiet=quiet or as_json) as bar, add_resume_hint(directory), prefix_errors(name):
-            progress = interruptible_progress(bar, interruption)
-            if resume is not None:
-                record = run_module.resume(directory, threads=threads, started=START_TIME, progress=progress)
-            else:
-                record = run_module.run(
-                    plan,
-                    directory,
-                    arch=arch,
-                    threads=threads,
-                    overrides=typed,
-                    estimate_error=estimate_error,
-                    started=START_TIME,
-                    progress=progress,
-                )
-    except KeyboardInterrupt:
-        return report_interruption(interruption, as_json, f"interrupted; nothing was written{resume_hint(directory)}")
+    with (
+        session.interruptible(
+            as_json, quiet, interruption, lambda: f"; nothing was written{session.resume_hint(directory)}"
+        ) as progress,
+        session.add_resume_hint(directory),
+        session.prefix_errors(name),
+    ):
+        if resume is not None:
+            record = run_module.resume(directory, threads=threads, started=START_TIME, progress=progress)
+        else:
+            record = run_module.run(
+                plan,
+                directory,
+                arch=arch,
+                threads=threads,
+                overrides=typed,
+                estimate_error=estimate_error,
+                started=START_TIME,
+                progress=progress,
+            )
     if as_json:
-        print_json({"directory": str(directory), **record})
+        session.print_json({"directory": str(directory), **record})
     if record["status"] != "complete":
         message = f"{name}: {record.get('error', 'interrupted')}; frames in {directory}: {record['frames']}"
-        remedy = f"; last good state: {record['dump']}" if record.get("dump") else resume_hint(directory)
+        remedy = f"; last good state: {record['dump']}" if record.get("dump") else session.resume_hint(directory)
         write_stderr([message + remedy])
     elif not quiet and not as_json:
         click.echo(run_summary(record, directory))
-    return EXIT_CODES.get(record["status"], interruption.code)
+    return session.EXIT_CODES.get(record["status"], interruption.code)
 
 
-@program.command()
-@scene_argument
-@image_option
-@set_option
-@json_option
-def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bool) -> int:
+def _require_no_settings(context: click.Context, action: str, allowed: Sequence[str]) -> None:
+    """Reject other options than the allowed ones next to one that reuses the settings of an earlier run."""
+    for option in context.command.params:
+        is_given = context.get_parameter_source(str(option.name)) is click.core.ParameterSource.COMMANDLINE
+        if is_given and option.name not in allowed:
+            name = option.opts[0] if isinstance(option, click.Option) else "SCENE"
+            raise click.UsageError(f"{action} a run with its own settings; leave out {name}")
+
+
+@options.program.command()
+@options.scene_argument
+@options.image_option
+@options.set_option
+@options.json_option
+def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bool) -> None:
     """Validate SCENE and print the steps, time, memory and disk space it needs; compute nothing."""
-    from taichi_msm.load import cost as cost_module
+    from taichi_msm.load import cost
     from taichi_msm.load.scene_file import load_plan
-    from taichi_msm.model import tool_force
-    from taichi_msm.model.tool_force import describe_forces, probe_records
+    from taichi_msm.model.tool_force import describe_forces, force_warnings, probe_records
     from taichi_msm.model.tools import path_warnings
-    from taichi_msm.render.notes import describe_calibrations, drawing_warnings
+    from taichi_msm.render.notes import describe_cameras, drawing_warnings
     from taichi_msm.render.texture import load_texture
 
     plan = load_plan(scene, overrides, image)
-    with prefix_errors(scene):
-        cost_module.require_disk(plan, Path("output"))
+    with session.prefix_errors(scene):
+        cost.require_disk(plan, Path("output"))
         if plan.scene.draws:
             load_texture(plan.scene)
     loaded, grid, stable_step = plan.scene, plan.grid, plan.stable_step
@@ -162,7 +153,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     }
     if loaded.time.at_rest:
         steps |= dict.fromkeys(("step", "stable_step", "steps_per_frame", "steps"))
-    budget, duration = cost_module.estimate_budget(plan), cost_module.estimate_duration(plan)
+    budget, duration = cost.estimate_budget(plan), cost.estimate_duration(plan)
     report: dict[str, Any] = {
         "scene": loaded.model_dump(mode="json"),
         **steps,
@@ -173,17 +164,15 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         "disk_while_running": budget.disk_bytes + budget.working_bytes,
         "probes": (records := probe_records(loaded)),
         "notes": [
-            *tool_force.force_warnings(loaded, records),
+            *force_warnings(loaded, records),
             *path_warnings(loaded, plan.tools),
             *drawing_warnings(loaded),
         ],
     }
     if as_json:
-        print_json(report)
-        return DONE
+        session.print_json(report)
+        return
     import yaml
-
-    from taichi_msm.load.cost import format_rough_time
 
     tolerances = [f"{name}.tolerance" for name in ("sheet", "time") if getattr(loaded, name).tolerance is not None]
     # Companion runs may refine a scene with a tolerance.
@@ -198,18 +187,14 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     )
     click.echo(
         f"\n{budget.points} points, {budget.frames} frames, {stepping}\n"
-        f"about {format_rough_time(duration.seconds)} to run{longer} (estimated from its work)\n"
+        f"about {cost.format_rough_time(duration.seconds)} to run{longer} (estimated from its work)\n"
         f"about {budget.memory_bytes / 2**20:.0f} MiB of memory, at most {budget.disk_bytes / 2**20:.1f} MiB on disk, "
         f"{budget.working_bytes / 2**20:.1f} MiB more while it runs"
     )
-    for line in describe_calibrations(loaded):
+    forces = enumerate(map(describe_forces, records))
+    lines = [f"probes.{index}: {description}" for index, description in forces if description]
+    for line in (*describe_cameras(loaded), *lines, *report["notes"]):
         click.echo(line)
-    for index, probe in enumerate(report["probes"]):
-        if description := describe_forces(probe):
-            click.echo(f"probes.{index}: {description}")
-    for note in report["notes"]:
-        click.echo(note)
-    return DONE
 
 
 def _lock_cost(plan: Plan) -> str:
@@ -223,10 +208,9 @@ def _lock_cost(plan: Plan) -> str:
     return f", {ratio:.2g} times shorter than without lock" if ratio > 1.01 else ""
 
 
-@program.command()
-def schema() -> int:
+@options.program.command()
+def schema() -> None:
     """Print the JSON Schema of a scene, for editors."""
     from taichi_msm.load.scene_file import schema
 
-    print_json(schema())
-    return DONE
+    session.print_json(schema())

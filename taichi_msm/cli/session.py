@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -15,37 +15,14 @@ from taichi_msm.errors import FilesError, SceneError
 from taichi_msm.runs.directory import require_no_link
 from taichi_msm.system.process import Interruption, write_stderr
 
-if TYPE_CHECKING:
-    from taichi_msm.cli.console import ProgressDisplay
-    from taichi_msm.model.plan import Plan
-
-
+# Exit codes; FILES: files cannot be read or written.
 DONE, BUG, INVALID_INPUT, DIVERGED, FILES = 0, 1, 2, 3, 4
 
 EXIT_CODES = {"complete": DONE, "diverged": DIVERGED}
 
 
-def plan_repetition(directory: str) -> tuple[Plan, list[str]]:
-    """Return the plan and overrides of an earlier run, after checking that its pictures are unchanged."""
-    from taichi_msm.load.check import check_scene
-    from taichi_msm.runs.finished import read_run
-
-    earlier = read_run(result_directory(directory, option="--again"))
-    earlier.require_same_pictures(drawn=earlier.scene.draws or "image" in earlier.sha256)
-    return check_scene(earlier.scene), earlier.overrides
-
-
 def result_directory(out: str | None, default: str = "", option: str = "--out") -> Path:
-    """Return the directory of results.
-
-    Args:
-        out: the directory given by the user; None: the default.
-        default: name of the default directory in output/.
-        option: name of the option in messages.
-
-    Raises:
-        click.BadParameter: when the name is empty, or no default directory has this name.
-    """
+    """Return the directory of results that the user gave by an option, or a default one in output/."""
     if out == "":
         raise click.BadParameter("is empty; name a directory", param_hint=option)
     if out is not None:
@@ -83,13 +60,10 @@ def prefix_errors(scene: str) -> Iterator[None]:
         raise SceneError([f"{scene}: {line}" for line in error.lines]) from None
 
 
-def interruptible_progress(bar: ProgressDisplay, interruption: Interruption) -> Callable[[str, int, int], None]:
-    """Return a progress callback that updates a display and raises KeyboardInterrupt after an interruption.
-
-    Args:
-        bar: the display.
-        interruption: listens to signals from the first call on.
-    """
+@contextmanager
+def show_progress(interruption: Interruption, quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
+    """Show the progress of the block by a callback, which raises KeyboardInterrupt after an interruption."""
+    from taichi_msm.cli.console import ProgressDisplay
 
     def progress(stage: str, done: int, total: int) -> None:
         bar.update(stage, done, total)
@@ -98,7 +72,31 @@ def interruptible_progress(bar: ProgressDisplay, interruption: Interruption) -> 
         if stage != "write":
             interruption.raise_if_requested()
 
-    return progress
+    with ProgressDisplay(quiet=quiet) as bar:
+        yield progress
+
+
+@contextmanager
+def report_interruption(interruption: Interruption, as_json: bool, rest: Callable[[], str]) -> Iterator[None]:
+    """Report an interruption of the block, and exit; `rest` returns the end of the message."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        report_failure("interrupted", [f"interrupted{rest()}"], as_json)
+        raise click.exceptions.Exit(interruption.code) from None
+
+
+@contextmanager
+def interruptible(
+    as_json: bool,
+    quiet: bool = False,
+    interruption: Interruption | None = None,
+    rest: Callable[[], str] = lambda: "; nothing was written",
+) -> Iterator[Callable[[str, int, int], None]]:
+    """Show the progress of the block by a callback; report an interruption, and exit."""
+    interruption = interruption or Interruption()
+    with report_interruption(interruption, as_json, rest), show_progress(interruption, quiet or as_json) as progress:
+        yield progress
 
 
 def print_json(value: Any) -> None:
@@ -106,22 +104,8 @@ def print_json(value: Any) -> None:
     click.echo(json.dumps(value, indent=2, allow_nan=False))
 
 
-def report_interruption(
-    interruption: Interruption, as_json: bool, message: str = "interrupted; nothing was written"
-) -> int:
-    """Report an interruption as `report_failure` does; return the exit code."""
-    report_failure("interrupted", [message], as_json)
-    return interruption.code
-
-
 def report_failure(status: str, lines: Sequence[str], as_json: bool) -> None:
-    """Report the failure of a command.
-
-    Args:
-        status: status in the JSON object.
-        lines: messages, printed to stderr.
-        as_json: whether to print a JSON object on stdout too.
-    """
+    """Print the failure of a command on stderr, and as a JSON object with a status on stdout."""
     write_stderr(lines)
     if as_json:
         print_json({"status": status, "errors": list(lines)})

@@ -6,29 +6,11 @@ import math
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from taichi_msm.cli.options import (
-    arch_option,
-    image_option,
-    json_option,
-    program,
-    scene_argument,
-    set_option,
-    threads_option,
-)
-from taichi_msm.cli.session import (
-    DIVERGED,
-    DONE,
-    EXIT_CODES,
-    interruptible_progress,
-    prefix_errors,
-    print_json,
-    report_interruption,
-    result_directory,
-)
+from taichi_msm.cli import options, session
 from taichi_msm.errors import FilesError, NotInstalledError, printable
 from taichi_msm.runs.directory import require_no_link
 from taichi_msm.system.process import Interruption, write_stderr
@@ -37,15 +19,15 @@ if TYPE_CHECKING:
     from taichi_msm.view.session import Session
 
 
-@program.command()
-@scene_argument
+@options.program.command()
+@options.scene_argument
 @click.option(
     "--out", metavar="DIR", help="Directory for the report.  [default: output/<name of the scene file>-study]"
 )
-@image_option
-@set_option
-@arch_option
-@threads_option
+@options.image_option
+@options.set_option
+@options.arch_option
+@options.threads_option
 @click.option(
     "--tolerance",
     type=float,
@@ -53,69 +35,58 @@ if TYPE_CHECKING:
     help="Largest error, as a fraction of the largest displacement.  [default: the scene's, or 1e-3]",
 )
 @click.option("--quick", is_flag=True, help="Take a minute instead of several: fewer and shorter measurements.")
-@json_option
+@options.json_option
 def study(
     scene: str,
     out: str | None,
     image: str | None,
     overrides: tuple[str, ...],
-    arch: str,
-    threads: int | None,
     tolerance: float | None,
-    quick: bool,
     as_json: bool,
+    **settings: Any,
 ) -> int:
     """Measure the speed and error of every setting of SCENE, and recommend one."""
     from taichi_msm.load.scene_file import load_scene
     from taichi_msm.scene.section import MAX_TOLERANCE, MIN_TOLERANCE
 
     loaded = load_scene(scene, overrides, image)
-    directory = result_directory(out, f"{Path(scene).stem}-study")
+    directory = session.result_directory(out, f"{Path(scene).stem}-study")
     if tolerance is not None and not MIN_TOLERANCE <= tolerance <= MAX_TOLERANCE:
         expected = f"expected a number, {MIN_TOLERANCE:g} to {MAX_TOLERANCE:g}"
         raise click.BadParameter(f"{tolerance:g} is not allowed; {expected}", param_hint="--tolerance")
 
-    from taichi_msm.cli.console import ProgressDisplay
     from taichi_msm.study.report import RECORD_FILE, format_summary, require_writable, study_record, write_report
     from taichi_msm.study.study import run_study
 
     require_writable(directory)
     interruption = Interruption()
-    with ProgressDisplay(quiet=as_json) as bar, prefix_errors(scene):
-        results = run_study(
-            loaded,
-            Path(scene).stem,
-            tolerance=tolerance,
-            quick=quick,
-            arch=arch,
-            threads=threads,
-            progress=interruptible_progress(bar, interruption),
-        )
-    if not results.stepping:
-        return report_interruption(interruption, as_json)
+    with session.interruptible(as_json, interruption=interruption) as progress, session.prefix_errors(scene):
+        results = run_study(loaded, Path(scene).stem, tolerance=tolerance, progress=progress, **settings)
+        if not results.stepping:
+            raise KeyboardInterrupt
     if results.status == "interrupted" and (directory / RECORD_FILE).exists():
         # A partial study must not replace a complete one.
         directory = require_no_link(directory / "interrupted", "--out")
     outputs = write_report(results, directory)
     if as_json:
-        print_json({"directory": str(directory), **study_record(results), "outputs": outputs})
+        session.print_json({"directory": str(directory), **study_record(results), "outputs": outputs})
     else:
         click.echo(format_summary(results))
         click.echo(printable(f"{directory}: {', '.join(outputs)}"))
-    return EXIT_CODES.get(results.status, interruption.code)
+    return session.EXIT_CODES.get(results.status, interruption.code)
 
 
-@program.command()
-@scene_argument
+@options.program.command()
+@options.scene_argument
 @click.option(
     "--out",
     metavar="DIR",
     help="Directory for saved images, films and scenes.  [default: output/<name of the scene file>-live]",
 )
-@image_option
-@set_option
-@arch_option
-@threads_option
+@options.image_option
+@options.set_option
+@options.arch_option
+@options.threads_option
 @click.option("--play", is_flag=True, help="Let the scene's own probes act as well.")
 @click.option(
     "--browser", is_flag=True, expose_value=False, help="Show the session on a page in a browser: the default."
@@ -162,14 +133,13 @@ def view(
     film = None if record is None else _film_path(record)
     permitted = [_require_origin(origin) for origin in origins]
     loaded = load_scene(scene, overrides, image)
-    directory = result_directory(out, f"{Path(scene).stem}-live")
+    directory = session.result_directory(out, f"{Path(scene).stem}-live")
 
     from taichi_msm.render.notes import drawing_warnings
     from taichi_msm.view.script import load_script, record_film, schedule_events
 
     loaded_script = load_script(script, loaded.render.size) if script is not None else None
 
-    from taichi_msm.cli.console import ProgressDisplay
     from taichi_msm.view.recording import Captures
     from taichi_msm.view.session import Session
 
@@ -178,31 +148,26 @@ def view(
     notices: list[str] = []
 
     def begin() -> Session:
-        with ProgressDisplay(quiet=False) as bar:
-            progress = interruptible_progress(bar, interruption)
+        with session.show_progress(interruption, quiet=False) as progress:
             return Session(loaded, captures, arch, threads, play=play, progress=lambda stage: progress(stage, 0, 0))
 
     try:
-        with prefix_errors(scene):
-            if film is not None and seconds is not None:
-                with begin() as session, ProgressDisplay(quiet=False) as bar:
-                    events = (
-                        schedule_events(loaded_script, session.frame_rate, loaded.render.size) if loaded_script else ()
-                    )
-                    progress = partial(interruptible_progress(bar, interruption), "film")
-                    record_film(session, film, seconds, events, progress, notices.append)
-                click.echo(printable(str(film)))
-                return DIVERGED if session.divergence_error else DONE
-            _serve(begin, scene, port, permitted, film, interruption)
-    except KeyboardInterrupt:
-        return report_interruption(
-            interruption, False, "interrupted" if seconds is None else "interrupted; no film was written"
-        )
+        with (
+            session.report_interruption(interruption, False, lambda: "; no film was written" if seconds else ""),
+            session.prefix_errors(scene),
+        ):
+            if film is None or seconds is None:
+                _serve(begin, scene, port, permitted, film, interruption)
+                return session.DONE
+            with begin() as live, session.show_progress(interruption, quiet=False) as progress:
+                events = schedule_events(loaded_script, live.frame_rate, loaded.render.size) if loaded_script else ()
+                record_film(live, film, seconds, events, partial(progress, "film"), notices.append)
+            click.echo(printable(str(film)))
+            return session.DIVERGED if live.divergence_error else session.DONE
     finally:
         write_stderr(notices)
         for path in captures.saved:
             click.echo(printable(str(path)))
-    return DONE
 
 
 def _film_path(record: str) -> Path:
@@ -245,10 +210,10 @@ def _serve(
 
     from taichi_msm.view.server import Server, listen
 
-    with listen(port) as listener, begin() as session:
-        server = Server(session, listener, title, origins)
+    with listen(port) as listener, begin() as live:
+        server = Server(live, listener, title, origins)
         if film is not None:
-            session.start_film(film)
+            live.start_film(film)
         click.echo(server.url)
         write_stderr(["open this address in a browser; Ctrl-C ends the session"])
         asyncio.run(server.run(interruption.raise_if_requested))

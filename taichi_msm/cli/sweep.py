@@ -7,18 +7,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from taichi_msm.cli.options import ShardType, json_option, program, workers_option
-from taichi_msm.cli.session import (
-    DONE,
-    FILES,
-    interruptible_progress,
-    print_json,
-    report_failure,
-    report_interruption,
-    result_directory,
-)
+from taichi_msm.cli import options, session
 from taichi_msm.errors import LostExecutorError, printable
-from taichi_msm.system.process import Interruption, write_stderr
+from taichi_msm.system.process import write_stderr
 
 if TYPE_CHECKING:
     from taichi_msm.sweeps.spec import Sweep
@@ -28,15 +19,17 @@ if TYPE_CHECKING:
 MAX_UNCONFIRMED_RUNS = 10_000
 
 
-@program.command()
+@options.program.command()
 @click.argument("file", metavar="SWEEP")
 @click.option("--out", metavar="DIR", help="Directory for the runs.  [default: output/<name of the sweep file>]")
-@workers_option(help="Processes that take the runs.  [default: one for each core, as far as memory goes]")
+@options.workers_option(help="Processes that take the runs.  [default: one for each core, as far as memory goes]")
 @click.option("--dask", metavar="ADDRESS", help="Let the workers of a dask scheduler take the runs.")
-@click.option("--shard", type=ShardType(), metavar="I/N", help="Take only part I of N of the runs; write no table.")
+@click.option(
+    "--shard", type=options.parse_shard, metavar="I/N", help="Take only part I of N of the runs; write no table."
+)
 @click.option("--dry-run", is_flag=True, help="Print the values of all runs and their cost; run nothing.")
 @click.option("--yes", is_flag=True, help=f"Take more than {MAX_UNCONFIRMED_RUNS} runs, or longer than a day.")
-@json_option
+@options.json_option
 def sweep(
     file: str,
     out: str | None,
@@ -48,64 +41,57 @@ def sweep(
     as_json: bool,
 ) -> int:
     """Run a scene many times with varied values, as SWEEP says, and write a table of the results."""
-    from taichi_msm.cli.console import ProgressDisplay
-    from taichi_msm.sweeps.runs import begin_sweep
+    from taichi_msm.sweeps.runs import begin_sweep, run_missing
     from taichi_msm.sweeps.spec import load_sweep
-    from taichi_msm.sweeps.sweep import finish_sweep, open_executor, run_missing
+    from taichi_msm.sweeps.sweep import finish_sweep, open_executor
     from taichi_msm.sweeps.tables import choose_worker_count, cost_line, count_statuses, estimate_cost, summary_lines
 
     if workers is not None and dask is not None:
         raise click.UsageError("--workers are processes here, and --dask has its own; leave out one of them")
     loaded = load_sweep(file)
-    directory = result_directory(out, Path(file).stem)
+    directory = session.result_directory(out, Path(file).stem)
     cost = estimate_cost(loaded)
     chosen = choose_worker_count(cost, loaded.runs, workers)
     if dry_run:
-        return print_dry_run(loaded, cost, shard or (1, 1), workers, as_json)
+        print_dry_run(loaded, cost, shard or (1, 1), workers, as_json)
+        return session.DONE
     if not yes and (loaded.runs > MAX_UNCONFIRMED_RUNS or cost.seconds > 86400):
         raise click.UsageError(f"{cost_line(loaded.runs, cost, chosen)}; add --yes if that is meant")
     state = begin_sweep(loaded, directory, shard or (1, 1))
-    outcomes, missing, total = state.done, len(state.missing), state.total
+    outcomes, missing = state.outcomes, len(state.missing)
+    total = len(outcomes) + missing
     chosen = choose_worker_count(cost, missing, workers)
     if not as_json:
         write_stderr([f"{len(outcomes)} of {total} runs have ended before"] if outcomes else [])
         local_workers = chosen if dask is None else None
         write_stderr([cost_line(missing, cost.scaled(missing / loaded.runs), local_workers)] if missing else [])
-    interruption = Interruption()
     files: list[str] = []
     notes: list[str] = []
     try:
-        with ProgressDisplay(quiet=as_json) as bar:
-            progress = interruptible_progress(bar, interruption)
-            scheduler = dask if missing else None  # Only runs need a cluster.
-            with open_executor(scheduler, chosen.number, state, progress) as executor:
-                for _ in run_missing(state, executor, progress):
-                    pass
-                if shard is None:
-                    files, notes = finish_sweep(state, executor, progress)
-    except KeyboardInterrupt:
-        return report_interruption(interruption, as_json, f"interrupted; {progress_message(len(outcomes), total)}")
+        with (
+            session.interruptible(as_json, rest=lambda: f"; {progress_message(len(outcomes), total)}") as progress,
+            # Only runs need a cluster.
+            open_executor(dask if missing else None, chosen.number, state, progress) as executor,
+        ):
+            for _ in run_missing(state, executor, progress):
+                pass
+            if shard is None:
+                files, notes = finish_sweep(state, executor, progress)
     except LostExecutorError as error:
-        report_failure("error", [f"{error}; {progress_message(len(outcomes), total)}"], as_json)
-        return FILES
+        session.report_failure("error", [f"{error}; {progress_message(len(outcomes), total)}"], as_json)
+        return session.FILES
     if as_json:
         counts = count_statuses(outcomes)
-        print_json({"directory": str(directory), "runs": len(outcomes), **counts, "outputs": files, "notes": notes})
+        session.print_json(
+            {"directory": str(directory), "runs": len(outcomes), **counts, "outputs": files, "notes": notes}
+        )
     else:
         click.echo("\n".join(map(printable, summary_lines(directory, outcomes, shard, files, notes))))
-    return DONE
+    return session.DONE
 
 
-def print_dry_run(loaded: Sweep, cost: SweepCost, shard: tuple[int, int], workers: int | None, as_json: bool) -> int:
-    """Print the values of the runs of a shard, and their cost; return the exit code.
-
-    Args:
-        loaded: the sweep.
-        cost: of the whole sweep.
-        shard: part I of N as (I, N).
-        workers: number of processes chosen by the user, or None.
-        as_json: whether to print a JSON object instead of a table.
-    """
+def print_dry_run(loaded: Sweep, cost: SweepCost, shard: tuple[int, int], workers: int | None, as_json: bool) -> None:
+    """Print the values of the runs of a shard, and their part of the cost of the sweep, as a table or as JSON."""
     from taichi_msm.sweeps.spec import format_override
     from taichi_msm.sweeps.tables import choose_worker_count, cost_line, csv_line
 
@@ -115,13 +101,12 @@ def print_dry_run(loaded: Sweep, cost: SweepCost, shard: tuple[int, int], worker
     chosen = choose_worker_count(cost, len(runs), workers)
     if as_json:
         rows = {"keys": loaded.keys, "runs": list(runs), "values": [values[run] for run in runs]}
-        print_json({**rows, **cost._asdict(), "workers": chosen.number})
-        return DONE
+        session.print_json({**rows, **cost._asdict(), "workers": chosen.number})
+        return
     click.echo(csv_line(["run", *loaded.keys]))
     for run in runs:
         click.echo(printable(csv_line([run, *map(format_override, values[run])])))
     click.echo(cost_line(len(runs), cost, chosen))
-    return DONE
 
 
 def progress_message(done: int, total: int) -> str:

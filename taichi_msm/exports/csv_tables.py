@@ -28,11 +28,7 @@ TRACKS_HEADER = ("time", "point", "across", "down", "x", "y", "occluded", "posit
 
 
 def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
-    """Write the forces and tracks of runs; arguments as for `FormatWriter`.
-
-    Raises:
-        FilesError: when a run has neither forces nor tracks.
-    """
+    """Write the forces and tracks of runs; arguments as for `FormatWriter`."""
     writers = {"forces": (FORCES_HEADER, _write_forces), "tracks": (TRACKS_HEADER, _write_tracks)}
     with ExitStack() as opened:
         tables: dict[str, TextIO] = {}
@@ -52,7 +48,6 @@ def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
 
 
 def _write_forces(run: FinishedRun, number: str, file: TextIO) -> None:
-    """Validate and copy the rows of a run."""
     path = run.result_path("forces")
     with reading(path), path.open(encoding="ascii", newline="") as source:
         # The limit bounds the memory for a foreign file; lines of a run are shorter.

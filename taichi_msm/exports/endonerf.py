@@ -16,16 +16,15 @@ Source: med-air/EndoNeRF, load_llff.py (`_load_data`, `load_llff_data`) and run_
 
 from __future__ import annotations
 
-import io
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from taichi_msm.errors import ArgumentError, FilesError, ProgressCallback
 from taichi_msm.exports.formats import one_folder_per_run
-from taichi_msm.exports.inputs import Pinhole, read_depth, read_picture_file, read_pinhole
+from taichi_msm.exports.inputs import Pinhole, encode_picture, read_depth, read_picture_file, read_pinhole
 from taichi_msm.runs.directory import create_file, write_new_file
 from taichi_msm.runs.finished import FinishedRun
 from taichi_msm.scene.outputs import zero_padded
@@ -38,26 +37,15 @@ MIN_UNIT_M, MAX_VALUE = 1e-5, 65535
 # Size of the pictures that EndoGaussian's loader takes for granted [px].
 LOADER_SIZE = (640, 512)
 
-# Largest relative difference of the focal lengths; and distance of the axis from the middle [px]: the loaders take it
-# through the middle of the pixel right and below of the picture's middle.
-FOCAL_TOLERANCE, CENTRE_TOLERANCE_PX = 1e-6, 0.5 + 1e-6
-
-# Signs that convert OpenCV's axes, right, down and forward, to right, up and backward.
-AXIS_SIGNS = np.array([1.0, -1.0, -1.0])
-
 
 @one_folder_per_run
 def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    """Write the frames, depths, masks and poses of a run; arguments as for `one_folder_per_run`.
-
-    Raises:
-        FilesError: as for `read_pinhole` and `read_depth`, and when a frame shows nothing.
-        ArgumentError: as for `read_pinhole`, and when the loaders cannot describe the camera.
-    """
+    """Write the frames, depths, masks and poses of a run; arguments as for `one_folder_per_run`."""
     camera, size = read_pinhole(run, FORMAT_NAME), run.scene.render.size
     _require_central(camera, size, run)
     for name in ("images", "depth", "masks"):
         (folder / name).mkdir()
+    png = partial(encode_picture, format="PNG", compress_level=1)
     bounds = np.array([_depth_bounds(run, frame) for frame in range(run.frames)])
     unit = MIN_UNIT_M * 10.0 ** max(0, np.ceil(np.log10(bounds.max() / MAX_VALUE / MIN_UNIT_M)))
     background = 0.0
@@ -68,9 +56,9 @@ def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[st
         # A depth below half a unit is not the background.
         values = np.where(depth > 0, np.maximum(np.rint(depth / unit), 1), 0).astype(np.uint16)
         write_new_file(folder / "images" / name, read_picture_file(run, "png", frame))
-        write_new_file(folder / "depth" / name, _png(values))
+        write_new_file(folder / "depth" / name, png(values))
         mask = run.read_picture("instrument", frame)[..., 0]
-        write_new_file(folder / "masks" / name, _png(np.where(mask > 127, 255, 0).astype(np.uint8)))
+        write_new_file(folder / "masks" / name, png(np.where(mask > 127, 255, 0).astype(np.uint8)))
     with create_file(folder / "poses_bounds.npy") as file:
         np.save(file, np.concatenate([_poses(camera, size, unit).reshape(run.frames, 15), bounds / unit], axis=1))
     notes = [f"depths, eyes and bounds are in units of {1000 * unit:g} mm"]
@@ -90,9 +78,10 @@ def _require_central(camera: Pinhole, size: tuple[int, int], run: FinishedRun) -
     across, down = camera.focal.tolist()
     x, y = (camera.centre - np.array(size) / 2).tolist()
     faults = []
-    if abs(across / down - 1) > FOCAL_TOLERANCE:
+    if abs(across / down - 1) > 1e-6:
         faults.append(f"its focal lengths are {across:g} and {down:g} px")
-    if max(abs(x), abs(y)) > CENTRE_TOLERANCE_PX:
+    # The loaders take the axis through the middle of the pixel right and below of the picture's middle.
+    if max(abs(x), abs(y)) > 0.5 + 1e-6:
         faults.append(f"its axis is {x:g} px to the right and {y:g} px below the middle")
     if faults:
         fault = f"{FORMAT_NAME} has one focal length and an axis through the middle, but {' and '.join(faults)}"
@@ -113,17 +102,12 @@ def _depth_bounds(run: FinishedRun, frame: int) -> tuple[float, float]:
 
 def _poses(camera: Pinhole, size: tuple[int, int], unit: float) -> NDArray[np.float64]:
     """Return the matrices of poses_bounds.npy, shape (frames, 3, 5)."""
-    poses = np.concatenate([camera.poses, np.tile([[[0.0, 0.0, 0.0, 1.0]]], (len(camera.poses), 1, 1))], axis=1)
-    signs = np.append(AXIS_SIGNS, 1.0)
+    poses = camera.matrices
+    # From OpenCV's axes, right, down and forward, to right, up and backward.
+    signs = np.array([1.0, -1.0, -1.0, 1.0])
     # From each camera to the first one, exactly the identity for a camera that does not move.
     to_first = signs[:, None] * (poses[0] @ np.linalg.inv(poses)) * signs
     to_first[(poses == poses[0]).all(axis=(1, 2))] = np.eye(4)
     to_first[:, :3, 3] /= unit
     optics = np.tile(np.array([[size[1]], [size[0]], [camera.focal[0]]]), (len(poses), 1, 1))
     return np.concatenate([to_first[:, :3], optics], axis=2)
-
-
-def _png(picture: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
-    file = io.BytesIO()
-    Image.fromarray(picture).save(file, "PNG", compress_level=1)
-    return file.getvalue()

@@ -5,14 +5,14 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,7 +27,6 @@ from taichi_msm.errors import (
 )
 from taichi_msm.exports.formats import ANY_CAMERA, FORMATS, ExportSource, FormatWriter, read_runs
 from taichi_msm.runs.directory import (
-    IsListed,
     Publication,
     PublicationSpec,
     create_file,
@@ -39,11 +38,6 @@ from taichi_msm.runs.finished import RESTORE_PICTURE, FinishedRun
 from taichi_msm.scene.outputs import OUTPUTS, zero_padded
 
 EXPORT_RECORD = "export.json"
-
-
-def _is_exported_file(record: Mapping[str, Any]) -> IsListed:
-    return {EXPORT_RECORD, *record["files"]}.__contains__
-
 
 # Files of all formats, as the folder may contain an earlier export of another format; any other file is an error.
 EXPORT_PATTERNS = (
@@ -103,7 +97,11 @@ def export(
         raise ArgumentError(f"format: {format!r}; take one of {', '.join(FORMATS)}{did_you_mean(str(format), FORMATS)}")
     if camera is not None and FORMATS[format].cameras != ANY_CAMERA:
         raise ArgumentError(f"camera: {camera!r}; {format} has no choice of a camera; leave it out")
-    directory = _default_folder(directories, format) if out is None else Path(out)
+    if out is None:
+        folder = Path(directories[0]) if len(directories) == 1 else require_no_link(Path("output"), "--out")
+        directory = require_no_link(folder / f"export-{format}", "--out")
+    else:
+        directory = Path(out)
     finished, incomplete = read_runs(directories)
     if camera is not None and not any(run.camera_names() for run in finished):
         raise ArgumentError(f"camera: {camera!r}; {finished[0].directory} has one camera, without a name; leave it out")
@@ -113,11 +111,6 @@ def export(
         count = f"{incomplete} of {incomplete + len(finished)} runs"
         exported.notes.insert(0, f"left out, as not complete: {count}; the sweep's table.csv has the reasons")
     return exported
-
-
-def _default_folder(directories: Sequence[str | Path], name: str) -> Path:
-    folder = Path(directories[0]) if len(directories) == 1 else require_no_link(Path("output"), "--out")
-    return require_no_link(folder / f"export-{name}", "--out")
 
 
 def _camera_views(run: FinishedRun, name: str, camera: str | None) -> list[FinishedRun]:
@@ -154,7 +147,13 @@ def _write_export(
         done += run.frames
     progress(0, total)
     notes: dict[str, list[Path]] = {}
-    spec = PublicationSpec("export", EXPORT_RECORD, EXPORT_PATTERNS, _is_exported_file, exclusive=True)
+    spec = PublicationSpec(
+        name="export",
+        record=EXPORT_RECORD,
+        patterns=EXPORT_PATTERNS,
+        read_record=lambda record: {EXPORT_RECORD, *record["files"]}.__contains__,
+        exclusive=True,
+    )
     with writing(directory), Publication(directory, spec) as publication:
         for run in chain.from_iterable(views):
             with run.unchanged():
@@ -200,12 +199,10 @@ def _name_run_in_errors(run: FinishedRun, name: str) -> Iterator[None]:
 
 
 def _name_runs(note: str, runs: Sequence[Path]) -> str:
-    """Prefix a warning with the runs to which it applies."""
     return f"{runs[0]}{f' and {len(runs) - 1} more' if len(runs) > 1 else ''}: {note}"
 
 
 def _write_index(runs: Sequence[FinishedRun], pairs: bool, path: Path) -> None:
-    """Write the table of runs, or of pairs of frames, by number."""
     rows: list[tuple[str | int, ...]] = []
     for run in runs:
         name = run.directory.as_posix()

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from taichi_msm.errors import FilesError, ProgressCallback
 from taichi_msm.runs.directory import MAX_RECORD_BYTES, list_files
 from taichi_msm.runs.finished import FinishedRun, read_run, reading
-from taichi_msm.scene.outputs import NUMBER_PATTERN, RUN_RECORD, RUNS_FOLDER, SWEEP_RECORD
+from taichi_msm.scene.outputs import NUMBER_PATTERN, RUN_RECORD, RUNS_FOLDER, SWEEP_RECORD, zero_padded
 from taichi_msm.system.files import read_regular
 
 
@@ -113,21 +113,40 @@ class ExportSource(NamedTuple):
 
 
 # Generator that writes all runs to an empty folder: yields the warnings about each run in turn, and finally writes the
-# files that combine runs.
+# files that combine runs. It raises a FilesError for results that are missing or damaged or do not suit the format, a
+# SceneError for a picture that has changed since the run, an ArgumentError for a camera that the format cannot
+# describe, and a NotInstalledError for a missing package.
 FormatWriter = Callable[[Sequence[ExportSource], Path], Iterator[list[str]]]
 
 
-def one_folder_per_run(write: Callable[[FinishedRun, Path, ProgressCallback], list[str]]) -> FormatWriter:
-    """Decorate a function that writes a run (run, empty folder, progress) and returns warnings, as a `FormatWriter`."""
+# Function that writes a run to a path, given with its progress, and returns warnings.
+RunWriter = Callable[[FinishedRun, Path, ProgressCallback], list[str]]
+
+
+def one_folder_per_run(write: RunWriter) -> FormatWriter:
+    """Decorate a function that writes a run to an existing folder, which is that of the export for a single run."""
 
     @wraps(write)
     def write_all(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
-        for source in sources:
-            run_folder = folder / source.name
-            run_folder.mkdir(exist_ok=True)
-            yield write(source.run, run_folder, source.progress)
+        for run, name, progress in sources:
+            (folder / name).mkdir(exist_ok=True)
+            yield write(run, folder / name, progress)
 
     return write_all
+
+
+def one_path_per_run(suffix: str = "") -> Callable[[RunWriter], FormatWriter]:
+    """Decorate a function that writes a run to a file or folder named by its number and the suffix."""
+
+    def decorate(write: RunWriter) -> FormatWriter:
+        @wraps(write)
+        def write_all(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
+            for run, name, progress in sources:
+                yield write(run, folder / f"{name or zero_padded(0)}{suffix}", progress)
+
+        return write_all
+
+    return decorate
 
 
 def read_runs(directories: Sequence[str | Path]) -> tuple[list[FinishedRun], int]:

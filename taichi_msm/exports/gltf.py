@@ -7,24 +7,31 @@ interpolation. Like this package, glTF uses metres, y up, and texture coordinate
 Browsers store each target in a layer of a texture, and WebGL 2 guarantees 256 layers. Runs that exceed this, or the
 size limit, are reduced to keyframes, and the largest interpolation error is reported.
 
-Source: the glTF 2.0 specification of Khronos, sections 3.7.2.2 (morph targets) and 3.11 (animations).
+A tool is a mesh of its instrument, which moves with the tip. glTF's cameras look along -z with y up, and have neither
+lens distortion nor another principal point than the centre.
+
+Source: the glTF 2.0 specification of Khronos, sections 3.6 (accessors), 3.7.2.2 (morph targets), 3.10 (cameras), 3.11
+(animations) and 4.4 (GLB). The container is too simple to justify a dependency on pygltflib.
 """
 
 from __future__ import annotations
 
-import heapq
+import json
+import math
+import struct
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from taichi_msm.errors import ProgressCallback
 from taichi_msm.exports.formats import one_folder_per_run
-from taichi_msm.exports.glb import GL_ARRAY_BUFFER, GL_ELEMENT_ARRAY_BUFFER, BinaryChunk
-from taichi_msm.exports.gltf_nodes import add_cameras, add_tools
-from taichi_msm.exports.inputs import EXPORT_REFINE, picture_png, unit_normals
-from taichi_msm.model.surface import refine_surface
+from taichi_msm.exports.inputs import EXPORT_REFINE, instrument_mesh, picture_png, unit_normals
+from taichi_msm.model.surface import place_instruments, refine_surface
+from taichi_msm.render.camera import is_moving, view_at
 from taichi_msm.runs.directory import create_file
 from taichi_msm.runs.finished import FinishedRun
 from taichi_msm.version import __version__
@@ -32,114 +39,126 @@ from taichi_msm.version import __version__
 # Limits of the morph targets: MAX_ARRAY_TEXTURE_LAYERS of WebGL 2, and a size that browsers load quickly.
 MAX_TARGETS = 256
 MAX_TARGETS_BYTES = 1 << 28
-TARGET_VERTEX_BYTES = 2 * 3 * 4  # differences of position and normal, float32
+
+COMPONENT_TYPES = {"f": 5126, "u": 5125}  # float32, uint32
+ACCESSOR_TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+
+# Constants of OpenGL for buffers of vertices and of vertex indices.
+GL_ARRAY_BUFFER, GL_ELEMENT_ARRAY_BUFFER = 34962, 34963
 
 # Constants of OpenGL for texture filtering and wrapping.
 GL_LINEAR, GL_LINEAR_MIPMAP_LINEAR, GL_CLAMP_TO_EDGE = 9729, 9987, 33071
 
+Array = NDArray[np.floating]
+Numbers = NDArray[Any]
+
 
 @one_folder_per_run
 def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    """Write the animated surface of a run with its picture, tools and cameras; arguments as for `one_folder_per_run`.
-
-    Raises:
-        FilesError: as for `FinishedRun.positions`.
-        SceneError: as for `picture_png`.
-    """
-    positions, picture, binary = run.positions(), picture_png(run), BinaryChunk()
-    max_targets = max(1, min(MAX_TARGETS, MAX_TARGETS_BYTES // (TARGET_VERTEX_BYTES * positions[0, ..., 0].size)))
+    """Write the animated surface with its picture, the tools and cameras; arguments as for `one_folder_per_run`."""
+    positions, picture = run.positions(), picture_png(run)
+    # Differences of position and normal, float32.
+    target_bytes = 2 * 3 * 4 * positions[0, ..., 0].size
+    max_targets = max(1, min(MAX_TARGETS, MAX_TARGETS_BYTES // target_bytes))
     keys = key_frames(positions, 1 + max_targets, progress)
-    primitive = _surface(positions[0], picture is not None, binary)
+    asset = {"version": "2.0", "generator": f"taichi_msm {__version__}"}
+    nodes = [{"mesh": 0, "name": "sheet"}]
+    glb = Glb({"asset": asset, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": nodes})
+    _add_sheet(glb, positions, picture, run.time, keys, progress)
+    _add_tools(glb, run, positions)
+    notes = _add_cameras(glb, run)
+    with create_file(folder / "surface.glb") as file:
+        file.writelines(glb.content())
+    if len(keys.frames) < run.frames:
+        notes.append(
+            f"{len(keys.frames)} of {run.frames} frames are key frames; between them no point is farther than "
+            f"{keys.error:.2g} m from where it was"
+        )
+    return notes
+
+
+def _add_sheet(
+    glb: Glb, positions: Array, picture: bytes | None, time: Array, keys: KeyFrames, progress: ProgressCallback
+) -> None:
+    """Add the mesh of the first frame, its matte material, and its morph targets and their animation."""
+    first, normals = refine_surface(positions[0], EXPORT_REFINE), unit_normals(positions[0])
+    attributes = glb.attributes(first.vertices, normals)
+    if picture is not None:
+        attributes["TEXCOORD_0"] = glb.accessor(first.texture_coordinates, GL_ARRAY_BUFFER)
+    primitive: dict[str, Any] = {"attributes": attributes, "indices": glb.indices(first.triangles), "material": 0}
     targets = []
     for count, frame in enumerate(keys.frames[1:]):
         progress(count, len(keys.frames))
-        targets.append(_target(positions[0], positions[frame], binary))
-    document: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": f"taichi_msm {__version__}"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": "sheet"}],
-        "materials": [_material(picture is not None)],
-        **(_texture(picture, binary) if picture is not None else {}),
-    }
-    mesh: dict[str, Any] = {"name": "sheet", "primitives": [{**primitive, "material": 0}]}
+        displacement = (positions[frame].astype(np.float64) - positions[0]).reshape(-1, 3)
+        targets.append(glb.attributes(displacement, unit_normals(positions[frame]) - normals))
+    colour = {} if picture is None else {"baseColorTexture": {"index": 0}}
+    rough = {**colour, "metallicFactor": 0.0, "roughnessFactor": 1.0}
+    glb.add("materials", {"name": "sheet", "doubleSided": True, "pbrMetallicRoughness": rough})
+    if picture is not None:
+        glb.add("textures", {"source": 0, "sampler": 0})
+        glb.add("images", {"name": "picture", "mimeType": "image/png", "bufferView": glb.view(picture)})
+        filters = {"magFilter": GL_LINEAR, "minFilter": GL_LINEAR_MIPMAP_LINEAR}
+        glb.add("samplers", {**filters, "wrapS": GL_CLAMP_TO_EDGE, "wrapT": GL_CLAMP_TO_EDGE})
+    mesh: dict[str, Any] = {"name": "sheet", "primitives": [primitive]}
     if targets:
-        times = run.time[keys.frames]
-        mesh["primitives"][0]["targets"] = targets
+        times = time[keys.frames]
+        primitive["targets"] = targets
         mesh["weights"] = [0.0] * len(targets)
         mesh["extras"] = {"targetNames": [f"{time:g} s" for time in times[1:]], "error": keys.error}
-        document["animations"] = [_animation(times.astype(np.float32), binary)]
-    document["meshes"] = [mesh]
-    add_tools(document, run, positions, binary)
-    notes = add_cameras(document, run, binary)
-    with create_file(folder / "surface.glb") as file:
-        file.writelines(binary.container(document))
-    if len(keys.frames) == run.frames:
-        return notes
-    return [
-        *notes,
-        f"{len(keys.frames)} of {run.frames} frames are key frames; between them no point is farther than "
-        f"{keys.error:.2g} m from where it was",
-    ]
+        # The first frame has no target.
+        glb.animate(0, "weights", times, np.eye(len(times))[:, 1:].reshape(-1))
+    glb.add("meshes", mesh)
 
 
-def _surface(position: NDArray[np.floating], has_picture: bool, binary: BinaryChunk) -> dict[str, Any]:
-    """Build the mesh of the first frame, with texture coordinates if there is a picture."""
-    first = refine_surface(position, EXPORT_REFINE)
-    attributes = {
-        "POSITION": binary.accessor(first.vertices.astype(np.float32), GL_ARRAY_BUFFER, bounds=True),
-        "NORMAL": binary.accessor(unit_normals(position).astype(np.float32), GL_ARRAY_BUFFER),
-    }
-    if has_picture:
-        attributes["TEXCOORD_0"] = binary.accessor(first.texture_coordinates.astype(np.float32), GL_ARRAY_BUFFER)
-    indices = first.triangles.reshape(-1).astype(np.uint32)
-    return {"attributes": attributes, "indices": binary.accessor(indices, GL_ELEMENT_ARRAY_BUFFER)}
+def _add_tools(glb: Glb, run: FinishedRun, positions: Array) -> None:
+    """Add a mesh for every probe with an instrument, and its motion."""
+    pairs = zip(positions, run.time.tolist(), strict=True)
+    placed = [place_instruments(run.scene, position, time) for position, time in pairs]
+    if not placed[0]:
+        return
+    metal = {"baseColorFactor": [0.6, 0.6, 0.62, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.5}
+    material = glb.add("materials", {"name": "instrument", "pbrMetallicRoughness": metal})
+    names = [f"probes.{index}" for index, probe in enumerate(run.scene.probes) if probe.instrument is not None]
+    for name, *solids in zip(names, *placed, strict=True):
+        vertices, normals, triangles = instrument_mesh(solids[0])
+        primitive = {"attributes": glb.attributes(vertices, normals), "indices": glb.indices(triangles)}
+        mesh = glb.add("meshes", {"name": name, "primitives": [{**primitive, "material": material}]})
+        tips = np.array([solid.tip for solid in solids])
+        _add_node(glb, {"name": name, "mesh": mesh}, {"translation": tips}, run.time)
 
 
-def _target(first: NDArray[np.floating], position: NDArray[np.floating], binary: BinaryChunk) -> dict[str, int]:
-    displacement = (position.astype(np.float64) - first).reshape(-1, 3).astype(np.float32)
-    normal_change = (unit_normals(position) - unit_normals(first)).astype(np.float32)
-    return {
-        "POSITION": binary.accessor(displacement, GL_ARRAY_BUFFER, bounds=True),
-        "NORMAL": binary.accessor(normal_change, GL_ARRAY_BUFFER),
-    }
+def _add_cameras(glb: Glb, run: FinishedRun) -> list[str]:
+    """Add the cameras of the scene, with their motion; return warnings about what glTF cannot describe."""
+    notes = []
+    for name in run.scene.render.all_cameras:
+        times = run.time.tolist() if is_moving(run.scene, name) else [0.0]
+        views = [view_at(run.scene, time, name) for time in times]
+        view, title = views[0], name or "camera"
+        width, height = (view.size / view.scale).tolist()
+        if view.pinhole:
+            field = {"yfov": 2 * math.atan(height / 2), "aspectRatio": width / height}
+            optics = {"type": "perspective", "perspective": {**field, "znear": 1e-3 * view.distance}}
+        else:
+            field = {"xmag": width / 2, "ymag": height / 2, "znear": 0.0, "zfar": 2 * view.distance}
+            optics = {"type": "orthographic", "orthographic": field}
+        if view.lens is not None or not np.allclose(view.centre, view.size / 2):
+            notes.append(f"{title}: without its distortion and its principal point, which a camera of glTF cannot have")
+        camera = glb.add("cameras", {"name": title, **optics})
+        pose = {
+            "translation": np.array([view.eye for view in views]),
+            "rotation": Rotation.from_matrix([view.axes.T for view in views]).as_quat(),
+        }
+        _add_node(glb, {"name": title, "camera": camera}, pose, run.time)
+    return notes
 
 
-def _animation(times: NDArray[np.float32], binary: BinaryChunk) -> dict[str, Any]:
-    # The first frame has no target.
-    weights = np.eye(len(times), dtype=np.float32)[:, 1:].reshape(-1)
-    sampler = {
-        "input": binary.accessor(times, bounds=True),
-        "interpolation": "LINEAR",
-        "output": binary.accessor(weights),
-    }
-    return {
-        "name": "motion",
-        "samplers": [sampler],
-        "channels": [{"sampler": 0, "target": {"node": 0, "path": "weights"}}],
-    }
-
-
-def _material(has_picture: bool) -> dict[str, Any]:
-    """Build a matte material."""
-    colour = {"baseColorTexture": {"index": 0}} if has_picture else {}
-    rough = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
-    return {"name": "sheet", "doubleSided": True, "pbrMetallicRoughness": {**colour, **rough}}
-
-
-def _texture(picture: bytes, binary: BinaryChunk) -> dict[str, Any]:
-    return {
-        "textures": [{"source": 0, "sampler": 0}],
-        "images": [{"name": "picture", "mimeType": "image/png", "bufferView": binary.view(picture)}],
-        "samplers": [
-            {
-                "magFilter": GL_LINEAR,
-                "minFilter": GL_LINEAR_MIPMAP_LINEAR,
-                "wrapS": GL_CLAMP_TO_EDGE,
-                "wrapT": GL_CLAMP_TO_EDGE,
-            }
-        ],
-    }
+def _add_node(glb: Glb, node: dict[str, Any], pose: dict[str, Array], time: Array) -> None:
+    index = glb.add("nodes", node)
+    glb.document["scenes"][0]["nodes"].append(index)
+    for path, values in pose.items():
+        node[path] = values[0].tolist()
+        if (values != values[0]).any():
+            glb.animate(index, path, time, values)
 
 
 class KeyFrames(NamedTuple):
@@ -149,9 +168,7 @@ class KeyFrames(NamedTuple):
     error: float  # largest interpolation error of any mass point in any frame [m]
 
 
-def key_frames(
-    position: NDArray[np.floating], limit: int, progress: ProgressCallback = lambda done, total: None
-) -> KeyFrames:
+def key_frames(position: Array, limit: int, progress: ProgressCallback = lambda done, total: None) -> KeyFrames:
     """Choose the keyframes of a motion: all frames if possible, otherwise by a greedy selection.
 
     The selection starts with the first and last frame, and repeatedly adds the frame with the largest interpolation
@@ -169,13 +186,12 @@ def key_frames(
         return KeyFrames(list(range(count)), 0.0)
     chosen = [0, count - 1]
     spans = [_worst_frame(position, 0, count - 1)]
-    while len(chosen) < limit and -spans[0].error > 0:
+    while len(chosen) < limit and (worst := min(spans)).error < 0:
         progress(len(chosen), limit)
-        span = heapq.heappop(spans)
-        chosen.append(span.frame)
-        heapq.heappush(spans, _worst_frame(position, span.first, span.frame))
-        heapq.heappush(spans, _worst_frame(position, span.frame, span.last))
-    return KeyFrames(sorted(chosen), -spans[0].error)
+        spans.remove(worst)
+        chosen.append(worst.frame)
+        spans += [_worst_frame(position, worst.first, worst.frame), _worst_frame(position, worst.frame, worst.last)]
+    return KeyFrames(sorted(chosen), -min(spans).error)
 
 
 class _Span(NamedTuple):
@@ -187,7 +203,7 @@ class _Span(NamedTuple):
     last: int  # keyframe at the end
 
 
-def _worst_frame(position: NDArray[np.floating], first: int, last: int) -> _Span:
+def _worst_frame(position: Array, first: int, last: int) -> _Span:
     """Find the frame with the largest interpolation error between two keyframes."""
     start, end = position[first].astype(np.float64), position[last].astype(np.float64)
     worst = _Span(0.0, first, first, last)
@@ -196,3 +212,105 @@ def _worst_frame(position: NDArray[np.floating], first: int, last: int) -> _Span
         error = position[frame] - (start + fraction * (end - start))
         worst = min(worst, _Span(-float(np.linalg.norm(error, axis=-1).max()), frame, first, last))
     return worst
+
+
+class Glb:
+    """Content of a .glb file with a scene.
+
+    Attributes:
+        document: the JSON document, without its buffers.
+    """
+
+    def __init__(self, document: dict[str, Any]) -> None:
+        self.document = document
+        self._views: list[dict[str, Any]] = []
+        self._accessors: list[dict[str, Any]] = []
+        self._parts: list[bytes | memoryview] = []
+        self._length = 0
+
+    def view(self, data: bytes | memoryview, target: int | None = None) -> int:
+        """Append bytes.
+
+        Args:
+            data: content of the view.
+            target: GL_ARRAY_BUFFER or GL_ELEMENT_ARRAY_BUFFER; None for other data.
+
+        Returns:
+            Index of the buffer view.
+        """
+        view = {"buffer": 0, "byteOffset": self._length, "byteLength": len(data)}
+        self._views.append(view if target is None else {**view, "target": target})
+        padding = _padding(len(data), b"\0")
+        self._parts += [data, padding]
+        self._length += len(data) + len(padding)
+        return len(self._views) - 1
+
+    def accessor(self, values: Numbers, target: int | None = None, *, bounds: bool = False) -> int:
+        """Append numbers.
+
+        Args:
+            values: floats, stored as float32, or integers, as uint32, shape (n,) or (n, k), k = 1 to 4.
+            target: as for `view`.
+            bounds: whether to store the minimum and maximum.
+
+        Returns:
+            Index of the accessor.
+        """
+        kind = np.float32 if values.dtype.kind == "f" else np.uint32
+        rows = np.ascontiguousarray(values, kind).reshape(len(values), -1)
+        accessor = {
+            "bufferView": self.view(rows.data.cast("B"), target),
+            "componentType": COMPONENT_TYPES[rows.dtype.kind],
+            "count": len(rows),
+            "type": ACCESSOR_TYPES[rows.shape[1]],
+        }
+        if bounds:
+            accessor |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
+        self._accessors.append(accessor)
+        return len(self._accessors) - 1
+
+    def attributes(self, positions: Numbers, normals: Numbers) -> dict[str, int]:
+        """Append the vertices of a mesh, or their changes, both of shape (vertices, 3)."""
+        return {
+            "POSITION": self.accessor(positions, GL_ARRAY_BUFFER, bounds=True),
+            "NORMAL": self.accessor(normals, GL_ARRAY_BUFFER),
+        }
+
+    def indices(self, triangles: Numbers) -> int:
+        """Append the vertices of triangles, shape (triangles, 3)."""
+        return self.accessor(triangles.reshape(-1), GL_ELEMENT_ARRAY_BUFFER)
+
+    def add(self, kind: str, entry: dict[str, Any]) -> int:
+        """Append an entry to a list of the document, such as "nodes"; return its index."""
+        self.document.setdefault(kind, []).append(entry)
+        return len(self.document[kind]) - 1
+
+    def animate(self, node: int, path: str, times: Numbers, values: Numbers) -> None:
+        """Append the values of a property of a node at times [s], with linear interpolation."""
+        if "animations" not in self.document:
+            self.add("animations", {"name": "motion", "samplers": [], "channels": []})
+        (animation,) = self.document["animations"]
+        sampler = {
+            "input": self.accessor(times, bounds=True),
+            "interpolation": "LINEAR",
+            "output": self.accessor(values),
+        }
+        target = {"node": node, "path": path}
+        animation["channels"].append({"sampler": len(animation["samplers"]), "target": target})
+        animation["samplers"].append(sampler)
+
+    def content(self) -> Iterator[bytes | memoryview]:
+        """Yield the parts of the file."""
+        buffers = {"accessors": self._accessors, "bufferViews": self._views, "buffers": [{"byteLength": self._length}]}
+        text = json.dumps({**self.document, **buffers}, separators=(",", ":"), allow_nan=False).encode()
+        text += _padding(len(text), b" ")
+        yield struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + self._length)
+        yield struct.pack("<I4s", len(text), b"JSON")
+        yield text
+        yield struct.pack("<I4s", self._length, b"BIN\0")
+        yield from self._parts
+
+
+def _padding(length: int, filler: bytes) -> bytes:
+    """Return the filler that aligns a chunk or a buffer view to 4 bytes."""
+    return filler * (-length % 4)

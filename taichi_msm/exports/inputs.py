@@ -1,6 +1,7 @@
 """Inputs shared by the export formats: picture, surface normals, tracks and camera of a run.
 
-Files are validated, as they may come from an untrusted source.
+Files are validated, as they may come from an untrusted source; all readers raise a FilesError for missing or damaged
+results.
 """
 
 from __future__ import annotations
@@ -41,8 +42,13 @@ def picture_png(run: FinishedRun) -> bytes | None:
     """
     if run.scene.image is None:
         return None
+    return encode_picture(load_texture(run.scene, run.sha256.get("image", "")), "PNG")
+
+
+def encode_picture(picture: NDArray[np.uint8] | NDArray[np.uint16], format: str, **options: int) -> bytes:  # noqa: A002
+    """Encode a picture in a format of Pillow, with its options."""
     file = io.BytesIO()
-    Image.fromarray(load_texture(run.scene, run.sha256.get("image", ""))).save(file, "PNG")
+    Image.fromarray(picture).save(file, format, **options)
     return file.getvalue()
 
 
@@ -70,9 +76,6 @@ def read_tracks(run: FinishedRun) -> tuple[NDArray[np.float32], NDArray[np.bool_
     Returns:
         Positions in the picture [px], shape (tracks, frames, 2), NaN behind the camera; and whether the track is
         occluded, shape (tracks, frames), True behind the camera.
-
-    Raises:
-        FilesError: when the tracks are missing or damaged.
     """
     path = run.result_path("tracks")
     with reading(path), zipfile.ZipFile(path) as archive:
@@ -90,9 +93,6 @@ def read_track_positions(run: FinishedRun) -> tuple[NDArray[np.float32], NDArray
     Returns:
         Coordinates on the sheet as fractions of its width and height, shape (tracks, 2); and positions [m], shape
         (tracks, frames, 3).
-
-    Raises:
-        FilesError: when the tracks are missing or damaged.
     """
     path = run.result_path("tracks")
     with reading(path), zipfile.ZipFile(path) as archive:
@@ -105,14 +105,7 @@ def read_track_positions(run: FinishedRun) -> tuple[NDArray[np.float32], NDArray
 
 
 def read_depth(run: FinishedRun, frame: int) -> NDArray[np.float32]:
-    """Read the depth of a frame.
-
-    Returns:
-        Depth along the optical axis [m], shape (height, width); 0: background.
-
-    Raises:
-        FilesError: when the file is missing or damaged.
-    """
+    """Read the depth of a frame along the optical axis [m], shape (height, width); 0: background."""
     path = run.result_path("depth", frame)
     with reading(path), Image.open(path, formats=["TIFF"]) as image:
         # Before any pixel is decoded.
@@ -125,13 +118,7 @@ def read_depth(run: FinishedRun, frame: int) -> NDArray[np.float32]:
 
 
 def read_picture_file(run: FinishedRun, key: str, frame: int) -> bytes:
-    """Read the file of a picture of a run, and validate it by decoding it.
-
-    Args:
-        run: the run.
-        key: entry of `output` that wrote the picture, such as "png".
-        frame: index of the frame.
-    """
+    """Read the file of a picture of an entry of `output`, such as "png", and validate it by decoding it."""
     run.read_picture(key, frame)
     path = run.result_path(key, frame)
     with reading(path):
@@ -151,6 +138,11 @@ class Pinhole(NamedTuple):
     centre: Array  # principal point, counted from the picture's upper left corner [px], shape (2,)
     poses: Array  # world-to-camera transform of every frame [m], shape (frames, 3, 4)
 
+    @property
+    def matrices(self) -> Array:
+        """The poses as matrices, shape (frames, 4, 4)."""
+        return np.concatenate([self.poses, np.tile([[[0.0, 0.0, 0.0, 1.0]]], (len(self.poses), 1, 1))], axis=1)
+
 
 def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
     """Read camera.json for a format that requires a pinhole camera.
@@ -160,7 +152,6 @@ def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
         name: name of the format, for messages.
 
     Raises:
-        FilesError: when the file is missing or damaged.
         ArgumentError: when the camera is orthographic or has lens distortion.
     """
     path = run.directory / run.camera / CAMERA_FILE
@@ -188,10 +179,6 @@ def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
     return Pinhole(focal, centre, poses)
 
 
-# Segments of the mesh of an instrument around its axis.
-SEGMENTS = 32
-
-
 def instrument_mesh(
     solid: Solid,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int32]]:
@@ -203,7 +190,7 @@ def instrument_mesh(
     axis = solid.axis
     across = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     across /= np.linalg.norm(across)
-    around = np.linspace(0, 2 * np.pi, SEGMENTS + 1)
+    around = np.linspace(0, 2 * np.pi, 32 + 1)  # 32 segments
     radial = np.cos(around)[:, None] * across + np.sin(around)[:, None] * np.cross(axis, across)
     along, outward, *normal = solid.shape.profile(solid.length, solid.radius).T[..., None, None]
     surface = refine_surface(outward * radial + along * axis, 0)

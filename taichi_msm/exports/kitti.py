@@ -30,21 +30,12 @@ from taichi_msm.runs.directory import write_new_file
 from taichi_msm.runs.finished import FinishedRun, reading
 from taichi_msm.scene.outputs import OUTPUTS, zero_padded
 
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-PNG_BIT_DEPTH, PNG_RGB = 16, 2
-# Filter that stores the byte-wise difference from the row above.
-PNG_UP_FILTER = 2
-
 # Source of each folder, an entry of `output`.
 SOURCE_OUTPUTS = {"flow_occ": "flow", "flow_noc": "occlusion", "image_2": "png"}
 
 
 def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
-    """Write the flow of runs, with pictures and occlusion if available; arguments as for `FormatWriter`.
-
-    Raises:
-        FilesError: when a run has a single frame.
-    """
+    """Write the flow of runs, with pictures and occlusion if available; arguments as for `FormatWriter`."""
     training, first = folder / "training", 0
     for name in SOURCE_OUTPUTS:
         (training / name).mkdir(parents=True)
@@ -113,16 +104,15 @@ def png16(picture: NDArray[np.uint16]) -> bytes:
     rows = picture.astype(">u2").view(np.uint8).reshape(height, -1)
     above = np.zeros_like(rows)
     above[1:] = rows[:-1]
-    filtered = np.full((height, 1 + rows.shape[1]), PNG_UP_FILTER, np.uint8)
+    # Filter 2 stores the byte-wise difference from the row above.
+    filtered = np.full((height, 1 + rows.shape[1]), 2, np.uint8)
     filtered[:, 1:] = rows - above
-    header = struct.pack(">IIBBBBB", width, height, PNG_BIT_DEPTH, PNG_RGB, 0, 0, 0)
+    # 16 bits per channel, and colour type 2: RGB.
+    header = struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0)
     # For rough flow of 512 x 512 pixels, level 1 takes 17 ms, the default 169 ms for 7 % fewer bytes.
     data = zlib.compress(filtered.tobytes(), 1)
-    return b"".join([PNG_SIGNATURE, *_chunk(b"IHDR", header), *_chunk(b"IDAT", data), *_chunk(b"IEND", b"")])
+    return b"\x89PNG\r\n\x1a\n" + _chunk(b"IHDR", header) + _chunk(b"IDAT", data) + _chunk(b"IEND", b"")
 
 
-def _chunk(kind: bytes, data: bytes) -> Iterator[bytes]:
-    yield struct.pack(">I", len(data))
-    yield kind
-    yield data
-    yield struct.pack(">I", zlib.crc32(data, zlib.crc32(kind)))
+def _chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(data, zlib.crc32(kind)))

@@ -9,7 +9,6 @@ Source: Wavefront's Advanced Visualizer manual, appendix B1 (OBJ) and its specif
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -27,16 +26,13 @@ MATERIAL_FILE = "surface.mtl"
 
 @one_folder_per_run
 def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    """Write the surface of every frame, the material and the picture; arguments as for `one_folder_per_run`.
-
-    Raises:
-        FilesError: as for `FinishedRun.positions`.
-        SceneError: as for `picture_png`.
-    """
+    """Write the surface of every frame, the material and the picture; arguments as for `one_folder_per_run`."""
     positions, picture = run.positions(), picture_png(run)
     if picture is not None:
         write_new_file(folder / PICTURE_FILE, picture)
-    write_new_file(folder / MATERIAL_FILE, "".join(f"{line}\n" for line in _material(picture is not None)).encode())
+    # A matte material.
+    material = ["newmtl sheet", "Kd 1 1 1", "Ks 0 0 0", "illum 1", *([f"map_Kd {PICTURE_FILE}"] if picture else [])]
+    write_new_file(folder / MATERIAL_FILE, "".join(f"{line}\n" for line in material).encode())
     first = refine_surface(positions[0], EXPORT_REFINE)
     coordinates = _lines("vt", first.texture_coordinates * (1, -1) + (0, 1))
     corners = np.repeat(first.triangles + 1, 3, axis=1)
@@ -53,13 +49,5 @@ def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[st
 
 
 def _lines(key: str, rows: NDArray[np.floating]) -> str:
-    """Format one line per row of numbers."""
     line = " ".join([key, *[FLOAT32_FORMAT] * rows.shape[1]]) + "\n"
     return (line * len(rows)) % tuple(rows.ravel().tolist())
-
-
-def _material(has_picture: bool) -> Iterable[str]:
-    """Yield the lines of a matte material."""
-    yield from ("newmtl sheet", "Kd 1 1 1", "Ks 0 0 0", "illum 1")
-    if has_picture:
-        yield f"map_Kd {PICTURE_FILE}"

@@ -14,7 +14,6 @@ Source: Rerun's documentation of archetypes.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import NotInstalledError, ProgressCallback
-from taichi_msm.exports.formats import FORMATS, ExportSource
+from taichi_msm.exports.formats import FORMATS, one_path_per_run
 from taichi_msm.exports.inputs import (
     EXPORT_REFINE,
     instrument_mesh,
@@ -39,39 +38,34 @@ from taichi_msm.render.labels import NO_FLOW
 from taichi_msm.render.texture import load_texture
 from taichi_msm.runs.arrays import read_flo
 from taichi_msm.runs.finished import FinishedRun, reading
-from taichi_msm.scene.outputs import OUTPUTS, zero_padded
+from taichi_msm.scene.outputs import OUTPUTS
 
-# Fraction of a turn between the hues of successive points.
-GOLDEN_RATIO = 0.618
+try:
+    import rerun
+except ImportError:
+    raise NotInstalledError("--format rerun: needs rerun-sdk, which is not installed; pip install rerun-sdk") from None
 
 
-def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
-    """Write a recording per run; arguments as for `FormatWriter`.
-
-    Raises:
-        FilesError: as for `FinishedRun.positions` and the readers of `inputs`.
-        SceneError: as for `load_texture`.
-        NotInstalledError: when rerun-sdk is not installed.
-    """
-    try:
-        import rerun
-    except ImportError:
-        raise NotInstalledError(
-            "--format rerun: needs rerun-sdk, which is not installed; pip install rerun-sdk"
-        ) from None
-    for run, name, progress in sources:
-        # The viewer merges recordings with the same identity.
-        identity = uuid5(NAMESPACE_URL, run.directory.resolve().as_uri())
-        with rerun.RecordingStream("taichi_msm", recording_id=identity) as recording:
-            recording.save(folder / f"{name or zero_padded(0)}.rrd")
-            recording.send_recording_name(run.directory.name)
-            # Without the timelines of the export itself.
-            recording.set_log_time_enabled(False)
-            recording.set_log_tick_enabled(False)
-            _log_run(run, recording, progress)
-            recording.flush()
-            recording.disconnect()
-        yield _notes(run)
+@one_path_per_run(".rrd")
+def write(run: FinishedRun, path: Path, progress: ProgressCallback) -> list[str]:
+    """Write a recording of a run; arguments as for `one_path_per_run`."""
+    # The viewer merges recordings with the same identity.
+    identity = uuid5(NAMESPACE_URL, run.directory.resolve().as_uri())
+    with rerun.RecordingStream("taichi_msm", recording_id=identity) as recording:
+        recording.save(path)
+        recording.send_recording_name(run.directory.name)
+        # Without the timelines of the export itself.
+        recording.set_log_time_enabled(False)
+        recording.set_log_tick_enabled(False)
+        _log_run(run, recording, progress)
+        recording.flush()
+        recording.disconnect()
+    views = _views(run).values()
+    missing = [key for key in FORMATS["rerun"].optional_outputs if not any(each.has_output(key) for each in views)]
+    notes = [f"without {key}, which is not among the results; {run.remedy(key)}" for key in missing]
+    if any(view_at(run.scene, 0.0, each.camera).lens is not None for each in views):
+        notes.append("Rerun has no lens distortion, so that points in space are off in the pictures of a lens")
+    return notes
 
 
 def _views(run: FinishedRun) -> dict[str, FinishedRun]:
@@ -81,21 +75,12 @@ def _views(run: FinishedRun) -> dict[str, FinishedRun]:
     return {entity: replace(run, camera=name) for entity, name in entities.items()}
 
 
-def _notes(run: FinishedRun) -> list[str]:
-    views = _views(run).values()
-    missing = [key for key in FORMATS["rerun"].optional_outputs if not any(each.has_output(key) for each in views)]
-    notes = [f"without {key}, which is not among the results; {run.remedy(key)}" for key in missing]
-    if any(view_at(run.scene, 0.0, each.camera).lens is not None for each in views):
-        notes.append("Rerun has no lens distortion, so that points in space are off in the pictures of a lens")
-    return notes
-
-
 def _log_run(run: FinishedRun, recording: Any, progress: ProgressCallback) -> None:
-    """Log all frames."""
-    import rerun
-
     positions, views = run.positions(), _views(run)
     tracks = next((read_track_positions(each)[1] for each in views.values() if each.has_output("tracks")), None)
+    # Distinct colours; the hues of successive points are 0.618 turns apart.
+    phase = np.arange(0 if tracks is None else len(tracks))[:, None] * 0.618 + np.array([0, 1 / 3, 2 / 3])
+    colours = (127.5 + 127.5 * np.cos(2 * np.pi * phase)).astype(np.uint8)
     instruments = [number for number, probe in enumerate(run.scene.probes) if probe.instrument is not None]
     recording.log("world", rerun.ViewCoordinates.RIGHT_HAND_Y_UP, static=True)
     for frame, position in enumerate(positions):
@@ -111,7 +96,7 @@ def _log_run(run: FinishedRun, recording: Any, progress: ProgressCallback) -> No
                 recording.log(f"world/tools/{number}", mesh, static=True)
             recording.log(f"world/tools/{number}", rerun.Transform3D(translation=solid.tip))
         if tracks is not None:
-            recording.log("world/tracks", rerun.Points3D(tracks[:, frame], colors=_colours(len(tracks))))
+            recording.log("world/tracks", rerun.Points3D(tracks[:, frame], colors=colours))
         for entity, each in views.items():
             view = view_at(run.scene, time, each.camera)
             if view.pinhole and (frame == 0 or is_moving(run.scene, each.camera)):
@@ -121,8 +106,6 @@ def _log_run(run: FinishedRun, recording: Any, progress: ProgressCallback) -> No
 
 def _mesh(run: FinishedRun, position: NDArray[np.floating], *, is_first: bool) -> Any:
     """Build the mesh of the first frame, or the vertices of a later one, for which the viewer keeps the rest."""
-    import rerun
-
     vertices: dict[str, Any] = {"vertex_positions": position.reshape(-1, 3), "vertex_normals": unit_normals(position)}
     if not is_first:
         return rerun.Mesh3D.from_fields(**vertices)
@@ -134,25 +117,14 @@ def _mesh(run: FinishedRun, position: NDArray[np.floating], *, is_first: bool) -
     return rerun.Mesh3D(**vertices, vertex_texcoords=surface.texture_coordinates, albedo_texture=picture)
 
 
-def _colours(count: int) -> NDArray[np.uint8]:
-    """Return distinct colours, shape (count, 3)."""
-    phase = np.arange(count)[:, None] * GOLDEN_RATIO + np.array([0, 1 / 3, 2 / 3])
-    return (127.5 + 127.5 * np.cos(2 * np.pi * phase)).astype(np.uint8)
-
-
 def _pinhole(view: View) -> tuple[Any, Any]:
     """Build pose and projection of a camera, in OpenCV's axes."""
-    import rerun
-
     pose = rerun.Transform3D(translation=view.eye, mat3x3=(view.axes * OPENCV_SIGNS).T)
     matrix, size = calibration(view)["intrinsics"], view.size.tolist()
     return pose, rerun.Pinhole(image_from_camera=matrix, resolution=size, camera_xyz=rerun.ViewCoordinates.RDF)
 
 
 def _log_pictures(run: FinishedRun, frame: int, entity: str, recording: Any) -> None:
-    """Log the outputs of a camera that the run has."""
-    import rerun
-
     if run.has_output("png"):
         picture = rerun.EncodedImage(contents=read_picture_file(run, "png", frame), media_type="image/png")
         recording.log(f"{entity}/picture", picture)

@@ -22,9 +22,8 @@ Source: athaddius/STIRLoader, STIRLoader/STIRLoader.py at 7e7f87c (lines 23 to 5
 
 from __future__ import annotations
 
-import io
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -32,16 +31,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from taichi_msm.errors import FilesError, NotInstalledError, ProgressCallback
-from taichi_msm.exports.formats import ExportSource
-from taichi_msm.exports.inputs import FIRST_PIXEL_CENTRE, Pinhole, read_pinhole, read_tracks
+from taichi_msm.exports.formats import one_path_per_run
+from taichi_msm.exports.inputs import FIRST_PIXEL_CENTRE, Pinhole, encode_picture, read_pinhole, read_tracks
 from taichi_msm.runs import media
 from taichi_msm.runs.directory import create_file, write_new_file
 from taichi_msm.runs.finished import FinishedRun
 from taichi_msm.scene import outputs
-from taichi_msm.scene.outputs import zero_padded
 
 FORMAT_NAME, CAMERAS = "stir", ("left", "right")
 
@@ -54,21 +51,11 @@ ALIGNMENT_TOLERANCE = 1e-6
 Pixels = NDArray[np.int64]
 
 
-def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
-    """Write the videos, marked tracks and cameras of runs; arguments as for `FormatWriter`.
-
-    Raises:
-        FilesError: as for `read_pinhole`, and when the cameras are not a rectified stereo pair.
-        ArgumentError: as for `read_pinhole`.
-        NotInstalledError: when PyAV is not installed.
-    """
+@one_path_per_run()
+def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
+    """Write the videos, marked tracks and cameras of a run; arguments as for `one_path_per_run`."""
     if not outputs.is_pyav_installed():
         raise NotInstalledError(f"--format {outputs.PYAV_NOT_INSTALLED.replace('mp4', FORMAT_NAME, 1)}")
-    for run, name, progress in sources:
-        yield _write_run(run, folder / (name or zero_padded(0)), progress)
-
-
-def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
     runs = [replace(run, camera=side) for side in CAMERAS]
     folder.mkdir()
     left, right = (read_pinhole(each, FORMAT_NAME) for each in runs)
@@ -80,7 +67,7 @@ def _write_run(run: FinishedRun, folder: Path, progress: ProgressCallback) -> li
         sequence = folder / each.camera / "seq00"
         (sequence / "segmentation").mkdir(parents=True)
         for name, centres in zip(("start", "end"), pixels[number], strict=True):
-            mask = _png(_discs(centres, run.scene.render.size, radius))
+            mask = encode_picture(_discs(centres, run.scene.render.size, radius), "PNG")
             write_new_file(sequence / "segmentation" / f"icg{name}seg.png", mask)
         _write_frames(each, sequence, partial(_report_progress, progress, number))
     return _notes(run.scene.render.size, pixels, tracks, baseline)
@@ -101,7 +88,6 @@ def _baseline(run: FinishedRun, left: Pinhole, right: Pinhole) -> float:
 
 
 def _calibration(left: Pinhole, right: Pinhole, baseline: float) -> dict[str, Any]:
-    """Build the content of calib.json."""
     matrices: dict[str, Any] = {}
     for side, camera in zip(CAMERAS, (left, right), strict=True):
         (across, down), (x, y) = camera.focal.tolist(), (camera.centre - FIRST_PIXEL_CENTRE).tolist()
@@ -143,7 +129,6 @@ def _discs(pixels: Pixels, size: tuple[int, int], radius: int) -> NDArray[np.uin
 
 
 def _write_frames(run: FinishedRun, folder: Path, progress: ProgressCallback) -> None:
-    """Write the video of a camera, and its first and last frame."""
     render = run.scene.render
     end = round(1000 * run.time[-1])
     (folder / "frames").mkdir()
@@ -153,18 +138,11 @@ def _write_frames(run: FinishedRun, folder: Path, progress: ProgressCallback) ->
             progress(frame, run.frames)
             video.add(run.read_picture("png", frame))
         video.close()
-    write_new_file(folder / "0ms_icgstart.png", _png(run.read_picture("png", 0)))
-    write_new_file(folder / f"{end}ms_icgend.png", _png(run.read_picture("png", run.frames - 1)))
-
-
-def _png(picture: NDArray[np.uint8]) -> bytes:
-    file = io.BytesIO()
-    Image.fromarray(picture).save(file, "PNG")
-    return file.getvalue()
+    for name, frame in (("0ms_icgstart.png", 0), (f"{end}ms_icgend.png", run.frames - 1)):
+        write_new_file(folder / name, encode_picture(run.read_picture("png", frame), "PNG"))
 
 
 def _notes(size: tuple[int, int], pixels: Pixels, tracks: int, baseline: float) -> list[str]:
-    """Return warnings about omitted tracks and limits of STIR's loader."""
     notes, marked = [], pixels.shape[2]
     if marked < tracks:
         notes.append(

@@ -42,11 +42,7 @@ class _Pickler(pickle.Pickler):
 
 
 def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
-    """Write the tracks and frames of runs; arguments as for `FormatWriter`.
-
-    Raises:
-        FilesError: when the videos exceed the free memory.
-    """
+    """Write the tracks and frames of runs; arguments as for `FormatWriter`."""
     _require_memory([source.run for source in sources])
     videos = {}
     for run, name, progress in sources:

@@ -18,66 +18,46 @@ evaluation/metrics.py, annotation_generation/adt_utils.py (filter_visibilities h
 
 from __future__ import annotations
 
-import io
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from taichi_msm.errors import ProgressCallback
-from taichi_msm.exports.formats import ExportSource
-from taichi_msm.exports.inputs import read_pinhole, read_track_positions, read_tracks
+from taichi_msm.exports.formats import one_path_per_run
+from taichi_msm.exports.inputs import encode_picture, read_pinhole, read_track_positions, read_tracks
 from taichi_msm.runs.arrays import write_arrays
 from taichi_msm.runs.directory import create_file
 from taichi_msm.runs.finished import FinishedRun
-from taichi_msm.scene.outputs import zero_padded
-
-FORMAT_NAME = "tapvid3d"
 
 
-def write(sources: Sequence[ExportSource], folder: Path) -> Iterator[list[str]]:
-    """Write the tracks and frames of runs; arguments as for `FormatWriter`.
-
-    Raises:
-        FilesError: as for `read_pinhole` and `read_tracks`.
-        ArgumentError: as for `read_pinhole`.
-    """
-    for run, name, progress in sources:
-        yield _write_run(run, folder / f"{name or zero_padded(0)}.npz", progress)
-
-
-def _write_run(run: FinishedRun, path: Path, progress: ProgressCallback) -> list[str]:
+@one_path_per_run(".npz")
+def write(run: FinishedRun, path: Path, progress: ProgressCallback) -> list[str]:
+    """Write the tracks and frames of a run; arguments as for `one_path_per_run`."""
     camera, (pixels, occluded), (_, position) = (
-        read_pinhole(run, FORMAT_NAME),
+        read_pinhole(run, "tapvid3d"),
         read_tracks(run),
         read_track_positions(run),
     )
     images = []
     for frame in range(run.frames):
         progress(frame, run.frames)
-        file = io.BytesIO()
         # Nearly lossless, without chroma subsampling.
-        Image.fromarray(run.read_picture("png", frame)).save(file, "JPEG", quality=95, subsampling=0)
-        images.append(file.getvalue())
+        images.append(encode_picture(run.read_picture("png", frame), "JPEG", quality=95, subsampling=0))
     is_exported: NDArray[np.bool_] = np.any(~occluded, axis=1)
     visible = ~occluded[is_exported]
     first = visible.argmax(axis=1)
     queries = np.column_stack([pixels[is_exported][np.arange(len(first)), first], first])
-    extrinsics = np.concatenate([camera.poses, np.tile([[[0.0, 0.0, 0.0, 1.0]]], (run.frames, 1, 1))], axis=1)
     rotated = np.einsum("fij,nfj->fni", camera.poses[..., :3], position[is_exported].astype(np.float64))
+    arrays = {
+        "images_jpeg_bytes": np.array(images),
+        "queries_xyt": queries.astype(np.float64),
+        "tracks_XYZ": rotated + camera.poses[:, None, :, 3],
+        "visibility": np.ascontiguousarray(visible.T),
+        "fx_fy_cx_cy": np.concatenate([camera.focal, camera.centre]),
+        "extrinsics_w2c": camera.matrices,
+    }
     with create_file(path) as archive:
-        write_arrays(
-            archive,
-            {
-                "images_jpeg_bytes": np.array(images),
-                "queries_xyt": queries.astype(np.float64),
-                "tracks_XYZ": rotated + camera.poses[:, None, :, 3],
-                "visibility": np.ascontiguousarray(visible.T),
-                "fx_fy_cx_cy": np.concatenate([camera.focal, camera.centre]),
-                "extrinsics_w2c": extrinsics,
-            },
-        )
+        write_arrays(archive, arrays)
     tracks, omitted = len(occluded), len(occluded) - int(is_exported.sum())
     return [f"{omitted} of {tracks} points are left out, as no frame shows them"] if omitted else []

@@ -9,19 +9,22 @@ rendered surface. The data of each point are
                      and virtual springs
     texture          texture coordinates from the lower left corner of the exported picture
 
-Source: VTK's own writer; for the .pvd file, ParaView's guide.
+Source: VTK's documentation of its XML formats; for the .pvd file, ParaView's guide.
 """
 
 from __future__ import annotations
 
+import struct
+import zlib
+from base64 import b64encode
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import NotInstalledError, ProgressCallback
+from taichi_msm.errors import ProgressCallback
 from taichi_msm.exports.formats import one_folder_per_run
 from taichi_msm.exports.inputs import EXPORT_REFINE, PICTURE_FILE, picture_png
 from taichi_msm.model.sheet import rest_positions
@@ -31,40 +34,34 @@ from taichi_msm.runs.finished import FinishedRun
 from taichi_msm.solver.planning import make_plan
 from taichi_msm.terms.elasticity import energy_density
 
-DISPLACEMENT, SPEED, ENERGY = "displacement", "speed", "energy_density"
-UNITS = {DISPLACEMENT: "m", SPEED: "m/s", ENERGY: "J/m2"}
+UNITS = {"displacement": "m", "speed": "m/s", "energy_density": "J/m2"}
+TYPES = {"f": "Float", "i": "Int", "u": "UInt"}
+TRIANGLE = 5  # VTK's number of the kind of a cell
 
 Array = NDArray[np.floating]
 
 
 @one_folder_per_run
 def write(run: FinishedRun, folder: Path, progress: ProgressCallback) -> list[str]:
-    """Write the surface of every frame, the collection and the picture; arguments as for `one_folder_per_run`.
-
-    Raises:
-        FilesError: as for `FinishedRun.positions`, and when a map has changed since the run.
-        SceneError: as for `picture_png`.
-        NotInstalledError: when VTK is not installed.
-    """
-    try:
-        import vtkmodules.vtkIOXML  # noqa: F401
-    except ImportError:
-        raise NotInstalledError("--format vtk: needs VTK, which is not installed; pip install vtk") from None
+    """Write the surface of every frame, the collection and the picture; arguments as for `one_folder_per_run`."""
     positions, picture = run.positions(), picture_png(run)
     run.require_same_pictures(drawn=False)
     plan, rest = make_plan(run.scene), rest_positions(run.scene.sheet)
-    for frame in range(run.frames):
+    collection = Element("VTKFile", type="Collection", version="0.1")
+    files = SubElement(collection, "Collection")
+    for frame, seconds in enumerate(run.time.tolist()):
         progress(frame, run.frames)
-        displacement = positions[frame] - rest
+        displacement, name = positions[frame] - rest, f"{frame:04}.vtu"
         values = {
-            DISPLACEMENT: displacement.reshape(-1, 3),
-            SPEED: speed(positions, run.time, frame).ravel(),
-            ENERGY: energy_density(plan, displacement).ravel(),
+            "displacement": displacement.reshape(-1, 3),
+            "speed": speed(positions, run.time, frame).ravel(),
+            "energy_density": energy_density(plan, displacement).ravel(),
         }
-        write_new_file(folder / _name(frame), _grid(positions[frame], values))
+        write_new_file(folder / name, _document(_grid(positions[frame], values)))
+        SubElement(files, "DataSet", timestep=repr(seconds), part="0", file=name)
     if picture is not None:
         write_new_file(folder / PICTURE_FILE, picture)
-    write_new_file(folder / "surface.pvd", _collection(run.time))
+    write_new_file(folder / "surface.pvd", _document(collection))
     return []
 
 
@@ -88,52 +85,35 @@ def speed(positions: Array, time: Array, frame: int) -> Array:
     return np.linalg.norm(displacement, axis=-1) / (time[after] - time[frame - 1])
 
 
-def _name(frame: int) -> str:
-    return f"{frame:04}.vtu"
-
-
-def _grid(position: Array, values: dict[str, Array]) -> bytes:
-    """Build the content of a .vtu file with point data."""
-    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
-    from vtkmodules.vtkCommonCore import vtkDataArray, vtkPoints
-    from vtkmodules.vtkCommonDataModel import VTK_TRIANGLE, vtkCellArray, vtkUnstructuredGrid
-    from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
-
-    def named(name: str, data: Array) -> Any:
-        # Data are stored in the precision of the run.
-        array = numpy_to_vtk(np.ascontiguousarray(data, position.dtype), deep=True)
-        array.SetName(name)
-        if name in UNITS:
-            array.GetInformation().Set(vtkDataArray.UNITS_LABEL(), UNITS[name])
-        return array
-
+def _grid(position: Array, values: dict[str, Array]) -> Element:
+    """Build a .vtu file with point data, which are stored in the precision of the run."""
     mesh = refine_surface(position, EXPORT_REFINE)
-    points, cells, grid = vtkPoints(), vtkCellArray(), vtkUnstructuredGrid()
-    points.SetData(named("points", mesh.vertices))
-    starts = np.arange(0, mesh.triangles.size + 1, 3)
-    cells.SetData(
-        numpy_to_vtkIdTypeArray(starts, deep=True),
-        numpy_to_vtkIdTypeArray(mesh.triangles.reshape(-1).astype(np.int64), deep=True),
-    )
-    grid.SetPoints(points)
-    grid.SetCells(VTK_TRIANGLE, cells)
-    for name, data in values.items():
-        grid.GetPointData().AddArray(named(name, data))
-    grid.GetPointData().SetActiveVectors(DISPLACEMENT)
-    grid.GetPointData().SetTCoords(named("texture", mesh.texture_coordinates * (1, -1) + (0, 1)))
-    # VTK writes to a string: to a file, it would only print an error when the disk is full.
-    writer = vtkXMLUnstructuredGridWriter()
-    writer.WriteToOutputStringOn()
-    writer.SetInputData(grid)
-    writer.Write()
-    return bytes(writer.GetOutputString(), "ascii")
+    root = Element("VTKFile", type="UnstructuredGrid", version="1.0", byte_order="LittleEndian")
+    root.attrib |= {"header_type": "UInt64", "compressor": "vtkZLibDataCompressor"}
+    sizes = {"NumberOfPoints": str(len(mesh.vertices)), "NumberOfCells": str(len(mesh.triangles))}
+    piece = SubElement(SubElement(root, "UnstructuredGrid"), "Piece", sizes)
+    data = SubElement(piece, "PointData", Vectors="displacement", TCoords="texture")
+    for name, array in {**values, "texture": mesh.texture_coordinates * (1, -1) + (0, 1)}.items():
+        _add_array(data, name, array.astype(position.dtype))
+    _add_array(SubElement(piece, "Points"), "points", mesh.vertices)
+    cells = SubElement(piece, "Cells")
+    _add_array(cells, "connectivity", mesh.triangles.reshape(-1).astype(np.int64))
+    _add_array(cells, "offsets", np.arange(3, mesh.triangles.size + 1, 3))
+    _add_array(cells, "types", np.full(len(mesh.triangles), TRIANGLE, np.uint8))
+    return root
 
 
-def _collection(time: Array) -> bytes:
-    """Build the content of the .pvd file."""
-    root = ElementTree.Element("VTKFile", type="Collection", version="0.1")
-    collection = ElementTree.SubElement(root, "Collection")
-    for frame, seconds in enumerate(time.tolist()):
-        ElementTree.SubElement(collection, "DataSet", timestep=repr(seconds), part="0", file=_name(frame))
-    ElementTree.indent(root)
-    return bytes(ElementTree.tostring(root, encoding="utf-8", xml_declaration=True))
+def _add_array(parent: Element, name: str, array: NDArray[Any]) -> None:
+    """Add numbers, compressed as a single block after a header with the sizes of blocks."""
+    kind, components = f"{TYPES[array.dtype.kind]}{8 * array.itemsize}", str(array[0].size)
+    element = SubElement(parent, "DataArray", type=kind, Name=name, NumberOfComponents=components, format="binary")
+    content = array.astype(array.dtype.newbyteorder("<")).tobytes()
+    packed = zlib.compress(content)
+    element.text = (b64encode(struct.pack("<4Q", 1, len(content), 0, len(packed))) + b64encode(packed)).decode()
+    if name in UNITS:
+        SubElement(element, "InformationKey", name="UNITS_LABEL", location="vtkDataArray").text = UNITS[name]
+
+
+def _document(root: Element) -> bytes:
+    indent(root)
+    return tostring(root, encoding="utf-8", xml_declaration=True)

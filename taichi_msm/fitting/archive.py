@@ -7,6 +7,7 @@ tracks.npz are accepted too.
 
 from __future__ import annotations
 
+import re
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,26 +22,13 @@ from taichi_msm.images import irregular_kind
 from taichi_msm.scene.section import MAX_MAGNITUDE
 from taichi_msm.system.process import available_memory
 
+Arrays = dict[str, NDArray[Any]]
+
 NEEDS = "time (T,), coordinates (N, 2) and position (N, T, 3) or pixel (N, T, 2)"
 MEMBERS = ("time", "coordinates", "position", "pixel", "sigma", "points", "occluded", "visible")
 
 # Parts of array names that suggest data of observations.
-SUGGESTIVE_NAME_PARTS = (
-    "visib",
-    "occlu",
-    "mask",
-    "valid",
-    "missing",
-    "lost",
-    "status",
-    "score",
-    "weight",
-    "confid",
-    "sigma",
-    "std",
-    "unit",
-    "scale",
-)
+SUGGESTIVE_PARTS = re.compile("visib|occlu|mask|valid|missing|lost|status|score|weight|confid|sigma|std|unit|scale")
 
 KINDS: dict[str, type[PointObservation]] = {"position": Positions, "pixel": Pixels}
 
@@ -56,19 +44,15 @@ def read_observations(observed: str | Path | Mapping[str, Any], rate: float) -> 
         SceneError: when arrays are missing, unknown, or have other shapes.
     """
     if isinstance(observed, Mapping):
-        filled = {
-            key: np.ma.filled(1.0 * value, np.nan) if np.ma.isMA(value) else value for key, value in observed.items()
-        }
-        require_understood("observed", names := [str(key) for key in filled])
-        arrays = {str(key): as_array(value, str(key)) for key, value in filled.items()}
-        return _checked("observed", arrays, names, rate)
-    return _checked(str(observed), *read_archive(str(observed)), rate)
-
-
-def _checked(name: str, arrays: dict[str, NDArray[Any]], names: list[str], rate: float) -> PointObservation:
-    """Validate arrays, and build observations; `names`: of all arrays in the source."""
+        name, names = "observed", [str(key) for key in observed]
+        _require_understood(name, names)
+        filled = (np.ma.filled(1.0 * value, np.nan) if np.ma.isMA(value) else value for value in observed.values())
+        arrays = {key: as_array(value, key) for key, value in zip(names, filled, strict=True)}
+    else:
+        name = str(observed)
+        arrays, names = _read_archive(name)
     arrays = _thinned(_masked(name, arrays, rate))
-    kinds = [kind for kind in ("position", "pixel") if kind in arrays]
+    kinds = [kind for kind in KINDS if kind in arrays]
     missing = [key for key in ("time", "coordinates") if key not in arrays]
     if missing := missing + ([] if kinds else ["position or pixel"]):
         found = ", ".join(map(ascii, names[:20])) or "nothing"
@@ -76,7 +60,11 @@ def _checked(name: str, arrays: dict[str, NDArray[Any]], names: list[str], rate:
         raise SceneError([f"{name}: {missing[0]}: missing; expected {NEEDS}, and it has {found}{suggestion}"])
     if len(kinds) == 2:
         raise SceneError([f"{name}: has both position and pixel; leave one of them out"])
-    kind = kinds[0]
+    return _checked(name, arrays, kinds[0]).with_sigma(arrays.get("sigma"))
+
+
+def _checked(name: str, arrays: Arrays, kind: str) -> PointObservation:
+    """Validate arrays, and build observations without sigma."""
     for key in ("time", "coordinates", kind):
         if arrays[key].dtype.kind not in "fiu":
             raise SceneError([f"{name}: {key}: {arrays[key].dtype} is no number; expected {NEEDS}"])
@@ -84,12 +72,12 @@ def _checked(name: str, arrays: dict[str, NDArray[Any]], names: list[str], rate:
     size = 3 if kind == "position" else 2
     points, times = len(coordinates) if coordinates.ndim else 0, len(time) if time.ndim else 0
     expected = {"time": (times,), "coordinates": (points, 2), kind: (points, times, size)}
-    for key, array in (("time", time), ("coordinates", coordinates), (kind, values)):
-        if array.shape != expected[key] or array.size == 0:
-            message = f"{name}: {key}: shape {array.shape}; expected {NEEDS}"
-            if key == kind and array.shape == (times, points, size):
-                message = f"{name}: {key}: shape {array.shape}; the points come first: take {key}.swapaxes(0, 1)"
-            raise SceneError([message])
+    for key, shape in expected.items():
+        if (found := arrays[key].shape) != shape or 0 in shape:
+            remedy = f"expected {NEEDS}"
+            if key == kind and found == (times, points, size):
+                remedy = f"the points come first: take {key}.swapaxes(0, 1)"
+            raise SceneError([f"{name}: {key}: shape {found}; {remedy}"])
     if not np.isfinite(time).all():
         raise SceneError([f"{name}: time: holds NaN or infinity; give the time of every column in seconds"])
     if not ((coordinates >= 0) & (coordinates <= 1)).all():
@@ -102,15 +90,14 @@ def _checked(name: str, arrays: dict[str, NDArray[Any]], names: list[str], rate:
         raise SceneError([f"{name}: {fault}"])
     if (largest := np.nanmax(np.abs(values))) > MAX_MAGNITUDE:
         raise SceneError([f"{name}: {kind}: {largest:g}; take NaN where not observed"])
-    observed = KINDS[kind](name, time, values, None, coordinates)
-    return observed.with_sigma(arrays.get("sigma"))
+    return KINDS[kind](name, time, values, None, coordinates)
 
 
-def _masked(name: str, arrays: dict[str, NDArray[Any]], rate: float) -> dict[str, NDArray[Any]]:
+def _masked(name: str, arrays: Arrays, rate: float) -> Arrays:
     """Apply the masks `visible` and `occluded`, and rename the `points` of a tracks.npz to `pixel`."""
     arrays = dict(arrays)
     flags = {key: arrays.pop(key) for key in ("visible", "occluded") if key in arrays}
-    key = next((key for key in ("points", "pixel", "position") if key in arrays), "points")
+    key = next((key for key in ("points", *KINDS) if key in arrays), "points")
     for flag, array in flags.items():
         shape = arrays[key].shape[:2] if key in arrays else ()
         if array.shape != shape or array.dtype.kind not in "biu" or not np.isin(array, (0, 1)).all():
@@ -119,34 +106,27 @@ def _masked(name: str, arrays: dict[str, NDArray[Any]], rate: float) -> dict[str
         if arrays[key].dtype.kind in "fiu" and arrays[key].ndim == 3:
             arrays[key] = np.where((array != (flag == "visible"))[..., None], np.nan, arrays[key])
     if flags and key == "points":
-        arrays = {
-            array_name: array for array_name, array in arrays.items() if array_name in ("time", "coordinates", "points")
-        }
-        arrays["pixel"] = arrays.pop("points")
-        arrays.setdefault("time", np.arange(arrays["pixel"].shape[1]) / rate)
+        tracks = {"pixel": arrays["points"], "time": np.arange(arrays["points"].shape[1]) / rate}
+        return tracks | {kept: arrays[kept] for kept in ("time", "coordinates") if kept in arrays}
     return arrays
 
 
-def _thinned(arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+def _thinned(arrays: Arrays) -> Arrays:
     """Convert the arrays of a trajectory.npz, thinned to at most 64 points per side."""
     position = arrays.get("position")
-    if position is not None and position.ndim == 4 and min(position.shape[:3]) > 0 and "coordinates" not in arrays:
-        rows, cols = (np.unique(np.linspace(0, n - 1, min(n, 64)).round().astype(int)) for n in position.shape[1:3])
-        down, across = np.meshgrid(
-            rows / max(position.shape[1] - 1, 1), cols / max(position.shape[2] - 1, 1), indexing="ij"
-        )
-        thinned = position[:, rows[:, None], cols].reshape(len(position), len(rows) * len(cols), position.shape[3])
-        coordinates = np.stack([across.ravel(), down.ravel()], axis=1)
-        return {**arrays, "coordinates": coordinates, "position": thinned.swapaxes(0, 1)}
-    return arrays
+    if position is None or position.ndim != 4 or min(position.shape[:3]) == 0 or "coordinates" in arrays:
+        return arrays
+    rows, cols = (np.unique(np.linspace(0, n - 1, min(n, 64)).round().astype(int)) for n in position.shape[1:3])
+    down, across = np.meshgrid(
+        rows / max(position.shape[1] - 1, 1), cols / max(position.shape[2] - 1, 1), indexing="ij"
+    )
+    thinned = position[:, rows[:, None], cols].reshape(len(position), len(rows) * len(cols), position.shape[3])
+    coordinates = np.stack([across.ravel(), down.ravel()], axis=1)
+    return {**arrays, "coordinates": coordinates, "position": thinned.swapaxes(0, 1)}
 
 
-def read_archive(name: str) -> tuple[dict[str, NDArray[Any]], list[str]]:
-    """Read the arrays of observations from an .npz, and the names of all its arrays.
-
-    Raises:
-        SceneError: when the file is not an .npz, or an array cannot be used.
-    """
+def _read_archive(name: str) -> tuple[Arrays, list[str]]:
+    """Read the arrays of observations from an .npz, and the names of all its arrays."""
     path, remedy = Path(name), f"name an .npz with {NEEDS}, or a run's trajectory.npz or tracks.npz"
     try:
         if kind := irregular_kind(path):
@@ -155,7 +135,7 @@ def read_archive(name: str) -> tuple[dict[str, NDArray[Any]], list[str]]:
             signature = file.read(6)
         if signature.startswith(b"PK"):
             with zipfile.ZipFile(path) as archive:
-                return _members(name, archive)
+                return _read_members(name, archive)
         reason = "a single array, as np.save writes" if signature == b"\x93NUMPY" else "not an .npz"
     except FileNotFoundError:
         reason = "no such file"
@@ -166,22 +146,20 @@ def read_archive(name: str) -> tuple[dict[str, NDArray[Any]], list[str]]:
     raise SceneError([f"{name}: {reason}; {remedy}"])
 
 
-def require_understood(name: str, keys: list[str]) -> None:
+def _require_understood(name: str, keys: list[str]) -> None:
     """Check that no array is ignored whose name suggests data of observations; SceneError: lists such arrays."""
-    ignored = [key for key in keys if key not in MEMBERS and any(word in key.lower() for word in SUGGESTIVE_NAME_PARTS)]
+    ignored = [key for key in keys if key not in MEMBERS and SUGGESTIVE_PARTS.search(key.lower())]
     if ignored:
         fault = "not understood; take NaN where not observed, or visible or occluded (N, T), and sigma for errors"
         raise SceneError([f"{name}: {', '.join(map(ascii, ignored))}: {fault}"])
 
 
-def _members(name: str, archive: zipfile.ZipFile) -> tuple[dict[str, NDArray[Any]], list[str]]:
+def _read_members(name: str, archive: zipfile.ZipFile) -> tuple[Arrays, list[str]]:
     infos = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-    require_understood(name, list(infos))
+    _require_understood(name, list(infos))
     members = {key: info for key, info in infos.items() if key in MEMBERS}
     if (size := sum(info.file_size for info in members.values())) > (limit := available_memory() // 4):
-        fault = (
-            f"{size / 1e9:.1f} GB of arrays, and there is memory for {limit / 1e9:.1f} GB; leave points or times out"
-        )
+        fault = f"{size / 1e9:.1f} GB of arrays, and there is memory for {limit / 1e9:.1f} GB; leave some points out"
         raise SceneError([f"{name}: {fault}"])
     arrays = {}
     for key, info in members.items():
@@ -189,8 +167,10 @@ def _members(name: str, archive: zipfile.ZipFile) -> tuple[dict[str, NDArray[Any
             with archive.open(info) as member:
                 arrays[key] = np.lib.format.read_array(member, allow_pickle=False)
         except Exception as error:  # zipfile, its decompressors and NumPy raise any kind
-            reason = str(error).partition("\n")[0] or type(error).__name__
-            reason = "encrypted" if info.flag_bits & 1 else reason
-            reason = "an array of Python objects" if reason.startswith("Object arrays") else f"cannot be read: {reason}"
+            reason = "cannot be read: " + (str(error).partition("\n")[0] or type(error).__name__)
+            if info.flag_bits & 1:
+                reason = "cannot be read: encrypted"
+            elif "Object arrays" in reason:
+                reason = "an array of Python objects"
             raise SceneError([f"{name}: {key}: {reason}; write it again by np.savez, as numbers"]) from None
     return arrays, list(infos)

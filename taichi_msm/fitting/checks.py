@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from taichi_msm.fitting.observation import Array, Observation
+from taichi_msm.fitting.parameters import Parameter
 from taichi_msm.fitting.points import ROUNDING_SHARE
 from taichi_msm.fitting.predict import Prediction
 from taichi_msm.scene.scene import Scene
@@ -30,24 +31,15 @@ def faults(observations: Sequence[Observation], scene: Scene, parameters: int) -
 
 
 def faults_at_start(
-    observations: Sequence[Observation],
-    scene: Scene,
-    first: Prediction,
-    *,
-    same_camera: bool = True,
-    same_signs: bool = True,
+    observations: Sequence[Observation], scene: Scene, first: Prediction, parameters: Sequence[Parameter] = ()
 ) -> Iterator[str]:
-    """Yield the faults of observations that a run of the scene shows.
+    """Yield the faults that a run of the scene shows: times that miss the motion, other cameras and conventions.
 
     Args:
         observations: the observations.
         scene: the scene with its initial values.
         first: prediction of the scene up to its end.
-        same_camera: whether the camera is not fitted.
-        same_signs: whether the parameters cannot change the signs of forces and motion.
-
-    Yields:
-        A line per fault: times that miss the motion, another camera, conventions of other programs.
+        parameters: of the fit, which may move the camera, or change the signs of forces and motion.
     """
     rate, motion, name = scene.time.frames_per_second, float(first.motion.max()), observations[0].name
     if motion <= ROUNDING_SHARE * max(scene.sheet.size):
@@ -63,22 +55,21 @@ def faults_at_start(
             f"observe between {moving[0]:g} and {moving[-1]:g} s too"
         )
         return
+    same_camera = not any(parameter.key.startswith("render.") for parameter in parameters)
     found = [
         fault
         for observed, predicted in zip(observations, first.values, strict=True)
         for fault in observed.faults_at_start(scene, predicted, same_camera=same_camera)
     ]
     yield from found
-    if same_signs and not found:
-        yield from _opposed(observations, scene, first)
+    if not found and all(parameter.is_log for parameter in parameters):
+        yield from opposed(observations, scene, first)
 
 
-def faults_at_solution(
-    observations: Sequence[Observation], scene: Scene, first: Prediction, best: Prediction
-) -> Iterator[str]:
-    """Yield the signs and units that contradict both the initial and the fitted scene."""
-    yield from _opposed(observations, scene, first, best)
-    yield from unit_faults(observations, first, best)
+def opposed(observations: Sequence[Observation], scene: Scene, *predictions: Prediction) -> Iterator[str]:
+    """Yield the components of the sign opposite to all predictions."""
+    for n, observed in enumerate(observations):
+        yield from observed.opposed(scene, *(prediction.values[n] for prediction in predictions))
 
 
 def unit_faults(observations: Sequence[Observation], *predictions: Prediction) -> Iterator[str]:
@@ -87,23 +78,15 @@ def unit_faults(observations: Sequence[Observation], *predictions: Prediction) -
         yield from observed.unit_faults(*(prediction.values[n] for prediction in predictions))
 
 
-def _opposed(observations: Sequence[Observation], scene: Scene, *predictions: Prediction) -> Iterator[str]:
-    for n, observed in enumerate(observations):
-        yield from observed.opposed(scene, *(prediction.values[n] for prediction in predictions))
-
-
 def _times(time: Array, name: str, scene: Scene) -> Iterator[str]:
-    duration = scene.time.duration
-    tolerance = FRAME_TOLERANCE / scene.time.frames_per_second
+    duration, rate = scene.time.duration, scene.time.frames_per_second
+    tolerance = FRAME_TOLERANCE / rate
     low, high = float(time.min()), float(time.max())
     if high > duration + tolerance:
-        are_milliseconds = duration / 30 < high / 1000 <= duration * (1 + FRAME_TOLERANCE)
-        rate = scene.time.frames_per_second
-        are_frame_numbers = bool((time == np.round(time)).all()) and high / rate <= duration + 1 / rate + tolerance
         remedy = "cut them off, or --set time.duration=..."
-        if are_frame_numbers:
+        if (time == np.round(time)).all() and high / rate <= duration + 1 / rate + tolerance:
             remedy = f"are they frame numbers? divide time by the frames per second, {rate:g} in the scene"
-        elif are_milliseconds:
+        elif duration / 30 < high / 1000 <= duration * (1 + FRAME_TOLERANCE):
             remedy = "are they in ms? divide time by 1000"
         yield f"{name}: time: up to {high:g} s, and the scene ends at {duration:g} s; {remedy}"
     elif low < -tolerance:

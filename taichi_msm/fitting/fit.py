@@ -5,23 +5,21 @@ from __future__ import annotations
 import math
 import secrets
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from typing_extensions import Unpack
 
 from taichi_msm.accuracy.mesh import CONTACT_ORDER
 from taichi_msm.errors import SceneError, StageProgressCallback, writing
 from taichi_msm.fitting import rejection
-from taichi_msm.fitting import result as result_module
 from taichi_msm.fitting.archive import read_observations
-from taichi_msm.fitting.checks import faults, faults_at_solution, faults_at_start, unit_faults
-from taichi_msm.fitting.force_table import read_forces
+from taichi_msm.fitting.checks import faults, faults_at_start, opposed, unit_faults
+from taichi_msm.fitting.forces import read_forces
 from taichi_msm.fitting.least_squares import (
     MAX_RELATIVE_ERROR,
     Misfit,
@@ -31,28 +29,15 @@ from taichi_msm.fitting.least_squares import (
     Search,
     Solution,
     Uncertainty,
+    UnidentifiedGroup,
     uncertainty,
     unseen,
 )
 from taichi_msm.fitting.machine_curve import CurveRuns, has_curve, search_by_curve
-from taichi_msm.fitting.machine_fit import (
-    TABLE_OPTIONS,
-    explanations,
-    fitted_tests,
-    read_machine_problem,
-    table_paths,
-    unknown_notes,
-)
-from taichi_msm.fitting.machine_model import MachineProblem
-from taichi_msm.fitting.observation import ErrorCorrelation, Observation
-from taichi_msm.fitting.parameters import (
-    Bounds,
-    Method,
-    Parameter,
-    as_data,
-    make_parameters,
-    require_types,
-)
+from taichi_msm.fitting.machine_fit import explanations, fitted_tests, unknown_notes
+from taichi_msm.fitting.machine_model import TABLE_OPTIONS, MachineProblem, read_machine_problem, table_paths
+from taichi_msm.fitting.observation import Array, ErrorCorrelation, Observation
+from taichi_msm.fitting.parameters import Bounds, Method, Parameter, as_data, make_parameters, require_types, rounded
 from taichi_msm.fitting.points import PointObservation
 from taichi_msm.fitting.predict import FitProblem, Prediction, Runs, without_outputs
 from taichi_msm.fitting.report import publication, write_report
@@ -61,8 +46,6 @@ from taichi_msm.fitting.stiffness_map import KEY, MapSettings, fit_map, map_sett
 from taichi_msm.load.check import check_scene
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.scene.scene import Scene
-
-Array = NDArray[np.float64]
 
 
 def fit(
@@ -165,11 +148,8 @@ def _read_problem(
     if unused := [name for name in TABLE_OPTIONS if method.get(name)]:
         raise SceneError([f"--{unused[0]}: is of tables of a testing machine; leave it out"])
     settings = map_settings(initial, free, bounds, method.get("resolution"))
-    number_options = {
-        "forces": forces,
-        **{name: method.get(name) for name in ("robust", "profile", "correlation", "drift")},
-    }
-    if settings is not None and (conflicting := [name for name, value in number_options.items() if value]):
+    options = {"forces": forces, **{name: method.get(name) for name in ("robust", "profile", "correlation", "drift")}}
+    if settings is not None and (conflicting := [name for name, value in options.items() if value]):
         raise SceneError([f"--free {KEY}: --{conflicting[0]} is of fits of numbers; leave it out"])
     parameters = () if settings is not None else make_parameters(initial, free, bounds)
     if forces is not None:
@@ -193,14 +173,10 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
     start = np.zeros(len(parameters))
     runs.expected = 8 * len(start) + 4
     first = runs.first(start)
-    same_camera = not any(parameter.key.startswith("render.") for parameter in parameters)
-    same_signs = all(parameter.is_log for parameter in parameters)
     machine = runs.job if isinstance(runs.job, MachineProblem) else None
-    found = (
-        []
-        if machine
-        else list(faults_at_start(observations, scene, first, same_camera=same_camera, same_signs=same_signs))
-    )
+    found: list[str] = []
+    if machine is None:
+        found += faults_at_start(observations, scene, first, parameters)
     if not any(probe.moved for probe in scene.probes):
         # The forces of force-controlled tools do not depend on the tissue.
         found += unit_faults(observations, first)
@@ -215,65 +191,55 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
         if machine:
             search.remember(start, first)
         solution = search.best(start)
-    if found := list(faults_at_solution(observations, scene, first, solution.predicted)):
+    # Signs and units that contradict both the initial and the fitted scene.
+    both = first, solution.predicted
+    if found := [*opposed(observations, scene, *both), *unit_faults(observations, *both)]:
         raise SceneError(found)
     uncertainties = uncertainty(misfit, solution, search.jacobian(solution), error_correlation)
     if isinstance(runs, CurveRuns):
         runs.by_tangent = False
-    profiles = Profiler(parameters, misfit, solution, uncertainties).profiles(runs) if method.get("profile") else None
+    profiles = Profiler(runs, misfit, solution, uncertainties).profiles() if method.get("profile") else None
     mesh, shifts = _mesh(runs, misfit, solution, uncertainties)
-    estimates = [
-        _estimate(parameters[n], x, n, uncertainties, profiles, shifts) for n, x in enumerate(solution.x.tolist())
-    ]
-    unidentified = unseen(
-        parameters, solution.x, uncertainties, forces=any(observed.noun == "forces" for observed in observations)
-    )
+    estimates = {
+        parameter.key: _estimate(parameter, float(solution.x[n]), n, uncertainties, profiles, shifts)
+        for n, parameter in enumerate(parameters)
+    }
+    values = {key: estimate.value for key, estimate in estimates.items()}
+    measures_forces = any(observed.noun == "forces" for observed in observations)
+    unidentified = unseen(parameters, solution.x, uncertainties, forces=measures_forces)
     rejection_reason = _rejection(misfit, solution, uncertainties, error_correlation)
-    fitted_values = {parameter.key: estimate.value for parameter, estimate in zip(parameters, estimates, strict=True)}
-    tests = fitted_tests(machine, fitted_values, solution.predicted.values[0]) if machine else ()
-    has_sigma = all(observed.sigma is not None for observed in observations)
+    tests = fitted_tests(machine, values, solution.predicted.values[0]) if machine else ()
+    residuals = misfit.split(misfit.of(solution.predicted))
     summaries: dict[str, Any] = {}
-    for observed, residuals, sigma in zip(
-        observations, misfit.split(misfit.of(solution.predicted)), uncertainties.scales, strict=True
-    ):
-        summaries |= observed.summary(residuals, sigma)
+    for observed, part, sigma in zip(observations, residuals, uncertainties.scales, strict=True):
+        summaries |= observed.summary(part, sigma)
+    has_sigma = all(observed.sigma is not None for observed in observations)
+    notes = [*unit_faults(observations, first), *(note for fitted in tests for note in fitted.loading.test.notes)]
+    notes += _search_notes(solution, parameters, fits_well=search.fits_well(solution))
+    notes += _uncertainty_notes(parameters, solution.x, uncertainties, shifts, unidentified)
+    notes += unknown_notes(tests, {key: values[key] for key, each in estimates.items() if not each.identifiable})
+    if rejection_reason:
+        notes += explanations(tests, fits_contact=any(key.startswith("contact") for key in values))
+    if uncertainties.factor > 1.5:
+        factor = rounded(math.sqrt(uncertainties.factor))
+        notes.append(f"the residual is {factor} times sigma, and the intervals are widened by this factor")
+    for observed, predicted, signal in zip(observations, solution.predicted.values, signals, strict=True):
+        notes += observed.residual_notes(predicted, signal, error_correlation)
     return FitResult(
         **summaries,
-        parameters={parameter.key: estimate for parameter, estimate in zip(parameters, estimates, strict=True)},
+        parameters=estimates,
         correlation=uncertainties.correlation.tolist(),
         rejection=rejection_reason,
         chi_square=float(uncertainties.residuals @ uncertainties.residuals) if has_sigma else None,
         degrees_of_freedom=uncertainties.freedom,
-        identifiable=all(estimate.identifiable for estimate in estimates),
+        identifiable=all(estimate.identifiable for estimate in estimates.values()),
         unseen=unidentified,
         mesh_error=mesh,
         runs=runs.count,
-        notes=[
-            *unit_faults(observations, first),
-            *(note for fitted in tests for note in fitted.loading.test.notes),
-            *result_module.search_notes(solution, parameters, fits_well=search.fits_well(solution)),
-            *result_module.mesh_notes(parameters, solution.x, uncertainties, shifts),
-            *result_module.correlation_notes(parameters, uncertainties, unidentified),
-            *unknown_notes(
-                tests,
-                {
-                    key: value
-                    for (key, value), each in zip(fitted_values.items(), estimates, strict=True)
-                    if not each.identifiable
-                },
-            ),
-            *(
-                explanations(tests, fits_contact=any(parameter.key.startswith("contact") for parameter in parameters))
-                if rejection_reason
-                else ()
-            ),
-            *result_module.residual_notes(misfit, solution, uncertainties, error_correlation),
-        ],
-        scene=Scene(**runs.job.fitted_data(as_data(scene), fitted_values)),
+        notes=notes,
+        scene=Scene(**runs.job.fitted_data(as_data(scene), values)),
         other_scenes=[
-            Scene(**machine.place(as_data(scene), fitted_values, n))
-            for n in range(1, len(tests))
-            if machine is not None
+            Scene(**machine.fitted_data(as_data(scene), values, n)) for n in range(1, len(tests)) if machine is not None
         ],
         observations=observations,
         fitted=solution.predicted.values,
@@ -283,6 +249,40 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
             for n, parameter in enumerate(parameters)
         },
     )
+
+
+def _search_notes(solution: Solution, parameters: Sequence[Parameter], *, fits_well: bool) -> Iterator[str]:
+    """Yield warnings about the search; `fits_well`: whether the residual is small."""
+    if not solution.converged:
+        yield "the search ended before it came to rest; start nearer by --set, or give --bounds"
+    if not fits_well:
+        yield "the residual is large: no values of these parameters reproduce the observations"
+    for parameter, x in zip(parameters, solution.x.tolist(), strict=True):
+        low, high = parameter.limits
+        if min(x - low, high - x) < 1e-3:
+            bounded = math.isfinite(parameter.low) or math.isfinite(parameter.high)
+            end = "a bound" if bounded else "1000 times from where it starts"
+            yield f"{parameter.key}: ended at {parameter.value(x):.4g}, {end}: its interval says little"
+
+
+def _uncertainty_notes(
+    parameters: Sequence[Parameter],
+    x: Array,
+    uncertainties: Uncertainty,
+    shifts: Array | None,
+    unidentified: Sequence[UnidentifiedGroup],
+) -> Iterator[str]:
+    """Yield warnings about mesh errors above the intervals, and correlated parameters except unidentified ones."""
+    half_widths = uncertainties.quantile * uncertainties.deviations
+    if shifts is not None and (moved := np.flatnonzero(shifts > half_widths).tolist()):
+        shares = [(parameters[n].key, parameters[n].share(x[n], float(shifts[n]))) for n in moved]
+        shifted = ", ".join(f"{key} by about {rounded(100 * share)} %" for key, share in shares)
+        yield f"the number of points moves {shifted}: farther than the interval; take more sheet.points"
+    for n, m in zip(*np.nonzero(np.triu(np.abs(uncertainties.correlation) > 0.95, 1)), strict=True):
+        keys = parameters[n].key, parameters[m].key
+        if not any({*keys} <= {*group.parameters} for group in unidentified):
+            fault = f"{keys[0]} and {keys[1]} correlate by {uncertainties.correlation[n, m]:.3f}"
+            yield f"{fault}: they are known best together"
 
 
 def _rejection(

@@ -1,25 +1,33 @@
-"""Measured forces of tools on the sheet, as in a forces.csv."""
+"""Measured forces of tools on the sheet, and their reader: a forces.csv with any separator and decimal mark.
+
+Empty cells and NaN mean "not measured"; any other cell must be a number.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.fitting import conventions
-from taichi_msm.fitting.observation import (
-    MAX_RESIDUAL_SHARE,
-    MAX_RESIDUAL_SIGMAS,
-    Array,
-    Observation,
-    ObservationModel,
-    time_weights,
-)
+from taichi_msm.errors import SceneError
+from taichi_msm.fitting import observation
+from taichi_msm.fitting.observation import Array, Observation, ObservationModel
+from taichi_msm.fitting.tables import Row, read_text
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
+
+# Units of force per newton, and the largest deviation of a ratio from them, as a factor.
+UNITS_PER_NEWTON, MAX_UNIT_FACTOR = {"mN": 1000.0, "gf": 101.97, "kN": 0.001}, 3.0
+
+# Columns and their units.
+COLUMNS = {"time": "s", "probe": "", "force_x": "N", "force_y": "N", "force_z": "N"}
+EXPECTED = f"name a forces.csv, with the columns {', '.join(COLUMNS)}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,14 +38,16 @@ class Forces(Observation):
     unit: ClassVar[str] = "N"
     is_independent: ClassVar[bool] = True
 
+    sigma: float | Array
+
     def signal(self, scene: Scene) -> float:
         """Return the root mean square of the forces."""
         return float(np.sqrt(np.nanmean(self.values**2)))
 
     def fits_well(self, residuals: Array, deviation: float, signal: float) -> bool:
-        """Return whether the residuals are small, in sigma or as a share of the forces; see `Observation.fits_well`."""
-        assert self.sigma is not None
-        limit = max((MAX_RESIDUAL_SHARE * signal) ** 2, MAX_RESIDUAL_SIGMAS**2 * np.mean(np.square(self.sigma)))
+        """Return whether the residuals are small, in sigma or as a share of the forces."""
+        limit = (observation.MAX_RESIDUAL_SHARE * signal) ** 2
+        limit = max(limit, observation.MAX_RESIDUAL_SIGMAS**2 * np.mean(np.square(self.sigma)))
         return float(np.mean(residuals**2)) <= limit
 
     def summary(self, residuals: Array, sigma: float | Array) -> dict[str, Any]:
@@ -55,7 +65,7 @@ class ForceModel(ObservationModel):
     """Map from a run to the forces of its tools at the measured times."""
 
     def __init__(self, scene: Scene, observed: ToolForces, frames: int) -> None:
-        self._probe, self._shares = observed.probe, time_weights(scene, observed.time, frames)
+        self._probe, self._shares = observed.probe, observation.time_weights(scene, observed.time, frames)
 
     def record(self, simulation: Simulation) -> Array:
         """Return the force of every probe in the current frame [N], shape (probes, 3)."""
@@ -79,14 +89,95 @@ class ToolForces(Forces):
 
     def opposed(self, scene: Scene, *predictions: Array) -> Iterator[str]:
         """Yield components that all predictions have with the other sign."""
-        for axis in conventions.opposed_axes(self.values, predictions, self.sigma):
+        for axis in observation.opposed_axes(self.values, predictions, self.sigma):
             fault = "is it the force on the tool? give the force on the sheet, of the other sign"
             yield f"{self.name}: force_{'xyz'[axis]}: acts against the scene's; {fault}"
 
     def unit_faults(self, *predictions: Array) -> Iterator[str]:
         """Yield the unit of force that explains the ratio of measured to predicted forces, for all predictions."""
-        if found := conventions.unit_of_force(self.values, predictions, self.sigma):
-            unit, per_newton, ratio = found
-            fault = f"{ratio:.3g} times those of the scene where the search begins; are they in {unit}?"
-            remedy = f"divide them by {per_newton:g}" if per_newton > 1 else f"multiply them by {1 / per_newton:g}"
-            yield f"{self.name}: forces: {fault} {remedy}, or start nearer by --set"
+        ratios = [self._ratio(predicted) for predicted in predictions]
+        for unit, per_newton in UNITS_PER_NEWTON.items():
+            if all(1 / MAX_UNIT_FACTOR < ratio / per_newton < MAX_UNIT_FACTOR for ratio in ratios):
+                fault = f"{ratios[0]:.3g} times those of the scene where the search begins; are they in {unit}?"
+                remedy = f"divide them by {per_newton:g}" if per_newton > 1 else f"multiply them by {1 / per_newton:g}"
+                yield f"{self.name}: forces: {fault} {remedy}, or start nearer by --set"
+                return
+
+    def _ratio(self, predictions: Array) -> float:
+        """Return the ratio of measured to predicted forces; 0: insignificant, or not parallel."""
+        measured, predicted = self.values[self.known], predictions[self.known]
+        lengths = float(np.linalg.norm(measured)), float(np.linalg.norm(predicted))
+        is_small = max(lengths) < observation.MIN_SIGMAS * self.sigma * np.sqrt(len(measured))
+        if len(measured) < observation.MIN_COUNT or is_small:
+            return 0.0
+        is_parallel = measured @ predicted > -observation.MAX_COSINE * lengths[0] * lengths[1] > 0
+        return lengths[0] / lengths[1] if is_parallel else 0.0
+
+
+def read_forces(path: str | Path, sigma: float, probes: int) -> ToolForces:
+    """Read a forces.csv.
+
+    Args:
+        path: the file.
+        sigma: standard deviation of the error of each component [N].
+        probes: number of tools of the scene.
+
+    Raises:
+        SceneError: when the file is not such a table, or refers to a missing tool.
+    """
+    name = str(path)
+    if not 0 < sigma < math.inf:
+        raise SceneError([f"--forces {name},{sigma:g}: take a number above 0, the standard deviation in newtons"])
+    grid = read_text(name, _is_header, EXPECTED)
+    header = next((n for n, row in enumerate(grid.rows) if _is_header(row)), None)
+    if header is None:
+        found = [{*re.findall(r"\w+", " ".join(row).lower())} & {*COLUMNS} for row in grid.rows]
+        missing = [key for key in COLUMNS if key not in max(found, key=len)]
+        raise SceneError([f"{name}: no row names {', '.join(missing)}; {EXPECTED}"])
+    names, units = map(list, zip(*_titles(grid.rows[header]), strict=True))
+    if repeated := [key for key in COLUMNS if names.count(key) > 1]:
+        fault = f"{repeated[0]}: {names.count(repeated[0])} columns of this name; leave one"
+        raise SceneError([f"{grid.place(header)}: {fault}"])
+    columns = [names.index(key) for key in COLUMNS]
+    _require_units(grid.place(header), [units[column] for column in columns])
+    rows = [n for n in range(header + 1, len(grid.rows)) if grid.has_content(n)]
+    below = grid.rows[rows[0]] if rows else []
+    units = [below[column].strip("[]() ") if column < len(below) else "" for column in columns]
+    if units[0].isalpha() and units[0].lower() != "nan":
+        _require_units(grid.place(rows.pop(0)), units)
+    for n in rows:
+        grid.require_names(n, header)
+    cells = [(n, column) for n in rows for column in columns if column < len(grid.rows[n])]
+    cells = [(n, column) for n, column in cells if grid.rows[n][column].lower() not in ("", "nan")]
+    table = np.full((len(grid.rows), len(names)), np.nan)
+    remedy = "take a number, or leave the cell empty where nothing was measured"
+    for cell, (value, _) in zip(cells, grid.numbers(header, cells, remedy), strict=True):
+        table[cell] = value
+    table = table[np.ix_(rows, columns)]
+    time, probe, force = table[:, 0], table[:, 1], table[:, 2:]
+    if not (np.isfinite(force).any() and np.isfinite(time).all()):
+        fault = "no row" if not len(time) else "no force" if np.isfinite(time).all() else "a row without a time"
+        raise SceneError([f"{name}: {fault}; {EXPECTED}, and numbers in them"])
+    if unknown := [index for index in probe.tolist() if index not in range(probes)]:
+        raise SceneError([f"{name}: probe: {unknown[0]:g}; the scene has {probes}, numbered from 0"])
+    _, kept = np.unique(table[:, :2], axis=0, return_index=True)
+    for n in set(range(len(rows))) - set(kept.tolist()):
+        raise SceneError([f"{grid.place(rows[n])}: a second row of {time[n]:g} s and probe {probe[n]:g}; leave one"])
+    return ToolForces(name, time, force, sigma, probe.astype(np.intp))
+
+
+def _titles(row: Row) -> list[tuple[str, str]]:
+    """Return the names and units of columns, such as force_x [N]."""
+    parts = [cell.lstrip("#% ").replace("(", "[").partition("[") for cell in row]
+    return [(name.strip().lower(), unit.rstrip("]) ")) for name, _, unit in parts]
+
+
+def _is_header(row: Row) -> bool:
+    return {*COLUMNS} <= {name for name, _ in _titles(row)}
+
+
+def _require_units(where: str, units: Sequence[str]) -> None:
+    """Check the units of the columns; SceneError: another one."""
+    for (key, expected), unit in zip(COLUMNS.items(), units, strict=True):
+        if unit not in (expected, "", "-", "1"):
+            raise SceneError([f"{where}: {key}: unit {unit!r}; give seconds and newtons"])

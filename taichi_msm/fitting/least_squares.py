@@ -38,18 +38,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import SceneError
-from taichi_msm.fitting.observation import ErrorCorrelation, Observation
+from taichi_msm.fitting.observation import Array, ErrorCorrelation, Observation
 from taichi_msm.fitting.parameters import Parameter, rounded
 from taichi_msm.fitting.predict import Prediction, Runs, difference_step
-
-Array = NDArray[np.float64]
 
 # Larger residuals are downweighted in robust fits.
 OUTLIER_SIGMAS = 2.0
 
 # Largest log of the factor between alternative starts and the first one.
 MAX_START_LOG = np.log(10.0)
-
 
 # Standard deviations of the residuals of every observation, in its unit: of all, or of each.
 Scales = tuple["float | Array", ...]
@@ -73,15 +70,12 @@ class Misfit:
         observations: the observations.
         signals: root mean square of what a fit explains of each, in its unit.
         robust: whether outliers are downweighted.
-
-    Attributes:
-        count: number of values of each observation.
     """
 
     def __init__(self, observations: Sequence[Observation], signals: Sequence[float], *, robust: bool) -> None:
         self.observations, self.signals, self.robust = observations, signals, robust
         self._known = [observed.known for observed in observations]
-        self.count = [int(known.sum()) for known in self._known]
+        self.count = [int(known.sum()) for known in self._known]  # of each observation
         self._observed = self._flatten([observed.values for observed in observations])
 
     def row(self, predicted: Prediction) -> Array:
@@ -145,8 +139,7 @@ class Search:
     def __init__(self, runs: Runs, misfit: Misfit, limits: tuple[Array, Array] | None = None) -> None:
         self._runs, self._misfit = runs, misfit
         self._delta = difference_step(runs.job.scene)
-        low, high = np.array([parameter.limits for parameter in runs.job.parameters]).T
-        self._limits = limits or (low, high)
+        self._limits = limits or runs.job.limits
         self._known: dict[bytes, Prediction | None] = {}
         self._neighbours: dict[bytes, Prediction | None] = {}
 
@@ -157,11 +150,8 @@ class Search:
             return solution
         starts = self.alternative_starts()
         self._runs.expected += len(starts)
-        costs = [
-            (self._cost(predicted, solution.scales), n)
-            for n, predicted in enumerate(self._runs.predict_many(starts))
-            if predicted is not None
-        ]
+        predictions = enumerate(self._runs.predict_many(starts))
+        costs = [(self._cost(predicted, solution.scales), n) for n, predicted in predictions if predicted is not None]
         for _, n in sorted(costs)[:2]:
             candidate = self.refine(starts[n])
             # Costs are comparable only with the same sigma.
@@ -189,10 +179,9 @@ class Search:
 
     def _predict(self, x: Array) -> Prediction | None:
         """Predict at x, with a cache."""
-        key = x.tobytes()
-        if key not in self._known:
-            self._known[key] = self._runs.predict_one(x)
-        return self._known[key]
+        if x.tobytes() not in self._known:
+            self._known[x.tobytes()] = self._runs.predict_one(x)
+        return self._known[x.tobytes()]
 
     def refine(self, start: Array) -> Solution:
         """Minimise from a start, alternating with an unknown sigma."""
@@ -245,49 +234,33 @@ class Search:
         return Solution(result.x, predicted, scales, float(result.cost), bool(result.status > 0))
 
     def _differences(self, x: Array, predicted: Prediction, *, signs: tuple[int, ...]) -> Array:
-        neighbours = [
-            [self._shifted(x, n, sign) for sign in signs if sign == 1 or self._has_both_sides(x, n)]
-            for n in range(len(x))
-        ]
+        """Return the Jacobian by differences upward, or downward at a bound; on both sides if `signs` has both."""
+        neighbours = []
+        for low, value, high, unit in zip(self._limits[0], x, self._limits[1], np.eye(len(x), dtype=bool), strict=True):
+            sides = [value + self._delta] if value + self._delta <= high else []
+            if not sides or (-1 in signs and low <= value - self._delta):
+                sides.append(value - self._delta)
+            neighbours.append([np.where(unit, side, x) for side in sides])
         self._runs.expected = max(self._runs.expected, self._runs.count + 3 * len(x))
         # At the end of the search, half of them are known from its last Jacobian.
-        missing = [
-            neighbour for pair in neighbours for neighbour in pair if neighbour.tobytes() not in self._neighbours
-        ]
+        each = [neighbour for pair in neighbours for neighbour in pair]
+        missing = [neighbour for neighbour in each if neighbour.tobytes() not in self._neighbours]
         computed = zip(missing, self._runs.predict_many(missing, predicted.steps), strict=True)
-        self._neighbours = {
-            **self._neighbours,
-            **{neighbour.tobytes(): prediction for neighbour, prediction in computed},
-        }
-        self._neighbours = {
-            neighbour.tobytes(): self._neighbours[neighbour.tobytes()] for pair in neighbours for neighbour in pair
-        }
+        known = self._neighbours | {neighbour.tobytes(): prediction for neighbour, prediction in computed}
+        self._neighbours = {neighbour.tobytes(): known[neighbour.tobytes()] for neighbour in each}
         columns = []
         for n, parameter in enumerate(self._runs.job.parameters):
-            known = [
-                (neighbour[n], prediction)
-                for neighbour in neighbours[n]
-                if (prediction := self._neighbours[neighbour.tobytes()]) is not None
-            ]
-            if not known and len(signs) == 1:
+            pairs = [(neighbour[n], known[neighbour.tobytes()]) for neighbour in neighbours[n]]
+            points = [(side, prediction) for side, prediction in pairs if prediction is not None]
+            if not points and len(signs) == 1:
                 # A downward step may succeed.
                 return self._differences(x, predicted, signs=(1, -1))
-            if not known:
+            if not points:
                 remedy = "give --bounds or another start by --set"
                 raise SceneError([f"{parameter.key}: no run close to its value succeeds; {remedy}"])
-            (x_first, first), (x_second, second) = [*known, (x[n], predicted)][:2]
+            (x_first, first), (x_second, second) = [*points, (x[n], predicted)][:2]
             columns.append((self._misfit.row(first) - self._misfit.row(second)) / (x_first - x_second))
         return np.stack(columns, axis=1)
-
-    def _has_both_sides(self, x: Array, n: int) -> bool:
-        """Return whether both steps of parameter n are within its bounds."""
-        return bool(self._limits[0][n] <= x[n] - self._delta and x[n] + self._delta <= self._limits[1][n])
-
-    def _shifted(self, x: Array, n: int, sign: int) -> Array:
-        """Return x with a step of parameter n: upward if `sign` is 1 and its bound allows, otherwise downward."""
-        shifted = x.copy()
-        shifted[n] += self._delta if sign == 1 and x[n] + self._delta <= self._limits[1][n] else -self._delta
-        return shifted
 
     def _cost(self, predicted: Prediction, scales: Scales) -> float:
         return self._misfit.cost(self._misfit.residuals(predicted, scales))
@@ -346,17 +319,11 @@ class Uncertainty:
 
         return float(t.ppf((1 + 0.95) / 2, self.freedom))
 
-    def combination_deviation(self, exponents: Array) -> float:
-        """Return the standard deviation of a combination of x, shape (n,)."""
-        return float(np.linalg.norm(exponents @ self.root))
-
     @property
     def unidentified(self) -> NDArray[np.bool_]:
         """Mask of the parameters with a component in an unidentified direction, without a valid `shift`, shape (n,)."""
-        return (
-            np.linalg.norm(self.directions[:, self.direction_deviations > MAX_DIRECTION_DEVIATION], axis=1)
-            > MIN_COMPONENT * 50
-        )
+        directions = self.directions[:, self.direction_deviations > MAX_DIRECTION_DEVIATION]
+        return np.linalg.norm(directions, axis=1) > MIN_COMPONENT * 50
 
     def shift(self, rows: Array) -> Array:
         """Return the shift of x due to an error of the predictions, in units of r, shape (numbers,)."""
@@ -390,19 +357,16 @@ def uncertainty(
     independent_root = root = np.sqrt(factor) * directions / singular_values
     independent = float(freedom)
     if error_correlation != (None, None):
-        correlated, independent = _correlated(misfit, singular.U, error_correlation)
-        independent = min(independent, freedom)
-        values, vectors = np.linalg.eigh(correlated)
+        # U^T K U, and the effective number of observations tr(K)^2 / tr(K^2).
+        pairs = zip(misfit.observations, misfit.split(singular.U), strict=True)
+        matrices, squares = zip(
+            *(observed.correlated(part, error_correlation) for observed, part in pairs), strict=True
+        )
+        independent = min(len(singular.U) ** 2 / sum(squares), freedom)
+        values, vectors = np.linalg.eigh(np.sum(matrices, axis=0))
         root = independent_root @ (vectors * np.sqrt(np.maximum(values, 0.0)))
     widening = np.linalg.norm(root, axis=1) / np.linalg.norm(independent_root, axis=1)
     return Uncertainty(scales, factor, freedom, independent, residuals, weighted, singular.Vh.T, root, widening)
-
-
-def _correlated(misfit: Misfit, rows: Array, error_correlation: ErrorCorrelation) -> tuple[Array, float]:
-    """Compute U^T K U, and the effective number of observations tr(K)^2 / tr(K^2)."""
-    pairs = zip(misfit.observations, misfit.split(rows), strict=True)
-    matrices, squares = zip(*(observed.correlated(part, error_correlation) for observed, part in pairs), strict=True)
-    return np.sum(matrices, axis=0), len(rows) ** 2 / sum(squares)
 
 
 # Relative tolerance of the end of an interval.
@@ -429,27 +393,26 @@ class Profile(NamedTuple):
 class Profiler:
     """Profile likelihood of a solution's parameters."""
 
-    def __init__(
-        self, parameters: Sequence[Parameter], misfit: Misfit, solution: Solution, uncertainties: Uncertainty
-    ) -> None:
-        self._misfit, self._solution, self._uncertainties = misfit, solution, uncertainties
+    def __init__(self, runs: Runs, misfit: Misfit, solution: Solution, uncertainties: Uncertainty) -> None:
+        self._runs, self._misfit, self._solution, self._uncertainties = runs, misfit, solution, uncertainties
         self._min_cost = misfit.cost(uncertainties.residuals)
-        self._low, self._high = np.array([parameter.limits for parameter in parameters]).T
+        self._low, self._high = runs.job.limits
 
-    def profiles(self, runs: Runs) -> list[Profile]:
+    def profiles(self) -> list[Profile]:
         """Compute the profiles of all parameters, with both sides of each in parallel."""
-        count = len(self._low)
+        count, runs = len(self._low), self._runs
         sides = {(n, sign): self._side(n, sign) for n in range(count) for sign in (-1, 1)}
         points: dict[tuple[int, int], list[ProfilePoint]] = {side_key: [] for side_key in sides}
-        requests: dict[tuple[int, int], Array | None] = {side_key: next(side, None) for side_key, side in sides.items()}
-        while waiting := [(side_key, x) for side_key, x in requests.items() if x is not None]:
-            runs.expected = max(runs.expected, runs.count + 2 * len(waiting))
-            predicted = runs.predict_many([x for _, x in waiting])
-            for (side_key, _), prediction in zip(waiting, predicted, strict=True):
+        requests = {side_key: x for side_key, side in sides.items() if (x := next(side, None)) is not None}
+        while requests:
+            runs.expected = max(runs.expected, runs.count + 2 * len(requests))
+            predictions = runs.predict_many(list(requests.values()))
+            for side_key, prediction in zip(list(requests), predictions, strict=True):
                 try:
                     requests[side_key] = sides[side_key].send(prediction)
                 except StopIteration as stop:
-                    requests[side_key], points[side_key] = None, stop.value
+                    del requests[side_key]
+                    points[side_key] = stop.value
         return [self._profile(n, points[n, -1], points[n, 1]) for n in range(count)]
 
     def _profile(self, n: int, below: list[ProfilePoint], above: list[ProfilePoint]) -> Profile:
@@ -475,10 +438,8 @@ class Profiler:
             trial = np.clip(x + sign * distance * direction, self._low, self._high)
             trial[n] = x[n] + sign * distance
             cost = yield from self._conditional_minimum(n, trial)
-            rise = (
-                math.sqrt(max(0.0, 2 * (cost - self._min_cost) / self._uncertainties.factor))
-                / self._uncertainties.widening[n]
-            )
+            rise = math.sqrt(max(0.0, 2 * (cost - self._min_cost) / self._uncertainties.factor))
+            rise /= self._uncertainties.widening[n]
             points.append(ProfilePoint(float(trial[n]), sign * rise))
             if abs(rise / quantile - 1) < PROFILE_TOLERANCE or (distance == limit and rise < quantile):
                 break
@@ -556,78 +517,57 @@ def unseen(
     parameters: Sequence[Parameter], x: Array, uncertainties: Uncertainty, *, forces: bool
 ) -> list[UnidentifiedGroup]:
     """Return the groups of unidentifiable parameters; `forces`: whether forces were measured."""
-    unidentified = uncertainties.directions[:, uncertainties.direction_deviations > MAX_DIRECTION_DEVIATION]
+    from scipy.sparse.csgraph import connected_components
+
+    directions = uncertainties.directions[:, uncertainties.direction_deviations > MAX_DIRECTION_DEVIATION]
+    members = np.flatnonzero(np.linalg.norm(directions, axis=1) > MIN_GROUP_COMPONENT)
+    # Parameters that share directions; the projection does not depend on the choice of their basis.
+    is_coupled = np.abs(directions @ directions.T) > MIN_GROUP_COMPONENT**2
+    count, labels = connected_components(is_coupled[np.ix_(members, members)], directed=False)
+    groups = [members[labels == label] for label in range(count)]
     pairs = zip(parameters, x.tolist(), uncertainties.deviations.tolist(), strict=True)
-    relative_errors = np.array([parameter.share(coordinate, deviation) for parameter, coordinate, deviation in pairs])
+    errors = np.array([parameter.share(coordinate, deviation) for parameter, coordinate, deviation in pairs])
     return [
-        _describe_group(parameters, uncertainties, relative_errors, group, unidentified[group], forces=forces)
-        for group in _unidentified_groups(unidentified)
+        _describe_group(
+            [parameters[n] for n in group],
+            float(errors[group].max()),
+            list(_known_combinations(parameters, uncertainties, group, directions[group])),
+            "" if forces else ", or give a force (--forces)",
+        )
+        for group in groups
     ]
 
 
-def _unidentified_groups(directions: Array) -> Iterator[Array]:
-    """Yield the indices of parameters that share unidentified directions."""
-    # The projection does not depend on the choice of the basis.
-    is_coupled = np.abs(directions @ directions.T) > MIN_GROUP_COMPONENT**2
-    remaining = set(np.flatnonzero(np.linalg.norm(directions, axis=1) > MIN_GROUP_COMPONENT).tolist())
-    while remaining:
-        group, new = set[int](), {min(remaining)}
-        while new:
-            group |= new
-            new = {m for n in new for m in remaining if is_coupled[n, m]} - group
-        remaining -= group
-        yield np.array(sorted(group))
+def _known_combinations(
+    parameters: Sequence[Parameter], uncertainties: Uncertainty, group: Array, directions: Array
+) -> Iterator[Combination]:
+    """Yield the identifiable combinations of a group of parameters, with their components in `directions`."""
+    for exponents in _complement(directions):
+        # Exponents close to a multiple of 1/2 are rounded.
+        half = np.round(2 * exponents) / 2
+        all_exponents = np.zeros(len(parameters))
+        all_exponents[group] = np.where(np.abs(exponents - half) < 0.06, half, exponents)
+        powers = {parameters[n].key: float(all_exponents[n]) for n in group if all_exponents[n]}
+        error = float(np.linalg.norm(all_exponents @ uncertainties.root))
+        if error <= MAX_RELATIVE_ERROR:
+            yield Combination(powers, error)
 
 
 def _describe_group(
-    parameters: Sequence[Parameter],
-    uncertainties: Uncertainty,
-    relative_errors: Array,
-    group: Array,
-    directions: Array,
-    *,
-    forces: bool,
+    group: Sequence[Parameter], largest: float, known: list[Combination], remedy: str
 ) -> UnidentifiedGroup:
-    """Describe a group of parameters, and its identifiable combinations.
-
-    Args:
-        parameters: of the fit.
-        uncertainties: of the fit.
-        relative_errors: relative standard error of each parameter.
-        group: indices of the group, shape (m,).
-        directions: components of the group in the unidentified directions, shape (m, directions).
-        forces: whether forces were measured.
-    """
-    keys = [parameters[n].key for n in group]
-    known = []
-    for exponents in _complement(directions):
-        all_exponents = np.zeros(len(parameters))
-        # Exponents close to a multiple of 1/2 are rounded.
-        half = np.round(2 * exponents) / 2
-        exponents = np.where(np.abs(exponents - half) < 0.06, half, exponents)
-        all_exponents[group] = exponents
-        powers = {key: float(power) for key, power in zip(keys, exponents, strict=True) if power}
-        known.append(Combination(powers, uncertainties.combination_deviation(all_exponents)))
-    remedy = "" if forces else ", or give a force (--forces)"
+    """Describe a group of parameters by their largest relative error, and by the combinations that are known."""
+    keys = [parameter.key for parameter in group]
     names = " and ".join([", ".join(keys[:-1]), keys[-1]] if len(keys) > 1 else keys)
-    known = [combination for combination in known if combination.standard_error <= MAX_RELATIVE_ERROR]
-    if known and not all(parameters[n].is_log for n in group):
+    fix = f"fix {'it' if len(keys) == 1 else 'them'}"
+    share = f"only to {rounded(100 * largest)} %" if largest <= MAX_RELATIVE_ERROR else ""
+    if known and not all(parameter.is_log for parameter in group):
         return UnidentifiedGroup(keys, [], f"{names} are not identifiable one by one: fix one{remedy}")
     if not known:
-        pronoun = "it" if len(keys) == 1 else "them"
-        if relative_errors[group].max() <= MAX_RELATIVE_ERROR:
-            return UnidentifiedGroup(
-                keys,
-                [],
-                f"{names}: known only to {rounded(100 * float(relative_errors[group].max()))} %: fix {pronoun}",
-            )
-        return UnidentifiedGroup(keys, [], f"{names}: not identifiable: fix {pronoun}")
-    knowledge = ", ".join(
-        f"{combination} is known to {rounded(100 * combination.standard_error)} %" for combination in known
-    )
-    largest = float(relative_errors[group].max())
-    each = "is not" if largest > MAX_RELATIVE_ERROR else f"only to {rounded(100 * largest)} %"
-    return UnidentifiedGroup(keys, known, f"{knowledge}, each alone {each}: fix one{remedy}")
+        found = f"known {share}" if share else "not identifiable"
+        return UnidentifiedGroup(keys, [], f"{names}: {found}: {fix}")
+    combinations = ", ".join(f"{each} is known to {rounded(100 * each.standard_error)} %" for each in known)
+    return UnidentifiedGroup(keys, known, f"{combinations}, each alone {share or 'is not'}: fix one{remedy}")
 
 
 def _complement(directions: Array) -> Iterator[Array]:

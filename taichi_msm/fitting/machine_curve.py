@@ -18,21 +18,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from taichi_msm.errors import DivergedError, SceneError
+from taichi_msm.errors import DivergedError, SceneError, StageProgressCallback
 from taichi_msm.fitting.least_squares import Misfit, Search, Solution
-from taichi_msm.fitting.machine_model import MachineModel, MachineProblem, contact_keys
-from taichi_msm.fitting.predict import Prediction, Runs, difference_step, mesh_error
+from taichi_msm.fitting.machine_model import MachineModel, MachineProblem
+from taichi_msm.fitting.observation import Array
+from taichi_msm.fitting.predict import FitProblem, Prediction, Runs, difference_step, mesh_error
 from taichi_msm.load.check import check_scene
 from taichi_msm.model.plan import Plan
 from taichi_msm.scene.scene import Scene
-
-Array = NDArray[np.float64]
 
 # Travels of a curve above 0, and its reach beyond the greatest travel if depths of contact are free.
 TRAVELS, CONTACT_MARGIN = 24, 0.05
@@ -53,21 +51,18 @@ MAX_STEPS, MIN_RELATIVE_CHANGE, MIN_CHANGE = 20, 1e-3, 0.05
 # Change of the forces by a change of x of 1 [sigma], below which a parameter is also searched from a smaller value.
 MIN_INFORMATION = 3.0
 
-# Number of starts of the parameters that need no curve.
-RELAXATION_STARTS = 64
+# Number of starts of the parameters that need no curve, and the largest logarithm of their factor.
+RELAXATION_STARTS, START_LOG = 64, np.log(10.0)
 
 # Keys of stiffnesses, which are scaled by the measured forces before the search.
 STIFFNESSES = ("young", "foundation", "structural")
 
-# Largest logarithm of the factor of these starts.
-START_LOG = np.log(10.0)
-
 
 def has_curve(job: object) -> bool:
     """Return whether the tests of a fit are quasi-static, and of a scene with one tool, which grips nothing."""
-    if not (isinstance(job, MachineProblem) and job.scene.time.at_rest):
+    if not isinstance(job, MachineProblem):
         return False
-    return len(job.scene.probes) == 1 and not job.scene.probes[0].grip
+    return job.scene.time.at_rest and len(job.scene.probes) == 1 and not job.scene.probes[0].grip
 
 
 def relax(elastic: Array, branches: Sequence[tuple[float, float]], h: float) -> Array:
@@ -93,8 +88,7 @@ def relax(elastic: Array, branches: Sequence[tuple[float, float]], h: float) -> 
     return force
 
 
-@dataclass(frozen=True, eq=False)
-class _Tangent:
+class _Tangent(NamedTuple):
     """A curve, and its dependence on the parameters."""
 
     x: Array  # coordinates of the parameters, shape (n,)
@@ -104,24 +98,19 @@ class _Tangent:
 
 
 class CurveRuns(Runs):
-    """Predictions of machine tests by a tangent, or curves, with a correction of every frame; see `Runs`.
-
-    Attributes:
-        by_tangent: whether predictions are by the tangent.
-        of_curve: mask of the parameters on which a curve depends, shape (n,).
-        of_contact: mask of the depths of contact, shape (n,).
-    """
+    """Predictions of machine tests by a tangent, or curves, with a correction of every frame; see `Runs`."""
 
     job: MachineProblem
     _predictor: MachineModel
     _tangent: _Tangent
 
-    def __init__(self, *arguments: Any) -> None:
-        super().__init__(*arguments)
+    def __init__(self, job: FitProblem, workers: int | None, progress: StageProgressCallback) -> None:
+        super().__init__(job, 1, progress)
         self._curves: dict[tuple[object, ...], Array] = {}
         self._correction: Array | float = 0.0
-        self.by_tangent = True
+        self.by_tangent = True  # whether predictions are by the tangent
         keys = [parameter.key for parameter in self.job.parameters]
+        # Masks of the parameters on which a curve depends, of depths of contact, and of locks, shape (n,).
         self.of_curve = np.array([not key.startswith(("contact", "tissue.relaxation.")) for key in keys])
         self.of_contact = np.array([key.startswith("contact") for key in keys])
         self._of_lock = np.array([key.endswith(".lock") for key in keys])
@@ -144,10 +133,6 @@ class CurveRuns(Runs):
         distance = np.where(self._of_lock, -np.expm1(-distance), distance)
         return self._predict(values, tangent.reach, tangent.forces * np.exp(distance @ tangent.slopes))
 
-    def predict_many(self, coordinates: Sequence[Array], steps: int | None = None) -> list[Prediction | None]:
-        """Predict at several x as `predict_one` does."""
-        return [self.predict_one(x, steps) for x in coordinates]
-
     def predict_coarse(self, x: Array, halvings: int) -> Prediction | None:
         """Predict by a curve with the cells per side halved `halvings` times; None if that fails."""
         try:
@@ -161,12 +146,7 @@ class CurveRuns(Runs):
         return mesh_error(self._plan_curve(values, self._reach(values)), self._report_progress)
 
     def run_curve(self, x: Array, halvings: int = 0) -> Prediction:
-        """Predict by a curve at x; raises as `ForwardModel.predict` does.
-
-        Args:
-            x: coordinates of the parameters, shape (n,).
-            halvings: number of halvings of the cells per side.
-        """
+        """Predict by a curve at x, of halved cells; raises as `ForwardModel.predict` does."""
         values = self._predictor.values(x)
         reach = self._reach(values)
         return self._predict(values, reach, self._forces(values, reach, halvings))
@@ -184,10 +164,9 @@ class CurveRuns(Runs):
     def with_valid_shares(self, x: Array) -> Array:
         """Return x with free shares reduced, if the sum of all shares is too large."""
         values = self._predictor.values(x)
-        branches = enumerate(self._predictor.data.get("tissue", {}).get("relaxation", ()))
-        shares = {f"tissue.relaxation.{n}.share": float(branch["share"]) for n, branch in branches}
-        free = [key for key in shares if key in values]
-        total = sum((shares | {key: values[key] for key in free}).values())
+        branches = self._branches(values)
+        free = [key for n in range(len(branches)) if (key := f"tissue.relaxation.{n}.share") in values]
+        total = sum(share for share, _ in branches)
         if total <= MAX_SHARES or not free:
             return x
         of_free = sum(values[key] for key in free)
@@ -214,23 +193,31 @@ class CurveRuns(Runs):
         return self._tangent.reach
 
     def _reach(self, values: dict[str, float]) -> float:
-        return self.job.reach(values) * (1 + CONTACT_MARGIN * self.of_contact.any())
+        """Return the greatest travel of a curve [m]; SceneError: no test has any."""
+        if not (reach := self.job.reach(values)):
+            raise SceneError(["contact: no test goes deeper; take a smaller depth"])
+        return reach * (1 + CONTACT_MARGIN * self.of_contact.any())
+
+    def _branches(self, values: dict[str, float]) -> list[tuple[float, float]]:
+        """Return share and time [s] of every branch of relaxation."""
+        branches = []
+        for n, branch in enumerate(self._predictor.data.get("tissue", {}).get("relaxation", ())):
+            key = f"tissue.relaxation.{n}"
+            branches.append((values.get(f"{key}.share", branch["share"]), values.get(f"{key}.time", branch["time"])))
+        return branches
 
     def _predict(self, values: dict[str, float], reach: float, forces: Array) -> Prediction:
         """Predict the tests by a curve."""
         from scipy.interpolate import PchipInterpolator
 
         curve = PchipInterpolator(np.linspace(0, reach, TRAVELS + 1), forces)
-        branches = [
-            tuple(values.get(f"tissue.relaxation.{n}.{key}", branch[key]) for key in ("share", "time"))
-            for n, branch in enumerate(self._predictor.data.get("tissue", {}).get("relaxation", ()))
-        ]
+        branches = self._branches(values)
         # Larger shares are scaled, as the search would not leave a wall there.
         scale = min(1.0, MAX_SHARES / max(sum(share for share, _ in branches), NO_SHARE))
         branches = [(scale * share, time) for share, time in branches]
         of_tests = [
             relax(curve(loading.travel(values.get(key))), branches, 1 / loading.rate)
-            for loading, key in zip(self.job.tests, contact_keys(len(self.job.tests)), strict=True)
+            for loading, key in zip(self.job.tests, self.job.contact_keys, strict=True)
         ]
         return Prediction((np.concatenate(of_tests)[:, None] + self._correction,), 1, np.zeros(1))
 
@@ -241,7 +228,7 @@ class CurveRuns(Runs):
         if key not in self._curves:
             self._report_progress()
             simulation, plan = self._predictor.start(self._plan_curve(values, reach), None, halvings)
-            self._curves[key] = self._predictor.forces(simulation, plan.grid.frames, self._report_progress)[:, 0]
+            self._curves[key] = self._predictor.forces(simulation, plan, self._report_progress)[:, 0]
             self.count += 1
         return self._curves[key]
 
@@ -251,8 +238,8 @@ class CurveRuns(Runs):
         if branches := data.get("tissue", {}).get("relaxation"):
             no_branches = [{**branch, "share": NO_SHARE} for branch in branches]
             data = {**data, "tissue": {**data["tissue"], "relaxation": no_branches}}
-        time, travel = np.arange(TRAVELS + 1.0), np.linspace(0, reach, TRAVELS + 1)
-        return check_scene(Scene(**self.job.approach.place(data, time, travel, 1.0)), self._predictor.maps)
+        placed = self.job.approach.place(data, np.linspace(0, reach, TRAVELS + 1), 1.0)
+        return check_scene(Scene(**placed), self._predictor.maps)
 
 
 def search_by_curve(runs: CurveRuns, misfit: Misfit, start: Array, first: Prediction) -> tuple[Search, Solution]:
@@ -300,8 +287,7 @@ def _scaled(runs: CurveRuns, misfit: Misfit, x: Array, initial: Prediction) -> A
     measured = predicted - misfit.of(initial)
     ratio = np.linalg.norm(measured) / max(float(np.linalg.norm(predicted)), 1e-300)
     is_stiffness = [parameter.is_log and parameter.path[-1] in STIFFNESSES for parameter in runs.job.parameters]
-    low, high = np.array([parameter.limits for parameter in runs.job.parameters]).T
-    return np.clip(np.where(is_stiffness, x + np.log(ratio), x), low, high)
+    return np.clip(np.where(is_stiffness, x + np.log(ratio), x), *runs.job.limits)
 
 
 def _descend(runs: CurveRuns, misfit: Misfit, start: Array, *, by_tests: bool) -> Solution:
@@ -342,7 +328,7 @@ def _descend(runs: CurveRuns, misfit: Misfit, start: Array, *, by_tests: bool) -
 
 def _limits(runs: CurveRuns, x: Array, region: Array) -> tuple[Array, Array]:
     """Return the bounds of x within the trust region, and of depths of contact within the reach of the curve."""
-    low, high = np.array([parameter.limits for parameter in runs.job.parameters]).T
+    low, high = runs.job.limits
     margin = np.array([CONTACT_MARGIN * runs.reach / (parameter.scale or 1) for parameter in runs.job.parameters])
     below = np.where(runs.of_contact, np.minimum(region, margin), region)
     return np.maximum(low, x - below), np.minimum(high, x + region)

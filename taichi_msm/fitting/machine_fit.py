@@ -1,31 +1,17 @@
-"""Fit of machine tests: options, tables, and explanations of a rejected model."""
+"""Fitted machine tests, and explanations of a rejected model."""
 
 from __future__ import annotations
 
-import secrets
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from taichi_msm.errors import SceneError
-from taichi_msm.fitting.machine_model import MachineProblem, contact_keys, machine_parameters, observe_tests
-from taichi_msm.fitting.machine_tables import cut_window, read_machine_test
-from taichi_msm.fitting.machine_test import Loading, build_loading, find_approach, late_contact_note
-from taichi_msm.fitting.parameters import Bounds, Method, as_data, rounded
-from taichi_msm.fitting.predict import without_outputs
-from taichi_msm.scene.scene import Scene
-
-Array = NDArray[np.float64]
-
-TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".xlsx")
-TABLE_OPTIONS = ("columns", "sheet", "block", "window", "rate", "contact")
-
-# Options of observed points.
-POINT_OPTIONS = ("sigma", "correlation", "drift", "resolution")
+from taichi_msm.fitting.machine_model import MachineProblem
+from taichi_msm.fitting.machine_test import Loading
+from taichi_msm.fitting.observation import Array
+from taichi_msm.fitting.parameters import rounded
 
 # The tool is held while the depth differs by at most this share of the travel.
 HELD_SHARE = 0.02
@@ -58,101 +44,27 @@ class FittedTest:
     def as_json(self) -> dict[str, Any]:
         """Return JSON data, as in fit.json."""
         loading = self.loading
-        numbers = {"contact": self.contact, "noise": loading.noise, "peak": loading.peak}
         return {
             "name": loading.test.name,
-            **numbers,
+            "contact": self.contact,
+            "noise": loading.noise,
+            "peak": loading.peak,
             "residual_force": self.residual,
             "frames": len(loading.force),
         }
 
 
-def is_table(path: object) -> bool:
-    """Return whether a path is that of a table of a testing machine, by its suffix."""
-    return isinstance(path, (str, Path)) and str(path).lower().endswith(TABLE_SUFFIXES)
-
-
-def table_paths(observed: Any) -> list[str]:
-    """Return the paths of tables; an empty list for other observations; SceneError: both are given."""
-    paths = [observed] if isinstance(observed, (str, Path)) or not isinstance(observed, Sequence) else list(observed)
-    others = [path for path in paths if not is_table(path)]
-    if len(others) == len(paths) == 1:
-        return []
-    if others or not paths:
-        fault = "of several files, each must be a table of a testing machine"
-        raise SceneError([f"{others[0] if others else 'observed'}: {fault}, {', '.join(TABLE_SUFFIXES)}"])
-    return [str(path) for path in paths]
-
-
-def read_machine_problem(
-    paths: Sequence[str],
-    scene: Scene,
-    free: Sequence[str],
-    bounds: Mapping[str, Bounds],
-    forces: object,
-    method: Method,
-) -> MachineProblem:
-    """Read tables of a testing machine, and build the fit.
-
-    Args:
-        paths: the tables.
-        scene: the scene with its initial values.
-        free: keys of the parameters.
-        bounds: smallest and largest values by key.
-        forces: forces of another file, which are refused.
-        method: options of the fit.
-
-    Raises:
-        SceneError: when a table, the scene or an option is invalid.
-    """
-    if forces is not None:
-        raise SceneError([f"--forces: {paths[0]} has the forces; leave the option out"])
-    if unused := [name for name in POINT_OPTIONS if method.get(name) is not None]:
-        raise SceneError([f"--{unused[0]}: is of observed points, and {paths[0]} has none; leave the option out"])
-    rate, contacts = method.get("rate"), list(method.get("contact") or ())
-    if rate is not None and not 0 < rate < np.inf:
-        raise SceneError([f"--rate {rate:g}: take a number of frames per second, above 0"])
-    if len(contacts) not in (0, 1, len(paths)):
-        raise SceneError([f"--contact: {len(contacts)} depths of {len(paths)} tables; give one, or one per table"])
-    approach = find_approach(scene)
-    tests = []
-    for n, path in enumerate(paths):
-        test = read_machine_test(path, method.get("columns") or (), method.get("sheet"), method.get("block"))
-        if (window := method.get("window")) is not None:
-            test = cut_window(test, *window)
-        contact = contacts[n if len(contacts) > 1 else 0] if contacts else None
-        loading = build_loading(test, scene, rate, contact, is_clamp=approach.is_clamp)
-        key = contact_keys(len(paths))[n]
-        is_found = contact is None and not approach.is_clamp and key not in free
-        if is_found and (note := late_contact_note(loading, key)):
-            loading = replace(loading, test=replace(loading.test, notes=(*loading.test.notes, note)))
-        tests.append(loading)
-    parameters = machine_parameters(scene, tests, free, bounds, approach.probe)
-    placed = Scene(**tests[0].place(as_data(without_outputs(scene)), approach))
-    observations = observe_tests(tests, approach)
-    if (count := sum(len(loading.force) for loading in tests)) <= len(parameters):
-        fault = f"{count} frames, too few for {len(parameters)} parameters; raise --rate"
-        raise SceneError([f"{observations.name}: {fault}"])
-    return MachineProblem(secrets.token_hex(8), placed, parameters, (observations,), tuple(tests), approach)
-
-
 def fitted_tests(job: MachineProblem, values: Mapping[str, float], forces: Array) -> tuple[FittedTest, ...]:
     """Split fitted forces, shape (frames of all tests, 1), by test; `values`: fitted values by key."""
     ends = np.cumsum([len(loading.force) for loading in job.tests])[:-1]
-    keys = contact_keys(len(job.tests))
     return tuple(
         FittedTest(loading, values.get(key, loading.contact), force)
-        for loading, key, force in zip(job.tests, keys, np.split(forces[:, 0], ends), strict=True)
+        for loading, key, force in zip(job.tests, job.contact_keys, np.split(forces[:, 0], ends), strict=True)
     )
 
 
 def unknown_notes(tests: Sequence[FittedTest], values: Mapping[str, float]) -> Iterator[str]:
-    """Yield the reasons for parameters that the tests do not identify, one per line.
-
-    Args:
-        tests: the fitted tests.
-        values: values of these parameters, by key.
-    """
+    """Yield the reasons for parameters that the tests do not identify, with their values by key."""
     for key, value in values.items():
         if key.startswith("tissue.relaxation.") and key.endswith(".time"):
             shortest = min(fitted.rise for fitted in tests)
@@ -170,22 +82,17 @@ def unknown_notes(tests: Sequence[FittedTest], values: Mapping[str, float]) -> I
 
 
 def explanations(tests: Sequence[FittedTest], *, fits_contact: bool) -> Iterator[str]:
-    """Yield reasons that a table shows for the rejection of a model, one per line.
-
-    Args:
-        tests: the fitted tests.
-        fits_contact: whether the depths of contact are parameters.
-    """
+    """Yield reasons that a table shows for the rejection of a model, where depths of contact are parameters or not."""
     for fitted in tests:
-        for reason in _explain(fitted, fits_contact=fits_contact):
+        if reason := _explain(fitted, fits_contact=fits_contact):
             yield f"{fitted.loading.test.name}: {reason}"
 
 
-def _explain(fitted: FittedTest, *, fits_contact: bool) -> Iterator[str]:
+def _explain(fitted: FittedTest, *, fits_contact: bool) -> str:
+    """Return the reason that a table shows, or an empty text."""
     loading, predicted = fitted.loading, fitted.force
     if float(predicted @ loading.force) < 0:
-        yield "the measured force acts against the model's: is the sign of the path, or of a column, wrong?"
-        return
+        return "the measured force acts against the model's: is the sign of the path, or of a column, wrong?"
     test, travel = loading.test, loading.travel(fitted.contact)
     peak = int(test.force.argmax())
     reach = float(travel.max())
@@ -195,11 +102,10 @@ def _explain(fitted: FittedTest, *, fits_contact: bool) -> Iterator[str]:
     at_ends = np.interp(test.time[[peak, last]], loading.time, predicted)
     model_fall = 1 - float(at_ends[1] / at_ends[0]) if last > peak and at_ends[0] > 0 else 0.0
     if fall > MIN_FALL_SHARE and model_fall < 0.5 * fall:
-        yield (
+        return (
             f"the force falls by {100 * fall:.0f} % while the tool is held, and the model's by "
             f"{100 * max(model_fall, 0.0):.0f} %: relaxation? Free the shares and times of tissue.relaxation"
         )
-        return
     at_peak = float(travel[loading.force.argmax()])
     rising = slice(0, int(np.argmax(travel >= (1 - HELD_SHARE) * at_peak)) + 1)
     depth, measured, model = travel[rising], loading.force[rising], predicted[rising]
@@ -211,19 +117,19 @@ def _explain(fitted: FittedTest, *, fits_contact: bool) -> Iterator[str]:
     (shift, *_), by_contact = _explained(residual, slope)
     _, by_curvature = _explained(residual, model, model * depth / reach)
     if not fits_contact and abs(shift) > MIN_CONTACT_SHARE * reach and by_contact > max(0.7, by_curvature - 0.05):
-        yield (
+        return (
             f"a contact at {fitted.contact + shift:.4g} m of the table, not {fitted.contact:.4g} m, would explain "
             f"{rounded(100 * by_contact)} % of the residual: give --contact, or --free contact"
         )
-        return
     halves = [float(np.interp(0.5 * depth[-1], np.maximum.accumulate(depth), force)) for force in (measured, model)]
     shares = [100 * half / float(force[-1]) for half, force in zip(halves, (measured, model), strict=True)]
-    if abs(shares[0] - shares[1]) > 100 * MIN_CURVATURE_SHARE:
-        way = "more" if shares[0] < shares[1] else "less"
-        yield (
-            f"at half the depth the force is {rounded(shares[0])} % of that at the peak, and the model's "
-            f"{rounded(shares[1])} %: the tissue stiffens {way} with the depth: lock? Free or change it"
-        )
+    if abs(shares[0] - shares[1]) <= 100 * MIN_CURVATURE_SHARE:
+        return ""
+    way = "more" if shares[0] < shares[1] else "less"
+    return (
+        f"at half the depth the force is {rounded(shares[0])} % of that at the peak, and the model's "
+        f"{rounded(shares[1])} %: the tissue stiffens {way} with the depth: lock? Free or change it"
+    )
 
 
 def _explained(residual: Array, *columns: Array) -> tuple[Array, float]:

@@ -1,31 +1,51 @@
-"""Forward model of machine tests: a run per test with the same parameters, and the forces at its frames."""
+"""Fit of machine tests: a run per test with the same parameters, and the forces at its frames."""
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from taichi_msm.errors import Pause, SceneError
 from taichi_msm.fitting.forces import Forces
-from taichi_msm.fitting.machine_test import Approach, Loading
-from taichi_msm.fitting.observation import ObservationModel
-from taichi_msm.fitting.parameters import Bounds, Parameter, make_parameters, with_values
-from taichi_msm.fitting.predict import FitProblem, ForwardModel, Prediction
+from taichi_msm.fitting.machine_tables import cut_window, read_machine_test
+from taichi_msm.fitting.machine_test import Approach, Loading, build_loading, find_approach, late_contact_note
+from taichi_msm.fitting.observation import Array, ObservationModel
+from taichi_msm.fitting.parameters import Bounds, Method, Parameter, as_data, make_parameters, with_values
+from taichi_msm.fitting.predict import FitProblem, ForwardModel, Prediction, without_outputs
 from taichi_msm.load.check import check_scene
 from taichi_msm.model.plan import Plan
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 
-Array = NDArray[np.float64]
+TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".xlsx")
+TABLE_OPTIONS = ("columns", "sheet", "block", "window", "rate", "contact")
+
+# Options of observed points.
+POINT_OPTIONS = ("sigma", "correlation", "drift", "resolution")
 
 
-def contact_keys(count: int) -> list[str]:
-    """Return the keys of the depths of contact of a number of tests."""
-    return ["contact"] if count == 1 else [f"contact.{n}" for n in range(count)]
+@dataclass(frozen=True, eq=False)
+class MachineForces(Forces, ObservationModel):
+    """Forces at the frames of all tests along the direction of the tool, of shape (frames, 1)."""
+
+    approach: Approach
+
+    def build_model(self, scene: Scene, frames: int) -> MachineForces:
+        """Return the map from the run of a test, which is the same for all."""
+        return self
+
+    def record(self, simulation: Simulation) -> Array:
+        """Return the force of the tool in the current frame [N], shape (3,)."""
+        return np.array(simulation.forces()[self.approach.probe].force)
+
+    def predict(self, recorded: Array) -> Array:
+        """Return the forces along the direction of the tool at all frames of a test [N], shape (frames, 1)."""
+        return np.asarray(recorded @ self.approach.direction[:, None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,28 +58,30 @@ class MachineProblem(FitProblem):
     tests: tuple[Loading, ...]
     approach: Approach
 
+    @property
+    def contact_keys(self) -> list[str]:
+        """Keys of the depths of contact of all tests."""
+        return contact_keys(len(self.tests))
+
     def build_model(self, threads: int | None) -> ForwardModel:
         """Build the forward model of the tests."""
         return MachineModel(self, threads)
 
-    def fitted_data(self, data: dict[str, Any], values: Mapping[str, float]) -> dict[str, Any]:
-        """Return a scene's data with parameter values by key, and with the path and the times of the first test."""
-        return self.place(data, values, 0)
-
-    def place(self, data: dict[str, Any], values: Mapping[str, float], n: int) -> dict[str, Any]:
+    def fitted_data(self, data: dict[str, Any], values: Mapping[str, float], n: int = 0) -> dict[str, Any]:
         """Return a scene's data with parameter values, by key, and with the path and the times of test n."""
-        contact = values.get(contact_keys(len(self.tests))[n])
-        return self.tests[n].place(self.with_scene_values(data, values), self.approach, contact)
+        test, contact = self.tests[n], values.get(self.contact_keys[n])
+        data = self.with_scene_values(data, values)
+        return self.approach.place(data, test.travel(contact), test.rate)
 
     def with_scene_values(self, data: dict[str, Any], values: Mapping[str, float]) -> dict[str, Any]:
         """Return a scene's data with parameter values by key, except depths of contact."""
-        of_scene = [parameter for parameter in self.parameters if parameter.key not in contact_keys(len(self.tests))]
-        return with_values(data, of_scene, [values[parameter.key] for parameter in of_scene])
+        of_scene = [parameter for parameter in self.parameters if parameter.key not in self.contact_keys]
+        return with_values(data, of_scene, values)
 
     def reach(self, values: Mapping[str, float]) -> float:
         """Return the greatest travel of all tests [m] with parameter values by key."""
-        keys = contact_keys(len(self.tests))
-        return max(float(test.travel(values.get(key)).max()) for test, key in zip(self.tests, keys, strict=True))
+        pairs = zip(self.tests, self.contact_keys, strict=True)
+        return max(float(test.travel(values.get(key)).max()) for test, key in pairs)
 
 
 class MachineModel(ForwardModel):
@@ -79,48 +101,104 @@ class MachineModel(ForwardModel):
         """Simulate all tests with the parameters at x; arguments and errors as of `ForwardModel.predict`."""
         forces, most_steps = [], 0
         for n in range(len(self.job.tests)):
-            simulation, plan = self.start(self.plan(x, n), steps, coarse)
-            forces.append(self.forces(simulation, plan.grid.frames, pause))
+            data = self.job.fitted_data(self.data, self.values(x), n)
+            simulation, plan = self.start(check_scene(Scene(**data), self.maps), steps, coarse)
+            forces.append(self.forces(simulation, plan, pause))
             most_steps = max(most_steps, plan.grid.steps_per_frame)
         return Prediction((np.concatenate(forces),), most_steps, np.zeros(1))
 
-    def forces(self, simulation: Simulation, frames: int, pause: Pause) -> Array:
-        """Return the forces along the tool's direction in a run of a number of frames [N], shape (frames + 1, 1)."""
+    def forces(self, simulation: Simulation, plan: Plan, pause: Pause) -> Array:
+        """Run a simulation to its end; return the forces along the tool's direction [N], shape (frames, 1)."""
         (observed,) = self.job.observations
-        model = observed.build_model(self.job.scene, frames + 1)
-        (recorded,) = self.record([model], simulation, frames + 1, pause)
+        frames = plan.grid.frames + 1
+        model = observed.build_model(plan.scene, frames)
+        (recorded,) = self.record([model], simulation, frames, pause)
         return model.predict(recorded)
 
-    def plan(self, x: Array, n: int = 0) -> Plan:
-        """Plan the scene of test n with the parameters at x; SceneError: it is not valid."""
-        return check_scene(Scene(**self.job.place(self.data, self.values(x), n)), self.maps)
 
-    def values(self, x: Array) -> dict[str, float]:
-        """Return the parameter values by key at x; SceneError: they are out of range."""
-        values = {
-            parameter.key: parameter.value(coordinate)
-            for parameter, coordinate in zip(self.job.parameters, x.tolist(), strict=True)
-        }
-        if not np.isfinite(list(values.values())).all():
-            raise SceneError(["the values are out of range"])
-        return values
+def contact_keys(count: int) -> list[str]:
+    """Return the keys of the depths of contact of a number of tests."""
+    return ["contact"] if count == 1 else [f"contact.{n}" for n in range(count)]
 
 
-def machine_parameters(
-    scene: Scene, tests: Sequence[Loading], free: Sequence[str], bounds: Mapping[str, Bounds], probe: int
-) -> tuple[Parameter, ...]:
-    """Build the parameters of the keys `free`, among them depths of contact.
+def is_table(path: object) -> bool:
+    """Return whether a path is that of a table of a testing machine, by its suffix."""
+    return isinstance(path, (str, Path)) and str(path).lower().endswith(TABLE_SUFFIXES)
+
+
+def table_paths(observed: Any) -> list[str]:
+    """Return the paths of tables; an empty list for other observations; SceneError: both are given."""
+    paths = [observed] if isinstance(observed, (str, Path)) or not isinstance(observed, Sequence) else list(observed)
+    others = [path for path in paths if not is_table(path)]
+    if len(others) == len(paths) == 1:
+        return []
+    if others or not paths:
+        fault = "of several files, each must be a table of a testing machine"
+        raise SceneError([f"{others[0] if others else 'observed'}: {fault}, {', '.join(TABLE_SUFFIXES)}"])
+    return [str(path) for path in paths]
+
+
+def read_machine_problem(
+    paths: Sequence[str],
+    scene: Scene,
+    free: Sequence[str],
+    bounds: Mapping[str, Bounds],
+    forces: object,
+    method: Method,
+) -> MachineProblem:
+    """Read tables of a testing machine, and build the fit.
 
     Args:
+        paths: the tables.
         scene: the scene with its initial values.
-        tests: the machine tests.
-        free: keys.
+        free: keys of the parameters.
         bounds: smallest and largest values by key.
-        probe: index of the tool.
+        forces: forces of another file, which are refused.
+        method: options of the fit.
 
     Raises:
-        SceneError: lists all faults.
+        SceneError: when a table, the scene or an option is invalid.
     """
+    if forces is not None:
+        raise SceneError([f"--forces: {paths[0]} has the forces; leave the option out"])
+    if unused := [name for name in POINT_OPTIONS if method.get(name) is not None]:
+        raise SceneError([f"--{unused[0]}: is of observed points, and {paths[0]} has none; leave the option out"])
+    rate, contacts = method.get("rate"), list(method.get("contact") or ())
+    if rate is not None and not 0 < rate < np.inf:
+        raise SceneError([f"--rate {rate:g}: take a number of frames per second, above 0"])
+    if len(contacts) not in (0, 1, len(paths)):
+        raise SceneError([f"--contact: {len(contacts)} depths of {len(paths)} tables; give one, or one per table"])
+    approach, tests = find_approach(scene), []
+    for n, (path, key) in enumerate(zip(paths, contact_keys(len(paths)), strict=True)):
+        test = read_machine_test(path, method.get("columns") or (), method.get("sheet"), method.get("block"))
+        if (window := method.get("window")) is not None:
+            test = cut_window(test, *window)
+        contact = contacts[n if len(contacts) > 1 else 0] if contacts else None
+        loading = build_loading(test, scene, rate, contact, is_clamp=approach.is_clamp)
+        is_found = contact is None and not approach.is_clamp and key not in free
+        if is_found and (note := late_contact_note(loading, key)):
+            loading = replace(loading, test=replace(loading.test, notes=(*loading.test.notes, note)))
+        tests.append(loading)
+    parameters = _make_parameters(scene, tests, free, bounds, approach.probe)
+    first, lengths = tests[0], [len(loading.force) for loading in tests]
+    placed = approach.place(as_data(without_outputs(scene)), first.travel(), first.rate)
+    observations = MachineForces(
+        ", ".join(loading.test.name for loading in tests),
+        np.concatenate([loading.scene_time for loading in tests]),
+        np.concatenate([loading.force for loading in tests])[:, None],
+        np.repeat([loading.sigma for loading in tests], lengths),
+        approach,
+    )
+    if sum(lengths) <= len(parameters):
+        fault = f"{sum(lengths)} frames, too few for {len(parameters)} parameters; raise --rate"
+        raise SceneError([f"{observations.name}: {fault}"])
+    return MachineProblem(secrets.token_hex(8), Scene(**placed), parameters, (observations,), tuple(tests), approach)
+
+
+def _make_parameters(
+    scene: Scene, tests: Sequence[Loading], free: Sequence[str], bounds: Mapping[str, Bounds], probe: int
+) -> tuple[Parameter, ...]:
+    """Build the parameters of the keys `free`, among them depths of contact; `probe`: index of the tool."""
     contacts = contact_keys(len(tests))
     for key in free:
         if key.partition(".")[0] == "contact" and key not in contacts:
@@ -134,55 +212,13 @@ def machine_parameters(
         parameters = {parameter.key: parameter for parameter in make_parameters(scene, of_scene, limits)}
     for key, test in zip(contacts, tests, strict=True):
         if key in free:
-            parameters[key] = _contact_parameter(key, test, bounds.get(key))
+            # Depths of contact are in metres of the table, and units of the range of depths with a motion of the tool.
+            low, high = first, last = float(test.depth[0]), float(test.depth.max())
+            if key in bounds:
+                low, high = max(first, bounds[key][0]), min(last, bounds[key][1])
+            if not (low <= test.contact <= high and low < high):
+                fault = f"the search begins at {test.contact:.4g} m, and the table's depths end at {last:.4g} m"
+                remedy = "take bounds around the start, or another start by --contact"
+                raise SceneError([f"--bounds {key}: {fault}; {remedy}"])
+            parameters[key] = Parameter(key, test.contact, low, high, high - low)
     return tuple(parameters[key] for key in free)
-
-
-def _contact_parameter(key: str, test: Loading, bounds: Bounds | None) -> Parameter:
-    """Build the parameter of a depth of contact [m of the table], in units of the range of depths."""
-    low, high = test.contact_range
-    if bounds is not None:
-        low, high = max(low, bounds[0]), min(high, bounds[1])
-    if not (low <= test.contact <= high and low < high):
-        end = test.contact_range[1]
-        found = f"the search begins at {test.contact:.4g} m, and the table's depths end at {end:.4g} m"
-        raise SceneError([f"--bounds {key}: {found}; take bounds around the start, or another start by --contact"])
-    return Parameter(key, test.contact, low, high, high - low)
-
-
-class MachineForceModel(ObservationModel):
-    """Map from the run of a machine test to the forces at its frames."""
-
-    def __init__(self, approach: Approach) -> None:
-        self._approach = approach
-
-    def record(self, simulation: Simulation) -> Array:
-        """Return the force of the tool in the current frame [N], shape (3,)."""
-        return np.array(simulation.forces()[self._approach.probe].force)
-
-    def predict(self, recorded: Array) -> Array:
-        """Return the forces along the direction of the tool at all frames [N], shape (frames, 1)."""
-        return np.asarray(recorded @ self._approach.direction[:, None])
-
-
-@dataclass(frozen=True, eq=False)
-class MachineForces(Forces):
-    """Forces at the frames of all tests along the direction of the tool, of shape (frames, 1)."""
-
-    approach: Approach
-
-    def build_model(self, scene: Scene, frames: int) -> MachineForceModel:
-        """Build the map from the run of a test."""
-        return MachineForceModel(self.approach)
-
-
-def observe_tests(tests: Sequence[Loading], approach: Approach) -> MachineForces:
-    """Return the forces of machine tests."""
-    lengths = [len(loading.force) for loading in tests]
-    return MachineForces(
-        ", ".join(loading.test.name for loading in tests),
-        np.concatenate([loading.scene_time for loading in tests]),
-        np.concatenate([loading.force for loading in tests])[:, None],
-        np.repeat([loading.sigma for loading in tests], lengths),
-        approach,
-    )

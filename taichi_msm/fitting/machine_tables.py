@@ -1,32 +1,23 @@
 """Reader of tests of a testing machine: time, depth and force from a text table or a workbook.
 
 A table is a row of names, perhaps a row of units, and rows of numbers. A file may have several of them, blocks, and
-other lines before, between and after them.
+other lines before, between and after them. Names are English, French or German; --columns chooses any other.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+import math
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import SceneError
-from taichi_msm.fitting.table_columns import (
-    Choice,
-    Column,
-    find_candidates,
-    is_header,
-    is_units,
-    missing_header,
-    parse_choices,
-    select_columns,
-)
-from taichi_msm.fitting.table_grids import WORKBOOK_SUFFIX, Grid, Row, choose_sheet, read_text, read_workbook
-from taichi_msm.fitting.table_numbers import VALUE_START, find_mixed_marks, parse_number
+from taichi_msm.errors import SceneError, did_you_mean
+from taichi_msm.fitting.tables import LETTER, WORKBOOK_SUFFIX, Grid, Row, parse_number, read_text, read_workbook
 
 Array = NDArray[np.float64]
 
@@ -35,26 +26,64 @@ MIN_ROWS = 10
 
 TORE = "it tore"
 
+EXPECTED = f"name a table of a testing machine: .csv, .tsv, .txt or {WORKBOOK_SUFFIX}"
+
+# Standard gravity [m/s2]: a kilogram-force in newtons.
+GRAVITY = 9.80665
+
+# Names of the quantities; and the ends of German compounds: Prüfzeit, Standardweg, Standardkraft.
+WORDS = {
+    "time": {"time", "temps", "zeit"},
+    "depth": {"depth", "displacement", "indentation", "extension", "elongation", "allongement", "stroke", "position"}
+    | {"travel", "distance", "weg"},
+    "force": {"force", "load", "fz", "kraft"},
+}
+ENDINGS = {"time": "zeit", "depth": "weg", "force": "kraft"}
+# Units in SI units, the usual one first.
+UNITS = {
+    "time": {"s": 1.0, "ms": 1e-3, "min": 60.0},
+    "depth": {"mm": 1e-3, "m": 1.0, "cm": 1e-2, "um": 1e-6},
+    "force": {"N": 1.0, "mN": 1e-3, "kN": 1e3, "gf": 1e-3 * GRAVITY, "kgf": GRAVITY},
+}
+# Other spellings: texture analysers write sec and g.
+UNIT_ALIASES = {"sec": "s", "g": "gf", "kg": "kgf", "µm": "um", "\N{GREEK SMALL LETTER MU}m": "um"}
+
+# A name and its unit: Time, s; Fz [gf]; Force (mN); Weg / mm; Force_N; Kraft in N.
+UNIT_PATTERN = re.compile(r"(.*?)[\s,/_\[(]+(?:in\s+)?([^\s,/_\[\]()]+)[\])]?")
+
+# A cell that stands for a value, valid or not: a number, NaN, or an error or a formula of a workbook.
+VALUE_START = re.compile(r"[+\-\N{MINUS SIGN}]?[.,]?\d|[+-]?(nan|inf)|[#=]", re.ASCII | re.IGNORECASE)
+
 
 @dataclass(frozen=True)
 class MachineTest:
-    """A test of a testing machine.
+    """A test of a testing machine."""
 
-    Attributes:
-        name: the file, and the sheet and block where there is a choice.
-        time: times, increasing [s], shape (n,).
-        depth: depths or elongations; their largest magnitude is positive [m], shape (n,).
-        force: forces; their largest magnitude is positive [N], shape (n,).
-        digit: last digit of the forces in the file [N].
-        notes: sentences about choices of the reader, and about the test.
-    """
+    name: str  # of the file, and the sheet and block where there is a choice
+    time: Array  # increasing [s], shape (n,)
+    depth: Array  # depths or elongations; their largest magnitude is positive [m], shape (n,)
+    force: Array  # their largest magnitude is positive [N], shape (n,)
+    digit: float  # last digit of the forces in the file [N]
+    notes: tuple[str, ...] = ()  # sentences about choices of the reader, and about the test
 
-    name: str
-    time: Array
-    depth: Array
-    force: Array
-    digit: float
-    notes: tuple[str, ...] = ()
+
+@dataclass(frozen=True)
+class _Block:
+    """A header, its row of units, its other rows with content, and the row after the last."""
+
+    header: int
+    units: int | None
+    rows: list[int]
+    end: int
+
+
+@dataclass(frozen=True)
+class _Column:
+    """A column of a quantity: its index, its title in the header, and its unit in SI units."""
+
+    index: int
+    title: str
+    scale: float
 
 
 def read_machine_test(
@@ -72,19 +101,18 @@ def read_machine_test(
         SceneError: when the file is not such a table, or needs a choice.
         NotInstalledError: when the file is a workbook and openpyxl is not installed.
     """
-    name, chosen = str(path), parse_choices(columns)
+    name, chosen = str(path), _parse_choices(columns)
     if name.lower().endswith(WORKBOOK_SUFFIX):
-        sheets = read_workbook(name)
-        tables = [title for title, grid in sheets.items() if grid is not None and _long_blocks(grid, chosen)]
-        grid = choose_sheet(name, sheets, sheet, tables)
+        sheets = read_workbook(name, EXPECTED)
+        grid = _choose_sheet(name, sheets, sheet, [title for title, each in sheets.items() if _blocks(each, chosen)])
     elif sheet is None:
-        grid = read_text(name, lambda row: is_header(row, chosen))
+        grid = read_text(name, lambda row: _is_header(row, chosen), EXPECTED)
     else:
         raise SceneError([f"--sheet {sheet}: {name} is a text, without sheets; leave the option out"])
     # A block without enough rows is described if there is no other.
-    blocks = _long_blocks(grid, chosen) or list(_blocks(grid, chosen))
+    blocks = _blocks(grid, chosen) or _blocks(grid, chosen, min_rows=0)
     if not blocks:
-        raise SceneError([missing_header(grid, chosen)])
+        raise SceneError([_missing_header(grid, chosen)])
     if block is None and len(blocks) > 1:
         listed = ", ".join(f"{n} (rows {part.header + 1} to {part.end})" for n, part in enumerate(blocks, 1))
         raise SceneError([f"{grid.title}: {len(blocks)} blocks of rows; choose one by --block: {listed}"])
@@ -118,139 +146,240 @@ def _finish(test: MachineTest) -> MachineTest:
     depth, force = (
         values if values[np.abs(values).argmax()] >= 0 else 0.0 - values for values in (test.depth, test.force)
     )
-    time, peak = test.time, int(force.argmax())
+    test, time, peak = replace(test, depth=depth, force=force), test.time, int(force.argmax())
     fallen = np.flatnonzero(force[peak:] < force[peak] / 2) + peak
     if not len(fallen) or not peak:
-        return replace(test, depth=depth, force=force)
+        return test
     # While a held tissue relaxes, the depth may creep, but not at half the speed of the test.
     speed = (depth[peak] - depth[0]) / (time[peak] - time[0])
     growth = depth[fallen[0]] - depth[peak]
     if growth <= 0 or growth < speed / 2 * (time[fallen[0]] - time[peak]):
-        return replace(test, depth=depth, force=force)
+        return test
     note = (
         f"{test.name}: the force falls by half from {force[peak]:.4g} N at {time[peak]:.4g} s while the depth grows: "
         f"{TORE}; --window {time[0]:.4g},{time[peak]:.4g} cuts it there"
     )
-    return replace(test, depth=depth, force=force, notes=(*test.notes, note))
+    return replace(test, notes=(*test.notes, note))
 
 
-@dataclass(frozen=True)
-class _Block:
-    """A header, its row of units, its other rows with content, and the row after the last."""
+def _parse_choices(columns: Sequence[str]) -> dict[str, str]:
+    """Parse chosen columns, such as "depth=Traverse, mm", into titles by quantity."""
+    chosen: dict[str, str] = {}
+    for text in columns:
+        quantity, _, title = (part.strip() for part in text.partition("="))
+        if quantity not in WORDS or not title:
+            expected = 'take time, depth or force and the name of its column, such as "depth=Traverse, mm"'
+            raise SceneError([f'--columns "{text}": {expected}'])
+        if quantity in chosen:
+            raise SceneError([f'--columns "{text}": {quantity} is chosen twice; leave one'])
+        chosen[quantity] = title
+    return chosen
 
-    header: int
-    units: int | None
-    rows: list[int]
-    end: int
+
+def _choose_sheet(name: str, sheets: dict[str, Grid], chosen: str | None, tables: list[str]) -> Grid:
+    """Return the chosen sheet of a workbook, or the only one with a table; `tables`: names of those."""
+    if chosen is None:
+        if len(tables) > 1:
+            raise SceneError([f"{name}: {len(tables)} sheets with a table; choose one by --sheet: {', '.join(tables)}"])
+        if not tables and len(sheets) != 1:
+            listed = ", ".join(sheets) or "none has cells"
+            raise SceneError(
+                [f"{name}: no sheet has a table of time, depth and force; choose one by --sheet: {listed}"]
+            )
+        chosen = next(iter(tables or sheets))
+    for title, grid in sheets.items():
+        if title.casefold() == chosen.casefold():
+            return grid
+    listed = ", ".join(tables or sheets)
+    raise SceneError([f"--sheet {chosen}: not in {name}{did_you_mean(chosen, sheets)}; it has {listed}"])
 
 
-def _blocks(grid: Grid, chosen: dict[str, Choice]) -> Iterator[_Block]:
-    """Find the blocks of a table."""
-    headers = [n for n, row in enumerate(grid.rows) if is_header(row, chosen)]
+def _blocks(grid: Grid, chosen: dict[str, str], min_rows: int = MIN_ROWS) -> list[_Block]:
+    """Find the blocks with enough rows of numbers, unlike a summary."""
+    headers = [n for n, row in enumerate(grid.rows) if _is_header(row, chosen)]
+    blocks = []
     for header, end in pairwise([*headers, len(grid.rows)]):
-        rows = [n for n in range(header + 1, end) if _has_content(grid, grid.rows[n])]
-        has_units = bool(rows) and is_units(grid.rows[rows[0]], find_candidates(grid.rows[header], chosen))
-        yield _Block(header, rows[0] if has_units else None, rows[1:] if has_units else rows, end)
+        rows = [n for n in range(header + 1, end) if grid.has_content(n)]
+        candidates = _find_candidates(grid.rows[header], chosen)
+        has_units = bool(rows) and any(
+            index < len(grid.rows[rows[0]]) and _scale(quantity, grid.rows[rows[0]][index]) is not None
+            for quantity, columns in candidates.items()
+            for index in columns
+        )
+        units, rows = (rows[0], rows[1:]) if has_units else (None, rows)
+        if sum(sum(parse_number(cell) is not None for cell in grid.rows[n]) >= len(WORDS) for n in rows) >= min_rows:
+            blocks.append(_Block(header, units, rows, end))
+    return blocks
 
 
-def _long_blocks(grid: Grid, chosen: dict[str, Choice]) -> list[_Block]:
-    """Return the blocks with enough rows of numbers for a test, unlike a summary."""
-
-    def length(block: _Block) -> int:
-        candidates = find_candidates(grid.rows[block.header], chosen).values()
-        rows = map(grid.rows.__getitem__, block.rows)
-        return sum(all(any(map(parse_number, _cells(row, columns))) for columns in candidates) for row in rows)
-
-    return [block for block in _blocks(grid, chosen) if length(block) >= MIN_ROWS]
+def _is_header(row: Row, chosen: dict[str, str]) -> bool:
+    """Return whether a row names all quantities in different cells."""
+    if sum(bool(LETTER.search(cell)) for cell in row) < len(WORDS):
+        return False
+    candidates = _find_candidates(row, chosen).values()
+    return any(len({*columns}) == len(columns) for columns in product(*candidates))
 
 
-def _has_content(grid: Grid, row: Row) -> bool:
-    """Return whether a row is not empty, a ruling or a comment of a text."""
-    is_comment = not grid.sheet and row[:1] and row[0].startswith(("#", "%"))
-    return not is_comment and any(character.isalnum() for cell in row for character in cell)
+def _find_candidates(row: Row, chosen: dict[str, str]) -> dict[str, list[int]]:
+    """Return the columns of a header that may be each quantity."""
+    found = {}
+    for quantity, title in chosen.items():
+        name = _plain(_split_title(title, quantity)[0])
+        same = [n for n, cell in enumerate(row) if _plain(cell) == _plain(title)]
+        found[quantity] = same or [
+            n for n, cell in enumerate(row) if name in (_plain(cell), _plain(_split_title(cell, quantity)[0]))
+        ]
+    taken = {column for columns in found.values() for column in columns}
+    for quantity in WORDS.keys() - chosen.keys():
+        found[quantity] = [n for n, cell in enumerate(row) if n not in taken and _is_named(cell, quantity)]
+    return {quantity: found[quantity] for quantity in WORDS}
 
 
-def _cells(row: Row, columns: Iterable[int]) -> list[str]:
-    """Return the cells of a row in some columns, as far as it has them."""
-    return [row[column] for column in columns if column < len(row)]
+def _is_named(cell: str, quantity: str) -> bool:
+    """Return whether a title has a name of a quantity, outside of brackets."""
+    words = re.findall(r"[^\W\d_]+", re.sub(r"[(\[].*?[)\]]", " ", cell).casefold())
+    return bool(WORDS[quantity] & {*words}) or any(word.endswith(ENDINGS[quantity]) for word in words)
 
 
-def _read_block(grid: Grid, block: _Block, chosen: dict[str, Choice]) -> MachineTest:
+def _plain(text: str) -> str:
+    """Return a name without differences of case and spaces."""
+    return " ".join(text.split()).casefold()
+
+
+def _scale(quantity: str, unit: str) -> float | None:
+    """Return a unit in SI units; None if it is not one of the quantity."""
+    unit, known = unit.strip("[]() "), UNITS[quantity]
+    # MN are not millinewtons.
+    if unit in known or unit == "MN":
+        return known.get(unit)
+    lower = {name.casefold(): scale for name, scale in known.items()}
+    return lower.get(UNIT_ALIASES.get(unit.casefold(), unit.casefold()))
+
+
+def _split_title(title: str, quantity: str) -> tuple[str, float | None]:
+    """Split a title into the name and the unit in SI units; None without a unit of the quantity."""
+    match_ = UNIT_PATTERN.fullmatch(title)
+    scale = _scale(quantity, match_[2]) if match_ else None
+    return (match_[1], scale) if match_ and scale is not None else (title, None)
+
+
+def _read_block(grid: Grid, block: _Block, chosen: dict[str, str]) -> MachineTest:
     """Read the numbers of a block."""
-    first = grid.rows[block.rows[0]] if block.rows else []
-    columns, notes = select_columns(grid, block.header, block.units, first, chosen)
+    columns, notes = _select_columns(grid, block, chosen)
     rows = list(_rows_of_numbers(grid, block, columns))
     if len(rows) < MIN_ROWS:
         raise SceneError([f"{grid.place(block.header)}: {len(rows)} rows of numbers; a test has at least {MIN_ROWS}"])
-    cells = [(row, column, grid.rows[row][column.index]) for row in rows for column in columns]
-    parsed = [_parse(grid, row, column, cell) for row, column, cell in cells]
-    if (mixed := find_mixed_marks(cell for _, _, cell in cells)) is not None:
-        row, column, cell = cells[mixed]
-        fault = "both . and , are decimal marks in this table; take one"
-        raise SceneError([f"{grid.place(row, column.index)}: {column.title}: {cell[:40]!r}; {fault}"])
+    cells = [(row, column.index) for row in rows for column in columns]
+    parsed = grid.numbers(block.header, cells, "take a number, or delete the row")
     scales = np.array([column.scale for column in columns])
     time, depth, force = (np.array([value for value, _ in parsed]).reshape(-1, len(columns)) * scales).T.copy()
-    _require_increasing(grid, rows, columns[0], time)
-    for column, values in zip(columns[1:], (depth, force), strict=True):
+    if len(still := np.flatnonzero(np.diff(time) <= 0)):
+        n = int(still[0])
+        fault = f"{time[n + 1]:.9g} s after {time[n]:.9g} s; time must increase: delete the row, or split the file"
+        raise SceneError([f"{grid.place(rows[n + 1], columns[0].index)}: {columns[0].title}: {fault}"])
+    for quantity, column, values in (("depth", columns[1], depth), ("force", columns[2], force)):
         if not np.ptp(values):
-            remedy = f'choose another column by --columns "{column.quantity}=NAME, UNIT"'
+            remedy = f'choose another column by --columns "{quantity}=NAME, UNIT"'
             raise SceneError([f"{grid.place(block.header, column.index)}: {column.title}: never changes; {remedy}"])
     digit = 10.0 ** min(power for _, power in parsed[2 :: len(columns)]) * columns[2].scale
     return MachineTest(grid.title, time, depth, force, digit, tuple(notes))
 
 
-def _rows_of_numbers(grid: Grid, block: _Block, columns: list[Column]) -> Iterator[int]:
-    """Return the rows of numbers of a block, up to the text after them.
+def _select_columns(grid: Grid, block: _Block, chosen: dict[str, str]) -> tuple[list[_Column], list[str]]:
+    """Select the columns of time, depth and force, of two candidates the one nearest 0 in the first row; and notes."""
+    header, titles = block.header, grid.rows[block.header]
+    units = grid.rows[block.units] if block.units is not None else []
+    first = grid.rows[block.rows[0]] if block.rows else []
+
+    def first_size(column: _Column) -> float:
+        number = parse_number(first[column.index]) if column.index < len(first) else None
+        return math.inf if number is None else abs(number[0]) * column.scale
+
+    selected, notes = [], []
+    for quantity, candidates in _find_candidates(titles, chosen).items():
+        given, columns = _split_title(chosen.get(quantity, ""), quantity)[1], []
+        for index in candidates:
+            scale = _split_title(titles[index], quantity)[1]
+            if scale is None and index < len(units):
+                scale = _scale(quantity, units[index])
+            if given is not None and scale not in (None, given):
+                title = chosen[quantity]
+                notes.append(f"{grid.title}: {quantity} is read as {title!r}, although the file has another unit")
+            scale = scale if given is None else given
+            if scale is not None:
+                columns.append(_Column(index, titles[index], scale))
+        usual, known = next(iter(UNITS[quantity])), ", ".join(UNITS[quantity])
+        if not columns:
+            title = titles[candidates[0]]
+            fault = f'no unit of {quantity} ({known}); give it by --columns "{quantity}={title}, {usual}"'
+            raise SceneError([f"{grid.place(header, candidates[0])}: {title}: {fault}"])
+        best = min(columns, key=first_size)
+        if (repeated := sum(column.title == best.title for column in columns)) > 1:
+            fault = f"{repeated} columns of this name; rename or delete all but one"
+            raise SceneError([f"{grid.place(header, best.index)}: {best.title}: {fault}"])
+        if (header, best.index) in grid.merged:
+            raise SceneError([_merged(grid, header, best.index)])
+        if others := [column.title for column in columns if column != best]:
+            than = " and ".join(map(repr, others))
+            notes.append(f"{grid.title}: {quantity} is {best.title!r}, nearer 0 in the first row than {than}")
+        selected.append(best)
+    return selected, notes
+
+
+def _missing_header(grid: Grid, chosen: dict[str, str]) -> str:
+    """Describe a table without a header."""
+    if not any(grid.rows):
+        return f"{grid.title}: is empty; a table has columns of time, depth and force"
+    # The row that names most; the cells of a text are separated only below a header.
+    cells = [row if grid.sheet else re.split(r"[\t;,|]", ";".join(row)) for row in grid.rows]
+    found = [{quantity for quantity, columns in _find_candidates(row, chosen).items() if columns} for row in cells]
+    best = max(range(len(found)), key=lambda row: len(found[row]))
+    if merged := [column for row, column in grid.merged if row == best and found[best]]:
+        return _merged(grid, best, min(merged))
+    shown = f"{grid.place(best)}: {', '.join(grid.rows[best])[:100]!r}"
+    missing = [quantity for quantity in WORDS if quantity not in found[best]]
+    if not missing:
+        return f"{shown} names time, depth and force, but not in a cell each; separate them"
+    quantity = missing[0] if found[best] else "depth"
+    known = ", ".join(UNITS[quantity])
+    remedy = f'choose columns by --columns "{quantity}=NAME, {next(iter(UNITS[quantity]))}" (units: {known})'
+    if not found[best]:
+        return f"{grid.title}: no row names time, depth and force; {remedy}"
+    return f"{shown} names no {repr(chosen[quantity]) if quantity in chosen else quantity}; {remedy}"
+
+
+def _merged(grid: Grid, row: int, column: int) -> str:
+    fault = "merged with the cell to its right; unmerge them and name each column"
+    return f"{grid.place(row, column)}: {grid.rows[row][column]}: {fault}"
+
+
+def _rows_of_numbers(grid: Grid, block: _Block, columns: list[_Column]) -> Iterator[int]:
+    """Yield the rows of numbers of a block, up to the text after them.
 
     Raises:
         SceneError: when a row has too few or too many cells, or when numbers follow the text.
     """
-    needed, text = [column.index for column in columns], None
+    indices, text, names = [column.index for column in columns], None, grid.rows[block.header]
     for n in block.rows:
         row = grid.rows[n]
-        cells = _cells(row, needed)
-        is_whole = len(row) > max(needed)
+        cells = [row[index] for index in indices if index < len(row)]
+        is_whole = len(cells) == len(indices)
         if is_whole and not any(cells):
             continue
         # A line of text may have a number in it, so a short row is known by the time, or by its first cell.
-        if not any(map(VALUE_START.match, cells if is_whole else _cells(row, needed[:1]) or row[:1])):
+        if not any(map(VALUE_START.match, cells if is_whole else row[indices[0] :][:1] or row[:1])):
             text = n if text is None else text
         elif text is None:
-            _require_cells(grid, n, block, columns)
+            grid.require_names(n, block.header)
+            for column in columns:
+                if column.index >= len(row) or not row[column.index]:
+                    fault = "empty"
+                    if not grid.sheet and column.index >= len(row):
+                        fault += f": the row has {len(row)} of {len(names)} cells separated by {grid.separator}"
+                        fault += " as in the header"
+                    remedy = "fill it in, or delete the row"
+                    raise SceneError([f"{grid.place(n, column.index)}: {column.title}: {fault}; {remedy}"])
             yield n
         elif is_whole and all(map(parse_number, cells)):
             fault = f"{', '.join(grid.rows[text])[:40]!r} within the rows of numbers"
             raise SceneError([f"{grid.place(text)}: {fault}; delete this row, or repeat the names after it"])
-
-
-def _require_cells(grid: Grid, n: int, block: _Block, columns: list[Column]) -> None:
-    """Raise an error unless a row has the cells of the columns, and a text not more of them than names."""
-    row, names = grid.rows[n], grid.rows[block.header]
-    as_header = f"separated by {grid.separator} as in the header"
-    if not grid.sheet and len(row) > len(names):
-        is_decimal = grid.separator == "commas"
-        remedy = "with decimal commas, separate cells by semicolons" if is_decimal else "name each column"
-        raise SceneError([f"{grid.place(n)}: {len(row)} cells {as_header}, and {len(names)} columns; {remedy}"])
-    for column in columns:
-        if column.index >= len(row) or not row[column.index]:
-            details = f": the row has {len(row)} of {len(names)} cells {as_header}"
-            fault = f"empty{'' if grid.sheet or len(row) > column.index else details}; fill it in, or delete the row"
-            raise SceneError([f"{grid.place(n, column.index)}: {column.title}: {fault}"])
-
-
-def _parse(grid: Grid, row: int, column: Column, cell: str) -> tuple[float, int]:
-    """Parse a cell; return the number and the power of ten of its last digit."""
-    if (parsed := parse_number(cell)) is not None:
-        return parsed
-    fault = f"{cell[:40]!r}; take a number, or delete the row"
-    if cell.startswith("="):
-        fault = f"{cell[:40]!r}, a formula without a saved value; calculate and save the workbook"
-    raise SceneError([f"{grid.place(row, column.index)}: {column.title}: {fault}"])
-
-
-def _require_increasing(grid: Grid, rows: list[int], column: Column, time: Array) -> None:
-    """Raise an error at the first time that is not after the one before."""
-    if len(still := np.flatnonzero(np.diff(time) <= 0)):
-        n = int(still[0])
-        fault = f"{time[n + 1]:.9g} s after {time[n]:.9g} s; time must increase: delete the row, or split the file"
-        raise SceneError([f"{grid.place(rows[n + 1], column.index)}: {column.title}: {fault}"])

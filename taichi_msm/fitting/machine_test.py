@@ -16,14 +16,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from taichi_msm.errors import SceneError
 from taichi_msm.fitting.machine_tables import MachineTest
+from taichi_msm.fitting.observation import Array
 from taichi_msm.model.tools import Clamp, Tool, build_tools, gap_to_sheet
 from taichi_msm.scene.scene import Scene
-
-Array = NDArray[np.float64]
 
 # Default frames per second, and largest number of frames at this default.
 FRAMES_PER_SECOND, MAX_FRAMES = 10.0, 200
@@ -59,35 +57,22 @@ class Approach:
     size: tuple[float, float]  # height and width of the sheet [m]
     is_clamp: bool
 
-    def keyframes(self, times: Array, travel: Array) -> list[list[float]]:
-        """Return the path of the tool.
-
-        Args:
-            times: times of the keyframes [s], shape (n,).
-            travel: distance from the first contact at these times [m], shape (n,).
-
-        Returns:
-            Keyframes [t, across, down, height], of a clamp [t, x, y, z].
-        """
-        height, width = self.size
-        x, y, z = (self.start + travel[:, None] * self.direction).T
-        if self.is_clamp:
-            return np.stack([times, x, y, z], axis=1).tolist()
-        return np.stack([times, x / width + 0.5, 0.5 - y / height, z - self.tip_height], axis=1).tolist()
-
-    def place(self, data: dict[str, Any], times: Array, travel: Array, rate: float) -> dict[str, Any]:
+    def place(self, data: dict[str, Any], travel: Array, rate: float) -> dict[str, Any]:
         """Return a scene's data with the path of the tool, and the times, of a test.
 
         Args:
             data: a scene.
-            times: times of the frames [s], shape (n,).
             travel: distance from the first contact at the frames [m], shape (n,).
             rate: frames per second.
         """
+        (height, width), time = self.size, np.arange(len(travel)) / rate
+        x, y, z = (self.start + travel[:, None] * self.direction).T
+        # Keyframes [t, across, down, height], of a clamp [t, x, y, z].
+        places = (x, y, z) if self.is_clamp else (x / width + 0.5, 0.5 - y / height, z - self.tip_height)
         probes = list(data["probes"])
-        probes[self.probe] = {**probes[self.probe], "path": self.keyframes(times, travel)}
-        time = {**data["time"], "duration": (len(times) - 1) / rate, "frames_per_second": rate}
-        return {**data, "probes": probes, "time": time}
+        probes[self.probe] = {**probes[self.probe], "path": np.stack([time, *places], axis=1).tolist()}
+        times = {**data["time"], "duration": (len(travel) - 1) / rate, "frames_per_second": rate}
+        return {**data, "probes": probes, "time": times}
 
 
 def find_approach(scene: Scene) -> Approach:
@@ -106,12 +91,8 @@ def find_approach(scene: Scene) -> Approach:
     start = np.zeros(3) if is_clamp else _first_contact(tool, direction, scene)
     if start is None:
         raise SceneError([f"{key}: the line from its first key to the farthest misses the sheet; direct it there"])
-    return Approach(tool.probe, start, direction, _tip_height(tool), scene.sheet.size, is_clamp)
-
-
-def _tip_height(tool: Tool) -> float:
-    """Return the height of the tip's centre above its lowest point [m]."""
-    return float(tool.tip_centres[0, 2] - tool.heights[0])
+    tip_height = float(tool.tip_centres[0, 2] - tool.heights[0])
+    return Approach(tool.probe, start, direction, tip_height, scene.sheet.size, is_clamp)
 
 
 def _first_contact(tool: Tool, direction: Array, scene: Scene) -> Array | None:
@@ -120,10 +101,10 @@ def _first_contact(tool: Tool, direction: Array, scene: Scene) -> Array | None:
     travel, reach = 0.0, float(np.linalg.norm(start)) + tool.length + math.hypot(*scene.sheet.size)
     # The distance from the sheet changes by at most the travel, so that the tool may advance by it (sphere tracing).
     # That of a tilted plate is approximate, so that it may have to go back.
-    goes_back = False
+    goes_back, tip_height = False, tool.tip_centres[0, 2] - tool.heights[0]
     for _ in range(1000):
         centre = start + travel * direction
-        placed = replace(tool, times=np.zeros(1), tip_centres=centre[None], heights=centre[2:] - _tip_height(tool))
+        placed = replace(tool, times=np.zeros(1), tip_centres=centre[None], heights=centre[2:] - tip_height)
         gap = gap_to_sheet(placed, scene.sheet)
         if abs(gap) <= tolerance or (goes_back and gap > 0):
             return np.asarray(centre)
@@ -161,26 +142,11 @@ class Loading:
         """Standard deviation of measured minus predicted forces [N]."""
         return max(self.noise, FORCE_ACCURACY * self.peak)
 
-    @property
-    def contact_range(self) -> tuple[float, float]:
-        """Smallest and largest depth of contact with a motion of the tool [m of the table]."""
-        return float(self.depth[0]), float(self.depth.max())
-
     def travel(self, contact: float | None = None) -> Array:
         """Return the distance of the tool from its first contact at every frame [m], shape (frames,)."""
         travel = np.maximum(self.depth - (self.contact if contact is None else contact), 0.0)
         travel[0] = 0.0
         return travel
-
-    def place(self, data: dict[str, Any], approach: Approach, contact: float | None = None) -> dict[str, Any]:
-        """Return a scene's data with the path of the tool, and the times, of this test.
-
-        Args:
-            data: a scene.
-            approach: line of its tool.
-            contact: depth of contact [m of the table]; None: that of the test.
-        """
-        return approach.place(data, self.scene_time, self.travel(contact), self.rate)
 
 
 def build_loading(
@@ -241,12 +207,7 @@ def _contact_row(test: MachineTest, noise: float, peak: int) -> int:
 
 
 def late_contact_note(loading: Loading, key: str) -> str | None:
-    """Return a note about a force that rises in the rows of the noise, so that the contact is found late, or None.
-
-    Args:
-        loading: the test.
-        key: parameter of its depth of contact.
-    """
+    """Return a note about a contact found late, as the force rises in the rows of the noise; `key`: its parameter."""
     from scipy.stats import kendalltau
 
     test, count = loading.test, _noise_rows(loading.test)
@@ -275,16 +236,9 @@ def _in_depth(test: MachineTest, noise: float, contact: float) -> Loading:
 
 
 def _means(coordinate: Array, at: Array, half_width: float, columns: Sequence[Array]) -> list[Array]:
-    """Average columns over the rows within `half_width` of each coordinate, or interpolate them.
+    """Average columns over the rows within `half_width` of each of n coordinates `at`, or interpolate them.
 
-    Args:
-        coordinate: of every row, increasing, shape (rows,).
-        at: coordinates of the results, shape (n,).
-        half_width: largest distance of averaged rows.
-        columns: values of every row, each of shape (rows,).
-
-    Returns:
-        The means of each column, shape (n,).
+    `coordinate` of every row increases; columns have the shape (rows,), and their means (n,).
     """
     # Rows on the border of two frames belong to both, up to rounding.
     reach = half_width * (1 + 1e-6)

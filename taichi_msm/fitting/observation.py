@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple
 
@@ -20,6 +20,9 @@ Array = NDArray[np.float64]
 
 # Largest residual of a good fit, as a share of the signal and in sigma.
 MAX_RESIDUAL_SHARE, MAX_RESIDUAL_SIGMAS = 0.1, 2.0
+
+# Largest cosine of opposed components, their smallest norm [sigma], and the smallest number of values.
+MAX_COSINE, MIN_SIGMAS, MIN_COUNT = -0.9, 5.0, 3
 
 
 class ErrorCorrelation(NamedTuple):
@@ -47,17 +50,11 @@ class ObservationModel(ABC):
 
 @dataclass(frozen=True, eq=False)
 class Observation(ABC):
-    """Measured values of any shape, NaN where not measured.
+    """Measured values of any shape, NaN where not measured."""
 
-    Attributes:
-        noun: name of the values, for messages.
-        unit: of the values and of sigma.
-        is_independent: whether the errors are independent, so that the values alone may reject a model.
-    """
-
-    noun: ClassVar[str]
-    unit: ClassVar[str]
-    is_independent: ClassVar[bool] = False
+    noun: ClassVar[str]  # name of the values, for messages
+    unit: ClassVar[str]  # of the values and of sigma
+    is_independent: ClassVar[bool] = False  # whether errors are independent: the values alone may reject a model
 
     name: str  # of the file, in messages
     time: Array  # of the values [s]
@@ -91,13 +88,7 @@ class Observation(ABC):
 
     @abstractmethod
     def fits_well(self, residuals: Array, deviation: float, signal: float) -> bool:
-        """Return whether residuals are small.
-
-        Args:
-            residuals: of the known values.
-            deviation: their estimated standard deviation.
-            signal: as of `signal`.
-        """
+        """Return whether the residuals of the known values, with an estimated `deviation`, are small."""
 
     @abstractmethod
     def summary(self, residuals: Array, sigma: float | Array) -> dict[str, Any]:
@@ -156,3 +147,21 @@ def time_weights(scene: Scene, time: Array, frames: int) -> Any:
     before = np.clip(np.floor(position), 0, frames - 2).astype(int)
     shares, frame = np.stack([1 - position + before, position - before]), np.stack([before, before + 1])
     return csr_matrix((shares.ravel(), (np.tile(row, 2), frame.ravel())), (len(time), frames))
+
+
+def opposed_axes(observed: Array, predictions: Sequence[Array], sigma: Any) -> list[int]:
+    """Return the components (last axis) of a significant size that have the other sign in all predictions."""
+    size = observed.shape[-1]
+    is_opposed = np.ones(size, np.bool_)
+    for predicted in predictions:
+        known = np.isfinite(observed) & np.isfinite(predicted)
+        first, second = (np.where(known, array, 0.0).reshape(-1, size) for array in (observed, predicted))
+        lengths = np.linalg.norm(first, axis=0), np.linalg.norm(second, axis=0)
+        counts = known.reshape(-1, size).sum(axis=0)
+        # Without sigma more values are needed.
+        is_opposed &= counts >= (12 if sigma is None else MIN_COUNT)
+        is_opposed &= lengths[0] > MIN_SIGMAS * (sigma or 0.0) * np.sqrt(counts)
+        for length in lengths:
+            is_opposed &= length > 0.1 * np.linalg.norm(length)
+        is_opposed &= (first * second).sum(axis=0) < MAX_COSINE * lengths[0] * lengths[1]
+    return np.flatnonzero(is_opposed).tolist()

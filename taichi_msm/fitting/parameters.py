@@ -14,15 +14,11 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from typing_extensions import TypedDict
 
 from taichi_msm.errors import MAX_WORKERS, ArgumentError, Key, SceneError, did_you_mean
 from taichi_msm.load.scene_file import parse_key
 from taichi_msm.scene.scene import Scene
-
-Array = NDArray[np.float64]
 
 # Sections with fittable numbers, and keys in them that are not: options, array sizes, and keys without effect.
 SECTIONS = ("tissue", "springs", "damping", "sheet", "probes", "render.camera", "render.cameras")
@@ -98,7 +94,7 @@ def make_parameters(scene: Scene, free: Sequence[str], bounds: Mapping[str, Boun
         faults.append("--free: names no key; take one or more, such as --free tissue.young")
     for key in free:
         try:
-            parameters.append(_parameter(scene, data, key, bounds.get(key)))
+            parameters.append(_parameter(scene, data, key, *bounds.get(key, (-math.inf, math.inf))))
         except SceneError as error:
             faults += error.lines
     for key in bounds:
@@ -109,44 +105,39 @@ def make_parameters(scene: Scene, free: Sequence[str], bounds: Mapping[str, Boun
     return tuple(parameters)
 
 
-def _parameter(scene: Scene, data: dict[str, Any], key: str, bounds: Bounds | None) -> Parameter:
-    path = parse_key(key)
-    option = f"--free {key}"
+def _parameter(scene: Scene, data: dict[str, Any], key: str, low: float, high: float) -> Parameter:
+    path, option = parse_key(key), f"--free {key}"
     if path and path[-1] in ("map", "foundation_map"):
-        raise SceneError(
-            [f"{option}: of maps only tissue.map is fitted; name numbers, such as {scene.kind}.{path[-1]}.range.1"]
-        )
+        example = f"{scene.kind}.{path[-1]}.range.1"
+        raise SceneError([f"{option}: of maps only tissue.map is fitted; name numbers, such as {example}"])
     value = _look_up(option, data, path)
-    is_fittable = any(key == section or key.startswith(f"{section}.") for section in SECTIONS)
+    if isinstance(value, list):
+        raise SceneError([f"{option}: a list; name one of its numbers by its index, such as {key}.0"])
+    is_fittable = any(f"{key}.".startswith(f"{section}.") for section in SECTIONS)
     if not is_fittable or not isinstance(value, float) or any(part in FIXED_KEYS for part in path):
-        if isinstance(value, list):
-            raise SceneError([f"{option}: a list; name one of its numbers by its index, such as {key}.0"])
         description = "a section" if isinstance(value, dict) else f"{value!r}"
         raise SceneError([f"{option}: {description}, which cannot be free; take a number of {', '.join(SECTIONS)}"])
-    low, high = bounds or (-math.inf, math.inf)
+    interval = f"--bounds {key}={low:g},{high:g}"
     if not low < high:
-        raise SceneError([f"--bounds {key}={low:g},{high:g}: give the smaller one first, then a larger one"])
+        raise SceneError([f"{interval}: give the smaller one first, then a larger one"])
     if not low <= value <= high:
-        raise SceneError([f"--bounds {key}={low:g},{high:g}: {value:g}, where it starts, is outside; --set {key}=..."])
-    scale = 0.0
-    if value == 0 or _is_coordinate(path):
-        if math.isfinite(high - low):
-            scale = high - low
-        elif _is_coordinate(path):
-            scale = _default_range(scene, path)
-        else:
-            raise SceneError(
-                [f"{option}: starts at 0, so its size is open; add --bounds {key}=LOW,HIGH, or --set {key}=..."]
-            )
+        raise SceneError([f"{interval}: {value:g}, where it starts, is outside; --set {key}=..."])
+    is_bounded, is_coordinate = math.isfinite(high - low), _is_coordinate(path)
+    if value and not is_coordinate:
+        scale = 0.0
+    elif is_bounded or is_coordinate:
+        scale = high - low if is_bounded else _default_range(scene, path)
+    else:
+        remedy = f"add --bounds {key}=LOW,HIGH, or --set {key}=..."
+        raise SceneError([f"{option}: starts at 0, so its size is open; {remedy}"])
     return Parameter(key, value, low, high, scale)
 
 
 def _look_up(option: str, data: Any, path: Key) -> Any:
     """Return the value of a key; SceneError: it does not exist."""
     for part in path or ("",):
-        known = (
-            list(data) if isinstance(data, dict) else [str(n) for n in range(len(data))] if type(data) is list else []
-        )
+        indices = range(len(data)) if isinstance(data, list) else ()
+        known = list(data) if isinstance(data, dict) else [str(n) for n in indices]
         if str(part) not in known:
             suggestion = did_you_mean(str(part), known) or (f"; take one of {', '.join(known)}" if known else "")
             raise SceneError([f"{option}: the scene has no {str(part) or 'such key'} there{suggestion}"])
@@ -183,15 +174,15 @@ def as_data(scene: Scene) -> dict[str, Any]:
     return scene.model_dump(mode="json", exclude_none=True)
 
 
-def with_values(data: dict[str, Any], parameters: Sequence[Parameter], values: Sequence[float]) -> dict[str, Any]:
-    """Return a copy of a scene's data with the values of parameters."""
+def with_values(data: dict[str, Any], parameters: Sequence[Parameter], values: Mapping[str, float]) -> dict[str, Any]:
+    """Return a copy of a scene's data with the values of parameters, by key."""
     changed = deepcopy(data)
-    for parameter, value in zip(parameters, values, strict=True):
+    for parameter in parameters:
         container: Any = changed
         for part in parameter.path[:-1]:
             container = container[part if isinstance(container, list) else str(part)]
         last = parameter.path[-1]
-        container[last if isinstance(container, list) else str(last)] = value
+        container[last if isinstance(container, list) else str(last)] = values[parameter.key]
     return changed
 
 
@@ -224,54 +215,65 @@ def require_types(observed: Any, free: Any, method: Mapping[str, Any], **others:
             raise ArgumentError(f"{name}: {value!r}; take {expected}")
 
 
-def _is_number(value: Any, kind: type = Real) -> bool:
-    return isinstance(value, kind) and not isinstance(value, bool)
+Check = Callable[[Any], bool]
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, Integral) and not isinstance(value, bool)
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str)
 
 
 def _is_path(value: Any) -> bool:
     return isinstance(value, (str, Path)) and "\0" not in str(value)
 
 
-def _is_sequence(value: Any, item: Callable[[Any], bool]) -> bool:
-    return isinstance(value, Sequence) and not isinstance(value, str) and all(map(item, value))
+def _is_list(item: Check) -> Check:
+    return lambda value: isinstance(value, Sequence) and not isinstance(value, str) and all(map(item, value))
 
 
-def _is_pair(value: Any, first: Callable[[Any], bool]) -> bool:
-    return isinstance(value, Sequence) and len(value) == 2 and first(value[0]) and _is_number(value[1])
+def _is_pair(first: Check) -> Check:
+    return lambda value: isinstance(value, Sequence) and len(value) == 2 and first(value[0]) and _is_number(value[1])
+
+
+def _is_observed(value: Any) -> bool:
+    return _is_path(value) or isinstance(value, Mapping) or _is_list(_is_path)(value)
+
+
+def _is_bounds(value: Any) -> bool:
+    return isinstance(value, Mapping) and all(map(_is_pair(_is_number), value.values()))
 
 
 # Check and description of each argument.
-_TYPES: dict[str, tuple[Callable[[Any], bool], str]] = {
-    "observed": (
-        lambda it: _is_path(it) or isinstance(it, Mapping) or _is_sequence(it, _is_path),
-        "the path of an .npz file or of a table, a list of tables, or a mapping of arrays",
-    ),
-    "free": (
-        lambda it: isinstance(it, Sequence) and not isinstance(it, str) and all(isinstance(key, str) for key in it),
-        "a list of keys, such as ['tissue.young']",
-    ),
-    "bounds": (
-        lambda it: isinstance(it, Mapping) and all(_is_pair(ends, _is_number) for ends in it.values()),
-        "a mapping of keys to two numbers each, such as {'tissue.young': (5e3, 1e5)}",
-    ),
+_TYPES: dict[str, tuple[Check, str]] = {
+    "observed": (_is_observed, "the path of an .npz file or of a table, a list of tables, or a mapping of arrays"),
+    "free": (_is_list(_is_text), "a list of keys, such as ['tissue.young']"),
+    "bounds": (_is_bounds, "a mapping of keys to two numbers each, such as {'tissue.young': (5e3, 1e5)}"),
     "forces": (
-        lambda it: _is_pair(it, _is_path),
+        _is_pair(_is_path),
         "a forces.csv and the standard deviation of its forces, such as ('forces.csv', 0.01)",
     ),
     "directory": (_is_path, "a path, or None"),
     "workers": (
-        lambda it: _is_number(it, Integral) and 1 <= it <= MAX_WORKERS,
+        lambda value: _is_whole(value) and 1 <= value <= MAX_WORKERS,
         f"a whole number, 1 to {MAX_WORKERS}, or None",
     ),
     "sigma": (_is_number, "a number, or None"),
+    "robust": (lambda value: isinstance(value, bool), "True or False"),
+    "profile": (lambda value: isinstance(value, bool), "True or False"),
     "correlation": (_is_number, "a number of pixels, or None"),
     "drift": (_is_number, "a number of seconds, or None"),
-    "columns": (lambda it: _is_sequence(it, lambda one: isinstance(one, str)), "a list such as ['depth=Traverse, mm']"),
-    "sheet": (lambda it: isinstance(it, str), "the name of a sheet, or None"),
-    "block": (lambda it: _is_number(it, Integral), "a whole number from 1, or None"),
-    "window": (lambda it: _is_pair(it, _is_number), "the first and the last time in seconds, such as (0.5, 12)"),
+    "resolution": (_is_whole, "a whole number, or None"),
+    "columns": (_is_list(_is_text), "a list such as ['depth=Traverse, mm']"),
+    "sheet": (_is_text, "the name of a sheet, or None"),
+    "block": (_is_whole, "a whole number from 1, or None"),
+    "window": (_is_pair(_is_number), "the first and the last time in seconds, such as (0.5, 12)"),
     "rate": (_is_number, "a number of frames per second, or None"),
-    "contact": (lambda it: _is_sequence(it, _is_number), "a list of depths in metres, such as [0.002]"),
-    "resolution": (lambda it: _is_number(it, Integral), "a whole number, or None"),
-    **dict.fromkeys(("robust", "profile"), (lambda it: isinstance(it, bool), "True or False")),
+    "contact": (_is_list(_is_number), "a list of depths in metres, such as [0.002]"),
 }

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
-from functools import partial, singledispatch
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
@@ -21,18 +22,20 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import printable
 from taichi_msm.fitting.forces import ToolForces
-from taichi_msm.fitting.machine_model import MachineForces
-from taichi_msm.fitting.machine_plots import MACHINE_PANELS
-from taichi_msm.fitting.observation import Observation
+from taichi_msm.fitting.machine_fit import FittedTest
+from taichi_msm.fitting.observation import Array, Observation
 from taichi_msm.fitting.points import PointObservation
 from taichi_msm.fitting.result import FitResult, FittedMap
 from taichi_msm.fitting.tikhonov import SmoothnessWeight
 from taichi_msm.plot_style import BLUE, DPI, GREY, ORANGE, SILVER, STYLE, TWO_COLUMN_WIDTH, VERMILION
 from taichi_msm.scene.sheet import Sheet
 
-Array = NDArray[np.float64]
-
 COLUMN_COUNT = 3
+
+DASHED = (0, (4, 2))
+
+# Function that plots a panel.
+Panel = Callable[[Axes], None]
 
 
 def plot(result: FitResult, file: BinaryIO) -> None:
@@ -46,60 +49,51 @@ def plot(result: FitResult, file: BinaryIO) -> None:
 
 
 def _figure(result: FitResult) -> Figure:
-    pairs = zip(result.observations, result.fitted, strict=True)
-    plots = [plot_panel for observed, fitted in pairs for plot_panel in observation_panels(observed, fitted, result)]
-    count = len(plots) + len(result.parameters) + 3 * (result.map is not None)
-    rows = math.ceil(count / COLUMN_COUNT)
+    panels = [] if result.map is None else _map_panels(result.map, result.scene.sheet)
+    for observed, fitted in zip(result.observations, result.fitted, strict=True):
+        panels += observation_panels(observed, fitted, result)
+    panels += [partial(_plot_parameter, result=result, key=key) for key in result.parameters]
+    rows = math.ceil(len(panels) / COLUMN_COUNT)
     engine = ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1)
     figure = Figure(figsize=(TWO_COLUMN_WIDTH, 2.7 * rows + 0.5), dpi=DPI, layout=engine)
     FigureCanvasAgg(figure)
     figure.suptitle(f"Fit to {printable(result.observations[0].name)}", x=0.01, ha="left", parse_math=False)
-    panels = list(figure.subplots(rows, COLUMN_COUNT, squeeze=False).ravel())
-    if result.map is not None:
-        plot_map(panels[:COLUMN_COUNT], result.map, result.scene.sheet)
-        panels, count = panels[COLUMN_COUNT:], count - COLUMN_COUNT
-    for axes, plot_panel in zip(panels, plots, strict=False):
-        plot_panel(axes)
-    for axes, key in zip(panels[len(plots) :], result.parameters, strict=False):
-        _plot_parameter(axes, result, key)
-    for axes in panels[count:]:
+    subplots = figure.subplots(rows, COLUMN_COUNT, squeeze=False).ravel()
+    for axes, panel in zip(subplots, panels, strict=False):
+        panel(axes)
+    for axes in subplots[len(panels) :]:
         axes.set_axis_off()
     return figure
 
 
-Panel = Callable[[Axes], None]
-
-
-@singledispatch
 def observation_panels(observed: Observation, fitted: Array, result: FitResult) -> list[Panel]:
-    """Return functions that plot the panels of an observation.
+    """Return the panels of an observation.
 
     Args:
         observed: the observation.
         fitted: its values in the fitted scene.
         result: of the fit.
     """
-    raise NotImplementedError(type(observed).__name__)
-
-
-@observation_panels.register
-def _point_panels(observed: PointObservation, fitted: Array, result: FitResult) -> list[Panel]:
-    point_count, time_count = (int(observed.is_observed.any(axis=axis).sum()) for axis in (1, 0))
-    # A single time shows no motion, a single point no map of residuals.
-    panels = [_plot_motion, _plot_match] * (time_count > 1)
-    panels += [partial(_plot_residuals, sheet=result.scene.sheet)] * (point_count > 1)
-    return [partial(panel, observed=observed, fitted=fitted) for panel in panels]
-
-
-@observation_panels.register
-def _force_panels(observed: ToolForces, fitted: Array, _result: FitResult) -> list[Panel]:
-    return [partial(_plot_forces, observed=observed, fitted=fitted)]
-
-
-@observation_panels.register
-def _machine_panels(_observed: MachineForces, _fitted: Array, result: FitResult) -> list[Panel]:
-    several = len(result.tests) > 1
-    return [partial(panel, fitted=test, several=several) for test in result.tests for panel in MACHINE_PANELS]
+    if isinstance(observed, PointObservation):
+        point_count, time_count = (int(observed.is_observed.any(axis=axis).sum()) for axis in (1, 0))
+        # A single time shows no motion, a single point no map of residuals.
+        panels = [_plot_motion, _plot_match] * (time_count > 1)
+        panels += [partial(_plot_residuals, sheet=result.scene.sheet)] * (point_count > 1)
+        return [partial(panel, observed=observed, fitted=fitted) for panel in panels]
+    if isinstance(observed, ToolForces):
+        return [partial(_plot_forces, observed=observed, fitted=fitted)]
+    # The file is in the title of the figure if there is one test only.
+    titles = [printable(Path(test.loading.test.name).name) for test in result.tests]
+    titles = ["Force over time"] if len(titles) == 1 else titles
+    return [
+        panel
+        for test, title in zip(result.tests, titles, strict=True)
+        for panel in (
+            partial(_plot_test_over_time, fitted=test, title=title),
+            partial(_plot_test_over_depth, fitted=test),
+            partial(_plot_test_residual, fitted=test),
+        )
+    ]
 
 
 def _unit(observed: PointObservation) -> tuple[float, str]:
@@ -111,15 +105,20 @@ def _plot_motion(axes: Axes, observed: PointObservation, fitted: Array) -> None:
     scale, unit = _unit(observed)
     order, centre = np.argsort(observed.time), np.nanmean(fitted, axis=1, keepdims=True)
     motion = np.nan_to_num(fitted - centre)
-    for number, n in enumerate(np.argsort(-np.linalg.norm(motion, axis=(1, 2)))[:3]):
+    for n in np.argsort(-np.linalg.norm(motion, axis=(1, 2)))[:3]:
         along = np.linalg.svd(motion[n], full_matrices=False).Vh[0]
         along = along if along[np.argmax(np.abs(along))] > 0 else -along
         line, points = (scale * (values[n] - centre[n]) @ along for values in (fitted, observed.values))
-        axes.plot(observed.time[order], line[order], color=BLUE, label="fitted" if number == 0 else None)
-        label = "observed" if number == 0 else None
-        axes.plot(observed.time, points, ".", color=VERMILION, markersize=3, label=label)
+        _plot_over_time(axes, observed.time[order], line[order], points[order])
     axes.set(title="The points that move most", xlabel="time [s]", ylabel=f"place along the motion [{unit}]")
     axes.legend()
+
+
+def _plot_over_time(axes: Axes, time: Array, fitted: Array, observed: Array) -> None:
+    """Plot a fitted line and observed dots; the first ones have labels."""
+    labels = (None, None) if axes.lines else ("fitted", "observed")
+    axes.plot(time, fitted, color=BLUE, label=labels[0])
+    axes.plot(time, observed, ".", color=VERMILION, markersize=3, label=labels[1])
 
 
 def _plot_match(axes: Axes, observed: PointObservation, fitted: Array) -> None:
@@ -152,63 +151,89 @@ def _plot_forces(axes: Axes, observed: ToolForces, fitted: Array) -> None:
     for probe in np.unique(observed.probe):
         rows = np.flatnonzero(observed.probe == probe)
         rows = rows[np.argsort(observed.time[rows])]
-        is_first = len(axes.lines) == 0
         for component in np.flatnonzero(np.isfinite(observed.values[rows]).any(axis=0)):
-            line, points = (force[rows, component] for force in (fitted, observed.values))
-            axes.plot(observed.time[rows], line, color=BLUE, label="fitted" if is_first else None)
-            label = "observed" if is_first else None
-            axes.plot(observed.time[rows], points, ".", color=VERMILION, markersize=3, label=label)
+            line = fitted[rows, component]
+            _plot_over_time(axes, observed.time[rows], line, observed.values[rows, component])
             largest = np.argmax(np.abs(line))
             if abs(line[largest]) > 0.1 * np.abs(fitted).max():
                 axes.text(observed.time[rows[largest]], line[largest], f"  {'xyz'[component]}")
-            is_first = False
     axes.set(title="Forces on the sheet", xlabel="time [s]", ylabel="force [N]")
+    axes.legend()
+
+
+def _plot_test_over_time(axes: Axes, fitted: FittedTest, title: str) -> None:
+    """Plot the force of a machine test over time: all rows of the table, frames, and the fitted force."""
+    loading = fitted.loading
+    axes.plot(loading.test.time, loading.test.force, ".", color=SILVER, markersize=2, label="table")
+    axes.plot(loading.time, loading.force, ".", color=VERMILION, markersize=3, label="measured, of a frame")
+    axes.plot(loading.time, fitted.force, color=BLUE, label="fitted")
+    axes.set_title(title, parse_math=False)
+    axes.set(xlabel="time [s]", ylabel="force [N]")
+    axes.legend()
+
+
+def _plot_test_over_depth(axes: Axes, fitted: FittedTest) -> None:
+    """Plot the force of a machine test over depth, with the depth of contact."""
+    loading = fitted.loading
+    axes.plot(1000 * loading.test.depth, loading.test.force, ".", color=SILVER, markersize=2)
+    axes.plot(1000 * loading.depth, loading.force, ".", color=VERMILION, markersize=3)
+    axes.plot(1000 * loading.depth, fitted.force, color=BLUE)
+    axes.axvline(1000 * fitted.contact, color=GREY, linewidth=0.8, linestyle=DASHED, label="contact")
+    axes.set(title="Force over depth", xlabel="depth of the table [mm]", ylabel="force [N]")
+    axes.legend()
+
+
+def _plot_test_residual(axes: Axes, fitted: FittedTest) -> None:
+    """Plot fitted minus measured force of a machine test over time, with twice the noise on either side."""
+    loading, residual = fitted.loading, fitted.force - fitted.loading.force
+    axes.axhspan(-2 * loading.noise, 2 * loading.noise, color=SILVER, alpha=0.4, linewidth=0, label="2 x noise")
+    axes.plot(loading.time, residual, color=BLUE, linewidth=0.8)
+    limit = 1.1 * float(np.abs(residual).max())
+    axes.set(xlabel="time [s]", ylabel="fitted minus measured [N]", ylim=(-limit, limit))
+    axes.set_title(f"Residual, {100 * fitted.residual / loading.peak:.2g} % rms of peak")
     axes.legend()
 
 
 def _plot_parameter(axes: Axes, result: FitResult, key: str) -> None:
     """Plot the profile of a parameter and its interval."""
-    estimate, curve = result.parameters[key], result.curves[key]
-    axes.plot([point.x for point in curve], [point.deviations**2 for point in curve], ".-", color=BLUE)
-    ends = [end for end in estimate.interval if end is not None]
+    estimate, (x, deviations) = result.parameters[key], np.array(result.curves[key]).T
+    axes.plot(x, deviations**2, ".-", color=BLUE)
     axes.axvline(estimate.value, color=GREY, linewidth=0.8)
-    for end in ends:
-        axes.axvline(end, color=ORANGE, linewidth=0.8, linestyle=(0, (4, 2)))
-    axes.set_xlim(min(point.x for point in curve), max(point.x for point in curve))
-    axes.set_ylim(0, 9)
+    for end in estimate.interval:
+        if end is not None:
+            axes.axvline(end, color=ORANGE, linewidth=0.8, linestyle=DASHED)
     axes.xaxis.set_major_locator(MaxNLocator(4))
     axes.set_title(printable(key), parse_math=False)
-    axes.set(xlabel="value; dashed: 95 %", ylabel="rise of chi-square")
+    axes.set(xlim=(x.min(), x.max()), ylim=(0, 9), xlabel="value; dashed: 95 %", ylabel="rise of chi-square")
 
 
-def plot_map(panels: Sequence[Axes], fitted_map: FittedMap, sheet: Sheet) -> None:
-    """Plot a map, its errors, and the weight of its smoothness on three panels."""
+def _map_panels(fitted_map: FittedMap, sheet: Sheet) -> list[Panel]:
+    """Return the panels of a map: the map, its errors, and the weight of its smoothness."""
     low, high = fitted_map.range
-    ratio = max(high / low, 1.05)
-    centre = np.sqrt(low * high)
-    norm = LogNorm(centre / np.sqrt(ratio), centre * np.sqrt(ratio))
-    _plot_cells(panels[0], fitted_map, fitted_map.factors, sheet, norm, ("Stiffness", "factor of young", "viridis"))
+    ratio, centre = np.sqrt(max(high / low, 1.05)), np.sqrt(low * high)
+    norm, label = LogNorm(centre / ratio, centre * ratio), "factor of young"
     errors = 100 * fitted_map.errors
-    max_error = float(np.nanmax(errors)) if not fitted_map.unknown.all() else 100.0
-    _plot_cells(
-        panels[1], fitted_map, errors, sheet, Normalize(0, max_error), ("Standard error", "error [%]", "cividis")
-    )
-    _plot_weight(panels[2], fitted_map.choice)
+    error_norm = Normalize(0, float(np.nanmax(errors)) if not fitted_map.unknown.all() else 100.0)
+    plot_cells = partial(_plot_cells, unknown=fitted_map.unknown, sheet=sheet)
+    return [
+        partial(plot_cells, values=fitted_map.factors, norm=norm, texts=("Stiffness", label, "viridis")),
+        partial(plot_cells, values=errors, norm=error_norm, texts=("Standard error", "error [%]", "cividis")),
+        partial(_plot_weight, choice=fitted_map.choice),
+    ]
 
 
 def _plot_cells(
-    axes: Axes, fitted_map: FittedMap, values: Array, sheet: Sheet, norm: Normalize, texts: tuple[str, str, str]
+    axes: Axes, values: Array, unknown: NDArray[np.bool_], sheet: Sheet, norm: Normalize, texts: tuple[str, str, str]
 ) -> None:
-    """Plot values of the map cells on the sheet, with unknown cells hatched."""
+    """Plot values of the map cells on the sheet, with unknown cells hatched; `texts`: title, label and colours."""
     title, label, colours = texts
-    image = axes.imshow(
-        np.where(fitted_map.unknown, np.nan, values), colours, norm=norm, extent=(0, 1, 1, 0), interpolation="nearest"
-    )
+    known = np.where(unknown, np.nan, values)
+    image = axes.imshow(known, colours, norm=norm, extent=(0, 1, 1, 0), interpolation="nearest")
     side = 1 / len(values)
-    for row, col in np.argwhere(fitted_map.unknown) * side:
+    for row, col in np.argwhere(unknown) * side:
         axes.add_patch(Rectangle((col, row), side, side, facecolor="none", edgecolor=SILVER, hatch="////", linewidth=0))
     height, width = sheet.size
-    across = "across; hatched: unknown" if fitted_map.unknown.any() else "across"
+    across = "across; hatched: unknown" if unknown.any() else "across"
     axes.set(title=title, xlabel=across, ylabel="down", aspect=height / width)
     axes.grid(visible=False)
     assert isinstance(axes.figure, Figure)
@@ -225,7 +250,7 @@ def _plot_cells(
 def _plot_weight(axes: Axes, choice: SmoothnessWeight) -> None:
     """Plot the excess of chi-square and its expectation against the weight of the smoothness."""
     axes.plot(choice.weights, choice.left, color=BLUE, label="excess")
-    axes.plot(choice.weights, choice.expected, color=GREY, linestyle=(0, (4, 2)), label="expected")
+    axes.plot(choice.weights, choice.expected, color=GREY, linestyle=DASHED, label="expected")
     chosen = np.abs(np.log(choice.weights / choice.weight)).argmin()
     axes.plot(choice.weights[chosen], choice.left[chosen], "o", color=VERMILION, label="taken")
     axes.set(title="Smoothness", xlabel="weight of the smoothness", ylabel="chi-square")

@@ -11,21 +11,13 @@ import math
 from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.fitting import conventions, rejection
-from taichi_msm.fitting.observation import (
-    MAX_RESIDUAL_SHARE,
-    MAX_RESIDUAL_SIGMAS,
-    Array,
-    ErrorCorrelation,
-    Observation,
-    ObservationModel,
-    time_weights,
-)
+from taichi_msm.fitting import observation, rejection
+from taichi_msm.fitting.observation import Array, ErrorCorrelation, Observation, ObservationModel
 from taichi_msm.model.surface import surface_weights
 from taichi_msm.render.camera import view_at
 from taichi_msm.runs.simulation import Simulation
@@ -64,11 +56,11 @@ class PointModel(ObservationModel):
         corners, weights = surface_weights(observed.coordinates, scene.sheet, scene.render.refine)
         number, (rows, cols) = np.arange(len(corners)), scene.sheet.points
         self._surface = csr_matrix((weights.ravel(), (number.repeat(4), corners.ravel())), (len(corners), rows * cols))
-        self._time_weights = time_weights(scene, observed.time, frames)
+        self._time_weights = observation.time_weights(scene, observed.time, frames)
 
     def record(self, simulation: Simulation) -> Array:
         """Return the observed points in the current frame [m], shape (N, 3)."""
-        return self.points_on_sheet(simulation.positions())
+        return self.on_sheet(simulation.positions()[None])[0]
 
     def predict(self, recorded: Array) -> Array:
         """Return the observations of points, shape (frames, N, 3), as `observe` does."""
@@ -79,9 +71,9 @@ class PointModel(ObservationModel):
         moved = recorded - self._observed.rest_positions(self.scene)
         return np.asarray(np.linalg.norm(moved, axis=2).max(axis=1))
 
-    def points_on_sheet(self, position: Array) -> Array:
-        """Interpolate the positions of a frame, shape (rows, cols, 3), at the observed points [m], shape (N, 3)."""
-        return np.asarray(self._surface @ position.reshape(-1, 3))
+    def on_sheet(self, position: Array) -> Array:
+        """Interpolate positions [m], shape (frames, rows, cols, 3), at the observed points, shape (frames, N, 3)."""
+        return np.array([self._surface @ frame.reshape(-1, 3) for frame in position])
 
     def interpolate(self, at_frames: Array) -> Array:
         """Interpolate points, shape (frames, N, 3), at the observed times, shape (N, T, 3)."""
@@ -90,7 +82,7 @@ class PointModel(ObservationModel):
 
     def points(self, position: Array) -> Array:
         """Interpolate positions [m], shape (frames, rows, cols, 3), in space and time; returns shape (N, T, 3)."""
-        return self.interpolate(np.array([self.points_on_sheet(frame) for frame in position]))
+        return self.interpolate(self.on_sheet(position))
 
     def observe(self, points: Array) -> Array:
         """Convert points [m], shape (N, T, 3), to observations, shape (N, T, 3 or 2); NaN behind the camera."""
@@ -112,18 +104,22 @@ class PointModel(ObservationModel):
         return np.array([(self._surface.T @ frame.reshape(-1, 3)).reshape(shape) for frame in at_frames])
 
 
+class Conventions(NamedTuple):
+    """Where points are expected at rest, and the remedies where they are not."""
+
+    tolerance: float  # largest offset with the correct camera and origin
+    place: str
+    remedy: str
+    mirror_remedies: tuple[str, str]  # of a mirrored x and y
+
+
 @dataclass(frozen=True, eq=False)
 class PointObservation(Observation):
-    """Points over time; values of shape (N, T, 3 or 2), times of shape (T,).
-
-    Attributes:
-        kind: name of the array of values.
-        correlation_remedy: option that gives the correlation of the errors of neighbouring points.
-    """
+    """Points over time; values of shape (N, T, 3 or 2), times of shape (T,)."""
 
     noun: ClassVar[str] = "coordinates"
-    kind: ClassVar[str]
-    correlation_remedy: ClassVar[str]
+    kind: ClassVar[str]  # name of the array of values
+    correlation_remedy: ClassVar[str]  # option for correlated errors of neighbouring points
 
     sigma: float | None
     coordinates: Array  # across and down as fractions of the sheet, shape (N, 2)
@@ -151,16 +147,8 @@ class PointObservation(Observation):
         """Convert the gradient of a loss by the values to that by points [m], shape (N, T, 3)."""
 
     @abstractmethod
-    def tolerance(self, scene: Scene) -> float:
-        """Return the largest offset from rest with the correct camera and origin."""
-
-    @abstractmethod
-    def mirror_remedies(self, scene: Scene) -> tuple[str, str]:
-        """Return the remedies of a mirrored x and y."""
-
-    @abstractmethod
-    def place_remedy(self, scene: Scene) -> tuple[str, str]:
-        """Return where the points are expected at rest, and the remedy where they are not."""
+    def conventions(self, scene: Scene) -> Conventions:
+        """Return the conventions of the values."""
 
     def rest_positions(self, scene: Scene) -> Array:
         """Return the rest positions of the points [m], shape (N, 3)."""
@@ -178,8 +166,10 @@ class PointObservation(Observation):
         return float(np.sqrt(np.nanmean(motion**2, axis=(1, 2)).max())) if len(motion) else math.inf
 
     def fits_well(self, residuals: Array, deviation: float, signal: float) -> bool:
-        """Return whether the deviation is small, in sigma or as a share of the motion; see `Observation.fits_well`."""
-        return deviation <= (MAX_RESIDUAL_SHARE * signal if self.sigma is None else MAX_RESIDUAL_SIGMAS * self.sigma)
+        """Return whether the deviation is small, in sigma or as a share of the motion."""
+        if self.sigma is None:
+            return deviation <= observation.MAX_RESIDUAL_SHARE * signal
+        return deviation <= observation.MAX_RESIDUAL_SIGMAS * self.sigma
 
     def summary(self, residuals: Array, sigma: float | Array) -> dict[str, Any]:
         """Return residual, sigma and unit."""
@@ -189,7 +179,7 @@ class PointObservation(Observation):
         """Yield sentinel values of lost points."""
         rest = self.at_rest(scene)
         is_sentinel = (self.values == self.values[..., :1]).all(axis=2)
-        is_sentinel &= ~(np.linalg.norm(rest - self.values[..., :1], axis=-1) < self.tolerance(scene))
+        is_sentinel &= ~(np.linalg.norm(rest - self.values[..., :1], axis=-1) < self.conventions(scene).tolerance)
         for sentinel, count in zip(*np.unique(self.values[is_sentinel][:, 0], return_counts=True), strict=True):
             if sentinel in (0, -1) or count > 1:
                 fault = f"{sentinel:g} in all numbers of {count} points and times"
@@ -212,14 +202,18 @@ class PointObservation(Observation):
             fault = "are behind the eye of the scene's camera, or beyond its lens, where the search begins"
             remedy = "give the scene the camera that saw them, or NaN in their place"
             yield f"{self.subject}: {invisible} of the observed points {fault}; {remedy}"
+        elif same_camera and (axes := self._mirrored_axes(scene)):
+            names = " and ".join("xy"[axis] for axis in axes)
+            remedy = " and ".join(self.conventions(scene).mirror_remedies[axis] for axis in axes)
+            yield f"{self.subject}: {names} of the points at rest has the other sign in the scene; take {remedy}"
         elif same_camera:
-            yield from self._faults_at_rest(scene, predicted)
+            yield from self._misplaced(scene, predicted)
 
     def opposed(self, scene: Scene, *predictions: Array) -> Iterator[str]:
         """Yield components of the motion that all predictions have with the other sign."""
         rest = self.at_rest(scene)
         moved = [prediction - rest for prediction in predictions]
-        for axis in conventions.opposed_axes(self.values - rest, moved, self.sigma):
+        for axis in observation.opposed_axes(self.values - rest, moved, self.sigma):
             fault = f"{'xyz'[axis]} changes against the scene's; is its sign, or that of a tool's force or path, wrong?"
             yield f"{self.subject}: {fault} change the sign of either"
 
@@ -231,9 +225,16 @@ class PointObservation(Observation):
 
     def correlated(self, rows: Array, correlation: ErrorCorrelation) -> tuple[Array, float]:
         """Return R^T K R, and tr(K^2); see `Observation.correlated`."""
+        from scipy.spatial.distance import cdist
+
         # Distances are those of mean observed positions; tracks without observations are left out.
         is_tracked: NDArray[np.bool_] = np.any(self.is_observed, axis=1)
-        space, time = self._correlations(is_tracked, correlation)
+        space, time = np.eye(int(is_tracked.sum())), np.eye(len(self.time))
+        if correlation.correlation is not None:
+            pixels = np.nanmean(self.values[is_tracked], axis=1)
+            space = np.exp(-cdist(pixels, pixels) / correlation.correlation)
+        if correlation.drift is not None:
+            time = np.exp(-np.abs(self.time[:, None] - self.time) / correlation.drift)
         by_track = np.zeros((*self.values.shape, rows.shape[1]))
         by_track[self.known] = rows
         by_track = by_track[is_tracked]
@@ -266,43 +267,27 @@ class PointObservation(Observation):
         # Rest positions may be behind the camera.
         return motion[np.isfinite(motion).any(axis=(1, 2))]
 
-    def _faults_at_rest(self, scene: Scene, predicted: Array) -> Iterator[str]:
-        """Yield the faults of the points at rest: mirrored axes, a wrong camera or origin."""
-        if axes := conventions.mirrored_axes(self.values, self.at_rest(scene), self.known):
-            remedies = self.mirror_remedies(scene)
-            remedy = " and ".join(remedies[axis] for axis in axes)
-            names = " and ".join("xy"[axis] for axis in axes)
-            yield f"{self.subject}: {names} of the points at rest has the other sign in the scene; take {remedy}"
-            return
-        yield from self._misplaced(scene, predicted)
-        yield from self._common_offset(scene, predicted)
-
-    def _common_offset(self, scene: Scene, predicted: Array) -> Iterator[str]:
-        """Yield an offset of all points at rest."""
-        yield from ()
+    def _mirrored_axes(self, scene: Scene) -> list[int]:
+        """Return the axes on which the points have the other sign than those at rest."""
+        count = self.is_observed.sum(axis=1)
+        expected, observed = (
+            np.where(self.known, each, 0.0).sum(axis=1)[count > 0, :2] / count[count > 0, None]
+            for each in (self.at_rest(scene), self.values)
+        )
+        if not (np.isfinite(expected).all() and len(expected) >= observation.MIN_COUNT):
+            return []
+        return observation.opposed_axes(observed - observed.mean(axis=0), [expected - expected.mean(axis=0)], None)
 
     def _misplaced(self, scene: Scene, predicted: Array) -> Iterator[str]:
         """Compare the first observed points with their rest positions: the camera or origin may differ."""
+        tolerance, place, remedy, _ = self.conventions(scene)
         rest, start = self.at_rest(scene), int(np.argmax(self.is_observed.any(axis=0)))
         offsets = np.linalg.norm((self.values - rest)[:, start], axis=1)[self.is_observed[:, start]]
         offset = float(np.median(np.where(np.isfinite(offsets), offsets, math.inf)))
         motion = float(np.nanmax(np.linalg.norm(predicted - rest, axis=2)))
-        if offset > max(self.tolerance(scene), 5 * (self.sigma or 0.0), 3.0 * max(motion, self.signal(scene))):
-            expected, remedy = self.place_remedy(scene)
-            fault = f"half of the points are {offset:.3g} {self.unit} or more from where {expected}"
+        if offset > max(tolerance, 5 * (self.sigma or 0.0), 3.0 * max(motion, self.signal(scene))):
+            fault = f"half of the points are {offset:.3g} {self.unit} or more from where {place}"
             yield f"{self.subject}: {fault}; {remedy}"
-
-    def _correlations(self, is_tracked: NDArray[np.bool_], correlation: ErrorCorrelation) -> tuple[Array, Array]:
-        """Return the correlations of the errors of tracks, shape (tracks, tracks), and of times, shape (T, T)."""
-        from scipy.spatial.distance import cdist
-
-        space, time = np.eye(int(is_tracked.sum())), np.eye(len(self.time))
-        if correlation.correlation is not None:
-            pixels = np.nanmean(self.values[is_tracked], axis=1)
-            space = np.exp(-cdist(pixels, pixels) / correlation.correlation)
-        if correlation.drift is not None:
-            time = np.exp(-np.abs(self.time[:, None] - self.time) / correlation.drift)
-        return space, time
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,24 +306,21 @@ class Positions(PointObservation):
         """Return the gradient."""
         return gradient
 
-    def tolerance(self, scene: Scene) -> float:
-        """Return a share of the sheet [m]."""
-        return MAX_OFFSET_SHARE * max(scene.sheet.size)
-
-    def mirror_remedies(self, scene: Scene) -> tuple[str, str]:
-        """Return the remedies of a mirrored x and y."""
-        return "-x, right of the middle above 0", "-y, above the middle above 0"
-
-    def place_remedy(self, scene: Scene) -> tuple[str, str]:
-        """Return where the points are expected at rest, and the remedy where they are not."""
-        return "they are at rest in the scene", "count from the sheet's middle, x right, y up, z toward the viewer"
+    def conventions(self, scene: Scene) -> Conventions:
+        """Return the conventions of positions."""
+        return Conventions(
+            MAX_OFFSET_SHARE * max(scene.sheet.size),
+            "they are at rest in the scene",
+            "count from the sheet's middle, x right, y up, z toward the viewer",
+            ("-x, right of the middle above 0", "-y, above the middle above 0"),
+        )
 
     def faults(self, scene: Scene) -> Iterator[str]:
         """Compare the extent of the observed points with that at rest; yield sentinel values of lost points."""
-        is_observed = self.is_observed
-        rest = self.rest_positions(scene)[is_observed.any(axis=1)]
+        is_observed = self.is_observed.any(axis=1)
+        rest = self.rest_positions(scene)[is_observed]
         if len(rest) > 1:
-            centres = np.nanmedian(self.values[is_observed.any(axis=1)], axis=1)[:, :2]
+            centres = np.nanmedian(self.values[is_observed], axis=1)[:, :2]
             extent, rest_extent = (
                 float(np.linalg.norm(points - points.mean(axis=0), axis=1).max()) for points in (centres, rest[:, :2])
             )
@@ -359,9 +341,8 @@ class Pixels(PointObservation):
 
     def observe(self, scene: Scene, points: Array) -> Array:
         """Project points by the scene's main camera; NaN behind the eye, or beyond the lens."""
-        return np.stack(
-            [view_at(scene, each).pixels(points[:, n]) for n, each in enumerate(self.time.tolist())], axis=1
-        )
+        pixels = [view_at(scene, time).pixels(points[:, n]) for n, time in enumerate(self.time.tolist())]
+        return np.stack(pixels, axis=1)
 
     def backward(self, scene: Scene, points: Array, gradient: Array) -> Array:
         """Convert the gradient by central differences of the projection; see `PointObservation.backward`."""
@@ -372,21 +353,14 @@ class Pixels(PointObservation):
         )
         return np.stack([(gradient * change).sum(axis=-1) for change in changes], axis=-1)
 
-    def tolerance(self, scene: Scene) -> float:
-        """Return a number of pixels."""
-        return MAX_OFFSET_PX
-
-    def mirror_remedies(self, scene: Scene) -> tuple[str, str]:
-        """Return the remedies of a mirrored x and y."""
+    def conventions(self, scene: Scene) -> Conventions:
+        """Return the conventions of pixels."""
         width, height = scene.render.size
-        return f"{width} - x, counted from the left", f"{height} - y, counted from above"
-
-    def place_remedy(self, scene: Scene) -> tuple[str, str]:
-        """Return where the points are expected at rest, and the remedy where they are not."""
-        width, height = scene.render.size
-        return (
+        return Conventions(
+            MAX_OFFSET_PX,
             f"the scene's camera sees them at rest in its {width} x {height} px",
             "give the scene that camera and size, and count from the picture's upper left corner, right and down",
+            (f"{width} - x, counted from the left", f"{height} - y, counted from above"),
         )
 
     def faults(self, scene: Scene) -> Iterator[str]:
@@ -399,11 +373,27 @@ class Pixels(PointObservation):
             fault = "are they fractions of the frame? multiply them by its width and height"
             yield f"{self.subject}: up to {largest:.3g}; {fault}, {width} and {height} in the scene"
 
-    def _common_offset(self, scene: Scene, predicted: Array) -> Iterator[str]:
-        """Yield a common offset by half a pixel."""
-        yield from conventions.half_pixel(
-            self.subject, self.values, self.at_rest(scene), predicted, self.is_observed, self.sigma
-        )
+    def _misplaced(self, scene: Scene, predicted: Array) -> Iterator[str]:
+        """Yield a wrong camera, or a common half-pixel offset of all points whose predicted motion is below 0.02 px."""
+        yield from super()._misplaced(scene, predicted)
+        rest = self.at_rest(scene)
+        is_at_rest = self.is_observed & (np.linalg.norm(predicted - rest, axis=2) < 0.02)
+        count = is_at_rest.sum(axis=1)
+        offsets = np.where(is_at_rest[..., None], self.values - rest, 0.0).sum(axis=1)[count > 0]
+        offsets = offsets / count[count > 0, None]
+        if len(offsets) < 5:
+            return
+        sigma_error = (self.sigma or 0.0) / np.sqrt(count.sum())
+        mean, error = offsets.mean(axis=0), np.maximum(offsets.std(axis=0, ddof=1) / np.sqrt(len(offsets)), sigma_error)
+        halves = np.where(np.abs(mean) < 0.25, 0.0, 0.5 * np.sign(mean))
+        distance = np.abs(np.stack([mean, np.median(offsets, axis=0)]) - halves).max(axis=0)
+        # The mean offset is within 3 standard errors of a half or 0, precise, and significant [px].
+        is_near = (distance <= 3.0 * error + 0.02) & (error < 0.1)
+        if is_near.all() and ((halves != 0) & (np.abs(mean) > 5.0 * error)).any():
+            shown = " and ".join(f"{offset:+.2g} px in {axis}" for offset, axis in zip(mean, "xy", strict=True))
+            side, remedy = (0, "add") if halves.min() < 0 else (1, "subtract")
+            question = f"is the centre of their first pixel at {side}? {remedy} 0.5, as it is at 0.5 here"
+            yield f"{self.subject}: points at rest are off by {shown} on average; {question}"
 
 
 def _residual_correlations(residuals: Array, coordinates: Array) -> tuple[float, float]:
@@ -415,10 +405,9 @@ def _residual_correlations(residuals: Array, coordinates: Array) -> tuple[float,
         is_known = np.isfinite(product)
         return 2 * float(product[is_known].sum()) / max(float(square[is_known].sum()), 1e-300)
 
-    # The nearest point is the point itself, the second its neighbour.
-    in_space = (
-        correlation(residuals, residuals[KDTree(coordinates).query(coordinates, 2)[1][:, 1]])
-        if len(residuals) > 1
-        else 0.0
-    )
+    in_space = 0.0
+    if len(residuals) > 1:
+        # The nearest point is the point itself, the second its neighbour.
+        neighbour = KDTree(coordinates).query(coordinates, 2)[1][:, 1]
+        in_space = correlation(residuals, residuals[neighbour])
     return in_space, correlation(residuals[:, 1:], residuals[:, :-1])

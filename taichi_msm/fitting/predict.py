@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from typing_extensions import Self
 
 from taichi_msm.accuracy.mesh import coarser_plan, estimate_mesh_error
 from taichi_msm.errors import DivergedError, ExecutorError, Pause, SceneError, StageProgressCallback
-from taichi_msm.fitting.observation import Observation, ObservationModel, time_in_frames
+from taichi_msm.fitting.observation import Array, Observation, ObservationModel, time_in_frames
 from taichi_msm.fitting.parameters import Parameter, as_data, with_values
 from taichi_msm.load import cost
 from taichi_msm.load.check import check_scene
@@ -28,8 +28,6 @@ from taichi_msm.sweeps.pool import DiedError, Pool
 from taichi_msm.sweeps.tables import PROCESS_BYTES
 from taichi_msm.system import runtime
 from taichi_msm.system.process import available_memory, available_threads
-
-Array = NDArray[np.float64]
 
 
 class Prediction(NamedTuple):
@@ -50,13 +48,19 @@ class FitProblem:
     observations: tuple[Observation, ...]
     signs: ClassVar[tuple[int, ...]] = (1, -1)  # of the finite differences at the solution
 
+    @property
+    def limits(self) -> tuple[Array, Array]:
+        """Smallest and largest coordinates of the parameters, each of shape (n,)."""
+        low, high = np.array([parameter.limits for parameter in self.parameters]).T
+        return low, high
+
     def build_model(self, threads: int | None) -> ForwardModel:
         """Build the forward model on a number of threads; None: all cores."""
         return ForwardModel(self, threads)
 
     def fitted_data(self, data: dict[str, Any], values: Mapping[str, float]) -> dict[str, Any]:
         """Return a scene's data with parameter values by key."""
-        return with_values(data, self.parameters, [values[parameter.key] for parameter in self.parameters])
+        return with_values(data, self.parameters, values)
 
 
 def without_outputs(scene: Scene) -> Scene:
@@ -98,7 +102,14 @@ class ForwardModel:
             SceneError: when the scene with these values is not valid, or has too few mass points to be coarsened.
             DivergedError: when the run diverges.
         """
-        return self._run(*self.start(self.plan(x), steps, coarse), to_end, pause)
+        simulation, plan = self.start(self.plan(x), steps, coarse)
+        # The mesh of a coarse run differs.
+        models = [observed.build_model(plan.scene, self._frames) for observed in self.job.observations]
+        frames = max(self._frames, plan.grid.frames + 1) if to_end else self._frames
+        pairs = list(zip(models, self.record(models, simulation, frames, pause), strict=True))
+        values = tuple(model.predict(recorded[: self._frames]) for model, recorded in pairs)
+        motion = np.max([model.motion(recorded) for model, recorded in pairs], axis=0)
+        return Prediction(values, plan.grid.steps_per_frame, motion)
 
     def start(self, plan: Plan, steps: int | None, coarse: int) -> tuple[Simulation, Plan]:
         """Restart the simulation, and return it with the plan as it is run; arguments as of `predict`."""
@@ -107,7 +118,11 @@ class ForwardModel:
                 raise SceneError(["sheet.points: too few to take half of them"])
             plan = coarser
         if plan.scene.time.step == "auto" and not plan.scene.time.at_rest:
-            plan = plan.with_grid(steps_per_frame=max(steps or _steps_with_margin(plan), plan.grid.steps_per_frame))
+            if steps is None:
+                # Stable for finite differences around these parameters.
+                frame = 1 / plan.grid.frames_per_second
+                steps = math.ceil(2 * frame / plan.stable_step * (1 + difference_step(plan.scene)))
+            plan = plan.with_grid(steps_per_frame=max(steps, plan.grid.steps_per_frame))
         if self._simulation is None:
             self._simulation = Simulation(plan, threads=self._threads)
         else:
@@ -128,24 +143,17 @@ class ForwardModel:
         pairs = zip(predicted.values, self.job.observations, strict=True)
         return predicted if all(np.isfinite(values[observed.known]).all() for values, observed in pairs) else None
 
+    def values(self, x: Array) -> dict[str, float]:
+        """Return the parameter values by key at x; SceneError: they are out of range."""
+        pairs = zip(self.job.parameters, x.tolist(), strict=True)
+        values = {parameter.key: parameter.value(coordinate) for parameter, coordinate in pairs}
+        if not np.isfinite(list(values.values())).all():
+            raise SceneError(["the values are out of range"])
+        return values
+
     def plan(self, x: Array) -> Plan:
         """Plan the scene with the parameters at x; SceneError: it is not valid."""
-        values = [
-            parameter.value(coordinate) for parameter, coordinate in zip(self.job.parameters, x.tolist(), strict=True)
-        ]
-        if not np.isfinite(values).all():
-            raise SceneError(["the values are out of range"])
-        data = with_values(self.data, self.job.parameters, values)
-        return check_scene(Scene(**data), self.maps)
-
-    def _run(self, simulation: Simulation, plan: Plan, to_end: bool, pause: Pause) -> Prediction:
-        # The mesh of a coarse run differs.
-        models = [observed.build_model(plan.scene, self._frames) for observed in self.job.observations]
-        frames = max(self._frames, plan.grid.frames + 1) if to_end else self._frames
-        pairs = list(zip(models, self.record(models, simulation, frames, pause), strict=True))
-        values = tuple(model.predict(recorded[: self._frames]) for model, recorded in pairs)
-        motion = np.max([model.motion(recorded) for model, recorded in pairs], axis=0)
-        return Prediction(values, plan.grid.steps_per_frame, motion)
+        return check_scene(Scene(**self.job.fitted_data(self.data, self.values(x))), self.maps)
 
     def record(
         self, models: Sequence[ObservationModel], simulation: Simulation, frames: int, pause: Pause
@@ -172,12 +180,6 @@ def difference_step(scene: Scene) -> float:
     return 1e-2 if scene.time.at_rest or any(probe.moved for probe in scene.probes) else 1e-5
 
 
-def _steps_with_margin(plan: Plan) -> int:
-    """Return a number of steps per frame that is stable for finite differences around the parameters of a plan."""
-    frame = 1 / plan.grid.frames_per_second
-    return math.ceil(2 * frame / plan.stable_step * (1 + difference_step(plan.scene)))
-
-
 # Forward model of the last fit in this process, by its token.
 _cached_models: dict[str, ForwardModel] = {}
 
@@ -185,22 +187,16 @@ _cached_models: dict[str, ForwardModel] = {}
 def predict(job: FitProblem, x: Array, steps: int | None) -> Prediction | None:
     """Predict in a worker process on one thread, as `ForwardModel.try_predict` does."""
     if job.token not in _cached_models:
-        for model in _cached_models.values():
-            model.close()
-        _cached_models.clear()
+        for token in list(_cached_models):
+            _cached_models.pop(token).close()
         _cached_models[job.token] = job.build_model(threads=1)
     return _cached_models[job.token].try_predict(x, steps)
 
 
 def mesh_error(plan: Plan, pause: Pause) -> float | None:
-    """Estimate the mesh error, as a fraction of the largest displacement.
+    """Estimate the mesh error of a plan, as a fraction of the largest displacement.
 
-    Args:
-        plan: of the scene.
-        pause: called several times a second; an exception from it ends the runs.
-
-    Returns:
-        The error; None for springs, with too few mass points, or if a coarser run fails.
+    It is None for springs, with too few mass points, or if a coarser run fails; `pause` is as for `ForwardModel`.
     """
     if coarser_plan(plan) is None:
         return None
@@ -219,14 +215,11 @@ class Runs:
         workers: number of worker processes; 1: no pool; None: by the duration of the first run.
         progress: called often with the stage, the finished and the expected number of runs; an exception from it ends
             the fit.
-
-    Attributes:
-        count: number of finished runs.
-        expected: expected number of runs.
     """
 
     def __init__(self, job: FitProblem, workers: int | None, progress: StageProgressCallback) -> None:
-        self.job, self.count, self.expected = job, 0, 0
+        self.job = job
+        self.count = self.expected = 0  # number of finished runs, and the expected number
         self._workers, self._progress = workers, progress
         self._predictor = job.build_model(threads=None)
         self._pool: Pool | None = None
@@ -262,7 +255,16 @@ class Runs:
             self._pool = Pool(workers)
         if self._pool is None or len(coordinates) < 2:
             return [self.predict_one(x, steps) for x in coordinates]
-        return self._predict_in_pool(self._pool, coordinates, steps)
+        futures: list[Future[Any]] = [self._pool.submit(predict, self.job, x, steps) for x in coordinates]
+        waiting = set(futures)
+        while waiting:
+            self._report_progress()
+            done, waiting = wait(waiting, 0.1)
+            self.count += len(done)
+        try:
+            return [future.result() for future in futures]
+        except DiedError as error:
+            raise ExecutorError(f"a run of the fit ended early: {error}; take fewer --workers") from None
 
     def _choose_workers(self) -> int:
         if self._workers is not None:
@@ -274,22 +276,10 @@ class Runs:
         process_bytes = PROCESS_BYTES + cost.estimate_budget(check_scene(self.job.scene)).memory_bytes
         return max(1, min(available_threads(), available_memory() // process_bytes, 2 * parameters))
 
-    def _predict_in_pool(self, pool: Pool, coordinates: Sequence[Array], steps: int | None) -> list[Prediction | None]:
-        futures: list[Future[Any]] = [pool.submit(predict, self.job, x, steps) for x in coordinates]
-        waiting = set(futures)
-        while waiting:
-            self._report_progress()
-            done, waiting = wait(waiting, 0.1)
-            self.count += len(done)
-        try:
-            return [future.result() for future in futures]
-        except DiedError as error:
-            raise ExecutorError(f"a run of the fit ended early: {error}; take fewer --workers") from None
-
     def _report_progress(self) -> None:
         self._progress("fit", self.count, max(self.expected, self.count + 1))
 
-    def __enter__(self) -> Runs:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: object, *_: object) -> None:

@@ -13,9 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.fitting.observation import ErrorCorrelation
-
-Array = NDArray[np.float64]
+from taichi_msm.fitting.observation import Array, ErrorCorrelation
 
 # Smallest probability of a model that is not rejected.
 MIN_PROBABILITY = 1e-3

@@ -1,44 +1,33 @@
-"""Result of a fit, and its warnings."""
+"""Result of a fit."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.fitting.least_squares import Misfit, ProfilePoint, Solution, Uncertainty, UnidentifiedGroup
+from taichi_msm.fitting.least_squares import ProfilePoint, UnidentifiedGroup
 from taichi_msm.fitting.machine_fit import FittedTest
-from taichi_msm.fitting.observation import ErrorCorrelation, Observation
-from taichi_msm.fitting.parameters import Parameter, rounded
+from taichi_msm.fitting.observation import Array, Observation
+from taichi_msm.fitting.parameters import rounded
 from taichi_msm.fitting.points import PointObservation
 from taichi_msm.fitting.tikhonov import SmoothnessWeight
 from taichi_msm.scene.scene import Scene
 
-Array = NDArray[np.float64]
-
 
 class Estimate(NamedTuple):
-    """Estimate of a parameter.
-
-    Attributes:
-        value: estimated value.
-        standard_error: of the value.
-        interval: ends of the 95 % confidence interval; None: beyond the bounds.
-        start: initial value.
-        identifiable: whether the standard error is at most the value, or the range of a coordinate or time.
-        mesh_error: conservative estimate of the discretisation error (mesh) of the value; None: not known.
-    """
+    """Estimate of a parameter."""
 
     value: float
-    standard_error: float
-    interval: tuple[float | None, float | None]
-    start: float
-    identifiable: bool
-    mesh_error: float | None
+    standard_error: float  # of the value
+    interval: tuple[float | None, float | None]  # ends of the 95 % confidence interval; None: beyond the bounds
+    start: float  # initial value
+    identifiable: bool  # whether the standard error is at most the value, or the range of a coordinate or time
+    mesh_error: float | None  # conservative estimate of the discretisation error of the value; None: not known
 
 
 def sixteen_bits(shares: Array) -> NDArray[np.uint16]:
@@ -84,9 +73,13 @@ class FittedMap:
         """Return JSON data, as in fit.json."""
         errors = [[None if math.isnan(error) else error for error in row] for row in self.errors.tolist()]
         return {
-            **{"resolution": len(self.factors), "range": self.range, "factors": self.factors.tolist()},
-            **{"standard_error": errors, "unknown": int(self.unknown.sum())},
-            **{"weight": self.choice.weight, "sigma": self.sigma},
+            "resolution": len(self.factors),
+            "range": self.range,
+            "factors": self.factors.tolist(),
+            "standard_error": errors,
+            "unknown": int(self.unknown.sum()),
+            "weight": self.choice.weight,
+            "sigma": self.sigma,
         }
 
     def summary(self) -> str:
@@ -175,38 +168,33 @@ class FitResult:
     def summary(self) -> list[str]:
         """Format the result in lines."""
         intervals = "intervals" if self.map is None else "errors of the fields"
-        lines = (
-            []
-            if self.rejection is None
-            else [f"the model is rejected: {self.rejection}; the {intervals} do not cover this"]
-        )
+        lines = []
+        if self.rejection is not None:
+            lines.append(f"the model is rejected: {self.rejection}; the {intervals} do not cover this")
         lines += [f"{key}: {_format_estimate(item)}" for key, item in self.parameters.items()]
         lines += [item.text for item in self.unseen]
         lines += [] if self.map is None else [self.map.summary()]
         chi_text = ""
         if self.chi_square is not None:
             chi_text = f", chi-square {self.chi_square:.3g} for {self.degrees_of_freedom} degrees of freedom"
-        lines += [_format_test(fitted) + chi_text for fitted in self.tests]
+        for fitted in self.tests:
+            peak, frames = fitted.loading.peak, len(fitted.loading.force)
+            residual = (
+                f"{fitted.residual:.3g} N, {rounded(100 * fitted.residual / peak)} % of the peak, at {frames} frames"
+            )
+            found = f"noise {fitted.loading.noise:.2g} N, contact at {fitted.contact:.4g} m"
+            lines.append(f"{fitted.loading.test.name}: residual {residual}; {found}{chi_text}")
         force_text = "" if self.residual_force is None else f", {self.residual_force:.3g} N"
         for observed in self.observations:
             if isinstance(observed, PointObservation):
                 points, times = observed.is_observed.shape
-                lines.append(
-                    f"residual {self.residual:.3g} {self.unit} of {points} points at {times} times"
-                    f"{force_text}{chi_text}"
-                )
+                residual = f"residual {self.residual:.3g} {self.unit} of {points} points at {times} times"
+                lines.append(f"{residual}{force_text}{chi_text}")
         if self.mesh_error is not None:
             qualifier = "at most about " if any(probe.moved for probe in self.scene.probes) else ""
             error = f"{qualifier}{rounded(100 * self.mesh_error)} % of the largest displacement"
             lines.append(f"mesh error of the fitted scene: {error}")
         return [*lines, *self.notes, f"{self.runs} runs, {self.seconds:.1f} s"]
-
-
-def _format_test(fitted: FittedTest) -> str:
-    loading = fitted.loading
-    share = rounded(100 * fitted.residual / loading.peak)
-    residual = f"residual {fitted.residual:.3g} N, {share} % of the peak, at {len(loading.force)} frames"
-    return f"{loading.test.name}: {residual}; noise {loading.noise:.2g} N, contact at {fitted.contact:.4g} m"
 
 
 def _format_estimate(estimate: Estimate) -> str:
@@ -221,56 +209,3 @@ def _format_estimate(estimate: Estimate) -> str:
     error_text = "?" if error > 1000 * max(abs(estimate.value), abs(estimate.start)) else rounded(error)
     suffix = "" if estimate.identifiable else ": not identifiable"
     return f"{written(estimate.value)} +- {error_text}, 95 % {low} to {high}, from {estimate.start:.6g}{suffix}"
-
-
-def search_notes(solution: Solution, parameters: Sequence[Parameter], *, fits_well: bool) -> Iterator[str]:
-    """Yield warnings about the search; `fits_well`: whether the residual is small."""
-    if not solution.converged:
-        yield "the search ended before it came to rest; start nearer by --set, or give --bounds"
-    if not fits_well:
-        yield "the residual is large: no values of these parameters reproduce the observations"
-    for parameter, x in zip(parameters, solution.x.tolist(), strict=True):
-        low, high = parameter.limits
-        if min(x - low, high - x) < 1e-3:
-            bounded = math.isfinite(parameter.low) or math.isfinite(parameter.high)
-            end = "a bound" if bounded else "1000 times from where it starts"
-            yield f"{parameter.key}: ended at {parameter.value(x):.4g}, {end}: its interval says little"
-
-
-def mesh_notes(
-    parameters: Sequence[Parameter], x: Array, uncertainties: Uncertainty, shifts: Array | None
-) -> Iterator[str]:
-    """Yield a warning about parameters whose mesh error exceeds their interval."""
-    half_widths = uncertainties.quantile * uncertainties.deviations
-    if shifts is not None and (
-        shifted := [
-            f"{parameter.key} by about {rounded(100 * parameter.share(x[n], float(shifts[n])))} %"
-            for n, parameter in enumerate(parameters)
-            if shifts[n] > half_widths[n]
-        ]
-    ):
-        remedy = "farther than the interval; take more sheet.points"
-        yield f"the number of points moves {', '.join(shifted)}: {remedy}"
-
-
-def correlation_notes(
-    parameters: Sequence[Parameter], uncertainties: Uncertainty, unidentified: Sequence[UnidentifiedGroup]
-) -> Iterator[str]:
-    """Yield warnings about correlated parameters, except unidentified ones."""
-    for n, m in zip(*np.nonzero(np.triu(np.abs(uncertainties.correlation) > 0.95, 1)), strict=True):
-        keys = parameters[n].key, parameters[m].key
-        if not any(set(keys) <= set(group.parameters) for group in unidentified):
-            fault = f"{keys[0]} and {keys[1]} correlate by {uncertainties.correlation[n, m]:.3f}"
-            yield f"{fault}: they are known best together"
-
-
-def residual_notes(
-    misfit: Misfit, solution: Solution, uncertainties: Uncertainty, error_correlation: ErrorCorrelation
-) -> Iterator[str]:
-    """Yield warnings about residuals above sigma, and those of every observation."""
-    if uncertainties.factor > 1.5:
-        factor = rounded(math.sqrt(uncertainties.factor))
-        yield f"the residual is {factor} times sigma, and the intervals are widened by this factor"
-    each = zip(misfit.observations, solution.predicted.values, misfit.signals, strict=True)
-    for observed, predicted, signal in each:
-        yield from observed.residual_notes(predicted, signal, error_correlation)

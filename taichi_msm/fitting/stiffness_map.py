@@ -8,12 +8,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from taichi_msm.accuracy.mesh import coarser_plan
 from taichi_msm.errors import SceneError, StageProgressCallback
 from taichi_msm.fitting.checks import faults, faults_at_start
 from taichi_msm.fitting.least_squares import MAX_RELATIVE_ERROR, ProfilePoint
+from taichi_msm.fitting.observation import Array
 from taichi_msm.fitting.parameters import Bounds, Parameter, make_parameters, rounded
 from taichi_msm.fitting.points import PointModel, PointObservation
 from taichi_msm.fitting.predict import Prediction, mesh_error, without_outputs
@@ -29,8 +29,6 @@ from taichi_msm.scene.sheet import StiffnessMap
 from taichi_msm.solver.planning import stable_step
 from taichi_msm.system import runtime
 from taichi_msm.system.process import available_memory
-
-Array = NDArray[np.float64]
 
 KEY = "tissue.map"
 
@@ -81,16 +79,14 @@ def map_settings(
         raise SceneError([f"--bounds {unknown[0]}: not among --free; take {KEY}=LOW,HIGH, factors of young"])
     low, high = bounds.get(KEY, (DEFAULT_LOW, DEFAULT_HIGH))
     low, high = (DEFAULT_LOW if low == -math.inf else low), (DEFAULT_HIGH if high == math.inf else high)
+    interval = f"--bounds {KEY}={low:g},{high:g}"
     if not 0 < low < high:
-        raise SceneError([f"--bounds {KEY}={low:g},{high:g}: take factors of young above 0, the smaller one first"])
+        raise SceneError([f"{interval}: take factors of young above 0, the smaller one first"])
     if low < 1 / MAX_FACTOR or high > MAX_FACTOR:
-        remedy = f"take factors of young from {1 / MAX_FACTOR:g} to {MAX_FACTOR:g}"
-        raise SceneError([f"--bounds {KEY}={low:g},{high:g}: {remedy}"])
-    force = (
-        make_parameters(scene, force_keys, {key: bounds[key] for key in force_keys if key in bounds})[0]
-        if force_keys
-        else None
-    )
+        raise SceneError([f"{interval}: take factors of young from {1 / MAX_FACTOR:g} to {MAX_FACTOR:g}"])
+    force = None
+    if force_keys:
+        (force,) = make_parameters(scene, force_keys, {key: bounds[key] for key in force_keys if key in bounds})
     return MapSettings(resolution, (low, high), force)
 
 
@@ -145,20 +141,11 @@ def fit_map(
         differences = (coarse_model.observe(coarse_points) - model.observe(points))[observations.known] / 3.0
         mesh_shift = float(np.sqrt(np.nanmean(differences**2)))
     sigma = math.hypot(observations.sigma, mesh_shift)
-    search = MapSearch(
-        adjoint,
-        model,
-        observations,
-        sigma,
-        grid,
-        limits,
-        report_progress,
-        force_limits=settings.force.limits if settings.force else None,
-    )
+    force_limits = settings.force.limits if settings.force else None
+    search = MapSearch(adjoint, model, observations, sigma, grid, limits, report_progress, force_limits=force_limits)
     solution = search.best(start)
-    factors, errors = (
-        values[:cell_count].reshape(settings.resolution, -1) for values in (np.exp(solution.x), solution.errors)
-    )
+    shape = settings.resolution, settings.resolution
+    factors, errors = (values[:cell_count].reshape(shape) for values in (np.exp(solution.x), solution.errors))
     fitted_map = FittedMap(factors, errors, solution.choice, sigma)
     fitted = search.predict(solution.x)[1]
     residuals = (fitted - observations.values)[observations.known]
@@ -166,20 +153,23 @@ def fit_map(
     update = {"map": StiffnessMap(image=image, range=fitted_map.range)}
     fitted_scene = scene.model_copy(update={"tissue": scene.tissue.model_copy(update=update)})
     fitted_scene = with_scaled_forces(fitted_scene, *np.exp(solution.x[cell_count:]).tolist())
-    parameters = {} if settings.force is None else {settings.force.key: _force_estimate(settings.force, solution)}
+    estimates, curves = {}, {}
+    if settings.force is not None:
+        key = settings.force.key
+        estimates[key], curves[key] = _force_estimate(settings.force, solution)
     mapped_plan = check_scene(without_outputs(fitted_scene), {**plan.maps, "map": MapImage(fitted_map.grey, "")})
     chi_square = float(np.sum((residuals / observations.sigma) ** 2))
     return FitResult(
-        parameters=parameters,
-        correlation=[[1.0]] * len(parameters),
-        curves={key: _curve(estimate, solution) for key, estimate in parameters.items()},
+        parameters=estimates,
+        correlation=[[1.0]] * len(estimates),
+        curves=curves,
         residual=float(np.sqrt(np.mean(residuals**2))),
         sigma=observations.sigma,
         unit=observations.unit,
         chi_square=chi_square,
         rejection=by_chi_square(chi_square, residuals.size, residuals.size),
         degrees_of_freedom=residuals.size,
-        identifiable=not fitted_map.unknown.any() and all(estimate.identifiable for estimate in parameters.values()),
+        identifiable=not fitted_map.unknown.any() and all(estimate.identifiable for estimate in estimates.values()),
         mesh_error=mesh_error(mapped_plan, report_progress),
         runs=search.runs + 1,
         notes=list(_notes(observations, solution, fitted_map, mesh_shift, limits, residuals)),
@@ -190,18 +180,13 @@ def fit_map(
     )
 
 
-def _force_estimate(parameter: Parameter, solution: MapSolution) -> Estimate:
+def _force_estimate(parameter: Parameter, solution: MapSolution) -> tuple[Estimate, list[ProfilePoint]]:
+    """Return the estimate of a force, and the quadratic approximation of its profile."""
     x, deviation = float(solution.x[-1]), float(np.nan_to_num(solution.errors[-1], nan=UNKNOWN_DEVIATION))
-    ends = sorted(parameter.value(x + side * 1.96 * deviation) for side in (-1, 1))
-    is_identifiable = deviation <= MAX_RELATIVE_ERROR
-    error = parameter.error(x, deviation)
-    return Estimate(parameter.value(x), error, (ends[0], ends[1]), parameter.start, is_identifiable, None)
-
-
-def _curve(estimate: Estimate, solution: MapSolution) -> list[ProfilePoint]:
-    """Return the quadratic approximation of a force's profile."""
-    deviation = float(np.nan_to_num(solution.errors[-1], nan=UNKNOWN_DEVIATION))
-    return [ProfilePoint(estimate.value * math.exp(n * deviation), float(n)) for n in np.linspace(-3, 3, 25)]
+    value, error, is_identifiable = parameter.value(x), parameter.error(x, deviation), deviation <= MAX_RELATIVE_ERROR
+    low, high = sorted(parameter.value(x + side * 1.96 * deviation) for side in (-1, 1))
+    curve = [ProfilePoint(value * math.exp(n * deviation), float(n)) for n in np.linspace(-3, 3, 25)]
+    return Estimate(value, error, (low, high), parameter.start, is_identifiable, None), curve
 
 
 def _faults(observations: PointObservation, scene: Scene, settings: MapSettings) -> Iterator[str]:
@@ -211,10 +196,9 @@ def _faults(observations: PointObservation, scene: Scene, settings: MapSettings)
         yield f"{observations.name}: sigma: missing: {fault}"
         return
     if (count := int(observations.known.sum())) <= (cell_count := settings.resolution**2):
-        fault = (
-            f"{count} numbers were observed, too few for {cell_count} fields; observe more points, or take fewer fields"
-        )
-        yield f"{observations.name}: {fault}: --resolution {max(2, math.isqrt(max(count - 1, 0)))}"
+        fault = f"{count} numbers were observed, too few for {cell_count} fields"
+        remedy = f"observe more points, or take fewer fields: --resolution {max(2, math.isqrt(max(count - 1, 0)))}"
+        yield f"{observations.name}: {fault}; {remedy}"
         return
     # Two copies of the Jacobian, in f64.
     if (needed := 16 * count * cell_count) > (free := available_memory()):
@@ -227,7 +211,7 @@ def _faults(observations: PointObservation, scene: Scene, settings: MapSettings)
 
 def _initial_points(position: Array, model: PointModel, observations: PointObservation, scene: Scene) -> Array:
     """Return the observed points in the initial run [m], shape (N, T, 3); SceneError: implausible observations."""
-    at_frames = np.array([model.points_on_sheet(frame) for frame in position])
+    at_frames = model.on_sheet(position)
     points = model.interpolate(at_frames)
     prediction = Prediction((model.observe(points),), 0, model.motion(at_frames))
     if invalid := list(faults_at_start([observations], scene, prediction)):

@@ -20,15 +20,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from taichi_msm.errors import SceneError
+from taichi_msm.fitting.observation import Array
 from taichi_msm.fitting.parameters import Bounds
 from taichi_msm.fitting.points import PointModel, PointObservation
 from taichi_msm.gradients.gradient import Adjoint
 from taichi_msm.scene.scene import Scene
-
-Array = NDArray[np.float64]
 
 # Largest relative error of a known map cell, with all other cells given.
 MAX_KNOWN_ERROR = 0.5
@@ -58,29 +56,19 @@ class SmoothnessWeight(NamedTuple):
 
 def with_scaled_forces(scene: Scene, factor: float = 1.0) -> Scene:
     """Scale the forces of all tools."""
-    totals = [
-        None if probe.total is None else tuple(factor * component for component in probe.total)
-        for probe in scene.probes
-    ]
+    totals = [probe.total and tuple(factor * component for component in probe.total) for probe in scene.probes]
     probes = [probe.model_copy(update={"total": total}) for probe, total in zip(scene.probes, totals, strict=True)]
     return scene.model_copy(update={"probes": tuple(probes)})
 
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
-    """Predictions linearised at a map.
+    """Predictions linearised at a map."""
 
-    Attributes:
-        x: logs of the factors of the map cells, shape (R^2,).
-        information: J^T J / excess, shape (R^2, R^2).
-        slope: gradient of chi-square / (2 excess) by x, shape (R^2,).
-        excess: chi-square of the best map per degree of freedom, at least 1.
-    """
-
-    x: Array
-    information: Array
-    slope: Array
-    excess: float
+    x: Array  # logs of the factors of the map cells, shape (R^2,)
+    information: Array  # J^T J / excess, shape (R^2, R^2)
+    slope: Array  # gradient of chi-square / (2 excess) by x, shape (R^2,)
+    excess: float  # chi-square of the best map per degree of freedom, at least 1
 
     def choose_weight(self, roughness: Array) -> SmoothnessWeight:
         """Choose the weight of L by the discrepancy principle."""
@@ -123,9 +111,6 @@ class MapSearch:
         limits: bounds of the logs of the factors.
         pause: called several times a second; an exception from it ends the search.
         force_limits: bounds of the log of a common factor of all forces, the last entry of x; None: forces are fixed.
-
-    Attributes:
-        runs: number of finished runs.
     """
 
     def __init__(
@@ -145,7 +130,7 @@ class MapSearch:
         extra_limits = [] if force_limits is None else [force_limits]
         self._roughness = np.pad(grid.roughness(), (0, len(extra_limits)))
         self._limits = np.array([limits] * self._cells + extra_limits).T
-        self.runs = 0
+        self.runs = 0  # finished ones
 
     def predict(self, x: Array) -> tuple[Array, Array]:
         """Predict the points [m], shape (N, T, 3), and the observations with a map."""
@@ -156,9 +141,8 @@ class MapSearch:
         predicted = self._model.observe(points)
         if not np.isfinite(predicted[self._observations.known]).all():
             fault = "an observed point gets behind the eye of the camera with some maps"
-            raise SceneError(
-                [f"{self._observations.name}: pixel: {fault}; give NaN in its place, or narrower --bounds"]
-            )
+            remedy = "give NaN in its place, or narrower --bounds"
+            raise SceneError([f"{self._observations.name}: pixel: {fault}; {remedy}"])
         return points, predicted
 
     def misfit(self, x: Array) -> tuple[float, Array]:
@@ -179,19 +163,14 @@ class MapSearch:
         choice = linearisation.choose_weight(self._roughness)
         # Weight and map alternate.
         for _ in range(4):
-            weight = choice.weight
-            x = self._minimise(
-                np.clip(linearisation.x + np.clip(choice.step, -MAX_INITIAL_STEP, MAX_INITIAL_STEP), *self._limits),
-                weight,
-                linearisation.excess,
-            )
+            weight, step = choice.weight, np.clip(choice.step, -MAX_INITIAL_STEP, MAX_INITIAL_STEP)
+            x = self._minimise(np.clip(linearisation.x + step, *self._limits), weight, linearisation.excess)
             linearisation = self._linearise(x)
             choice = linearisation.choose_weight(self._roughness)
             if 1 / MAX_WEIGHT_CHANGE < choice.weight / weight < MAX_WEIGHT_CHANGE:
                 break
-        return MapSolution(
-            x, linearisation.errors(weight, self._roughness), linearisation.excess, choice._replace(weight=weight)
-        )
+        errors = linearisation.errors(weight, self._roughness)
+        return MapSolution(x, errors, linearisation.excess, choice._replace(weight=weight))
 
     def _linearise(self, x: Array) -> Linearisation:
         """Linearise at x by finite differences, a run per map cell."""
@@ -211,10 +190,8 @@ class MapSearch:
 
         def cost(x: Array) -> tuple[float, Array]:
             (chi_square, gradient), smoothness_gradient = self.misfit(x), self._roughness @ x
-            chi_square, gradient = chi_square / excess, gradient / excess
-            return (
-                chi_square + weight * float(x @ smoothness_gradient)
-            ) / 2, gradient / 2 + weight * smoothness_gradient
+            value = chi_square / excess + weight * float(x @ smoothness_gradient)
+            return value / 2, gradient / excess / 2 + weight * smoothness_gradient
 
         options = {"maxcor": 50, "ftol": 1e-6, "gtol": 0.0, "maxiter": 300}
         bounds = list(zip(*self._limits, strict=True))

@@ -36,30 +36,17 @@ COMPLEX_STEP = 1e-60
 
 @dataclass
 class SheetGradient:
-    """Derivatives of a loss with respect to the coefficients of a sheet.
+    """Derivatives of a loss with respect to the coefficients of a sheet."""
 
-    Attributes:
-        springs: with respect to k - tau of every spring along rows, along columns, and of both diagonals of a cell,
-            with shapes as in `springs.stiffness`.
-        tensions: with respect to tau of each family at constant k - tau, shape (3,).
-        foundation: with respect to log K, the foundation stiffness of every mass point, shape (rows, cols).
-        bending: with respect to the logarithm of the bending stiffness.
-        stiffening: with respect to log(lock) and to the factor of the springs, shape (2,).
-        foundation_stiffening: with respect to log(lock) and to the factor of the foundation, shape (2,).
-        keep: with respect to the factor `keep` of the steps.
-        gain: with respect to the logarithm of the gain of all steps but step 0.
-        first_gain: with respect to the logarithm of the gain of step 0.
-    """
-
-    springs: tuple[Array, Array, Array]
-    tensions: Array
-    foundation: Array
-    bending: float
-    stiffening: Array
-    foundation_stiffening: Array
-    keep: float = 0.0
-    gain: float = 0.0
-    first_gain: float = 0.0
+    springs: tuple[Array, Array, Array]  # k - tau of every spring, with shapes as of `springs.spring_stiffness`
+    tensions: Array  # tau of each family at constant k - tau, shape (3,)
+    foundation: Array  # log K, the foundation stiffness of every mass point, shape (rows, cols)
+    bending: float  # logarithm of the bending stiffness
+    stiffening: Array  # log(lock) and factor of the springs, shape (2,)
+    foundation_stiffening: Array  # log(lock) and factor of the foundation, shape (2,)
+    keep: float = 0.0  # factor `keep` of the steps
+    gain: float = 0.0  # logarithm of the gain of all steps but step 0
+    first_gain: float = 0.0  # logarithm of the gain of step 0
 
     def work(self, plan: Plan) -> float:
         """Return the derivative with respect to the logarithm of a common factor of all internal forces."""
@@ -91,16 +78,7 @@ class Derivatives:
 
 
 def scene_derivatives(plan: Plan, gradient: SheetGradient, loads: LoadGradient) -> Derivatives:
-    """Apply the chain rule.
-
-    Args:
-        plan: plan of the scene.
-        gradient: derivatives with respect to the coefficients of the sheet.
-        loads: derivatives with respect to the loads.
-
-    Returns:
-        Derivatives with respect to the numbers of the scene.
-    """
+    """Apply the chain rule to derivatives with respect to the coefficients of a sheet and to its loads."""
     material, kind = plan.material, plan.scene.kind
     assert material.factors is not None
     by_coefficient = _coefficient_gradient(plan, gradient)
@@ -126,11 +104,7 @@ def _sheet_coefficients(plan: Plan, scene: Scene) -> NDArray[Any]:
 
 
 def _coefficient_gradient(plan: Plan, gradient: SheetGradient) -> Array:
-    """Return the derivatives with respect to the coefficients of a sheet.
-
-    They are across, down, shear, tension, virtual, bending, lock and factor of the springs and of the foundation, keep
-    and both gains.
-    """
+    """Return the derivatives with respect to the coefficients of a sheet, in the order of `_sheet_coefficients`."""
     material = plan.material
     assert material.factors is not None
     unit = spring_stiffness(replace(material, across=1.0, down=1.0, shear=1.0), material.factors)
@@ -207,11 +181,7 @@ def _with_value(section: Any, path: tuple[str, ...], value: complex) -> Any:
 
 
 class LoadGradient:
-    """Derivatives of a loss with respect to the loads of the probes, accumulated over blocks of steps.
-
-    Attributes:
-        by_key: derivatives by key, as in `Derivatives`.
-    """
+    """Derivatives with respect to the loads, accumulated over blocks of steps; `by_key` is as in `Derivatives`."""
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
@@ -227,12 +197,10 @@ class LoadGradient:
             self.by_key[f"probes.{index}.at"] = np.zeros((*np.shape(probe.at)[:-1], 2))
 
     def add(self, schedule_of: Callable[[Plan], Schedule], by_slot: Array, times: tuple[float, float]) -> None:
-        """Add the derivatives of a block of steps.
+        """Add the derivatives of a block of steps, whose loads are in an interval of times [s].
 
-        Args:
-            schedule_of: returns the schedule of these steps for a plan with other loads.
-            by_slot: derivatives with respect to the force and the control point of every slot, shape (steps, slots, 5).
-            times: interval that contains all loads of these steps [s].
+        `schedule_of` returns the schedule of these steps for a plan with other loads. `by_slot` are the derivatives
+        with respect to the force and the control point of every slot, shape (steps, slots, 5).
         """
         height, width = self._plan.scene.sheet.size
         for index, slots in self._slots.items():

@@ -61,12 +61,7 @@ def _require_memory(plan: Plan) -> None:
 
 
 class Adjoint:
-    """Differentiable simulation in f64, compiled once for repeated runs, also with another stiffness map.
-
-    Args:
-        plan: plan of the scene.
-        device: a CPU.
-        cores: number of CPU cores; None for all.
+    """Differentiable simulation in f64 on a CPU, compiled once for repeated runs, also with another stiffness map.
 
     Raises:
         SceneError: when a probe has a path, or the memory does not suffice.
@@ -133,7 +128,6 @@ class Adjoint:
         return scene_derivatives(plan, *self._sheet.backward(np.asarray(by_position, float), pause))
 
     def _with_factors(self, factors: Array) -> Plan:
-        """Replace the stiffness map."""
         plan, factors = self._plan, as_array(factors, "factors")
         assert plan.material.factors is not None
         shape, lower_bound = plan.material.factors.shape, plan.material.tension
@@ -155,17 +149,7 @@ Loss = Callable[[Array], tuple[float, Array]]
 
 @dataclass(frozen=True)
 class Gradient(Derivatives):
-    """Value of a loss, and its derivatives with respect to the numbers of a scene.
-
-    Attributes:
-        numbers: derivatives by key: material numbers other than 0, such as tissue.young; the components of a force,
-            such as probes.0.total, shape (3,); the percents of a load, such as probes.0.load, shape (keyframes,); and
-            across and down of a control point, such as probes.0.at, shape (2,), or (keyframes, 2) for a moving one.
-        maps: derivatives with respect to the factors of maps: tissue.map or springs.map, of cells, shape (rows - 1,
-            cols - 1); with a foundation also tissue.foundation_map, of mass points, shape (rows, cols). A scene without
-            such a map has the factor 1 everywhere.
-        value: value of the loss.
-    """
+    """Value of a loss, and its derivatives with respect to the numbers of a scene, see `Derivatives`."""
 
     value: float
 

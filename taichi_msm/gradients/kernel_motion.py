@@ -37,7 +37,7 @@ from taichi_msm.terms.springs import ALONG_COLUMN, ALONG_ROW, DIAGONAL, SpringTe
 # where the forces carried to the next row begin; rows of carried forces per worker; number of times that a worker
 # checks its neighbour before it gives up; buffer that contains p, 0 or 1; whether the last step adds the derivative of
 # the loss.
-COUNT, WORKERS, ROWS, STRIP, SHAPE, MOMENT_ROW, CARRY, CARRIED_ROWS, MAX_CHECKS, BUFFER, WITH_LOSS, SIZES = range(12)
+COUNT, WORKERS, ROWS, STRIP, SHAPE, MOMENT_ROW, CARRY, CARRIED_ROWS, MAX_CHECKS, BUFFER, WITH_LOSS = range(11)
 
 # Integers per worker in the array `progress`; the first is the number of its finished steps, the others are padding.
 STRIDE = 16
@@ -60,48 +60,32 @@ LOAD_DERIVATIVES = 5
 
 
 class AdjointSheet(NamedTuple):
-    """Arrays of a `KernelSheet`, extended for the adjoint.
+    """Arrays of a `KernelSheet`, extended for the adjoint."""
 
-    Attributes:
-        u: p, q and the derivative of the loss; with bending also the moments of p.
-        by_column, stiffness, fields, constants, rows, width: as in `KernelSheet`.
-        shapes: displacements at the steps of a segment, three arrays.
-        derivatives: accumulated derivatives.
-    """
-
-    u: Any
+    u: Any  # p, q and the derivative of the loss; with bending also the moments of p
     by_column: Any
     stiffness: Any
     fields: Any
     constants: Any
     rows: Any
     width: Any
-    shapes: Any
-    derivatives: Any
+    shapes: Any  # displacements at the steps of a segment, three arrays
+    derivatives: Any  # accumulated derivatives
 
 
 class AdjointBand(NamedTuple):
-    """A worker's band of rows at a step, within a kernel.
+    """A worker's band of rows at a step, within a kernel."""
 
-    Attributes:
-        low, high: first row, and the row after the last one.
-        source, target: rows where the buffers begin that are read and written.
-        shape: row where the displacements begin.
-        carry: row of the forces that are carried to the next row.
-        moments: row where the moments begin.
-        n: index of the step in the table of loads.
-        with_loss: whether the derivative of the loss is added.
-    """
-
-    low: Any
-    high: Any
+    low: Any  # first row
+    high: Any  # row after the last
+    # source, target: rows where the buffers begin that are read and written
     source: Any
     target: Any
-    shape: Any
-    carry: Any
-    moments: Any
-    n: Any
-    with_loss: Any
+    shape: Any  # row where the displacements begin
+    carry: Any  # row of the forces that are carried to the next row
+    moments: Any  # row where the moments begin
+    n: Any  # index of the step in the table of loads
+    with_loss: Any  # whether the derivative of the loss is added
 
 
 class LoadTables(NamedTuple):
@@ -109,21 +93,6 @@ class LoadTables(NamedTuple):
 
     loads: Any
     by_load: Any
-
-
-@cache
-def adjoint_kernels(code: KernelConfig, *, parallel: bool) -> tuple[Callable[..., None], Callable[..., None]]:
-    """Build the kernel that steps forward and stores all displacements, and the one that sweeps backward.
-
-    Args:
-        code: compile-time configuration of the steps.
-        parallel: whether the workers run in parallel.
-
-    Returns:
-        Both kernels. They share the arguments `sizes` (int64, shape (11,), at the indices from `COUNT` on) and
-        `progress` (int64, `STRIDE` per worker).
-    """
-    return _build_store(code, parallel=parallel), _build_sweep(code, parallel=parallel)
 
 
 def _build_run_worker(step_band: Callable[..., None], *, parallel: bool) -> Callable[..., None]:
@@ -185,24 +154,16 @@ def _build_store_moments(code: KernelConfig) -> list[Callable[..., None]]:
     return [store_moments]
 
 
-def _build_clear(code: KernelConfig) -> Callable[..., None]:
-    """Build the function that sets a row of u to 0."""
-    vector = code.vector
+@cache
+def build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
+    """Build the kernel that steps forward and stores all displacements.
 
-    @ti.func
-    def clear(sheet: ti.template(), row):
-        for b in range(1, sheet.width - 1):
-            for c in ti.static(range(3)):
-                sheet.u[c][row * sheet.width + b] = vector(0)
-
-    return clear
-
-
-def _build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
-    """Build the kernel that steps forward and stores all displacements."""
+    Its arguments `sizes` (int64, indices from `COUNT` on) and `progress` (int64, `STRIDE` per worker) are also those of
+    `build_sweep`.
+    """
     real, vector, vectors = code.real, code.vector, code.vectors
     count_of_numbers, join_strips, step = code.first_constant(None), build_join_strips(code), build_point_step(code)
-    clear, storing = _build_clear(code), _build_store_moments(code)
+    storing = _build_store_moments(code)
 
     @ti.func
     def move(sheet: ti.template(), entry: ti.template(), target, force: ti.template(), now: ti.template()):
@@ -212,7 +173,6 @@ def _build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
 
     @ti.func
     def step_band(sheet: ti.template(), loads: ti.template(), sizes: ti.template(), worker, k):
-        """Run step k of the launch for a band."""
         workers = ti.cast(sizes[WORKERS], ti.i32)
         low, high = sheet.rows * worker // workers, sheet.rows * (worker + 1) // workers
         shape = (ti.cast(sizes[SHAPE], ti.i32) + k) * sheet.rows
@@ -220,7 +180,9 @@ def _build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
         moments = ti.cast(sizes[MOMENT_ROW], ti.i32) + MOMENT_ROWS * worker
         band = ti.static(AdjointBand(low, high, shape, shape, shape, carry, moments, k, 0))
         if low == 0:
-            clear(sheet, carry)
+            for b in range(1, sheet.width - 1):
+                for c in ti.static(range(3)):
+                    sheet.u[c][carry * sheet.width + b] = vector(0)
         for i in range(ti.max(low - 1, 0), high):
             for store_moments in ti.static(storing):
                 if i >= low:
@@ -239,13 +201,11 @@ def _build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
 
     @ti.kernel
     def store(
-        sizes: ti.types.ndarray(dtype=ti.i64, ndim=1),
-        progress: ti.types.ndarray(dtype=ti.i64, ndim=1),
+        sizes: ti.types.ndarray(dtype=ti.i64, ndim=1), progress: ti.types.ndarray(dtype=ti.i64, ndim=1),
         loads: ti.types.ndarray(dtype=real, ndim=2),
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
-        constants_of: ti.types.ndarray(dtype=vector, ndim=1),
-        by_column: vectors, stiffness: vectors, fields: vectors,
+        constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
         ti.loop_config(serialize=not parallel)
         for index in range(ti.cast(sizes[WORKERS], ti.i32) * ITERATIONS_PER_THREAD):
@@ -260,22 +220,16 @@ def _build_store(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
 
 
 def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
-    """Build the function that sweeps a row of the adjoint by a step."""
     vector, columns, springs = code.vector, code.first_column(None), code.require(SpringTerm)
     structural, shear, tension = springs.structural, springs.shear, springs.tense
-    differentiate, (*_, row_stiffness, column_stiffness, diagonal_stiffness) = (
-        springs.build_spring_tangent(code),
-        springs.build_spring_forces(code),
-    )
+    differentiate = springs.build_spring_tangent(code)
+    *_, row_stiffness, column_stiffness, diagonal_stiffness = springs.build_spring_forces(code)
     tangents = [add for term in code.terms for add in term.build_tangents(code)]
     reducing = [reduce for term in code.terms for reduce in term.build_damping(code)]
     probes, foundation_term = code.require(ProbeTerm), code.get(FoundationTerm)
     laplacians = [] if code.get(BendingTerm) is None else [build_laplacian(code)]
-    add_load_derivatives, slots, standing = (
-        probes.build_load_adjoint(code, SUM_PARTS),
-        len(probes.moves),
-        probes.moves.count(False),
-    )
+    add_load_derivatives = probes.build_load_adjoint(code, SUM_PARTS)
+    slots, standing = len(probes.moves), probes.moves.count(False)
     foundation = code.first_column(FoundationTerm) if foundation_term else 0
     foundation_derivatives = [foundation_term.build_derivatives(code)] if foundation_term else []
     shares = [foundation_term.build_share(code)] if foundation_term and foundation_term.locks else []
@@ -311,10 +265,8 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
         for b in range(width - 1):
             # The cell to the right of the entry: the spring along its upper edge, and its diagonals.
             right = [vector(0) for _ in ti.static(range(results))]
-            falling, rising = (
-                [vector(0) for _ in ti.static(range(results))],
-                [vector(0) for _ in ti.static(range(results))],
-            )
+            falling = [vector(0) for _ in ti.static(range(results))]
+            rising = [vector(0) for _ in ti.static(range(results))]
             if ti.static(structural):
                 k = row_stiffness(sheet, i, kind, b)
                 spring = spring_tangent(
@@ -411,19 +363,15 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
     return sweep_row
 
 
-def _build_sweep(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
+@cache
+def build_sweep(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
     """Build the kernel that sweeps the adjoint, from the last step to the first."""
-    real, vector, vectors = code.real, code.vector, code.vectors
-    count_of_numbers, join_strips, storing = (
-        code.first_constant(None),
-        build_join_strips(code),
-        _build_store_moments(code),
-    )
-    clear, sweep_row = _build_clear(code), _build_sweep_row(code)
+    real, vector, vectors, count_of_numbers = code.real, code.vector, code.vectors, code.first_constant(None)
+    join_strips, storing = build_join_strips(code), _build_store_moments(code)
+    sweep_row = _build_sweep_row(code)
 
     @ti.func
     def step_band(sheet: ti.template(), tables: ti.template(), sizes: ti.template(), worker, k):
-        """Run the k-th step of the launch for a band."""
         workers = ti.cast(sizes[WORKERS], ti.i32)
         low, high = sheet.rows * worker // workers, sheet.rows * (worker + 1) // workers
         n = ti.cast(sizes[COUNT], ti.i32) - 1 - k
@@ -435,7 +383,9 @@ def _build_sweep(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
         source, target = buffer * sheet.rows, (1 - buffer) * sheet.rows
         band = ti.static(AdjointBand(low, high, source, target, shape, carry, moments, n, with_loss))
         if low == 0:
-            clear(sheet, carry)
+            for b in range(1, sheet.width - 1):
+                for c in ti.static(range(3)):
+                    sheet.u[c][carry * sheet.width + b] = vector(0)
         for i in range(ti.max(low - 1, 0), high):
             for store_moments in ti.static(storing):
                 if i >= low:
@@ -448,10 +398,8 @@ def _build_sweep(code: KernelConfig, *, parallel: bool) -> Callable[..., None]:
 
     @ti.kernel
     def sweep(
-        sizes: ti.types.ndarray(dtype=ti.i64, ndim=1),
-        progress: ti.types.ndarray(dtype=ti.i64, ndim=1),
-        loads: ti.types.ndarray(dtype=real, ndim=2),
-        by_load: ti.types.ndarray(dtype=real, ndim=3),
+        sizes: ti.types.ndarray(dtype=ti.i64, ndim=1), progress: ti.types.ndarray(dtype=ti.i64, ndim=1),
+        loads: ti.types.ndarray(dtype=real, ndim=2), by_load: ti.types.ndarray(dtype=real, ndim=3),
         p_x: vectors, p_y: vectors, p_z: vectors,
         u_x: vectors, u_y: vectors, u_z: vectors,
         constants_of: ti.types.ndarray(dtype=vector, ndim=1),
@@ -477,9 +425,7 @@ def copy_kernel(code: KernelConfig) -> Callable[..., None]:
 
     @ti.kernel
     def copy(
-        entries: ti.i32,
-        source: ti.i32,
-        target: ti.i32,
+        entries: ti.i32, source: ti.i32, target: ti.i32,
         from_x: vectors, from_y: vectors, from_z: vectors,
         to_x: vectors, to_y: vectors, to_z: vectors,
     ):  # fmt: skip

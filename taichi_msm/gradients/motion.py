@@ -8,7 +8,8 @@ adjoint is swept over them (`kernel_motion`).
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,25 +17,8 @@ from numpy.typing import NDArray
 from taichi_msm.accuracy import divergence
 from taichi_msm.accuracy.divergence import DivergenceMonitor
 from taichi_msm.errors import DivergedError, Pause
+from taichi_msm.gradients import kernel_motion as kernels
 from taichi_msm.gradients.chain_rule import LoadGradient, SheetGradient
-from taichi_msm.gradients.kernel_motion import (
-    ADJOINT_PARTS,
-    BENDING_SUM,
-    BUFFERS,
-    FOUNDATION_LOCK_SUMS,
-    FOUNDATION_PART,
-    KEEP_SUM,
-    LOAD_DERIVATIVES,
-    LOCK_SUMS,
-    LOSS,
-    ROW_SUMS,
-    SPRING_PARTS,
-    STRIDE,
-    SUM_PARTS,
-    TENSION_SUMS,
-    adjoint_kernels,
-    copy_kernel,
-)
 from taichi_msm.model.loads import average_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import area_shares
@@ -44,8 +28,8 @@ from taichi_msm.solver.backoff import Backoff
 from taichi_msm.solver.bands import MOMENT_ROWS
 from taichi_msm.solver.dynamics import STEPS_PER_TABLE, Dynamics
 from taichi_msm.solver.kernel_cpu import MAX_CHECKS, PAGE
-from taichi_msm.solver.state import largest_displacement
-from taichi_msm.system.runtime import Device, Memory, compilation_options, write_vectors
+from taichi_msm.solver.state import State, largest_displacement
+from taichi_msm.system.runtime import Memory, compilation_options, write_vectors
 from taichi_msm.terms.base import GAIN
 from taichi_msm.terms.foundation import point_shares
 from taichi_msm.terms.loads import ProbeTerm
@@ -66,9 +50,7 @@ Array = NDArray[np.float64]
 def segment_steps(steps: int, shape_bytes: int) -> int:
     """Return the length of a segment [steps]. Its displacements and all checkpoints need about equal memory.
 
-    Args:
-        steps: number of steps of the run.
-        shape_bytes: memory of the displacements of a step [bytes], half of that of a checkpoint.
+    `shape_bytes` is the memory of the displacements of a step, half of that of a checkpoint.
     """
     return min(steps, max(math.ceil(math.sqrt(2 * steps)), SEGMENT_BYTES // shape_bytes))
 
@@ -77,61 +59,21 @@ def motion_bytes(plan: Plan) -> int:
     """Estimate the memory of the adjoint of a dynamic sheet, without the positions at the frames [bytes]."""
     steps, shape_bytes = plan.grid.steps, 3 * 8 * math.prod(plan.scene.sheet.points)
     segment = segment_steps(steps, shape_bytes)
-    return shape_bytes * (segment + 2 * -(-steps // segment) + ADJOINT_PARTS + SUM_PARTS)
+    return shape_bytes * (segment + 2 * -(-steps // segment) + kernels.ADJOINT_PARTS + kernels.SUM_PARTS)
 
 
-class _Arrays(NamedTuple):
-    """Arrays of the adjoint; each list contains three arrays, for x, y and z.
+class MotionAdjoint(Dynamics):
+    """Dynamic sheet, of a plan in f64 with a stiffness map, and its adjoint."""
 
-    Attributes:
-        checkpoints: displacements at the beginning of every segment.
-        checkpoint_differences: differences d at the beginning of every segment.
-        shapes: displacements at every step of a segment.
-        differences: difference d at the current step of a segment.
-        adjoint: adjoint state, see `kernel_motion`.
-        loss: derivative of the loss with respect to the displacements of a frame.
-        derivatives: accumulated derivatives, see `kernel_motion`.
-    """
+    _allocated_for: tuple[SheetLayout, int] | None = None  # layout and number of steps
 
-    checkpoints: list[Any]
-    checkpoint_differences: list[Any]
-    shapes: list[Any]
-    differences: list[Any]
-    adjoint: list[Any]
-    loss: list[Any]
-    derivatives: Any
-
-
-class MotionAdjoint:
-    """Dynamic sheet and its adjoint.
-
-    Args:
-        plan: the plan, in f64 and with a stiffness map.
-        device: a CPU.
-        layout: replaces the layout chosen by `choose_layout`, for tests.
-        cores: number of CPU cores; None for all.
-    """
-
-    def __init__(self, plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> None:
-        self._forward, self._backoff = Dynamics(plan, device, layout, cores), Backoff()
-        self._allocate()
-
-    def restart(self, plan: Plan) -> None:
-        """Restart with the same scene or another."""
-        before = self.layout, self.plan.grid.steps
-        self._forward.restart(plan)
-        if (self.layout, plan.grid.steps) != before:
+    def restart(self, plan: Plan, state: State | None = None) -> None:
+        """Restart with the same scene or another, see `SheetSolver.restart`."""
+        super().restart(plan, state)
+        if self._allocated_for != (self.layout, plan.grid.steps):
             self._allocate()
-
-    @property
-    def plan(self) -> Plan:
-        """The current plan."""
-        return self._forward.plan
-
-    @property
-    def layout(self) -> SheetLayout:
-        """The memory layout, and the configuration of the kernels."""
-        return self._forward.layout
+            self._allocated_for = self.layout, plan.grid.steps
+            self._backoff = Backoff()
 
     @property
     def _decay_parts(self) -> int:
@@ -146,7 +88,7 @@ class MotionAdjoint:
         # The carried forces of two workers never share a page.
         self._carried_rows = 1 - (-PAGE // row_bytes)
         self._worker_rows = (MOMENT_ROWS + self._carried_rows) * layout.workers
-        row_sums = -(-ROW_SUMS * layout.rows // layout.width)
+        row_sums = -(-kernels.ROW_SUMS * layout.rows // layout.width)
 
         def scalar(rows: int) -> Any:
             return memory.array("f64", layout.config.lanes, rows * layout.width)
@@ -156,21 +98,21 @@ class MotionAdjoint:
 
         checkpoint_rows = -(-plan.grid.steps // self._segment) * layout.rows
         self._memory = memory
-        self._arrays = _Arrays(
-            vector(checkpoint_rows), vector(checkpoint_rows),
-            vector(self._segment * layout.rows + self._worker_rows), vector(layout.rows),
-            vector(ADJOINT_PARTS * layout.rows + self._worker_rows), vector(layout.rows),
-            scalar((SUM_PARTS + self._decay_parts) * layout.rows + row_sums),
-        )  # fmt: skip
+        # Displacements and differences d at the beginning of every segment; each list has three arrays, for x, y and z.
+        self._checkpoints, self._checkpoint_differences = vector(checkpoint_rows), vector(checkpoint_rows)
+        # Displacements at every step of a segment, and differences at its current step.
+        self._shapes = vector(self._segment * layout.rows + self._worker_rows)
+        self._differences = vector(layout.rows)
+        # Adjoint state, and accumulated derivatives, see `kernel_motion`.
+        self._adjoint = vector(kernels.ADJOINT_PARTS * layout.rows + self._worker_rows)
+        self._derivatives = scalar((kernels.SUM_PARTS + self._decay_parts) * layout.rows + row_sums)
+        # Derivative of the loss with respect to the displacements of a frame.
+        self._loss = vector(layout.rows)
 
     def run(self, pause: Pause = lambda: None) -> Array:
         """Run all steps and store the checkpoints.
 
-        Args:
-            pause: called several times a second; an exception from it ends the run.
-
-        Returns:
-            Displacements at every frame [m], shape (F + 1, rows, cols, 3).
+        Returns the displacements at every frame [m], shape (F + 1, rows, cols, 3).
 
         Raises:
             DivergedError: when the sheet diverges.
@@ -179,11 +121,11 @@ class MotionAdjoint:
         monitor, frames = DivergenceMonitor(plan), np.zeros((grid.frames + 1, *plan.scene.sheet.points, 3))
         stops = {*range(0, grid.steps + 1, grid.steps_per_frame), *range(0, grid.steps, self._segment)}
         for n in sorted(stops):
-            self._forward.advance(n - self._forward.steps_done, pause)
+            self.advance(n - self.steps_done, pause)
             if n % self._segment == 0 and n < grid.steps:
                 self._store_checkpoint(n // self._segment)
             if n and n % grid.steps_per_frame == 0:
-                reading = self._forward.read()
+                reading = self.read()
                 fault = monitor.check_frame(reading)
                 if fault:
                     message = divergence.format_message(grid.time(n), n, fault, exact=False)
@@ -192,28 +134,19 @@ class MotionAdjoint:
         return frames
 
     def backward(self, by_frame: Array, pause: Pause = lambda: None) -> tuple[SheetGradient, LoadGradient]:
-        """Sweep the adjoint of the last `run` backward in time.
-
-        Args:
-            by_frame: derivative of the loss with respect to the displacements at every frame, shape (F + 1, rows, cols,
-                3).
-            pause: called several times a second; an exception from it ends the sweep.
-
-        Returns:
-            Derivatives with respect to the coefficients of the sheet, and to its loads.
-        """
-        grid, layout, arrays = self.plan.grid, self.layout, self._arrays
+        """Sweep the adjoint of the last `run` backward in time, see `Adjoint.backward`."""
+        grid, layout = self.plan.grid, self.layout
         _, gain, _ = coefficients(self.plan)
         shares = area_shares(self.plan.scene.sheet) if layout.config.by_area else np.ones((layout.rows, layout.cols))
         start = gain * (~self.plan.fixed / shares)[..., None] * by_frame[-1]
         for c in range(3):
             # p, an empty buffer, and q.
             parts = start[..., c], 0 * start[..., c], start[..., c]
-            write_vectors(arrays.adjoint[c], to_lanes(layout, np.concatenate(parts)))
-        zeros = np.zeros((SUM_PARTS * layout.rows, layout.cols))
+            write_vectors(self._adjoint[c], to_lanes(layout, np.concatenate(parts)))
+        zeros = np.zeros((kernels.SUM_PARTS * layout.rows, layout.cols))
         decay_gradients = layout.config.require(ProbeTerm).decay_gradients(self.plan).reshape(-1, layout.cols)
-        write_vectors(arrays.derivatives, to_lanes(layout, np.concatenate([zeros, decay_gradients])))
-        loads, self._buffer, work = LoadGradient(self.plan), BUFFERS, np.zeros(2)
+        write_vectors(self._derivatives, to_lanes(layout, np.concatenate([zeros, decay_gradients])))
+        loads, self._buffer, work = LoadGradient(self.plan), kernels.BUFFERS, np.zeros(2)
         block = max(1, STEPS_PER_TABLE // self._segment) * self._segment
         for first in reversed(range(0, grid.steps, block)):
             work += self._sweep_block(first, min(first + block, grid.steps), by_frame, loads, pause)
@@ -221,8 +154,8 @@ class MotionAdjoint:
 
     def _sweep_block(self, first: int, end: int, by_frame: Array, loads: LoadGradient, pause: Pause) -> Array:
         """Sweep backward over a block of segments; return the work of the loads on p after step 0 and in step 0."""
-        table, h = self._forward.sheet.step_table(first, end - first), self.plan.grid.step
-        by_slot = np.zeros((end - first, len(self.plan.slots), LOAD_DERIVATIVES))
+        table, h = self.step_table(first, end - first), self.plan.grid.step
+        by_slot = np.zeros((end - first, len(self.plan.slots), kernels.LOAD_DERIVATIVES))
         at = end
         for begin in reversed(range(first, end, self._segment)):
             self._store_shapes(begin, table[begin - first : at - first], pause)
@@ -242,9 +175,9 @@ class MotionAdjoint:
         return np.array([work[int(first == 0) :].sum(), work[: int(first == 0)].sum()])
 
     def _store_checkpoint(self, segment: int) -> None:
-        arrays, sheet, first = self._arrays, self._forward.sheet.kernel.arrays, segment * self._shape_entries
-        self._copy_shape(0, first, sheet.u, arrays.checkpoints)
-        self._copy_shape(0, first, sheet.d, arrays.checkpoint_differences)
+        sheet, first = self.kernel.arrays, segment * self._shape_entries
+        self._copy_shape(0, first, sheet.u, self._checkpoints)
+        self._copy_shape(0, first, sheet.d, self._checkpoint_differences)
 
     @property
     def _shape_entries(self) -> int:
@@ -252,19 +185,26 @@ class MotionAdjoint:
 
     def _copy_shape(self, from_entry: int, to_entry: int, source: list[Any], target: list[Any]) -> None:
         with compilation_options():
-            copy_kernel(self.layout.config)(self._shape_entries, from_entry, to_entry, *source, *target)
+            kernels.copy_kernel(self.layout.config)(self._shape_entries, from_entry, to_entry, *source, *target)
 
     def _store_shapes(self, first: int, table: Array, pause: Pause) -> None:
         """Repeat a segment from its checkpoint with a table of loads, and store the displacements of all steps."""
-        layout, arrays, count = self.layout, self._arrays, len(table) - 1
+        layout, count = self.layout, len(table) - 1
         checkpoint = first // self._segment * self._shape_entries
-        self._copy_shape(checkpoint, 0, arrays.checkpoints, arrays.shapes)
-        self._copy_shape(checkpoint, 0, arrays.checkpoint_differences, arrays.differences)
+        self._copy_shape(checkpoint, 0, self._checkpoints, self._shapes)
+        self._copy_shape(checkpoint, 0, self._checkpoint_differences, self._differences)
         max_steps = self._max_launch_steps()
         for done in range(0, count, max_steps):
             steps = min(max_steps, count - done)
             sizes = self._sizes(steps, done, self._segment * layout.rows)
-            self._launch(0, sizes, table[done : done + steps], *arrays.shapes, *arrays.differences, *self._sheet_arrays)
+            self._launch(
+                kernels.build_store,
+                sizes,
+                table[done : done + steps],
+                *self._shapes,
+                *self._differences,
+                *self._sheet_arrays,
+            )
             pause()
 
     def _launch_begin(self, first: int, end: int) -> int:
@@ -274,67 +214,75 @@ class MotionAdjoint:
 
     def _sweep(self, first: int, end: int, by_frame: Array, table: Array) -> Array:
         """Sweep backward from step `end` of a segment; return the derivatives by load, shape (steps, slots, 5)."""
-        layout, arrays, grid, count = self.layout, self._arrays, self.plan.grid, len(table)
+        layout, grid, count = self.layout, self.plan.grid, len(table)
         frame, steps_after_frame = divmod(end - count, grid.steps_per_frame)
         if not steps_after_frame:
             self._write_loss(by_frame[frame])
-        sizes = self._sizes(count, end - first - 1, ADJOINT_PARTS * layout.rows, not steps_after_frame)
-        columns = LOAD_DERIVATIVES * len(self.plan.slots)
+        sizes = self._sizes(count, end - first - 1, kernels.ADJOINT_PARTS * layout.rows, not steps_after_frame)
+        columns = kernels.LOAD_DERIVATIVES * len(self.plan.slots)
         by_row = np.zeros((count, layout.rows, max(1, columns)))
-        self._launch(1, sizes, table, by_row, *arrays.adjoint, *arrays.shapes, *self._sheet_arrays, arrays.derivatives)
+        self._launch(
+            kernels.build_sweep,
+            sizes,
+            table,
+            by_row,
+            *self._adjoint,
+            *self._shapes,
+            *self._sheet_arrays,
+            self._derivatives,
+        )
         self._buffer = (self._buffer + count) % 2
-        return by_row[..., :columns].sum(axis=1).reshape(count, -1, LOAD_DERIVATIVES)
+        return by_row[..., :columns].sum(axis=1).reshape(count, -1, kernels.LOAD_DERIVATIVES)
 
     def _write_loss(self, by_displacement: Array) -> None:
-        """Copy the derivative with respect to the displacements of a frame to the device."""
         for c in range(3):
-            write_vectors(self._arrays.loss[c], to_lanes(self.layout, by_displacement[..., c]))
-        self._copy_shape(0, LOSS * self._shape_entries, self._arrays.loss, self._arrays.adjoint)
+            write_vectors(self._loss[c], to_lanes(self.layout, by_displacement[..., c]))
+        self._copy_shape(0, kernels.LOSS * self._shape_entries, self._loss, self._adjoint)
 
     def _sheet_gradient(self, gain: float, work: Array) -> SheetGradient:
-        """Read and sum the accumulated derivatives."""
         layout = self.layout
-        rows, cols, derivatives = layout.rows, layout.cols, self._arrays.derivatives.to_numpy()
-        parts = from_lanes(layout, derivatives, SUM_PARTS * rows).reshape(SUM_PARTS, rows, cols)
-        first = (SUM_PARTS + self._decay_parts) * rows * layout.width
+        rows, cols, derivatives = layout.rows, layout.cols, self._derivatives.to_numpy()
+        parts = from_lanes(layout, derivatives, kernels.SUM_PARTS * rows).reshape(kernels.SUM_PARTS, rows, cols)
+        first = (kernels.SUM_PARTS + self._decay_parts) * rows * layout.width
         # The sums of a row are added lane by lane, and then row by row.
-        row_sums = derivatives[first : first + ROW_SUMS * rows].reshape(rows, ROW_SUMS, -1)
+        row_sums = derivatives[first : first + kernels.ROW_SUMS * rows].reshape(rows, kernels.ROW_SUMS, -1)
         sums = row_sums.sum(axis=2).sum(axis=0)
-        springs = parts[SPRING_PARTS][:, :-1], parts[SPRING_PARTS + 1][:-1], parts[SPRING_PARTS + 2][:-1, :-1]
-        foundation, keep = parts[FOUNDATION_PART] * point_shares(self.plan), float(sums[KEEP_SUM]) / gain
-        tensions, bending = sums[TENSION_SUMS:BENDING_SUM], float(sums[BENDING_SUM])
-        stiffening, foundation_stiffening = sums[LOCK_SUMS:FOUNDATION_LOCK_SUMS], sums[FOUNDATION_LOCK_SUMS:]
-        gradient = SheetGradient(springs, tensions, foundation, bending, stiffening, foundation_stiffening, keep=keep)
+        # In the order of the constants in `kernel_motion`.
+        along_rows, along_columns, diagonals, foundation = parts
+        springs = along_rows[:, :-1], along_columns[:-1], diagonals[:-1, :-1]
+        ends = kernels.TENSION_SUMS, kernels.BENDING_SUM, kernels.LOCK_SUMS, kernels.FOUNDATION_LOCK_SUMS
+        keep, tensions, bending, stiffening, foundation_stiffening = np.split(sums, ends)
+        foundation = foundation * point_shares(self.plan)
+        gradient = SheetGradient(springs, tensions, foundation, float(bending[0]), stiffening, foundation_stiffening)
+        gradient.keep = float(keep[0]) / gain
         gradient.gain = gradient.work(self.plan) + float(work[0])
         gradient.first_gain = float(work[1])
         return gradient
 
     @property
     def _sheet_arrays(self) -> tuple[Any, ...]:
-        """Read-only arrays of the sheet."""
-        arrays = self._forward.sheet.kernel.arrays
+        arrays = self.kernel.arrays
         return arrays.constants, arrays.by_column, arrays.stiffness, arrays.fields
 
     def _max_launch_steps(self) -> int:
         return max(1, NODE_STEPS_PER_LAUNCH // (self.layout.rows * self.layout.cols))
 
     def _sizes(self, count: int, shape: int, moment_row: int, with_loss: bool = False) -> NDArray[np.int64]:
-        """Return the sizes of a launch in the order of `kernel_motion`."""
         layout = self.layout
         carry = moment_row + MOMENT_ROWS * layout.workers
         return np.array([
             count, layout.workers, layout.rows, layout.strip, shape, moment_row, carry, self._carried_rows,
-            MAX_WAIT_CHECKS, self._buffer if moment_row == ADJOINT_PARTS * layout.rows else 0, with_loss,
+            MAX_WAIT_CHECKS, self._buffer if moment_row == kernels.ADJOINT_PARTS * layout.rows else 0, with_loss,
         ])  # fmt: skip
 
-    def _launch(self, kernel: int, sizes: NDArray[np.int64], *arguments: Any) -> None:
-        """Launch a kernel of `adjoint_kernels`; if a worker times out, a single worker finishes the launch."""
+    def _launch(self, build: Callable[..., Callable[..., None]], sizes: NDArray[np.int64], *arguments: Any) -> None:
+        """Launch a kernel; if a worker times out, a single worker finishes the launch."""
         config, workers = self.layout.config, self.layout.workers
-        progress = np.zeros(STRIDE * workers, np.int64)
+        progress = np.zeros(kernels.STRIDE * workers, np.int64)
         with compilation_options():
             if workers > 1 and not self._backoff.is_active:
                 self._backoff.start_launch()
-                adjoint_kernels(config, parallel=True)[kernel](sizes, progress, *arguments)
-                self._backoff.end_launch(timed_out=bool((progress[::STRIDE] < sizes[0]).any()))
-            if (progress[::STRIDE] < sizes[0]).any():
-                adjoint_kernels(config, parallel=False)[kernel](sizes, progress, *arguments)
+                build(config, parallel=True)(sizes, progress, *arguments)
+                self._backoff.end_launch(timed_out=bool((progress[:: kernels.STRIDE] < sizes[0]).any()))
+            if (progress[:: kernels.STRIDE] < sizes[0]).any():
+                build(config, parallel=False)(sizes, progress, *arguments)

@@ -21,7 +21,6 @@ from taichi_msm.model.loads import Schedule, decay, decay_gradient, evaluate_fra
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import spacing
 from taichi_msm.solver.rest import QuasiStatics
-from taichi_msm.system.runtime import Device
 from taichi_msm.terms.elasticity import SpringFamily, spring_families
 from taichi_msm.terms.foundation import foundation_derivatives, foundation_force, foundation_tangent, point_shares
 
@@ -34,49 +33,25 @@ Array = NDArray[np.float64]
 RESIDUAL_TOLERANCE = 1e-6
 
 
-class RestAdjoint:
-    """Quasi-static sheet and its adjoint; the plan must have a stiffness map."""
-
-    def __init__(self, plan: Plan, device: Device) -> None:
-        self.plan = plan
-        self._sheet = QuasiStatics(plan, device)
-        self._displacements = np.empty(0)
-
-    def restart(self, plan: Plan) -> None:
-        """Restart with the same scene or another."""
-        self.plan = plan
-        self._sheet.restart(plan)
+class RestAdjoint(QuasiStatics):
+    """Quasi-static sheet, of a plan with a stiffness map, and its adjoint."""
 
     def run(self, pause: Pause) -> Array:
-        """Solve all frames.
-
-        Args:
-            pause: called several times a second; an exception from it ends the run.
-
-        Returns:
-            Displacements at every frame [m], shape (F + 1, rows, cols, 3).
+        """Solve all frames; return the displacements at every frame [m], shape (F + 1, rows, cols, 3).
 
         Raises:
             DivergedError: when a frame has no equilibrium.
         """
-        self._sheet.restart(self.plan)
+        self.restart(self.plan)
         frames = []
         for n in range(self.plan.grid.frames + 1):
-            self._sheet.advance(int(n > 0), pause)
-            frames.append(self._sheet.displacement())
+            self.advance(int(n > 0), pause)
+            frames.append(self.displacement())
         self._displacements = np.array(frames)
         return self._displacements.copy()
 
     def backward(self, by_frame: Array, pause: Pause) -> tuple[SheetGradient, LoadGradient]:
-        """Differentiate a loss at the last `run`.
-
-        Args:
-            by_frame: derivative of the loss with respect to the displacements at every frame, shape (F + 1, rows, cols,
-                3).
-            pause: called several times a second; an exception from it ends the differentiation.
-
-        Returns:
-            Derivatives with respect to the coefficients of the sheet, and to its loads.
+        """Differentiate a loss at the last `run`, see `Adjoint.backward`.
 
         Raises:
             MsmError: when the tangent stiffness is singular.
@@ -116,7 +91,6 @@ class RestAdjoint:
         return gradient, loads
 
     def _add_loads(self, loads: LoadGradient, frame: int, at_frame: Schedule, p: Array) -> None:
-        """Add the derivatives with respect to the loads of a frame."""
         scene, by_slot = self.plan.scene, np.zeros((1, len(at_frame.slots), 5))
         for n, slot in enumerate(at_frame.slots):
             probe, at = scene.probes[slot.probe], at_frame.point[0, n]
@@ -129,7 +103,6 @@ class RestAdjoint:
 
 
 def _add_springs(gradient: SheetGradient, families: Sequence[SpringFamily], u: Array, p: Array) -> None:
-    """Add the derivatives with respect to stiffness and tension of the springs."""
     for n, family in enumerate(families):
         q, edges, square_difference, square = family.elongation(u)
         p_difference = p[family.start] - p[family.end]

@@ -49,19 +49,12 @@ class Coefficient(NamedTuple):
 
 
 class LensModel(ABC):
-    """A lens model.
+    """A lens model."""
 
-    Attributes:
-        name: value of `distortion.model`, and of `model` in camera.json.
-        meaning: description of the model, for users.
-        coefficients: the coefficients by name, in the order of camera.json; at most 8, the place in `uniforms`.
-        focal_length: the coefficient that stands in place of fx and fy; empty if there is none.
-    """
-
-    name: ClassVar[str]
-    meaning: ClassVar[str]
-    coefficients: ClassVar[Mapping[str, Coefficient]]
-    focal_length: ClassVar[str] = ""
+    name: ClassVar[str]  # value of `distortion.model`, and of `model` in camera.json
+    meaning: ClassVar[str]  # for users
+    coefficients: ClassVar[Mapping[str, Coefficient]]  # in the order of camera.json; at most 8, the place in `uniforms`
+    focal_length: ClassVar[str] = ""  # the coefficient that stands in place of fx and fy, if there is one
 
     @abstractmethod
     def build(self, operations: Operations) -> Callable[..., Any]:

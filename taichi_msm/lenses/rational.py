@@ -17,17 +17,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from taichi_msm.lenses.model import (
-    MAX_RADIUS,
-    MIN_COEFFICIENT,
-    Coefficient,
-    LensModel,
-    Operations,
-    positive_roots,
-)
-
-# The determinant is evaluated at this radius instead of at smaller ones.
-MIN_RADIUS = 1e-8
+from taichi_msm.lenses.model import MAX_RADIUS, MIN_COEFFICIENT, Coefficient, LensModel, Operations, positive_roots
 
 
 class Rational(LensModel):
@@ -95,7 +85,7 @@ def _min_determinant(coefficients: Sequence[float], r: Any) -> Any:
     where c is the cosine of the angle between the point and (p2, p1). The Jacobian is symmetric, and on the axis it is
     the identity; so the lens does not fold within a circle where the minimum is positive.
     """
-    r = np.maximum(r, MIN_RADIUS)
+    r = np.maximum(r, 1e-8)  # to divide by a
     numerator, denominator = _factors(coefficients)
     q = r * r
     ratio = numerator(q) / denominator(q)

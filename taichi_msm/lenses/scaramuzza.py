@@ -23,12 +23,6 @@ from taichi_msm.lenses.model import MAX_RADIUS, NUMPY, Array, Coefficient, LensM
 # Steps of the iteration; lenses of endoscopes need 3, those that fold back 5.
 STEPS = 5
 
-# Discriminant of the parabola's roots at which the lens ends, just before the fold, where it is 0.
-MIN_DISCRIMINANT = 1e-7
-
-# Maximum error of t, 1e-6 px at a focal length of 1000 px, and the number of radii at which it is verified.
-ROOT_TOLERANCE, ROOT_CHECKS = 1e-9, 2048
-
 
 class Scaramuzza(LensModel):
     """Scaramuzza's polynomial model."""
@@ -56,11 +50,12 @@ class Scaramuzza(LensModel):
             # The solution with a3 = a4 = 0, at most the stereographic one.
             t = 2.0 * r / (1.0 + sqrt(1.0 + maximum(b2 * (-4.0), 1.0) * r * r))
             for _ in range(STEPS):
-                # The nearer root of the parabola that touches h = t - r g; Newton's method is slow near a fold.
+                # The nearer root of the parabola that touches h = t - r g; Newton's method is slow near a fold. The
+                # discriminant is 0 at the fold, just before which the lens ends.
                 h = t - r * (1.0 + t * t * (b2 + t * (b3 + t * b4)))
                 first = 1.0 - r * t * (2.0 * b2 + t * (3.0 * b3 + t * (4.0 * b4)))
                 second = r * (2.0 * b2 + t * (6.0 * b3 + t * (12.0 * b4)))
-                t = t - 2.0 * h / (first + sqrt(maximum(first * first + 2.0 * h * second, MIN_DISCRIMINANT)))
+                t = t - 2.0 * h / (first + sqrt(maximum(first * first + 2.0 * h * second, 1e-7)))
             ratio = t / r
             u, v = x * ratio, y * ratio
             return c * u + d * v, e * u + v
@@ -85,11 +80,12 @@ class Scaramuzza(LensModel):
         g = Polynomial([1, 0, a2 * a0, a3 * a0**2, a4 * a0**3])
         fold = min(positive_roots(g - t * g.deriv()), default=np.inf)
         end = min([fold, *positive_roots(g - t / MAX_RADIUS)])
-        radial_positions = end * np.sin(np.linspace(0, np.pi / 2, ROOT_CHECKS))
+        radial_positions = end * np.sin(np.linspace(0, np.pi / 2, 2048))
         radii = radial_positions / g(radial_positions)
         with np.errstate(all="ignore"):
             roots, _ = self.build(NUMPY)(radii, 0.0, a0, a2, a3, a4, 1.0, 0.0, 0.0)
-        is_wrong = ~(np.abs(roots - radial_positions) <= ROOT_TOLERANCE)
+        # 1e-6 px at a focal length of 1000 px.
+        is_wrong = ~(np.abs(roots - radial_positions) <= 1e-9)
         if is_wrong.any():
             return float(radii[max(0, np.argmax(is_wrong) - 1)])
         return MAX_RADIUS

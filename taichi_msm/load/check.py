@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-from taichi_msm.errors import ArgumentError, Problem, SceneError
+from taichi_msm.errors import ArgumentError, Key, Problem, SceneError
 from taichi_msm.load import cost
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import Maps
@@ -33,13 +33,9 @@ _REPLACEMENTS: dict[str, Any] = {
 
 
 def validate(data: dict[str, Any]) -> tuple[Plan | None, list[Problem]]:
-    """Validate the keys of a scene separately, then combinations of keys.
+    """Validate the keys of a scene separately, then combinations of keys; return the plan or None, and all problems.
 
-    Faulty sections are replaced by valid ones before combinations are checked, so that all problems are reported at
-    once.
-
-    Returns:
-        The plan, or None if there are problems; the problems.
+    Faulty sections are replaced by valid ones before combinations are checked, so that all problems come at once.
     """
     problems: list[Problem] = []
     plan = None
@@ -52,10 +48,25 @@ def validate(data: dict[str, Any]) -> tuple[Plan | None, list[Problem]]:
             plan, new_problems = _check_combinations(scene)
             # The speed of a tool depends on the step, which a replaced section would change.
             replaced = {problem.path[0] for problem in problems} & {"sheet", "tissue", "springs", "time"}
-            problems += [problem for problem in new_problems if not (replaced and "path" in problem.path)]
+            problems += [
+                _with_file(problem, data) for problem in new_problems if not (replaced and "path" in problem.path)
+            ]
             break
         data = _replace_faulty(data, new_problems)
     return (None if problems else plan), problems
+
+
+def value_at(data: Any, key: Key) -> Any:
+    """Return the value of a key of plain data, or None if it is missing."""
+    for part in key:
+        data = data.get(part) if isinstance(data, dict) else None
+    return data
+
+
+def _with_file(problem: Problem, data: dict[str, Any]) -> Problem:
+    """Name the trajectory file that a problem is about."""
+    path = value_at(data, problem.path) if problem.path[-1:] == ("poses",) else None
+    return Problem(problem.path, f"{path}: {problem.message}") if isinstance(path, str) else problem
 
 
 def _check_combinations(
@@ -119,11 +130,7 @@ def _replace_faulty(data: dict[str, Any], problems: list[Problem]) -> dict[str, 
 
 
 def parse_model(model: type[Model], data: dict[str, Any]) -> tuple[Model | None, list[Problem]]:
-    """Validate the keys of a section separately.
-
-    Returns:
-        The section, or None if there are problems; the problems.
-    """
+    """Validate the keys of a section separately; return it, or None if there are problems, and the problems."""
     try:
         return model.model_validate(data), []
     except ValidationError as error:

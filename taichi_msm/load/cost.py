@@ -72,33 +72,19 @@ OUTPUT_NUMBERS = 15
 
 @dataclass(frozen=True)
 class Budget:
-    """Memory and disk space of a run.
-
-    Attributes:
-        points: number of mass points.
-        steps: number of time steps.
-        frames: number of frames, including the initial one.
-        simulation_bytes: memory for the state of the sheet and its output.
-        drawing_bytes: memory for a frame and the texture; 0 if nothing is drawn.
-        track_bytes: memory for the tracks until the run ends, and size of their file.
-        picture_bytes: upper bound of the size of the files with pictures and labels.
-        trajectory_bytes: size of the file of positions.
-        force_bytes: upper bound of the size of the table of forces.
-        record_bytes: upper bound of the size of run.json and camera.json.
-        working_bytes: additional disk space until the run ends.
-    """
+    """Memory and disk space of a run."""
 
     points: int
     steps: int
-    frames: int
-    simulation_bytes: int
-    drawing_bytes: int
-    track_bytes: int
-    picture_bytes: int
-    trajectory_bytes: int
-    force_bytes: int
-    record_bytes: int
-    working_bytes: int
+    frames: int  # including the initial one
+    simulation_bytes: int  # memory for the state of the sheet and its output
+    drawing_bytes: int  # memory for a frame and the texture; 0 if nothing is drawn
+    track_bytes: int  # memory for the tracks until the run ends, and size of their file
+    picture_bytes: int  # upper bound of the size of the files with pictures and labels
+    trajectory_bytes: int  # size of the file of positions
+    force_bytes: int  # upper bound of the size of the table of forces
+    record_bytes: int  # upper bound of the size of run.json and camera.json
+    working_bytes: int  # additional disk space until the run ends
 
     @property
     def memory_bytes(self) -> int:
@@ -174,15 +160,7 @@ def size_problems(plan: Plan) -> Iterator[Problem]:
 
 
 def require_disk(plan: Plan, directory: Path) -> None:
-    """Check the free disk space for the results of a run.
-
-    Args:
-        plan: plan of the run.
-        directory: folder of the results, which need not exist.
-
-    Raises:
-        SceneError: when there is not enough disk space.
-    """
+    """Raise a SceneError if there is not enough disk space for a run in a directory, which need not exist."""
     scene, budget, free = plan.scene, estimate_budget(plan), _free_disk(directory)
     needed = budget.disk_bytes + budget.working_bytes
     if needed <= free:
@@ -242,15 +220,10 @@ WORK_UNIT_S, CALIBRATION_S = 1.5e-9, 1e-4
 
 
 class DurationEstimate(NamedTuple):
-    """Estimated duration of a run.
-
-    Attributes:
-        seconds: total duration [s].
-        start: part of the duration before the first step [s].
-    """
+    """Estimated duration of a run [s]."""
 
     seconds: float
-    start: float
+    start: float  # part of it before the first step
 
 
 def estimate_duration(plan: Plan) -> DurationEstimate:

@@ -15,26 +15,15 @@ from taichi_msm.system.runtime import Device
 
 
 class ResolvedPlan(NamedTuple):
-    """Plan with all settings chosen.
+    """Plan with all settings chosen."""
 
-    Attributes:
-        plan: plan whose scene contains the chosen numbers of mass points, time step and precision.
-        estimate: estimate of the time-step error; None without `time.tolerance`.
-        mesh: estimate of the discretisation error (mesh); None without `sheet.tolerance`.
-    """
-
-    plan: Plan
-    estimate: TimeStepEstimate | None
-    mesh: MeshEstimate | None
+    plan: Plan  # its scene contains the chosen numbers of mass points, time step and precision
+    estimate: TimeStepEstimate | None  # of the time-step error; None without `time.tolerance`
+    mesh: MeshEstimate | None  # of the discretisation error; None without `sheet.tolerance`
 
 
 def resolve(plan: Plan, device: Device, progress: ProgressCallback = lambda done, total: None) -> ResolvedPlan:
-    """Choose the settings that a valid scene leaves open, by trial runs if it has tolerances.
-
-    Args:
-        plan: plan of the scene.
-        device: device of the run and of the trial runs.
-        progress: callback with the progress of the trial runs.
+    """Choose the settings that a valid scene leaves open, by trial runs on the device if it has tolerances.
 
     Raises:
         SceneError: when a tolerance cannot be met, or the precision of the device does not suffice.

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from taichi_msm.errors import ArgumentError, Key, Problem, SceneError, truncate
 from taichi_msm.images import PICTURE_SUFFIXES, file_sha256, irregular_kind
-from taichi_msm.load.check import validate
+from taichi_msm.load.check import validate, value_at
 from taichi_msm.load.yaml_reader import MAX_DEPTH, Document, Mark, UnreadableError, mark_at, read_yaml
 from taichi_msm.model.plan import Plan
 from taichi_msm.scene.scene import Scene
@@ -32,39 +32,25 @@ MAP_KEYS: tuple[Key, ...] = (
 )
 PICTURE_KEYS = (IMAGE_KEY, *MAP_KEYS)
 
-# Keys whose values are paths of other files; ANY_CAMERA stands for the name of any camera.
-ANY_CAMERA = "*"
-CAMERA_FILE_KEYS: tuple[Key, ...] = tuple(
-    ("render", *camera, key) for camera in (("camera",), ("cameras", ANY_CAMERA)) for key in ("calibration", "poses")
-)
+# Keys of a camera whose values are paths of files.
+CAMERA_FILE_KEYS = ("calibration", "poses")
 
 # Limit of the lines of an error, as a broken file may have tens of thousands of problems.
 MAX_LINES = 100
 
 
 class FileKind(NamedTuple):
-    """Kind of a YAML file.
-
-    Attributes:
-        name: name of the kind, for messages.
-        needs: required keys, for messages.
-    """
+    """Kind of a YAML file: its name and its required keys, for messages."""
 
     name: str
     needs: str
 
 
 class ParsedFile(NamedTuple):
-    """Parsed YAML file, whose keys are not validated.
+    """Parsed YAML file, a mapping, whose keys are not validated."""
 
-    Attributes:
-        name: path of the file, for messages.
-        folder: folder of the file, to which its paths are relative.
-        document: content, a mapping.
-    """
-
-    name: str
-    folder: Path
+    name: str  # path of the file, for messages
+    folder: Path  # to which paths in the file are relative
     document: Document
 
 
@@ -103,13 +89,7 @@ def load_scene(
 def load_plan(
     path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = (), image: str | Path | None = None
 ) -> Plan:
-    """Read and validate a scene file, as `load_scene`, and plan the scene for a CPU.
-
-    Raises:
-        ArgumentError: when the path is a mapping, or the overrides are neither a sequence of texts nor a mapping from
-            texts.
-        SceneError: when the scene is invalid.
-    """
+    """Read and validate a scene file, as `load_scene`, and plan the scene for a CPU."""
     if isinstance(path, Mapping):
         raise ArgumentError("path: a mapping; Scene(**mapping) is its scene, and load_scene reads a file")
     return plan_file(read_file(str(path), SCENE_KIND), overrides, image)
@@ -118,12 +98,7 @@ def load_plan(
 def plan_file(
     file: ParsedFile, overrides: Sequence[str] | Mapping[str, Any] = (), image: str | Path | None = None
 ) -> Plan:
-    """Validate a parsed scene file, with overrides and image as in `load_scene`, and plan the scene for a CPU.
-
-    Raises:
-        ArgumentError: when the overrides are neither a sequence of texts nor a mapping from texts.
-        SceneError: when the scene is invalid.
-    """
+    """Validate a parsed scene file, with overrides and image as in `load_scene`, and plan the scene for a CPU."""
     if isinstance(overrides, str) or not (
         isinstance(overrides, (Sequence, Mapping)) and all(isinstance(item, str) for item in overrides)
     ):
@@ -149,31 +124,17 @@ def plan_file(
 
 def names_file(key: Key) -> bool:
     """Return whether the value of a key, if it is a text, is the path of a file."""
-    return any(
-        len(key) == len(pattern)
-        and all(expected in (str(part), ANY_CAMERA) for part, expected in zip(key, pattern, strict=True))
-        for pattern in (*PICTURE_KEYS, *CAMERA_FILE_KEYS)
-    )
+    is_camera = key[:-1] == ("render", "camera") or (key[:2] == ("render", "cameras") and len(key) == 4)
+    return key in PICTURE_KEYS or (is_camera and key[-1] in CAMERA_FILE_KEYS)
 
 
 def camera_files(data: Mapping[str, Any]) -> list[tuple[Key, str]]:
     """List the keys of cameras whose values are paths of files, with these paths."""
-    render = data.get("render")
-    cameras = render.get("cameras") if isinstance(render, dict) else None
-    names = list(cameras) if isinstance(cameras, dict) else []
-    keys = [
-        tuple(name if part == ANY_CAMERA else part for part in pattern)
-        for pattern in CAMERA_FILE_KEYS
-        for name in (names if ANY_CAMERA in pattern else [ANY_CAMERA])
-    ]
-    return [(key, path) for key in keys if isinstance(path := _value(data, key), str)]
-
-
-def _value(data: Any, key: Key) -> Any:
-    """Return the value of a key, or None if it is missing."""
-    for part in key:
-        data = data.get(part) if isinstance(data, dict) else None
-    return data
+    cameras = value_at(data, ("render", "cameras"))
+    sections: list[Key] = [("render", "camera")]
+    sections += [("render", "cameras", name) for name in (cameras if isinstance(cameras, dict) else ())]
+    keys = [(*section, name) for name in CAMERA_FILE_KEYS for section in sections]
+    return [(key, path) for key in keys if isinstance(path := value_at(data, key), str)]
 
 
 def schema() -> dict[str, Any]:
@@ -182,19 +143,12 @@ def schema() -> dict[str, Any]:
 
 
 class Override(NamedTuple):
-    """A value that replaces one of the file.
+    """A value that replaces one of the file."""
 
-    Attributes:
-        name: the override as in messages.
-        path: path to the key.
-        value: new value.
-        problems: problems of the override; with any, it is not applied.
-    """
-
-    name: str
+    name: str  # as in messages
     path: Key
     value: Any = None
-    problems: Sequence[Problem] = ()
+    problems: Sequence[Problem] = ()  # with any, the override is not applied
 
 
 def parse_override(text: str) -> Override:
@@ -234,26 +188,15 @@ def parse_key(key: str) -> Key:
 
 
 class _Origin(NamedTuple):
-    """Location of a key in the file or the overrides, sortable in the order of reading.
+    """Location of a key in the file or the overrides, sortable in the order of reading."""
 
-    Attributes:
-        source: 0 for the file, or the number of the override.
-        mark: line and column in the file.
-        name: location as in messages, such as press.yaml:7:3.
-    """
-
-    source: int
+    source: int  # 0 for the file, or the number of the override
     mark: Mark
-    name: str
+    name: str  # as in messages, such as press.yaml:7:3
 
 
 class Draft:
-    """Content of a parsed file with overrides, before validation.
-
-    Attributes:
-        data: content with the overrides that were applied.
-        problems: problems, each with its origin.
-    """
+    """Content of a parsed file with overrides, before validation, and problems, each with its origin."""
 
     def __init__(self, file: ParsedFile) -> None:
         document = file.document
@@ -273,15 +216,11 @@ class Draft:
             self.problems.append((origin, problem))
 
     def resolve_path(self, key: Key, folder: Path) -> None:
-        """Make the path of a file relative to the current directory.
+        """Make the path of a file, relative to a folder, relative to the current directory.
 
-        A path that is neither in the folder nor in an override is a problem.
-
-        Args:
-            key: key of the path; other values than paths are ignored.
-            folder: folder to which the path is relative.
+        A path that is neither in the folder nor in an override is a problem, and so is a camera's file that is missing.
         """
-        section, path = _value(self.data, key[:-1]), _value(self.data, key)
+        section, path = value_at(self.data, key[:-1]), value_at(self.data, key)
         if not (isinstance(path, str) and 0 < len(path) <= MAX_PATH):
             return
         section[key[-1]] = str(folder / path)
@@ -293,6 +232,16 @@ class Draft:
             message = f"{path} is not below the scene's folder; put {noun} there{remedy}"
             self.problems.append((self._origin(key), Problem(key, message)))
             del section[key[-1]]
+        elif key not in PICTURE_KEYS:
+            # Validation stops at the first file of the cameras that is missing.
+            try:
+                (folder / path).stat()
+            except OSError as error:
+                kind = "trajectory" if key[-1] == "poses" else "calibration"
+                message = f"{folder / path}: {(error.strerror or str(error)).lower()}; name a {kind} that can be read"
+                self.problems.append((self._origin(key), Problem(key, message)))
+            except ValueError:
+                pass  # Validation refuses the path.
 
     def report(self, problems: Iterable[Problem]) -> None:
         """Add problems with their origins, except those of keys that already have a problem."""
@@ -385,7 +334,9 @@ def _read_text(name: str, kind: FileKind) -> str:
     except ValueError:
         raise SceneError([f"{name}: not a path; name a {kind.name} file"]) from None
     except OSError as error:
-        raise SceneError([f"{name}: {(error.strerror or str(error)).lower()}"]) from None
+        similar = (other for other in path.parent.glob("*.y*ml") if isinstance(error, FileNotFoundError))
+        hint = next((f"; did you mean '{other}'?" for other in similar if other.stem == path.stem), "")
+        raise SceneError([f"{name}: {(error.strerror or str(error)).lower()}{hint}"]) from None
     if len(raw) > MAX_BYTES:
         raise SceneError([f"{name}: larger than {MAX_BYTES // 2**20} MiB; a {kind.name} is smaller"])
     try:

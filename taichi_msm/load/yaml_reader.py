@@ -25,13 +25,8 @@ MAX_FAULTS = 1000
 # Longer plain scalars are texts, because Python cannot convert integers of several thousand digits.
 MAX_NUMBER_LENGTH = 100
 
-# The C parser is twenty times faster than the one in Python, and returns the same data.
-_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-
 # Characters that YAML excludes, and line breaks of YAML that editors do not count, which would shift line numbers.
 _NOT_ALLOWED = re.compile("[^\t\n\r\x20-\x7e\xa0-\u2027\u202a-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-
-_SURROGATE = re.compile("[\ud800-\udfff]")
 
 _NUMBERS: tuple[tuple[re.Pattern[str], Callable[[str], float]], ...] = (
     (re.compile(r"[-+]?[0-9]+"), int),
@@ -48,37 +43,22 @@ _WORDS: dict[str, bool | None] = {
 
 
 class Mark(NamedTuple):
-    """Position in a text.
-
-    Attributes:
-        line: number of the line, from 1.
-        column: number of the column, from 1.
-    """
+    """Position in a text, counted from 1."""
 
     line: int
     column: int
 
 
 class Document(NamedTuple):
-    """Content of a YAML document.
+    """Content of a YAML document."""
 
-    Attributes:
-        data: None, bool, int, float, str, and lists and dicts of these; None for an empty text.
-        marks: positions of all keys and of all items of lists.
-        faults: the first MAX_FAULTS faults that did not stop parsing, with their positions.
-    """
-
-    data: Any
-    marks: dict[Key, Mark]
-    faults: list[tuple[Mark, Problem]]
+    data: Any  # None, bool, int, float, str, and lists and dicts of these; None for an empty text
+    marks: dict[Key, Mark]  # positions of all keys and of all items of lists
+    faults: list[tuple[Mark, Problem]]  # the first MAX_FAULTS that did not stop parsing, with their positions
 
 
 class UnreadableError(Exception):
-    """The text is not YAML, or has too many values or too deep nesting.
-
-    Attributes:
-        mark: position of the fault.
-    """
+    """The text is not YAML, or has too many values or too deep nesting."""
 
     def __init__(self, mark: Mark, message: str) -> None:
         super().__init__(message)
@@ -90,23 +70,17 @@ def read_yaml(text: str) -> Document:
     if match := _NOT_ALLOWED.search(text):
         message = f"character U+{ord(match[0]):04X} is not allowed; remove it"
         raise UnreadableError(mark_at(text, match.start()), message)
-    reader = _DocumentBuilder(yaml.parse(text, Loader=_LOADER))
+    reader = _DocumentBuilder(yaml.parse(text, Loader=yaml.CSafeLoader))
     try:
         return Document(reader.document(), reader.marks, reader.faults)
     except yaml.MarkedYAMLError as error:
         raise _syntax_error(text, error) from None
-    except (yaml.YAMLError, ValueError) as error:
-        # PyYAML's Python parser passes invalid escapes to chr(), which raises a ValueError.
+    except yaml.YAMLError as error:
         raise UnreadableError(Mark(1, 1), f"not valid YAML: {error}") from None
 
 
 def mark_at(text: str, index: int) -> Mark:
-    """Return the line and column of a character.
-
-    Args:
-        text: text whose lines end with line feeds.
-        index: index of the character.
-    """
+    """Return the position of the character at an index."""
     before = text[:index]
     return Mark(before.count("\n") + 1, index - before.rfind("\n"))
 
@@ -132,8 +106,8 @@ def _mark(mark: Any) -> Mark:
     return Mark(mark.line + 1, mark.column + 1)
 
 
-def _resolve(text: str) -> Any:
-    """Convert a plain scalar to its value."""
+def _plain_value(text: str) -> Any:
+    """Convert a plain scalar."""
     if text in _WORDS:
         return _WORDS[text]
     if text[0] in "+-.0123456789" and len(text) <= MAX_NUMBER_LENGTH:
@@ -144,12 +118,7 @@ def _resolve(text: str) -> Any:
 
 
 class _DocumentBuilder:
-    """Builder of data from the events of a parser.
-
-    Attributes:
-        marks: positions of the keys and items so far.
-        faults: faults so far, with their positions.
-    """
+    """Builder of data, positions and faults from the events of a parser."""
 
     def __init__(self, events: Iterator[Any]) -> None:
         self.marks: dict[Key, Mark] = {(): Mark(1, 1)}
@@ -174,7 +143,7 @@ class _DocumentBuilder:
         if isinstance(event, yaml.AliasEvent):
             return None
         if isinstance(event, yaml.ScalarEvent):
-            return _resolve(event.value) if event.implicit[0] else event.value
+            return _plain_value(event.value) if event.implicit[0] else event.value
         if isinstance(event, yaml.SequenceStartEvent):
             return self._items(path)
         return self._mapping(path)
@@ -189,9 +158,6 @@ class _DocumentBuilder:
         if isinstance(event, yaml.AliasEvent):
             self._add_fault(event, path, f"alias *{event.anchor} is not allowed; write the value out")
             return
-        if isinstance(event, yaml.ScalarEvent) and event.style == '"' and _SURROGATE.search(event.value):
-            # The C parser already rejects surrogates.
-            raise UnreadableError(_mark(event.start_mark), "not valid YAML: invalid Unicode escape")
         if event.anchor is not None:
             self._add_fault(event, path, f"anchor &{event.anchor} is not allowed; remove it")
         if event.tag is not None:

@@ -87,15 +87,7 @@ def average_loads(plan: Plan, first: int, count: int) -> Schedule:
 
 
 def evaluate_loads(plan: Plan, t: Array) -> Schedule:
-    """Evaluate the loads without averaging, with one slot per probe.
-
-    Args:
-        plan: the plan.
-        t: times that differ from all keyframes [s], shape (n,).
-
-    Returns:
-        Loads at these times, instead of at steps.
-    """
+    """Evaluate the loads at times t [s] that differ from all keyframes, without averaging, with one slot per probe."""
     scene = plan.scene
     slots = plan.slots if scene.time.at_rest else probe_slots(scene.probes, scene.sheet, 0.0)
     strength, point = np.zeros((len(t), len(slots), 3)), np.zeros((len(t), len(slots), 2))
@@ -110,11 +102,7 @@ def evaluate_loads(plan: Plan, t: Array) -> Schedule:
 
 
 class FrameLoad:
-    """The load of a force-controlled probe at frames, without averaging.
-
-    Attributes:
-        moves: whether the control point moves.
-    """
+    """The load of a force-controlled probe at frames, without averaging. `moves`: whether the control point moves."""
 
     def __init__(self, probe: Probe, sheet: Sheet) -> None:
         self._line, (self._times, self._points) = _load(probe), control_points(probe, sheet)
@@ -122,11 +110,7 @@ class FrameLoad:
         self._keys = np.unique(np.concatenate([self._line.times, self._times]))
 
     def at(self, frame: int, rate: float) -> tuple[float, Array]:
-        """Evaluate the load at a frame, for a frame rate [1/s]; at a jump, the value after the jump counts.
-
-        Returns:
-            The load [%], and the control point, x and y at rest [m], shape (2,).
-        """
+        """Return the load [%] and the control point, x and y at rest [m], at a frame; those after a jump at a jump."""
         time = frame / rate
         # Frame times are rounded, so a keyframe very close to the frame counts as at the frame.
         key = float(self._keys[max(0, self._keys.searchsorted(time + FRAME_TOLERANCE / rate, "right") - 1)])
@@ -183,9 +167,8 @@ class LoadBounds:
     def between(self, begin: float, end: float) -> tuple[Array, bool, int]:
         """Bound the loads of all steps in the closed time interval from `begin` to `end` [s].
 
-        Returns:
-            The largest force at the control point of each slot [N], shape (slots,); whether the virtual springs are
-            active at any time; and the number of their activations.
+        Returns the largest force at the control point of each slot [N]; whether the virtual springs are active at any
+        time; and the number of their activations.
         """
         # The averaged load of a step depends on the whole hat.
         begin, end = begin - self._h, end + self._h
@@ -197,11 +180,7 @@ class LoadBounds:
 class _PiecewiseLinear:
     """A piecewise linear function of time [s], 0 before the first keyframe and constant after the last.
 
-    It jumps where two keyframes have the same time.
-
-    Args:
-        times: times of the keyframes, ascending [s], shape (n,).
-        values: values at the keyframes, shape (n,).
+    The times of the keyframes are ascending. It jumps where two keyframes have the same time.
     """
 
     def __init__(self, times: Array, values: Array) -> None:
@@ -220,16 +199,10 @@ class _PiecewiseLinear:
         return self._values(t, self.times.searchsorted(t, "right"))
 
     def averages(self, t: Array, h: float, begin: float = -math.inf, end: float = math.inf) -> Array:
-        """Average the function with the hat function.
+        """Average the function with the hat functions of half-width h [s] about t [s], 0 or later.
 
-        Args:
-            t: centres of the hat, 0 or later [s], shape (n,).
-            h: half-width of the hat [s].
-            begin: time before which the function counts as 0 [s].
-            end: time after which the function counts as 0 [s].
-
-        Returns:
-            Averages, shape (n,); the value at t where neither a keyframe nor begin nor end lies within the hat.
+        Before `begin` and after `end` [s] the function counts as 0. Where neither a keyframe nor begin nor end lies
+        within the hat, the average is the value at t.
         """
         edges = [edge for edge in (begin, end) if math.isfinite(edge)]
         averages = self.values(t) * ((begin <= t) & (t < end))
@@ -297,7 +270,6 @@ def _control_point(segment: ProbeSegment, t: Array) -> Array:
 
 
 def _load(probe: Probe) -> _PiecewiseLinear:
-    """Return the percent of a probe's force as a function of time."""
     return _PiecewiseLinear(*np.array(probe.load, dtype=float).T)
 
 

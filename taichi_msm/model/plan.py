@@ -57,12 +57,9 @@ class ProbeSlot:
 
 
 def probe_slots(probes: Sequence[Probe], sheet: Sheet, h: float) -> tuple[ProbeSlot, ...]:
-    """Build the slots of all force-controlled probes.
+    """Build the slots of all force-controlled probes, for a half-width h of the hat, the step [s].
 
-    Args:
-        probes: probes of a scene.
-        sheet: the sheet.
-        h: half-width of the hat, equal to the step [s]; with 0, loads are not averaged and every probe has one slot.
+    With h = 0, loads are not averaged and every probe has one slot.
     """
     slots = []
     for index, probe in enumerate(probes):

@@ -95,7 +95,7 @@ Maps = Mapping[str, MapImage]
 
 
 class LockNumbers(NamedTuple):
-    """Numbers of a law that locks, see `terms.locking`."""
+    """Numbers of a law that locks, see `terms.law`."""
 
     lock: float  # m: strain of a spring; of the foundation a depth [m]
     factor: float  # largest tangent stiffness, relative to the initial one
@@ -231,12 +231,9 @@ def material_key_problems(scene: Scene) -> Iterator[Problem]:
 
 
 def tissue_problems(scene: Scene, fixed: NDArray[np.bool_], factors: Array | None) -> Iterator[Problem]:
-    """Report impossible values of keys of tissue.
+    """Report impossible values of keys of tissue, in a scene without `material_key_problems`.
 
-    Args:
-        scene: a scene without `material_key_problems`.
-        fixed: whether each mass point is fixed, shape (rows, cols).
-        factors: factors of the stiffness, shape (rows - 1, cols - 1); None without a readable map.
+    `factors` are those of the stiffness; None without a readable map.
     """
     tissue, sheet = scene.tissue, scene.sheet
     if tissue is None:

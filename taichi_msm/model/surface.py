@@ -20,15 +20,7 @@ Array = NDArray[np.float64]
 
 
 def to_positions(displacement: NDArray[Any], sheet: Sheet) -> NDArray[Any]:
-    """Convert displacements to positions, in place.
-
-    Args:
-        displacement: x - X [m], shape (rows, cols, 3); overwritten.
-        sheet: the sheet.
-
-    Returns:
-        Positions x [m], a read-only view of the same array.
-    """
+    """Convert displacements [m], shape (rows, cols, 3), to positions, in place; return a read-only view."""
     position, (x, y) = displacement, axes(sheet)
     # The sum is computed in float64 and rounded once, without a float64 copy of the sheet.
     np.add(position[..., 0], x, out=position[..., 0], casting="same_kind")
@@ -60,16 +52,7 @@ def surface_point(position: NDArray[np.floating], refine: int, sheet: Sheet, res
 
 
 def surface_positions(position: NDArray[np.floating], refine: int, coordinates: NDArray[np.floating]) -> Array:
-    """Compute the positions of material points on the refined surface.
-
-    Args:
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        refine: number of vertices inserted between neighbouring mass points.
-        coordinates: fractions of the sheet's width from its left and of its height from its top, shape (n, 2).
-
-    Returns:
-        Positions [m], shape (n, 3).
-    """
+    """Compute the positions [m], shape (n, 3), of material points on the refined surface, see `surface_weights`."""
     return _interpolate(position, refine, coordinates.astype(np.float64))[0]
 
 
@@ -116,18 +99,11 @@ def _cell_coordinates(coordinates: Array, points: tuple[int, int], refine: int) 
 
 
 class Surface(NamedTuple):
-    """Textured triangles.
+    """Textured triangles, with vertices row by row from the top left."""
 
-    Attributes:
-        vertices: positions [m], shape (vertices, 3), row by row from the top left.
-        triangles: indices of vertices, shape (triangles, 3), counter-clockwise as seen from above.
-        texture_coordinates: fractions of the texture's width from its left and of its height from its top, shape
-            (vertices, 2).
-    """
-
-    vertices: NDArray[np.floating]
-    triangles: NDArray[np.int32]
-    texture_coordinates: NDArray[np.float64]
+    vertices: NDArray[np.floating]  # positions [m], shape (vertices, 3)
+    triangles: NDArray[np.int32]  # indices of vertices, shape (triangles, 3), counter-clockwise as seen from above
+    texture_coordinates: NDArray[np.float64]  # fractions of the texture from left and from top, shape (vertices, 2)
 
 
 class Solid(NamedTuple):
@@ -143,12 +119,8 @@ class Solid(NamedTuple):
 def refine_surface(position: NDArray[np.floating], refine: int) -> Surface:
     """Refine the sheet bilinearly (section 2 of the paper) and triangulate it.
 
-    Args:
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        refine: number of vertices inserted between neighbouring mass points.
-
-    Returns:
-        The surface; every small quad is divided by the diagonal from top left to bottom right.
+    Between neighbouring mass points `refine` vertices are inserted. Every small quad is divided by the diagonal from
+    top left to bottom right.
     """
     vertices = _insert(_insert(position, refine, 0), refine, 1)
     rows, cols = vertices.shape[:2]
@@ -166,13 +138,7 @@ def refine_surface(position: NDArray[np.floating], refine: int) -> Surface:
 
 
 def place_instruments(scene: Scene, position: NDArray[np.floating], time: float) -> list[Solid]:
-    """Return a solid for every probe with an instrument, in the order of the probes.
-
-    Args:
-        scene: the scene.
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        time: the time [s].
-    """
+    """Return a solid for every probe with an instrument, in the order of the probes, at a time [s]."""
     moved = {tool.probe: tool for tool in build_tools(scene.probes, scene.sheet)}
     placed = []
     for index, probe in enumerate(scene.probes):
@@ -188,14 +154,7 @@ def place_instruments(scene: Scene, position: NDArray[np.floating], time: float)
 
 
 def place_instrument(instrument: Instrument, scene: Scene, position: NDArray[np.floating], rest: Array) -> Solid:
-    """Place the instrument of a force-controlled probe on the surface.
-
-    Args:
-        instrument: the instrument.
-        scene: the scene.
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        rest: rest position of the point that the tip touches, x and y [m], shape (2,).
-    """
+    """Place the instrument of a force-controlled probe on the surface, where the rest position is x and y [m]."""
     axis = unit_vector(instrument.shaft)
     point, normal = surface_point(position, scene.render.refine, scene.sheet, rest)
     outward = normal if normal @ axis >= 0 else -normal

@@ -52,12 +52,7 @@ class ProbeForce(NamedTuple):
 
 
 def probe_force(probe: Probe, sheet: Sheet) -> ProbeForce:
-    """Compute the force law of a probe.
-
-    Args:
-        probe: a force-controlled probe.
-        sheet: the sheet; the size of its cells scales a `total`.
-    """
+    """Compute the force law of a force-controlled probe; the size of the sheet's cells scales a `total`."""
     rim = probe.falloff * probe.radius
     if probe.total is None:
         assert probe.force is not None
@@ -69,11 +64,7 @@ def probe_force(probe: Probe, sheet: Sheet) -> ProbeForce:
 
 
 def control_points(probe: Probe, sheet: Sheet) -> tuple[Array, Array]:
-    """Return the keyframes of a probe's control point.
-
-    Returns:
-        Times [s], shape (n,), and control points, x and y at rest [m], shape (n, 2).
-    """
+    """Return the times [s] and control points, x and y at rest [m], of a probe's keyframes, shapes (n,) and (n, 2)."""
     first = probe.at[0]
     keys = probe.at if isinstance(first, tuple) else ((0.0, *probe.at),)
     time, across, down = np.array(keys, dtype=float).T
@@ -87,16 +78,7 @@ def control_point(probe: Probe, sheet: Sheet, time: float) -> Array:
 
 
 def point_at(times: Array, points: Array, time: float) -> Array:
-    """Interpolate a control point between keyframes; at a jump, the point after the jump.
-
-    Args:
-        times: times of the keyframes [s], shape (n,).
-        points: control points at the keyframes [m], shape (n, 2).
-        time: the time [s].
-
-    Returns:
-        The control point [m], shape (2,).
-    """
+    """Interpolate a control point [m], shape (2,), between keyframes; at a jump, the point after the jump."""
     # Frame times are rounded, so a keyframe very close to the time counts as reached.
     after = int(np.searchsorted(times, time + 1e-12 * max(1.0, abs(time)), side="right"))
     if after in (0, len(times)):

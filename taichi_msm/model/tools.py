@@ -74,17 +74,11 @@ class Tool:
         return float(np.linalg.norm(np.diff(self.tip_centres, axis=0), axis=1).sum())
 
     def max_stride(self, step: float, first: int = 0) -> tuple[float, int]:
-        """Find the largest displacement of the tool in a step.
+        """Find the largest displacement of the tool [m] in a step [s], from keyframe `first` on.
 
-        The displacement is a convex function of the start of the step, as long as no keyframe enters or leaves the
-        step. It is therefore evaluated only where one does.
-
-        Args:
-            step: duration of the step [s].
-            first: index of the keyframe at which the search begins.
-
-        Returns:
-            The displacement [m], and the index of the keyframe at the end of its path segment.
+        Also returns the index of the keyframe at the end of its path segment. The displacement is a convex function of
+        the start of the step, as long as no keyframe enters or leaves the step. It is therefore evaluated only where
+        one does.
         """
         begin = np.maximum([0.0, *self.times, *(self.times - step)], max(0.0, self.times[first] if first else 0.0))
         strides = np.linalg.norm(self.tip_centre(begin + step) - self.tip_centre(begin), axis=1)
@@ -102,12 +96,7 @@ class Tool:
         return x, y, z
 
     def touches(self, positions: Array, t: float) -> bool:
-        """Return whether any point lies inside the shape or, up to rounding, on its surface.
-
-        Args:
-            positions: points [m], shape (n, 3).
-            t: the time [s].
-        """
+        """Return whether any position [m], shape (n, 3), is in or, up to rounding, on the shape at a time t [s]."""
         r = positions - self.tip_centre(np.array([t]))[0]
         depth, *_ = self.shape.build_depth(NUMPY)(*r.T, *self.axis, self.length, self.radius)
         return bool((depth > -1e-6 * self.radius).any())
@@ -115,8 +104,7 @@ class Tool:
     def substep_times(self, begin: float, end: float) -> Array:
         """Divide a time interval [s] so that the tool moves by at most its stride, and if rough straight, in each part.
 
-        Returns:
-            Ends of the subintervals [s].
+        Returns the ends of the parts.
         """
         count, max_stride = 1, self.stride * (1 + 1e-9)
         while True:
@@ -148,12 +136,7 @@ def touching_tools(tools: Sequence[Tool]) -> list[Tool]:
 
 
 def build_tools(probes: Sequence[Probe], sheet: Sheet) -> tuple[Tool, ...]:
-    """Build the position-controlled tools of a scene.
-
-    Args:
-        probes: all probes of the scene.
-        sheet: the sheet; paths are fractions of its size.
-    """
+    """Build the position-controlled tools of a scene from all its probes."""
     height, width = sheet.size
     tools: list[Tool] = []
     for index, probe in enumerate(probes):
@@ -227,7 +210,6 @@ def friction_problem(tool: Tool, *, at_rest: bool) -> str:
 
 
 def _clamp_problems(clamp: Clamp, scene: Scene) -> Iterator[Problem]:
-    """Report a clamp of fixed mass points, or of none, and a path that does not begin at rest."""
     key, begin = ("probes", clamp.probe), [float(clamp.times[0]), *clamp.tip_centres[0].tolist()]
     if clamp.side in fixed_sides(scene.sheet):
         yield Problem((*key, "clamp"), f"{clamp.side} is in sheet.fixed; remove it there, or clamp another side")
@@ -240,16 +222,9 @@ def _clamp_problems(clamp: Clamp, scene: Scene) -> Iterator[Problem]:
 
 
 def too_fast(tool: Tool, grid: TimeGrid, first: int = 0) -> tuple[int, str] | None:
-    """Check the speed of a tool against the time step.
+    """Return the keyframe at the end of the fastest segment from keyframe `first` on, and a message.
 
-    Args:
-        tool: the tool.
-        grid: the time grid, with the step.
-        first: index of the keyframe at which the check begins.
-
-    Returns:
-        The index of the keyframe at the end of the fastest segment, and a message; None if the tool is slow enough, or
-        a clamp.
+    Return None if the tool is slow enough for the time step, or a clamp.
     """
     stride, key = tool.max_stride(grid.step, first)
     if isinstance(tool, Clamp) or stride <= tool.stride * (1 + 1e-9):
@@ -261,13 +236,7 @@ def too_fast(tool: Tool, grid: TimeGrid, first: int = 0) -> tuple[int, str] | No
 
 
 def min_steps_per_frame(tools: Sequence[Tool], grid: TimeGrid, least: int) -> int:
-    """Compute the smallest number of steps per frame with which no tool is too fast.
-
-    Args:
-        tools: the position-controlled tools.
-        grid: the time grid, of which only the frame rate is used.
-        least: lower bound of the result.
-    """
+    """Compute the smallest number of steps per frame, at least `least`, with which no tool is too fast."""
 
     def speed_ratio(tool: Tool) -> float:
         return tool.max_stride(1 / grid.frames_per_second / least)[0] / tool.stride
@@ -318,14 +287,9 @@ def path_warnings(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:
 
 
 def overlap(tools: Sequence[Tool], duration: float) -> tuple[int, int, float] | None:
-    """Find two capsules that intersect, at 1025 equidistant times.
+    """Find two capsules that intersect, at 1025 equidistant times of the scene's duration [s].
 
-    Args:
-        tools: the position-controlled tools.
-        duration: duration of the scene [s].
-
-    Returns:
-        The indices of their probes, and the first time [s]; None if no tools intersect.
+    Returns the indices of their probes, and the first time [s]; None if no tools intersect.
     """
     times = np.linspace(0, duration, 1025)
     for a, b in combinations([tool for tool in touching_tools(tools) if tool.shape.name == "capsule"], 2):

@@ -19,7 +19,6 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.model.plan import Plan
@@ -42,41 +41,19 @@ def coefficients(plan: Plan) -> Coefficients:
     return Coefficients(1 - g * h, undamped, undamped / 2)
 
 
-def step_gains(plan: Plan, first: int, count: int) -> NDArray[np.float64]:
-    """Return the gains of steps first, ..., first + count - 1 [m/N], shape (count,)."""
-    _, gain, first_gain = coefficients(plan)
-    return np.where(first + np.arange(count) == 0, first_gain, gain)
-
-
 def mean_force(plan: Plan, displacement: NDArray[Any], steps: int) -> NDArray[Any]:
-    """Compute the mean force that has the effect of a displacement, beyond that of all other forces.
+    """Compute the mean force [N] with the effect of a sum of displacements [m] in `steps`, beyond that of other forces.
 
     It is m (1 + g h / 2) / h^2 times the displacement per step, or m / h^2 with backward differences.
-
-    Args:
-        plan: the plan.
-        displacement: sum of the displacements in these steps [m].
-        steps: number of steps.
-
-    Returns:
-        The force [N], of the same shape.
     """
     return displacement / (coefficients(plan).gain * steps)
 
 
 def stability_limit(frequency: float, drag: float, difference: str) -> float:
-    """Compute the largest stable step.
+    """Compute the largest stable step [s] for the highest angular frequency w [rad/s] and g = C / m [1/s].
 
-    With the highest angular frequency w it is 2 / w for central differences of the damping, and
-    (sqrt(g^2 + 4 w^2) - g) / w^2 for backward differences, which the code rearranges to avoid cancellation.
-
-    Args:
-        frequency: w [rad/s].
-        drag: g = C / m [1/s].
-        difference: "central" or "backward".
-
-    Returns:
-        The step [s]; infinite without stiffness and damping.
+    It is 2 / w for central differences of the damping, and (sqrt(g^2 + 4 w^2) - g) / w^2 for backward ones, which the
+    code rearranges to avoid cancellation; infinite without stiffness and damping.
     """
     g = drag if difference == "backward" else 0.0
     limit = math.hypot(g, 2 * frequency) + g

@@ -24,21 +24,13 @@ SEARCH_ROUNDS = 32
 
 
 class Bins(NamedTuple):
-    """Lists of the cells that overlap each bin.
+    """Lists of the cells that overlap each bin."""
 
-    Attributes:
-        size: width and height of a bin [px or samples].
-        columns: number of bins in a row.
-        lengths: number of cells in each list, shape (rows of bins, columns).
-        starts: first entry of each list, then the end of the last one; on the device.
-        entries: cells of all lists, on the device; on a GPU the order within a list is arbitrary.
-    """
-
-    size: int
-    columns: int
-    lengths: NDArray[np.int32]
-    starts: Any
-    entries: Any
+    size: int  # width and height of a bin [px or samples]
+    columns: int  # bins in a row
+    lengths: NDArray[np.int32]  # number of cells in each list, shape (rows of bins, columns)
+    starts: Any  # first entry of each list, then the end of the last one; on the device
+    entries: Any  # cells of all lists, on the device; on a GPU the order within a list is arbitrary
 
 
 def build_bins(launches: Launches, bounds: Any, cells: int, extent: tuple[int, int], size: int) -> Bins:
@@ -91,13 +83,7 @@ def _build_in_parallel(launches: Launches, bounds: Any, cells: int, extent: tupl
 
 @ti.func
 def store_bounds(cell, left, right, top, bottom, width, height, bounds: ti.template()):
-    """Store the bounding box of a cell, clipped to the picture.
-
-    Args:
-        left, right, top, bottom: edges of the bounding box [px or samples].
-        width, height: size of the picture, in the same unit.
-        bounds: bounding boxes of the cells, written; `BOUNDS_STRIDE` integers per cell.
-    """
+    """Store the bounding box of a cell, clipped to the picture; all in [px] or all in [samples]."""
     entry = cell * BOUNDS_STRIDE
     bounds[entry + FIRST_X] = ti.cast(ti.floor(ti.math.clamp(left, 0.0, MAX_BOUND)), ti.i32)
     bounds[entry + FIRST_Y] = ti.cast(ti.floor(ti.math.clamp(top, 0.0, MAX_BOUND)), ti.i32)
@@ -154,13 +140,7 @@ def _list_cells(cells: ti.i32, size: ti.i32, columns: ti.i32, bounds: Integers, 
 
 @ti.func
 def owner_of(item, owners, ends: ti.template()):
-    """Return the index of an item's owner, by binary search.
-
-    Args:
-        item: index of the item.
-        owners: number of owners.
-        ends: cumulative number of items up to and including each owner.
-    """
+    """Return the index of an item's owner among `owners`; `ends` is the end of the items of each owner."""
     low, high = 0, owners - 1
     while low < high:
         middle = (low + high) // 2

@@ -25,17 +25,8 @@ Array = NDArray[np.float64]
 OBLIQUE_DIRECTION = np.array([0.0, -0.64, 0.77])
 OBLIQUE_FOV = 32.0
 
-# Margin of the preset fit on every side, as a fraction of the picture's width or height.
-FIT_MARGIN = 0.02
-
-# Kernels multiply the matrix by the samples along a side of a pixel, in f32.
-MAX_MATRIX_ENTRY = float(np.finfo(np.float32).max) / MAX_SUPERSAMPLE
-
 # Maximum baseline of a stereo pair, in units of the sheet's larger side.
 MAX_BASELINE_RATIO = 1e6
-
-# Maximum time between the first two poses [s]; for more than two poses also in units of the scene's duration.
-MAX_GAP_S, MAX_GAP_RATIO = 1e5, 5
 
 # Signs that convert the axes right, up, toward the camera to OpenCV's right, down, forward.
 OPENCV_SIGNS = np.array([[1.0], [-1.0], [-1.0]])
@@ -50,36 +41,21 @@ class View(NamedTuple):
 
     from the top-left corner, with w = depth for a pinhole camera, and w = 1 for the orthographic one. Lens distortion
     is applied to these pixels.
-
-    Attributes:
-        matrix: maps (x, y, z, 1) [m] to (X, Y, w, depth) with x = X / w, y = Y / w, shape (4, 4).
-        near: near plane [m]; only surfaces with a larger w are drawn.
-        axes: unit vectors right, up and toward the camera, as rows, shape (3, 3).
-        eye: origin of the camera's frame and of depth [m], shape (3,).
-        scale: pixels per metre at w = 1, horizontal and vertical, shape (2,).
-        centre: principal point [px], shape (2,).
-        size: width and height of the picture [px], shape (2,).
-        distance: distance of the eye from the target [m]; for a moving camera that at the start.
-        pinhole: whether the projection is perspective.
-        lens: lens distortion; None if there is none.
-        baseline: distance to the companion camera of a parallel stereo pair, along the x axis [m]; 0 without one.
-        companion: view of the first camera that is `beside` this one; None without one.
-        light_view: view of the camera at the light; None if it is this one.
     """
 
-    matrix: Array
-    near: float
-    axes: Array
-    eye: Array
-    scale: Array
-    centre: Array
-    size: Array
-    distance: float
-    pinhole: bool
+    matrix: Array  # maps (x, y, z, 1) [m] to (X, Y, w, depth) with x = X / w, y = Y / w, shape (4, 4)
+    near: float  # near plane [m]; only surfaces with a larger w are drawn
+    axes: Array  # unit vectors right, up and toward the camera, as rows, shape (3, 3)
+    eye: Array  # origin of the camera's frame and of depth [m], shape (3,)
+    scale: Array  # pixels per metre at w = 1, horizontal and vertical, shape (2,)
+    centre: Array  # principal point [px], shape (2,)
+    size: Array  # width and height of the picture [px], shape (2,)
+    distance: float  # of the eye from the target [m]; for a moving camera at the start
+    pinhole: bool  # whether the projection is perspective
     lens: Lens | None = None
-    baseline: float = 0.0
-    companion: View | None = None
-    light_view: View | None = None
+    baseline: float = 0.0  # distance to the companion of a parallel stereo pair, along the x axis [m]
+    companion: View | None = None  # the first camera that is `beside` this one
+    light_view: View | None = None  # the camera at the light; None if it is this one
 
     @property
     def lens_model(self) -> str:
@@ -96,13 +72,9 @@ class View(NamedTuple):
         return points @ self.matrix[:, :3].T + self.matrix[:, 3]
 
     def pixels(self, points: Array) -> Array:
-        """Project points to pixels, with lens distortion.
+        """Project points [m], shape (..., 3), to distorted pixels [px], shape (..., 2).
 
-        Args:
-            points: world coordinates [m], shape (..., 3).
-
-        Returns:
-            Pixels [px], shape (..., 2); NaN behind the near plane and beyond the limit of the lens.
+        The pixels are NaN behind the near plane and beyond the limit of the lens.
         """
         x, y, w, _ = np.moveaxis(self.project(points), -1, 0)
         w = np.where(w > self.near, w, np.nan)
@@ -129,14 +101,7 @@ class View(NamedTuple):
         return self.centre + self.scale * self.lens.undistort((pixels - self.centre) / self.scale)
 
     def disparity(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the disparity to the companion camera of a stereo pair without lens distortion.
-
-        Args:
-            depth: depths [m], any shape; 0 where no surface is visible.
-
-        Returns:
-            Displacement to the left in the companion's picture [px], same shape; 0 where the depth is 0.
-        """
+        """Return the disparity to the companion camera of a stereo pair without lens distortion [px], 0 at depth 0."""
         w = np.where(depth == 0, np.inf, depth if self.pinhole else 1.0)
         return (self.scale[0] * self.baseline / w).astype(np.float32)
 
@@ -158,16 +123,17 @@ def calibration(camera: View) -> dict[str, Any]:
         OpenCV's pixels, where the centre of the first one is (0, 0); "model" and "distortion": lens model and its
         coefficients in its order.
     """
-    matrices: dict[str, Any] = {"projection": camera.matrix[:3].tolist()}
-    if camera.pinhole:
-        (focal_x, focal_y), (x, y) = camera.scale.tolist(), camera.centre.tolist()
-        matrices["intrinsics"] = [[focal_x, 0.0, x], [0.0, focal_y, y], [0.0, 0.0, 1.0]]
-        matrices["pose"] = pose(camera)
-        lens = camera.lens or IDENTITY_LENS
-        matrices["calibration"] = [[focal_x, 0.0, x - 0.5], [0.0, focal_y, y - 0.5], [0.0, 0.0, 1.0]]
-        matrices["model"] = lens.model
-        matrices["distortion"] = list(lens.coefficients)
-    return matrices
+    projection = {"projection": camera.matrix[:3].tolist()}
+    if not camera.pinhole:
+        return projection
+    (focal_x, focal_y), (x, y), lens = camera.scale.tolist(), camera.centre.tolist(), camera.lens or IDENTITY_LENS
+    return projection | {
+        "intrinsics": [[focal_x, 0.0, x], [0.0, focal_y, y], [0.0, 0.0, 1.0]],
+        "pose": pose(camera),
+        "calibration": [[focal_x, 0.0, x - 0.5], [0.0, focal_y, y - 0.5], [0.0, 0.0, 1.0]],
+        "model": lens.model,
+        "distortion": list(lens.coefficients),
+    }
 
 
 def pose(camera: View) -> list[list[float]]:
@@ -265,7 +231,7 @@ def camera_problems(scene: Scene) -> Iterator[Problem]:
 
 
 def _single_camera_problems(camera: Camera, scene: Scene, name: str) -> Iterator[Problem]:
-    """List the problems of a camera; keys are relative to its section."""
+    """List the problems of a camera, of which only the first is valid; keys are relative to its section."""
     if camera.beside is None:
         yield from _extrinsics_problems(camera, scene)
     else:
@@ -275,12 +241,11 @@ def _single_camera_problems(camera: Camera, scene: Scene, name: str) -> Iterator
 
 
 def _placement_problems(camera: Camera, scene: Scene, name: str) -> Iterator[Problem]:
-    """List the problems of the place of a camera with a reference camera; keys are relative to its section."""
+    """List the problems of the place of a camera with a reference camera."""
     key, distance = "baseline", abs(scene.render.origin(name)[1])
     if camera.rotation is not None and camera.translation is not None:
         if fault := _rotation_fault(np.array(camera.rotation)):
             yield Problem(("rotation",), fault)
-            return
         key, distance = "translation", math.hypot(*camera.translation)
     if distance > MAX_BASELINE_RATIO * max(scene.sheet.size):
         message = (
@@ -323,29 +288,28 @@ def _pair_problems(scene: Scene) -> Iterator[Problem]:
 
 
 def _extrinsics_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
-    """List the problems of a camera's extrinsics at any frame; keys are relative to its section."""
+    """List the problems of a camera's extrinsics at any frame."""
+    place = next((name,) for name in ("eye", "pose", "poses") if getattr(camera, name) is not None)
     if camera.pose is not None and (fault := _rotation_fault(np.array(camera.pose.rotation))):
         yield Problem(("pose", "rotation"), fault)
-        return
     if camera.poses is not None:
+        assert not isinstance(camera.poses, str)
         begin, end, duration = camera.poses[0][0], camera.poses[-1][0], scene.time.duration
         tolerance = FRAME_TOLERANCE / scene.time.frames_per_second
-        gap = camera.poses[min(1, len(camera.poses) - 1)][0] - max(begin, 0.0)  # type: ignore[operator]
-        if gap > MAX_GAP_S or (len(camera.poses) > 2 and gap > MAX_GAP_RATIO * duration):
+        gap = camera.poses[min(1, len(camera.poses) - 1)][0] - max(begin, 0.0)
+        # Longer gaps are those of times in other units than seconds.
+        if gap > 1e5 or (len(camera.poses) > 2 and gap > 5 * duration):
             message = f"its first poses are {gap:.6g} s apart, and the scene lasts {duration:g} s"
-            yield Problem(("poses",), f"{message}; set poses_time, the unit of its times: ms, us or ns")
-            return
-        if begin > tolerance or end < duration - tolerance:  # type: ignore[operator]
+            yield Problem(place, f"{message}; set poses_time, the unit of its times: ms, us or ns")
+        if begin > tolerance or end < duration - tolerance:
             message = f"covers {begin:.12g} s to {end:.12g} s, but the scene goes from 0 s to {duration:g} s"
             remedy = "set poses_start: 0 to begin at the first pose, or another time of the file"
-            if begin <= tolerance:  # type: ignore[operator]
+            if begin <= tolerance:
                 remedy = "shorten time.duration or give the poses of all of it"
-            yield Problem(("poses",), f"{message}; {remedy}")
-            return
+            yield Problem(place, f"{message}; {remedy}")
     if camera.eye is None and extrinsics(camera, 0.0).distance < MIN_MAGNITUDE:
         message = "puts the eye on the middle of the sheet, which the light's strength depends on; move it away"
-        yield Problem((_extrinsics_key(camera),), message)
-        return
+        yield Problem(place, message)
     rate = scene.time.frames_per_second
     for time in [frame / rate for frame in range(scene.time.frames + 1)] if camera.moves else [0.0]:
         when = f" at {time:g} s" if camera.moves else ""
@@ -355,28 +319,19 @@ def _extrinsics_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
             )
             toward = normalised(np.subtract(eye, target))
             if math.dist(eye, target) < MIN_MAGNITUDE:
-                yield Problem(("eye",), f"{eye} is also the target{when}; move one of them")
-                return
+                yield Problem(place, f"{eye} is also the target{when}; move one of them")
             if not np.linalg.norm(np.cross(toward, normalised(np.array(up)))) > 1e-9:
-                message = f"{up} is zero or along the line of sight{when}; take a direction across it"
-                yield Problem(("up",), message)
-                return
-        if np.abs(_pinhole(camera, scene, time).matrix).max() > MAX_MATRIX_ENTRY:
+                yield Problem(("up",), f"{up} is zero or along the line of sight{when}; take a direction across it")
+        # Kernels multiply the matrix by the samples along a side of a pixel, in f32.
+        if np.abs(_pinhole(camera, scene, time).matrix).max() > float(np.finfo(np.float32).max) / MAX_SUPERSAMPLE:
+            message = f"is too far away for its focal length{when}; move it nearer"
             if camera.eye is not None and camera.intrinsics is None:
                 message = f"{eye} is too far away for {camera.fov:g} degrees{when}; move it nearer or widen fov"
-            else:
-                message = f"is too far away for its focal length{when}; move it nearer"
-            yield Problem((_extrinsics_key(camera),), message)
-            return
-
-
-def _extrinsics_key(camera: Camera) -> str:
-    """Return the key that defines the extrinsics of a camera."""
-    return next(name for name in ("eye", "pose", "poses") if getattr(camera, name) is not None)
+            yield Problem(place, message)
 
 
 def _lens_problems(camera: View) -> Iterator[Problem]:
-    """Report a fold of the lens distortion within the picture; keys are relative to the camera's section."""
+    """Report a fold of the lens distortion within the picture."""
     if camera.lens is None or not np.isnan(camera.undistort(border_points(camera.size))).any():
         return
     fault = "folds back" if camera.lens.limit < MAX_RADIUS else "reaches 88 degrees"
@@ -443,7 +398,7 @@ def orbit_camera(camera: Camera, right: float, up: float) -> Camera:
 
 
 def _rotation(axis: Array, angle: float) -> Array:
-    """Return the rotation about a unit vector by an angle [rad], by Rodrigues' formula."""
+    """Return the rotation about a unit vector by an angle [rad]; Rodrigues' formula."""
     x, y, z = axis
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
@@ -475,9 +430,9 @@ def _pinhole(camera: Camera, scene: Scene, time: float) -> View:
 
 def _pinhole_at(camera: Camera, scene: Scene, place: Extrinsics) -> View:
     """Return the view of a pinhole camera with some extrinsics."""
-    columns, lines = scene.render.size
-    eye, axes, distance = place
-    right, up, depth = axes * np.array([[1.0], [1.0], [-1.0]])
+    (columns, lines), (eye, axes, distance) = scene.render.size, place
+    right, up, toward = axes
+    depth = -toward
     if (intrinsics := camera.intrinsics) is not None:
         # OpenCV's first pixel has its centre at (0, 0), here at (0.5, 0.5).
         focal_x, focal_y = camera.focal_lengths
@@ -488,19 +443,18 @@ def _pinhole_at(camera: Camera, scene: Scene, place: Extrinsics) -> View:
     rows = [focal_x * right + x * depth, -focal_y * up + y * depth, depth, depth]
     matrix = np.array([[*row, -row @ eye] for row in rows])
     near, size = 1e-6 * math.hypot(*scene.sheet.size), np.array([columns, lines], float)
-    distortion = camera.distortion
-    lens = None if distortion is None else Lens(distortion.model, distortion.coefficients)
     scale, centre = np.array([focal_x, focal_y]), np.array([x, y])
-    lens = None if lens == IDENTITY_LENS else lens
-    return View(matrix, near, axes, eye, scale, centre, size, distance, pinhole=True, lens=lens)
+    lens = Lens(camera.distortion.model, camera.distortion.coefficients) if camera.distortion else IDENTITY_LENS
+    lens_or_none = None if lens == IDENTITY_LENS else lens
+    return View(matrix, near, axes, eye, scale, centre, size, distance, pinhole=True, lens=lens_or_none)
 
 
 def _preset(name: str, scene: Scene) -> Camera:
-    return {"oblique": _oblique, "fit": _fit}[name](scene)
+    return _oblique(scene) if name == "oblique" else _fit(scene)
 
 
 def _fit(scene: Scene) -> Camera:
-    """Return the fit preset, for which the sheet at rest fills the picture up to a margin.
+    """Return the fit preset, for which the sheet at rest fills the picture up to a margin of 2 %.
 
     The eye is d from the plane across the line of sight through the sheet's centre. The corners are a above and below
     that line, and b behind and before the plane. With the eye a b / d below the line, they are projected to a / d above
@@ -509,7 +463,7 @@ def _fit(scene: Scene) -> Camera:
     (height, width), (columns, lines) = scene.sheet.size, scene.render.size
     axes = look_at_axes(OBLIQUE_DIRECTION.tolist(), (0, 0, 0), (0, 1, 0))
     a, b = height / 2 * axes[1, 1], -height / 2 * axes[2, 1]
-    half_height = (1 - 2 * FIT_MARGIN) * math.tan(math.radians(OBLIQUE_FOV) / 2)
+    half_height = (1 - 2 * 0.02) * math.tan(math.radians(OBLIQUE_FOV) / 2)
     distance = max(a / half_height, width / 2 / (half_height * columns / lines) + b)
     eye = distance * axes[2] - a * b / distance * axes[1]
     target = eye - eye[2] / axes[2, 2] * axes[2]
@@ -529,17 +483,11 @@ def _oblique(scene: Scene) -> Camera:
 
 
 class Extrinsics(NamedTuple):
-    """Position and orientation of a camera at a time.
+    """Position and orientation of a camera at a time."""
 
-    Attributes:
-        eye: position [m], shape (3,).
-        axes: unit vectors right, up and toward the camera, as rows, shape (3, 3).
-        distance: distance of the eye from the target, for a pose from the centre of the sheet at rest [m].
-    """
-
-    eye: Array
-    axes: Array
-    distance: float
+    eye: Array  # position [m], shape (3,)
+    axes: Array  # unit vectors right, up and toward the camera, as rows, shape (3, 3)
+    distance: float  # of the eye from the target, for a pose from the centre of the sheet at rest [m]
 
 
 def extrinsics(camera: Camera, time: float) -> Extrinsics:

@@ -13,14 +13,25 @@ Arguments that the functions of kernel 2 share, and that their docstrings omit:
     rows, cols; i, j      number of rows and columns of mass points; row and column of one
     nodes                 projected mass points, as stored by `project`
     corner                first entry of a cell's upper left mass point in `nodes`
+    distorted_entry       the same after lens distortion, as stored by `store_distorted`
     near, depth           near plane [m]; depth [m]
     facing                1 if the front of a cell is visible, -1 for its back
     quad_column, quad_row column and row of sub-quads in their cell
+    quad_side             side of the sub-quads, as a fraction of the cell's
+    lower                 whether the triangle below the diagonal is meant, in a cell that is not invertible
+    enlargement           fraction of its side by which that triangle is enlarged
     s, t                  coordinates on a triangle, to the right and down
+    across, along         coordinates in a cell, to the right and down, from 0 to 1
     normal                list of three components, of any length
     samples               G-buffer; with lens distortion also the undistortion map
+    texels                levels of the texture, as returned by `pyramid`
+    colours, labels       colours of all pixels, as words or bytes; labels of all pixels, one label after the other
     entry                 first entry of a tile in the G-buffer
+    visible, inside       masks of the samples of a tile
+    colour                list of red, green and blue, 0 to 255
     left, top             first column and row of a tile [samples]
+    row, end_row          first row of pixels, and the row after the last one
+    slope_x, slope_y      gradient of the grey level, to the right and down [1/texel]
     x, y                  columns and rows of the undistorted samples of a tile, one number per lane
     lens                  name of the lens model; empty without lens distortion
     first, end, ended     first index of a launch; index after the last one; counter of finished threads (`end_thread`)
@@ -32,6 +43,7 @@ from collections import namedtuple
 from functools import cache
 from typing import Any, NamedTuple
 
+from taichi_msm.render import uniforms as uni
 from taichi_msm.render.labels import LABELS
 from taichi_msm.system.runtime import ti
 
@@ -52,37 +64,21 @@ Bytes = ti.types.ndarray(dtype=ti.u8, ndim=1)
 
 
 class DrawingConfig(NamedTuple):
-    """Compile-time configuration of kernel 2; everything else is passed as an argument.
+    """Compile-time configuration of kernel 2; everything else is passed as an argument."""
 
-    Attributes:
-        refined: whether cells are subdivided.
-        supersample: samples per pixel along each axis.
-        headlit: whether the sheet is lit by a headlight.
-        tissue: whether the sheet is shaded as wet tissue.
-        relief: whether tissue is shaded with a relief.
-        vignette: whether tissue is shaded with a vignette.
-        wireframe: whether the mass-point mesh is drawn.
-        shapes: names of the shapes of the instruments.
-        metal: whether instruments are shaded.
-        picture: whether colours are written.
-        labels: names of the labels that are written; they require one sample per pixel.
-        lens: name of the lens model; empty without lens distortion.
-        lanes: number of samples in a tile.
-    """
-
-    refined: bool
-    supersample: int
-    headlit: bool
-    tissue: bool
-    relief: bool
-    vignette: bool
-    wireframe: bool
-    shapes: tuple[str, ...]
-    metal: bool
-    picture: bool
-    labels: frozenset[str]
-    lens: str
-    lanes: int
+    refined: bool  # whether cells are subdivided
+    supersample: int  # samples per pixel along each axis
+    headlit: bool  # whether the sheet is lit by a headlight
+    tissue: bool  # whether the sheet is shaded as wet tissue
+    relief: bool  # whether tissue is shaded with a relief
+    vignette: bool  # whether tissue is shaded with a vignette
+    wireframe: bool  # whether the mass-point mesh is drawn
+    shapes: tuple[str, ...]  # of the instruments
+    metal: bool  # whether instruments are shaded
+    picture: bool  # whether colours are written
+    labels: frozenset[str]  # that are written; they require one sample per pixel
+    lens: str  # name of the lens model; empty without lens distortion
+    lanes: int  # samples in a tile
 
     @property
     def tile_width(self) -> int:
@@ -126,11 +122,6 @@ class DrawingConfig(NamedTuple):
     def map_has_steps(self) -> bool:
         """Whether the undistortion map includes the steps to the next samples."""
         return bool(self.lens) and (self.tissue or self.wireframe)
-
-    @property
-    def band_map_vectors(self) -> int:
-        """Vectors of the undistortion map per column of tiles in a band on a CPU, without the band's bounding box."""
-        return self.band_lines * self.map_planes
 
     @property
     def band_rows(self) -> int:
@@ -181,47 +172,67 @@ def _planes(config: DrawingConfig) -> Any:
 
 
 class Band(NamedTuple):
-    """Band of the picture, or a part of one, with the view; lengths are in samples.
-
-    Attributes:
-        config: compile-time configuration.
-        samples: G-buffer; with lens distortion also the undistortion map.
-        first: first entry of the band in `samples`, at the left edge of the picture.
-        tiles_across: number of tiles in a row.
-        left, right: first column, and the column after the last one.
-        top, bottom: first row, and the row after the last one.
-        width, height: size of the picture.
-        near: near plane [m]; only surfaces with a larger w are drawn.
-        uniforms: constants of the view (uniforms.py).
-        map_start: first entry of the band's undistortion map in `samples`.
-    """
+    """Arguments of a kernel, and a band of the picture or a part of one; lengths are in samples."""
 
     config: DrawingConfig
-    samples: Any
-    first: Any
-    tiles_across: Any
-    left: Any
-    right: Any
-    top: Any
-    bottom: Any
-    width: Any
-    height: Any
-    near: Any
     uniforms: Any
-    map_start: Any
+    sizes: Any
+    nodes: Any
+    samples: Any
+    rows: Any
+    cols: Any
+    subdivisions: Any  # sub-quads along a side of a cell
+    near: Any
+    instrument_count: Any
+    width: Any  # of the picture
+    height: Any
+    tiles_across: Any  # tiles in a row of the picture
+    first: Any = 0  # first entry of the band in `samples`, at the left edge of the picture
+    map_start: Any = 0  # first entry of its undistortion map in `samples`
+    left: Any = 0.0  # first column
+    right: Any = 0.0  # column after the last one
+    top: Any = 0
+    bottom: Any = 0
+
+
+@ti.func
+def read_arguments(
+    uniforms: ti.template(), sizes: ti.template(), nodes: ti.template(), samples: ti.template(), config: ti.template()
+):
+    """Return the arguments of a kernel as a `Band` without extent."""
+    rows, cols, instrument_count = sizes[uni.ROWS], sizes[uni.COLS], sizes[uni.INSTRUMENT_COUNT]
+    width, height = sizes[uni.WIDTH] * config.supersample, sizes[uni.HEIGHT] * config.supersample
+    subdivisions, near = uniforms[uni.SUBDIVISIONS], uniforms[uni.NEAR]
+    tiles_across = (width + config.tile_width - 1) // config.tile_width
+    return ti.static(
+        Band(
+            config, uniforms, sizes, nodes, samples, rows, cols, subdivisions, near, instrument_count, width, height,
+            tiles_across,
+        )
+    )  # fmt: skip
+
+
+@ti.func
+def triple(array: ti.template(), first):
+    """Return three numbers of an array as a list."""
+    return [array[first + n] for n in ti.static(range(3))]
+
+
+@ti.func
+def dot(a: ti.template(), b: ti.template()):
+    """Return the scalar product of lists of three components."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@ti.func
+def cross(a: ti.template(), b: ti.template()):
+    """Return the vector product of lists of three components."""
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
 @ti.func
 def clip(low_x, high_x, low_y, high_y, band: ti.template()):
-    """Clip a rectangle to a band.
-
-    Args:
-        low_x, high_x: edges of the rectangle, left and right [samples].
-        low_y, high_y: edges of the rectangle, upper and lower [samples].
-
-    Returns:
-        First and end column, first and end row of samples.
-    """
+    """Return first and end column, first and end row of the samples of a band within a rectangle [samples]."""
     return (
         ti.cast(ti.math.clamp(ti.floor(low_x), band.left, band.right), ti.i32),
         ti.cast(ti.math.clamp(ti.ceil(high_x), band.left, band.right), ti.i32),
@@ -232,15 +243,7 @@ def clip(low_x, high_x, low_y, high_y, band: ti.template()):
 
 @ti.func
 def tile_range(first_column, end_column, first_row, end_row, band: ti.template()):
-    """Return the tiles that a rectangle of samples overlaps.
-
-    Args:
-        first_column, end_column: first column of the rectangle, and the column after the last one [samples].
-        first_row, end_row: first row, and the row after the last one [samples].
-
-    Returns:
-        First and end tile in a row of tiles, first and end row of tiles, both counted from the band's top.
-    """
+    """Return first and end tile in a row, first and end row of tiles from the band's top, for the result of `clip`."""
     tile_width, tile_height = ti.static((band.config.tile_width, band.config.tile_height))
     return (
         first_column // tile_width,
@@ -260,22 +263,19 @@ def sample_centres(left, top, config: ti.template()):
 
 
 @ti.func
-def undistorted_centres(left, top, entry, samples: ti.template(), config: ti.template()):
-    """Return the undistorted x and y of the sample centres of a tile [samples].
-
-    Args:
-        entry: first entry of the tile in the undistortion map.
-    """
-    x, y = sample_centres(left, top, config)
-    if ti.static(config.has_distortion):
-        x, y = samples[entry], samples[entry + 1]
-    return x, y
-
-
-@ti.func
 def map_entry(entry, band: ti.template()):
     """Return the first entry of a tile in the undistortion map."""
     return band.map_start + (entry - band.first) // band.config.planes * band.config.map_planes
+
+
+@ti.func
+def undistorted_centres(left, top, entry, band: ti.template()):
+    """Return the undistorted x and y of the sample centres of a tile [samples]."""
+    x, y = sample_centres(left, top, band.config)
+    if ti.static(band.config.has_distortion):
+        stored = map_entry(entry, band)
+        x, y = band.samples[stored], band.samples[stored + 1]
+    return x, y
 
 
 @ti.func
@@ -296,11 +296,7 @@ def tile_box(entry, left, top, band: ti.template()):
 
 @ti.func
 def map_steps(entry, band: ti.template()):
-    """Return the steps from the samples of a tile to the next ones on the right and below, undistorted [samples].
-
-    Returns:
-        x and y of the step to the right, x and y of the step downward.
-    """
+    """Return the undistorted steps between samples: x and y to the right, x and y downward [samples]."""
     steps_entry = map_entry(entry, band) + 2
     return [band.samples[steps_entry + n] for n in ti.static(range(4))]
 
@@ -315,25 +311,13 @@ def clear_tile(entry, band: ti.template()):
 
 @ti.func
 def store_visible(entry, visible, value, samples: ti.template()):
-    """Store values of one plane for the visible samples of a tile.
-
-    Args:
-        entry: entry of the plane's vector in `samples`.
-        visible: mask of the samples.
-        value: values, one per lane.
-    """
+    """Store values of one plane, whose vector is at `entry`, for the visible samples of a tile."""
     samples[entry] = ti.select(visible, value, samples[entry])
 
 
 @ti.func
 def store_visible_unit(entry, visible, vector: ti.template(), samples: ti.template()):
-    """Store normalised vectors in three planes for the visible samples of a tile.
-
-    Args:
-        entry: entry of the first plane's vector in `samples`.
-        visible: mask of the samples.
-        vector: list of three components, one number per lane.
-    """
-    length = ti.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
+    """Store normalised vectors in the three planes from `entry` on, for the visible samples of a tile."""
+    length = ti.sqrt(dot(vector, vector))
     for n in ti.static(range(3)):
         store_visible(entry + n, visible, vector[n] / length, samples)

@@ -20,98 +20,43 @@ from taichi_msm.render import uniforms as uni
 from taichi_msm.render.config import (
     INFINITY,
     clip,
-    map_entry,
+    cross,
+    dot,
     map_steps,
     sample_centres,
     store_visible,
     store_visible_unit,
     tile_box,
     tile_range,
+    triple,
     undistorted_centres,
 )
-from taichi_msm.render.geometry import NODE_STRIDE, facet, line_of_sight, on_triangle, w_at
-from taichi_msm.render.lens_kernels import DISTORTED_STRIDE
+from taichi_msm.render.lens_kernels import store_distorted
 from taichi_msm.render.lens_table import INVALID_COORDINATE
 from taichi_msm.shapes import SHAPES
 from taichi_msm.system.runtime import ti
 
-# Numbers per unit normal; in `nodes` the normals follow the projected mass points.
-NORMAL_STRIDE = 3
-
-# Maximum footprint, above that of any texture.
-MAX_FOOTPRINT = 1e12
-
-
-class DrawnSheet(NamedTuple):
-    """Projected mass points and texture size of the sheet.
-
-    Attributes:
-        nodes: projected mass points, `NODE_STRIDE` numbers each; then the normals.
-        rows, cols: number of rows and columns of mass points.
-        subdivisions: number of sub-quads along a side of a cell.
-        texture_width, texture_height: size of the texture [texels].
-        distorted_start: entry of `nodes` at which the distorted mass points begin, with lens distortion.
-    """
-
-    nodes: Any
-    rows: Any
-    cols: Any
-    subdivisions: Any
-    texture_width: Any
-    texture_height: Any
-    distorted_start: Any
-
 
 class Cell(NamedTuple):
-    """Cell with its position on the sheet and on the texture.
-
-    Attributes:
-        patch: surface of the cell.
-        i, j: row and column of the cell.
-        rows, cols: number of rows and columns of cells of the sheet.
-        texel_x, texel_y: integer part of the texture coordinates of the upper left mass point [texels].
-        fraction_x, fraction_y: fractional part of these coordinates [texels].
-        texels_across, texels_down: width and height of the cell [texels].
-        normal: entry of the normal at the upper left mass point.
-    """
+    """Cell with its position on the sheet and on the texture."""
 
     patch: Any
-    i: Any
-    j: Any
-    rows: Any
+    i: Any  # row
+    j: Any  # column
+    rows: Any  # of cells of the sheet
     cols: Any
-    texel_x: Any
+    texel_x: Any  # texture coordinates of the upper left mass point [texels]: integer part
     texel_y: Any
-    fraction_x: Any
+    fraction_x: Any  # their fractional part
     fraction_y: Any
-    texels_across: Any
+    texels_across: Any  # width of the cell [texels]
     texels_down: Any
-    normal: Any
-
-
-class Part(NamedTuple):
-    """Part of a cell that a thread of a GPU covers.
-
-    Attributes:
-        invertible: whether the cell is drawn by inverting its bilinear map; the part is then the entire cell.
-        first, end: otherwise, the first triangle of the part, and the triangle after the last one.
-    """
-
-    invertible: Any
-    first: Any
-    end: Any
+    normal: Any  # entry of the normal at the upper left mass point
 
 
 @ti.func
 def max_edge(p_x, p_y, q_x, q_y, box: ti.template(), facing):
-    """Return the maximum of `geometry.edge` over the samples within a box.
-
-    It is rounded as `geometry.edge` is, so that no tile with a sample inside is skipped.
-
-    Args:
-        p_x, p_y, q_x, q_y: ends of the edge [samples].
-        box: left, right, top and bottom [samples].
-    """
+    """Return the maximum of `geometry.edge` over the samples within a box; rounded alike, so that none is skipped."""
     left, right, top, bottom = ti.static(box)
     x = ti.select((q_y - p_y) * facing > 0.0, left, right)
     y = ti.select((q_x - p_x) * facing > 0.0, bottom, top)
@@ -132,21 +77,14 @@ def may_cover(box: ti.template(), facing, outline: ti.template()):
 
 @ti.func
 def cover_tile(
-    entry, x, y, inside, quad_column, quad_row, lower, enlargement,
-    cell: ti.template(), sheet: ti.template(), band: ti.template(),
-):  # fmt: skip
-    """Cover a tile of samples with sub-quads of a cell, one per sample.
-
-    Args:
-        inside: mask of the samples that the cell covers.
-        lower: whether the triangle below the diagonal is drawn, if the cell is drawn triangle by triangle.
-        enlargement: fraction of its side by which that triangle is enlarged.
-    """
+    entry, x, y, inside, quad_column, quad_row, lower, enlargement, cell: ti.template(), band: ti.template()
+):
+    """Cover a tile of samples with sub-quads of a cell, one per sample."""
     config = ti.static(band.config)
     plane = ti.static(config.plane)
     below_diagonal = config.float_vector(ti.cast(lower, ti.f32)) > 0.5
     triangle = ti.static(
-        geometry.triangle_at(x, y, quad_column, quad_row, 1.0 / sheet.subdivisions, below_diagonal, cell.patch)
+        geometry.triangle_at(x, y, quad_column, quad_row, 1.0 / band.subdivisions, below_diagonal, cell.patch)
     )
     s, t = geometry.on_triangle(x, y, triangle)
     if not cell.patch.invertible:
@@ -156,38 +94,32 @@ def cover_tile(
     if ti.static(config.unordered):
         # At equal depth the first cell and triangle are visible, whatever the order of processing.
         cell_index = cell.i * cell.cols + cell.j
-        piece = (quad_row * sheet.subdivisions + quad_column) * 2.0 + ti.select(triangle.below, 0.0, 1.0)
+        piece = (quad_row * band.subdivisions + quad_column) * 2.0 + ti.select(triangle.below, 0.0, 1.0)
         stored_cell, stored_piece = band.samples[entry + plane.cell], band.samples[entry + plane.triangle]
         is_first = (cell_index < stored_cell) | ((cell_index == stored_cell) & (piece < stored_piece))
         visible = visible | (inside & (depth == band.samples[entry + plane.depth]) & is_first)
         store_visible(entry + plane.cell, visible, cell_index, band.samples)
         store_visible(entry + plane.triangle, visible, piece, band.samples)
     store_visible(entry + plane.depth, visible, depth, band.samples)
-    store_surface(entry, visible, x, y, s, t, quad_column, quad_row, triangle, cell, sheet, band)
+    store_surface(entry, visible, x, y, s, t, quad_column, quad_row, triangle, cell, band)
 
 
 @ti.func
-def cover_cell(i, j, part: ti.template(), sheet: ti.template(), band: ti.template()):
+def cover_cell(i, j, invertible, first, end, outline: ti.template(), band: ti.template()):
     """Cover the samples of a band with a cell.
 
     Args:
-        i, j: row and column of the upper left mass point of the cell.
-        part: part of the cell that is drawn, on a GPU; ignored on a CPU.
+        i, j: row and column of the cell.
+        invertible: whether the cell is drawn by inverting its bilinear map, instead of triangle by triangle.
+        first, end: otherwise, the first of its triangles, and the triangle after the last one.
     """
     config, float_vector = ti.static((band.config, band.config.float_vector))
-    corner = (i * sheet.cols + j) * geometry.NODE_STRIDE
-    outline = ti.static(geometry.cell_outline(corner, sheet.cols, band.near, sheet.nodes))
-    invertible = geometry.is_invertible(outline)
-    if ti.static(config.unordered):
-        invertible = part.invertible
-    patch = ti.static(geometry.cell_patch(corner, sheet.cols, outline.facing, invertible, sheet.nodes, False))
-    cell = ti.static(cell_at(i, j, patch, sheet))
-    subdivisions = ti.cast(sheet.subdivisions, ti.i32)
-    first, end = 0, ti.select(invertible, 1, 2 * subdivisions * subdivisions)
-    if ti.static(config.unordered):
-        first, end = part.first, part.end
+    corner, normal_entry, distorted_entry = geometry.point_entries(i * band.cols + j, band)
+    patch = ti.static(geometry.cell_patch(corner, band.cols, outline.facing, invertible, band.nodes, False))
+    cell = ti.static(cell_at(i, j, normal_entry, patch, band))
+    subdivisions = ti.cast(band.subdivisions, ti.i32)
     for piece in range(first, end):
-        # A cell that is not inverted is drawn triangle by triangle: two per sub-quad.
+        # Two triangles per sub-quad.
         quad = piece // 2
         quad_s = ti.cast(quad % subdivisions, ti.f32)
         quad_t = ti.cast(quad // subdivisions, ti.f32)
@@ -196,13 +128,12 @@ def cover_cell(i, j, part: ti.template(), sheet: ti.template(), band: ti.templat
         enlargement = geometry.ENLARGEMENT
         if not invertible:
             low_x, high_x, low_y, high_y, enlargement = geometry.triangle_bounds(
-                quad_s, quad_t, lower, 1.0 / sheet.subdivisions, band.near, band.width, band.height,
+                quad_s, quad_t, lower, 1.0 / band.subdivisions, band.near, band.width, band.height,
                 patch, band.uniforms, config.lens,
             )  # fmt: skip
         elif ti.static(config.has_distortion):
-            distorted_entry = sheet.distorted_start + (i * sheet.cols + j) * DISTORTED_STRIDE
             low_x, high_x, low_y, high_y = geometry.distorted_cell_bounds(
-                distorted_entry, sheet.cols, outline, band.uniforms, sheet.nodes
+                distorted_entry, band.cols, outline, band.uniforms, band.nodes
             )
         first_column, end_column, first_row, end_row = clip(low_x - 0.5, high_x + 0.5, low_y - 0.5, high_y + 0.5, band)
         first_tile, end_tile, first_tile_row, end_tile_row = tile_range(
@@ -226,7 +157,7 @@ def cover_cell(i, j, part: ti.template(), sheet: ti.template(), band: ti.templat
             overlaps = True
             if n < tiles:
                 if ti.static(config.has_distortion):
-                    x, y = undistorted_centres(tile_x, tile_y, map_entry(entry, band), band.samples, config)
+                    x, y = undistorted_centres(tile_x, tile_y, entry, band)
                 if invertible:
                     overlaps = may_cover(tile_box(entry, tile_x, tile_y, band), outline.facing, outline)
                     if overlaps:
@@ -234,7 +165,7 @@ def cover_cell(i, j, part: ti.template(), sheet: ti.template(), band: ti.templat
                         left_edge, right_edge, top_edge, bottom_edge = geometry.edges(x, y, outline.facing, outline)
                         inside = (left_edge >= 0.0) & (right_edge > 0.0) & (top_edge >= 0.0) & (bottom_edge > 0.0)
                         if ti.static(config.refined):
-                            quad_column, quad_row = geometry.find_quads(x, y, inside, sheet.subdivisions, patch)
+                            quad_column, quad_row = geometry.find_quads(x, y, inside, band.subdivisions, patch)
                 else:
                     # Outside the bounds, rounding would cover samples that depend on the shape of the tiles.
                     sample_x, sample_y = sample_centres(tile_x, tile_y, config)
@@ -250,7 +181,7 @@ def cover_cell(i, j, part: ti.template(), sheet: ti.template(), band: ti.templat
                 if pending >= 0:
                     cover_tile(
                         pending, pending_x, pending_y, pending_inside > 0.0, pending_column, pending_row, lower,
-                        enlargement, cell, sheet, band,
+                        enlargement, cell, band,
                     )  # fmt: skip
                 pending = entry
                 pending_x, pending_y, pending_inside = x, y, ti.select(inside, 1.0, 0.0)
@@ -269,11 +200,7 @@ def compile_ray(shape: str) -> Callable[..., Any]:
 
 @ti.func
 def intersect_instrument(x, y, index, uniforms: ti.template(), shapes: ti.template()):
-    """Intersect lines of sight with an instrument.
-
-    Args:
-        index: of the instrument.
-        shapes: names of the shapes of all instruments.
+    """Intersect lines of sight with the instrument of an index; `shapes` are the shapes of all instruments.
 
     Returns:
         Depth of the first intersection [m], INFINITY without one; three components of a normal of any length.
@@ -282,11 +209,11 @@ def intersect_instrument(x, y, index, uniforms: ti.template(), shapes: ti.templa
     tip, axis = base + uni.TIP, base + uni.AXIS
     # The line of sight is P = O + D t, with t relative to the depth of the tip and the origin at the tip.
     start = uniforms[tip + 2] * (-1.0)
-    across, up = line_of_sight(x, y, uniforms)
-    w = w_at(start, uniforms)
+    across, up = geometry.line_of_sight(x, y, uniforms)
+    w = geometry.w_at(start, uniforms)
     o_x, o_y = across * w - uniforms[tip], up * w - uniforms[tip + 1]
     d_x, d_y = across * uniforms[uni.PINHOLE], up * uniforms[uni.PINHOLE]
-    a_x, a_y, a_z = uniforms[axis], uniforms[axis + 1], uniforms[axis + 2]
+    a_x, a_y, a_z = triple(uniforms, axis)
     length, radius = uniforms[base + uni.LENGTH], uniforms[base + uni.RADIUS]
     d_d, d_a = d_x * d_x + d_y * d_y + 1.0, d_x * a_x + d_y * a_y - a_z
     o_a, o_d, o_o = o_x * a_x + o_y * a_y, o_x * d_x + o_y * d_y, o_x * o_x + o_y * o_y
@@ -310,7 +237,7 @@ def cover_tile_with_instrument(entry, x, y, index, band: ti.template()):
     """Cover a tile of samples with an instrument."""
     plane, samples = ti.static((band.config.plane, band.samples))
     depth, n_x, n_y, n_z = intersect_instrument(x, y, index, band.uniforms, band.config.shapes)
-    visible = (w_at(depth, band.uniforms) > band.near) & (depth < samples[entry + plane.depth])
+    visible = (geometry.w_at(depth, band.uniforms) > band.near) & (depth < samples[entry + plane.depth])
     if ti.static(band.config.has_distortion):
         visible = visible & (x < INVALID_COORDINATE)
     store_visible(entry + plane.depth, visible, depth, samples)
@@ -325,10 +252,10 @@ def cover_tile_with_instrument(entry, x, y, index, band: ti.template()):
 
 
 @ti.func
-def cover_instruments(count, band: ti.template()):
+def cover_instruments(band: ti.template()):
     """Cover a band with the instruments."""
     config, uniforms = ti.static((band.config, band.uniforms))
-    for index in range(count):
+    for index in range(band.instrument_count):
         base = uni.INSTRUMENTS + index * uni.INSTRUMENT_STRIDE
         left, right = uniforms[base + uni.LEFT], uniforms[base + uni.RIGHT]
         top, bottom = uniforms[base + uni.TOP], uniforms[base + uni.BOTTOM]
@@ -350,74 +277,59 @@ def cover_instruments(count, band: ti.template()):
                         box = ti.static(tile_box(entry, tile_x, tile_y, band))
                         overlaps = box[0] <= right and box[1] >= left and box[2] <= bottom and box[3] >= top
                     if overlaps:
-                        x, y = undistorted_centres(tile_x, tile_y, map_entry(entry, band), band.samples, config)
+                        x, y = undistorted_centres(tile_x, tile_y, entry, band)
                         cover_tile_with_instrument(entry, x, y, index, band)
 
 
 @ti.func
-def cell_at(i, j, patch: ti.template(), sheet: ti.template()):
+def cell_at(i, j, normal_entry, patch: ti.template(), band: ti.template()):
     """Return the cell with a mass point as its upper left corner."""
+    rows, cols = band.rows - 1, band.cols - 1
+    texture_width, texture_height = band.sizes[uni.LEVELS + 1], band.sizes[uni.LEVELS + 2]
     # In f64, for the accuracy of a fraction of a texel on any sheet.
-    texel_x = ti.cast(j, ti.f64) * sheet.texture_width / (sheet.cols - 1) - 0.5
-    texel_y = ti.cast(i, ti.f64) * sheet.texture_height / (sheet.rows - 1) - 0.5
+    texel_x = ti.cast(j, ti.f64) * texture_width / cols - 0.5
+    texel_y = ti.cast(i, ti.f64) * texture_height / rows - 0.5
     whole_x, whole_y = ti.floor(texel_x), ti.floor(texel_y)
     first_x, first_y = ti.cast(whole_x, ti.f32), ti.cast(whole_y, ti.f32)
     fraction_x, fraction_y = ti.cast(texel_x - whole_x, ti.f32), ti.cast(texel_y - whole_y, ti.f32)
-    texels_across = ti.cast(sheet.texture_width, ti.f32) / (sheet.cols - 1)
-    texels_down = ti.cast(sheet.texture_height, ti.f32) / (sheet.rows - 1)
+    texels_across, texels_down = ti.cast(texture_width, ti.f32) / cols, ti.cast(texture_height, ti.f32) / rows
     row, column = ti.cast(i, ti.f32), ti.cast(j, ti.f32)
-    cell_rows, cell_cols = ti.cast(sheet.rows - 1, ti.f32), ti.cast(sheet.cols - 1, ti.f32)
-    normal = sheet.rows * sheet.cols * NODE_STRIDE + (i * sheet.cols + j) * NORMAL_STRIDE
+    cell_rows, cell_cols = ti.cast(rows, ti.f32), ti.cast(cols, ti.f32)
     return ti.static(
         Cell(
             patch, row, column, cell_rows, cell_cols, first_x, first_y, fraction_x, fraction_y,
-            texels_across, texels_down, normal,
+            texels_across, texels_down, normal_entry,
         )
     )  # fmt: skip
 
 
 @ti.func
-def store_normal(
-    position: ti.template(), i, j, rows, cols, config: ti.template(), uniforms: ti.template(), nodes: ti.template()
-):
-    """Store the normal of the sheet at a mass point in `nodes`, if the shading uses it; for tissue in camera axes."""
+def store_point(position: ti.template(), i, j, band: ti.template()):
+    """Project a mass point; if used, also distort it and compute its normal, for tissue in camera axes."""
+    config = ti.static(band.config)
+    geometry.project(position, i, j, band.cols, band.uniforms, band.nodes, False)
+    entry, normal_entry, distorted_entry = geometry.point_entries(i * band.cols + j, band)
+    if ti.static(config.has_distortion):
+        store_distorted(distorted_entry, entry, band.uniforms, band.nodes, config.lens)
     if ti.static(config.headlit or config.tissue):
-        i0, i1 = ti.max(i - 1, 0), ti.min(i + 1, rows - 1)
-        j0, j1 = ti.max(j - 1, 0), ti.min(j + 1, cols - 1)
+        i0, i1 = ti.max(i - 1, 0), ti.min(i + 1, band.rows - 1)
+        j0, j1 = ti.max(j - 1, 0), ti.min(j + 1, band.cols - 1)
         right = [position[i, j1, n] - position[i, j0, n] for n in ti.static(range(3))]
         up = [position[i0, j, n] - position[i1, j, n] for n in ti.static(range(3))]
-        cross = [
-            right[1] * up[2] - right[2] * up[1],
-            right[2] * up[0] - right[0] * up[2],
-            right[0] * up[1] - right[1] * up[0],
-        ]
-        length = ti.sqrt(cross[0] * cross[0] + cross[1] * cross[1] + cross[2] * cross[2])
-        normal = [cross[n] / ti.max(length, 1e-30) for n in ti.static(range(3))]
-        normal_entry = rows * cols * NODE_STRIDE + (i * cols + j) * NORMAL_STRIDE
+        area = cross(right, up)
+        length = ti.sqrt(dot(area, area))
+        normal = [area[n] / ti.max(length, 1e-30) for n in ti.static(range(3))]
         for n in ti.static(range(3)):
-            axis = uni.AXES + 3 * n
-            nodes[normal_entry + n] = (
-                uniforms[axis] * normal[0] + uniforms[axis + 1] * normal[1] + uniforms[axis + 2] * normal[2]
-                if ti.static(config.tissue)
-                else normal[n]
-            )
+            band.nodes[normal_entry + n] = normal[n]
+            if ti.static(config.tissue):
+                band.nodes[normal_entry + n] = dot(triple(band.uniforms, uni.AXES + 3 * n), normal)
 
 
 @ti.func
-def normal_at(across, along, cell: ti.template(), sheet: ti.template()):
-    """Interpolate the normals of the mass points bilinearly.
-
-    Args:
-        across, along: coordinates in the cell, to the right and down, from 0 to 1.
-
-    Returns:
-        A list of three components; not normalised.
-    """
-    below = cell.normal + sheet.cols * NORMAL_STRIDE
-    a = [sheet.nodes[cell.normal + n] for n in ti.static(range(3))]
-    b = [sheet.nodes[cell.normal + NORMAL_STRIDE + n] for n in ti.static(range(3))]
-    c = [sheet.nodes[below + n] for n in ti.static(range(3))]
-    d = [sheet.nodes[below + NORMAL_STRIDE + n] for n in ti.static(range(3))]
+def normal_at(across, along, cell: ti.template(), band: ti.template()):
+    """Interpolate the normals of the mass points bilinearly; not normalised."""
+    corners = ti.static(geometry.corner_entries(cell.normal, band.cols, geometry.NORMAL_STRIDE))
+    a, b, c, d = [triple(band.nodes, entry) for entry in corners]
     return [
         a[n] + (b[n] - a[n]) * across + (c[n] - a[n] + (d[n] - b[n] - (c[n] - a[n])) * across) * along
         for n in ti.static(range(3))
@@ -433,27 +345,18 @@ def absolute(values):
 @ti.func
 def headlight(normal: ti.template(), uniforms: ti.template()):
     """Return the reflected share of the headlight: the absolute cosine between normal and direction to the light."""
-    length = ti.sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2])
-    light = uni.HEADLIGHT
-    cosine = absolute(normal[0] * uniforms[light] + normal[1] * uniforms[light + 1] + normal[2] * uniforms[light + 2])
-    cosine = cosine / ti.max(length, 1e-30)
+    cosine = absolute(dot(normal, triple(uniforms, uni.HEADLIGHT))) / ti.max(ti.sqrt(dot(normal, normal)), 1e-30)
     # The normal of an infinite or NaN point is NaN; the limits remove it.
     return ti.max(ti.min(cosine, 1.0), 0.0)
 
 
 @ti.func
 def footprint(entry, x, y, s, t, texels_x, texels_y, triangle: ti.template(), band: ti.template()):
-    """Return the squared size of samples on the texture, for mipmapping.
+    """Return the squared size of samples on the texture in `uniforms.SHARP` texels, and the side that is visible.
 
     With x = X / w the Jacobian of (x, y) with respect to (s, t) is (R_1, D_1; R_2, D_2) / w, where R_1 = R_x - x R_w
-    and so on; that of (s, t) with respect to (x, y) is its inverse.
-
-    Args:
-        texels_x, texels_y: width and height of the sub-quad [texels].
-
-    Returns:
-        Squared size, in units of `uniforms.SHARP` texels: the larger of width and height; and 1 where the front of the
-        triangle is visible, else -1.
+    and so on; that of (s, t) with respect to (x, y) is its inverse. The size is the larger of width and height; the
+    side is 1 for the front of the triangle, else -1. The sub-quad is `texels_x` wide and `texels_y` high [texels].
     """
     p, r, d = ti.static((triangle.p, triangle.r, triangle.d))
     r_1 = r[0] - x * r[2]
@@ -470,16 +373,15 @@ def footprint(entry, x, y, s, t, texels_x, texels_y, triangle: ti.template(), ba
     across_1, across_2, down_1, down_2 = d_1 * texels_x, d_2 * texels_x, r_1 * texels_y, r_2 * texels_y
     largest = ti.max(across_1 * across_1 + down_1 * down_1, across_2 * across_2 + down_2 * down_2)
     square = largest * (scale * scale) * (1.0 / (uni.SHARP * uni.SHARP))
-    return ti.min(square, MAX_FOOTPRINT), ti.select(scale < 0.0, -1.0, 1.0)
+    # The limit is above the footprint on any texture.
+    return ti.min(square, 1e12), ti.select(scale < 0.0, -1.0, 1.0)
 
 
 @ti.func
 def distance_to_line(coordinate, right_coordinate, lower_coordinate):
     """Return the distance of samples from the nearest mesh line [samples].
 
-    Args:
-        coordinate: coordinate across the lines [cells].
-        right_coordinate, lower_coordinate: that of the next samples on the right and below, on the same triangle.
+    The coordinates across the lines [cells] are those of the samples and of the next ones on the right and below.
     """
     step_right, step_down = right_coordinate - coordinate, lower_coordinate - coordinate
     slope = ti.sqrt(step_right * step_right + step_down * step_down)
@@ -489,12 +391,12 @@ def distance_to_line(coordinate, right_coordinate, lower_coordinate):
 @ti.func
 def store_surface(
     entry, visible, x, y, s, t, quad_column, quad_row,
-    triangle: ti.template(), cell: ti.template(), sheet: ti.template(), band: ti.template(),
+    triangle: ti.template(), cell: ti.template(), band: ti.template(),
 ):  # fmt: skip
-    """Store the attributes of the visible samples of a tile, which `visible` masks."""
+    """Store the attributes of the visible samples of a tile."""
     config, samples = ti.static((band.config, band.samples))
     plane = ti.static(config.plane)
-    quad_side = 1.0 / sheet.subdivisions
+    quad_side = 1.0 / band.subdivisions
     across = (quad_column + s) * quad_side
     along = (quad_row + t) * quad_side
     store_visible(entry + plane.texel_x, visible, cell.fraction_x + across * cell.texels_across + cell.texel_x, samples)
@@ -503,16 +405,16 @@ def store_surface(
         store_visible(entry + plane.across, visible, (cell.j + across) / cell.cols, samples)
         store_visible(entry + plane.down, visible, (cell.i + along) / cell.rows, samples)
     if ti.static("normals" in config.labels):
-        store_visible_unit(entry + plane.facet_x, visible, facet(x, y, triangle, band.uniforms), samples)
+        store_visible_unit(entry + plane.facet_x, visible, geometry.facet(x, y, triangle, band.uniforms), samples)
     if ti.static(config.headlit):
-        normal = normal_at(across, along, cell, sheet)
+        normal = normal_at(across, along, cell, band)
         store_visible(entry + plane.light, visible, headlight(normal, band.uniforms), samples)
     if ti.static(config.tissue):
         size, front = footprint(
             entry, x, y, s, t, cell.texels_across * quad_side, cell.texels_down * quad_side, triangle, band
         )
         # At a fold, the interpolated normal may point away from the camera; `front` moves it to the visible side.
-        normal = normal_at(across, along, cell, sheet)
+        normal = normal_at(across, along, cell, band)
         store_visible(entry + plane.normal_x, visible, normal[0] * front, samples)
         store_visible(entry + plane.normal_y, visible, normal[1] * front, samples)
         store_visible(entry + plane.normal_z, visible, normal[2] * front, samples)
@@ -522,8 +424,8 @@ def store_surface(
         if ti.static(config.map_has_steps):
             map_step = map_steps(entry, band)
             right_x, right_y, below_x, below_y = x + map_step[0], y + map_step[1], x + map_step[2], y + map_step[3]
-        s_right, t_right = on_triangle(right_x, right_y, triangle)
-        s_below, t_below = on_triangle(below_x, below_y, triangle)
+        s_right, t_right = geometry.on_triangle(right_x, right_y, triangle)
+        s_below, t_below = geometry.on_triangle(below_x, below_y, triangle)
         distance = ti.min(
             distance_to_line(across, (quad_column + s_right) * quad_side, (quad_column + s_below) * quad_side),
             distance_to_line(along, (quad_row + t_right) * quad_side, (quad_row + t_below) * quad_side),

@@ -10,26 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.render import geometry
 from taichi_msm.render import uniforms as uni
-from taichi_msm.render.config import INFINITY, Band, Bytes, DrawingConfig, Floats, Integers, clear_tile
-from taichi_msm.render.coverage import NORMAL_STRIDE, DrawnSheet, cover_cell, cover_instruments, store_normal
-from taichi_msm.render.geometry import NODE_STRIDE, SCREEN, may_cover_rows, project
-from taichi_msm.render.labels import label_offsets
-from taichi_msm.render.lens_kernels import DISTORTED_STRIDE, store_distorted
-from taichi_msm.render.lens_table import bounds, tiled_map
-from taichi_msm.render.shading import Appearance, PixelArrays, resolve
-from taichi_msm.system.runtime import (
-    ITERATIONS_PER_THREAD,
-    Memory,
-    compilation_options,
-    current_device,
-    ti,
-    write_vectors,
-)
-
-# Numbers per mass point without the distorted ones. After the numbers of all mass points, two numbers per row follow:
-# the first and the last row of the picture that it reaches, without distortion.
-UNDISTORTED_STRIDE = NODE_STRIDE + NORMAL_STRIDE
+from taichi_msm.render.config import INFINITY, Bytes, DrawingConfig, Floats, Integers, clear_tile, read_arguments
+from taichi_msm.render.coverage import cover_cell, cover_instruments, store_point
+from taichi_msm.render.labels import values_per_pixel
+from taichi_msm.render.lens_table import INVALID_COORDINATE
+from taichi_msm.render.shading import resolve
+from taichi_msm.system import runtime
+from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, ti
 
 
 class Bands:
@@ -48,24 +37,18 @@ class Bands:
         self._config, self._size, self._texels = config, size, texels
         self._draw = _kernel(config)
         (rows, cols), (width, height) = shape, size
-        self._workers = min(-(-height // config.band_rows), current_device().threads)
-        self._memory = memory = Memory()
-        self._nodes = memory.array(
-            "f32", 0, rows * (cols * (UNDISTORTED_STRIDE + DISTORTED_STRIDE * config.has_distortion) + 2)
-        )
-        band_vectors = config.band_lines * config.tiles_across(width) * config.planes
-        # With lens distortion the undistortion map comes before the bands.
-        self._table = -(-height // config.band_rows) * _map_vectors(config, width)
-        self._samples = memory.array("f32", config.lanes, self._table + self._workers * band_vectors)
+        self._workers = min(-(-height // config.band_rows), runtime.current_device().threads)
+        self._memory = memory = runtime.Memory()
+        # After the numbers of the mass points, two per row: the first and last row of the picture without distortion.
+        self._nodes = memory.array("f32", 0, rows * (cols * geometry.POINT_STRIDE + 2))
+        tiles_of_band = config.band_lines * config.tiles_across(width)
+        # With lens distortion the undistortion map comes before the bands; after each of its bands their bounds.
+        map_vectors = -(-height // config.band_rows) * (tiles_of_band * config.map_planes + config.has_distortion)
+        self._samples = memory.array("f32", config.lanes, map_vectors + self._workers * tiles_of_band * config.planes)
 
     def set_undistortion_map(self, table: NDArray[np.float32]) -> None:
         """Set the undistortion map of the following pictures, as returned by `undistortion_map`."""
-        config, tiles = self._config, tiled_map(table, self._config)
-        rows = config.band_rows * config.supersample
-        boxes = [bounds(table[first : first + rows, :, :2]) for first in range(0, len(table), rows)]
-        padded_boxes = np.pad(boxes, ((0, 0), (0, config.lanes - len(boxes[0]))))
-        bands = np.concatenate([tiles, padded_boxes[:, None].astype(np.float32)], axis=1)
-        write_vectors(self._samples, bands.reshape(-1, config.lanes))
+        runtime.write_vectors(self._samples, _tiled_map(table, self._config))
 
     def draw(
         self, position: NDArray[np.float32], uniforms: NDArray[np.float32], sizes: NDArray[np.int32]
@@ -87,9 +70,9 @@ class Bands:
         # Without labels the argument is unused; passing a Taichi array takes half the time of a NumPy array.
         labels: Any = self._nodes
         if config.labels:
-            labels = np.zeros(label_offsets(config.labels)[""] * width * height, np.float32)
+            labels = np.zeros(values_per_pixel(config.labels) * width * height, np.float32)
         sizes[[uni.ROWS_TAKEN, uni.ROWS_PROJECTED, uni.BANDS_TAKEN]] = 0
-        with compilation_options(optimised=False):
+        with runtime.compilation_options(optimised=False):
             self._draw(
                 position, self._texels, uniforms, self._workers, sizes, self._nodes, self._samples,
                 picture.ravel().view(np.int32) if config.writes_words else picture.ravel(), labels,
@@ -97,89 +80,101 @@ class Bands:
         return picture[:, :width], labels
 
 
-def _map_vectors(config: DrawingConfig, width: int) -> int:
-    """Return the vectors per band of the undistortion map and its bounds, for a picture of this width [px]."""
-    return config.band_map_vectors * config.tiles_across(width) + 1 if config.lens else 0
+def _tiled_map(table: NDArray[np.float32], config: DrawingConfig) -> NDArray[np.float32]:
+    """Rearrange an undistortion map into bands and tiles, and add the bounding box of each tile and each band."""
+    rows, columns, planes = table.shape
+    band_height, lines = config.band_rows * config.supersample, config.band_lines
+    tile_height, tile_width = config.tile_height, config.tile_width
+    bands, tiles_across = -(-rows // band_height), -(-columns // tile_width)
+    padding = (0, bands * band_height - rows), (0, tiles_across * tile_width - columns), (0, 0)
+    padded = np.pad(table, padding, constant_values=INVALID_COORDINATE).reshape(bands, band_height, -1, planes)
+    padding_of_lines = (0, 0), (0, lines * tile_height - band_height), (0, 0), (0, 0)
+    padded = np.pad(padded, padding_of_lines, constant_values=INVALID_COORDINATE)
+    tiles = padded.reshape(bands, lines, tile_height, tiles_across, tile_width, planes).transpose(0, 1, 3, 5, 2, 4)
+    tiles = tiles.reshape(bands, lines, tiles_across, planes, config.lanes)
+    positions = tiles[..., :2, :]
+    low, high = positions.min(axis=-1), np.where(positions < INVALID_COORDINATE, positions, -np.inf).max(axis=-1)
+    # A tile without valid coordinates has an invalid box.
+    boxes = np.stack([low, np.maximum(low, high)], axis=-1).reshape(bands, lines, tiles_across, 1, 4)
+    band_boxes = np.stack([low.min(axis=(1, 2)), high.max(axis=(1, 2))], axis=-1).reshape(bands, 1, 4)
+    boxes, band_boxes = (
+        np.pad(box, [*[(0, 0)] * (box.ndim - 1), (0, config.lanes - 4)]) for box in (boxes, band_boxes)
+    )
+    vectors = np.concatenate([tiles, boxes], axis=3).reshape(bands, -1, config.lanes)
+    return np.concatenate([vectors, band_boxes], axis=1).reshape(-1, config.lanes)
 
 
 @ti.func
-def project_row(
-    position: ti.template(), i, rows, cols, config: ti.template(), uniforms: ti.template(), nodes: ti.template()
-):
+def project_row(position: ti.template(), i, band: ti.template()):
     """Project a row of mass points, and store the first and last row of the picture that it overlaps."""
+    cols, nodes = ti.static((band.cols, band.nodes))
     first_row, last_row = INFINITY, -INFINITY
     for j in range(cols):
-        project(position, i, j, cols, uniforms, nodes, False)
-        store_normal(position, i, j, rows, cols, config, uniforms, nodes)
-        entry = (i * cols + j) * NODE_STRIDE
-        if ti.static(config.has_distortion):
-            distorted_entry = rows * cols * UNDISTORTED_STRIDE + (i * cols + j) * DISTORTED_STRIDE
-            store_distorted(distorted_entry, entry, uniforms, nodes, config.lens)
-        if nodes[entry + 2] > uniforms[uni.NEAR]:
-            first_row = ti.min(first_row, nodes[entry + SCREEN + 1])
-            last_row = ti.max(last_row, nodes[entry + SCREEN + 1])
+        store_point(position, i, j, band)
+        entry = (i * cols + j) * geometry.NODE_STRIDE
+        if nodes[entry + 2] > band.near:
+            first_row = ti.min(first_row, nodes[entry + geometry.SCREEN + 1])
+            last_row = ti.max(last_row, nodes[entry + geometry.SCREEN + 1])
         else:
             first_row, last_row = -INFINITY, INFINITY
-    row_entry = rows * cols * (UNDISTORTED_STRIDE + DISTORTED_STRIDE * config.has_distortion) + 2 * i
+    row_entry = band.rows * cols * geometry.POINT_STRIDE + 2 * i
     nodes[row_entry] = first_row
     nodes[row_entry + 1] = last_row
 
 
 @ti.func
-def project_all(
-    position: ti.template(), rows, cols, config: ti.template(), uniforms: ti.template(), sizes: ti.template(),
-    nodes: ti.template(),
-):  # fmt: skip
+def project_all(position: ti.template(), band: ti.template()):
     """Project all mass points, row by row, shared among the workers; return when every row is finished.
 
     A worker waits only for rows that a running worker has taken, so a worker that starts late does not delay others.
     """
+    sizes = ti.static(band.sizes)
     has_row = True
     while has_row:
         i = ti.atomic_add(sizes[uni.ROWS_TAKEN], 1)
-        has_row = i < rows
+        has_row = i < band.rows
         if has_row:
-            project_row(position, i, rows, cols, config, uniforms, nodes)
+            project_row(position, i, band)
             ti.atomic_add(sizes[uni.ROWS_PROJECTED], 1)
     finished = ti.atomic_add(sizes[uni.ROWS_PROJECTED], 0)
-    while finished < rows:
+    while finished < band.rows:
         finished = ti.atomic_add(sizes[uni.ROWS_PROJECTED], 0)
 
 
 @ti.func
-def cover_band(sheet: ti.template(), band: ti.template()):
+def cover_band(band: ti.template()):
     """Cover the samples of a band with the sheet."""
-    config, nodes = ti.static((band.config, sheet.nodes))
+    config, cols, nodes = ti.static((band.config, band.cols, band.nodes))
     lines = (band.bottom - band.top + config.tile_height - 1) // config.tile_height
     for tile in range(lines * band.tiles_across):
         clear_tile(band.first + tile * config.planes, band)
-    rows_start = sheet.rows * sheet.cols * (UNDISTORTED_STRIDE + DISTORTED_STRIDE * config.has_distortion)
     # Undistorted rows of the samples of the band.
     top, bottom = ti.cast(band.top, ti.f32), ti.cast(band.bottom, ti.f32)
     if ti.static(config.has_distortion):
-        box = band.samples[band.map_start + config.band_map_vectors * band.tiles_across]
+        box = band.samples[band.map_start + config.band_lines * config.map_planes * band.tiles_across]
         top, bottom = box[2] - 1.0, box[3] + 1.0
-    for i in range(sheet.rows - 1):
-        row_entry = rows_start + 2 * i
+    subdivisions = ti.cast(band.subdivisions, ti.i32)
+    for i in range(band.rows - 1):
+        row_entry = band.rows * cols * geometry.POINT_STRIDE + 2 * i
         first_row = ti.min(nodes[row_entry], nodes[row_entry + 2])
         last_row = ti.max(nodes[row_entry + 1], nodes[row_entry + 3])
         if first_row < bottom and last_row > top:
-            for j in range(sheet.cols - 1):
+            for j in range(cols - 1):
+                overlaps = True
+                corner, _, distorted_entry = geometry.point_entries(i * cols + j, band)
                 if ti.static(config.has_distortion):
-                    cell = i * sheet.cols + j
-                    distorted_entry = sheet.distorted_start + cell * DISTORTED_STRIDE
-                    if may_cover_rows(
-                        cell * NODE_STRIDE, distorted_entry, sheet.cols, band.top, band.bottom, band.uniforms, nodes
-                    ):
-                        cover_cell(i, j, (), sheet, band)
-                else:
-                    cover_cell(i, j, (), sheet, band)
+                    overlaps = geometry.may_cover_rows(
+                        corner, distorted_entry, cols, band.top, band.bottom, band.uniforms, nodes
+                    )
+                if overlaps:
+                    outline = ti.static(geometry.cell_outline(corner, cols, band.near, nodes))
+                    invertible = geometry.is_invertible(outline)
+                    pieces = ti.select(invertible, 1, 2 * subdivisions * subdivisions)
+                    cover_cell(i, j, invertible, 0, pieces, outline, band)
 
 
 @cache
 def _kernel(config: DrawingConfig) -> Callable[..., None]:
-    factor = config.supersample
-
     @ti.kernel
     def draw(
         position: ti.types.ndarray(dtype=ti.f32, ndim=3), texels: Floats, uniforms: Floats, workers: ti.i32,
@@ -188,32 +183,14 @@ def _kernel(config: DrawingConfig) -> Callable[..., None]:
     ):  # fmt: skip
         for index in range(workers * ITERATIONS_PER_THREAD):
             if index % ITERATIONS_PER_THREAD == 0:
-                rows, cols = sizes[uni.ROWS], sizes[uni.COLS]
-                width, height = sizes[uni.WIDTH], sizes[uni.HEIGHT]
+                picture = ti.static(read_arguments(uniforms, sizes, nodes, samples, config))
                 # Starting a separate parallel loop takes longer than projecting a sheet of usual size.
-                project_all(position, rows, cols, config, uniforms, sizes, nodes)
-                texture_width, texture_height = sizes[uni.LEVELS + 1], sizes[uni.LEVELS + 2]
-                instrument_count, subdivisions, near = (
-                    sizes[uni.INSTRUMENT_COUNT],
-                    uniforms[uni.SUBDIVISIONS],
-                    uniforms[uni.NEAR],
-                )
-                tiles_across = (width * factor + config.tile_width - 1) // config.tile_width
-                first = index // ITERATIONS_PER_THREAD * tiles_across * (config.band_lines * config.planes)
-                map_vectors = 0
-                if ti.static(config.has_distortion):
-                    map_vectors = tiles_across * config.band_map_vectors + 1
-                    first += (height + config.band_rows - 1) // config.band_rows * map_vectors
-                distorted_start = rows * cols * UNDISTORTED_STRIDE
-                sheet = ti.static(
-                    DrawnSheet(nodes, rows, cols, subdivisions, texture_width, texture_height, distorted_start)
-                )
-                appearance = ti.static(
-                    Appearance(config, texels, sizes, texture_width, texture_height, uniforms, instrument_count)
-                )
-                pixels = width * height
-                output = ti.static(PixelArrays(colours, labels, pixels))
-                samples_width, samples_height = width * factor, height * factor
+                project_all(position, picture)
+                height = sizes[uni.HEIGHT]
+                tiles_of_band = picture.tiles_across * config.band_lines
+                map_vectors = tiles_of_band * config.map_planes + int(config.has_distortion)
+                map_end = (height + config.band_rows - 1) // config.band_rows * map_vectors
+                first = map_end + index // ITERATIONS_PER_THREAD * tiles_of_band * config.planes
                 # Bands are taken one by one, so that others take those of a delayed worker.
                 has_band = True
                 while has_band:
@@ -221,19 +198,16 @@ def _kernel(config: DrawingConfig) -> Callable[..., None]:
                     has_band = row < height
                     if has_band:
                         end_row = ti.min(row + config.band_rows, height)
-                        top, bottom = row * factor, end_row * factor
+                        top, bottom = row * config.supersample, end_row * config.supersample
                         map_start = row // config.band_rows * map_vectors
                         band = ti.static(
-                            Band(
-                                config, samples, first, tiles_across, 0.0, samples_width, top, bottom,
-                                samples_width, samples_height, near, uniforms, map_start,
+                            picture._replace(
+                                first=first, map_start=map_start, right=picture.width, top=top, bottom=bottom
                             )
-                        )  # fmt: skip
-                        cover_band(sheet, band)
-                        if ti.static(len(config.shapes) > 0):
-                            cover_instruments(instrument_count, band)
-                        resolve(
-                            first, row, end_row, 0, width, tiles_across, width, map_start, samples, appearance, output
                         )
+                        cover_band(band)
+                        if ti.static(len(config.shapes) > 0):
+                            cover_instruments(band)
+                        resolve(row, end_row, 0, sizes[uni.WIDTH], texels, colours, labels, band)
 
     return draw

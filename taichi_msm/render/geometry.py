@@ -14,11 +14,13 @@ from typing import Any, NamedTuple
 
 from taichi_msm.render import lens_kernels
 from taichi_msm.render import uniforms as uni
-from taichi_msm.render.config import INFINITY
+from taichi_msm.render.config import INFINITY, cross
 from taichi_msm.system.runtime import ti
 
-# Numbers per mass point: X, Y, w, depth, and at SCREEN its x and y in the picture [samples].
-SCREEN, NODE_STRIDE = uni.SCREEN, 6
+# Numbers per mass point: X, Y, w, depth, and at SCREEN its x and y in the picture [samples]. In kernel 2, `nodes` holds
+# the normals after them, and then the distorted mass points.
+SCREEN, NODE_STRIDE, NORMAL_STRIDE, DISTORTED_STRIDE = uni.SCREEN, 6, 3, lens_kernels.DISTORTED_STRIDE
+POINT_STRIDE = NODE_STRIDE + NORMAL_STRIDE + DISTORTED_STRIDE
 
 # Triangles of cells that are not inverted are enlarged to close gaps between them: by this fraction of their side, and
 # by this fraction of the picture's side, the resolution of f32.
@@ -30,65 +32,42 @@ MAX_COORDINATE = float(1 << 16)
 
 
 class Outline(NamedTuple):
-    """Projected corners of a cell, and their bounding box [samples].
+    """Projected corners of a cell, and their bounding box [samples]."""
 
-    Attributes:
-        x, y: lists of the corners' coordinates.
-        left, right, top, bottom: edges of the bounding box.
-        facing: 1 if the front is visible, -1 for the back, 0 if the cell is folded.
-        in_front, behind: whether all corners are in front of the near plane; whether all are behind it.
-    """
-
-    x: Any
+    x: Any  # list of the corners' coordinates
     y: Any
     left: Any
     right: Any
     top: Any
     bottom: Any
-    facing: Any
-    in_front: Any
-    behind: Any
+    facing: Any  # 1 if the front is visible, -1 for the back, 0 if the cell is folded
+    in_front: Any  # whether all corners are in front of the near plane
+    behind: Any  # whether all corners are behind it
 
 
 class Patch(NamedTuple):
-    """Bilinear surface between four mass points.
-
-    Attributes:
-        a, b, c, d: coefficients A to D, vectors (X, Y, w, depth).
-        facing: as in `Outline`.
-        invertible: whether the cell is drawn by inverting the bilinear map, instead of triangle by triangle.
-    """
+    """Bilinear surface between four mass points: coefficients A to D, vectors (X, Y, w, depth)."""
 
     a: Any
     b: Any
     c: Any
     d: Any
-    facing: Any
-    invertible: Any
+    facing: Any  # as in `Outline`
+    invertible: Any  # whether the cell is drawn by inverting the bilinear map, instead of triangle by triangle
 
 
 class Triangle(NamedTuple):
-    """Triangle P + R s + D t of a sub-quad.
-
-    Attributes:
-        p: corner P, a list of X, Y, w and depth.
-        r, d: sides R to the right and D down.
-        below: whether it is the triangle below the diagonal, where t > s.
-    """
+    """Triangle P + R s + D t of a sub-quad, of lists of X, Y, w and depth."""
 
     p: Any
     r: Any
     d: Any
-    below: Any
+    below: Any  # whether it is the triangle below the diagonal, where t > s
 
 
 @ti.func
 def project(position: ti.template(), i, j, cols, uniforms: ti.template(), nodes: ti.template(), double: ti.template()):
-    """Project a mass point, and store X, Y, w, depth, x and y in `nodes`.
-
-    Args:
-        double: whether `nodes` is f64; the sums are in a different order then.
-    """
+    """Store X, Y, w, depth, x and y of a mass point; sums are in a different order if `nodes` is f64, `double`."""
     entry = (i * cols + j) * NODE_STRIDE
     x, y, z = position[i, j, 0], position[i, j, 1], position[i, j, 2]
     for n in ti.static(range(4)):
@@ -114,24 +93,40 @@ def line_of_sight(x, y, uniforms: ti.template()):
 
 
 @ti.func
+def point_entries(point, band: ti.template()):
+    """Return the first entries of a mass point, of its normal and of the distorted mass point in `nodes`."""
+    points = band.rows * band.cols
+    return (
+        point * NODE_STRIDE,
+        points * NODE_STRIDE + point * NORMAL_STRIDE,
+        points * (NODE_STRIDE + NORMAL_STRIDE) + point * DISTORTED_STRIDE,
+    )
+
+
+@ti.func
 def corner_entry(cell, cols):
     """Return the first entry of a cell's upper left mass point."""
     return (cell // (cols - 1) * cols + cell % (cols - 1)) * NODE_STRIDE
 
 
 @ti.func
+def corner_entries(first, cols, stride: ti.template()):
+    """Return the entries of the four corners of a cell, `stride` numbers per mass point; `first` is the upper left."""
+    below = first + cols * stride
+    return ti.static((first, first + stride, below, below + stride))
+
+
+@ti.func
 def cell_outline(corner, cols, near, nodes: ti.template()):
     """Return the `Outline` of a cell."""
-    below = corner + cols * NODE_STRIDE
-    corners = ti.static((corner, corner + NODE_STRIDE, below, below + NODE_STRIDE))
+    corners = ti.static(corner_entries(corner, cols, NODE_STRIDE))
     x = [nodes[entry + SCREEN] for entry in corners]
     y = [nodes[entry + SCREEN + 1] for entry in corners]
     w = [nodes[entry + 2] for entry in corners]
     facing = facing_of(x, y)
     in_front = w[0] > near and w[1] > near and w[2] > near and w[3] > near
     behind = w[0] <= near and w[1] <= near and w[2] <= near and w[3] <= near
-    left, right = ti.min(x[0], x[1], x[2], x[3]), ti.max(x[0], x[1], x[2], x[3])
-    top, bottom = ti.min(y[0], y[1], y[2], y[3]), ti.max(y[0], y[1], y[2], y[3])
+    left, right, top, bottom = ti.min(*x), ti.max(*x), ti.min(*y), ti.max(*y)
     return ti.static(Outline(x, y, left, right, top, bottom, facing, in_front, behind))
 
 
@@ -148,16 +143,9 @@ def is_invertible(outline: ti.template()):
 
 @ti.func
 def cell_patch(corner, cols, facing, invertible, nodes: ti.template(), double: ti.template()):
-    """Return the `Patch` of a cell.
-
-    Args:
-        double: whether `nodes` is f64; D is summed in a different order then.
-    """
-    below = corner + cols * NODE_STRIDE
-    a = ti.Vector([nodes[corner + n] for n in ti.static(range(4))])
-    right = ti.Vector([nodes[corner + NODE_STRIDE + n] for n in ti.static(range(4))])
-    down = ti.Vector([nodes[below + n] for n in ti.static(range(4))])
-    opposite = ti.Vector([nodes[below + NODE_STRIDE + n] for n in ti.static(range(4))])
+    """Return the `Patch` of a cell; D is summed in a different order if `nodes` is f64, `double`."""
+    corners = ti.static(corner_entries(corner, cols, NODE_STRIDE))
+    a, right, down, opposite = [ti.Vector([nodes[entry + n] for n in ti.static(range(4))]) for entry in corners]
     b, c = right - a, down - a
     d = opposite - right - down + a if ti.static(double) else opposite - right - c
     return ti.static(Patch(a, b, c, d, facing, invertible))
@@ -165,13 +153,9 @@ def cell_patch(corner, cols, facing, invertible, nodes: ti.template(), double: t
 
 @ti.func
 def edge(p_x, p_y, q_x, q_y, x, y, facing):
-    """Return twice the signed area of the triangle p, q, (x, y), times `facing`.
+    """Return twice the signed area of the triangle p, q, (x, y), times `facing`; its sign is the side of the line p q.
 
-    Its sign is the side of the line p q on which (x, y) lies. Both cells at an edge compute the same bits except for
-    the sign.
-
-    Args:
-        p_x, p_y, q_x, q_y: ends of the edge [samples].
+    Both cells at an edge compute the same bits except for the sign.
     """
     step_x, step_y = (q_x - p_x) * facing, (q_y - p_y) * facing
     return step_x * (y - p_y) - step_y * (x - p_x)
@@ -190,19 +174,14 @@ def edges(x, y, facing, outline: ti.template()):
 
 
 @ti.func
-def turn(p_x, p_y, q_x, q_y, r_x, r_y):
-    """Return twice the signed area of a triangle p, q, r; positive if its vertices are clockwise in the picture."""
-    return (q_x - p_x) * (r_y - q_y) - (q_y - p_y) * (r_x - q_x)
-
-
-@ti.func
 def facing_of(x: ti.template(), y: ti.template()):
     """Return `facing` of a cell from lists of its corners' x and y; 0 if it is folded and both sides are visible."""
+    # Twice the signed areas of the triangles of three corners, positive if clockwise in the picture.
     turns = [
-        turn(x[n], y[n], x[m], y[m], x[k], y[k]) for n, m, k in ti.static(((0, 1, 3), (1, 3, 2), (3, 2, 0), (2, 0, 1)))
+        (x[m] - x[n]) * (y[k] - y[m]) - (y[m] - y[n]) * (x[k] - x[m])
+        for n, m, k in ti.static(((0, 1, 3), (1, 3, 2), (3, 2, 0), (2, 0, 1)))
     ]
-    least, most = ti.min(turns[0], turns[1], turns[2], turns[3]), ti.max(turns[0], turns[1], turns[2], turns[3])
-    return ti.select(least > 0, 1.0, ti.select(most < 0, -1.0, 0.0))
+    return ti.select(ti.min(*turns) > 0, 1.0, ti.select(ti.max(*turns) < 0, -1.0, 0.0))
 
 
 @ti.func
@@ -229,12 +208,7 @@ def find_quads(x, y, inside, subdivisions, patch: ti.template()):
 
 @ti.func
 def triangle_at(x, y, quad_column, quad_row, quad_side, lower, patch: ti.template()):
-    """Return the `Triangle` of a sub-quad at samples.
-
-    Args:
-        quad_side: side of the sub-quad, as a fraction of the cell's.
-        lower: whether the triangle below the diagonal is returned, if the patch is not invertible.
-    """
+    """Return the `Triangle` of a sub-quad at samples."""
     a, b, c, d = ti.static((patch.a, patch.b, patch.c, patch.d))
     s0 = quad_column * quad_side
     t0 = quad_row * quad_side
@@ -268,11 +242,7 @@ def on_triangle(x, y, triangle: ti.template()):
 
 @ti.func
 def is_within(s, t, enlargement, near, triangle: ti.template()):
-    """Return whether (s, t) is in an enlarged triangle and in front of the near plane.
-
-    Args:
-        enlargement: fraction of the side by which the triangle is enlarged.
-    """
+    """Return whether (s, t) is in an enlarged triangle and in front of the near plane."""
     larger = ti.select(triangle.below, t, s)
     smaller = ti.select(triangle.below, s, t)
     return (
@@ -301,7 +271,7 @@ def facet(x, y, triangle: ti.template(), uniforms: ti.template()):
         for k in ti.static((triangle.r, triangle.d))
     ]
     r, d = ti.static(sides)
-    normal = [r[1] * d[2] - r[2] * d[1], r[2] * d[0] - r[0] * d[2], r[0] * d[1] - r[1] * d[0]]
+    normal = cross(r, d)
     right, up = line_of_sight(x, y, uniforms)
     cosine = (normal[0] * right - normal[1] * up) * uniforms[uni.PINHOLE] + normal[2]
     sign = ti.select(cosine > 0.0, -1.0, 1.0)
@@ -310,61 +280,26 @@ def facet(x, y, triangle: ti.template(), uniforms: ti.template()):
 
 @ti.func
 def may_cover_rows(corner, distorted_entry, cols, top, bottom, uniforms: ti.template(), nodes: ti.template()):
-    """Return whether a cell may overlap rows of a picture with lens distortion; cheaper than `distorted_cell_bounds`.
-
-    Args:
-        distorted_entry: first entry of this mass point after distortion, as stored by `store_distorted`.
-        top, bottom: edges of the rows [samples].
-    """
-    below, distorted_below = corner + cols * NODE_STRIDE, distorted_entry + cols * lens_kernels.DISTORTED_STRIDE
-    distorted_corners = ti.static(
-        (
-            distorted_entry,
-            distorted_entry + lens_kernels.DISTORTED_STRIDE,
-            distorted_below,
-            distorted_below + lens_kernels.DISTORTED_STRIDE,
-        )
-    )
+    """Return whether a cell may overlap rows of a distorted picture; cheaper than `distorted_cell_bounds`."""
+    distorted_corners = ti.static(corner_entries(distorted_entry, cols, DISTORTED_STRIDE))
     within = [nodes[entry + 2] for entry in distorted_corners]
     rows = [nodes[entry + 1] for entry in distorted_corners]
-    corners = ti.static((corner, corner + NODE_STRIDE, below, below + NODE_STRIDE))
+    corners = ti.static(corner_entries(corner, cols, NODE_STRIDE))
     x = [nodes[entry + SCREEN] for entry in corners]
     y = [nodes[entry + SCREEN + 1] for entry in corners]
-    longest = ti.max(
-        lens_kernels.squared_side(x, y, 0, 1),
-        lens_kernels.squared_side(x, y, 1, 3),
-        lens_kernels.squared_side(x, y, 3, 2),
-        lens_kernels.squared_side(x, y, 2, 0),
-    )
-    margin = uniforms[uni.SAGITTA_FACTOR] * longest + 2.0
-    last_row, first_row = ti.max(rows[0], rows[1], rows[2], rows[3]), ti.min(rows[0], rows[1], rows[2], rows[3])
+    margin = uniforms[uni.SAGITTA_FACTOR] * lens_kernels.squared_length(x, y) + 2.0
     partly_valid = within[0] + within[1] + within[2] + within[3] < 3.5
-    return partly_valid or (last_row + margin > top and first_row - margin < bottom)
+    return partly_valid or (ti.max(*rows) + margin > top and ti.min(*rows) - margin < bottom)
 
 
 @ti.func
 def distorted_cell_bounds(distorted_entry, cols, outline: ti.template(), uniforms: ti.template(), nodes: ti.template()):
-    """Return the bounding box of a cell in a picture with lens distortion, as `lens_kernels.distorted_bounds`.
-
-    Args:
-        distorted_entry: first entry of the cell's upper left mass point, as stored by `store_distorted`.
-        outline: `Outline` of the cell, without distortion.
-    """
-    below = distorted_entry + cols * lens_kernels.DISTORTED_STRIDE
-    corners = ti.static(
-        (distorted_entry, distorted_entry + lens_kernels.DISTORTED_STRIDE, below, below + lens_kernels.DISTORTED_STRIDE)
-    )
-    x, y = ti.static((outline.x, outline.y))
-    longest = ti.max(
-        lens_kernels.squared_side(x, y, 0, 1),
-        lens_kernels.squared_side(x, y, 1, 3),
-        lens_kernels.squared_side(x, y, 3, 2),
-        lens_kernels.squared_side(x, y, 2, 0),
-    )
+    """Return the bounding box of a cell in a distorted picture, as `lens_kernels.distorted_bounds`."""
+    corners = ti.static(corner_entries(distorted_entry, cols, DISTORTED_STRIDE))
     within = nodes[corners[0] + 2] + nodes[corners[1] + 2] + nodes[corners[2] + 2] + nodes[corners[3] + 2] > 3.5
     distorted_x = [nodes[entry] for entry in corners]
     distorted_y = [nodes[entry + 1] for entry in corners]
-    return lens_kernels.distorted_bounds(x, y, distorted_x, distorted_y, within, longest, uniforms)
+    return lens_kernels.distorted_bounds(outline.x, outline.y, distorted_x, distorted_y, within, uniforms)
 
 
 @ti.func
@@ -372,11 +307,7 @@ def is_off_screen(corners: ti.template(), left, right, top, bottom):
     """Return whether a polygon, possibly partly behind the camera, is beyond an edge of the picture.
 
     For an edge x of the picture, X = x w is a plane that extends behind the camera; points beyond it have a larger X,
-    or a smaller one at the left edge.
-
-    Args:
-        corners: corners of the polygon, vectors (X, Y, w, ...).
-        left, right, top, bottom: edges of the picture [samples].
+    or a smaller one at the left edge. `corners` are vectors (X, Y, w, ...).
     """
     off_screen = False
     for axis, sign, edge in ti.static(((0, -1.0, left), (0, 1.0, right), (1, -1.0, top), (1, 1.0, bottom))):
@@ -392,16 +323,10 @@ def triangle_bounds(
     quad_column, quad_row, lower, quad_side, near, width, height,
     patch: ti.template(), uniforms: ti.template(), lens: ti.template(),
 ):  # fmt: skip
-    """Return the bounding box of a triangle of a sub-quad in the picture.
+    """Return the bounding box of a triangle of a sub-quad in the picture, and `enlargement`.
 
-    Args:
-        lower: whether it is the triangle below the diagonal.
-        quad_side: side of the sub-quad, as a fraction of the cell's.
-        width, height: size of the picture [samples].
-
-    Returns:
-        Least and largest x, least and largest y [samples]; and the fraction of its side by which the triangle is
-        enlarged.
+    The box is the least and largest x, the least and largest y [samples]; the largest is below the least if the
+    triangle is outside a picture of this width and height [samples].
     """
     a, b, c, d = ti.static((patch.a, patch.b, patch.c, patch.d))
     low_x, high_x, low_y, high_y = 0.0, ti.cast(width, ti.f32), -INFINITY, INFINITY
@@ -414,27 +339,18 @@ def triangle_bounds(
     if not lower:
         r = a + b * s1 + (c + d * s1) * t0
     if p[2] > near and q[2] > near and r[2] > near:
-        low_x = ti.min(p[0] / p[2], q[0] / q[2], r[0] / r[2])
-        high_x = ti.max(p[0] / p[2], q[0] / q[2], r[0] / r[2])
-        low_y = ti.min(p[1] / p[2], q[1] / q[2], r[1] / r[2])
-        high_y = ti.max(p[1] / p[2], q[1] / q[2], r[1] / r[2])
+        x = [k[0] / k[2] for k in ti.static((p, q, r))]
+        y = [k[1] / k[2] for k in ti.static((p, q, r))]
+        low_x, high_x, low_y, high_y = ti.min(*x), ti.max(*x), ti.min(*y), ti.max(*y)
         extent = ti.max(high_x - low_x, high_y - low_y, 1e-3)
         if ti.static(lens != ""):
             box = uni.VISIBLE
             perimeter = uniforms[box + 1] - uniforms[box] + uniforms[box + 3] - uniforms[box + 2]
             enlargement += SCREEN_ENLARGEMENT * perimeter / extent
-            x = [k[0] / k[2] for k in ti.static((p, q, r))]
-            y = [k[1] / k[2] for k in ti.static((p, q, r))]
-            longest = ti.max(
-                lens_kernels.squared_side(x, y, 0, 1),
-                lens_kernels.squared_side(x, y, 1, 2),
-                lens_kernels.squared_side(x, y, 2, 0),
-            )
             distorted = [lens_kernels.distorted_point(x[n], y[n], uniforms, lens) for n in ti.static(range(3))]
             low_x, high_x, low_y, high_y = lens_kernels.distorted_bounds(
                 x, y, [vertex[0] for vertex in distorted], [vertex[1] for vertex in distorted],
-                distorted[0][2] and distorted[1][2] and distorted[2][2],
-                longest, uniforms,
+                distorted[0][2] and distorted[1][2] and distorted[2][2], uniforms,
             )  # fmt: skip
         else:
             enlargement += SCREEN_ENLARGEMENT * (width + height) / extent

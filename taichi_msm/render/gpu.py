@@ -12,23 +12,13 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.render import geometry
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.bins import BOUNDS_STRIDE, SEARCH_ROUNDS, build_bins, is_in_bounds, owner_of, store_bounds
-from taichi_msm.render.config import INFINITY, Band, Bytes, DrawingConfig, Floats, Integers, clear_tile
-from taichi_msm.render.coverage import NORMAL_STRIDE, DrawnSheet, Part, cover_cell, cover_instruments, store_normal
-from taichi_msm.render.geometry import (
-    NODE_STRIDE,
-    cell_outline,
-    cell_patch,
-    corner_entry,
-    distorted_cell_bounds,
-    is_invertible,
-    project,
-    triangle_bounds,
-)
-from taichi_msm.render.labels import label_offsets
-from taichi_msm.render.lens_kernels import DISTORTED_STRIDE, store_distorted
-from taichi_msm.render.shading import Appearance, PixelArrays, resolve
+from taichi_msm.render.config import INFINITY, Bytes, DrawingConfig, Floats, Integers, clear_tile, read_arguments
+from taichi_msm.render.coverage import cover_cell, cover_instruments, store_point
+from taichi_msm.render.labels import values_per_pixel
+from taichi_msm.render.shading import resolve
 from taichi_msm.system.launches import VULKAN_THREADS, Launches, end_thread
 from taichi_msm.system.runtime import compilation_options, ti, write_vectors
 
@@ -37,9 +27,6 @@ MARGIN = 1.5
 
 # Maximum number of parts; if there are more triangles, a part has several of them.
 MAX_PARTS = 1 << 22
-
-# Numbers per mass point, without the distorted ones.
-UNDISTORTED_STRIDE = NODE_STRIDE + NORMAL_STRIDE
 
 
 class Threads:
@@ -58,7 +45,7 @@ class Threads:
         # Rows of pixels in a strip.
         self._rows = min(max(1, VULKAN_THREADS // (samples_across * config.supersample)), height)
         self._texels = launches.upload(texels)
-        self._nodes = launches.array(np.float32, rows * cols * (UNDISTORTED_STRIDE + DISTORTED_STRIDE))
+        self._nodes = launches.array(np.float32, rows * cols * geometry.POINT_STRIDE)
         self._pieces = launches.array(np.int32, self._cells)
         strip = self._rows * config.supersample * samples_across * config.planes
         # With lens distortion the undistortion map comes before the strip.
@@ -66,8 +53,7 @@ class Threads:
             config.float_vector, height * config.supersample * samples_across * config.map_planes + strip
         )
         self._colours = launches.array(np.uint8, 3 * width * height if config.picture else 1)
-        label_count = label_offsets(config.labels)[""]
-        self._labels = launches.array(np.float32, max(label_count * width * height, 1))
+        self._labels = launches.array(np.float32, max(values_per_pixel(config.labels) * width * height, 1))
 
     def set_undistortion_map(self, table: NDArray[np.float32]) -> None:
         """Set the undistortion map of the following pictures, as returned by `undistortion_map`."""
@@ -130,7 +116,6 @@ class Threads:
 @cache
 def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable[..., None]]:
     """Return the kernels that project the sheet and compute the bounding boxes of its parts."""
-    factor = config.supersample
 
     @ti.kernel
     def project_points(
@@ -142,18 +127,15 @@ def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable
         A cell has 1 piece if its bilinear map is inverted, otherwise one per triangle, and 0 behind the eye.
         """
         for index in range(sizes[uni.ROWS] * sizes[uni.COLS]):
-            rows, cols = sizes[uni.ROWS], sizes[uni.COLS]
-            project(position, index // cols, index % cols, cols, uniforms, nodes, False)
-            store_normal(position, index // cols, index % cols, rows, cols, config, uniforms, nodes)
-            if ti.static(config.has_distortion):
-                distorted_entry = rows * cols * UNDISTORTED_STRIDE + index * DISTORTED_STRIDE
-                store_distorted(distorted_entry, index * NODE_STRIDE, uniforms, nodes, config.lens)
+            picture = ti.static(read_arguments(uniforms, sizes, nodes, (), config))
+            store_point(position, index // picture.cols, index % picture.cols, picture)
 
         for cell in range((sizes[uni.ROWS] - 1) * (sizes[uni.COLS] - 1)):
             cols, subdivisions = sizes[uni.COLS], ti.cast(uniforms[uni.SUBDIVISIONS], ti.i32)
-            outline = ti.static(cell_outline(corner_entry(cell, cols), cols, uniforms[uni.NEAR], nodes))
+            corner = geometry.corner_entry(cell, cols)
+            outline = ti.static(geometry.cell_outline(corner, cols, uniforms[uni.NEAR], nodes))
             pieces[cell] = ti.select(
-                outline.behind, 0, ti.select(is_invertible(outline), 1, 2 * subdivisions * subdivisions)
+                outline.behind, 0, ti.select(geometry.is_invertible(outline), 1, 2 * subdivisions * subdivisions)
             )
 
     @ti.kernel
@@ -171,27 +153,28 @@ def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable
             bounds: bounding box of each part, written.
         """
         for item in range(first, end):
-            cols, width, height = sizes[uni.COLS], sizes[uni.WIDTH] * factor, sizes[uni.HEIGHT] * factor
-            cell = owner_of(item, (sizes[uni.ROWS] - 1) * (cols - 1), ends)
+            picture = ti.static(read_arguments(uniforms, sizes, nodes, (), config))
+            cols, width, height = picture.cols, picture.width, picture.height
+            cell = owner_of(item, (picture.rows - 1) * (cols - 1), ends)
             parts_of_cell = ti.max((pieces[cell] + pieces_per_part - 1) // pieces_per_part, 1)
             piece = (item - ends[cell] + parts_of_cell) * pieces_per_part
             owners[2 * item], owners[2 * item + 1] = cell, piece
-            outline = ti.static(cell_outline(corner_entry(cell, cols), cols, uniforms[uni.NEAR], nodes))
+            corner = geometry.corner_entry(cell, cols)
+            outline = ti.static(geometry.cell_outline(corner, cols, picture.near, nodes))
             left, right, top, bottom = outline.left, outline.right, outline.top, outline.bottom
             if ti.static(config.has_distortion):
-                distorted_entry = (
-                    sizes[uni.ROWS] * cols * UNDISTORTED_STRIDE
-                    + corner_entry(cell, cols) // NODE_STRIDE * DISTORTED_STRIDE
+                _, _, distorted_entry = geometry.point_entries(corner // geometry.NODE_STRIDE, picture)
+                left, right, top, bottom = geometry.distorted_cell_bounds(
+                    distorted_entry, cols, outline, uniforms, nodes
                 )
-                left, right, top, bottom = distorted_cell_bounds(distorted_entry, cols, outline, uniforms, nodes)
             if pieces[cell] != 1:
                 left, right, top, bottom = INFINITY, -INFINITY, INFINITY, -INFINITY
-                patch = ti.static(cell_patch(corner_entry(cell, cols), cols, outline.facing, False, nodes, False))
-                subdivisions = ti.cast(uniforms[uni.SUBDIVISIONS], ti.i32)
+                patch = ti.static(geometry.cell_patch(corner, cols, outline.facing, False, nodes, False))
+                subdivisions = ti.cast(picture.subdivisions, ti.i32)
                 for triangle in range(piece, ti.min(piece + pieces_per_part, pieces[cell])):
                     s, t = ti.cast(triangle // 2 % subdivisions, ti.f32), ti.cast(triangle // 2 // subdivisions, ti.f32)
-                    low_x, high_x, low_y, high_y, _ = triangle_bounds(
-                        s, t, triangle % 2 == 0, 1.0 / uniforms[uni.SUBDIVISIONS], uniforms[uni.NEAR], width, height,
+                    low_x, high_x, low_y, high_y, _ = geometry.triangle_bounds(
+                        s, t, triangle % 2 == 0, 1.0 / picture.subdivisions, picture.near, width, height,
                         patch, uniforms, config.lens,
                     )  # fmt: skip
                     if not high_x < low_x:
@@ -209,7 +192,16 @@ def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable
 @cache
 def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable[..., None]]:
     """Return the kernels that cover the samples of a strip and shade its pixels."""
-    factor, planes = config.supersample, config.planes
+    factor = config.supersample
+
+    @ti.func
+    def place(x, y, across, strip_row, picture: ti.template()):
+        """Return the band of `across` x `across` samples at column x and row y, in a strip from `strip_row` on."""
+        samples_of_map = picture.width * picture.height * config.map_planes
+        first = samples_of_map + (y - strip_row) * picture.width * config.planes
+        map_start = y * picture.width * config.map_planes
+        right, bottom = x + across, y + across
+        return ti.static(picture._replace(first=first, map_start=map_start, left=x, right=right, top=y, bottom=bottom))
 
     @ti.kernel
     def cover_samples(
@@ -232,29 +224,21 @@ def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callab
             entries: parts of all lists.
         """
         for index in range(first, end):
-            rows, cols, subdivisions = sizes[uni.ROWS], sizes[uni.COLS], uniforms[uni.SUBDIVISIONS]
-            width, height = sizes[uni.WIDTH] * factor, sizes[uni.HEIGHT] * factor
-            x, y = index % width, top + index // width
-            table = width * height * config.map_planes
-            line, near = table + index // width * width * planes, uniforms[uni.NEAR]
-            map_start, distorted_start = y * width * config.map_planes, rows * cols * UNDISTORTED_STRIDE
-            texture_width, texture_height = sizes[uni.LEVELS + 1], sizes[uni.LEVELS + 2]
-            sheet = ti.static(
-                DrawnSheet(nodes, rows, cols, subdivisions, texture_width, texture_height, distorted_start)
-            )
-            band = ti.static(
-                Band(config, samples, line, width, x, x + 1, y, y + 1, width, height, near, uniforms, map_start)
-            )
+            picture = ti.static(read_arguments(uniforms, sizes, nodes, samples, config))
+            x, y = index % picture.width, top + index // picture.width
+            band = ti.static(place(x, y, 1, top, picture))
             if listed == 0:
-                clear_tile(table + index * planes, band)
+                clear_tile(band.first + x * config.planes, band)
             bin_index = y // sizes[uni.BIN_SIZE] * sizes[uni.BINS_ACROSS] + x // sizes[uni.BIN_SIZE]
             begin = starts[bin_index] + listed
             for n in range(begin, ti.min(begin + count, starts[bin_index + 1])):
                 if is_in_bounds(entries[n], x, y, bounds):
                     cell, piece = owners[2 * entries[n]], owners[2 * entries[n] + 1]
-                    is_inverted, end_piece = pieces[cell] == 1, ti.min(piece + pieces_per_part, pieces[cell])
-                    part = ti.static(Part(is_inverted, piece, end_piece))
-                    cover_cell(cell // (cols - 1), cell % (cols - 1), part, sheet, band)
+                    end_piece = ti.min(piece + pieces_per_part, pieces[cell])
+                    corner = geometry.corner_entry(cell, band.cols)
+                    outline = ti.static(geometry.cell_outline(corner, band.cols, band.near, nodes))
+                    i, j = cell // (band.cols - 1), cell % (band.cols - 1)
+                    cover_cell(i, j, pieces[cell] == 1, piece, end_piece, outline, band)
             end_thread(ended)
 
     @ti.kernel
@@ -264,28 +248,12 @@ def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callab
     ):  # fmt: skip
         """Cover the pixels of a strip, which begins at `row`, with the instruments; write their colours and labels."""
         for index in range(first, end):
-            width, height, instrument_count = sizes[uni.WIDTH], sizes[uni.HEIGHT], sizes[uni.INSTRUMENT_COUNT]
-            x, y = index % width, row + index // width
-            left, top, samples_across = x * factor, y * factor, width * factor
-            table = samples_across * height * factor * config.map_planes
-            line = table + (y - row) * factor * samples_across * planes
-            map_start = top * samples_across * config.map_planes
+            picture = ti.static(read_arguments(uniforms, sizes, (), samples, config))
+            x, y = index % sizes[uni.WIDTH], row + index // sizes[uni.WIDTH]
+            band = ti.static(place(x * factor, y * factor, factor, row * factor, picture))
             if ti.static(len(config.shapes) > 0):
-                band = ti.static(
-                    Band(
-                        config, samples, line, samples_across, left, left + factor, top, top + factor,
-                        samples_across, height * factor, uniforms[uni.NEAR], uniforms, map_start,
-                    )
-                )  # fmt: skip
-                cover_instruments(instrument_count, band)
-            appearance = ti.static(
-                Appearance(
-                    config, texels, sizes, sizes[uni.LEVELS + 1], sizes[uni.LEVELS + 2], uniforms, instrument_count
-                )
-            )
-            pixels = width * height
-            output = ti.static(PixelArrays(colours, labels, pixels))
-            resolve(line, y, y + 1, x, x + 1, samples_across, width, map_start, samples, appearance, output)
+                cover_instruments(band)
+            resolve(y, y + 1, x, x + 1, texels, colours, labels, band)
             end_thread(ended)
 
     return cover_samples, resolve_pixels

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
-from itertools import accumulate
+from collections.abc import Collection, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,21 +35,13 @@ class Labels(NamedTuple):
 
 
 class Label(NamedTuple):
-    """Layout of a label in the output of kernel 2: one or several values per pixel, row by row.
+    """Layout of a label in the output of kernel 2: one or several values per pixel, row by row."""
 
-    Attributes:
-        planes: names of the G-buffer planes with the values (config.py).
-        missing_value: value in pixels without a visible surface.
-        sheet_only: whether pixels of instruments also have the missing value.
-        dtype: type of the values.
-        is_optional: whether it is written only on request.
-    """
-
-    planes: tuple[str, ...]
-    missing_value: float
-    sheet_only: bool
+    planes: tuple[str, ...]  # names of the G-buffer planes with the values (config.py)
+    missing_value: float  # in pixels without a visible surface
+    sheet_only: bool  # whether pixels of instruments also have the missing value
     dtype: type[np.generic]
-    is_optional: bool = False
+    is_optional: bool = False  # whether it is written only on request
 
 
 # The fields of `Labels`.
@@ -67,11 +58,18 @@ def requested_labels(outputs: Collection[str]) -> frozenset[str]:
     return frozenset(name for name, label in LABELS.items() if name in outputs or not label.is_optional)
 
 
-def label_offsets(names: Collection[str]) -> dict[str, int]:
-    """Return the number of values per pixel before each label, and under "" that of all."""
-    chosen = [name for name in LABELS if name in names]
-    counts = accumulate((len(LABELS[name].planes) for name in chosen), initial=0)
-    return dict(zip([*chosen, ""], counts, strict=True))
+def label_offsets(names: Collection[str]) -> Iterator[tuple[str, Label, int]]:
+    """List the labels of these names with the number of values per pixel before each."""
+    offset = 0
+    for name, label in LABELS.items():
+        if name in names:
+            yield name, label, offset
+            offset += len(label.planes)
+
+
+def values_per_pixel(names: Collection[str]) -> int:
+    """Return the number of values per pixel of labels."""
+    return sum(len(LABELS[name].planes) for name in names)
 
 
 def label_channels(plane: Any, names: Collection[str]) -> list[tuple[int, int, int, int, Label]]:
@@ -79,35 +77,27 @@ def label_channels(plane: Any, names: Collection[str]) -> list[tuple[int, int, i
 
     Args:
         plane: index of each plane of the G-buffer, by name.
-        names: names of the labels that are written.
+        names: names of the labels.
 
     Returns:
-        For each plane its index, the number of values per pixel before the label, its position in the label, the number
-        of planes of the label, and the label.
+        For each plane its index, the values per pixel before the label, its position among the planes of the label,
+        their number, and the label.
     """
     return [
-        (getattr(plane, plane_name), offset, n, len(LABELS[name].planes), LABELS[name])
-        for name, offset in label_offsets(names).items()
-        if name
-        for n, plane_name in enumerate(LABELS[name].planes)
+        (getattr(plane, plane_name), offset, n, len(label.planes), label)
+        for _, label, offset in label_offsets(names)
+        for n, plane_name in enumerate(label.planes)
         if hasattr(plane, plane_name)
     ]
 
 
 def labels_of(numbers: NDArray[np.float32], size: tuple[int, int], names: Collection[str]) -> Labels:
-    """Convert the output of kernel 2 to labels.
-
-    Args:
-        numbers: values of the pixels, one label after the other.
-        size: width and height of the picture [px].
-        names: names of the labels that are written.
-    """
+    """Convert the output of kernel 2, one label after the other, to labels of a picture of a size [px]."""
     (width, height), arrays = size, {}
-    for name, offset in label_offsets(names).items():
-        if name:
-            label, count = LABELS[name], len(LABELS[name].planes)
-            values = numbers.reshape(-1, width * height)[offset : offset + count]
-            arrays[name] = values.reshape((height, width, count)[: 2 + (count > 1)]).astype(label.dtype, copy=False)
+    for name, label, offset in label_offsets(names):
+        count = len(label.planes)
+        values = numbers.reshape(-1, width * height)[offset : offset + count]
+        arrays[name] = values.reshape((height, width, count)[: 2 + (count > 1)]).astype(label.dtype, copy=False)
     # Rounding may move coordinates beyond the sheet's edge.
     arrays["coordinates"] = arrays["coordinates"].clip(0, 1)
     return Labels(**arrays)
@@ -157,19 +147,11 @@ class Sight(NamedTuple):
 
 
 class FrameOutputs(NamedTuple):
-    """The outputs of one frame; None for those that were not requested.
+    """The outputs of one frame; None for those that were not requested."""
 
-    Attributes:
-        picture: colours, shape (height, width, 3).
-        labels: ground-truth labels of the pixels.
-        flow: optical flow from the previous frame to this one.
-        stereo: labels of the stereo pair.
-        tracks: pixels and occlusion of the tracked points.
-    """
-
-    picture: NDArray[np.uint8] | None = None
+    picture: NDArray[np.uint8] | None = None  # colours, shape (height, width, 3)
     labels: Labels | None = None
-    flow: Flow | None = None
+    flow: Flow | None = None  # from the previous frame to this one
     stereo: Stereo | None = None
     tracks: Sight | None = None
 

@@ -19,15 +19,10 @@ UNDISTORTION_TOLERANCE = 1e-11
 
 
 class Lens(NamedTuple):
-    """A lens distortion model and its coefficients.
+    """A lens distortion model and its coefficients."""
 
-    Attributes:
-        model: name of the model.
-        coefficients: all coefficients of the model, in its order.
-    """
-
-    model: str
-    coefficients: tuple[float, ...]
+    model: str  # its name
+    coefficients: tuple[float, ...]  # all of the model, in its order
 
     @property
     def limit(self) -> float:

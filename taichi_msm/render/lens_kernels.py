@@ -79,50 +79,37 @@ def store_distorted(distorted_entry, entry, uniforms: ti.template(), nodes: ti.t
 
 
 @ti.func
-def squared_side(x: ti.template(), y: ti.template(), n: ti.template(), m: ti.template()):
-    """Return the squared distance between vertices n and m of lists of x and y."""
-    return (x[n] - x[m]) * (x[n] - x[m]) + (y[n] - y[m]) * (y[n] - y[m])
+def squared_length(x: ti.template(), y: ti.template()):
+    """Return the squared length of the longest side of a triangle, or of a cell with corners row by row."""
+    sides = ti.static(((0, 1), (1, 2), (2, 0)) if len(x) == 3 else ((0, 1), (1, 3), (3, 2), (2, 0)))
+    squares = [(x[n] - x[m]) * (x[n] - x[m]) + (y[n] - y[m]) * (y[n] - y[m]) for n, m in sides]
+    return ti.max(*squares)
 
 
 @ti.func
 def distorted_bounds(
     x: ti.template(), y: ti.template(), distorted_x: ti.template(), distorted_y: ti.template(), is_valid,
-    squared_length, uniforms: ti.template(),
+    uniforms: ti.template(),
 ):  # fmt: skip
-    """Return the bounding box of the samples that a convex polygon covers after distortion.
+    """Return the bounding box of the samples that a triangle or a cell covers after distortion.
 
     Args:
         x, y: lists of the coordinates of the undistorted vertices [samples].
         distorted_x, distorted_y: lists of those of the distorted vertices [samples].
         is_valid: whether all vertices are within the limit of the lens.
-        squared_length: square of the longest side [samples^2].
 
     Returns:
-        Least and largest x, least and largest y [samples]; an empty box, with the largest below the least, if the
-        polygon is outside the picture.
+        Least and largest x, least and largest y [samples]; the largest are below the least outside the picture.
     """
-    margin = ti.min(uniforms[uni.STRETCH_FACTOR] * ti.sqrt(squared_length), 1e6)
+    squared = squared_length(x, y)
+    margin = ti.min(uniforms[uni.STRETCH_FACTOR] * ti.sqrt(squared), 1e6)
     if is_valid:
-        margin = ti.min(margin, uniforms[uni.SAGITTA_FACTOR] * squared_length)
-    left, right = x[0], x[0]
-    top, bottom = y[0], y[0]
-    low_x, high_x = distorted_x[0], distorted_x[0]
-    low_y, high_y = distorted_y[0], distorted_y[0]
-    for n in ti.static(range(1, len(x))):
-        left, right = ti.min(left, x[n]), ti.max(right, x[n])
-        top, bottom = ti.min(top, y[n]), ti.max(bottom, y[n])
-        low_x, high_x = ti.min(low_x, distorted_x[n]), ti.max(high_x, distorted_x[n])
-        low_y, high_y = ti.min(low_y, distorted_y[n]), ti.max(high_y, distorted_y[n])
-    box = uni.VISIBLE
-    is_visible = (
-        right >= uniforms[box]
-        and left <= uniforms[box + 1]
-        and bottom >= uniforms[box + 2]
-        and top <= uniforms[box + 3]
-    )
+        margin = ti.min(margin, uniforms[uni.SAGITTA_FACTOR] * squared)
+    left, right, top, bottom = [uniforms[uni.VISIBLE + n] for n in ti.static(range(4))]
+    is_visible = ti.max(*x) >= left and ti.min(*x) <= right and ti.max(*y) >= top and ti.min(*y) <= bottom
     return (
-        ti.select(is_visible, low_x - margin, INVALID_COORDINATE),
-        ti.select(is_visible, high_x + margin, -INVALID_COORDINATE),
-        ti.select(is_visible, low_y - margin, INVALID_COORDINATE),
-        ti.select(is_visible, high_y + margin, -INVALID_COORDINATE),
+        ti.select(is_visible, ti.min(*distorted_x) - margin, INVALID_COORDINATE),
+        ti.select(is_visible, ti.max(*distorted_x) + margin, -INVALID_COORDINATE),
+        ti.select(is_visible, ti.min(*distorted_y) - margin, INVALID_COORDINATE),
+        ti.select(is_visible, ti.max(*distorted_y) + margin, -INVALID_COORDINATE),
     )

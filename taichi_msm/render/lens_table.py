@@ -6,16 +6,13 @@ With this map, and with bounds of the distortion of cells, kernel 2 covers disto
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.render.camera import View, border_points
 from taichi_msm.render.lens import Lens
-
-if TYPE_CHECKING:
-    from taichi_msm.render.config import DrawingConfig
 
 Array = NDArray[np.float64]
 Pair = tuple[float, float]
@@ -29,17 +26,11 @@ class VisibleRegion(NamedTuple):
 
     A line of length L is distorted into a curve whose distance from its chord is at most `sagitta_factor` L^2, because
     its second derivatives are at most 8 `sagitta_factor`. The length of the curve is at most 2 `stretch_factor` L.
-
-    Attributes:
-        radius: largest distance from the optical axis.
-        box: left, right, top and bottom without distortion [px].
-        sagitta_factor: bound of the sagitta, divided by L^2 [1/px].
-        stretch_factor: half the bound of the length, divided by L.
     """
 
-    radius: float
-    box: tuple[float, float, float, float]
-    sagitta_factor: float
+    radius: float  # largest distance from the optical axis
+    box: tuple[float, float, float, float]  # left, right, top and bottom without distortion [px]
+    sagitta_factor: float  # [1/px]
     stretch_factor: float
 
 
@@ -118,40 +109,3 @@ def undistortion_map(view: View, supersample: int, *, with_steps: bool) -> NDArr
                 is_valid, np.moveaxis(inverse, -1, -2).reshape(*is_valid.shape[:2], 4), 0
             )
     return table
-
-
-def bounds(coordinates: NDArray[np.float32]) -> Array:
-    """Return left, right, top and bottom of the valid points, shape (..., 2); an empty box if none is valid."""
-    valid = coordinates[coordinates[..., 0] < INVALID_COORDINATE]
-    if not len(valid):
-        return np.array([INVALID_COORDINATE, -INVALID_COORDINATE, INVALID_COORDINATE, -INVALID_COORDINATE])
-    (left, top), (right, bottom) = valid.min(axis=0), valid.max(axis=0)
-    return np.array([left, right, top, bottom])
-
-
-def tiled_map(table: NDArray[np.float32], config: DrawingConfig) -> NDArray[np.float32]:
-    """Rearrange an undistortion map into the bands and tiles of kernel 2, and add the bounding box of each tile.
-
-    Args:
-        table: undistortion map, shape (rows, columns, 2 or 6).
-        config: compile-time configuration.
-
-    Returns:
-        The map, shape (bands, vectors per band, lanes).
-    """
-    rows, columns, planes = table.shape
-    band_height, lines = config.band_rows * config.supersample, config.band_lines
-    tile_height, tile_width = config.tile_height, config.tile_width
-    bands, tiles_across = -(-rows // band_height), -(-columns // tile_width)
-    padding = (0, bands * band_height - rows), (0, tiles_across * tile_width - columns), (0, 0)
-    padded = np.pad(table, padding, constant_values=INVALID_COORDINATE).reshape(bands, band_height, -1, planes)
-    padding_of_lines = (0, 0), (0, lines * tile_height - band_height), (0, 0), (0, 0)
-    padded = np.pad(padded, padding_of_lines, constant_values=INVALID_COORDINATE)
-    tiles = padded.reshape(bands, lines, tile_height, tiles_across, tile_width, planes).transpose(0, 1, 3, 5, 2, 4)
-    tiles = tiles.reshape(bands, lines, tiles_across, planes, config.lanes)
-    # A tile without valid coordinates has an invalid box.
-    low = tiles[..., :2, :].min(axis=-1)
-    high = np.where(tiles[..., :2, :] < INVALID_COORDINATE, tiles[..., :2, :], low[..., None]).max(axis=-1)
-    box = np.stack([low, high], axis=-1).reshape(bands, lines, tiles_across, 1, 4)
-    box = np.pad(box, ((0, 0), (0, 0), (0, 0), (0, 0), (0, config.lanes - 4)))
-    return np.concatenate([tiles, box], axis=3).reshape(bands, -1, config.lanes)

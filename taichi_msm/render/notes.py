@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.lenses import MODELS
 from taichi_msm.render import texture
-from taichi_msm.render.camera import View, is_moving, view_at
+from taichi_msm.render.camera import View, is_moving, pair_transform, view_at
 from taichi_msm.scene.camera import Camera, Distortion
 from taichi_msm.scene.render import Light
 from taichi_msm.scene.scene import Scene
@@ -49,22 +49,29 @@ def drawing_warnings(scene: Scene) -> Iterator[str]:
             )
 
 
-def describe_calibrations(scene: Scene) -> Iterator[str]:
-    """Describe each camera with intrinsics: lens model, size, fields of view with its distortion, coefficients."""
+def describe_cameras(scene: Scene) -> Iterator[str]:
+    """Describe each camera with intrinsics or a reference camera: lens, fields of view, coefficients and baseline."""
     for name, camera in scene.render.all_cameras.items():
-        if not isinstance(camera, Camera) or camera.intrinsics is None:
+        if not isinstance(camera, Camera):
             continue
-        view, distortion = view_at(scene, 0.0, name), camera.distortion or Distortion()
-        (x, y), (width, height) = view.centre, view.size
-        edges = (view.undistort(np.array([[0, y], [width, y], [x, 0], [x, height]])) - view.centre) / view.scale
-        left, right, top, bottom = np.degrees(np.arctan(edges[[0, 1, 2, 3], [0, 0, 1, 1]]))
-        fov = " x ".join(
-            "(the lens's)" if np.isnan(angle) else f"{angle:.1f}" for angle in (right - left, bottom - top)
-        )
-        pairs = zip(MODELS[distortion.model].coefficients, distortion.coefficients, strict=True)
-        values = "".join(f", {coefficient} {value:g}" for coefficient, value in pairs if value)
-        facts = f"{distortion.model}, {width:g} x {height:g} px, fov {fov} degrees"
-        yield f"{camera_key(name)}: {facts}{values or ', no distortion'}"
+        facts = [] if camera.intrinsics is None else [_describe_lens(camera, view_at(scene, 0.0, name))]
+        if camera.beside is not None:
+            baseline = np.linalg.norm(pair_transform(camera)["translation"])
+            facts.append(f"beside {camera.beside} with a baseline of {baseline:.6g} m")
+        if facts:
+            yield f"{camera_key(name)}: {', '.join(facts)}"
+
+
+def _describe_lens(camera: Camera, view: View) -> str:
+    """Describe the lens model, the size, the fields of view with the distortion, and the coefficients."""
+    distortion = camera.distortion or Distortion()
+    (x, y), (width, height) = view.centre, view.size
+    edges = (view.undistort(np.array([[0, y], [width, y], [x, 0], [x, height]])) - view.centre) / view.scale
+    left, right, top, bottom = np.degrees(np.arctan(edges[[0, 1, 2, 3], [0, 0, 1, 1]]))
+    fov = " x ".join("(the lens's)" if np.isnan(angle) else f"{angle:.1f}" for angle in (right - left, bottom - top))
+    pairs = zip(MODELS[distortion.model].coefficients, distortion.coefficients, strict=True)
+    values = "".join(f", {coefficient} {value:g}" for coefficient, value in pairs if value)
+    return f"{distortion.model}, {width:g} x {height:g} px, fov {fov} degrees{values or ', no distortion'}"
 
 
 def camera_key(name: str) -> str:
@@ -118,13 +125,10 @@ def _stretched_picture(scene: Scene) -> Iterator[str]:
         settings += f' --set "sheet.points=[{rows},{cols}]"'
     warning = (
         f"the picture of {width} x {height} pixels is stretched onto a sheet {sheet_width:g} m wide and "
-        f"{sheet_height:g} m high; "
-        f"{settings} makes the sheet like the picture"
+        f"{sheet_height:g} m high; {settings} makes the sheet like the picture"
     )
-    cut_width, cut_height = (
-        min(width, round(height * sheet_width / sheet_height)),
-        min(height, round(width * sheet_height / sheet_width)),
-    )
+    cut_width = min(width, round(height * sheet_width / sheet_height))
+    cut_height = min(height, round(width * sheet_height / sheet_width))
     # In a picture of few pixels even the best region may be stretched.
     if cut_width and cut_height and _nearly_equal(sheet_width * cut_height, sheet_height * cut_width):
         region = left + (width - cut_width) // 2, top + (height - cut_height) // 2, cut_width, cut_height

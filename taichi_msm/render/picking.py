@@ -11,12 +11,10 @@ from taichi_msm.render.camera import View
 CELLS_PER_BATCH = 1024
 
 Array = NDArray[np.float64]
-Pixel = tuple[float, float]
-SheetCoordinates = tuple[float, float]
-Hit = tuple[float, SheetCoordinates]
+Pair = tuple[float, float]
 
 
-def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pixel) -> SheetCoordinates | None:
+def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pair) -> Pair | None:
     """Return the material point at the centre of a pixel, on the nearest triangle there.
 
     The camera maps a point to (X, Y, w, depth). Then a = X - x w and b = Y - y w are linear in the point, and 0 if it
@@ -33,7 +31,7 @@ def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pixel) 
     """
     rows, cols = position.shape[:2]
     ray = view.centred_at(pixel)
-    hits: list[Hit] = []
+    hits: list[tuple[float, Pair]] = []
     cells = np.argwhere(_cells_on_ray(position, ray))
     for first in range(0, len(cells), CELLS_PER_BATCH):
         i, j = cells[first : first + CELLS_PER_BATCH].T
@@ -45,20 +43,14 @@ def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pixel) 
     return column / (cols - 1), row / (rows - 1)
 
 
-def intersect_rest_plane(view: View, pixel: Pixel) -> NDArray[np.floating] | None:
-    """Intersect the line of sight through a pixel's centre with the plane of the sheet at rest.
+def intersect_rest_plane(view: View, pixel: Pair) -> NDArray[np.floating] | None:
+    """Return x and y [m] at which the line of sight through a pixel's centre meets the plane of the sheet at rest.
 
-    Args:
-        view: the camera.
-        pixel: column and row, counted from (0, 0).
-
-    Returns:
-        x and y [m]; None without an intersection in front of the camera.
+    The first pixel is (0, 0). None without an intersection in front of the camera.
     """
     matrix = view.centred_at(pixel).matrix
     planar = matrix[:2, :2]
-    scale = np.linalg.norm(planar, axis=1).prod()
-    if not abs(np.linalg.det(planar)) > 1e-9 * scale:
+    if not abs(np.linalg.det(planar)) > 1e-9 * np.linalg.norm(planar, axis=1).prod():
         return None
     point = np.linalg.solve(planar, -matrix[:2, 3])
     return point if matrix[2] @ [*point, 0, 1] > view.near else None
@@ -77,7 +69,9 @@ def _cells_on_ray(position: NDArray[np.floating], ray: View) -> NDArray[np.bool_
     return is_candidate
 
 
-def _hits_in_cells(corners: Array, i: NDArray[np.intp], j: NDArray[np.intp], refine: int, near: float) -> list[Hit]:
+def _hits_in_cells(
+    corners: Array, i: NDArray[np.intp], j: NDArray[np.intp], refine: int, near: float
+) -> list[tuple[float, Pair]]:
     """List depth [m] and position (column, row) on the sheet [cells] of the hits in some cells."""
     subdivisions = refine + 1
     fractions = np.arange(subdivisions + 1) / subdivisions
@@ -89,7 +83,7 @@ def _hits_in_cells(corners: Array, i: NDArray[np.intp], j: NDArray[np.intp], ref
     low, high = quads[..., :2].min(axis=-2), quads[..., :2].max(axis=-2)
     cell, quad_row, quad_column = np.nonzero(((low <= 0) & (high >= 0)).all(axis=-1))
     quad = quads[cell, quad_row, quad_column]
-    hits: list[Hit] = []
+    hits: list[tuple[float, Pair]] = []
     for third in (1, 2):  # index of the corner off the diagonal: upper right, lower left
         triangle = quad[:, [0, third, 3]]
         p, q, r = np.moveaxis(triangle[..., :2], 1, 0)

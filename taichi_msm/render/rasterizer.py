@@ -70,7 +70,6 @@ class Rasterizer:
         self.scene = scene
         self.config = config or drawing_config(scene)
         self._view = view_at(scene, 0.0)
-        self._cached: tuple[View, NDArray[np.float32]] | None = None
         self._optics: tuple[object, ...] = ()
         self._texture_size = texture.shape[1], texture.shape[0]
         texels, levels = pyramid(texture, minified=self.config.tissue)
@@ -79,16 +78,7 @@ class Rasterizer:
         self._backend: Bands | Threads = backend(self.config, scene.sheet.points, scene.render.size, texels)
 
     def draw(self, position: NDArray[Any], camera: View | None = None, rods: Sequence[Solid] = ()) -> NDArray[np.uint8]:
-        """Draw the picture.
-
-        Args:
-            position: positions of the mass points [m], shape (rows, cols, 3).
-            camera: the camera; by default the scene's main camera at the start.
-            rods: the instruments.
-
-        Returns:
-            Colours, shape (height, width, 3).
-        """
+        """Draw the picture, shape (height, width, 3); arguments as for `look`."""
         picture = self.look(position, camera, rods).picture
         assert picture is not None
         return picture
@@ -101,32 +91,18 @@ class Rasterizer:
             camera: the camera; by default the scene's main camera at the start.
             rods: the instruments.
         """
-        self._sizes[uni.INSTRUMENT_COUNT] = len(rods)
-        camera = camera or self._view
-        uniforms = self._uniforms(camera, rods)
-        self._update_undistortion_map(camera)
-        picture, labels = self._backend.draw(np.ascontiguousarray(position, np.float32), uniforms, self._sizes)
-        return FrameOutputs(
-            np.ascontiguousarray(picture) if self.config.picture else None,
-            labels_of(labels, self.scene.render.size, self.config.labels) if self.config.labels else None,
-        )
-
-    def _update_undistortion_map(self, camera: View) -> None:
-        """Replace the undistortion map if the optics of the camera have changed."""
-        if not self.config.lens:
-            return
-        if camera.optics != self._optics:
+        config, camera = self.config, camera or self._view
+        if config.lens and camera.optics != self._optics:
             self._optics = camera.optics
             self._backend.set_undistortion_map(
-                undistortion_map(camera, self.config.supersample, with_steps=self.config.map_has_steps)
+                undistortion_map(camera, config.supersample, with_steps=config.map_has_steps)
             )
-
-    def _uniforms(self, camera: View, rods: Sequence[Solid]) -> NDArray[np.float32]:
-        """Return the uniforms of a view; without instruments they are cached until the camera changes."""
-        if rods or self._cached is None or self._cached[0] is not camera:
-            render, size = self.scene.render, self.scene.sheet.size
-            uniforms = uni.view_uniforms(camera, render, self.config.supersample, size, self._texture_size, rods)
-            if rods:
-                return uniforms.astype(np.float32)
-            self._cached = camera, uniforms.astype(np.float32)
-        return self._cached[1]
+        self._sizes[uni.INSTRUMENT_COUNT] = len(rods)
+        uniforms = uni.view_uniforms(camera, self.scene, rods, config.supersample, self._texture_size)
+        picture, labels = self._backend.draw(
+            np.ascontiguousarray(position, np.float32), uniforms.astype(np.float32), self._sizes
+        )
+        return FrameOutputs(
+            np.ascontiguousarray(picture) if config.picture else None,
+            labels_of(labels, self.scene.render.size, config.labels) if config.labels else None,
+        )

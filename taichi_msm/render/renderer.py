@@ -29,17 +29,11 @@ Array = NDArray[Any]
 
 
 class Shot(NamedTuple):
-    """State of the sheet and the instruments at a time, and the camera.
+    """State of the sheet and the instruments at a time, and the camera."""
 
-    Attributes:
-        positions: positions of the mass points [m], shape (rows, cols, 3).
-        view: the camera.
-        rods: the instruments.
-    """
-
-    positions: Array
+    positions: Array  # of the mass points [m], shape (rows, cols, 3)
     view: View
-    rods: Sequence[Solid] = ()
+    rods: Sequence[Solid] = ()  # the instruments
 
 
 class Renderer:
@@ -188,15 +182,12 @@ class Renderer:
 
     def _stereo(self, labels: Labels, shot: Shot) -> Stereo:
         """Return the requested labels of a stereo pair."""
-        stereo = Stereo()
-        if "disparity" in self.scene.output:
-            stereo = stereo._replace(disparity=shot.view.disparity(labels.depth))
-        if "stereo" in self.scene.output:
-            from taichi_msm.render.tracking import compute_stereo
+        disparity = shot.view.disparity(labels.depth) if "disparity" in self.scene.output else None
+        if "stereo" not in self.scene.output:
+            return Stereo(disparity)
+        from taichi_msm.render.tracking import compute_stereo
 
-            flow, occlusion = compute_stereo(self.scene, labels, *shot)
-            stereo = stereo._replace(stereo=flow, stereo_occlusion=occlusion)
-        return stereo
+        return Stereo(disparity, *compute_stereo(self.scene, labels, *shot))
 
     def _labels(self, shot: Shot, names: Collection[str]) -> Labels:
         labels = self._rasterizer(picture=False, labels=names, camera=shot.view).look(*shot).labels

@@ -17,76 +17,32 @@ the light.
 The texture is filtered with mipmaps, at 1, 1/2, 1/4, ... of its size, so that a sample of many texels is their mean.
 """
 
-from typing import Any, NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.render import uniforms as uni
-from taichi_msm.render.config import INFINITY, DrawingConfig, sample_centres, undistorted_centres
+from taichi_msm.render.config import INFINITY, dot, sample_centres, triple, undistorted_centres
 from taichi_msm.render.geometry import line_of_sight, w_at
 from taichi_msm.render.labels import label_channels
 from taichi_msm.system.runtime import ti
 
 
-class Appearance(NamedTuple):
-    """Texture, light and instruments.
-
-    Attributes:
-        config: compile-time configuration.
-        texels: levels of the texture, as returned by `pyramid`.
-        sizes: sizes and counters.
-        width, height: size of the first level [texels].
-        uniforms: constants of the view.
-        instrument_count: number of instruments.
-    """
-
-    config: DrawingConfig
-    texels: Any
-    sizes: Any
-    width: Any
-    height: Any
-    uniforms: Any
-    instrument_count: Any
-
-
-class PixelArrays(NamedTuple):
-    """Output arrays of kernel 2.
-
-    Attributes:
-        colours: colours of the pixels, as words or bytes.
-        labels: labels of all pixels, one label after the other (labels.py).
-        pixels: number of pixels.
-    """
-
-    colours: Any
-    labels: Any
-    pixels: Any
-
-
 @ti.func
-def shade(entry, left, top, map_entry, samples: ti.template(), appearance: ti.template()):
-    """Shade a tile: light the texture, then draw the mesh and the instruments.
-
-    Args:
-        map_entry: first entry of the tile in the undistortion map, with lens distortion.
-
-    Returns:
-        Red, green and blue, 0 to 255.
-    """
-    config, uniforms = ti.static((appearance.config, appearance.uniforms))
+def shade(entry, left, top, texels: ti.template(), band: ti.template()):
+    """Shade a tile: light the texture, then draw the mesh and the instruments; return the colour."""
+    config, samples, uniforms = ti.static((band.config, band.samples, band.uniforms))
     plane = ti.static(config.plane)
     depth = samples[entry + plane.depth]
     is_covered = depth < INFINITY
-    colour, slope_x, slope_y = filter_texture(entry, is_covered, samples, appearance)
+    colour, slope_x, slope_y = filter_texture(entry, is_covered, texels, band)
     if ti.static(config.headlit):
         for n in ti.static(range(3)):
             colour[n] *= samples[entry + plane.light]
-    x, y = undistorted_centres(left, top, map_entry, samples, config)
+    x, y = undistorted_centres(left, top, entry, band)
     normal = [samples[entry + (plane.normal_x + n)] for n in ti.static(range(3 * (config.tissue or config.metal)))]
     if ti.static(config.tissue):
         column, row = sample_centres(left, top, config)
-        share, gloss = light_tissue(x, y, depth, normal, slope_x, slope_y, column, row, appearance)
+        share, gloss = light_tissue(x, y, depth, normal, slope_x, slope_y, column, row, band)
         for n in ti.static(range(3)):
             colour[n] = ti.min(colour[n] * share + gloss, 255.0)
     if ti.static(config.wireframe):
@@ -105,48 +61,28 @@ def shade(entry, left, top, map_entry, samples: ti.template(), appearance: ti.te
 
 
 @ti.func
-def write_colours(
-    colour: ti.template(), row, end_row, tile, tiles_across, colours: ti.template(), config: ti.template()
-):
-    """Write the colours of a tile without supersampling.
-
-    Args:
-        colour: red, green and blue, 0 to 255.
-        row, end_row: first row of pixels of the tile; end of the rows that are written.
-        tile: column of the tile.
-        colours: colours of the picture, written.
-    """
+def write_colours(colour: ti.template(), row, end_row, tile, colours: ti.template(), band: ti.template()):
+    """Write the colours of the tile in column `tile` of tiles, without supersampling."""
     packed = ti.floor(colour[0] + 0.5) + ti.floor(colour[1] + 0.5) * 256.0 + ti.floor(colour[2] + 0.5) * 65536.0
-    width = ti.static(config.tile_width)
-    for tile_line in ti.static(range(config.tile_height)):
+    width = ti.static(band.config.tile_width)
+    for tile_line in ti.static(range(band.config.tile_height)):
         if row + tile_line < end_row:
             pixels = [ti.cast(packed[tile_line * width + n], ti.i32) for n in ti.static(range(width))]
-            if ti.static(config.writes_words):
+            word = ((row + tile_line) * band.tiles_across + tile) * 3
+            if ti.static(band.config.writes_words):
                 # Four pixels of three bytes fill three words.
-                word = ((row + tile_line) * tiles_across + tile) * 3
                 colours[word] = pixels[0] | (pixels[1] << 24)
                 colours[word + 1] = (pixels[1] >> 8) | (pixels[2] << 16)
                 colours[word + 2] = (pixels[2] >> 16) | (pixels[3] << 8)
             else:
                 for n in ti.static(range(3)):
-                    colours[((row + tile_line) * tiles_across + tile) * 3 + n] = ti.cast(
-                        (pixels[0] >> (8 * n)) & 255, ti.u8
-                    )
+                    colours[word + n] = ti.cast((pixels[0] >> (8 * n)) & 255, ti.u8)
 
 
 @ti.func
-def write_means(
-    first, row, end_row, left, right, tiles_across, width,
-    samples: ti.template(), colours: ti.template(), config: ti.template(),
-):  # fmt: skip
-    """Write the colours of pixels, each the mean of its samples.
-
-    Args:
-        first: first entry of the band in the G-buffer.
-        row, end_row: first row of pixels, and the row after the last one.
-        left, right: first column of pixels, and the column after the last one.
-        colours: colours of the picture, written.
-    """
+def write_means(row, end_row, left, right, colours: ti.template(), band: ti.template()):
+    """Write the colours of the pixels in columns `left` to `right`, each the mean of its samples."""
+    config = ti.static(band.config)
     factor, tile_width, tile_height = ti.static((config.supersample, config.tile_width, config.tile_height))
     for y in range(row, end_row):
         for x in range(left, right):
@@ -154,23 +90,17 @@ def write_means(
                 total = 0.0
                 for row_offset, column_offset in ti.static(ti.ndrange(factor, factor)):
                     line, column = (y - row) * factor + row_offset, x * factor + column_offset
-                    tile = (line // tile_height) * tiles_across + column // tile_width
+                    tile = (line // tile_height) * band.tiles_across + column // tile_width
                     lane = (line % tile_height) * tile_width + column % tile_width
-                    total += samples[first + tile * config.planes + config.plane.red + n][lane]
-                colours[(y * width + x) * 3 + n] = ti.cast(ti.cast(total / (factor * factor) + 0.5, ti.i32), ti.u8)
+                    total += band.samples[band.first + tile * config.planes + config.plane.red + n][lane]
+                pixel = y * band.sizes[uni.WIDTH] + x
+                colours[pixel * 3 + n] = ti.cast(ti.cast(total / (factor * factor) + 0.5, ti.i32), ti.u8)
 
 
 @ti.func
-def write_labels(
-    entry, left, row, end_row, width, samples: ti.template(), output: ti.template(), config: ti.template()
-):  # fmt: skip
-    """Write the labels of the pixels of a tile.
-
-    Args:
-        left: first column of pixels.
-        row, end_row: first row of pixels; end of the rows that are written.
-        output: arrays of the picture, written.
-    """
+def write_labels(entry, left, row, end_row, labels: ti.template(), band: ti.template()):
+    """Write the labels of the pixels of a tile."""
+    config, samples = ti.static((band.config, band.samples))
     plane, channels = ti.static((config.plane, label_channels(config.plane, config.labels)))
     is_covered = samples[entry + plane.depth] < INFINITY
     is_sheet = is_covered
@@ -182,80 +112,60 @@ def write_labels(
     ]
     for line in ti.static(range(config.tile_height)):
         for n in ti.static(range(config.tile_width)):
-            if row + line < end_row and left + n < width:
-                pixel = (row + line) * width + left + n
+            if row + line < end_row and left + n < band.width:
+                pixel = (row + line) * band.width + left + n
                 for channel, value in ti.static(zip(channels, values, strict=True)):
                     _, first, number, count = ti.static(channel[:4])
-                    index = first * output.pixels + count * pixel + number
-                    output.labels[index] = value[line * config.tile_width + n]
+                    index = first * band.width * band.height + count * pixel + number
+                    labels[index] = value[line * config.tile_width + n]
 
 
 @ti.func
 def resolve(
-    first, row, end_row, left, right, tiles_across, width, map_start,
-    samples: ti.template(), appearance: ti.template(), output: ti.template(),
-):  # fmt: skip
-    """Shade the samples of a band, or of a part of a band, and write its pixels.
-
-    Args:
-        first: first entry of the band in the G-buffer, at the left edge of the picture.
-        row, end_row: first row of pixels, and the row after the last one.
-        left, right: first column of pixels, and the column after the last one.
-        map_start: first entry of the band in the undistortion map, with lens distortion.
-        output: arrays of the picture, written.
-    """
-    config = ti.static(appearance.config)
+    row, end_row, left, right, texels: ti.template(), colours: ti.template(), labels: ti.template(), band: ti.template()
+):
+    """Shade the samples of the pixels in columns `left` to `right` of a band, and write the pixels."""
+    config = ti.static(band.config)
     factor, tile_width, tile_height = ti.static((config.supersample, config.tile_width, config.tile_height))
     lines = ((end_row - row) * factor + tile_height - 1) // tile_height
     for tile_row in range(lines):
         for tile in range(left * factor // tile_width, (right * factor + tile_width - 1) // tile_width):
-            entry = first + (tile_row * tiles_across + tile) * config.planes
+            entry = band.first + (tile_row * band.tiles_across + tile) * config.planes
             column, top = tile * tile_width, tile_row * tile_height
             if ti.static(len(config.labels) > 0):
-                write_labels(entry, column, row + top, end_row, width, samples, output, config)
+                write_labels(entry, column, row + top, end_row, labels, band)
             if ti.static(config.picture):
-                map_entry = map_start + (tile_row * tiles_across + tile) * config.map_planes
-                colour = shade(entry, column, row * factor + top, map_entry, samples, appearance)
+                colour = shade(entry, column, row * factor + top, texels, band)
                 if ti.static(factor == 1):
-                    write_colours(colour, row + top, end_row, tile, tiles_across, output.colours, config)
+                    write_colours(colour, row + top, end_row, tile, colours, band)
                 else:
                     for n in ti.static(range(3)):
-                        samples[entry + config.plane.red + n] = colour[n]
+                        band.samples[entry + config.plane.red + n] = colour[n]
     if ti.static(config.picture and factor > 1):
-        write_means(first, row, end_row, left, right, tiles_across, width, samples, output.colours, config)
+        write_means(row, end_row, left, right, colours, band)
 
 
 @ti.func
 def illuminate(x, y, depth, normal: ti.template(), uniforms: ti.template()):
-    """Compute the illumination of samples.
-
-    Returns:
-        N L; M V; d0 / d; the upward component of the direction of ideal reflection of V.
-    """
-    n_x, n_y, n_z = ti.static((normal[0], normal[1], normal[2]))
+    """Return N L; M V; d0 / d; and the upward component of the direction of ideal reflection of V."""
     offset_x, offset_y = line_of_sight(x, y, uniforms)
     w = w_at(depth, uniforms)
     right, up = offset_x * w, offset_y * w
-    l_x, l_y, l_z = uniforms[uni.LIGHT_X] - right, uniforms[uni.LIGHT_Y] - up, uniforms[uni.LIGHT_Z] + depth
-    v_x, v_y, v_z = right * (uniforms[uni.PINHOLE] * (-1.0)), up * (uniforms[uni.PINHOLE] * (-1.0)), w
+    light = [uniforms[uni.LIGHT_X] - right, uniforms[uni.LIGHT_Y] - up, uniforms[uni.LIGHT_Z] + depth]
+    eye = [right * (uniforms[uni.PINHOLE] * (-1.0)), up * (uniforms[uni.PINHOLE] * (-1.0)), w]
     # Scalar products before normalisation.
-    n_l = n_x * l_x + n_y * l_y + n_z * l_z
-    n_v = n_x * v_x + n_y * v_y + n_z * v_z
-    l_v = l_x * v_x + l_y * v_y + l_z * v_z
-    n_n = ti.max(n_x * n_x + n_y * n_y + n_z * n_z, 1e-30)
-    l_l = ti.max(l_x * l_x + l_y * l_y + l_z * l_z, 1e-30)
-    v_v = ti.max(v_x * v_x + v_y * v_y + v_z * v_z, 1e-30)
+    n_l, n_v, l_v = dot(normal, light), dot(normal, eye), dot(light, eye)
+    n_n, l_l, v_v = [ti.max(dot(vector, vector), 1e-30) for vector in ti.static((normal, light, eye))]
     to_n = 1.0 / n_n
     # One division for both roots.
     root_l, root_v = ti.sqrt(l_l), ti.sqrt(v_v)
     to_both = 1.0 / (root_l * root_v)
     to_l, to_v = to_both * root_v, to_both * root_l
-    cosine = n_l * ti.sqrt(to_n) * to_l
     return (
-        cosine,
+        n_l * ti.sqrt(to_n) * to_l,
         (2.0 * n_l * n_v * to_n - l_v) * to_both,
         ti.min(uniforms[uni.LIGHT_DISTANCE] * to_l, 4.0),
-        (2.0 * n_v * n_y * to_n - v_y) * to_v,
+        (2.0 * n_v * normal[1] * to_n - eye[1]) * to_v,
     )
 
 
@@ -269,56 +179,43 @@ def specular(mirror):
 
 
 @ti.func
-def light_transmission(x, y, depth, instrument_count, uniforms: ti.template(), config: ti.template()):
+def light_transmission(x, y, depth, band: ti.template()):
     """Return the share of the light that is not shaded by the instruments."""
+    uniforms = ti.static(band.uniforms)
     offset_x, offset_y = line_of_sight(x, y, uniforms)
     w = w_at(depth, uniforms)
     right, up = offset_x * w, offset_y * w
-    transmission = config.float_vector(1)
-    for index in range(instrument_count):
+    transmission = band.config.float_vector(1)
+    for index in range(band.instrument_count):
         base = uni.INSTRUMENTS + index * uni.INSTRUMENT_STRIDE
-        tip, axis = base + uni.TIP, base + uni.AXIS
-        p_x, p_y, p_z = right - uniforms[tip], up - uniforms[tip + 1], depth * (-1.0) - uniforms[tip + 2]
-        u_x, u_y, u_z = uniforms[axis], uniforms[axis + 1], uniforms[axis + 2]
-        foot = ti.max(ti.min(p_x * u_x + p_y * u_y + p_z * u_z, uniforms[base + uni.LENGTH]), 0.0)
-        f_x, f_y, f_z = p_x - u_x * foot, p_y - u_y * foot, p_z - u_z * foot
+        tip, axis = triple(uniforms, base + uni.TIP), triple(uniforms, base + uni.AXIS)
+        point = [right - tip[0], up - tip[1], depth * (-1.0) - tip[2]]
+        foot = ti.max(ti.min(dot(point, axis), uniforms[base + uni.LENGTH]), 0.0)
+        away = [point[n] - axis[n] * foot for n in ti.static(range(3))]
         square = uniforms[base + uni.RADIUS] * uniforms[base + uni.RADIUS]
-        transmission *= 1.0 - uni.SHADE * square / ti.max(f_x * f_x + f_y * f_y + f_z * f_z, square)
+        transmission *= 1.0 - uni.SHADE * square / ti.max(dot(away, away), square)
     return transmission
 
 
 @ti.func
 def apply_relief(normal: ti.template(), slope_x, slope_y, uniforms: ti.template()):
-    """Tilt normals by the relief, in place, against the gradient of the grey level.
-
-    Args:
-        slope_x, slope_y: gradient of the grey level, to the right and down [1/texel].
-    """
-    n_x, n_y, n_z = ti.static((normal[0], normal[1], normal[2]))
-    length = 1.0 / ti.max(ti.sqrt(n_x * n_x + n_y * n_y + n_z * n_z), 1e-30)
-    a = [uniforms[uni.ACROSS + k] for k in ti.static(range(3))]
-    b = [uniforms[uni.UP + k] for k in ti.static(range(3))]
-    n = [n_x * length, n_y * length, n_z * length]
+    """Tilt normals by the relief, in place, against the gradient of the grey level."""
+    length = 1.0 / ti.max(ti.sqrt(dot(normal, normal)), 1e-30)
+    a, b = triple(uniforms, uni.ACROSS), triple(uniforms, uni.UP)
+    n = [normal[k] * length for k in ti.static(range(3))]
     relief_x, relief_y = slope_x * uniforms[uni.SLOPE_X], slope_y * uniforms[uni.SLOPE_Y]
-    projection = relief_x * (a[0] * n[0] + a[1] * n[1] + a[2] * n[2]) + relief_y * (
-        b[0] * n[0] + b[1] * n[1] + b[2] * n[2]
-    )
+    projection = relief_x * dot(a, n) + relief_y * dot(b, n)
     for k in ti.static(range(3)):
         normal[k] = n[k] * (projection + 1.0) - relief_x * a[k] - relief_y * b[k]
 
 
 @ti.func
-def light_tissue(x, y, depth, normal: ti.template(), slope_x, slope_y, column, row, appearance: ti.template()):
-    """Compute the lighting of wet tissue.
+def light_tissue(x, y, depth, normal: ti.template(), slope_x, slope_y, column, row, band: ti.template()):
+    """Return the factor of the colours of wet tissue, and the gloss that is added to them, 0 to 255.
 
-    Args:
-        slope_x, slope_y: gradient of the grey level, to the right and down [1/texel].
-        column, row: column and row of the samples in the picture.
-
-    Returns:
-        The factor of the colours, and the gloss that is added to them, 0 to 255.
+    The samples are at `column` and `row` of the picture.
     """
-    config, uniforms = ti.static((appearance.config, appearance.uniforms))
+    config, uniforms = ti.static((band.config, band.uniforms))
     tilted = [normal[n] for n in ti.static(range(3))]
     if ti.static(config.relief):
         apply_relief(tilted, slope_x, slope_y, uniforms)
@@ -327,7 +224,7 @@ def light_tissue(x, y, depth, normal: ti.template(), slope_x, slope_y, column, r
     factor = uniforms[uni.AMBIENT] + (1.0 - uniforms[uni.AMBIENT]) * diffuse
     gloss = specular(mirror) * nearness * (255.0 * uniforms[uni.GLOSS])
     if ti.static(len(config.shapes) > 0):
-        transmission = light_transmission(x, y, depth, appearance.instrument_count, uniforms, config)
+        transmission = light_transmission(x, y, depth, band)
         factor, gloss = factor * transmission, gloss * transmission
     if ti.static(config.vignette):
         # The distance from the centre of the picture is in units of half its diagonal.
@@ -341,11 +238,7 @@ def light_tissue(x, y, depth, normal: ti.template(), slope_x, slope_y, column, r
 
 @ti.func
 def light_metal(x, y, depth, normal: ti.template(), uniforms: ti.template()):
-    """Compute the colour of metal, which reflects a room with a bright ceiling and a dark floor.
-
-    Returns:
-        Red, green and blue.
-    """
+    """Return the colour of metal, which reflects a room with a bright ceiling and a dark floor."""
     # Metal at or behind the light is lit as if it were in front of it.
     lit_depth = ti.max(depth, uni.METAL_NEAREST * uniforms[uni.LIGHT_DISTANCE])
     cosine, mirror, _, upward = illuminate(x, y, lit_depth, normal, uniforms)
@@ -353,11 +246,6 @@ def light_metal(x, y, depth, normal: ti.template(), uniforms: ti.template()):
     factor = uni.METAL_AMBIENT + uni.METAL_DIFFUSE * ti.max(cosine, 0.0) + uni.METAL_MIRROR * brightness * brightness
     gloss = specular(mirror) * (255.0 * uni.METAL_GLOSS)
     return [ti.min(factor * uni.METAL[n] + gloss, 255.0) for n in ti.static(range(3))]
-
-
-def pack_rgb(colours: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Pack each colour into one number, red + 256 green + 65536 blue, which f32 represents exactly."""
-    return colours.astype(np.float32) @ np.array([1, 1 << 8, 1 << 16], np.float32)
 
 
 def pyramid(texture: NDArray[np.uint8], *, minified: bool) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
@@ -368,25 +256,21 @@ def pyramid(texture: NDArray[np.uint8], *, minified: bool) -> tuple[NDArray[np.f
         minified: whether all levels are built; otherwise only the first.
 
     Returns:
-        The packed texels of all levels, row by row; and for every level its start, width and height, shape (levels, 3).
+        The texels of all levels, row by row, each red + 256 green + 65536 blue, which f32 represents exactly; and for
+        every level its start, width and height, shape (levels, 3).
     """
     level, texels, levels, first = texture, [], [], 0
     while True:
         height, width, _ = level.shape
-        texels.append(pack_rgb(level).ravel())
+        texels.append((level.astype(np.float32) @ np.array([1, 1 << 8, 1 << 16], np.float32)).ravel())
         levels.append((first, width, height))
         first += width * height
         if not minified or width == height == 1:
             return np.concatenate(texels), np.array(levels, np.int32)
-        level = downsample(level)
-
-
-def downsample(colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Average blocks of 2 x 2 texels; an odd last row or column is repeated."""
-    height, width, _ = colours.shape
-    even = np.pad(colours, ((0, height % 2), (0, width % 2), (0, 0)), "edge").astype(np.uint16)
-    sums = even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2]
-    return ((sums + 2) // 4).astype(np.uint8)
+        # The mean of 2 x 2 texels; an odd last row or column is repeated.
+        even = np.pad(level, ((0, height % 2), (0, width % 2), (0, 0)), "edge").astype(np.uint16)
+        sums = even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2]
+        level = ((sums + 2) // 4).astype(np.uint8)
 
 
 @ti.func
@@ -396,9 +280,8 @@ def to_integers(values, config: ti.template()):
 
 
 @ti.func
-def fetch_rgb(index, appearance: ti.template()):
-    """Gather the texels at some indices; return their red, green and blue."""
-    config, texels = ti.static((appearance.config, appearance.texels))
+def fetch_rgb(index, texels: ti.template(), config: ti.template()):
+    """Gather the texels at some indices; return their colours."""
     texel = config.float_vector([texels[index[lane]] for lane in ti.static(range(config.lanes))])
     blue = ti.floor(texel * (1.0 / 65536.0))
     remainder = texel - blue * 65536.0
@@ -415,7 +298,7 @@ def bilinear(upper_left, upper_right, lower_left, lower_right, u, v):
 
 
 @ti.func
-def fetch(first, width, height, x, y, appearance: ti.template()):
+def fetch(first, width, height, x, y, texels: ti.template(), config: ti.template()):
     """Filter a level of the texture bilinearly.
 
     Args:
@@ -424,9 +307,8 @@ def fetch(first, width, height, x, y, appearance: ti.template()):
         x, y: column and row in the level [texels].
 
     Returns:
-        The colour; and with a relief the gradient of the grey level, to the right and down [1/texel].
+        The colour; with a relief the gradient of the grey level, to the right and down [1/texel].
     """
-    config = ti.static(appearance.config)
     # Beyond the centres of its outermost texels the texture is constant.
     texel_x = ti.max(ti.min(x, width - 1.0), 0.0)
     texel_y = ti.max(ti.min(y, height - 1.0), 0.0)
@@ -436,8 +318,8 @@ def fetch(first, width, height, x, y, appearance: ti.template()):
     right = ti.min(left + 1, width - 1)
     upper = row * width + first
     lower = ti.min(row + 1, height - 1) * width + first
-    ul, ur = fetch_rgb(upper + left, appearance), fetch_rgb(upper + right, appearance)
-    ll, lr = fetch_rgb(lower + left, appearance), fetch_rgb(lower + right, appearance)
+    ul, ur = fetch_rgb(upper + left, texels, config), fetch_rgb(upper + right, texels, config)
+    ll, lr = fetch_rgb(lower + left, texels, config), fetch_rgb(lower + right, texels, config)
     slope_x, slope_y = u, v
     if ti.static(config.relief):
         grey_ul, grey_ur = ul[0] + ul[1] + ul[2], ur[0] + ur[1] + ur[2]
@@ -448,17 +330,17 @@ def fetch(first, width, height, x, y, appearance: ti.template()):
 
 
 @ti.func
-def filter_texture(entry, is_covered, samples: ti.template(), appearance: ti.template()):
-    """Filter the texture for the samples of a tile that show a surface, the mask `is_covered`.
-
-    Returns:
-        As for `fetch`.
-    """
-    config, sizes = ti.static((appearance.config, appearance.sizes))
+def filter_texture(entry, is_covered, texels: ti.template(), band: ti.template()):
+    """Filter the texture, as `fetch`, for the samples of a tile that show a surface, the mask `is_covered`."""
+    config, sizes, samples = ti.static((band.config, band.sizes, band.samples))
     float_vector, integer_vector, plane = ti.static((config.float_vector, config.integer_vector, config.plane))
     x = ti.select(is_covered, samples[entry + plane.texel_x], 0.0)
     y = ti.select(is_covered, samples[entry + plane.texel_y], 0.0)
-    first, width, height = integer_vector(0), integer_vector(appearance.width), integer_vector(appearance.height)
+    first, width, height = (
+        integer_vector(0),
+        integer_vector(sizes[uni.LEVELS + 1]),
+        integer_vector(sizes[uni.LEVELS + 2]),
+    )
     coarse_first, coarse_width, coarse_height = first, width, height
     texel_size, footprint, max_footprint = float_vector(1), float_vector(0), 0.0
     if ti.static(config.tissue):
@@ -485,13 +367,13 @@ def filter_texture(entry, is_covered, samples: ti.template(), appearance: ti.tem
                 level += 1
             x = (x + 0.5) / texel_size - 0.5
             y = (y + 0.5) / texel_size - 0.5
-    colour, slope_x, slope_y = fetch(first, width, height, x, y, appearance)
+    colour, slope_x, slope_y = fetch(first, width, height, x, y, texels, config)
     if ti.static(config.tissue):  # noqa: SIM102  (evaluated at compile time)
         if max_footprint > 1.0:
             x = x * 0.5 - 0.25
             y = y * 0.5 - 0.25
             coarse_colour, coarse_slope_x, coarse_slope_y = fetch(
-                coarse_first, coarse_width, coarse_height, x, y, appearance
+                coarse_first, coarse_width, coarse_height, x, y, texels, config
             )
             coarse_weight = ti.max(ti.min(ti.sqrt(footprint) / texel_size - 1.0, 1.0), 0.0)
             for n in ti.static(range(3)):

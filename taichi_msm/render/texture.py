@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError, Problem, SceneError, as_array
 from taichi_msm.images import MAX_SIDE_PX, PictureError, has_transparency, picture_size, read_rgb
 from taichi_msm.scene.scene import Scene
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
 
 
 def load_texture(scene: Scene, sha256: str | None = None) -> NDArray[np.uint8]:
@@ -29,8 +28,6 @@ def load_texture(scene: Scene, sha256: str | None = None) -> NDArray[np.uint8]:
     Raises:
         SceneError: when there is no picture, or it is invalid.
     """
-    import numpy as np
-
     if scene.image is None:
         raise SceneError(["image: no picture is named"])
     try:
@@ -38,16 +35,13 @@ def load_texture(scene: Scene, sha256: str | None = None) -> NDArray[np.uint8]:
     except PictureError as error:
         raise SceneError([f"image: {error}"]) from None
     x, y, width, height = region = scene.region or (0, 0, *image.size)
-    outside = [str(problem) for problem in _region_problems(region, image.size)]
-    if outside:
+    if outside := [str(problem) for problem in _region_problems(region, image.size)]:
         raise SceneError(outside)
     return np.array(image.crop((x, y, x + width, y + height)))
 
 
 def require_texture(texture: Any) -> NDArray[np.uint8]:
     """Return an argument as a texture, shape (height, width, 3); raise an ArgumentError if it is not one."""
-    import numpy as np
-
     picture = as_array(texture, "texture")
     is_picture = picture.dtype == np.uint8 and picture.ndim == 3 and picture.shape[2] == 3
     if not (is_picture and min(picture.shape) > 0 and max(picture.shape) <= MAX_SIDE_PX):

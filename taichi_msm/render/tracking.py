@@ -62,15 +62,8 @@ def locate_points(scene: Scene, coordinates: Array, position: Array, view: View,
 def compute_flow(scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Solid] = ()) -> Flow:
     """Compute the optical flow and the occlusion of another frame's pixels.
 
-    Args:
-        scene: the scene.
-        coordinates: coordinates in the labels of the other frame, shape (height, width, 2).
-        position: positions of the mass points in this frame [m], shape (rows, cols, 3).
-        view: the camera of this frame.
-        rods: the instruments of this frame.
-
-    Raises:
-        DeviceError: when the device ended a thread early.
+    Arguments and errors as for `locate_points`, except that `coordinates` are those in the labels of the other frame,
+    shape (height, width, 2).
     """
     shape = coordinates.shape[:2]
     moved, hidden = _track(scene, coordinates.reshape(-1, 2), position, view, rods, as_flow=True)
@@ -80,15 +73,7 @@ def compute_flow(scene: Scene, coordinates: Array, position: Array, view: View, 
 def compute_stereo(scene: Scene, labels: Labels, position: Array, view: View, rods: Sequence[Solid] = ()) -> Flow:
     """Compute the flow from a camera's picture to that of its companion at the same time, also of instruments.
 
-    Args:
-        scene: the scene.
-        labels: labels of the camera's picture.
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        view: the camera, with its companion.
-        rods: the instruments.
-
-    Raises:
-        DeviceError: when the device ended a thread early.
+    Arguments and errors as for `locate_points`, except for the labels of the camera's picture.
     """
     companion = view.companion
     assert companion is not None
@@ -110,7 +95,7 @@ def compute_stereo(scene: Scene, labels: Labels, position: Array, view: View, ro
 def _instrument_depth(scene: Scene, pixels: Array, view: View, rods: Sequence[Solid]) -> Array:
     """Return the depth of the instruments at undistorted pixels, shape (n, 2) [m]; INFINITY next to them."""
     launches = Launches(bounded=lanes("f64") == 1)
-    uniforms = uni.view_uniforms(view._replace(lens=None), scene.render, 1, scene.sheet.size, (1, 1), rods)
+    uniforms = uni.view_uniforms(view._replace(lens=None), scene, rods)
     depth = launches.array(np.float64, len(pixels))
     launches.launch(
         _ray_kernel(scene.shapes), len(pixels), launches.upload(np.ascontiguousarray(pixels).ravel()),
@@ -125,13 +110,7 @@ def _track(
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Return the pixels of points, `as_flow` relative to another frame's pixels, and their occlusion.
 
-    Args:
-        scene: the scene.
-        points: coordinates of material points, shape (n, 2); or points of instruments [m], shape (n, 3).
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        view: the camera.
-        rods: the instruments.
-        as_flow: whether the pixels are relative to those of another frame.
+    The points are coordinates of material points, shape (n, 2), or points of instruments [m], shape (n, 3).
     """
     total, is_material = len(points), points.shape[-1] == 2
     if total == 0:
@@ -145,7 +124,7 @@ def _track(
     # With bins half as wide as cells, most bins only overlap the cells around one mass point.
     bin_size = max(4, round((width * height / cells) ** 0.5 / 2))
     launches = Launches(bounded=lanes("f64") == 1)
-    uniform_values = uni.view_uniforms(undistorted, scene.render, 1, scene.sheet.size, (1, 1), rods)
+    uniform_values = uni.view_uniforms(undistorted, scene, rods)
     if view.lens is not None:
         uni.set_lens(uniform_values, view, 1, view.lens.limit)
     uniforms = launches.upload(uniform_values)
@@ -192,25 +171,20 @@ def _outline_cells(
     for index in range((sizes[uni.ROWS] - 1) * (sizes[uni.COLS] - 1)):
         cols, entry = sizes[uni.COLS], index * CELL_STRIDE
         corner = geometry.corner_entry(index, cols)
-        below = corner + cols * NODE_STRIDE
         outline = ti.static(geometry.cell_outline(corner, cols, uniforms[uni.NEAR], nodes))
         left, right, top, bottom, facing = outline.left, outline.right, outline.top, outline.bottom, outline.facing
-        corners = [
-            [nodes[corner_start + n] for n in ti.static(range(3))]
-            for corner_start in ti.static((corner, corner + NODE_STRIDE, below, below + NODE_STRIDE))
-        ]
+        corners = ti.static(geometry.corner_entries(corner, cols, NODE_STRIDE))
+        projected = [[nodes[corner_start + n] for n in ti.static(range(4))] for corner_start in corners]
         if outline.behind:
             left, right, top, bottom = 1.0, -1.0, 1.0, -1.0
         elif not outline.in_front:
             left, right, top, bottom, facing = -UNBOUNDED, UNBOUNDED, -UNBOUNDED, UNBOUNDED, 0.0
             width, height = ti.cast(sizes[uni.WIDTH], ti.f64), ti.cast(sizes[uni.HEIGHT], ti.f64)
-            if geometry.is_off_screen(corners, 0.0, width, 0.0, height):
+            if geometry.is_off_screen(projected, 0.0, width, 0.0, height):
                 left, right = 1.0, -1.0
         cell[entry + CELL_MIN_X], cell[entry + CELL_MAX_X] = left, right
         cell[entry + CELL_MIN_Y], cell[entry + CELL_MAX_Y] = top, bottom
-        cell[entry + CELL_MIN_DEPTH] = ti.min(
-            nodes[corner + 3], nodes[corner + NODE_STRIDE + 3], nodes[below + 3], nodes[below + NODE_STRIDE + 3]
-        )
+        cell[entry + CELL_MIN_DEPTH] = ti.min(projected[0][3], projected[1][3], projected[2][3], projected[3][3])
         cell[entry + CELL_FACING] = facing
         store_bounds(index, left, right, top, bottom, sizes[uni.WIDTH], sizes[uni.HEIGHT], bounds)
 
@@ -248,10 +222,7 @@ def _mark_simple_bins(
 
 @ti.func
 def _quad_depth(x, y, quad_column, quad_row, quad_side, lower, near, patch: ti.template()):
-    """Return the depth of a sub-quad of a cell at (x, y), or INFINITY.
-
-    In a cell that is not invertible, this is the depth of the triangle below the diagonal, if `lower`, or above it.
-    """
+    """Return the depth of a sub-quad of a cell at (x, y), or INFINITY."""
     triangle = ti.static(geometry.triangle_at(x, y, quad_column, quad_row, quad_side, lower, patch))
     s, t = geometry.on_triangle(x, y, triangle)
     depth = geometry.depth_at(s, t, triangle)
@@ -358,13 +329,7 @@ def _other_point(entry, points: ti.template(), _sizes: ti.template(), _subdivisi
 
 @cache
 def _kernel(lens: str, shapes: tuple[str, ...], is_material: bool) -> Callable[..., None]:
-    """Return the kernel that locates points.
-
-    Args:
-        lens: name of the lens model; empty without lens distortion.
-        shapes: names of the shapes of the instruments.
-        is_material: whether the points are material points of the sheet, otherwise points of instruments.
-    """
+    """Return the kernel that locates material points of the sheet, or points of instruments."""
     Points: Any = Floats if is_material else Doubles
     locate, stride, limit = (_material_point, 2, 2.0) if is_material else (_other_point, 4, INFINITY)
 

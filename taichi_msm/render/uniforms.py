@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from taichi_msm.model.surface import Solid
 from taichi_msm.render.camera import View
 from taichi_msm.render.lens_table import visible_region
-from taichi_msm.scene.render import Render
 from taichi_msm.scene.scene import Scene
 from taichi_msm.shapes import SHAPES
 
@@ -91,12 +90,7 @@ KINDS = {name: float(number) for number, name in enumerate(SHAPES)}
 
 
 def sizes_of(scene: Scene, levels: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Build the array of sizes; those that change from frame to frame are 0.
-
-    Args:
-        scene: the scene.
-        levels: levels of the texture, as returned by `pyramid`.
-    """
+    """Build the array of sizes, for levels from `pyramid`; those that change from frame to frame are 0."""
     sizes = np.zeros(LEVELS + levels.size, np.int32)
     sizes[[ROWS, COLS, WIDTH, HEIGHT, LEVEL_COUNT]] = *scene.sheet.points, *scene.render.size, len(levels)
     sizes[LEVELS:] = levels.flat
@@ -104,23 +98,18 @@ def sizes_of(scene: Scene, levels: NDArray[np.int32]) -> NDArray[np.int32]:
 
 
 def view_uniforms(
-    view: View,
-    render: Render,
-    factor: int,
-    sheet: tuple[float, float],
-    texture: tuple[int, int],
-    rods: Sequence[Solid],
+    view: View, scene: Scene, rods: Sequence[Solid], factor: int = 1, texture: tuple[int, int] = (1, 1)
 ) -> Array:
     """Build the array of uniforms of a view.
 
     Args:
         view: the camera.
-        render: the rendering settings.
-        factor: samples per pixel along each axis.
-        sheet: height and width of the sheet [m].
-        texture: width and height of the texture [texels].
+        scene: has the rendering settings and the size of the sheet.
         rods: the instruments.
+        factor: samples per pixel along each axis.
+        texture: width and height of the texture [texels].
     """
+    render, sheet = scene.render, scene.sheet.size
     uniforms = np.zeros(INSTRUMENTS + len(rods) * INSTRUMENT_STRIDE)
     uniforms[MATRIX:AXES] = (view.matrix * np.array([[factor], [factor], [1], [1]])).ravel()
     uniforms[AXES:NEAR] = view.axes.ravel()
@@ -153,14 +142,7 @@ def view_uniforms(
 
 
 def set_lens(uniforms: Array, view: View, factor: int, radius: float) -> None:
-    """Set the uniforms of a lens.
-
-    Args:
-        uniforms: constants of the view, updated.
-        view: camera with lens distortion.
-        factor: samples per pixel along each axis.
-        radius: limit of the lens, or largest visible radius, at w = 1 [m].
-    """
+    """Set the uniforms of a lens; `radius` is its limit, or the largest visible radius, at w = 1 [m]."""
     assert view.lens is not None
     uniforms[LENS : LENS + len(view.lens.coefficients)] = view.lens.coefficients
     uniforms[LENS_RADIUS] = radius

@@ -71,12 +71,7 @@ def read_rows(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, row_shape: 
 
 
 def map_array(path: Path, name: str, dtype: DTypeLike, shape: Shape) -> NDArray[Any]:
-    """Map an array of the expected dtype and shape, not empty, into memory, and verify its CRC-32.
-
-    Raises:
-        ValueError: when dtype, shape or checksum differ.
-        Exception: as for `read_array`.
-    """
+    """Map an array, not empty, into memory; otherwise as `read_array`."""
     header = _header(dtype, shape)
     with path.open("rb") as file, zipfile.ZipFile(file) as archive:
         info = _entry(archive, name, dtype, shape)
@@ -116,17 +111,9 @@ def write_flo(file: BinaryIO, flow: NDArray[np.float32]) -> None:
 
 
 def read_flo(path: Path, size: tuple[int, int]) -> NDArray[np.float32]:
-    """Read optical flow from a .flo file.
+    """Read optical flow to the right and down [px], shape (height, width, 2), read-only.
 
-    Args:
-        path: path of the file.
-        size: expected width and height [px].
-
-    Returns:
-        Flow to the right and down [px], shape (height, width, 2), read-only.
-
-    Raises:
-        ValueError: when the file does not contain flow of this size.
+    Raises a ValueError when the file does not contain flow of the given width and height [px].
     """
     width, height = size
     header, length = _flo_header(width, height), 8 * width * height

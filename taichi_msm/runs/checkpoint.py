@@ -1,64 +1,181 @@
 """Checkpoint of an unfinished run, from which another process can continue it.
 
-A checkpoint is a folder with the manifest of the run, the positions and, if requested, the forces of every frame, and
-the last saved state of the solver. Each part has a checksum, which is verified before the part is used: SHA-256 for the
-manifest and for each frame, CRC-32 for the state. Contents are also validated, because the folder may be untrusted.
+A checkpoint is a folder with two files: `state.npz` has the manifest of the run, which contains all inputs on which its
+results depend, and the last saved state of the solver; `frames` has positions and forces of every frame. The CRC-32 of
+each part is verified before the part is used. Contents are also validated, because the folder may be untrusted.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
-import math
 import os
-import re
+import shutil
 import time
 import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
-from dataclasses import asdict, fields
+from contextlib import suppress
+from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, cast
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 
-from taichi_msm.errors import DamagedError, FilesError, ForeignError
+from taichi_msm.accuracy.mesh import MeshEstimate
+from taichi_msm.accuracy.time_step import TimeStepEstimate
+from taichi_msm.errors import DamagedError, FilesError, ForeignError, SceneError
+from taichi_msm.images import PictureError, file_sha256
 from taichi_msm.model.plan import Plan
-from taichi_msm.runs.arrays import read_array, write_arrays
-from taichi_msm.runs.directory import (
-    DRAFT_FILE,
-    FILE,
-    FOLDER,
-    HIDDEN_FOLDER_PATTERN,
-    LOCK_FILE,
-    STAGING_FOLDER,
-    clear_folder,
-    create_file,
-    replacing,
-    require_kind,
-)
+from taichi_msm.render.camera import camera_problems
+from taichi_msm.runs.arrays import read_array, read_rows, write_arrays
+from taichi_msm.runs.directory import FILE, FOLDER, STAGING_FOLDER, create_file, require_kind
+from taichi_msm.scene.scene import Scene
+from taichi_msm.solver.planning import try_plan
 from taichi_msm.solver.state import PeakForce, ProbeForces, RunProgress, Snapshot, State, TipForce
+from taichi_msm.system.compiler import result_versions
+from taichi_msm.system.runtime import ARCHS
 from taichi_msm.terms import memory_names
 
-# A folder without the manifest is not a checkpoint.
-CHECKPOINT_FOLDER, MANIFEST_FILE, POSITIONS_FILE, FORCES_FILE, STATE_FILE = (
-    "checkpoint",
-    "manifest.json",
-    "positions",
-    "forces",
-    "state.npz",
-)
+# A folder without the state file is not a checkpoint.
+CHECKPOINT_FOLDER, STATE_FILE, FRAMES_FILE = "checkpoint", "state.npz", "frames"
 CHECKPOINT_PATTERNS = (
-    *(re.escape(name) for name in (MANIFEST_FILE, POSITIONS_FILE, FORCES_FILE, STATE_FILE)),
-    *(f"{HIDDEN_FOLDER_PATTERN}/{name}" for name in (LOCK_FILE, DRAFT_FILE)),
+    r"(?:state\.npz|state\.new|frames)",
+    r"(?:manifest\.json|positions|forces)",  # of earlier versions
 )
+
+# A manifest contains the scene twice; a scene file may have 1 MiB.
+MAX_MANIFEST_BYTES = 1 << 26
 
 # Upper bound of the time spent on saving states, as a fraction of the run's time.
 MAX_SAVE_TIME_FRACTION = 0.02
 
 # Numbers of a `TipForce`, tip and force, and of a `PeakForce`, time and force.
 FORCE_COLUMNS, PEAK_FORCE_COLUMNS = 6, 4
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """Inputs of a run."""
+
+    given: Scene  # as loaded
+    scene: Scene  # with resolved mesh, step and precision
+    overrides: tuple[str, ...]  # of the scene file
+    estimate: TimeStepEstimate | None  # time-step error, if `time.tolerance` required it before the run
+    mesh: MeshEstimate | None  # mesh error, if `sheet.tolerance` required it before the run
+    asks_estimate: bool | None  # whether to estimate the error during the run; None if it is cheap
+    folder: str  # the current directory, to which picture paths are relative
+    arch: str  # cpu, cuda or vulkan
+    sha256: Mapping[str, str]  # of the files of picture, maps and cameras, by their keys in the scene
+    versions: Mapping[str, str]  # of all software that affects the results
+
+    def as_json(self) -> dict[str, Any]:
+        """Convert the manifest to data for JSON."""
+        return cast(dict[str, Any], _MANIFEST_ADAPTER.dump_python(self, mode="json"))
+
+    def require_same_inputs(self, sha256: Mapping[str, str], versions: Mapping[str, str]) -> None:
+        """Raise a FilesError if a file or a version has changed, so that resuming might not yield the same bits.
+
+        Args:
+            sha256: current digests of picture, maps and cameras, from `input_digests`.
+            versions: current versions.
+        """
+        for key, path in self.scene.pictures.items():
+            if sha256.get(key) != self.sha256.get(key):
+                raise FilesError(f"{path} has changed since the run began; put it back, or run the scene again")
+        original, current = result_versions(self.versions, self.arch), result_versions(versions, self.arch)
+        if original != current:
+            # If the run began with a tested compiler, and the current one is untested, only the latter is compared.
+            changed = any(version != current.get(name) for name, version in original.items())
+            named = original if changed else self.versions
+            others = [f"{name} {version}" for name, version in named.items() if version != versions.get(name)]
+            raise FilesError(f"the run began with {', '.join(others)}; use these versions, or run the scene again")
+
+    def has_same_bits_as(self, other: Manifest) -> bool:
+        """Return whether both runs produce results with the same bits, so that one can continue the other."""
+        return self._result_inputs() == other._result_inputs()
+
+    def _result_inputs(self) -> tuple[Any, ...]:
+        # Pictures are compared by digest, not by path.
+        scene = self.scene.with_pictures(lambda path: "any")
+        # The order of the cameras matters, because the light is at the first one; dictionaries compare without order.
+        cameras = list(scene.render.all_cameras)
+        return scene, cameras, self.arch, self.sha256, result_versions(self.versions, self.arch)
+
+
+_MANIFEST_ADAPTER = TypeAdapter(Manifest)
+
+
+def read_manifest(directory: Path) -> tuple[Manifest, Plan]:
+    """Read the manifest of the unfinished run in a directory, and plan its scene.
+
+    Raises:
+        DamagedError: when the manifest is damaged or its scene cannot be run.
+        FilesError: when there is no unfinished run.
+        SceneError: when a map of the scene cannot be read.
+    """
+    path = directory / STAGING_FOLDER / CHECKPOINT_FOLDER / STATE_FILE
+    try:
+        file = _open_state(directory)
+    except (FileNotFoundError, NotADirectoryError):
+        raise FilesError(f"{directory}: there is no unfinished run to resume") from None
+    except OSError as error:
+        raise FilesError(f"{path}: {(error.strerror or str(error)).lower()}") from None
+    try:
+        with file, zipfile.ZipFile(file) as archive:
+            manifest = _MANIFEST_ADAPTER.validate_python(json.loads(_manifest_bytes(archive)))
+        # The current directory may be another one.
+        manifest = replace(manifest, scene=manifest.scene.with_pictures(partial(os.path.join, manifest.folder)))
+    except Exception:  # zipfile raises almost any type for a forged archive
+        raise _damaged(path) from None
+    plan, problems = try_plan(manifest.scene)
+    if unreadable := [str(problem) for problem in problems if problem.path[-1:] == ("image",)]:
+        raise SceneError(unreadable)
+    numbers = () if manifest.estimate is None else asdict(manifest.estimate).values()
+    possible = manifest.arch in ARCHS and all(number >= 0 for number in numbers)
+    if plan is None or problems or not possible or list(camera_problems(manifest.scene)):
+        raise DamagedError(f"{path} is of a scene that cannot be run; run the scene again")
+    return manifest, plan
+
+
+def is_unfinished(directory: Path) -> bool:
+    """Return whether a directory has an unfinished run that can be continued."""
+    try:
+        _open_state(directory).close()
+    except (OSError, FilesError):
+        return False
+    return True
+
+
+def input_digests(plan: Plan) -> dict[str, str]:
+    """Compute the SHA-256 of the files of picture, maps and cameras, by their keys in the scene.
+
+    An unreadable picture is omitted. Digests of maps and cameras are those of the files as read for the plan.
+    """
+    scene = plan.scene
+    sha256 = {**plan.sha256} | {f"{scene.kind}.{name}.image": image.sha256 for name, image in plan.maps.items()}
+    if scene.image is not None:
+        with suppress(PictureError):
+            sha256["image"] = file_sha256(scene.image)
+    return sha256
+
+
+def _open_state(directory: Path) -> BinaryIO:
+    """Open the state of the unfinished run in a directory; raise an OSError or a ForeignError without one."""
+    checkpoint = require_kind(require_kind(directory / STAGING_FOLDER, FOLDER) / CHECKPOINT_FOLDER, FOLDER)
+    return require_kind(checkpoint / STATE_FILE, FILE).open("rb")
+
+
+def _manifest_bytes(archive: zipfile.ZipFile) -> bytes:
+    if archive.getinfo("manifest.npy").file_size > MAX_MANIFEST_BYTES:
+        raise ValueError("too large")
+    return read_rows(archive, "manifest", np.uint8, ()).tobytes()
+
+
+def _damaged(path: Path) -> DamagedError:
+    return DamagedError(f"{path} is damaged; run the scene again")
 
 
 class Checkpoint:
@@ -77,20 +194,16 @@ class Checkpoint:
     """
 
     def __init__(self, folder: Path, plan: Plan) -> None:
-        scene, grid = plan.scene, plan.grid
+        scene = plan.scene
         self.frames = 0
-        self._folder = folder
-        self._grid = grid
-        self._shape, self._probes = (*scene.sheet.points, 3), len(scene.probes)
-        self._memory_shape = (len(memory_names(plan)), *scene.sheet.points)
-        self.precision = np.dtype(np.float32 if grid.precision == "f32" else np.float64)
-        self._next_save = 0.0
-        # Checksums of all parts include this digest, so that parts of different runs do not mix.
-        self._manifest_digest = b""
-        self._positions = ArrayFile(folder / POSITIONS_FILE, self._shape, self.precision)
-        self._forces = ArrayFile(folder / FORCES_FILE, (self._probes, FORCE_COLUMNS), np.float64)
-        self._array_files = [self._positions] if scene.output else []
-        self._array_files += [self._forces] if scene.asks_for("forces") else []
+        self.precision = np.dtype(np.float32 if plan.grid.precision == "f32" else np.float64)
+        self._plan, self._state_path, self._frames_path = plan, folder / STATE_FILE, folder / FRAMES_FILE
+        self._next_save, self._manifest = 0.0, b""
+        self._file: BinaryIO | None = None  # without outputs, the frames are not needed
+        self._stored_probes = len(scene.probes) if scene.asks_for("forces") else 0
+        position = "position", self.precision, (*scene.sheet.points, 3)
+        forces = "forces", np.float64, (self._stored_probes, FORCE_COLUMNS)
+        self._record = np.dtype([("checksum", np.int64), position, forces])
 
     @property
     def is_save_due(self) -> bool:
@@ -100,147 +213,135 @@ class Checkpoint:
     def begin(self, manifest: Mapping[str, Any]) -> None:
         """Begin the checkpoint of a new run in place of an earlier one."""
         self.close()
-        self._folder.mkdir(exist_ok=True)
         self.invalidate()
-        clear_folder(self._folder, CHECKPOINT_PATTERNS)
-        data = dump_with_checksum(manifest)
-        self._manifest_digest = sha256_digest(data)
-        for array_file in self._array_files:
-            array_file.begin(self._manifest_digest)
-        with replacing(self._folder / MANIFEST_FILE) as file:
-            file.write(data)
+        folder = self._state_path.parent
+        if folder.exists():
+            shutil.rmtree(folder)
+        folder.mkdir()
+        self._manifest = json.dumps(manifest).encode()
+        if self._plan.scene.output:
+            # Unbuffered, so that stored frames survive when the process is killed.
+            self._file = create_file(self._frames_path, buffering=0)
+        self._write_state({})
 
     def invalidate(self) -> None:
-        """Delete the manifest, so that the remaining files no longer count as a checkpoint."""
-        (self._folder / MANIFEST_FILE).unlink(missing_ok=True)
+        """Delete the state, so that the remaining file no longer counts as a checkpoint."""
+        self._state_path.unlink(missing_ok=True)
 
     def reopen(self) -> Snapshot | None:
-        """Open the checkpoint of an earlier run to continue it.
-
-        Returns:
-            The last saved state; None when the run continues from its first frame.
-        """
+        """Open the checkpoint of an earlier run; return its last saved state, None to continue from the first frame."""
         self.close()
-        try:
-            self._manifest_digest = sha256_digest((self._folder / MANIFEST_FILE).read_bytes())
-            for array_file in self._array_files:
-                array_file.reopen(self._manifest_digest)
-        except FileNotFoundError as error:
-            raise damaged_checkpoint(self._folder / Path(error.filename).name) from None
         saved = self.load()
-        frames = 0 if saved is None else saved.progress.frame + 1
-        for array_file in self._array_files:
-            array_file.require_length(frames)
-        self.frames = frames
+        self.frames = 0 if saved is None else saved.progress.frame + 1
+        if self._plan.scene.output:
+            try:
+                self._file = self._frames_path.open("r+b", buffering=0)
+            except FileNotFoundError:
+                raise _damaged(self._frames_path) from None
+            status = os.fstat(self._file.fileno())
+            if status.st_nlink > 1:
+                raise ForeignError.at(self._frames_path, "a file that has other names")
+            if status.st_size < self.frames * self._record.itemsize:
+                raise _damaged(self._frames_path)
         return saved
 
     def add(self, position: NDArray[Any], forces: Sequence[TipForce]) -> None:
-        """Store the next frame.
-
-        Args:
-            position: positions of the mass points [m], shape (rows, cols, 3).
-            forces: the force of every probe.
-        """
-        for array_file, values in ((self._positions, position), (self._forces, _tip_force_array(forces))):
-            if array_file in self._array_files:
-                array_file.write(self.frames, values)
+        """Store the next frame: positions of the mass points [m], shape (rows, cols, 3), and forces of all probes."""
+        if self._file:
+            parts = np.ascontiguousarray(position, self.precision), _tip_force_array(forces)[: self._stored_probes]
+            self._file.seek(self.frames * self._record.itemsize)
+            for part in (np.array(self._checksum(self.frames, *parts)), *parts):
+                remaining = part.reshape(-1).view(np.uint8).data
+                while remaining:  # a write to an unbuffered file may be partial
+                    remaining = remaining[self._file.write(remaining) :]
         self.frames += 1
 
     def read_positions(self, frame: int) -> NDArray[Any]:
         """Read the positions of the mass points in a frame [m], shape (rows, cols, 3)."""
-        return self._positions.read(frame)
+        return self._read(frame)[0]
 
     def read_forces(self, frame: int) -> tuple[TipForce, ...]:
         """Read the force of every probe in a frame; only for scenes that output forces."""
-        return _tip_forces(self._forces.read(frame))
+        return _tip_forces(self._read(frame)[1])
 
     def save(self, saved: Snapshot) -> str:
         """Save a state in place of the previous one; all frames up to it must be stored.
 
-        Returns:
-            Path of the archive, which contains the fields of `State` and `RunProgress` by name.
+        Returns the path of the archive, which contains the fields of `State` and `RunProgress` by name.
         """
         start = time.perf_counter()
-        path = self._folder / STATE_FILE
-        with replacing(path) as file:
-            write_arrays(file, self._arrays(saved))
+        self._write_state(_state_arrays(saved))
         now = time.perf_counter()
         self._next_save = now + (now - start) / MAX_SAVE_TIME_FRACTION
-        return str(path)
+        return str(self._state_path)
 
     def load(self) -> Snapshot | None:
         """Read the last saved state; None if there is none."""
-        empty = self._arrays(Snapshot(State(0, np.empty(0), np.empty(0)), RunProgress(), ProbeForces((), ())))
-        types = {name: (array.dtype, array.shape) for name, array in empty.items()}
-        types["forces"] = types["forces"][0], (self._probes, FORCE_COLUMNS)
-        types["greatest"] = types["greatest"][0], (self._probes, PEAK_FORCE_COLUMNS)
-        types |= dict.fromkeys(("displacement", "difference"), (self.precision, self._shape))
-        types["memory"] = self.precision, self._memory_shape
+        scene, grid, zero = self._plan.scene, self._plan.grid, (0.0, 0.0, 0.0)
+        position = np.empty((*scene.sheet.points, 3), self.precision)
+        memory = np.empty((len(memory_names(self._plan)), *scene.sheet.points), self.precision)
+        felt = ProbeForces((TipForce(0, zero, zero),) * len(scene.probes), (PeakForce(0, zero),) * len(scene.probes))
+        expected = _state_arrays(Snapshot(State(0, position, position, memory), RunProgress(), felt))
         try:
-            with (self._folder / STATE_FILE).open("rb") as file, zipfile.ZipFile(file) as archive:
-                arrays = {name: read_array(archive, name, *expected) for name, expected in types.items()}
+            with self._state_path.open("rb") as file, zipfile.ZipFile(file) as archive:
+                self._manifest = _manifest_bytes(archive)
+                if len(archive.namelist()) == 1:
+                    return None
+                arrays = {name: read_array(archive, name, each.dtype, each.shape) for name, each in expected.items()}
         except FileNotFoundError:
             return None
         except Exception:  # zipfile raises almost any type for a forged archive
-            raise damaged_checkpoint(self._folder / STATE_FILE) from None
+            raise _damaged(self._state_path) from None
         progress = RunProgress(**{field.name: arrays[field.name].item() for field in fields(RunProgress)})
         state = State(int(arrays["steps"]), arrays["displacement"], arrays["difference"], arrays["memory"])
         greatest = tuple(PeakForce(time, (x, y, z)) for time, x, y, z in arrays["greatest"].tolist())
-        saved = Snapshot(state, progress, ProbeForces(_tip_forces(arrays["forces"]), greatest))
-        steps_per_frame = self._grid.steps_per_frame
         if not (
-            progress.frame <= self._grid.frames
-            and progress.frame * steps_per_frame <= saved.state.steps <= (progress.frame + 1) * steps_per_frame
+            progress.frame <= grid.frames
+            and 0 <= state.steps - progress.frame * grid.steps_per_frame <= grid.steps_per_frame
             and all(np.isfinite(array).all() for array in arrays.values())
             and all(value >= 0 for value in asdict(progress).values())
-            and arrays["manifest"].tobytes() == self._manifest_digest
         ):
-            raise damaged_checkpoint(self._folder / STATE_FILE)
-        return saved
+            raise _damaged(self._state_path)
+        return Snapshot(state, progress, ProbeForces(_tip_forces(arrays["forces"]), greatest))
 
     def close(self) -> None:
-        """Close the files."""
-        for array_file in self._array_files:
-            array_file.close()
+        """Close the file."""
+        if self._file:
+            self._file.close()
 
-    def _arrays(self, saved: Snapshot) -> dict[str, NDArray[Any]]:
-        """Convert a state, its progress and the manifest's digest to arrays by name."""
-        greatest = np.array([(peak.time, *peak.force) for peak in saved.felt.greatest]).reshape(-1, PEAK_FORCE_COLUMNS)
-        forces = {"forces": _tip_force_array(saved.felt.forces), "greatest": greatest}
-        named = {**saved.state._asdict(), **asdict(saved.progress), **forces}
-        named["manifest"] = np.frombuffer(self._manifest_digest, np.uint8)
-        return {name: np.asarray(value) for name, value in named.items()}
+    def _write_state(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        draft = self._state_path.with_suffix(".new")
+        draft.unlink(missing_ok=True)
+        with create_file(draft) as file:
+            write_arrays(file, {"manifest": np.frombuffer(self._manifest, np.uint8), **arrays})
+        draft.replace(self._state_path)
 
+    def _read(self, frame: int) -> tuple[NDArray[Any], NDArray[np.float64]]:
+        """Read positions and forces of a frame; raise a DamagedError unless they are finite and their checksum fits."""
+        assert self._file
+        self._file.seek(frame * self._record.itemsize)
+        records = np.fromfile(self._file, self._record, 1)
+        if len(records) == 1:
+            position, forces = records["position"][0], records["forces"][0]
+            is_sound = records["checksum"][0] == self._checksum(frame, position, forces)
+            if is_sound and np.isfinite(position).all() and np.isfinite(forces).all():
+                return position, forces
+        raise _damaged(self._frames_path)
 
-def open_manifest(directory: Path) -> BinaryIO:
-    """Open the manifest of the unfinished run in a directory; raise an OSError or a ForeignError without one."""
-    checkpoint = require_kind(require_kind(directory / STAGING_FOLDER, FOLDER) / CHECKPOINT_FOLDER, FOLDER)
-    return require_kind(checkpoint / MANIFEST_FILE, FILE).open("rb")
-
-
-def is_unfinished(directory: Path) -> bool:
-    """Return whether a directory has an unfinished run that can be continued."""
-    try:
-        open_manifest(directory).close()
-    except (OSError, FilesError):
-        return False
-    return True
-
-
-def dump_with_checksum(content: Any) -> bytes:
-    """Serialise a value as JSON with its SHA-256."""
-    return json.dumps({"sha256": sha256_digest(json.dumps(content).encode()).hex(), "content": content}).encode()
+    def _checksum(self, frame: int, *parts: NDArray[Any]) -> int:
+        """Compute the CRC-32 of a frame, its index and the manifest, so that parts of different runs do not mix."""
+        checksum = zlib.crc32(frame.to_bytes(8, "little"), zlib.crc32(self._manifest))
+        for part in parts:
+            checksum = zlib.crc32(part.data, checksum)
+        return checksum
 
 
-def load_with_checksum(data: bytes) -> Any:
-    """Parse the output of `dump_with_checksum`; raise a ValueError when any byte of it has changed."""
-    try:
-        content = json.loads(data)["content"]
-        if dump_with_checksum(content) == data:
-            return content
-    except (KeyError, TypeError, RecursionError):
-        pass
-    raise ValueError("damaged")
+def _state_arrays(saved: Snapshot) -> dict[str, NDArray[Any]]:
+    """Convert a state and its progress to arrays by name."""
+    greatest = np.array([(peak.time, *peak.force) for peak in saved.felt.greatest]).reshape(-1, PEAK_FORCE_COLUMNS)
+    forces = {"forces": _tip_force_array(saved.felt.forces), "greatest": greatest}
+    named = {**saved.state._asdict(), **asdict(saved.progress), **forces}
+    return {name: np.asarray(value) for name, value in named.items()}
 
 
 def _tip_force_array(forces: Sequence[TipForce]) -> NDArray[np.float64]:
@@ -249,87 +350,3 @@ def _tip_force_array(forces: Sequence[TipForce]) -> NDArray[np.float64]:
 
 def _tip_forces(numbers: NDArray[np.float64]) -> tuple[TipForce, ...]:
     return tuple(TipForce(n, (x, y, z), (a, b, c)) for n, (x, y, z, a, b, c) in enumerate(numbers.tolist()))
-
-
-DIGEST_BYTES = 32
-
-
-class ArrayFile:
-    """Growing file of arrays of equal shape and dtype, one per frame.
-
-    Each array has a SHA-256 that also covers its index and the digest of the run's manifest.
-    """
-
-    def __init__(self, path: Path, shape: tuple[int, ...], dtype: Any) -> None:
-        self._path, self._shape, self._dtype = path, shape, np.dtype(dtype)
-        self._size = DIGEST_BYTES + math.prod(shape) * self._dtype.itemsize
-        self._manifest_digest = b""
-        self._file: BinaryIO
-        self._open = ExitStack()
-
-    def begin(self, manifest_digest: bytes) -> None:
-        """Create the file for a new run."""
-        # Unbuffered, so that stored frames survive when the process is killed.
-        self._manifest_digest, self._file = (
-            manifest_digest,
-            self._open.enter_context(create_file(self._path, buffering=0)),
-        )
-
-    def reopen(self, manifest_digest: bytes) -> None:
-        """Open the file of an earlier run; raise a FileNotFoundError when it is missing."""
-        self._manifest_digest, self._file = (
-            manifest_digest,
-            self._open.enter_context(self._path.open("r+b", buffering=0)),
-        )
-        if os.fstat(self._file.fileno()).st_nlink > 1:
-            raise ForeignError.at(self._path, "a file that has other names")
-
-    def require_length(self, count: int) -> None:
-        """Raise a DamagedError if the file has fewer than `count` arrays."""
-        if os.fstat(self._file.fileno()).st_size < count * self._size:
-            raise damaged_checkpoint(self._path)
-
-    def write(self, index: int, values: NDArray[Any]) -> None:
-        """Write an array at an index, in place of an earlier one."""
-        data = np.ascontiguousarray(values, self._dtype).reshape(-1).view(np.uint8).data
-        self._file.seek(index * self._size)
-        for remaining in (memoryview(self._digest(index, data)), data):
-            while remaining:  # A write to an unbuffered file may be partial.
-                remaining = remaining[self._file.write(remaining) :]
-
-    def read(self, index: int) -> NDArray[Any]:
-        """Read the array at an index; raise a DamagedError if its checksum differs or it is not finite."""
-        record = np.empty(self._size, np.uint8)
-        self._file.seek(index * self._size)
-        remaining = record.data
-        while remaining and (count := self._file.readinto(remaining)):  # type: ignore[attr-defined]
-            remaining = remaining[count:]
-        data = record[DIGEST_BYTES:]
-        values = data.view(self._dtype).reshape(self._shape)
-        if (
-            remaining
-            or record[:DIGEST_BYTES].tobytes() != self._digest(index, data.data)
-            or not np.isfinite(values).all()
-        ):
-            raise damaged_checkpoint(self._path)
-        return values
-
-    def close(self) -> None:
-        """Close the file."""
-        self._open.close()
-
-    def _digest(self, index: int, data: memoryview) -> bytes:
-        return sha256_digest(self._manifest_digest, index.to_bytes(8, "little"), data)
-
-
-def damaged_checkpoint(path: Path) -> DamagedError:
-    """Build the error for a damaged part of a checkpoint."""
-    return DamagedError(f"{path} is damaged; run the scene again")
-
-
-def sha256_digest(*parts: bytes | memoryview) -> bytes:
-    """Compute the SHA-256 of concatenated bytes."""
-    sha256 = hashlib.sha256()
-    for part in parts:
-        sha256.update(part)
-    return sha256.digest()

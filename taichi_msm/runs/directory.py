@@ -56,16 +56,16 @@ class Publication:
     Args:
         directory: destination; created if missing.
         spec: kind of the publication.
-        names: names of all files that may be published; checked at entry for conflicts with foreign files.
+        names: names of all files that may be published; checked for conflicts with foreign files.
 
     Raises:
-        FilesError: at entry and in `publish`, when another process publishes to the directory, or a foreign file is at
+        FilesError: here and in `publish`, when another process publishes to the directory, or a foreign file is at
             the path of a result.
         OSError: when the directory cannot be written.
 
     Attributes:
         staging_folder: folder for unpublished files.
-        new_folder: folder for the new files under their final names; created at entry.
+        new_folder: folder for the new files under their final names.
         keep_companion: whether the companion folder is kept at exit.
     """
 
@@ -73,18 +73,30 @@ class Publication:
         self.staging_folder = directory / STAGING_FOLDER
         self.new_folder = self.staging_folder / NEW_FOLDER
         self.keep_companion = True
-        self._directory = directory
-        self._spec = spec
-        self._names = names
-        self._record = directory / spec.record
+        self._directory, self._spec, self._record = directory, spec, directory / spec.record
         self._companion, inner = spec.companion or ("", ())
         self._patterns = [
             *(rf"{folder}/{pattern}" for folder in (NEW_FOLDER, READY_FOLDER) for pattern in spec.patterns),
             *(rf"{self._companion}/{pattern}" for pattern in inner),
             *(LOCK_FILE, re.escape(PREVIOUS_RECORD)),
         ]
-        self._lock: BinaryIO
-        self._open = ExitStack()
+        with ExitStack() as opened:
+            opened.enter_context(ensured_folder(directory))
+            try:
+                self._lock = self._acquire(opened)
+            except BlockingIOError:
+                fault = f"another {spec.name} is writing there; choose another --out"
+                raise FilesError(f"{directory}: {fault}") from None
+            self._complete()
+            self._clear()
+            earlier = self._listed_results(self._record)
+            if spec.exclusive:
+                for name in list_files(directory, spec.patterns, strict=True, ignored=(STAGING_FOLDER,)):
+                    if name not in earlier:
+                        raise ForeignError.at(directory / name, FILE)
+            self._require_free(names, earlier)
+            self.new_folder.mkdir()
+            self._open = opened.pop_all()
 
     @property
     def lock_descriptors(self) -> tuple[int, ...]:
@@ -101,23 +113,6 @@ class Publication:
         self._complete()
 
     def __enter__(self) -> Publication:
-        with ExitStack() as opened:
-            opened.enter_context(ensured_folder(self._directory))
-            try:
-                opened.enter_context(self._acquire())
-            except BlockingIOError:
-                fault = f"another {self._spec.name} is writing there; choose another --out"
-                raise FilesError(f"{self._directory}: {fault}") from None
-            self._complete()
-            self._clear()
-            earlier = self._listed_results(self._record)
-            if self._spec.exclusive:
-                for name in list_files(self._directory, self._spec.patterns, strict=True, ignored=(STAGING_FOLDER,)):
-                    if name not in earlier:
-                        raise ForeignError.at(self._directory / name, FILE)
-            self._require_free(self._names, earlier)
-            self.new_folder.mkdir()
-            self._open = opened.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -150,9 +145,7 @@ class Publication:
         for folder in sorted(parent_folders(names)):
             # Checked here, so that it fails before the run and not during the moves.
             path = require_kind(self._directory / folder, FOLDER)
-            if entry_kind(path) is None:
-                continue
-            if not os.access(path, os.W_OK):
+            if entry_kind(path) is not None and not os.access(path, os.W_OK):
                 raise PermissionError(errno.EACCES, f"{folder} is not a writable directory")
         for name in names:
             actual = entry_kind(self._directory / name)
@@ -191,23 +184,30 @@ class Publication:
 
     def _clear(self) -> None:
         """Delete the contents of the staging folder except for the lock and a kept companion."""
+        list(list_files(self.staging_folder, self._patterns, strict=True))  # raises an error for foreign files
         keep = (LOCK_FILE, self._companion) if self.keep_companion else (LOCK_FILE,)
-        clear_folder(self.staging_folder, self._patterns, keep)
+        for path in [path for path in self.staging_folder.iterdir() if path.name not in keep]:
+            if entry_kind(path) == FOLDER:
+                shutil.rmtree(path)
+            else:
+                path.unlink()
 
-    def _acquire(self) -> ExitStack:
+    def _acquire(self, opened: ExitStack) -> BinaryIO:
         """Create the staging folder, and lock it until all processes with the lock's descriptor have ended."""
+        path = self.staging_folder / LOCK_FILE
         # An ending run may delete the folder before the lock is opened or acquired.
         for _ in range(100):
-            with suppress(FileNotFoundError), ExitStack() as opened:
+            with suppress(FileNotFoundError), ExitStack() as attempt:
                 with suppress(FileExistsError):
                     self.staging_folder.mkdir()
                 # Raise an error for foreign files before anything is written.
                 list(list_files(require_kind(self.staging_folder, FOLDER), self._patterns, strict=True))
-                opened.callback(_try_to_remove, self.staging_folder.rmdir)
-                self._lock = opened.enter_context(lock_file(self.staging_folder / LOCK_FILE))
-                if os.path.samestat(os.fstat(self._lock.fileno()), (self.staging_folder / LOCK_FILE).lstat()):
-                    opened.callback(_try_to_remove, (self.staging_folder / LOCK_FILE).unlink)
-                    return opened.pop_all()
+                attempt.callback(_try_to_remove, self.staging_folder.rmdir)
+                lock = attempt.enter_context(lock_file(path))
+                if os.path.samestat(os.fstat(lock.fileno()), path.lstat()):
+                    attempt.callback(_try_to_remove, path.unlink)
+                    opened.push(attempt.pop_all())
+                    return lock
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
 
 
@@ -240,11 +240,9 @@ def require_kind(path: Path, wanted: str) -> Path:
 
 
 def require_no_link(folder: Path, option: str) -> Path:
-    """Return a default folder, which may have come with the scene; raise a FilesError if it is a symbolic link.
+    """Return a default folder; raise a FilesError if it is a link, which may have come with the scene.
 
-    Args:
-        folder: the folder.
-        option: command-line option that selects it, for messages.
+    `option` is the command-line option that selects another folder.
     """
     try:
         is_link = folder.is_symlink()
@@ -284,27 +282,6 @@ def list_files(top: Path, patterns: Collection[str], *, strict: bool, ignored: C
     return walk(top, "")
 
 
-def clear_folder(top: Path, patterns: Collection[str], keep: Collection[str] = ()) -> None:
-    """Delete the contents of a folder.
-
-    Args:
-        top: the folder.
-        patterns: patterns of all permitted files, as for `list_files`.
-        keep: names of entries to keep.
-
-    Raises:
-        ForeignError: when an entry matches no pattern; nothing is deleted then.
-    """
-    list(list_files(top, patterns, strict=True))
-    for path in list(top.iterdir()):
-        if path.name in keep:
-            continue
-        if entry_kind(path) == FOLDER:
-            shutil.rmtree(path)
-        else:
-            path.unlink()
-
-
 def parent_folders(names: Iterable[str]) -> set[str]:
     """Collect all ancestor folders of relative paths."""
     inner = {name.rpartition("/")[0] for name in names if "/" in name}
@@ -319,16 +296,7 @@ else:
 HIDDEN_FOLDER_PATTERN, LOCK_FILE, DRAFT_FILE = r"\.partial-[0-9a-f]{16}", "lock", "draft"
 
 # Files that a hidden folder may contain.
-STAGED_PATTERNS = (
-    LOCK_FILE,
-    DRAFT_FILE,
-    "picture",
-    "session",
-    "copy",
-    r"animation\.gif",
-    r"study\.(?:png|md|json)",
-    r"sweep\.json",
-)
+STAGED_PATTERN = r"lock|draft|picture|session|copy|animation\.(?:gif|mp4)|study\.(?:png|md|json)|sweep\.json"
 
 
 @contextmanager
@@ -367,7 +335,7 @@ def _clear_abandoned(folder: Path) -> None:
         if re.fullmatch(HIDDEN_FOLDER_PATTERN, hidden.name) and entry_kind(hidden) == FOLDER:
             # Folders that are locked, incomplete, of another user or with foreign files are kept.
             with suppress(OSError, FilesError):
-                list(list_files(hidden, STAGED_PATTERNS, strict=True))
+                list(list_files(hidden, [STAGED_PATTERN], strict=True))
                 if entry_kind(hidden / LOCK_FILE) == FILE:
                     with (hidden / LOCK_FILE).open("ab", 0) as file:
                         is_abandoned = _try_lock(file)
@@ -418,8 +386,7 @@ def write_new_file(path: Path, data: bytes) -> None:
 def lock_file(path: Path) -> BinaryIO:
     """Lock a file, created if missing, until it is closed here and in all processes that inherit it.
 
-    Raises:
-        BlockingIOError: when another process holds the lock.
+    Raises a BlockingIOError when another process holds the lock.
     """
     file = path.open("ab", 0)
     try:

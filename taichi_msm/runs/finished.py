@@ -50,13 +50,9 @@ class FinishedRun:
         return np.arange(self.frames) / self.scene.time.frames_per_second
 
     def positions(self) -> NDArray[np.floating]:
-        """Map the trajectory into memory after verifying it.
+        """Map the positions of the mass points [m], shape (frames, rows, cols, 3), into memory, read-only.
 
-        Returns:
-            Positions of the mass points [m], shape (frames, rows, cols, 3), read-only.
-
-        Raises:
-            FilesError: when the trajectory is missing, damaged or of another run.
+        Raises a FilesError when the trajectory is missing, damaged or of another run.
         """
         path = self.result_path("trajectory")
         dtype = np.dtype(np.float32 if self.scene.time.precision == "f32" else np.float64)
@@ -72,17 +68,9 @@ class FinishedRun:
         return positions
 
     def read_picture(self, key: str, frame: int) -> NDArray[np.uint8]:
-        """Read a picture of a frame.
+        """Read the picture of a frame, shape (height, width, 3), that an entry of `output`, such as "png", wrote.
 
-        Args:
-            key: entry of `output` that wrote it, such as "png".
-            frame: index of the frame.
-
-        Returns:
-            Colours, shape (height, width, 3).
-
-        Raises:
-            FilesError: when it is missing, cannot be decoded or has the wrong size.
+        Raises a FilesError when it is missing, cannot be decoded or has the wrong size.
         """
         path = self.result_path(key, frame)
         try:
@@ -145,14 +133,9 @@ class FinishedRun:
         return f'run the scene again with --set "output=[{outputs}]"'
 
     def result_path(self, key: str, frame: int = 0) -> Path:
-        """Return the verified path of an output file.
+        """Return the path of the file that an entry of `output` wrote, for a frame if it wrote one per frame.
 
-        Args:
-            key: entry of `output` that wrote it.
-            frame: index of the frame, for outputs with a file per frame.
-
-        Raises:
-            FilesError: when the file is missing or is not a regular file of the run.
+        Raises a FilesError when the file is missing or is not a regular file of the run.
         """
         result, folder = OUTPUTS[key].result, self._output_folder(key)
         path = folder / OUTPUTS[key].path(frame)
@@ -161,16 +144,10 @@ class FinishedRun:
         return self.require_own_file(path, key)
 
     def require_own_file(self, path: Path, key: str) -> Path:
-        """Return a path below the run's folder after checking that it is a regular file, reached without links.
+        """Return a path below the run's folder; raise a FilesError unless it is a regular file, reached without links.
 
-        In untrusted results, a link could make an export expose other files.
-
-        Args:
-            path: path of the file.
-            key: entry of `output` that writes it, for messages.
-
-        Raises:
-            FilesError: when the file is missing or not regular, or when one of its folders is a link.
+        In untrusted results, a link could make an export expose other files. `key` is the entry of `output` that writes
+        the file, for messages.
         """
         below = path.relative_to(self.directory)
         for inner in [*list(below.parents)[-2::-1], below]:
@@ -185,11 +162,9 @@ class FinishedRun:
 
 
 def read_run(directory: str | Path) -> FinishedRun:
-    """Read the record of a finished run; other results are read on demand.
+    """Read the record of a finished run, run.json; other results are read on demand.
 
-    Raises:
-        ArgumentError: when the directory is not a valid path.
-        FilesError: when run.json is missing or invalid.
+    Raises an ArgumentError when the directory is no path, a FilesError when the record is missing or invalid.
     """
     require_path(directory)
     path = Path(directory) / RUN_RECORD

@@ -1,4 +1,4 @@
-"""Streaming writers of PNG, animated GIF and MP4.
+"""Streaming writers of animated GIF and MP4.
 
 GIF: all frames share a palette, and their times are exact to 10 ms at any frame rate. At most two frames are queued,
 whereas Pillow's writer keeps all frames in memory; for RGB pictures, it also computes a palette per frame, which takes
@@ -11,26 +11,15 @@ MP4: H.264, encoded by PyAV, whose wheels include the encoder (`docs/decisions/0
 from __future__ import annotations
 
 import math
-import os
 import struct
-import time
-import zlib
 from collections import deque
-from collections.abc import Callable, Sequence
-from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
-from contextlib import ExitStack, suppress
 from fractions import Fraction
 from pathlib import Path
-from threading import Event
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-
-from taichi_msm.errors import Pause
-from taichi_msm.runs.directory import create_file
-from taichi_msm.scene.outputs import OUTPUTS
 
 Picture = NDArray[np.uint8]  # colours, shape (height, width, 3), or palette indices, shape (height, width)
 
@@ -54,14 +43,11 @@ def predict_colours(picture: Picture) -> Picture:
 
 
 class Palette:
-    """Colour palette of an animation.
+    """Colour palette of an animation; `table` has the colours, shape (256, 3).
 
     Args:
         samples: typical colours, shape (n, m, 3).
         background: a colour that the palette contains exactly.
-
-    Attributes:
-        table: the colours, shape (256, 3).
     """
 
     def __init__(self, samples: Picture, background: tuple[int, int, int]) -> None:
@@ -85,13 +71,6 @@ class Palette:
         return indices
 
 
-class _TimedFrame(NamedTuple):
-    """A queued frame of a GIF."""
-
-    start: int  # time at which it appears [1/100 s]
-    indices: Picture  # palette indices, shape (height, width)
-
-
 class GifWriter:
     """Writer of an endlessly looping GIF. Frame f lasts from f / rate to (f + 1) / rate, rounded to 1/100 s.
 
@@ -110,8 +89,8 @@ class GifWriter:
         self._palette = palette
         self._frames = 0
         self._latest: Picture | None = None
-        # Two frames are queued, because a short last frame shortens its predecessor.
-        self._queue: deque[_TimedFrame] = deque()
+        # Start times [1/100 s] and palette indices. Two frames are queued, because a short last one shortens the other.
+        self._queue: deque[tuple[int, Picture]] = deque()
         self._screen: Picture | None = None
         self._file = file
         self._file.write(b"GIF89a" + struct.pack("<HHBBB", *size, 0xF7, 0, 0) + palette.table.tobytes())
@@ -123,14 +102,14 @@ class GifWriter:
         self._frames += 1
         self._latest = picture
         queue = self._queue
-        if queue and start - queue[-1].start < MIN_GIF_DELAY:
+        if queue and start - queue[-1][0] < MIN_GIF_DELAY:
             return
         indices = self._palette.indices(picture)
-        if queue and np.array_equal(indices, queue[-1].indices):
+        if queue and np.array_equal(indices, queue[-1][1]):
             return
-        queue.append(_TimedFrame(start, indices))
+        queue.append((start, indices))
         if len(queue) > 2:
-            self._write_first(until=queue[1].start)
+            self._write_first(until=queue[1][0])
 
     def close(self) -> None:
         """Write the queued frames and close the file."""
@@ -144,15 +123,15 @@ class GifWriter:
 
     def _write_last(self, indices: Picture) -> None:
         """Write the queued frames, and the latest frame at the end."""
-        first, last = self._queue[0], self._queue.pop()
+        first, last = self._queue[0][0], self._queue.pop()[0]
         end = self._centiseconds(self._frames)
-        start = min(last.start, end - MIN_GIF_DELAY)
-        if start - first.start < MIN_GIF_DELAY:
+        start = min(last, end - MIN_GIF_DELAY)
+        if start - first < MIN_GIF_DELAY:
             self._queue.clear()
-            start = first.start
+            start = first
         else:
             self._write_first(until=start)
-        self._queue.append(_TimedFrame(start, indices))
+        self._queue.append((start, indices))
         self._write_first(until=max(end, start + 1))
 
     def _write_first(self, until: int) -> None:
@@ -245,167 +224,3 @@ def _rate_fraction(rate: float) -> Fraction:
     if rate < 1:
         return 1 / Fraction(1 / rate).limit_denominator(MAX_RATE_DENOMINATOR)
     return Fraction(rate).limit_denominator(MAX_RATE_DENOMINATOR)
-
-
-# Time between calls of `pause` while waiting for the encoder.
-PAUSE_INTERVAL_S = 0.1
-
-
-class EncodingJob(NamedTuple):
-    """Formats, destinations and size of the pictures of a run."""
-
-    folders: tuple[Path, ...]  # destination of each camera
-    size: tuple[int, int]  # width and height [px]
-    rate: float  # frames per second
-    png: bool  # whether to write frames/0000.png and so on
-    gif: bool  # whether to write animation.gif
-    background: tuple[int, int, int]  # a colour that the GIF contains exactly
-    mp4: bool = False  # whether to write animation.mp4
-    quality: int = 65  # of the MP4 [%]
-
-    def still_paths(self, number: int) -> list[Path]:
-        """Return the paths of a frame's PNGs, one per camera."""
-        return [folder / OUTPUTS["png"].path(number) for folder in self.folders]
-
-
-class EncodingReport(NamedTuple):
-    """Result of an encoding job."""
-
-    frames: int  # number of completely encoded frames
-    seconds: float  # processor time
-
-
-class PictureWriter:
-    """Encoder of pictures in threads of this process, which a KeyboardInterrupt does not reach.
-
-    Args:
-        job: formats, destinations and size of the pictures.
-        max_queued: number of frames that may be queued; with 0, `add` returns when its frame is encoded.
-        discard_queued: when set, frames whose encoding has not begun are discarded, except for the first one.
-
-    Raises:
-        OSError: from any method, at the latest from `finish`, when a file cannot be written.
-    """
-
-    def __init__(self, job: EncodingJob, max_queued: int = 0, discard_queued: Event | None = None) -> None:
-        self._job, self._max_queued, self._discard_queued = job, max_queued, discard_queued or Event()
-        self._frames = self._added_frames = 0
-        self._seconds = 0.0
-        self._videos: list[list[GifWriter | Mp4Writer]] = []
-        self._files = ExitStack()
-        self._pending: deque[Future[None]] = deque()
-        self._still_executor = ThreadPoolExecutor(max(1, min(max_queued, os.cpu_count() or 1)))
-        self._video_executor = ThreadPoolExecutor(1)
-
-    def add(self, pictures: Picture, pause: Pause = lambda: None) -> None:
-        """Add the pictures of the next frame; wait while the queue is full.
-
-        Args:
-            pictures: colours, shape (cameras, height, width, 3); the caller must not change them afterwards.
-            pause: called several times a second while waiting.
-        """
-        number = self._added_frames
-        self._added_frames += 1
-        paths = self._job.still_paths(number) if self._job.png else []
-        for path in paths if number == 0 else ():
-            path.parent.mkdir()
-        stills = [
-            self._still_executor.submit(self._write_still, *each, number) for each in zip(pictures, paths, strict=False)
-        ]
-        self._pending.append(self._video_executor.submit(self._complete_frame, pictures, number, stills))
-        while len(self._pending) > self._max_queued and not self._discard_queued.is_set():
-            with suppress(CancelledError):
-                _wait_for(self._pending[0], pause)
-            self._pending.popleft()
-
-    def finish(self, pause: Pause = lambda: None, *, discard_queued: bool = False) -> EncodingReport:
-        """Wait until all pictures are encoded.
-
-        Args:
-            pause: called several times a second while waiting; if it raises, `finish` can be called again.
-            discard_queued: whether to discard frames whose encoding has not begun, except for the first one.
-
-        Returns:
-            The number of encoded frames and the processor time.
-        """
-        if discard_queued:
-            self._discard_queued.set()
-        with suppress(CancelledError):  # all later frames are cancelled, too
-            for task in self._pending:
-                _wait_for(task, pause)
-        self._still_executor.shutdown()
-        _wait_for(self._video_executor.submit(self._close_videos), pause)
-        for number in range(self._frames, self._added_frames) if self._job.png else ():
-            for path in self._job.still_paths(number):
-                path.unlink(missing_ok=True)
-        return EncodingReport(self._frames, self._seconds)
-
-    def abort(self) -> None:
-        """End the threads and close incomplete files."""
-        self._discard_queued.set()
-        self._still_executor.shutdown()
-        self._video_executor.shutdown()
-        with suppress(OSError):
-            self._files.close()
-
-    def _write_still(self, picture: Picture, path: Path, number: int) -> float:
-        """Write a PNG; return the processor time [s]."""
-        self._cancel_if_discarding(number)
-        return _measure_cpu_time(_write_png, picture, path)
-
-    def _complete_frame(self, pictures: Picture, number: int, stills: Sequence[Future[float]]) -> None:
-        """Wait for the PNGs of a frame, then append it to the videos: they have no frames without a PNG."""
-        self._cancel_if_discarding(number)
-        self._seconds += sum(still.result() for still in stills)
-        self._seconds += _measure_cpu_time(self._append_to_videos, pictures)
-        self._frames += 1
-
-    def _cancel_if_discarding(self, number: int) -> None:
-        """Raise a CancelledError if queued frames are discarded; the first frame is always kept."""
-        if self._discard_queued.is_set() and number > 0:
-            raise CancelledError
-
-    def _append_to_videos(self, pictures: Picture) -> None:
-        if self._frames == 0:
-            self._videos = [self._open_videos(*each) for each in zip(self._job.folders, pictures, strict=True)]
-        for videos, picture in zip(self._videos, pictures, strict=True):
-            for video in videos:
-                video.add(picture)
-
-    def _open_videos(self, folder: Path, picture: Picture) -> list[GifWriter | Mp4Writer]:
-        """Open the videos of a camera; its first picture determines the palette."""
-        job = self._job
-        videos: list[GifWriter | Mp4Writer] = []
-        if job.gif:
-            file = self._files.enter_context(create_file(folder / OUTPUTS["gif"].path()))
-            videos.append(GifWriter(file, job.size, job.rate, Palette(predict_colours(picture), job.background)))
-        if job.mp4:
-            file = self._files.enter_context(create_file(folder / OUTPUTS["mp4"].path()))
-            videos.append(Mp4Writer(file, job.size, job.rate, job.quality))
-        return videos
-
-    def _close_videos(self) -> None:
-        while self._videos:
-            for video in self._videos.pop():
-                self._seconds += _measure_cpu_time(video.close)
-
-
-def _wait_for(task: Future[None], pause: Pause) -> None:
-    """Wait for a task and raise its exception."""
-    while not wait([task], PAUSE_INTERVAL_S).done:
-        pause()
-    task.result()
-
-
-def _write_png(picture: Picture, path: Path) -> None:
-    with create_file(path) as file:
-        # For 512 x 512 pixels of shaded tissue, Pillow's default takes 93 ms, and level 1 takes 17 ms and 348 kB.
-        # Run-length encoding takes 16 ms and 314 kB, because only the background repeats.
-        Image.fromarray(picture).save(file, "PNG", compress_level=1, compress_type=zlib.Z_RLE)
-
-
-def _measure_cpu_time(work: Callable[..., None], *args: object) -> float:
-    """Call a function; return its processor time [s], which excludes waiting for a core."""
-    start = time.thread_time()
-    work(*args)
-    return time.thread_time() - start

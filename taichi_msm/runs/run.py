@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
@@ -38,12 +38,12 @@ from taichi_msm.render.camera import view_at
 from taichi_msm.render.labels import FrameOutputs
 from taichi_msm.render.notes import drawing_warnings
 from taichi_msm.render.texture import load_texture
-from taichi_msm.runs.manifest import Manifest, input_digests, read_manifest
+from taichi_msm.runs.checkpoint import Manifest, input_digests, read_manifest
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.runs.writer import ResultWriter, RunRecord
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.planning import ENCODING_WORK
-from taichi_msm.solver.state import ProbeForces, RunProgress
+from taichi_msm.solver.state import RunProgress
 from taichi_msm.system import process, runtime
 from taichi_msm.system.compiler import versions
 from taichi_msm.system.runtime import Device
@@ -51,17 +51,10 @@ from taichi_msm.version import commit
 
 
 class Stopwatch:
-    """Timer of the stages of a run. A nested stage pauses the outer one.
-
-    Args:
-        started: `time.perf_counter()` at the beginning of the stage startup; None for now.
-
-    Attributes:
-        seconds: time spent in each stage [s].
-    """
+    """Timer of the stages of a run, the first of which is startup. A nested stage pauses the outer one."""
 
     def __init__(self, started: float | None) -> None:
-        self.seconds: dict[str, float] = {}
+        self.seconds: dict[str, float] = {}  # time spent in each stage
         self._stage = "startup"
         self._started = self._last = time.perf_counter() if started is None else started
 
@@ -201,16 +194,14 @@ def resume(
 
 def _find_unfinished(context: _RunContext) -> Manifest | None:
     """Find the unfinished run in the directory, if it produces the same bits and the same error estimate."""
-    manifest = context.manifest
     try:
         unfinished, _ = read_manifest(context.directory)
     except (FilesError, SceneError):
         return None
-    if not manifest.has_same_bits_as(unfinished):
-        return None
-    if _choose_companions(context, resumed=True) != _choose_companions(context, resumed=False):
-        return None
-    return replace(manifest, versions=unfinished.versions)
+    same_estimate = _choose_companions(context, resumed=True) == _choose_companions(context, resumed=False)
+    if context.manifest.has_same_bits_as(unfinished) and same_estimate:
+        return replace(context.manifest, versions=unfinished.versions)
+    return None
 
 
 def _with_versions(manifest: Manifest) -> Manifest:
@@ -264,14 +255,12 @@ class _Run:
         self._frames = plan.grid.frames + 1
         progress("compile", 0, self._frames)
         self._cores = cores = free_cores(plan)
-        # The writer is created first, so that its encoder starts while kernels are compiled.
+        # The writer is created first, so that its encoder starts while kernels are compiled. With one thread, no core
+        # is free for the encoder.
+        in_subprocess = device.threads > 1
         self._writer = opened.enter_context(
             ResultWriter(
-                context.directory,
-                plan,
-                manifest.as_json(),
-                resumes=resumes,
-                encode_in_subprocess=device.threads > 1,  # with one thread, no core is free for it
+                context.directory, plan, manifest.as_json(), resumes=resumes, encode_in_subprocess=in_subprocess
             )
         )
         self._simulation = opened.enter_context(Simulation(plan, device.arch, device.threads, context.texture, cores))
@@ -298,42 +287,34 @@ class _Run:
             self._writer.read_positions(frame)
 
     def prepare(self) -> None:
-        """Compile, and restore the simulation and its companion runs to the state of the unfinished run."""
-        writer, rest = self._writer, rest_positions(self._context.plan.scene.sheet)
+        """Compile, and restore the simulation to the state of the unfinished run."""
         with self._stopwatch.stage("compile"):
             self._simulation.compile(partial(self._progress, "compile", 0, self._frames))
             if self._error:
                 self._error.compile()
-        if writer.saved:
-            self._simulation.restore(writer.saved)
-        if self._path_dependence and self._context.plan.scene.output:
-            for frame in range(writer.frames):
-                self._path_dependence.check_frame(frame, writer.read_positions(frame) - rest)
-        if self._error:
-            with self._stopwatch.stage("pilot"):
-                for frame in range(1, writer.frames):
-                    report = partial(self._progress, "pilot", frame, writer.frames)
-                    self._error.compare_frame(writer.read_positions(frame) - rest, report)
+        if self._writer.saved:
+            self._simulation.restore(self._writer.saved)
 
     def simulate_frames(self) -> None:
-        """Simulate, draw and write every missing frame, and complete the results."""
+        """Simulate, draw and write every missing frame, and estimate the error."""
         writer, simulation, scene = self._writer, self._simulation, self._context.plan.scene
         stage, rest = self._stopwatch.stage, rest_positions(scene.sheet)
         observed = dict.fromkeys(scene.render.all_cameras, FrameOutputs())
         # Frames without steps are reported as a separate stage, because they distort the estimated remaining time.
         redrawn_frames = max(self._resumed, 1)
-        for frame in range(writer.frames, self._frames):
+        for frame in range(0 if scene.output else writer.frames, self._frames):
             kind, total = ("redraw", redrawn_frames) if frame < redrawn_frames else ("frames", self._frames)
             report = partial(self._progress, kind, frame, total)
             report()
             with stage("simulate"):
                 simulation.advance(max(0, frame - simulation.frame), self._pause)
             position = writer.read_positions(frame) if frame < self._resumed else simulation.positions()
-            with stage("render"):
-                time = frame / scene.time.frames_per_second
-                for camera, previous in observed.items():
-                    observed[camera] = simulation.observe(previous.labels, camera, position, time)
-            writer.add(position, observed, simulation.forces(), report)
+            if frame == writer.frames:  # without pictures and labels, stored frames are complete
+                with stage("render"):
+                    time = frame / scene.time.frames_per_second
+                    for camera, previous in observed.items():
+                        observed[camera] = simulation.observe(previous.labels, camera, position, time)
+                writer.add(position, observed, simulation.forces())
             if self._path_dependence:
                 self._path_dependence.check_frame(frame, position - rest)
             if self._error and frame > 0:
@@ -341,23 +322,16 @@ class _Run:
                     tool_forces = [simulation.forces()[tool.probe].force for tool in self._context.plan.tools]
                     forces = np.array(tool_forces).reshape(-1, 3) if frame >= self._resumed else None
                     self._error.compare_frame(position - rest, report, forces)
-        try:
+        # All frames are finished; after an interruption, the estimate of the coarse companion run remains valid.
+        with suppress(KeyboardInterrupt):
             if self._error:
-                displacements = (
-                    (writer.read_positions(frame) - rest for frame in range(1, self._frames)) if scene.output else None
-                )
+                displacements = (writer.read_positions(frame) - rest for frame in range(1, self._frames))
                 with stage("pilot"):
-                    self._error.finish(displacements, partial(self._progress, "pilot"))
+                    self._error.finish(displacements if scene.output else None, partial(self._progress, "pilot"))
             if self._path_dependence and self._repeats_solution:
+                report = partial(self._progress, "pilot", 0, 1)
                 with stage("pilot"):
-                    self._path_dependence.finish(
-                        self._context.device, self._cores, partial(self._progress, "pilot", 0, 1)
-                    )
-        except KeyboardInterrupt:
-            # All frames are finished; the estimate of the coarse companion run remains valid.
-            writer.finish()
-        else:
-            writer.finish(partial(self._progress, "frames", self._frames, self._frames))
+                    self._path_dependence.finish(self._context.device, self._cores, report)
 
     def save_finished_frames(self) -> dict[str, Any]:
         """Save the state and the finished frames of an interrupted run; reraise if there is no new frame."""
@@ -367,10 +341,9 @@ class _Run:
             # A divergence within this frame will recur in the resumed run.
             with suppress(DivergedError):
                 writer.save(simulation.save())
-        # Queued pictures are discarded, to end soon; there may be no new frame then.
         if writer.frames > self._resumed:
-            writer.finish(discard_queued=True)
-        if writer.frames <= self._resumed:
+            writer.finish()
+        if writer.frames <= self._resumed:  # also if an incomplete last frame was dropped
             raise KeyboardInterrupt
         return {"status": "interrupted"}
 
@@ -380,9 +353,8 @@ class _Run:
         self._error, self._estimates = None, RunErrorEstimates(reason="the run diverged")
         ending: dict[str, Any] = {"status": "diverged", "error": str(error), "dump": None}
         with suppress(KeyboardInterrupt):
-            diagnosis = self._simulation.diagnose(
-                writer.load(), partial(self._progress, "diagnosis", writer.frames, self._frames)
-            )
+            report = partial(self._progress, "diagnosis", writer.frames, self._frames)
+            diagnosis = self._simulation.diagnose(writer.load(), report)
             ending["error"] = diagnosis.message
             if diagnosis.last_sound_state:
                 ending["dump"] = writer.save(diagnosis.last_sound_state)
@@ -390,23 +362,17 @@ class _Run:
 
     def publish_results(self, ending: dict[str, Any]) -> RunRecord:
         """Publish the results together with run.json."""
-        writer, simulation, device, stopwatch = self._writer, self._simulation, self._context.device, self._stopwatch
+        writer, simulation, device = self._writer, self._simulation, self._context.device
         self._progress("write", writer.frames, self._frames)
         writer.finish()
-        estimates = self._error.estimates if self._error else self._estimates
-        stages = ["startup", *(["pilot"] if "pilot" in stopwatch.seconds else []), "compile", "simulate", "render"]
-        seconds = {stage: stopwatch.seconds.get(stage, 0.0) for stage in stages}
+        seconds = self._stopwatch.seconds
+        stages = ["startup", *(["pilot"] if "pilot" in seconds else []), "compile", "simulate", "render"]
+        timings = {stage: seconds.get(stage, 0.0) for stage in stages}
         record = {
             **ending,
-            **_run_entries(
-                self._context,
-                simulation.progress,
-                simulation.felt,
-                estimates,
-                self._path_dependence.warnings() if self._path_dependence else (),
-            ),
+            **self._scene_entries(),
             "resumed": self._resumed,
-            "timings": {**seconds, "encode": writer.encode_seconds, "total": stopwatch.total()},
+            "timings": {**timings, "encode": writer.encode_seconds, "total": self._stopwatch.total()},
             "arch": device.arch,
             "device": device.name,
             "threads": device.threads,
@@ -416,6 +382,49 @@ class _Run:
             "commit": commit(),
         }
         return cast(RunRecord, writer.publish(record))
+
+    def _scene_entries(self) -> dict[str, Any]:
+        """Build the entries of run.json about the scene, the last frame and the errors."""
+        manifest, plan, progress = self._context.manifest, self._context.plan, self._simulation.progress
+        scene = plan.scene
+        estimates = self._error.estimates if self._error else self._estimates
+        probes = [
+            ProbeRecord(
+                **record,
+                greatest_force=math.hypot(*peak.force),
+                greatest_force_vector=list(peak.force),
+                greatest_force_time=peak.time,
+            )
+            for record, peak in zip(probe_records(scene), self._simulation.felt.greatest, strict=True)
+        ]
+
+        def takes_an_hour_at_most(plan: Plan) -> bool:
+            return cost.estimate_duration(plan).seconds <= 3600
+
+        notes = [
+            *run_warnings(plan, probes, progress, estimates, takes_an_hour_at_most, _pixels_per_metre(scene)),
+            *(self._path_dependence.warnings() if self._path_dependence else ()),
+            *drawing_warnings(scene),
+        ]
+        # Picture paths are as given; only the sections sheet and time contain resolved values.
+        simulated = manifest.given.model_copy(update={"sheet": scene.sheet, "time": scene.time})
+        return {
+            "scene": simulated.model_dump(mode="json"),
+            "asked": _chosen_keys(manifest.given, scene),
+            "working_directory": manifest.folder,
+            "sha256": dict(manifest.sha256),
+            "overrides": list(manifest.overrides),
+            "points": list(scene.sheet.points),
+            **_step_entries(plan, progress),
+            "max_displacement": progress.max_displacement,
+            "max_displacement_frame": progress.max_displacement_frame,
+            "shortest_spring": progress.shortest_spring,
+            "longest_spring": progress.longest_spring,
+            "probes": probes,
+            "notes": notes,
+            "error_estimate": _error_record(estimates),
+            **({"error_estimate_reason": estimates.reason} if estimates.estimate is None else {}),
+        }
 
     def _pause(self) -> None:
         """Report the progress within a frame, and save the state when due."""
@@ -436,49 +445,6 @@ def _choose_companions(context: _RunContext, *, resumed: bool) -> CompanionRuns:
     if companions.planned and resumed and not context.plan.scene.output:
         return CompanionRuns(reason="the frames before the interruption were not kept")
     return companions
-
-
-def _run_entries(
-    context: _RunContext,
-    progress: RunProgress,
-    felt: ProbeForces,
-    estimates: RunErrorEstimates,
-    path_dependence: Iterable[str],
-) -> dict[str, Any]:
-    """Build the entries of run.json about the scene, the last frame and the errors."""
-    manifest, plan = context.manifest, context.plan
-    scene = plan.scene
-    probes = [
-        ProbeRecord(
-            **record,
-            greatest_force=math.hypot(*peak.force),
-            greatest_force_vector=list(peak.force),
-            greatest_force_time=peak.time,
-        )
-        for record, peak in zip(probe_records(scene), felt.greatest, strict=True)
-    ]
-    return {
-        # Picture paths are as given; only the sections sheet and time contain resolved values.
-        "scene": manifest.given.model_copy(update={"sheet": scene.sheet, "time": scene.time}).model_dump(mode="json"),
-        "asked": _chosen_keys(manifest.given, scene),
-        "working_directory": manifest.folder,
-        "sha256": dict(manifest.sha256),
-        "overrides": list(manifest.overrides),
-        "points": list(scene.sheet.points),
-        **_step_entries(plan, progress),
-        "max_displacement": progress.max_displacement,
-        "max_displacement_frame": progress.max_displacement_frame,
-        "shortest_spring": progress.shortest_spring,
-        "longest_spring": progress.longest_spring,
-        "probes": probes,
-        "notes": [
-            *run_warnings(plan, probes, progress, *estimates, _is_affordable, _pixels_per_metre(scene)),
-            *path_dependence,
-            *drawing_warnings(scene),
-        ],
-        "error_estimate": error_record(estimates),
-        **({"error_estimate_reason": estimates.reason} if estimates.estimate is None else {}),
-    }
 
 
 def _step_entries(plan: Plan, progress: RunProgress) -> dict[str, Any]:
@@ -513,11 +479,6 @@ def _chosen_keys(given: Scene, scene: Scene) -> dict[str, Any]:
     return {key: requested for key, requested, resolved in pairs if requested != resolved}
 
 
-def _is_affordable(plan: Plan) -> bool:
-    """Return whether a run takes an estimated hour at most, so that a warning may recommend it."""
-    return cost.estimate_duration(plan).seconds <= 3600
-
-
 def _pixels_per_metre(scene: Scene) -> float | None:
     """Return the image scale at the centre of the sheet [px/m]; None without pictures or outside of them."""
     if not scene.renders:
@@ -529,7 +490,7 @@ def _pixels_per_metre(scene: Scene) -> float | None:
     return scale if math.isfinite(scale) else None
 
 
-def error_record(estimates: RunErrorEstimates) -> dict[str, Any] | None:
+def _error_record(estimates: RunErrorEstimates) -> dict[str, Any] | None:
     """Build the error estimate for run.json; unknown values are null."""
     estimate, mesh, keys = estimates.estimate, estimates.mesh, ("error", "rounding", "in_f64", "order", "at_least")
     if estimate is not None:

@@ -7,7 +7,6 @@ import math
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from html import escape
 from itertools import count
 from string import Template
 from typing import Any
@@ -17,8 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm.accuracy import divergence
-from taichi_msm.accuracy.diagnosis import Diagnosis, diagnose
-from taichi_msm.accuracy.divergence import DivergenceMonitor
+from taichi_msm.accuracy.divergence import Diagnosis, DivergenceMonitor, diagnose
 from taichi_msm.errors import (
     ArgumentError,
     DivergedError,
@@ -91,17 +89,19 @@ class Simulation:
         texture = None if texture is None else require_texture(texture)
         self.device = runtime.start(arch, threads)
         self._plan = resolve(plan, self.device).plan
-        # The original probes, before `steer`.
-        self._probes = self.scene.probes
-        self._monitor: DivergenceMonitor
-        self._force_recorder: ForceRecorder
-        self._probe_forces: ProbeForces
-        self._frame_positions: Array | None
-        self._divergence: DivergedError | None
+        self._probes = self.scene.probes  # the original ones, before `steer`
         self._closed, self._cores = False, cores
         self._dynamics = build_dynamics(self._plan, self.device, cores=cores)
         self._reset()
         self.renderer = Renderer(self.scene, texture)
+
+    def _reset(self) -> None:
+        """Start from the flat sheet; a quasi-static first frame is solved later."""
+        self._divergence: DivergedError | None = None
+        self._monitor, self._force_recorder = DivergenceMonitor(self._plan), ForceRecorder(self._plan)
+        self._probe_forces = self._force_recorder.at_rest()
+        flat = to_positions(self._dynamics.displacement(), self.scene.sheet)
+        self._frame_positions: Array | None = None if self.scene.time.at_rest else flat
 
     @property
     def scene(self) -> Scene:
@@ -241,7 +241,7 @@ class Simulation:
         self._solve_first_frame()
         reading = self._dynamics.read()
         self._require_no_fault(reading, self._monitor.check(reading))
-        return Snapshot(self._dynamics.state(), self.progress, self._probe_forces, self.scene.probes)
+        return self._snapshot()
 
     def restore(self, saved: Snapshot) -> None:
         """Continue from a saved state of the same scene, to the same bits; it may be between two frames.
@@ -270,7 +270,9 @@ class Simulation:
 
     def positions(self) -> Array:
         """Return the positions of the mass points [m], shape (rows, cols, 3), in the scene's precision; read-only."""
-        return self._position
+        self._solve_first_frame()
+        assert self._frame_positions is not None
+        return self._frame_positions
 
     def forces(self) -> list[TipForce]:
         """Return the tip position and the force on the sheet of every probe at the last frame."""
@@ -289,11 +291,11 @@ class Simulation:
             Velocities [m/s], shape (rows, cols, 3), in the scene's precision; 0 at the start.
         """
         self._require_open()
-        return self._dynamics.state().difference / self._position.dtype.type(self._plan.grid.step)
+        return self._dynamics.state().difference / self.positions().dtype.type(self._plan.grid.step)
 
     def surface(self) -> Surface:
         """Return the refined surface as a triangle mesh with texture coordinates."""
-        return refine_surface(self._position, self.scene.render.refine)
+        return refine_surface(self.positions(), self.scene.render.refine)
 
     def diagnose(self, start: Snapshot | None = None, pause: Pause = lambda: None) -> Diagnosis:
         """Determine why the simulation diverged in `advance`. Afterwards, call `restore` before `advance`.
@@ -309,11 +311,7 @@ class Simulation:
         if self._divergence is None:
             raise MsmError("this simulation has not diverged; there is nothing to find out")
         if self.scene.time.at_rest:
-            last_state = (
-                None
-                if self._frame_positions is None
-                else Snapshot(self._dynamics.state(), self.progress, self._probe_forces, self.scene.probes)
-            )
+            last_state = None if self._frame_positions is None else self._snapshot()
             return Diagnosis(str(self._divergence), last_state)
         return diagnose(self._dynamics, start, pause)
 
@@ -393,7 +391,7 @@ class Simulation:
         if not (is_real_array(point, (2,)) and np.isfinite(point).all()):
             raise ArgumentError(f"pixel: {pixel!r}; take two numbers, x to the right and y down")
         x, y = point.tolist()
-        return pick(self._position, self.scene.render.refine, self.renderer.resolve_camera(camera, self.time), (x, y))
+        return pick(self.positions(), self.scene.render.refine, self.renderer.resolve_camera(camera, self.time), (x, y))
 
     def observe(
         self,
@@ -433,7 +431,7 @@ class Simulation:
         rows, cols = self.scene.sheet.points
         largest = 1000 * self.progress.max_displacement
         caption = f"{self.time:g} s, {rows} × {cols} points, largest displacement so far {largest:.1f} mm"
-        return captioned_figure(self.draw(), caption)
+        return f'<figure><img alt="" src="{_jpeg_data_url(self.draw())}"><figcaption>{caption}</figcaption></figure>'
 
     def compile(self, pause: Pause = lambda: None) -> None:
         """Compile all kernels, which otherwise happens at the first frame.
@@ -468,13 +466,6 @@ class Simulation:
         remedy = "keep its `scene` and what `save` returns, and `restore` that in a new one"
         raise MsmError(f"a Simulation cannot be pickled or copied; {remedy}")
 
-    @property
-    def _position(self) -> Array:
-        """Positions at the last frame [m]; a quasi-static first frame is solved if necessary."""
-        self._solve_first_frame()
-        assert self._frame_positions is not None
-        return self._frame_positions
-
     def _solve_first_frame(self, pause: Pause = lambda: None) -> None:
         """Solve the equilibrium of the first frame, if it is still missing."""
         if self._frame_positions is None:
@@ -495,6 +486,9 @@ class Simulation:
         )
         self._frame_positions = position
 
+    def _snapshot(self) -> Snapshot:
+        return Snapshot(self._dynamics.state(), self.progress, self._probe_forces, self.scene.probes)
+
     def _require_open(self) -> None:
         # Kernels would write to freed memory.
         if self._closed:
@@ -505,9 +499,9 @@ class Simulation:
         """Validate positions and time, place the instruments, and set up the camera."""
         self._require_open()
         if positions is None:
-            positions = self._position
+            positions = self.positions()
         else:
-            positions, shape = as_array(positions, "positions"), self._position.shape
+            positions, shape = as_array(positions, "positions"), self.positions().shape
             if not is_real_array(positions, shape):
                 raise ArgumentError(
                     f"positions: {positions.dtype} of shape {positions.shape}; take numbers of shape {shape}"
@@ -529,14 +523,6 @@ class Simulation:
                 divergence.format_message(time, steps, fault, exact=False), steps, time, point
             )
             raise self._divergence
-
-    def _reset(self) -> None:
-        """Start from the flat sheet; a quasi-static first frame is solved later."""
-        self._divergence = None
-        self._monitor, self._force_recorder = DivergenceMonitor(self._plan), ForceRecorder(self._plan)
-        self._probe_forces = self._force_recorder.at_rest()
-        flat = to_positions(self._dynamics.displacement(), self.scene.sheet)
-        self._frame_positions = None if self.scene.time.at_rest else flat
 
     def _restore_paths(self, probes: Sequence[Probe]) -> None:
         """Replace steered tool paths by those of the given probes."""
@@ -591,7 +577,7 @@ class Player:
         self.rate = rate
 
     def _repr_html_(self) -> str:
-        sources = [jpeg_data_url(frame) for frame in self.frames]
+        sources = [_jpeg_data_url(frame) for frame in self.frames]
         return _PLAYER_HTML.substitute(
             name=f"taichi-msm-{next(_player_numbers)}",
             first=sources[0],
@@ -601,14 +587,9 @@ class Player:
         )
 
 
-def jpeg_data_url(picture: NDArray[np.uint8]) -> str:
+def _jpeg_data_url(picture: NDArray[np.uint8]) -> str:
     """Encode a picture, shape (height, width, 3), as a data URL with a JPEG."""
     file = io.BytesIO()
     # Differences are invisible, and hundreds of frames fit into a notebook.
     Image.fromarray(picture).save(file, "JPEG", quality=92)
     return f"data:image/jpeg;base64,{b64encode(file.getvalue()).decode()}"
-
-
-def captioned_figure(picture: NDArray[np.uint8], caption: str) -> str:
-    """Format a picture, shape (height, width, 3), and a plain text as an HTML figure."""
-    return f'<figure><img alt="" src="{jpeg_data_url(picture)}"><figcaption>{escape(caption)}</figcaption></figure>'

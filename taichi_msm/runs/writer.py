@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from typing_extensions import NotRequired
 
-from taichi_msm.errors import Pause, writing
+from taichi_msm.errors import writing
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.surface import surface_positions
 from taichi_msm.model.tool_force import ProbeRecord
@@ -24,25 +24,18 @@ from taichi_msm.render.camera import calibration, is_moving, pair_transform, pos
 from taichi_msm.render.labels import FrameOutputs, track_grid
 from taichi_msm.runs.arrays import ChunkedArray, write_arrays, write_flo
 from taichi_msm.runs.checkpoint import CHECKPOINT_FOLDER, CHECKPOINT_PATTERNS, Checkpoint
-from taichi_msm.runs.directory import IsListed, Publication, PublicationSpec, create_file, write_new_file
-from taichi_msm.runs.encoder import Encoder
-from taichi_msm.runs.media import EncodingJob, PictureWriter
+from taichi_msm.runs.directory import Publication, PublicationSpec, create_file, write_new_file
+from taichi_msm.runs.encoder import Encoder, EncodingJob, PictureWriter
 from taichi_msm.scene import outputs
 from taichi_msm.scene.outputs import CAMERA_FILE, OUTPUTS
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.state import Snapshot, TipForce
 
-
-def _is_listed_in(record: Mapping[str, Any]) -> IsListed:
-    """Return the predicate of the file names that a record lists."""
-    return partial(outputs.is_result, set(record["outputs"]), int(record["frames"]))
-
-
 RUN_PUBLICATION = PublicationSpec(
     "run",
     outputs.RUN_RECORD,
     outputs.RESULT_PATTERNS,
-    _is_listed_in,
+    lambda record: partial(outputs.is_result, set(record["outputs"]), int(record["frames"])),
     companion=(CHECKPOINT_FOLDER, CHECKPOINT_PATTERNS),
 )
 
@@ -62,7 +55,7 @@ class ResultWriter:
         encode_in_subprocess: whether pictures are encoded in a separate process; otherwise, `add` encodes them.
 
     Raises:
-        FilesError: at entry and in all methods, when the directory cannot be written, another run writes there, or a
+        FilesError: here and in all methods, when the directory cannot be written, another run writes there, or a
             foreign file is at the path of a result.
 
     Attributes:
@@ -80,23 +73,30 @@ class ResultWriter:
         resumes: bool = False,
         encode_in_subprocess: bool = True,
     ) -> None:
-        self.saved: Snapshot | None = None
-        self.frames = 0
-        self.encode_seconds = 0.0
-        self._directory = directory
+        self._directory, self._manifest = directory, manifest
         self._scene = scene = plan.scene
-        self._manifest = manifest
-        self._resumes = resumes
-        self._encodes_in_subprocess = encode_in_subprocess
-        names = outputs.file_names(outputs.result_names(scene.folders), scene.time.frames + 1)
-        self._publication = Publication(directory, RUN_PUBLICATION, names)
-        folder = self._publication.staging_folder / CHECKPOINT_FOLDER
-        self._checkpoint = Checkpoint(folder, plan)
-        staged = self._publication.new_folder
-        self._labels = {name: LabelWriter(staged / name, scene, name) for name in scene.render.all_cameras}
-        self._encoder: Encoder | PictureWriter | None = None
-        self._open = ExitStack()
         self._finished = False
+        self.encode_seconds = 0.0
+        names = outputs.file_names(outputs.result_names(scene.folders), scene.time.frames + 1)
+        with writing(directory), ExitStack() as opened:
+            self._publication = opened.enter_context(Publication(directory, RUN_PUBLICATION, names))
+            staged = self._publication.new_folder
+            for name in scene.render.all_cameras if scene.renders else ():
+                (staged / name).mkdir(exist_ok=True)
+            self._labels = {name: LabelWriter(staged / name, scene, name) for name in scene.render.all_cameras}
+            self._encoder: Encoder | PictureWriter | None = None
+            if scene.draws:
+                folders = tuple(staged / name for name in scene.render.all_cameras)
+                render, rate = scene.render, scene.time.frames_per_second
+                job = EncodingJob(folders, render.size, rate, scene.output, render.background, render.quality)
+                locks = self._publication.lock_descriptors
+                self._encoder = Encoder(job, locks) if encode_in_subprocess else PictureWriter(job)
+                opened.callback(self._encoder.abort)
+            self._checkpoint = Checkpoint(self._publication.staging_folder / CHECKPOINT_FOLDER, plan)
+            opened.callback(self._checkpoint.close)
+            self.saved = self._checkpoint.reopen() if resumes else None
+            self.frames = 0 if scene.renders else self.stored_frames
+            self._open = opened.pop_all()
 
     @property
     def stored_frames(self) -> int:
@@ -109,19 +109,14 @@ class ResultWriter:
             return self._checkpoint.read_positions(frame)
 
     def add(
-        self,
-        position: NDArray[Any],
-        observed: Mapping[str, FrameOutputs],
-        forces: Sequence[TipForce] = (),
-        pause: Pause = lambda: None,
+        self, position: NDArray[Any], observed: Mapping[str, FrameOutputs], forces: Sequence[TipForce] = ()
     ) -> None:
-        """Add the next frame.
+        """Add the next frame, which may be in the checkpoint already.
 
         Args:
             position: positions of the mass points [m], shape (rows, cols, 3).
             observed: pictures and labels, by the names of the cameras.
-            forces: force of every probe; unused for a frame that the checkpoint contains.
-            pause: as for `Encoder.add`.
+            forces: force of every probe.
         """
         with writing(self._directory):
             # Positions are stored first, so that an interruption never leaves a picture without positions.
@@ -135,7 +130,7 @@ class ResultWriter:
                 labels.add(self.frames, observed[name], position)
             if self._encoder:
                 pictures = [frame.picture for frame in observed.values() if frame.picture is not None]
-                self._encoder.add(np.stack(pictures) if len(pictures) > 1 else pictures[0][None], pause)
+                self._encoder.add(np.stack(pictures) if len(pictures) > 1 else pictures[0][None])
             self.frames += 1
 
     @property
@@ -153,18 +148,13 @@ class ResultWriter:
         with writing(self._directory):
             return self._checkpoint.load()
 
-    def finish(self, pause: Pause = lambda: None, *, discard_queued: bool = False) -> None:
-        """Wait until all frames are encoded, and write the files that combine frames.
-
-        Args:
-            pause: as for `Encoder.finish`.
-            discard_queued: as for `Encoder.finish`.
-        """
+    def finish(self) -> None:
+        """Wait until all frames are encoded, and write the files that combine frames."""
         if self._finished:
             return
         with writing(self._directory):
             if self._encoder:
-                self.frames, self.encode_seconds = self._encoder.finish(pause, discard_queued=discard_queued)
+                self.frames, self.encode_seconds = self._encoder.finish()
             for labels in self._labels.values():
                 labels.finish(self.frames)
             if self.frames and "trajectory" in self._scene.output:
@@ -174,14 +164,7 @@ class ResultWriter:
         self._finished = True
 
     def publish(self, record: Mapping[str, Any]) -> dict[str, Any]:
-        """Write run.json and replace earlier results.
-
-        Args:
-            record: content of run.json, except for the entries "frames" and "outputs".
-
-        Returns:
-            The complete content of run.json.
-        """
+        """Replace earlier results; write and return run.json, which is `record` with "frames" and "outputs" added."""
         self.finish()
         with writing(self._directory):
             results = outputs.result_names(self._scene.folders if self.frames else {})
@@ -221,30 +204,6 @@ class ResultWriter:
                 rows.writerows((time, force.probe, *force.tip, *force.force) for force in forces)
 
     def __enter__(self) -> ResultWriter:
-        scene = self._scene
-        with writing(self._directory), ExitStack() as opened:
-            opened.enter_context(self._publication)
-            for name in scene.render.all_cameras if scene.renders else ():
-                (self._publication.new_folder / name).mkdir(exist_ok=True)
-            if scene.draws:
-                job = EncodingJob(
-                    folders=tuple(self._publication.new_folder / name for name in scene.render.all_cameras),
-                    size=scene.render.size,
-                    rate=scene.time.frames_per_second,
-                    png="png" in scene.output,
-                    gif="gif" in scene.output,
-                    background=scene.render.background,
-                    mp4="mp4" in scene.output,
-                    quality=scene.render.quality,
-                )
-                locks = self._publication.lock_descriptors
-                self._encoder = Encoder(job, locks) if self._encodes_in_subprocess else PictureWriter(job)
-                opened.callback(self._encoder.abort)
-            opened.callback(self._checkpoint.close)
-            if self._resumes:
-                self.saved = self._checkpoint.reopen()
-            self.frames = 0 if scene.renders else self.stored_frames
-            self._open = opened.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -252,15 +211,9 @@ class ResultWriter:
 
 
 class LabelWriter:
-    """Writer of the labels of a camera, frame by frame.
+    """Writer of the labels of a camera, frame by frame; an unnamed camera has an empty name."""
 
-    Args:
-        folder: destination of the files.
-        scene: the scene, whose `output` selects the labels.
-        camera: name of the camera; empty for an unnamed camera.
-    """
-
-    def __init__(self, folder: Path, scene: Scene, camera: str = "") -> None:
+    def __init__(self, folder: Path, scene: Scene, camera: str) -> None:
         self._folder, self._scene, self._camera = folder, scene, camera
         selected = [output for name, output in OUTPUTS.items() if name in scene.folders[camera]]
         self._frame_outputs = [output for output in selected if output.source in ("labels", "flow", "stereo")]
@@ -273,13 +226,7 @@ class LabelWriter:
         self._added = 0
 
     def add(self, frame: int, observed: FrameOutputs, position: NDArray[Any]) -> None:
-        """Write the labels of a frame and the optical flow from the previous frame.
-
-        Args:
-            frame: index of the frame.
-            observed: labels and flow of the frame.
-            position: positions of the mass points [m], shape (rows, cols, 3).
-        """
+        """Write the labels of a frame, and the tracks with positions of mass points [m], shape (rows, cols, 3)."""
         self._added = frame + 1
         for output in self._frame_outputs:
             number = frame - 1 if output.is_frame_pair else frame
@@ -318,9 +265,8 @@ _LABEL_WRITERS: dict[str, Callable[[BinaryIO, Any], None]] = {
     ".npy": np.save,
     ".tiff": lambda file, depth: Image.fromarray(depth).save(file, "TIFF"),
     ".flo": write_flo,
-    ".png": lambda file, mask: Image.fromarray(mask).save(
-        file, "PNG", compress_level=1
-    ),  # masks consist of few large areas
+    # Masks consist of few large areas.
+    ".png": lambda file, mask: Image.fromarray(mask).save(file, "PNG", compress_level=1),
 }
 
 

@@ -3,21 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from itertools import pairwise
+from collections.abc import Collection, Iterable
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    Field,
-    SerializerFunctionWrapHandler,
-    StrictBool,
-    ValidationError,
-    ValidationInfo,
-    create_model,
-    field_validator,
-    model_serializer,
-    model_validator,
-)
+from pydantic import Field, StrictBool, ValidationError, ValidationInfo, create_model, field_validator, model_validator
 from typing_extensions import Self
 
 from taichi_msm.camera_files.calibration import Calibration
@@ -29,7 +18,6 @@ from taichi_msm.camera_files.trajectory import pose_fault
 from taichi_msm.lenses import MODELS
 from taichi_msm.lenses.model import MAX_COEFFICIENT
 from taichi_msm.scene.section import (
-    MIN_FOV,
     MIN_MAGNITUDE,
     FilePath,
     Number,
@@ -37,6 +25,7 @@ from taichi_msm.scene.section import (
     Section,
     Vector,
     key,
+    require_increasing,
     scene_fault,
 )
 
@@ -99,10 +88,8 @@ class Distortion(_Coefficients):  # type: ignore[misc]
         name = MODELS[self.model].focal_length
         return getattr(self, name) if name else None
 
-    @model_serializer(mode="wrap")
-    def _dump_own_keys(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        own = MODELS[self.model].coefficients
-        return {name: value for name, value in dump(self).items() if name == "model" or name in own}
+    def _unused_keys(self) -> Collection[str]:
+        return type(self).model_fields.keys() - {"model", *MODELS[self.model].coefficients}
 
     @model_validator(mode="after")
     def _check_coefficients_of_model(self) -> Self:
@@ -235,10 +222,11 @@ class Camera(Section):
         "direction that is up in the picture, or its keyframes",
         "three numbers: [x, y, z]," + _OR_KEYFRAMES,
     )
-    fov: Annotated[Number, Field(ge=MIN_FOV, lt=180)] = key(
+    # In f32, directions are resolved to 2^-24, 3.4e-6 degrees; below the minimum, about 300 rows would be distinct.
+    fov: Annotated[Number, Field(ge=0.001, lt=180)] = key(
         40.0,
         "vertical field of view, without distortion [degrees]",
-        f"a number from {MIN_FOV:g} to below 180, in degrees",
+        "a number from 0.001 to below 180, in degrees",
     )
 
     @property
@@ -274,12 +262,8 @@ class Camera(Section):
     def _check_order(cls, keyframes: Any, info: ValidationInfo) -> Any:
         if info.field_name == "eye" and keyframes is None and not {"beside", "pose", "poses"} & _given(info):
             raise scene_fault("missing; expected " + cls.model_fields["eye"].json_schema_extra["expects"])  # type: ignore
-        if keyframes is None or not isinstance(keyframes[0], tuple):
-            return keyframes  # A constant vector.
-        for n, ((previous, *_), (time, *_)) in enumerate(pairwise(keyframes), 1):
-            if time <= previous:
-                times = f"is at {time:g} s, and the key before it at {previous:g} s"
-                raise scene_fault(f"{times}; sort the keys, each later than the last", n)
+        if keyframes is not None and isinstance(keyframes[0], tuple):
+            require_increasing(keyframes)
         return keyframes
 
     @model_validator(mode="after")
@@ -344,23 +328,17 @@ class Camera(Section):
                 fault = f"{focal:g} is not the focal length of the lens, a0 = {lens_focal:g}"
                 raise scene_fault(f"{fault}; remove fx and fy", "intrinsics", name)
 
-    @model_serializer(mode="wrap")
-    def _dump_used_keys(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Omit keys that others replace, because their defaults would be invalid when the scene is read again."""
+    def _unused_keys(self) -> Collection[str]:
         needed = {"eye", "target", "up"} if self.eye is not None else {"pose", "poses"} & self.model_fields_set
         if self.beside is not None:
             needed = {"beside", "baseline"} if self.baseline is not None else {"beside", "rotation", "translation"}
         if self.beside is None or self.has_own_lens:
             needed |= {"intrinsics"} if self.intrinsics is not None else {"fov"}
         needed |= {name for name in ("distortion", "outside") if name in self.model_fields_set}
-        return {name: value for name, value in dump(self).items() if name in needed}
+        return type(self).model_fields.keys() - needed
 
     def with_poses(self) -> Self:
-        """Return a copy with the rows of the trajectory file, if there is one.
-
-        Raises:
-            PydanticCustomError: when the file cannot be used.
-        """
+        """Return a copy with the rows of the trajectory file, if there is one."""
         if not isinstance(self.poses, str):
             return self
         try:
@@ -371,14 +349,7 @@ class Camera(Section):
         return self.model_validate(kept | {"poses": rows})
 
     def calibrated(self, size: tuple[int, int]) -> Self:
-        """Return a copy with the intrinsics and the distortion of the calibration file, if there is one.
-
-        Args:
-            size: width and height of the pictures [px].
-
-        Raises:
-            PydanticCustomError: when the file cannot be used, or its size differs from `size` without `scale`.
-        """
+        """Return a copy with the intrinsics and distortion of the calibration file for pictures of a size [px]."""
         if self.calibration is None:
             return self
         # Only a stereo pair uses the distance of the cameras.

@@ -1,12 +1,12 @@
 """Outputs of a run, and the names of their files.
 
-A new output is a row of the table in this module, and a field with its values.
+A new output is a row of the table in this module and of that in its page, and a field with its values.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from importlib.util import find_spec
 from typing import Literal, NamedTuple
 
@@ -40,29 +40,17 @@ FORCES_HEADER = ("time", "probe", "tip_x", "tip_y", "tip_z", "force_x", "force_y
 
 
 class Output(NamedTuple):
-    """An output of a run, which an entry of a scene's `output` selects.
+    """An output of a run, which an entry of a scene's `output` selects."""
 
-    Attributes:
-        name: name of the output. Of the sources labels, flow and stereo, also the field of `Labels`, `Flow` or
-            `Stereo` that is written, in the format of the file's suffix.
-        file: path of the file, or that of the first frame of a series.
-        source: origin of the values: a field of `FrameOutputs`, positions or forces.
-        description: content of the file, for users.
-        pixel_bytes: upper bound of the file's size per pixel [bytes], reached by a picture of noise; 0 if the size
-            does not depend on the pixels.
-        needs_camera: whether the values are meaningful only with the camera's matrices.
-        needs_stereo_pair: whether only the reference camera of a stereo pair has this output.
-        entry: entry of `output` that selects it; empty if it is the name.
-    """
-
+    # Of the sources labels, flow and stereo, also the field of `Labels`, `Flow` or `Stereo` that is written, in the
+    # format of the file's suffix.
     name: str
-    file: str
+    file: str  # path, or that of the first frame of a series
     source: Literal["picture", "labels", "flow", "stereo", "tracks", "positions", "forces"]
-    description: str
-    pixel_bytes: float = 0
-    needs_camera: bool = False
-    needs_stereo_pair: bool = False
-    entry: str = ""
+    pixel_bytes: float = 0  # upper bound of the file's size per pixel, of a picture of noise; 0 if independent of them
+    needs_camera: bool = False  # whether the values are meaningful only with the camera's matrices
+    needs_stereo_pair: bool = False  # whether only the reference camera of a stereo pair has it
+    entry: str = ""  # entry of `output` that selects it; empty if it is the name
 
     @property
     def result(self) -> str:
@@ -98,87 +86,33 @@ class Output(NamedTuple):
         return max(0, frames - self.is_frame_pair)
 
 
-def _all_outputs() -> Iterator[Output]:
-    """Iterate over the outputs, in their order in messages and help.
-
-    Upper bounds of the size: PNG stores noise uncompressed, a code of a GIF has 12 bits, a pixel of yuv420p has 12 bits
-    before encoding, and a mask has two values. Most pictures take a half or a third of them.
-    """
-    yield Output("png", "frames/0000.png", "picture", "the picture", pixel_bytes=3.01)
-    yield Output("gif", "animation.gif", "picture", "the pictures as an animation", pixel_bytes=1.51)
-    description = (
-        "the pictures as a video, H.264 in yuv420p; an odd last row or column is repeated; needs PyAV "
-        "(`pip install av`)"
-    )
-    yield Output("mp4", "animation.mp4", "picture", description, pixel_bytes=1.6)
-    description = "`time` [s], shape (frames,), and `position` of the mass points [m], shape (frames, rows, cols, 3)"
-    yield Output("trajectory", "trajectory.npz", "positions", description)
-    description = (
-        "a row for each frame and probe: `time` [s], `probe`, `tip_x`, `tip_y`, `tip_z` [m] of the lowest point of a "
-        "position-controlled tool, or of the control point on the deformed sheet, and `force_x`, `force_y`, `force_z` "
-        "[N] on the mass points that are not fixed; of a position-controlled tool the mean since the previous frame"
-    )
-    yield Output("forces", "forces.csv", "forces", description)
-    description = (
-        "float32 (height, width, 2): the material point at the pixel's centre, as fractions of the sheet's width from "
-        "its left and of its height from its top; NaN where the sheet is not visible"
-    )
-    yield Output("coordinates", "coordinates/0000.npy", "labels", description, pixel_bytes=8, needs_camera=True)
-    description = (
-        "float32 [m], along the optical axis from the eye; with `camera: top` from a plane above the sheet at rest, at "
-        "a distance equal to the larger side of the sheet; 0: background"
-    )
-    yield Output("depth", "depth/0000.tiff", "labels", description, pixel_bytes=4, needs_camera=True)
-    description = (
-        "float32 (height, width, 3): the unit normal of the drawn triangle, without relief, or of the instrument, "
-        "toward the camera, in its axes (x right, y down, z forward); NaN: background"
-    )
-    yield Output("normals", "normals/0000.npy", "labels", description, pixel_bytes=12, needs_camera=True)
-    description = (
-        "Middlebury's format: the motion of the visible material point until the next frame, right and down [px], also "
-        "where it is hidden there; 1e10: no sheet, or it moves behind the eye or beyond the lens's limit"
-    )
-    yield Output("flow", "flow/0000.flo", "flow", description, pixel_bytes=8, needs_camera=True)
-    description = "255 where the visible material point is hidden or outside the picture in the next frame, else 0"
-    yield Output("occlusion", "occlusion/0000.png", "flow", description, pixel_bytes=0.5)
-    description = (
-        "of the reference camera of a stereo pair: float32 [px], fx × baseline / depth, the distance to the left in "
-        "the picture of the first camera that is `beside` it; 0: background"
-    )
-    yield Output(
-        "disparity",
-        "disparity/0000.tiff",
-        "stereo",
-        description,
-        pixel_bytes=4,
-        needs_camera=True,
-        needs_stereo_pair=True,
-    )
-    description = (
-        "of the reference camera of a stereo pair: Middlebury's format, from the pixel to the place of its tissue or "
-        "instrument in the picture of the first camera that is `beside` it, at the same time, right and down [px], "
-        "also where it is hidden there; 1e10: background, or it is behind that camera or beyond its lens's limit"
-    )
-    yield Output(
-        "stereo", "stereo/0000.flo", "stereo", description, pixel_bytes=8, needs_camera=True, needs_stereo_pair=True
-    )
-    yield Output(
+# The outputs, in their order in messages and help; docs/files.md and docs/labels.md describe them. Upper bounds of the
+# size: PNG stores noise uncompressed, a code of a GIF has 12 bits, a pixel of yuv420p has 12 bits before encoding, and
+# a mask has two values. Most pictures take a half or a third of them.
+_ROWS = (
+    Output("png", "frames/0000.png", "picture", pixel_bytes=3.01),
+    Output("gif", "animation.gif", "picture", pixel_bytes=1.51),
+    Output("mp4", "animation.mp4", "picture", pixel_bytes=1.6),
+    Output("trajectory", "trajectory.npz", "positions"),
+    Output("forces", "forces.csv", "forces"),
+    Output("coordinates", "coordinates/0000.npy", "labels", pixel_bytes=8, needs_camera=True),
+    Output("depth", "depth/0000.tiff", "labels", pixel_bytes=4, needs_camera=True),
+    Output("normals", "normals/0000.npy", "labels", pixel_bytes=12, needs_camera=True),
+    Output("flow", "flow/0000.flo", "flow", pixel_bytes=8, needs_camera=True),
+    Output("occlusion", "occlusion/0000.png", "flow", pixel_bytes=0.5),
+    Output("disparity", "disparity/0000.tiff", "stereo", pixel_bytes=4, needs_camera=True, needs_stereo_pair=True),
+    Output("stereo", "stereo/0000.flo", "stereo", pixel_bytes=8, needs_camera=True, needs_stereo_pair=True),
+    Output(
         "stereo_occlusion",
         "stereo-occlusion/0000.png",
         "stereo",
-        "255 where the pixel's tissue or instrument is hidden or outside the picture in that camera, else 0",
         pixel_bytes=0.5,
         needs_stereo_pair=True,
         entry="stereo",
-    )
-    description = "255 where an instrument is visible, else 0"
-    yield Output("instrument", "instrument/0000.png", "labels", description, pixel_bytes=0.5)
-    description = (
-        "of `render.tracks` × `render.tracks` points at the centres of equal cells of the sheet: `coordinates` (N, 2), "
-        "`points` (N, frames, 2) [px] from the picture's upper left corner, NaN behind the eye, `occluded` (N, frames) "
-        "and `position` (N, frames, 3) [m] in the world, on the drawn surface"
-    )
-    yield Output("tracks", "tracks.npz", "tracks", description, needs_camera=True)
+    ),
+    Output("instrument", "instrument/0000.png", "labels", pixel_bytes=0.5),
+    Output("tracks", "tracks.npz", "tracks", needs_camera=True),
+)
 
 
 def zero_padded(number: int) -> str:
@@ -186,7 +120,7 @@ def zero_padded(number: int) -> str:
     return f"{number:06}"
 
 
-OUTPUTS = {output.name: output._replace(entry=output.entry or output.name) for output in _all_outputs()}
+OUTPUTS = {output.name: output._replace(entry=output.entry or output.name) for output in _ROWS}
 
 # Entries of `output`.
 ENTRIES = list(dict.fromkeys(output.entry for output in OUTPUTS.values()))
@@ -208,13 +142,10 @@ RESULT_PATTERNS = (
 
 
 def result_names(folders: Mapping[str, Collection[str]]) -> list[str]:
-    """List the results of a run, as in `outputs` of run.json.
+    """List the results of a run, as in `outputs` of run.json: folders of series, files, matrices of cameras, record.
 
     Args:
         folders: names of the outputs, by the folders of the cameras; "" is the folder of the run.
-
-    Returns:
-        The folders of series, then the files, the matrices of the cameras and the record.
     """
     selected = [(folder, output) for output in OUTPUTS.values() for folder in folders if output.name in folders[folder]]
     selected.sort(key=lambda item: not item[1].is_series)
@@ -237,13 +168,7 @@ def file_names(results: Iterable[str], frames: int) -> list[str]:
 
 
 def is_result(results: Collection[str], frames: int, name: str) -> bool:
-    """Return whether a path is in `file_names`, without listing them.
-
-    Args:
-        results: names of the results, from `result_names`.
-        frames: number of frames.
-        name: path relative to the folder of the run.
-    """
+    """Return whether a path is in `file_names`, without listing them."""
     folder, _, file = name.rpartition("/")
     output, number = SERIES_FOLDERS.get(folder.rpartition("/")[2]), file.partition(".")[0]
     if output is None or not number.isdecimal():

@@ -3,18 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    Field,
-    SerializerFunctionWrapHandler,
-    StrictBool,
-    ValidationInfo,
-    field_validator,
-    model_serializer,
-    model_validator,
-)
+from pydantic import Field, StrictBool, ValidationInfo, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 from typing_extensions import Self
 
@@ -23,10 +15,7 @@ from taichi_msm.scene.camera import Camera
 from taichi_msm.scene.outputs import CAMERA_NAME, EXPORT_PREFIX, MAX_CAMERA_NAME, SERIES_FOLDERS
 from taichi_msm.scene.section import (
     MAX_PIXELS,
-    MAX_REFINE,
-    MAX_RELIEF,
     MAX_SUPERSAMPLE,
-    MAX_TRACKS,
     Byte,
     Integer,
     Number,
@@ -47,10 +36,8 @@ class Light(Section):
 
     ambient: UnitInterval = key(0.2, "ambient fraction of the light", "a number, 0 to 1")
     gloss: UnitInterval = key(0.4, "brightness of the wet highlight, as a fraction of white", "a number, 0 to 1")
-    relief: Annotated[Number, Field(ge=-MAX_RELIEF, le=MAX_RELIEF)] = key(
-        0.0,
-        "height of white above black in the image, in percent of the sheet's larger side",
-        f"a number, -{MAX_RELIEF} to {MAX_RELIEF}",
+    relief: Annotated[Number, Field(ge=-10, le=10)] = key(
+        0.0, "height of white above black in the image, in percent of the sheet's larger side", "a number, -10 to 10"
     )
     vignette: UnitInterval = key(0.0, "darkening of the picture's corners, as a fraction", "a number, 0 to 1")
 
@@ -61,8 +48,8 @@ class Render(Section):
     size: tuple[Pixels, Pixels] = key(
         (512, 512), "width, height of a frame [px]", f"two whole numbers, 1 to {MAX_PIXELS}: [width, height] in pixels"
     )
-    refine: Annotated[Integer, Field(ge=0, le=MAX_REFINE)] = key(
-        10, "vertices inserted between two neighbouring mass points when drawing", f"a whole number, 0 to {MAX_REFINE}"
+    refine: Annotated[Integer, Field(ge=0, le=64)] = key(
+        10, "vertices inserted between two neighbouring mass points when drawing", "a whole number, 0 to 64"
     )
     camera: AnyCamera = key(
         "top",
@@ -96,8 +83,8 @@ class Render(Section):
     quality: Annotated[Integer, Field(ge=1, le=100)] = key(
         65, "quality of the video of output: mp4 [%]", "a whole number, 1 to 100"
     )
-    tracks: Annotated[Integer, Field(ge=1, le=MAX_TRACKS)] = key(
-        16, "material points along each side of the grid of tracked points", f"a whole number, 1 to {MAX_TRACKS}"
+    tracks: Annotated[Integer, Field(ge=1, le=256)] = key(
+        16, "material points along each side of the grid of tracked points", "a whole number, 1 to 256"
     )
 
     @field_validator("camera", mode="after")
@@ -145,11 +132,8 @@ class Render(Section):
             raise scene_fault("is given together with cameras; remove one of them, or set it to null", "camera")
         return self
 
-    @model_serializer(mode="wrap")
-    def _dump_used_key(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Omit `cameras` if it is missing, or else `camera`."""
-        unused = "cameras" if self.cameras is None else "camera"
-        return {name: value for name, value in dump(self).items() if name != unused}
+    def _unused_keys(self) -> Collection[str]:
+        return ("cameras",) if self.cameras is None else ("camera",)
 
     @property
     def all_cameras(self) -> dict[str, AnyCamera]:

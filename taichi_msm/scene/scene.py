@@ -5,11 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Annotated, Literal
 
-from pydantic import (
-    ConfigDict,
-    Field,
-    model_validator,
-)
+from pydantic import ConfigDict, Field, model_validator
 
 from taichi_msm.scene.outputs import ENTRIES, OUTPUTS
 from taichi_msm.scene.render import Render
@@ -79,7 +75,7 @@ class Time(Section):
         return round(self.duration * self.frames_per_second)
 
     @model_validator(mode="after")
-    def _check_frame_count(self) -> Time:
+    def _check_combination(self) -> Time:
         frames = self.duration * self.frames_per_second
         if not 0.5 < frames <= 1e9 or abs(frames - round(frames)) > FRAME_TOLERANCE:
             nearest = max(1, round(min(frames, 1e9))) / self.frames_per_second
@@ -88,21 +84,12 @@ class Time(Section):
                 f"not a whole number up to 1e9; try {nearest:.12g}",
                 "duration",
             )
-        return self
-
-    @model_validator(mode="after")
-    def _check_one_step(self) -> Time:
         if self.tolerance is not None and self.step != "auto":
             message = f"a tolerance chooses the step, but step is {self.step:.12g}"
             raise scene_fault(f"{message}; set step: auto or remove the tolerance", "tolerance")
-        return self
-
-    @model_validator(mode="after")
-    def _check_fits_motion(self) -> Time:
         if self.at_rest and self.tolerance is not None:
-            raise scene_fault(
-                "is for the time step, and motion: quasistatic takes none; remove the tolerance", "tolerance"
-            )
+            message = "is for the time step, and motion: quasistatic takes none; remove the tolerance"
+            raise scene_fault(message, "tolerance")
         if self.at_rest and self.precision == "f32":
             raise scene_fault("f32 is too coarse for motion: quasistatic; take auto or f64", "precision")
         return self

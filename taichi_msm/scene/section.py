@@ -7,18 +7,14 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import cache
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from itertools import islice, pairwise
 from types import UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
 
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    ValidationError,
-)
-from pydantic_core import PydanticCustomError
+from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, ValidationError, model_serializer
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails, PydanticCustomError
 from typing_extensions import Self
 
 from taichi_msm.errors import ArgumentError, Key, Problem, SceneError, did_you_mean, truncate
@@ -33,13 +29,16 @@ SCENE_FAULT = "refused"
 
 
 def scene_fault(message: str, *below: str | int) -> PydanticCustomError:
-    """Return the error that a validator raises for a fault of its value.
-
-    Args:
-        message: message for the user, without the key.
-        below: keys and indices from the validated value to the value at fault.
-    """
+    """Return the error that a validator raises for a fault of its value, or of the value at the keys `below` it."""
     return PydanticCustomError(SCENE_FAULT, message, {"below": below})
+
+
+def require_increasing(keyframes: Iterable[Sequence[float]]) -> None:
+    """Refuse keyframes whose times, their first numbers, do not increase."""
+    for n, ((previous, *_), (time, *_)) in enumerate(pairwise(keyframes), 1):
+        if time <= previous:
+            times = f"is at {time:g} s, and the key before it at {previous:g} s"
+            raise scene_fault(f"{times}; sort the keys, each later than the last", n)
 
 
 def format_value(value: Any) -> str:
@@ -48,13 +47,7 @@ def format_value(value: Any) -> str:
 
 
 def key_problems(error: ValidationError, section: type[BaseModel], data: Any) -> list[Problem]:
-    """Translate pydantic's errors to problems at the keys of a scene.
-
-    Args:
-        error: error of the validation.
-        section: model that the data was validated against.
-        data: plain data, as passed to the validation.
-    """
+    """Translate errors of the validation of plain data against a section to problems at its keys."""
     # A broken file of the largest size could have tens of thousands of faults.
     errors = error.errors(include_url=False, include_input=False)[:1000]
     faults = [_fault(details, section) for details in errors]
@@ -62,78 +55,36 @@ def key_problems(error: ValidationError, section: type[BaseModel], data: Any) ->
 
 
 class _Fault(NamedTuple):
-    """An error of pydantic, in terms of the scene.
+    """An error of pydantic, in terms of the scene."""
 
-    Attributes:
-        path: path to the key at fault.
-        error_type: pydantic's type of the error.
-        text: pydantic's message.
-        context: pydantic's numbers and names of the message.
-        section: section that the key belongs to.
-        expects: allowed values, for the message.
-        branches: keys above the fault that allow several kinds of value, each with the name of the validated kind.
-        words: allowed texts.
-    """
-
-    path: Key
-    error_type: str
-    text: str
-    context: dict[str, Any]
-    section: type[BaseModel]
-    expects: str
-    branches: tuple[tuple[Key, str], ...]
-    words: tuple[str, ...]
+    path: Key  # to the key at fault
+    error: ErrorDetails
+    kind: str  # pydantic's type of the error
+    section: type[BaseModel]  # that the key belongs to, or that of the keys below it
+    field: FieldInfo | None  # of the last key in the path
+    branches: tuple[tuple[Key, str], ...]  # keys that allow several kinds of value, each with the validated kind
 
 
-def _fault(error: Any, section: type[BaseModel]) -> _Fault:
+def _fault(error: ErrorDetails, section: type[BaseModel]) -> _Fault:
     """Translate an error, by its location in the models without pydantic's names of union members."""
     path: Key = ()
-    expects = ""
+    field = None
     branches: tuple[tuple[Key, str], ...] = ()
-    words: tuple[tuple[str, ...], ...] = (), ()
     parts = iter(error["loc"])
     for part in parts:
         path += (part,)
-        if part in section.model_fields:
-            section, expects, is_mapping, is_union, words = _key_info(section, part)
-            path += (name,) if is_mapping and (name := next(parts, None)) is not None else ()
-            if is_union:
-                branches += ((path, next(parts, "")),)
-    context = error.get("ctx", {})
-    path += context.get("below", ())
-    in_list = bool(path) and isinstance(path[-1], int)
-    return _Fault(path, error["type"], error["msg"], context, section, expects, branches, words[in_list])
-
-
-class _KeyInfo(NamedTuple):
-    """Properties of a key.
-
-    Attributes:
-        section: section of the keys below it, or else the section that it belongs to.
-        expects: allowed values, for the message.
-        is_mapping: whether the value is a mapping from names.
-        is_union: whether the value, or each value of the mapping, may be of several kinds.
-        words: texts that the value, and the items of a list, may be.
-    """
-
-    section: type[BaseModel]
-    expects: str
-    is_mapping: bool
-    is_union: bool
-    words: tuple[tuple[str, ...], ...]
-
-
-@cache
-def _key_info(section: type[BaseModel], name: str) -> _KeyInfo:
-    field = section.model_fields[name]
-    extra = field.json_schema_extra
-    assert isinstance(extra, dict)
-    kinds = _kinds(field.annotation)
-    if is_mapping := get_origin(kinds[0]) is dict:
-        kinds = _kinds(get_args(kinds[0])[1])
-    words = tuple(tuple(_words(field.annotation, depth)) for depth in (0, 1))
-    inner = next(_sections(field.annotation), section)
-    return _KeyInfo(inner, str(extra["expects"]), is_mapping, len(kinds) > 1, words)
+        if part not in section.model_fields:
+            continue
+        field = section.model_fields[str(part)]
+        kinds = _kinds(field.annotation)
+        if get_origin(kinds[0]) is dict:  # a mapping from names
+            kinds = _kinds(get_args(kinds[0])[1])
+            path += tuple(islice(parts, 1))
+        if len(kinds) > 1:
+            branches += ((path, str(next(parts, ""))),)
+        section = next(_sections(field.annotation), section)
+    path += error.get("ctx", {}).get("below", ())
+    return _Fault(path, error, error["type"], section, field, branches)
 
 
 def _kinds(annotation: Any) -> list[Any]:
@@ -146,7 +97,7 @@ def _kinds(annotation: Any) -> list[Any]:
 def _words(annotation: Any, depth: int) -> Iterator[str]:
     """Iterate over the texts that an annotation allows within lists nested to a depth."""
     if get_origin(annotation) is Literal:
-        yield from (word for word in get_args(annotation) if depth == 0)
+        yield from get_args(annotation) if depth == 0 else ()
         return
     for argument in get_args(annotation):
         yield from _words(argument, depth - (get_origin(annotation) is tuple))
@@ -154,7 +105,7 @@ def _words(annotation: Any, depth: int) -> Iterator[str]:
 
 def _sections(annotation: Any) -> Iterator[type[BaseModel]]:
     """Iterate over the sections of an annotation such as tuple[Probe, ...]."""
-    if get_origin(annotation) is None and isinstance(annotation, type) and issubclass(annotation, BaseModel):
+    if isinstance(annotation, type) and get_origin(annotation) is None and issubclass(annotation, BaseModel):
         yield annotation
     for argument in get_args(annotation):
         yield from _sections(argument)
@@ -173,7 +124,7 @@ def _choose_kinds(faults: Sequence[_Fault]) -> Iterator[_Fault]:
         for key, kind in fault.branches:
             deepest = max(depths[key].values())
             if list(depths[key].values()).count(deepest) > 1:
-                yield fault._replace(path=key, error_type="choice")
+                yield fault._replace(path=key, kind="choice")
                 break
             if depths[key][kind] != deepest:
                 break
@@ -184,48 +135,42 @@ def _choose_kinds(faults: Sequence[_Fault]) -> Iterator[_Fault]:
 def _drop_short(faults: Iterable[_Fault]) -> Iterator[_Fault]:
     """Merge the faults of missing items into a fault of their list; drop it if an item of the list is at fault."""
     merged = [
-        fault._replace(path=fault.path[:-1], error_type="too_short")
-        if fault.error_type == "missing" and isinstance(fault.path[-1], int)
+        fault._replace(path=fault.path[:-1], kind="too_short")
+        if fault.kind == "missing" and isinstance(fault.path[-1], int)
         else fault
         for fault in faults
     ]
     parents = {fault.path[:n] for fault in merged for n in range(len(fault.path))}
-    return (fault for fault in merged if fault.error_type != "too_short" or fault.path not in parents)
+    return (fault for fault in merged if fault.kind != "too_short" or fault.path not in parents)
 
 
 def _message(fault: _Fault, data: Any) -> str:
     """Format a fault with the allowed values."""
-    if fault.error_type == SCENE_FAULT:
-        return fault.text
-    if fault.error_type == "missing":
-        return f"missing; expected {fault.expects}"
-    if fault.error_type == "extra_forbidden":
-        return _unknown(str(fault.path[-1]), list(fault.section.model_fields))
+    if fault.kind == SCENE_FAULT:
+        return fault.error["msg"]
+    if fault.kind == "extra_forbidden":
+        known = list(fault.section.model_fields)
+        return "unknown key" + (did_you_mean(str(fault.path[-1]), known) or f"; allowed: {', '.join(known)}")
+    assert fault.field is not None
+    expected = f"expected {fault.field.json_schema_extra['expects']}"  # type: ignore[index]
+    if fault.kind == "missing":
+        return f"missing; {expected}"
     for part in fault.path:
         data = data[part]
-    limit = fault.context.get("ge", fault.context.get("le"))
+    context = fault.error.get("ctx", {})
+    limit = context.get("ge", context.get("le"))
     if limit in (MAX_MAGNITUDE, -MAX_MAGNITUDE) or (limit == MIN_MAGNITUDE and data > 0):
         return f"{format_value(data)} is out of range; numbers are from {MIN_MAGNITUDE:g} to {MAX_MAGNITUDE:g} in size"
-    hint = did_you_mean(data, fault.words) if isinstance(data, str) else ""
-    return f"{format_value(data)} is not allowed; expected {fault.expects}{hint}"
-
-
-def _unknown(name: str, known: Sequence[str]) -> str:
-    return "unknown key" + (did_you_mean(name, known) or f"; allowed: {', '.join(known)}")
+    is_item = isinstance(fault.path[-1], int)
+    hint = did_you_mean(data, _words(fault.field.annotation, is_item)) if isinstance(data, str) else ""
+    return f"{format_value(data)} is not allowed; {expected}{hint}"
 
 
 # Limits of the scene's numbers.
 MAX_POINTS = 4096  # rows or columns of mass points
 MAX_PROBES = 16
 MAX_PIXELS = 8192  # width or height of a frame
-MAX_REFINE = 64
-MAX_TRACKS = 256
-MAX_RELIEF = 10  # [%]
 MAX_SUPERSAMPLE = 4
-
-# Minimum field of view [degrees]. In f32, directions are resolved to 2^-24, which is 3.4e-6 degrees; a narrower picture
-# would have fewer than about 300 distinct rows.
-MIN_FOV = 1e-3
 
 # Approximate limit of operating systems for the length of a path.
 MAX_PATH = 4096
@@ -306,20 +251,20 @@ class Section(BaseModel, metaclass=_SectionMeta):
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """Return a copy of the section with some keys replaced.
-
-        Args:
-            update: new values by keys.
-            deep: ignored, as the values are immutable.
-
-        Raises:
-            ArgumentError: when `update` is not a mapping from texts.
-            SceneError: when a key is unknown or a value is invalid.
-        """
+        """Return a copy of the section with some keys replaced; `deep` is ignored, as the values are immutable."""
         del deep
         if not (update is None or (isinstance(update, Mapping) and all(isinstance(name, str) for name in update))):
             raise ArgumentError(f"update: {update!r}; take a mapping from keys to values")
         return type(self)(**{**{name: getattr(self, name) for name in self.model_fields_set}, **(update or {})})
+
+    def _unused_keys(self) -> Collection[str]:
+        """Return the keys that a dump omits, as they would be invalid when the scene is read again."""
+        return ()
+
+    @model_serializer(mode="wrap")
+    def _dump_used_keys(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        unused = self._unused_keys()
+        return {name: value for name, value in dump(self).items() if name not in unused}
 
     def __setattr__(self, name: str, value: object) -> None:
         raise SceneError([f"{name}: a scene cannot be changed; use model_copy(update={{{name!r}: ...}})"])

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from collections.abc import Collection
+from typing import Literal
 
-from pydantic import SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import model_validator
 from typing_extensions import Self
 
 from taichi_msm.scene.section import (
@@ -108,10 +109,8 @@ class Foundation(Section):
         10.0, "largest stiffness of a foundation that locks, relative to that at rest", "a number from 1 to 1000"
     )
 
-    @model_serializer(mode="wrap")
-    def _dump_used_keys(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Omit lock and factor of a linear foundation."""
-        return {name: value for name, value in dump(self).items() if self.lock or name in ("young", "depth")}
+    def _unused_keys(self) -> Collection[str]:
+        return () if self.lock else ("lock", "factor")
 
     @model_validator(mode="after")
     def _check_factor(self) -> Self:

@@ -2,18 +2,10 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
+from collections.abc import Collection
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    ConfigDict,
-    Field,
-    SerializerFunctionWrapHandler,
-    ValidationInfo,
-    field_validator,
-    model_serializer,
-    model_validator,
-)
+from pydantic import ConfigDict, Field, ValidationInfo, field_validator, model_validator
 from typing_extensions import Self
 
 from taichi_msm.scene.section import (
@@ -29,6 +21,7 @@ from taichi_msm.scene.section import (
     Side,
     Vector,
     key,
+    require_increasing,
     scene_fault,
 )
 
@@ -72,10 +65,8 @@ class Instrument(Section):
             raise scene_fault("does not go with radius, of a round end; remove one of them", "plate")
         return self
 
-    @model_serializer(mode="wrap")
-    def _dump_shape(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Omit the key of the other shape."""
-        return {name: value for name, value in dump(self).items() if value is not None}
+    def _unused_keys(self) -> Collection[str]:
+        return ("radius",) if self.radius is None else ("plate",)
 
 
 # Keys that only a force-controlled tool has, and those that only a position-controlled tool has.
@@ -216,21 +207,10 @@ class Probe(Section):
 
     @field_validator("path", mode="after")
     @classmethod
-    def _check_times_increase(cls, path: tuple[tuple[float, ...], ...] | None) -> tuple[tuple[float, ...], ...] | None:
-        for n, ((previous, *_), (time, *_)) in enumerate(pairwise(path or ()), 1):
-            if time <= previous:
-                raise scene_fault(
-                    f"is at {time:g} s, and the key before it at {previous:g} s; "
-                    "sort the keys, each later than the last",
-                    n,
-                )
-        return path
-
-    @field_validator("path", mode="after")
-    @classmethod
-    def _check_fractions(
+    def _check_path(
         cls, path: tuple[PathKeyframe, ...] | None, info: ValidationInfo
     ) -> tuple[PathKeyframe, ...] | None:
+        require_increasing(path or ())
         for n, keyframe in enumerate(path or ()):
             for axis in (1, 2):
                 if info.data.get("clamp", "") is None and not MIN_FRACTION <= keyframe[axis] <= MAX_FRACTION:
@@ -271,10 +251,7 @@ class Probe(Section):
             raise scene_fault("missing; with path expected a mapping with radius, shaft and length", "instrument")
         return self
 
-    @model_serializer(mode="wrap")
-    def _dump_kind(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Omit the keys of the other kind of tool, which would be invalid when the scene is read again."""
-        omitted = _FORCE_KEYS | {"clamp"} if self.path is not None else _PATH_KEYS | {"clamp", "path"}
+    def _unused_keys(self) -> Collection[str]:
         if self.clamp is not None:
-            omitted = _FORCE_KEYS | _PATH_KEYS | {"instrument"}
-        return {name: value for name, value in dump(self).items() if name not in omitted}
+            return _FORCE_KEYS | _PATH_KEYS | {"instrument"}
+        return _FORCE_KEYS | {"clamp"} if self.path is not None else _PATH_KEYS | {"clamp", "path"}

@@ -10,9 +10,6 @@ import numpy as np
 from taichi_msm.arithmetic import Operations
 from taichi_msm.shapes.shape import MIN_DISTANCE_M, Array, Shape
 
-# Segments of a mesh between the side and a pole.
-POLE_SEGMENTS = 8
-
 
 class Capsule(Shape):
     """A capsule."""
@@ -60,8 +57,8 @@ class Capsule(Shape):
         return intersect
 
     def profile(self, length: float, radius: float) -> Array:
-        """Return two quarters of a circle; see `Shape.profile`."""
-        latitude = np.linspace(np.pi / 2, 0, POLE_SEGMENTS + 1)
+        """Return two quarters of a circle, of 8 segments each; see `Shape.profile`."""
+        latitude = np.linspace(np.pi / 2, 0, 9)
         latitude, offset = np.concatenate([latitude, -latitude[::-1]]), np.repeat([length, 0.0], len(latitude))
         normals = np.stack([np.sin(latitude), np.cos(latitude)])
         return np.stack([offset + radius * normals[0], radius * normals[1], *normals], axis=1)

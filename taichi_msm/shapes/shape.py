@@ -23,15 +23,10 @@ MIN_DISTANCE_M = 1e-18
 
 
 class Shape(ABC):
-    """The shape of a tool.
+    """The shape of a tool."""
 
-    Attributes:
-        name: the shape, for messages.
-        max_stride: largest displacement of a tool in a step, in radii.
-    """
-
-    name: ClassVar[str]
-    max_stride: ClassVar[float]
+    name: ClassVar[str]  # for messages
+    max_stride: ClassVar[float]  # largest displacement of a tool in a step, in radii
 
     @abstractmethod
     def build_depth(self, operations: Operations) -> Callable[..., Any]:

@@ -20,15 +20,17 @@ results for such vectors. Unary minus, `-=`, abs, any and all are therefore not 
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.solver.state import State
-from taichi_msm.system.runtime import Memory, ti, write_vectors
+from taichi_msm.system.runtime import Memory, compilation_options, ti, write_vectors
 from taichi_msm.terms.base import AREA_SHARE, GAIN, MOBILITY, SQUARED_MOTION, KernelConfig, KernelSheet
 
 NUMBER_BYTES = {"f32": 4, "f64": 8}
@@ -68,14 +70,9 @@ class InitialData(NamedTuple):
 
 
 def to_lanes(layout: SheetLayout, values: NDArray[Any]) -> NDArray[Any]:
-    """Arrange rows of values in lanes with halo, in the precision of the kernels.
+    """Arrange rows of values, shape (..., cols), in lanes with halo, in the precision of the kernels.
 
-    Args:
-        layout: layout of the sheet.
-        values: shape (..., cols); values too large for the precision become infinite.
-
-    Returns:
-        Entries, shape (entries, lanes); 0 where an entry has no column.
+    Values too large for the precision become infinite. Entries without a column are 0; shape (entries, lanes).
     """
     column = np.arange(layout.config.lanes) * layout.strip + np.arange(-1, layout.strip + 1)[:, None]
     inside = (column >= 0) & (column < layout.cols)
@@ -86,16 +83,7 @@ def to_lanes(layout: SheetLayout, values: NDArray[Any]) -> NDArray[Any]:
 
 
 def from_lanes(layout: SheetLayout, entries: NDArray[Any], rows: int) -> NDArray[Any]:
-    """Arrange entries in rows, the inverse of `to_lanes`.
-
-    Args:
-        layout: layout of the sheet.
-        entries: shape (entries, lanes).
-        rows: number of rows to return.
-
-    Returns:
-        Values, shape (rows, cols).
-    """
+    """Arrange entries, shape (entries, lanes), in a number of rows, shape (rows, cols): the inverse of `to_lanes`."""
     laid = entries[: rows * layout.width].reshape(rows, layout.width, layout.config.lanes)
     return laid[:, 1:-1].transpose(0, 2, 1).reshape(rows, -1)[:, : layout.cols]
 
@@ -159,34 +147,35 @@ class SheetArrays:
         return self._memory.array(self._layout.config.precision, self._layout.config.lanes, count * self._layout.width)
 
 
-class SheetKernel(Protocol):
+class SheetKernel:
     """A sheet in the memory of a device, with the kernel that reads it."""
 
     arrays: SheetArrays
+    _layout: SheetLayout
+    _read: Callable[..., None]  # built by `build_read`
+    _top_row = 0  # row of u that contains the first row of the sheet
 
     def read(self, differences: bool, values: NDArray[Any], measures: NDArray[Any]) -> None:
-        """Read displacements or last differences, and measure every row.
+        """Read displacements or last differences (at rest, forces), and measure every row.
 
         Args:
             differences: whether to read last differences instead of displacements.
-            values: output [m], shape (rows, cols, 3).
+            values: output [m], at rest of forces [N], shape (rows, cols, 3).
             measures: output, shape (rows, measures).
         """
+        layout = self._layout
+        with compilation_options():
+            self._read(self._top_row, layout.rows, layout.cols, differences, values, measures, *self.arrays.all)
 
 
-class StepKernel(SheetKernel, Protocol):
+class StepKernel(SheetKernel, ABC):
     """A sheet in the memory of a device, with the kernels that step and read it."""
 
-    def __init__(self, layout: SheetLayout, start: InitialData) -> None: ...
-
+    @abstractmethod
     def advance(self, count: int, table: NDArray[Any]) -> None:
-        """Advance the sheet by a number of steps.
+        """Advance the sheet by `count` steps, with rows of the load table, shape (count, columns)."""
 
-        Args:
-            count: number of steps.
-            table: rows of the load table, shape (count, columns).
-        """
-
+    @abstractmethod
     def compile(self, table: NDArray[Any]) -> None:
         """Compile all kernels without taking a step."""
 
@@ -225,53 +214,24 @@ def build_point_step(config: KernelConfig) -> Callable[..., None]:
     return move
 
 
-def build_measure(config: KernelConfig) -> Callable[..., Any]:
-    """Build the Taichi function that adds the measures of an entry, motion first, to a list of vectors."""
-    vector = config.vector
-    measuring_terms = [measure for term in config.terms for measure in term.build_measures(config)]
-
-    @ti.func
-    def measure(measures: ti.template(), sheet: ti.template(), p, i, b):
-        """Measure entry b of row i of the sheet, stored in row p of u; the row below is stored in row p + 1."""
-        kind = ti.select(i == sheet.rows - 1, 2, ti.select(i == 0, 0, 1))
-        motion = vector(0)
-        for c in ti.static(range(3)):
-            change = sheet.d[c][i * sheet.width + b]
-            motion += change * change
-        if ti.static(config.by_area):
-            motion *= sheet.by_column[(AREA_SHARE + kind) * sheet.width + b]
-        measures[SQUARED_MOTION] += motion
-        for measure_term in ti.static(measuring_terms):
-            measure_term(measures, sheet, p, i, kind, b)
-
-    return measure
-
-
+@cache
 def build_read(config: KernelConfig, *, parallel: bool, iterations: int) -> Callable[..., None]:
-    """Build the kernel that reads and measures a sheet.
+    """Build the kernel that reads and measures a sheet, parallel over rows or not.
 
-    Args:
-        config: compile-time configuration.
-        parallel: whether the rows are distributed over threads.
-        iterations: number of loop iterations per row, of which only the first does work.
+    Of the `iterations` loop iterations per row only the first does work.
     """
     real, vector, vectors, lanes = config.real, config.vector, config.vectors, config.lanes
     count = config.first_constant(None)
-    measure = build_measure(config)
+    measuring = [measure for term in config.terms for measure in term.build_measures(config)]
     reductions = ["sum", *(reduction for term in config.terms for reduction in term.reductions)]
 
     @ti.kernel
     def read(
-        first: ti.i32,
-        rows: ti.i32,
-        cols: ti.i32,
-        differences: ti.i32,
-        values: ti.types.ndarray(dtype=real, ndim=3),
-        measures: ti.types.ndarray(dtype=real, ndim=2),
+        first: ti.i32, rows: ti.i32, cols: ti.i32, differences: ti.i32,
+        values: ti.types.ndarray(dtype=real, ndim=3), measures: ti.types.ndarray(dtype=real, ndim=2),
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
-        constants_of: ti.types.ndarray(dtype=vector, ndim=1),
-        by_column: vectors, stiffness: vectors, fields: vectors,
+        constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
         ti.loop_config(serialize=not parallel)
         for index in range(rows * iterations):
@@ -281,9 +241,18 @@ def build_read(config: KernelConfig, *, parallel: bool, iterations: int) -> Call
                 constants = [constants_of[n][0] for n in ti.static(range(count))]
                 u, d = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z))
                 sheet = ti.static(KernelSheet(u, d, by_column, stiffness, fields, constants, rows, width))
+                kind = ti.select(i == rows - 1, 2, ti.select(i == 0, 0, 1))
                 sums = [vector(0) for _ in ti.static(reductions)]
                 for b in range(1, strip + 1):
-                    measure(sums, sheet, p, i, b)
+                    motion = vector(0)
+                    for c in ti.static(range(3)):
+                        change = d[c][i * width + b]
+                        motion += change * change
+                    if ti.static(config.by_area):
+                        motion *= sheet.by_column[(AREA_SHARE + kind) * width + b]
+                    sums[SQUARED_MOTION] += motion
+                    for measure in ti.static(measuring):
+                        measure(sums, sheet, p, i, kind, b)
                     for c in ti.static(range(3)):
                         value = ti.select(differences, d[c][i * width + b], u[c][p * width + b])
                         for lane in ti.static(range(lanes)):

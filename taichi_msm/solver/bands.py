@@ -19,6 +19,7 @@ after a limited number of checks the worker records its progress and ends. Furth
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any, NamedTuple
 
 from taichi_msm.solver.arrays import build_point_step
@@ -30,7 +31,7 @@ from taichi_msm.terms.bending import BendingTerm
 # Integer arguments of a launch: steps taken before it; steps to take; workers; steps of a pass; rows of `carried` per
 # worker; rows of the sheet; columns of a strip; the first row that is not fixed, and the row after the last; the first
 # row of moments in u; the number of checks after which a waiting worker ends.
-FIRST, COUNT, WORKERS, DEPTH, CARRIED_ROWS, ROWS, STRIP, FIRST_ROW, END_ROW, MOMENT_ROW, MAX_CHECKS, SIZES = range(12)
+FIRST, COUNT, WORKERS, DEPTH, CARRIED_ROWS, ROWS, STRIP, FIRST_ROW, END_ROW, MOMENT_ROW, MAX_CHECKS = range(11)
 
 # The borders of a band at which its worker begins and ends.
 BEGIN, END = 0, 1
@@ -39,7 +40,7 @@ BEGIN, END = 0, 1
 # the border. The first of these lines also contains the worker's pass, round, and step of the round.
 COUNTER_STRIDE = 16
 WORKER_STRIDE = 2 * COUNTER_STRIDE
-PASS_INDEX, ROUND, STEP, PLACE_END = 1, 2, 3, 4
+PASS_INDEX, ROUND, STEP = 1, 2, 3
 
 # Rows of moments per worker.
 MOMENT_ROWS = 3
@@ -79,11 +80,8 @@ def build_step_row(
 ) -> Callable[..., Any]:
     """Build the Taichi function that steps a row of a band, as soon as the neighbours' rows are available.
 
-    Args:
-        config: compile-time configuration.
-        move: function that steps an entry, as for `build_pass_row`.
-        corrects: whether the corrections of terms are applied after the step.
-        parallel: whether the band has neighbours.
+    For `move` see `build_pass_row`; `corrects`: whether the corrections of terms are applied after the step;
+    `parallel`: whether the band has neighbours.
     """
     vector, bending, copied = config.vector, config.get(BendingTerm), config.reach
     join_strips = build_join_strips(config)
@@ -197,13 +195,9 @@ def build_step_row(
     return step_row
 
 
+@cache
 def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None]:
-    """Build the kernel that takes steps.
-
-    Args:
-        config: compile-time configuration.
-        parallel: whether several workers step at the same time.
-    """
+    """Build the kernel that takes steps, with several workers at the same time if `parallel`."""
     real, vector, vectors, lanes = config.real, config.vector, config.vectors, config.lanes
     constant_count = config.first_constant(None)
     step_row = build_step_row(config, build_point_step(config), corrects=True, parallel=parallel)
@@ -247,14 +241,12 @@ def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None
 
     @ti.kernel
     def advance(
-        sizes: ti.types.ndarray(dtype=ti.i64, ndim=1),
-        progress: ti.types.ndarray(dtype=ti.i64, ndim=1),
+        sizes: ti.types.ndarray(dtype=ti.i64, ndim=1), progress: ti.types.ndarray(dtype=ti.i64, ndim=1),
         loads: ti.types.ndarray(dtype=real, ndim=2),
         carried_x: vectors, carried_y: vectors, carried_z: vectors,
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
-        constants_of: ti.types.ndarray(dtype=vector, ndim=1),
-        by_column: vectors, stiffness: vectors, fields: vectors,
+        constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
         ti.loop_config(serialize=not parallel)
         for index in range(ti.cast(sizes[WORKERS], ti.i32) * ITERATIONS_PER_THREAD):
@@ -262,9 +254,8 @@ def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None
             if index % ITERATIONS_PER_THREAD == 0:
                 rows, width = ti.cast(sizes[ROWS], ti.i32), ti.cast(sizes[STRIP], ti.i32) + 2
                 constants = [constants_of[n][0] for n in ti.static(range(constant_count))]
-                sheet = ti.static(
-                    KernelSheet((u_x, u_y, u_z), (d_x, d_y, d_z), by_column, stiffness, fields, constants, rows, width)
-                )
+                u, d = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z))
+                sheet = ti.static(KernelSheet(u, d, by_column, stiffness, fields, constants, rows, width))
                 worker, workers = index // ITERATIONS_PER_THREAD, ti.cast(sizes[WORKERS], ti.i32)
                 first_row, end_row = ti.cast(sizes[FIRST_ROW], ti.i32), ti.cast(sizes[END_ROW], ti.i32)
                 low = first_row + (end_row - first_row) * worker // workers

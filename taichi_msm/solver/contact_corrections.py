@@ -11,20 +11,14 @@ from numpy.typing import NDArray
 from taichi_msm.solver.arrays import SheetArrays, SheetLayout
 from taichi_msm.system.runtime import compilation_options, ti
 from taichi_msm.terms.base import AREA_SHARE, KernelConfig
-from taichi_msm.terms.contact import ContactTerm
-from taichi_msm.terms.contact_layout import CORRECTIONS
+from taichi_msm.terms.contact import CORRECTIONS, ContactTerm
 
 
 def sum_corrections(layout: SheetLayout, arrays: SheetArrays, *, clear: bool) -> NDArray[np.float64]:
     """Sum the contact corrections over the mass points, weighted with their shares of a cell's mass.
 
-    Args:
-        layout: layout of the sheet.
-        arrays: arrays of the sheet.
-        clear: whether to set the fields of corrections to 0 afterwards.
-
-    Returns:
-        Sums [m], shape (tools, 3). The order of summation depends neither on lanes nor on workers.
+    Returns the sums [m], shape (tools, 3); `clear` sets the corrections to 0 afterwards. The order of summation depends
+    neither on lanes nor on workers.
     """
     contact = layout.config.get(ContactTerm)
     if contact is None:
@@ -44,13 +38,9 @@ def _build_sum(config: KernelConfig) -> Callable[..., None]:
 
     @ti.kernel
     def add_up(
-        rows: ti.i32,
-        cols: ti.i32,
-        clear: ti.i32,
-        by_column: vectors,
-        fields: vectors,
-        sums: ti.types.ndarray(dtype=ti.f64, ndim=2),
-    ):
+        rows: ti.i32, cols: ti.i32, clear: ti.i32,
+        by_column: vectors, fields: vectors, sums: ti.types.ndarray(dtype=ti.f64, ndim=2),
+    ):  # fmt: skip
         share_of, corrections = ti.static(by_column, fields)
         ti.loop_config(serialize=serial)
         for i in range(rows):

@@ -11,29 +11,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import DeviceError, MsmError, Pause
-from taichi_msm.model.loads import FrameLoad, decay
+from taichi_msm.errors import MsmError, Pause
+from taichi_msm.model.loads import FrameLoad, average_loads, decay
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.surface import surface_point
 from taichi_msm.model.tool_force import probe_force
-from taichi_msm.model.verlet import mean_force
-from taichi_msm.solver.arrays import NUMBER_BYTES, InitialData, SheetLayout, StepKernel
+from taichi_msm.model.verlet import coefficients, mean_force
+from taichi_msm.solver.arrays import InitialData, StepKernel
 from taichi_msm.solver.contact_corrections import sum_corrections
 from taichi_msm.solver.kernel_cpu import ScatterKernel
 from taichi_msm.solver.kernel_gpu import STEPS_PER_LAUNCH, GatherKernel
-from taichi_msm.solver.planned_sheet import PlannedSheet
+from taichi_msm.solver.sheet_solver import SheetSolver
 from taichi_msm.solver.state import PeakForce, ProbeForces, Reading, State, TipForce
-from taichi_msm.system.process import available_threads
-from taichi_msm.system.runtime import Device, lanes
-from taichi_msm.terms import build_terms
-from taichi_msm.terms.base import KernelConfig
-
-# With fewer mass points per worker, an additional worker costs more waiting time than it saves.
-POINTS_PER_WORKER = 450
-
-# A pass over a larger band takes several steps, so that the rows stay in the cache.
-CACHE_BYTES = 3 << 17
+from taichi_msm.terms.base import GAIN
 
 # Largest numbers of steps times mass points, about 0.1 s of one core, and of steps in a launch. Ctrl-C is handled only
 # between launches.
@@ -44,101 +35,27 @@ MAX_STEPS_PER_LAUNCH = 8192
 STEPS_PER_TABLE = 4096
 
 
-def choose_layout(plan: Plan, device: Device, cores: int | None = None) -> SheetLayout:
-    """Choose the memory layout of a sheet, its division among workers, and the configuration of its kernels.
-
-    Args:
-        plan: the plan.
-        device: the device.
-        cores: largest number of CPU cores; by default all available cores.
-
-    Raises:
-        DeviceError: when the device does not support the scene.
-    """
-    (rows, cols), fixed, precision = plan.scene.sheet.points, plan.fixed, plan.grid.precision
-    fixed_rows = bool(fixed[0].all()), bool(fixed[-1].all())
-    if plan.scene.time.at_rest:
-        if device.arch != "cpu":
-            raise DeviceError(f"--arch {device.arch}: time.motion: quasistatic runs on a CPU only; take --arch cpu")
-        workers = 1
-    elif device.arch == "cpu":
-        # Workers wait by spinning, so more workers than cores would delay each other.
-        cores = min(device.threads, available_threads() if cores is None else cores)
-        workers = max(1, min(cores, rows * cols // POINTS_PER_WORKER, (rows - sum(fixed_rows)) // 2))
-    else:
-        workers = 0
-    config = KernelConfig(precision, lanes(precision), plan.open_edges and plan.material.by_area, build_terms(plan))
-    if device.arch == "vulkan" and precision == "f64" and any(slot.moves for slot in plan.slots):
-        raise DeviceError(
-            "--arch vulkan: has no exp in f64, which control points that move need; take time.precision: f32 without a "
-            "tolerance or an estimate of the error, or --arch cpu"
-        )
-    # Per mass point a pass reads displacement, last difference and carried force, with three components each.
-    fits = workers == 0 or rows // workers * cols * 9 * NUMBER_BYTES[precision] <= CACHE_BYTES
-    depth = 1 if fits or config.reach > 1 else 8
-    return SheetLayout(rows, cols, workers, depth, fixed_rows, config)
-
-
-class Dynamics:
+class Dynamics(SheetSolver[StepKernel]):
     """The sheet in motion.
 
-    Args:
-        plan: the plan.
-        device: the device.
-        layout: replaces the layout chosen by `choose_layout`, for tests.
-        cores: largest number of CPU cores; by default all available cores.
-
-    Attributes:
-        layout: the memory layout, and the configuration of the kernels.
-        steps_done: number of steps taken.
-        launches: number of launches, each followed by a call of `pause`.
-        inconsistent: whether an exception such as KeyboardInterrupt interrupted a launch. The number of steps taken is
-            then unknown, and `advance`, `state` and `read` raise MsmError until `restart` is called.
+    An exception such as KeyboardInterrupt during a launch leaves the sheet inconsistent, because the number of steps
+    taken is then unknown.
     """
 
-    def __init__(self, plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> None:
-        self._device, self._given_layout, self._cores = device, layout, cores
-        self.launches = 0
-        self._sheet: PlannedSheet[StepKernel] | None = None
-        self.restart(plan)
-
     def restart(self, plan: Plan, state: State | None = None) -> None:
-        """Restart with the same or another plan, without compilation if only coefficients differ.
+        self._first_tabled, self._loads = 0, np.empty((0, 0))
+        super().restart(plan, state)
 
-        Args:
-            plan: the plan.
-            state: state to continue from, of a sheet with the same mass points and steps; by default the sheet at rest.
-        """
-        self.layout = self._given_layout or choose_layout(plan, self._device, self._cores)
-        self.steps_done, self.inconsistent = 0 if state is None else state.steps, True
-        self._sheet = None  # Frees its memory before the new sheet is allocated.
-        self._sheet = PlannedSheet(plan, self.layout, _build_kernel, state)
-        self._tabulate(STEPS_PER_TABLE)
-        self.inconsistent = False
+    def _build_kernel(self, start: InitialData) -> StepKernel:
+        return (ScatterKernel if self.layout.workers else GatherKernel)(self.layout, start)
 
     def steer(self, plan: Plan) -> None:
-        """Continue with other probes, with the same kernels and the same steps.
-
-        Args:
-            plan: a plan that differs in its probes only.
-
-        Raises:
-            ArgumentError: when the new probes require other kernels.
-        """
-        self.sheet.steer(plan)
+        super().steer(plan)
         # A caller that steers usually steers again at the next frame, so the table has only the steps of one frame.
         self._tabulate(plan.grid.steps_per_frame)
 
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
-        """Advance the sheet by a number of steps. A call at a frame resets the sums of contact corrections.
-
-        Args:
-            steps: number of steps.
-            pause: function called after every launch. If it raises, another call of `advance` continues.
-
-        Raises:
-            MsmError: when the sheet is inconsistent.
-        """
+        """Advance, see `SheetSolver.advance`. A call at a frame resets the sums of contact corrections."""
         points = self.layout.rows * self.layout.cols
         max_steps, depth = max(1, min(MAX_STEPS_PER_LAUNCH, POINT_STEPS_PER_LAUNCH // points)), self.layout.depth
         # A launch takes whole passes; a single pass may exceed the limit up to four times.
@@ -147,67 +64,49 @@ class Dynamics:
             max_steps = STEPS_PER_LAUNCH
         self._require_consistent()
         if steps and self.steps_done % self.plan.grid.steps_per_frame == 0:
-            sum_corrections(self.layout, self.sheet.kernel.arrays, clear=True)
+            sum_corrections(self.layout, self.kernel.arrays, clear=True)
         end = self.steps_done + steps
         while self.steps_done < end:
             count = min(max_steps, end - self.steps_done)
             self.inconsistent = True
-            self.sheet.kernel.advance(count, self._next_loads(count))
+            self.kernel.advance(count, self._next_loads(count))
             self.steps_done += count
             self.inconsistent = False
-            self.launches += 1
             pause()
 
     def compile(self) -> None:
-        """Compile all kernels without taking a step."""
-        self.sheet.kernel.compile(self._loads)
+        self.kernel.compile(self._next_loads(1))
         self.displacement()
         self.tool_forces()
 
-    def displacement(self) -> NDArray[Any]:
-        """Read the displacements x - X [m], shape (rows, cols, 3), in the scene's precision."""
-        return self.read().displacement
-
     def state(self) -> State:
-        """Read the state on which the next steps depend."""
         self._require_consistent()
-        u, d = (self.sheet.read_arrays(differences=differences)[0] for differences in (False, True))
-        return State(self.steps_done, u, d, self.sheet.read_memory())
+        u, d = (self._read_arrays(differences=differences)[0] for differences in (False, True))
+        return State(self.steps_done, u, d, self._read_memory())
 
     def read(self) -> Reading:
-        """Read the displacements and measure the sheet, in the scene's precision."""
         self._require_consistent()
-        return self.sheet.read(self.steps_done, moving=True)
+        return self._measure(moving=True)
 
     def tool_forces(self) -> NDArray[np.float64]:
-        """Compute at a frame the mean force of each position-controlled tool since the previous frame.
+        """Compute the mean force of each position-controlled tool since the previous frame [N], shape (tools, 3).
 
-        It is the force with the effect of the contact corrections (`verlet.mean_force`), summed over mass points.
-
-        Returns:
-            Forces on the sheet [N], shape (tools, 3).
+        It has the effect of the contact corrections (`verlet.mean_force`), summed over mass points.
         """
-        sums = sum_corrections(self.layout, self.sheet.kernel.arrays, clear=False)
+        sums = sum_corrections(self.layout, self.kernel.arrays, clear=False)
         return mean_force(self.plan, sums, self.plan.grid.steps_per_frame)
+
+    def step_table(self, first: int, count: int) -> NDArray[Any]:
+        """Compute the load table of steps first, ..., first + count - 1, shape (count, columns)."""
+        table = self.load_table(average_loads(self.plan, first, count), first)
+        _, table[:, GAIN], first_gain = coefficients(self.plan)
+        if first == 0:
+            table[0, GAIN] = first_gain
+        return table
 
     def _require_consistent(self) -> None:
         if self.inconsistent:
             raise MsmError("interrupted while steps were taken; restore a saved state, or restart the scene")
-
-    def close(self) -> None:
-        """Release the memory of the device."""
-        self._sheet = None
-
-    @property
-    def sheet(self) -> PlannedSheet[StepKernel]:
-        """The sheet in the memory of the device."""
-        assert self._sheet is not None, "it is closed"
-        return self._sheet
-
-    @property
-    def plan(self) -> Plan:
-        """The current plan."""
-        return self.sheet.plan
 
     def _next_loads(self, count: int) -> NDArray[Any]:
         """Return the rows of the load table for the next steps, shape (count, columns)."""
@@ -218,13 +117,7 @@ class Dynamics:
         return self._loads[done : done + count]
 
     def _tabulate(self, count: int) -> None:
-        """Compute the load table of the next steps."""
-        self._first_tabled, self._loads = self.steps_done, self.sheet.step_table(self.steps_done, count)
-
-
-def _build_kernel(layout: SheetLayout, start: InitialData) -> StepKernel:
-    """Build the kernel for the device."""
-    return (ScatterKernel if layout.workers else GatherKernel)(layout, start)
+        self._first_tabled, self._loads = self.steps_done, self.step_table(self.steps_done, count)
 
 
 Array = NDArray[np.float64]
@@ -253,11 +146,8 @@ class ForceRecorder:
     def follow(self, before: ProbeForces, frame: int, position: NDArray[Any], tools: Array) -> ProbeForces:
         """Compute the forces at a frame and their maxima up to it.
 
-        Args:
-            before: forces at the previous frame.
-            frame: number of the frame.
-            position: positions of the mass points [m], shape (rows, cols, 3).
-            tools: forces of the position-controlled tools [N], shape (tools, 3).
+        They follow from the forces at the frame before, the positions [m], and the forces of position-controlled tools
+        [N].
         """
         forces, time = self._forces(frame, position, tools), frame / self._plan.grid.frames_per_second
         peaks = zip(before.greatest, (PeakForce(time, tip.force) for tip in forces), strict=True)
@@ -280,7 +170,6 @@ class ForceRecorder:
         return tuple(forces)
 
     def _decay_sum(self, index: int, at: Array) -> float:
-        """Sum the decay factors of a probe over the mass points that are not fixed."""
         probe, sheet = self._plan.scene.probes[index], self._plan.scene.sheet
         if self._loads[index].moves:
             return float(decay(probe, sheet, at)[~self._plan.fixed].sum())

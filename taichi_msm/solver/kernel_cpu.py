@@ -13,18 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.solver.arrays import NUMBER_BYTES, InitialData, SheetArrays, SheetLayout, build_read
+from taichi_msm.solver import bands
+from taichi_msm.solver.arrays import NUMBER_BYTES, InitialData, SheetArrays, SheetLayout, StepKernel, build_read
 from taichi_msm.solver.backoff import Backoff
-from taichi_msm.solver.bands import (
-    COUNTER_STRIDE,
-    MOMENT_ROWS,
-    PASS_INDEX,
-    PLACE_END,
-    ROUND,
-    STEP,
-    WORKER_STRIDE,
-    build_advance,
-)
 from taichi_msm.system.compiler import active_compiler
 from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, compilation_options, ti
 from taichi_msm.terms.base import KernelConfig
@@ -37,18 +28,21 @@ PAGE = 4096
 MAX_CHECKS = round(1.32e-3 / active_compiler().poll_s)
 
 
-class ScatterKernel:
-    """A `StepKernel` in the memory of a CPU."""
+class ScatterKernel(StepKernel):
+    """A sheet in the memory of a CPU."""
 
     def __init__(self, layout: SheetLayout, start: InitialData) -> None:
         self._layout = layout
-        self._parallel_kernel, self._read = _kernels(layout.config, parallel=layout.workers > 1)
-        self._serial_kernel, _ = _kernels(layout.config, parallel=False)
+        parallel = layout.workers > 1
+        iterations = ITERATIONS_PER_THREAD if parallel else 1
+        self._read = build_read(layout.config, parallel=parallel, iterations=iterations)
+        self._parallel_kernel = bands.build_advance(layout.config, parallel=parallel)
+        self._serial_kernel = bands.build_advance(layout.config, parallel=False)
         self._steps, self._backoff = 0, Backoff()
         self._first_row, self._end_row = int(layout.fixed_rows[0]), layout.rows - int(layout.fixed_rows[1])
         # The sheet's rows, two copies for every border of every worker, and moments.
         self._borders = self._border_rows()
-        moments = 0 if layout.config.get(BendingTerm) is None else MOMENT_ROWS * layout.workers
+        moments = 0 if layout.config.get(BendingTerm) is None else bands.MOMENT_ROWS * layout.workers
         sheet_rows = np.arange(layout.rows, dtype=np.int32), self._borders, np.full(moments, -1, np.int32)
         self.arrays = SheetArrays(layout, np.concatenate(sheet_rows), start)
         # Rows of `carried` per worker: one per step of a pass, and one page, which no prefetcher crosses.
@@ -56,10 +50,10 @@ class ScatterKernel:
         self._carried_rows = layout.depth - (-PAGE // row_bytes)
         # Forces carried to the next row, per worker and step of a pass.
         self._carried = [self.arrays.rows(layout.workers * self._carried_rows) for _ in range(3)]
-        self._progress = np.zeros(layout.workers * WORKER_STRIDE, np.int64)
+        self._progress = np.zeros(layout.workers * bands.WORKER_STRIDE, np.int64)
+        self._places = self._progress.reshape(-1, bands.WORKER_STRIDE)  # a view, with one row per worker
 
     def advance(self, count: int, table: NDArray[Any]) -> None:
-        """Advance the sheet by a number of steps, see `StepKernel.advance`."""
         if self._layout.workers == 1:
             self._advance_alone(0, count, table)
             return
@@ -67,20 +61,17 @@ class ScatterKernel:
         while first < count:
             if self._backoff.is_active:
                 first = self._advance_in_backoff(first, count, table)
-            else:
-                first = self._advance_together(first, count, table)
+                continue
+            self._backoff.start_launch()
+            taken, timed_out = self._launch_together(first, count, table)
+            self._backoff.end_launch(timed_out=timed_out)
+            first += taken
 
     def compile(self, table: NDArray[Any]) -> None:
-        """Compile all kernels without taking a step."""
         self._advance_alone(0, 0, table)
         if self._layout.workers > 1:
             self._launch_together(0, 0, table)
             self._copy_borders()
-
-    def read(self, differences: bool, values: NDArray[Any], measures: NDArray[Any]) -> None:
-        """Read displacements or last differences, and measure every row, see `StepKernel.read`."""
-        with compilation_options():
-            self._read(0, self._layout.rows, self._layout.cols, differences, values, measures, *self.arrays.all)
 
     def _advance_alone(self, first: int, end: int, table: NDArray[Any]) -> None:
         """Advance with a single worker from step `first` to step `end`."""
@@ -98,19 +89,12 @@ class ScatterKernel:
         self._copy_borders()
         return first
 
-    def _advance_together(self, first: int, end: int, table: NDArray[Any]) -> int:
-        """Advance with all workers; return the number of the next step, below `end` after a timeout."""
-        self._backoff.start_launch()
-        count, timed_out = self._launch_together(first, end, table)
-        self._backoff.end_launch(timed_out=timed_out)
-        return first + count
-
     def _launch_together(self, first: int, end: int, table: NDArray[Any]) -> tuple[int, bool]:
         """Launch all workers; return the number of steps taken, and whether a worker timed out."""
         workers, depth, count, steps_before = self._layout.workers, self._layout.depth, end - first, self._steps
         self._start_pass()
         self._launch(self._parallel_kernel, workers, count, table[first:])
-        passes, rounds = self._progress[PASS_INDEX::WORKER_STRIDE], self._progress[ROUND::WORKER_STRIDE]
+        passes, rounds = self._places[:, bands.PASS_INDEX], self._places[:, bands.ROUND]
         timed_out = not (passes * depth >= count).all()
         if timed_out:
             # All workers continue to the end of the pass that the foremost worker has begun.
@@ -125,12 +109,10 @@ class ScatterKernel:
         """Update the copies of the rows at the borders of bands after steps of a single worker."""
         with compilation_options():
             _build_copy(self._layout.config)(*self.arrays.u, self._borders, self._layout.rows, self._layout.width)
-        self._progress[::COUNTER_STRIDE] = self._steps
+        self._progress[:: bands.COUNTER_STRIDE] = self._steps
 
     def _start_pass(self) -> None:
-        """Reset all workers to the first row of the first pass."""
-        places = self._progress.reshape(-1, WORKER_STRIDE)[:, PASS_INDEX:PLACE_END]
-        places[:, [PASS_INDEX - 1, ROUND - 1, STEP - 1]] = 0, -1, 0
+        self._places[:, [bands.PASS_INDEX, bands.ROUND, bands.STEP]] = 0, -1, 0
 
     def _launch(self, kernel: Callable[..., None], workers: int, count: int, table: NDArray[Any]) -> None:
         layout = self._layout
@@ -158,13 +140,6 @@ class ScatterKernel:
 
 
 @cache
-def _kernels(config: KernelConfig, *, parallel: bool) -> tuple[Callable[..., None], Callable[..., None]]:
-    """Build the kernels of a configuration, which are compiled at their first launch."""
-    iterations = ITERATIONS_PER_THREAD if parallel else 1
-    return build_advance(config, parallel=parallel), build_read(config, parallel=parallel, iterations=iterations)
-
-
-@cache
 def _build_copy(config: KernelConfig) -> Callable[..., None]:
     """Build the kernel that updates the copies of the rows at the borders of bands."""
     vectors = config.vectors
@@ -172,9 +147,7 @@ def _build_copy(config: KernelConfig) -> Callable[..., None]:
     @ti.kernel
     def copy(
         u_x: vectors, u_y: vectors, u_z: vectors,
-        borders: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        rows: ti.i32,
-        width: ti.i32,
+        borders: ti.types.ndarray(dtype=ti.i32, ndim=1), rows: ti.i32, width: ti.i32,
     ):  # fmt: skip
         for n, b in ti.ndrange(borders.shape[0], width):
             for u in ti.static((u_x, u_y, u_z)):

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.solver.arrays import InitialData, SheetArrays, SheetLayout, build_point_step, build_read
+from taichi_msm.solver.arrays import InitialData, SheetArrays, SheetLayout, StepKernel, build_point_step, build_read
 from taichi_msm.system.runtime import compilation_options, ti
 from taichi_msm.terms.base import DX, DY, HAS_LEFT, HAS_RIGHT, Entry, KernelConfig, KernelRow, KernelSheet
 from taichi_msm.terms.bending import BendingTerm
@@ -23,46 +23,33 @@ from taichi_msm.terms.springs import SpringTerm
 STEPS_PER_LAUNCH = 8
 
 
-class GatherKernel:
-    """A `StepKernel` in the memory of a GPU."""
+class GatherKernel(StepKernel):
+    """A sheet in the memory of a GPU."""
 
     def __init__(self, layout: SheetLayout, start: InitialData) -> None:
         self._layout = layout
-        self._advance, self._read = _kernels(layout.config)
+        self._advance = _build_advance(layout.config)
+        self._read = build_read(layout.config, parallel=True, iterations=1)
         # Index of the buffer of u_n. Each buffer has a halo of one row above and below.
-        self._now = 0
+        self._now, self._top_row = 0, 1
         buffer = np.pad(np.arange(layout.rows, dtype=np.int32), 1, constant_values=-1)
         moments = np.full(0 if layout.config.get(BendingTerm) is None else layout.rows + 2, -1, np.int32)
         self.arrays = SheetArrays(layout, np.concatenate([buffer, buffer, moments]), start)
 
     def advance(self, count: int, table: NDArray[Any]) -> None:
-        """Advance the sheet by at most STEPS_PER_LAUNCH steps, see `StepKernel.advance`."""
+        """Advance the sheet by at most STEPS_PER_LAUNCH steps."""
         with compilation_options():
             self._advance(self._now, count, self._layout.rows, self._layout.cols, table, *self.arrays.all)
         self._now = (self._now + count) % 2
+        self._top_row = self._now * (self._layout.rows + 2) + 1
 
     def compile(self, table: NDArray[Any]) -> None:
-        """Compile all kernels without taking a step."""
         self.advance(0, table)
-
-    def read(self, differences: bool, values: NDArray[Any], measures: NDArray[Any]) -> None:
-        """Read displacements or last differences, and measure every row, see `StepKernel.read`."""
-        first, layout = self._now * (self._layout.rows + 2) + 1, self._layout
-        with compilation_options():
-            self._read(first, layout.rows, layout.cols, differences, values, measures, *self.arrays.all)
-
-
-@cache
-def _kernels(config: KernelConfig) -> tuple[Callable[..., None], Callable[..., None]]:
-    """Build the kernels of a configuration, which are compiled at their first launch."""
-    return _build_advance(config), build_read(config, parallel=True, iterations=1)
 
 
 def _build_step(config: KernelConfig) -> Callable[..., None]:
-    """Build the Taichi function that steps a mass point."""
     real, vector, columns, springs = config.real, config.vector, config.first_column(None), config.require(SpringTerm)
-    structural, shear = springs.structural, springs.shear
-    masks_edges = springs.masks_edges
+    structural, shear, open_edges = springs.structural, springs.shear, springs.open_edges
     share_of_row, share_of_column = springs.build_shares(config)
     along, to_other_row, of_row, of_column, of_diagonal = springs.build_spring_forces(config)
     move, corrections = build_point_step(config), [term.build_correction(config) for term in config.terms]
@@ -82,7 +69,7 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
                 else:
                     k *= of_diagonal(sheet, lower, b + ti.static(min(right, 0)))
                     length = ti.sqrt(dx * dx + up * up)
-                if ti.static(right != 0 and masks_edges):
+                if ti.static(right != 0 and open_edges):
                     exists = sheet.by_column[ti.static(HAS_LEFT if right < 0 else HAS_RIGHT) * sheet.width + b]
                 pull = to_other_row(sheet, q * sheet.width + b + right, right, u, up, length, k, exists * row_exists)
                 for c in ti.static(range(3)):
@@ -91,9 +78,8 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
 
     @ti.func
     def by_right(sheet: ti.template(), p, i, kind, b):
-        """Return the force of entry b of row p on its right neighbour."""
         exists, here = vector(1), p * sheet.width + b
-        if ti.static(masks_edges):
+        if ti.static(open_edges):
             exists = sheet.by_column[HAS_RIGHT * sheet.width + b]
         k, u = of_row(sheet, i, kind, b) * vector(1), [sheet.u[c][here] for c in ti.static(range(3))]
         return along(sheet, here + 1, u, k, share_of_row(exists, kind))
@@ -127,6 +113,7 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
     return step
 
 
+@cache
 def _build_advance(config: KernelConfig) -> Callable[..., None]:
     """Build the kernel that takes steps."""
     real, vector, vectors, constant_count = config.real, config.vector, config.vectors, config.first_constant(None)
@@ -135,15 +122,10 @@ def _build_advance(config: KernelConfig) -> Callable[..., None]:
 
     @ti.kernel
     def advance(
-        now: ti.i32,
-        count: ti.i32,
-        rows: ti.i32,
-        cols: ti.i32,
-        loads: ti.types.ndarray(dtype=real, ndim=2),
+        now: ti.i32, count: ti.i32, rows: ti.i32, cols: ti.i32, loads: ti.types.ndarray(dtype=real, ndim=2),
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
-        constants_of: ti.types.ndarray(dtype=vector, ndim=1),
-        by_column: vectors, stiffness: vectors, fields: vectors,
+        constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
         for n in ti.static(range(STEPS_PER_LAUNCH)):
             for store_moment in ti.static(storing):

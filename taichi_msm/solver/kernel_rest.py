@@ -11,7 +11,7 @@ The norms are taken over all mass points and weighted with M. M bounds the stiff
 frequency exceeds 1, and the largest step dt = 1 is stable. The kernel stores the momentum q = M v.
 
 Contact forces of position-controlled tools are removed from the forces, and mass points are projected out of the tools
-(`terms.contact_rest`). Before the projection a mass point that presses on a tool moves by F / M into it, so that it
+(`terms.contact`). Before the projection a mass point that presses on a tool moves by F / M into it, so that it
 stays in contact.
 
 An evaluation of the forces passes over the rows like a step; a second loop moves the mass points. Sums over mass points
@@ -27,7 +27,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.solver.arrays import InitialData, SheetArrays, SheetLayout, build_read, point_forces, to_lanes
+from taichi_msm.solver.arrays import (
+    InitialData,
+    SheetArrays,
+    SheetKernel,
+    SheetLayout,
+    build_read,
+    point_forces,
+    to_lanes,
+)
 from taichi_msm.solver.bands import MOMENT_ROWS, RowBand, build_join_strips, build_step_row
 from taichi_msm.system.runtime import compilation_options, ti, write_vectors
 from taichi_msm.terms.base import MOBILITY, Entry, KernelConfig, KernelRow, KernelSheet, RestCorrection
@@ -55,10 +63,10 @@ LARGEST_STEP, SMALLEST_STEP = 1.0, 0.02
 
 
 class RestSheet(NamedTuple):
-    """A `KernelSheet` with the additional arrays of FIRE."""
+    """A `KernelSheet` with the additional arrays of FIRE; d contains the forces without those of contact."""
 
     u: Any
-    d: Any  # forces without those of contact, instead of last differences
+    d: Any
     by_column: Any
     stiffness: Any
     fields: Any
@@ -69,18 +77,16 @@ class RestSheet(NamedTuple):
     work: Any  # 1 / M of every mass point [m/N], followed by SUMS rows of reductions
 
 
-class Relaxation:
+class Relaxation(SheetKernel):
     """A sheet in the memory of a CPU, and the kernels that find its equilibrium.
 
-    Args:
-        layout: layout of the sheet.
-        start: initial values.
-        masses: M of every mass point [N/m], shape (rows, cols).
+    `masses` contains M of every mass point [N/m], shape (rows, cols).
     """
 
     def __init__(self, layout: SheetLayout, start: InitialData, masses: NDArray[Any]) -> None:
         self._layout = layout
-        self._relax, self._scale_kernel, self._read = _kernels(layout.config)
+        self._relax, self._scale_kernel = _build_relax(layout.config), _build_scale(layout.config)
+        self._read = build_read(layout.config, parallel=False, iterations=1)
         moments = 0 if layout.config.get(BendingTerm) is None else MOMENT_ROWS
         # The sheet's rows, moments, and the forces carried to the next row.
         self._stored = np.concatenate([np.arange(layout.rows, dtype=np.int32), np.full(moments + 1, -1, np.int32)])
@@ -106,15 +112,9 @@ class Relaxation:
             write_vectors(self.arrays.u[c], to_lanes(self._layout, np.where(held, displacement[self._stored, :, c], 0)))
 
     def relax(self, count: int, tolerance: float, row: NDArray[Any]) -> tuple[int, float]:
-        """Evaluate the forces and move the mass points, repeatedly, until all forces are small.
+        """Evaluate the forces and move the mass points, at most `count` times, until no force exceeds a tolerance [N].
 
-        Args:
-            count: largest number of evaluations.
-            tolerance: largest force on a mass point at convergence [N].
-            row: row of the load table, shape (1, columns).
-
-        Returns:
-            The number of evaluations, and the largest force of the last one [N], infinite if any force is NaN.
+        Returns the number of evaluations, and the largest force of the last one [N], infinite if any force is NaN.
         """
         fire = self._fire
         fire[[COUNT, SQUARED_TOLERANCE]] = count, tolerance * tolerance
@@ -130,26 +130,8 @@ class Relaxation:
             self._scale_kernel(self._layout.rows, self._layout.width, largest, row, *self.arrays.all)
         return float(np.sqrt(largest[0]))
 
-    def read(self, differences: bool, values: NDArray[Any], measures: NDArray[Any]) -> None:
-        """Read displacements or forces, and measure every row.
-
-        Args:
-            differences: whether to read forces [N] instead of displacements [m].
-            values: output, shape (rows, cols, 3).
-            measures: output, shape (rows, measures).
-        """
-        with compilation_options():
-            self._read(0, self._layout.rows, self._layout.cols, differences, values, measures, *self.arrays.all)
-
-
-@cache
-def _kernels(config: KernelConfig) -> tuple[Callable[..., None], Callable[..., None], Callable[..., None]]:
-    """Build the kernels of a configuration, which are compiled at their first launch."""
-    return _build_relax(config), _build_scale(config), build_read(config, parallel=False, iterations=1)
-
 
 def _corrections(config: KernelConfig) -> list[RestCorrection]:
-    """Build the corrections of all terms."""
     return [correction for term in config.terms if (correction := term.build_rest_correction(config)) is not None]
 
 
@@ -186,6 +168,7 @@ def _build_store(config: KernelConfig) -> Callable[..., None]:
     return store
 
 
+@cache
 def _build_relax(config: KernelConfig) -> Callable[..., None]:
     """Build the kernel that evaluates forces and moves mass points."""
     real, vector, vectors, lanes = config.real, config.vector, config.vectors, config.lanes
@@ -197,7 +180,6 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
 
     @ti.func
     def add_up(sheet: ti.template(), n: ti.template()):
-        """Sum row n of the reductions, column by column."""
         total = ti.cast(0, real)
         for lane in ti.static(range(lanes)):
             for b in range(1, sheet.width - 1):
@@ -206,7 +188,6 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
 
     @ti.func
     def evaluate(sheet: ti.template(), row: ti.template(), band: ti.template()):
-        """Evaluate the forces at the current displacements."""
         for n in range(sheet.rows * sheet.width, (sheet.rows + SUMS) * sheet.width):
             sheet.work[n] = vector(0)
         for line in range(-1, band.high - band.low):
@@ -245,14 +226,11 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
 
     @ti.kernel
     def relax(
-        fire: ti.types.ndarray(dtype=real, ndim=1),
-        row: ti.types.ndarray(dtype=real, ndim=2),
-        q_x: vectors, q_y: vectors, q_z: vectors,
-        work: vectors,
+        fire: ti.types.ndarray(dtype=real, ndim=1), row: ti.types.ndarray(dtype=real, ndim=2),
+        q_x: vectors, q_y: vectors, q_z: vectors, work: vectors,
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
-        constants_of: ti.types.ndarray(dtype=vector, ndim=1),
-        by_column: vectors, stiffness: vectors, fields: vectors,
+        constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
         ti.loop_config(serialize=True)
         for _ in range(1):
@@ -306,6 +284,7 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
     return relax
 
 
+@cache
 def _build_scale(config: KernelConfig) -> Callable[..., None]:
     """Build the kernel that squares the largest force of a spring, a load or the foundation on a mass point."""
     real, vector, vectors, columns = config.real, config.vector, config.vectors, config.first_column(None)
@@ -317,14 +296,11 @@ def _build_scale(config: KernelConfig) -> Callable[..., None]:
 
     @ti.kernel
     def compute_scale(
-        rows: ti.i32,
-        width: ti.i32,
-        result: ti.types.ndarray(dtype=real, ndim=1),
-        row: ti.types.ndarray(dtype=real, ndim=2),
+        rows: ti.i32, width: ti.i32,
+        result: ti.types.ndarray(dtype=real, ndim=1), row: ti.types.ndarray(dtype=real, ndim=2),
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
-        constants_of: ti.types.ndarray(dtype=vector, ndim=1),
-        by_column: vectors, stiffness: vectors, fields: vectors,
+        constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
         ti.loop_config(serialize=True)
         for _ in range(1):

@@ -78,12 +78,7 @@ class Work(NamedTuple):
 
 
 def count_work(plan: Plan, companions: float) -> Work:
-    """Estimate the work of a run.
-
-    Args:
-        plan: the plan.
-        companions: work of the companion runs [f64 steps of the whole sheet per step of the run].
-    """
+    """Estimate the work of a run; `companions` is that of companion runs [f64 steps of the sheet per step]."""
     steps = _stepping_work(plan)
     stepping = F64_WORK * steps if plan.grid.precision == "f64" else steps
     return Work(START_WORK, stepping, F64_WORK * companions * steps, _other_work(plan.scene) - START_WORK)
@@ -95,18 +90,12 @@ def is_f64_cheap(plan: Plan) -> bool:
 
 
 def affords_companions(plan: Plan, companions: float) -> bool:
-    """Return whether companion runs take at most MAX_COMPANION_SHARE of the work of a run.
-
-    Args:
-        plan: the plan.
-        companions: work of the companion runs [f64 steps of the whole sheet per step of the run].
-    """
+    """Return whether `companions`, as for `count_work`, take at most MAX_COMPANION_SHARE of the work of a run."""
     work = count_work(plan, companions)
     return work.companions <= MAX_COMPANION_SHARE * sum(work)
 
 
 def _stepping_work(plan: Plan) -> float:
-    """Estimate the work of stepping in f32, or of the equilibrium of every frame."""
     moving, points = sum(slot.moves for slot in plan.slots), plan.scene.sheet.points
     cost = 1 + MOVING_LOAD_WORK * moving + BENDING_WORK * (plan.material.bending > 0) + CONTACT_WORK * len(plan.tools)
     steps = float(plan.grid.steps)
@@ -117,7 +106,6 @@ def _stepping_work(plan: Plan) -> float:
 
 
 def _other_work(scene: Scene) -> float:
-    """Estimate the work of everything except stepping."""
     pixels = (scene.time.frames + 1) * math.prod(scene.render.size) * len(scene.render.all_cameras) * scene.renders
     return START_WORK + pixels * (ENCODING_WORK + SAMPLE_WORK * scene.render.supersample**2)
 
@@ -197,16 +185,7 @@ def choose_precision(plan: Plan, arch: str) -> Plan:
 
 
 def stable_step(material: Material, sheet: Sheet, difference: str) -> float:
-    """Compute the largest stable step of a sheet, see `verlet.stability_limit`.
-
-    Args:
-        material: coefficients of the sheet.
-        sheet: the sheet.
-        difference: "central" or "backward".
-
-    Returns:
-        The step [s]; infinite without stiffness and damping.
-    """
+    """Compute the largest stable step of a sheet [s], see `verlet.stability_limit`."""
     return stability_limit(highest_frequency(material, sheet), material.drag, difference)
 
 
@@ -216,17 +195,10 @@ def stable_steps(plan: Plan) -> int:
 
 
 def steps_per_frame(time: Time, limit: float) -> int:
-    """Compute the number of steps per frame.
+    """Compute the number of steps per frame, for the largest stable step `limit` [s]; 1 in quasi-static scenes.
 
-    With `auto`, it is the smallest number whose step is at most half the stability limit. A given step is rounded to a
-    fraction of a frame. `accuracy.time_step` increases the number for a tolerance.
-
-    Args:
-        time: time keys of the scene.
-        limit: the largest stable step [s].
-
-    Returns:
-        The number of steps; 1 in quasi-static scenes.
+    With `auto`, it is the smallest number whose step is at most half the limit. A given step is rounded to a fraction
+    of a frame. `accuracy.time_step` increases the number for a tolerance.
     """
     if time.at_rest:
         return 1
@@ -253,7 +225,6 @@ def freeze_grid(plan: Plan) -> Plan:
 
 
 def _step_problems(plan: Plan) -> Iterator[Problem]:
-    """Check that a given step is stable and divides a frame."""
     if plan.scene.time.at_rest:
         return
     given, limit, frame = plan.scene.time.step, plan.stable_step, 1 / plan.grid.frames_per_second
@@ -310,17 +281,15 @@ def steer_plan(plan: Plan, probes: Sequence[Probe | Mapping[str, Any] | None], n
         raise ArgumentError(f"probes: {len(probes)} are given, and the scene has {len(before)}; give all of them")
     given = [_fill_omitted_keys(*pair) for pair in zip(before, probes, strict=True)]
     after = plan.with_probes(given)
-    changes = [
-        _PathChange(plan, index, *pair, now)
-        for index, pair in enumerate(zip(before, after.scene.probes, strict=True))
-        if pair[0].moved and pair[1].moved and pair[0] != pair[1]
-    ]
-    if lines := [str(problem) for change in changes for problem in change.problems()]:
+    joined, lines = list(after.scene.probes), []
+    for index, (old, new) in enumerate(zip(before, after.scene.probes, strict=True)):
+        if old.moved and new.moved and old != new:
+            lines += [str(problem) for problem in _path_problems(plan, index, old, new, now)]
+            if not lines:
+                joined[index], _ = _join_paths(plan, old, new, now)
+    if lines:
         raise SceneError(lines)
-    changed = {change.index: change.probe for change in changes}
-    if not changed:
-        return after
-    return after.with_probes([changed.get(index, probe) for index, probe in enumerate(after.scene.probes)])
+    return after.with_probes(joined) if joined != list(after.scene.probes) else after
 
 
 def with_current_paths(plan: Plan, probes: Sequence[Probe]) -> Plan:
@@ -341,73 +310,50 @@ def _fill_omitted_keys(before: Probe, given: Probe | Mapping[str, Any] | None) -
     return {"instrument": before.instrument, "friction": before.friction, "grip": before.grip, **given}
 
 
-class _PathChange:
-    """A new path of a position-controlled tool from the current time on.
+def _join_paths(plan: Plan, before: Probe, given: Probe, now: float) -> tuple[Probe, int]:
+    """Return a probe whose path also has the past keyframes on which later steps depend, and the index of the last."""
+    assert before.path is not None
+    assert given.path is not None
+    tolerance = FRAME_TOLERANCE / plan.grid.frames_per_second
+    past = _past_keyframes(before.path, now, tolerance)
+    begun = [begin for begin, end in given.grip if begin < now < end]
+    if before.path[-1][0] < now - tolerance and not begun:
+        past = past[-1:]  # The tool has not pressed since its last keyframe.
+    # Averages of loads reach one step back, and bounds of the energy one frame.
+    since = min([now - 1 / plan.grid.frames_per_second, *begun]) - 2 * plan.grid.step
+    past = past[max((n for n, key in enumerate(past) if key[0] <= since), default=0) :]
+    return given.model_copy(update={"path": (*past, *given.path)}), len(past) - 1
 
-    Args:
-        plan: the current plan.
-        index: index of the probe.
-        before: the current probe.
-        given: the new probe; its path contains only keyframes after `now`.
-        now: the current time [s].
 
-    Attributes:
-        index: index of its probe.
-        probe: the probe with the new path, including those past keyframes on which later steps depend.
-    """
-
-    def __init__(self, plan: Plan, index: int, before: Probe, given: Probe, now: float) -> None:
-        self.index, self._plan, self._before, self._given, self._now = index, plan, before, given, now
-        # Times that differ by less count as equal [s].
-        self._time_tolerance = FRAME_TOLERANCE / plan.grid.frames_per_second
-        assert before.path is not None
-        assert given.path is not None
-        self._past, h = _past_keyframes(before.path, now, self._time_tolerance), plan.grid.step
-        begun = [begin for begin, end in given.grip if begin < now < end]
-        if before.path[-1][0] < now - self._time_tolerance and not begun:
-            self._past = self._past[-1:]  # The tool has not pressed since its last keyframe.
-        # Averages of loads reach one step back, and bounds of the energy one frame.
-        since = min([now - 1 / plan.grid.frames_per_second, *begun]) - 2 * h
-        self._past = self._past[max((n for n, key in enumerate(self._past) if key[0] <= since), default=0) :]
-        self.probe = given.model_copy(update={"path": (*self._past, *given.path)}) if self._is_later() else given
-
-    def problems(self) -> Iterator[Problem]:
-        """Report keyframes in the past, jumps of position or shape, and grips that begin in the past."""
-        now, tolerance, key = self._now, self._time_tolerance, ("probes", self.index)
-        assert self._given.path is not None
-        if not self._is_later():
-            text = f"is at {self._given.path[0][0]:g} s, and it is {now:g} s; give only times after that"
-            yield Problem((*key, "path", 0), text)
-            return
-        if self._given.clamp != self._before.clamp:
-            yield Problem((*key, "clamp"), "cannot change; restart with the new scene")
-            return
-        grid, sheet = self._plan.grid, self._plan.scene.sheet
-        (old_tool,), (tool,) = build_tools((self._before,), sheet), build_tools((self.probe,), sheet)
-        first = len(self._past) - 1
-        at_rest = self._plan.scene.time.at_rest
-        if problem := friction_problem(tool, at_rest=at_rest):
-            yield Problem((*key, "friction"), problem)
-        if not at_rest and (fault := too_fast(tool, grid, first)):
-            yield Problem((*key, "path", fault[0] - first - 1), fault[1])
-        deviation = _shape_change(old_tool, tool)
-        if deviation > tool.stride:
-            yield Problem(
-                (*key, "instrument"),
-                f"changes by {deviation:.3g} m in a step, over {tool.stride:.3g} m; change it little by little",
-            )
-        for n, (begin, end) in enumerate(self._given.grip):
-            has_ended = end <= now + tolerance
-            continues = any(
-                begin == old_begin and old_end > now + tolerance for old_begin, old_end in self._before.grip
-            )
-            if begin < now - tolerance and not (has_ended or continues):
-                text = f"begins at {begin:g} s, and it is {now:g} s; begin at that time or later"
-                yield Problem((*key, "grip", n), text)
-
-    def _is_later(self) -> bool:
-        assert self._given.path is not None
-        return self._given.path[0][0] > self._now + self._time_tolerance
+def _path_problems(plan: Plan, index: int, before: Probe, given: Probe, now: float) -> Iterator[Problem]:
+    """Report keyframes in the past, jumps of position or shape, and grips that begin in the past."""
+    key, sheet, at_rest = ("probes", index), plan.scene.sheet, plan.scene.time.at_rest
+    # Times that differ by less count as equal [s].
+    tolerance = FRAME_TOLERANCE / plan.grid.frames_per_second
+    assert given.path is not None
+    if given.path[0][0] <= now + tolerance:
+        text = f"is at {given.path[0][0]:g} s, and it is {now:g} s; give only times after that"
+        yield Problem((*key, "path", 0), text)
+        return
+    if given.clamp != before.clamp:
+        yield Problem((*key, "clamp"), "cannot change; restart with the new scene")
+        return
+    joined, first = _join_paths(plan, before, given, now)
+    (old_tool,), (tool,) = build_tools((before,), sheet), build_tools((joined,), sheet)
+    if problem := friction_problem(tool, at_rest=at_rest):
+        yield Problem((*key, "friction"), problem)
+    if not at_rest and (fault := too_fast(tool, plan.grid, first)):
+        yield Problem((*key, "path", fault[0] - first - 1), fault[1])
+    deviation = _shape_change(old_tool, tool)
+    if deviation > tool.stride:
+        text = f"changes by {deviation:.3g} m in a step, over {tool.stride:.3g} m; change it little by little"
+        yield Problem((*key, "instrument"), text)
+    for n, (begin, end) in enumerate(given.grip):
+        has_ended = end <= now + tolerance
+        continues = any(begin == old_begin and old_end > now + tolerance for old_begin, old_end in before.grip)
+        if begin < now - tolerance and not (has_ended or continues):
+            text = f"begins at {begin:g} s, and it is {now:g} s; begin at that time or later"
+            yield Problem((*key, "grip", n), text)
 
 
 def _past_keyframes(path: Sequence[Keyframe], now: float, tolerance: float) -> list[Keyframe]:

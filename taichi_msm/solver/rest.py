@@ -26,23 +26,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import DivergedError, MsmError, Pause
+from taichi_msm.errors import DivergedError, Pause
 from taichi_msm.model.loads import evaluate_frame_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.tools import Clamp
 from taichi_msm.scene.section import MIN_MAGNITUDE
 from taichi_msm.solver.arrays import InitialData, SheetLayout
-from taichi_msm.solver.dynamics import Dynamics, choose_layout
+from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.solver.kernel_rest import Relaxation
-from taichi_msm.solver.planned_sheet import PlannedSheet
 from taichi_msm.solver.sheet_solver import SheetSolver
 from taichi_msm.solver.state import Reading, State, largest_displacement
 from taichi_msm.system.runtime import Device
-from taichi_msm.terms import fictitious_masses
+from taichi_msm.terms import contact_rest, fictitious_masses
 from taichi_msm.terms.contact import ContactTerm
-from taichi_msm.terms.contact_rest import grips, memory_after_grips, set_tools, touched_points
-from taichi_msm.terms.rough import compute_pulls, release, stick, stuck_points, without_rough_tools
 
 # Residual forces, relative to the largest force: at convergence, at the perturbation, and at convergence of a sheet
 # that can be unstable.
@@ -60,53 +57,29 @@ EVALUATIONS_PER_LAUNCH, POINT_EVALUATIONS_PER_LAUNCH = 64, 40_000_000
 Array = NDArray[np.float64]
 
 
-class QuasiStatics:
-    """The sheet in quasi-static motion, a `SheetSolver`; a frame counts as a step.
-
-    Args:
-        plan: the plan.
-        device: the device.
-        layout: replaces the layout chosen by `choose_layout`, for tests.
-        cores: largest number of CPU cores; by default all available cores.
+class QuasiStatics(SheetSolver[Relaxation]):
+    """The sheet in quasi-static motion; a frame counts as a step.
 
     Attributes:
-        layout: the memory layout, and the configuration of the kernels.
-        steps_done: number of the last frame found.
         evaluations: number of evaluations of the forces for the last frame.
-        residual: largest residual force of the last frame, relative to the largest force.
+        residual: of the last frame, relative to the largest force.
     """
 
-    def __init__(self, plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> None:
-        self._device, self._given_layout, self._cores = device, layout, cores
-        self._sheet: PlannedSheet[Relaxation] | None = None
-        self.restart(plan)
-
     def restart(self, plan: Plan, state: State | None = None) -> None:
-        """Restart with the same or another plan.
-
-        Args:
-            plan: the plan.
-            state: state to continue from; by default the first call of `advance` also finds the first frame.
-        """
         self.evaluations, self.residual = 0, 0.0
+        # Without a state the first call of `advance` also finds the first frame.
         self._last_frame, self._interrupted = state, False
-        self.layout = self._given_layout or choose_layout(plan, self._device, self._cores)
-        self.steps_done = 0 if state is None else state.steps
         # A mass point without stiffness would have mass 0.
         self._masses = np.maximum(fictitious_masses(plan), MIN_MAGNITUDE)
-        self._sheet = None  # Frees its memory before the new sheet is allocated.
-        self._sheet = PlannedSheet(plan, self.layout, self._build_kernel, state)
+        super().restart(plan, state)
 
-    def steer(self, plan: Plan) -> None:
-        """Continue with a plan that differs in its probes only, see `PlannedSheet.steer`."""
-        self.sheet.steer(plan)
+    def _build_kernel(self, start: InitialData) -> Relaxation:
+        return Relaxation(self.layout, start, self._masses)
 
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
         """Find the equilibria of the next frames, and of the first frame if it is still missing.
 
-        Args:
-            steps: number of frames.
-            pause: function called after every launch. If it raises, another call continues from the last frame found.
+        After an exception from `pause` another call continues from the last frame found.
 
         Raises:
             DivergedError: when the iteration does not converge.
@@ -116,104 +89,51 @@ class QuasiStatics:
             frame = self.steps_done + (self._last_frame is not None)
             self._settle(frame, pause)
             self.steps_done = frame
-            displacement = self.sheet.read_arrays(differences=False)[0]
-            self._last_frame = State(frame, displacement, np.zeros_like(displacement), self.sheet.read_memory())
+            displacement = self._read_arrays(differences=False)[0]
+            self._last_frame = State(frame, displacement, np.zeros_like(displacement), self._read_memory())
 
     def compile(self) -> None:
-        """Compile all kernels without moving a mass point."""
-        row = self.sheet.load_table(evaluate_frame_loads(self.plan, 0), 0)
-        self._relaxation.relax(0, 0.0, row)
-        self._relaxation.scale(row)
+        row = self.load_table(evaluate_frame_loads(self.plan, 0), 0)
+        self.kernel.relax(0, 0.0, row)
+        self.kernel.scale(row)
         self.displacement()
 
-    def displacement(self) -> Array:
-        """Read the displacements x - X [m], shape (rows, cols, 3)."""
-        return self.read().displacement
-
     def state(self) -> State:
-        """Return the state of the last frame found, on which the next frames depend."""
-        return self._last_state
-
-    def read(self) -> Reading:
-        """Read the displacements and measure the sheet; its energy is that of springs and bending."""
-        reading = self.sheet.read(self.steps_done, moving=False)
-        return reading._replace(residual=self.residual, evaluations=self.evaluations)
-
-    def tool_forces(self) -> Array:
-        """Compute the force of each position-controlled tool on the sheet [N], shape (tools, 3).
-
-        It is opposite to the sum of all other forces on the mass points that the tool touches or holds.
-        """
-        touched, force = self._touched().astype(float), self.sheet.read_arrays(differences=True)[0]
-        # Subtraction from 0 avoids -0.
-        return 0.0 - np.einsum("tij,ijk->tk", touched, force)
-
-    def _touched(self) -> NDArray[np.bool_]:
-        """Return whether each tool touches or holds each mass point, shape (tools, rows, cols)."""
-        return touched_points(len(self.plan.tools), self._read_contact())
-
-    @property
-    def _contact(self) -> slice:
-        """The part of the memory that belongs to contact."""
-        return self.layout.config.memory_slice(ContactTerm)
-
-    @property
-    def _contact_column(self) -> int:
-        """The first column of the load table that belongs to contact."""
-        return self.layout.config.first_column(ContactTerm)
-
-    def _read_contact(self) -> Array:
-        """Read the memory of contact, shape (numbers, rows, cols)."""
-        return self.sheet.read_memory()[self._contact]
-
-    def _write_contact(self, memory: Array) -> None:
-        """Write the memory of contact, shape (numbers, rows, cols)."""
-        self._relaxation.arrays.set_fields(self.layout.config.first_field(ContactTerm), memory)
-
-    def close(self) -> None:
-        """Release the memory."""
-        self._sheet = None
-
-    @property
-    def sheet(self) -> PlannedSheet[Relaxation]:
-        """The sheet in memory."""
-        if self._sheet is None:
-            raise MsmError("interrupted while the sheet was restarted; restart the scene")
-        return self._sheet
-
-    @property
-    def plan(self) -> Plan:
-        """The current plan."""
-        return self.sheet.plan
-
-    @property
-    def inconsistent(self) -> bool:
-        """Whether an exception interrupted `restart`."""
-        return self._sheet is None
-
-    def _build_kernel(self, layout: SheetLayout, start: InitialData) -> Relaxation:
-        return Relaxation(layout, start, self._masses)
-
-    @property
-    def _relaxation(self) -> Relaxation:
-        return self.sheet.kernel
-
-    @property
-    def _last_state(self) -> State:
-        """The state of the last frame found; before the first one, the flat sheet."""
+        """Return the state of the last frame found; before the first one, the flat sheet."""
         if self._last_frame is not None:
             return self._last_frame
         shape = self.layout.rows, self.layout.cols
         memory = np.zeros((len(self.layout.config.memory_fields), *shape))
         return State(0, np.zeros((*shape, 3)), np.zeros((*shape, 3)), memory)
 
+    def read(self) -> Reading:
+        reading = self._measure(moving=False)
+        return reading._replace(residual=self.residual, evaluations=self.evaluations)
+
+    def tool_forces(self) -> Array:
+        touched, force = self._touched().astype(float), self._read_arrays(differences=True)[0]
+        # Subtraction from 0 avoids -0.
+        return 0.0 - np.einsum("tij,ijk->tk", touched, force)
+
+    def _touched(self) -> NDArray[np.bool_]:
+        return contact_rest.touched_points(len(self.plan.tools), self._read_contact())
+
+    @property
+    def _contact_column(self) -> int:
+        return self.layout.config.first_column(ContactTerm)
+
+    def _read_contact(self) -> Array:
+        return self._read_memory()[self.layout.config.memory_slice(ContactTerm)]
+
+    def _write_contact(self, memory: Array) -> None:
+        self.kernel.arrays.set_fields(self.layout.config.first_field(ContactTerm), memory)
+
     def _settle(self, frame: int, pause: Pause) -> None:
-        """Find the equilibrium of a frame."""
         self.evaluations = 0
-        relaxation, before, loads = self._relaxation, self._last_state, evaluate_frame_loads(self.plan, frame)
-        tools, contact_before = self.plan.tools, before.memory[self._contact]
-        contact = memory_after_grips(self.plan, frame, before.displacement, contact_before)
-        held_before, held = grips(tools, contact_before), grips(tools, contact)
+        relaxation, before, loads = self.kernel, self.state(), evaluate_frame_loads(self.plan, frame)
+        tools, contact_before = self.plan.tools, before.memory[self.layout.config.memory_slice(ContactTerm)]
+        contact = contact_rest.memory_after_grips(self.plan, frame, before.displacement, contact_before)
+        held_before, held = contact_rest.is_gripping(tools, contact_before), contact_rest.is_gripping(tools, contact)
         if tools:
             self._write_contact(contact)
         if self._interrupted:
@@ -221,8 +141,8 @@ class QuasiStatics:
         self._interrupted, residual, rough = True, 0.0, any(tool.rough for tool in tools)
         *_, end = times = self._shape_times(frame)
         for start, time in pairwise(times):
-            row = self.sheet.load_table(loads, frame)
-            set_tools(self.plan, frame, time, row[0, self._contact_column :])
+            row = self.load_table(loads, frame)
+            contact_rest.set_tools(self.plan, frame, time, row[0, self._contact_column :])
             # After a release the flat shape is tried even if a tool is in the way.
             free = not (loads.strength.any() or held or self._is_clamp_displaced(time))
             free = free and (held_before or not self._meets_tool(time))
@@ -242,47 +162,46 @@ class QuasiStatics:
         config = self.layout.config
         changing = [term for term in config.terms if term.mark_update(row[0, config.first_column(type(term)) :])]
         if changing:
-            self._relaxation.relax(1, math.inf, row)
+            self.kernel.relax(1, math.inf, row)
 
     def _stick(self, frame: int, times: tuple[float, float], row: NDArray[Any], pause: Pause) -> None:
         """Let the mass points stick that rough tools reach between the current shape and the next one."""
-        plan, memory, start = self.plan, self._read_contact(), self.sheet.read_arrays(differences=False)[0]
-        after = stick(plan, memory, start, start, times)
-        if stuck_points(plan, memory).any() and (after != memory).any():
+        plan, memory, start = self.plan, self._read_contact(), self._read_arrays(differences=False)[0]
+        after = contact_rest.stick(plan, memory, start, start, times)
+        if contact_rest.stuck_points(plan, memory).any() and (after != memory).any():
             # To second order, mass points move as on a sheet that no further tool touches until they stick.
-            self._relax(frame, without_rough_tools(plan, row, self._contact_column), PERTURBATION_TOLERANCE, pause)
-            after = stick(plan, memory, start, self.sheet.read_arrays(differences=False)[0], times)
+            smooth = contact_rest.without_rough_tools(plan, row, self._contact_column)
+            self._relax(frame, smooth, PERTURBATION_TOLERANCE, pause)
+            after = contact_rest.stick(plan, memory, start, self._read_arrays(differences=False)[0], times)
         self._write_contact(after)
 
     def _balance(self, frame: int, row: NDArray[Any], tolerance: float, pause: Pause, *, free: bool) -> float:
         """Find the shape in which all forces balance, the flat one if `free`; return the relative residual."""
-        if free and not stuck_points(self.plan, self._read_contact()).any() and self._try_flat(row):
+        if free and not contact_rest.stuck_points(self.plan, self._read_contact()).any() and self._try_flat(row):
             return 0.0
         return self._relax(frame, row, tolerance, pause)
 
     def _release(self, time: float, row: NDArray[Any], tolerance: float) -> float:
         """Release mass points on which rough tools pull by more than a tolerance; return the largest relative pull."""
         memory = self._read_contact()
-        shape, force = (self.sheet.read_arrays(differences=forces)[0] for forces in (False, True))
-        pulls = compute_pulls(self.plan, memory, shape, force, time)
-        largest = float(pulls.max()) / max(MIN_FORCE_N, self._relaxation.scale(row))
+        shape, force = (self._read_arrays(differences=forces)[0] for forces in (False, True))
+        pulls = contact_rest.compute_pulls(self.plan, memory, shape, force, time)
+        largest = float(pulls.max()) / max(MIN_FORCE_N, self.kernel.scale(row))
         if largest > tolerance:
-            self._write_contact(release(self.plan, memory, pulls))
+            self._write_contact(contact_rest.release(self.plan, memory, pulls))
         return largest
 
     def _meets_tool(self, time: float) -> bool:
-        """Return whether a tool at a time [s] touches the current sheet."""
-        position = rest_positions(self.plan.scene.sheet) + self.sheet.read_arrays(differences=False)[0]
+        position = rest_positions(self.plan.scene.sheet) + self._read_arrays(differences=False)[0]
         return any(tool.touches(position[~self.plan.fixed], time) for tool in self.plan.tools)
 
     def _is_clamp_displaced(self, time: float) -> bool:
-        """Return whether any clamp is displaced at a time [s]."""
         clamps = [tool for tool in self.plan.tools if isinstance(tool, Clamp)]
         return any(clamp.tip_centre(np.array([time])).any() for clamp in clamps)
 
     def _try_flat(self, row: NDArray[Any]) -> bool:
         """Return whether the flat shape is an equilibrium; if so, keep it."""
-        relaxation, shape = self._relaxation, self.sheet.read_arrays(differences=False)[0]
+        relaxation, shape = self.kernel, self._read_arrays(differences=False)[0]
         relaxation.place(np.zeros_like(shape))
         count, force = relaxation.relax(1, 0.0, row)
         self.evaluations += count
@@ -299,7 +218,7 @@ class QuasiStatics:
 
     def _relax(self, frame: int, row: NDArray[Any], tolerance: float, pause: Pause) -> float:
         """Iterate until the residual, relative to the largest force, is below a tolerance; return it."""
-        relaxation, longer = self._relaxation, max(self.layout.rows, self.layout.cols)
+        relaxation, longer = self.kernel, max(self.layout.rows, self.layout.cols)
         relaxation.stop()
         points = self.layout.rows * self.layout.cols
         per_launch = max(1, min(EVALUATIONS_PER_LAUNCH, POINT_EVALUATIONS_PER_LAUNCH // points))
@@ -346,12 +265,11 @@ class QuasiStatics:
         # This generator returns the same numbers in every version of NumPy.
         noise = 2 * np.random.RandomState(0).random_sample((rows, cols, 3)) - 1
         moves = (~self.plan.fixed / self._masses)[..., None]
-        self._relaxation.place(self.sheet.read_arrays(differences=False)[0] + force * noise * moves)
+        self.kernel.place(self._read_arrays(differences=False)[0] + force * noise * moves)
 
     def _diverged(self, frame: int, residual: float, evaluations: int) -> DivergedError:
-        """Build the error of an iteration that did not converge."""
         plan, time = self.plan, frame / self.plan.grid.frames_per_second
-        row, column, *_ = largest_displacement(self.sheet.read_arrays(differences=True)[0])
+        row, column, *_ = largest_displacement(self._read_arrays(differences=True)[0])
         remedy = (
             "the sheet may hang slack, fold or wrinkle; give it a foundation, pretension or bending, or take less load"
         )
@@ -369,6 +287,6 @@ class QuasiStatics:
 
 def build_dynamics(
     plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None
-) -> SheetSolver:
+) -> SheetSolver[Any]:
     """Build the dynamic or quasi-static solver of a plan, with the arguments of `Dynamics`."""
     return (QuasiStatics if plan.scene.time.at_rest else Dynamics)(plan, device, layout, cores)

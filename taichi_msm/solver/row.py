@@ -27,8 +27,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
             see `build_point_step`.
     """
     vector, columns, springs = config.vector, config.first_column(None), config.require(SpringTerm)
-    structural, shear = springs.structural, springs.shear
-    masks_edges = springs.masks_edges
+    structural, shear, open_edges = springs.structural, springs.shear, springs.open_edges
     share_of_row, share_of_column = springs.build_shares(config)
     along, to_other_row, of_row, of_column, of_diagonal = springs.build_spring_forces(config)
 
@@ -52,7 +51,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
         left, last = [vector(0) for _ in ti.static(range(3))], [vector(0) for _ in ti.static(range(3))]
         this, following = [vector(0) for _ in ti.static(range(3))], [vector(0) for _ in ti.static(range(3))]
         has_left, has_right = vector(1), vector(1)
-        if ti.static(masks_edges):
+        if ti.static(open_edges):
             has_right = sheet.by_column[HAS_RIGHT * width + 0]
         u = [sheet.u[c][row] for c in ti.static(range(3))]
         if ti.static(structural):
@@ -75,7 +74,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
                 u[c] = sheet.u[c][row + b]
                 last[c] = this[c]
                 this[c] = following[c]
-            if ti.static(masks_edges):
+            if ti.static(open_edges):
                 has_left, has_right = sheet.by_column[HAS_LEFT * width + b], sheet.by_column[HAS_RIGHT * width + b]
             if ti.static(shear):
                 to_left = to_other_row(
@@ -113,7 +112,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
                 entry = ti.static(Entry(line, b, u))
                 move(sheet, entry, here, force, now)
         if ti.static(shear):
-            if ti.static(masks_edges):
+            if ti.static(open_edges):
                 has_left = sheet.by_column[HAS_LEFT * width + strip + 1]
             for c in ti.static(range(3)):
                 u[c] = sheet.u[c][row + strip + 1]
@@ -134,7 +133,6 @@ def build_correct_row(config: KernelConfig, correction: Correction) -> Callable[
 
     @ti.func
     def correct_row(sheet: ti.template(), i, kind, loads: ti.template(), n):
-        """Correct row i after step n of the launch."""
         now = [loads[n, c] for c in ti.static(range(columns))]
         at = i * sheet.width
         # Smallest and largest displacements along y and z.

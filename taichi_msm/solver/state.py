@@ -68,7 +68,7 @@ class RunProgress:
     peak: float = 0.0  # largest energy at any frame so far [J]
     residual: float = 0.0  # as in a `Reading`, the largest of all frames so far
     evaluations: int = 0  # as in a `Reading`, the sum over all frames so far
-    # least_energy, energy_growth: as `EnergyGrowth.follow` returns them
+    # least_energy, energy_growth: as `DivergenceMonitor` measures them
     least_energy: float = 0.0
     energy_growth: float = 0.0
     pierced_by: int = 0  # number, from 1, of the first probe reported by `piercing`; 0 without a report

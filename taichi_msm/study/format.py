@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from taichi_msm.study.result import MeshMeasurement, PeerMeasurement, SteppingMeasurement, Study, Timing
+from taichi_msm.study.result import MeshMeasurement, SteppingMeasurement, Study, Timing
 
 # Units of time: number in a second, and name.
 TIME_UNITS = ((1, "s"), (1e3, "ms"), (1e6, "us"))
@@ -14,7 +14,7 @@ TIME_UNITS = ((1, "s"), (1e3, "ms"), (1e6, "us"))
 Columns = Mapping[str, Callable[[Any], str]]
 
 # A measurement with an error.
-ErrorMeasurement = SteppingMeasurement | PeerMeasurement | MeshMeasurement
+ErrorMeasurement = SteppingMeasurement | MeshMeasurement
 
 
 def format_number(value: float) -> str:
@@ -51,11 +51,6 @@ def format_error(measurement: ErrorMeasurement) -> str:
     """Format the error, or its bound."""
     error = comparable_error(measurement)
     return f"{'' if measurement.known else '< '}{format_number(error)}" if error < math.inf else "diverged"
-
-
-def is_mostly_rounding(measurement: ErrorMeasurement) -> bool:
-    """Return whether rounding in f32 dominates the error."""
-    return isinstance(measurement, SteppingMeasurement) and (measurement.rounding or 0) > (measurement.error or 0) / 2
 
 
 def machine_summary(study: Study) -> str:
@@ -102,5 +97,5 @@ def format_table(measurements: Sequence[Any], columns: Columns, remark: Callable
     if remark and any(map(remark, measurements)):
         columns = {**columns, "": remark}
     rows = [[cell(measurement) for cell in columns.values()] for measurement in measurements]
-    text_columns = [n for n, name in enumerate(columns) if name in ("method", "without", "")]
+    text_columns = [n for n, name in enumerate(columns) if name in ("method", "")]
     return markdown_table(list(columns), rows, text_columns)

@@ -1,4 +1,4 @@
-"""Figure of a study: work-precision diagrams of stepping, drawing and meshes, and the cost of every term."""
+"""Figure of a study: work-precision diagrams of stepping, drawing and meshes."""
 
 from __future__ import annotations
 
@@ -29,19 +29,12 @@ from taichi_msm.plot_style import (
     ONE_COLUMN_WIDTH,
     ORANGE,
     PURPLE,
-    SILVER,
     SKY,
     STYLE,
     TWO_COLUMN_WIDTH,
     VERMILION,
 )
-from taichi_msm.study.format import (
-    ErrorMeasurement,
-    format_number,
-    is_mostly_rounding,
-    machine_summary,
-    time_unit,
-)
+from taichi_msm.study.format import ErrorMeasurement, format_number, machine_summary
 from taichi_msm.study.result import DrawingMeasurement, Study
 from taichi_msm.system.compiler import compiler_label
 
@@ -51,17 +44,29 @@ PRECISION_LINES: dict[str, dict[str, Any]] = {
     "f32": {"linestyle": "-", "marker": "o"},
     "f64": {"linestyle": (0, (3.5, 1.8)), "marker": "s"},
 }
-DOP853_LINE: dict[str, Any] = {"color": INK, "linestyle": ":", "marker": "D"}
 TOLERANCE_LINE: dict[str, Any] = {"color": GREY, "linewidth": 0.8, "linestyle": (0, (6, 3))}
-RECOMMENDED_MARKER: dict[str, Any] = {"ls": "none", "marker": "o", "ms": 11, "mfc": "none", "mec": INK, "zorder": 5}
+RECOMMENDED_MARKER: dict[str, Any] = {
+    "ls": "none",
+    "marker": "o",
+    "ms": 11,
+    "mfc": "none",
+    "mec": INK,
+    "zorder": 5,
+}
 BOUND_MARKER: dict[str, Any] = {"mfc": "white"}
-ROUNDING_MARKER: dict[str, Any] = {"fillstyle": "bottom", "markerfacecoloralt": "white"}
 LEGEND_MARKER: dict[str, Any] = {"linestyle": "none", "marker": "o", "color": GREY}
-SUPERSAMPLE_COLOURS = (SKY, BLUE, GREEN, ORANGE, PURPLE, VERMILION)
+SUPERSAMPLE_COLOURS = (
+    SKY,
+    BLUE,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    VERMILION,
+)
 MARKERS = "osD^vPX"
 
 # Mosaic by the number of panels.
-PANEL_MOSAICS = {1: "A", 2: "AB", 3: "AB;AC", 4: "AB;CD"}
+PANEL_MOSAICS = {1: "A", 2: "AB", 3: "AB;AC"}
 
 Panel = Callable[[Axes, Study], None]
 
@@ -87,8 +92,6 @@ def panels(study: Study) -> Iterator[Panel]:
         yield _plot_drawing
     if any(_drawable(mesh.error) for mesh in study.points):
         yield _plot_meshes
-    if study.terms:
-        yield _plot_terms
 
 
 def _drawable(value: float | None) -> bool:
@@ -99,7 +102,10 @@ def _drawable(value: float | None) -> bool:
 def _figure(study: Study) -> Figure:
     study_panels = list(panels(study))
     layout = PANEL_MOSAICS[len(study_panels)]
-    size = (TWO_COLUMN_WIDTH if len(study_panels) > 1 else ONE_COLUMN_WIDTH, 4.2 * (layout.count(";") + 1) + 0.5)
+    size = (
+        TWO_COLUMN_WIDTH if len(study_panels) > 1 else ONE_COLUMN_WIDTH,
+        4.2 * (layout.count(";") + 1) + 0.5,
+    )
     figure = Figure(figsize=size, dpi=DPI, layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1, wspace=0.05))
     FigureCanvasAgg(figure)
     versions = study.machine["versions"]
@@ -110,7 +116,7 @@ def _figure(study: Study) -> Figure:
         f"{_recommendation_line(study)}\n{machine}", x=0.01, ha="left", size=8, parse_math=False, wrap=True
     )
     axes = figure.subplot_mosaic(layout)
-    for name, panel in zip("ABCD", study_panels, strict=False):
+    for name, panel in zip("ABC", study_panels, strict=False):
         panel(axes[name], study)
     return figure
 
@@ -135,39 +141,29 @@ def _plot_stepping(axes: Axes, study: Study) -> None:
         diverged = [point.seconds.median for point in points if point.error is None]
         right = axes.get_yaxis_transform()
         axes.plot([0.985] * len(diverged), diverged, "x", color=line["color"], transform=right)
-    if study.peers:
-        handles.append(_plot_line(axes, study.peers, DOP853_LINE, "SciPy DOP853"))
     best = study.best_stepping
     if best is not None and _drawable(best.error):
         axes.plot([best.error or 0.0], [best.seconds.median], **RECOMMENDED_MARKER)
-    _scale_errors(axes, [*study.stepping, *study.peers], study.tolerance)
+    _scale_errors(axes, study.stepping, study.tolerance)
     _legend(axes, [*handles, *_marker_legend(study)])
 
 
 def _plot_line(axes: Axes, points: Sequence[ErrorMeasurement], line: dict[str, Any], label: str) -> Line2D:
     """Plot a line through measurements; return its legend handle."""
     points = [point for point in points if _drawable(point.error)]
-    errors = [point.error or 0.0 for point in points]
-    axes.plot(errors, [point.seconds.median for point in points], **line, zorder=3)
-    _plot_spread(axes, errors, points, line["color"])
-    for point, error in zip(points, errors, strict=True):
-        # Markers are hollow for upper bounds, and half filled where rounding dominates.
-        if not point.known or is_mostly_rounding(point):
-            axes.plot(
-                [error], [point.seconds.median], **line | (ROUNDING_MARKER if point.known else BOUND_MARKER), zorder=4
-            )
+    _plot_times(axes, [point.error or 0.0 for point in points], points, line)
+    for point in points:
+        if not point.known:
+            axes.plot([point.error or 0.0], [point.seconds.median], **line | BOUND_MARKER, zorder=4)
     return Line2D([], [], **line, label=label)
 
 
 def _marker_legend(study: Study) -> Iterator[Line2D]:
     """Yield the legend handles of the plotted kinds of markers."""
-    points: list[ErrorMeasurement] = [*study.stepping, *study.peers]
     yield Line2D([], [], **TOLERANCE_LINE, label="tolerance")
     if study.best_stepping is not None:
         yield Line2D([], [], **RECOMMENDED_MARKER | {"ms": 8}, label="recommended")
-    if any(point.known and is_mostly_rounding(point) for point in points):
-        yield Line2D([], [], **LEGEND_MARKER | ROUNDING_MARKER, label="mostly rounding")
-    if any(_drawable(point.error) and not point.known for point in points):
+    if any(_drawable(point.error) and not point.known for point in study.stepping):
         yield Line2D([], [], **LEGEND_MARKER | BOUND_MARKER, label="at most this error")
     if any(point.error is None for point in study.stepping):
         yield Line2D([], [], **LEGEND_MARKER | {"marker": "x"}, label="diverged")
@@ -181,11 +177,11 @@ def _plot_drawing(axes: Axes, study: Study) -> None:
     markers = dict(zip(sorted({drawing.refine for drawing in drawings}), cycle(MARKERS)))
     for supersample, colour in colours.items():
         series = [drawing for drawing in drawings if drawing.supersample == supersample]
-        axes.plot(*zip(*map(_coordinates, series), strict=True), color=colour, linewidth=0.8)
-        _plot_spread(axes, [drawing.psnr or 0.0 for drawing in series], series, colour, 1e3)
+        line = {"color": colour, "linewidth": 0.8}
+        _plot_times(axes, [drawing.psnr or 0.0 for drawing in series], series, line, 1e3)
     for drawing in drawings:
-        colour, marker = colours[drawing.supersample], markers[drawing.refine]
-        axes.plot(*_coordinates(drawing), color=colour, marker=marker, **BOUND_MARKER, zorder=3)
+        marker = {"color": colours[drawing.supersample], "marker": markers[drawing.refine], **BOUND_MARKER}
+        axes.plot(*_coordinates(drawing), **marker, zorder=3)
     best = study.best_drawing
     if best is not None and _drawable(best.psnr):
         axes.plot(*_coordinates(best), **RECOMMENDED_MARKER)
@@ -213,45 +209,22 @@ def _plot_meshes(axes: Axes, study: Study) -> None:
         handles.append(_plot_line(axes, [mesh], line, f"{mesh.name}{role}{bound}"))
         if (mesh.rows, mesh.cols) == study.recommended_points:
             axes.plot([mesh.error or 0.0], [mesh.seconds.median], **RECOMMENDED_MARKER)
-        if _drawable(mesh.estimate):
-            axes.plot([mesh.error or 0.0, mesh.estimate or 0.0], [mesh.seconds.median] * 2, color=ORANGE, linewidth=0.7)
-            axes.plot([mesh.estimate or 0.0], [mesh.seconds.median], color=ORANGE, marker=marker)
-    if any(_drawable(mesh.estimate) for mesh in meshes):
-        handles.append(Line2D([], [], color=ORANGE, marker="o", linestyle="none", label="estimated by run"))
-    _scale_errors(axes, meshes, study.mesh_tolerance, [mesh.estimate or 0.0 for mesh in meshes])
+    _scale_errors(axes, meshes, study.mesh_tolerance)
     _legend(axes, [*handles, Line2D([], [], **TOLERANCE_LINE, label="tolerance")])
 
 
-def _plot_terms(axes: Axes, study: Study) -> None:
-    scale, name = time_unit(study.terms[0].seconds.median)
-    rows = range(len(study.terms))
-    times = [scale * term.seconds.median for term in study.terms]
-    below = [scale * (term.seconds.median - term.seconds.fastest) for term in study.terms]
-    above = [scale * (term.seconds.slowest - term.seconds.median) for term in study.terms]
-    colours = [SKY if term.without else SILVER for term in study.terms]
-    error_line = {"linewidth": 0.8, "ecolor": INK}
-    bars = axes.barh(rows, times, height=0.6, color=colours, xerr=(below, above), error_kw=error_line)
-    axes.bar_label(bars, [format_number(time) for time in times], padding=3, size=7, color=GREY)
-    axes.axvline(times[0], **TOLERANCE_LINE, zorder=0)
-    axes.set_yticks(rows, [f"without {term.without}" if term.without else "whole step" for term in study.terms])
-    axes.set(title="Terms", xlabel=f"time of a step [{name.replace('us', 'µs')}]")
-    axes.margins(x=0.12)
-    axes.invert_yaxis()
-    axes.grid(visible=False, axis="y")
-    axes.tick_params(axis="y", length=0)
-
-
-def _plot_spread(
+def _plot_times(
     axes: Axes,
     x: Sequence[float],
     points: Sequence[ErrorMeasurement | DrawingMeasurement],
-    colour: str,
+    line: dict[str, Any],
     scale: float = 1,
 ) -> None:
-    """Plot the range of the times of every measurement as a thin line."""
-    fastest = [scale * point.seconds.fastest for point in points]
-    slowest = [scale * point.seconds.slowest for point in points]
-    axes.vlines(x, fastest, slowest, color=colour, linewidth=0.7, alpha=0.6)
+    """Plot a line through the medians of the times, with thin bars from the fastest to the slowest."""
+    times = [point.seconds for point in points]
+    axes.plot(x, [scale * each.median for each in times], **line, zorder=3)
+    fastest, slowest = [scale * each.fastest for each in times], [scale * each.slowest for each in times]
+    axes.vlines(x, fastest, slowest, color=line["color"], linewidth=0.7, alpha=0.6)
 
 
 def _extremes(points: Iterable[ErrorMeasurement | DrawingMeasurement]) -> Iterator[float]:
@@ -259,10 +232,10 @@ def _extremes(points: Iterable[ErrorMeasurement | DrawingMeasurement]) -> Iterat
         yield from (point.seconds.fastest, point.seconds.slowest)
 
 
-def _scale_errors(axes: Axes, points: Sequence[ErrorMeasurement], tolerance: float, more: Iterable[float] = ()) -> None:
+def _scale_errors(axes: Axes, points: Sequence[ErrorMeasurement], tolerance: float) -> None:
     """Scale the axes to times and errors, and mark the tolerance."""
     axes.axvline(tolerance, **TOLERANCE_LINE)
-    _scale(axes, "x", [*(point.error or 0.0 for point in points), *more, tolerance], 2)
+    _scale(axes, "x", [*(point.error or 0.0 for point in points), tolerance], 2)
     _scale(axes, "y", _extremes(points), 1)
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from taichi_msm.errors import printable, writing
 from taichi_msm.runs.directory import hidden_folder
@@ -26,7 +26,6 @@ from taichi_msm.study.format import (
 from taichi_msm.study.result import (
     DrawingMeasurement,
     Measurement,
-    PeerMeasurement,
     Reference,
     SteppingMeasurement,
     Study,
@@ -119,12 +118,6 @@ STEPPING_COLUMNS: Columns = {
     "of it rounding": lambda point: "" if point.rounding is None else format_number(point.rounding),
     "time of the scene": lambda point: format_timing(point.seconds),
 }
-PEER_COLUMNS: Columns = {
-    "rtol": lambda peer: f"{peer.rtol:g}",
-    "error": format_error,
-    "evaluations": lambda peer: str(peer.evaluations),
-    "time of the scene": lambda peer: format_timing(peer.seconds),
-}
 DRAWING_COLUMNS: Columns = {
     "refine": lambda drawing: str(drawing.refine),
     "supersample": lambda drawing: str(drawing.supersample),
@@ -136,15 +129,8 @@ MESH_COLUMNS: Columns = {
     "points": lambda mesh: mesh.name,
     "steps/frame": lambda mesh: str(mesh.steps_per_frame),
     "error": format_error,
-    "estimate": lambda mesh: "not known" if mesh.estimate is None else format_number(mesh.estimate),
     "time of the scene": lambda mesh: format_timing(mesh.seconds),
 }
-TERM_COLUMNS: Columns = {
-    "without": lambda term: term.without or "nothing",
-    "time of a step": lambda term: format_timing(term.seconds),
-}
-
-M = TypeVar("M", SteppingMeasurement, PeerMeasurement)
 
 
 def format_page(study: Study) -> str:
@@ -156,7 +142,7 @@ def format_page(study: Study) -> str:
         f"Measured on {machine_summary(study)}, with taichi-msm {versions['taichi-msm']}, {compiler_label(versions)}, "
         f"NumPy {versions['numpy']} and Python {versions['python']} ({versions['platform']}). "
         "Times are medians, with the fastest and the slowest in brackets.",
-        *(_stepping(study) if study.stepping or study.peers else ()),
+        *(_stepping(study) if study.stepping else ()),
     ]
     if study.drawing:
         blocks += [
@@ -167,10 +153,6 @@ def format_page(study: Study) -> str:
         ]
     if study.points:
         blocks += _meshes(study)
-    if study.terms:
-        full = study.terms[0].seconds.median
-        share: Columns = {"of the whole step": lambda term: f"{100 * term.seconds.median / full:.0f} %"}
-        blocks += ["## Terms", format_table(study.terms, {**TERM_COLUMNS, **share})]
     if study.notes:
         blocks += ["## Notes", "\n".join(f"- {note}" for note in study.notes)]
     blocks += ["## Recommendation", *remarks(study)]
@@ -194,12 +176,9 @@ def format_summary(study: Study) -> str:
     if fastest:
         names = "method", "step", "error", "time of the scene"
         blocks.append(_methods_table(study, fastest, {name: STEPPING_COLUMNS[name] for name in names}))
-    if peer := _best(study.peers, study.tolerance):
-        blocks.append(
-            f"SciPy's DOP853 at rtol {peer.rtol:g}: error {format_error(peer)}, {format_timing(peer.seconds)}"
-        )
     if study.drawing:
-        blocks.append(_drawings_table(study, list(_drawings(study))))
+        best_drawings = map(study.best_refinement, sorted({drawing.supersample for drawing in study.drawing}))
+        blocks.append(_drawings_table(study, [drawing for drawing in best_drawings if drawing]))
     if study.points:
         blocks.append(_meshes_table(study))
     notes = [f"note: {printable(note)}" for note in study.notes]
@@ -271,10 +250,7 @@ def _stepping(study: Study) -> Iterator[str]:
     orders = [f"{method} {order:.2f}" for method, order in study.orders.items() if order is not None]
     if orders:
         yield f"Observed orders: {', '.join(orders)}."
-    if study.peers:
-        yield "SciPy's DOP853 on the same equations:"
-        yield format_table(study.peers, PEER_COLUMNS)
-    yield from _bounds([*study.stepping, *study.peers])
+    yield from _bounds(study.stepping)
 
 
 def _meshes(study: Study) -> Iterator[str]:
@@ -283,9 +259,8 @@ def _meshes(study: Study) -> Iterator[str]:
     yield (
         "The error is that made by the number of points, at the points and between them, where the displacement is "
         "interpolated by cubics: the largest anywhere at any frame, as a fraction of the largest displacement. The "
-        f"reference is {reference}. All are stepped in f64 with the same "
-        "step. The estimate is that of `run`, by a companion run with half the cells per side. "
-        "Times are those of each sheet's automatic step."
+        f"reference is {reference}. All are stepped in f64 with the same step. Times are those of each sheet's "
+        "automatic step."
     )
     yield _meshes_table(study)
     yield from _bounds(study.points)
@@ -312,16 +287,7 @@ def _meshes_table(study: Study) -> str:
     return format_table(study.points, MESH_COLUMNS, lambda mesh: roles.get((mesh.rows, mesh.cols), ""))
 
 
-def _drawings(study: Study) -> Iterator[DrawingMeasurement]:
-    """Yield the best refinement for every supersampling."""
-    for supersample in sorted({drawing.supersample for drawing in study.drawing}):
-        render = {**study.settings["render"], "supersample": supersample}
-        best = replace(study, settings={**study.settings, "render": render}).best_drawing
-        if best is not None:
-            yield best
-
-
-def _best(points: Sequence[M], tolerance: float) -> M | None:
+def _best(points: Sequence[SteppingMeasurement], tolerance: float) -> SteppingMeasurement | None:
     """Return the fastest measurement within the tolerance, otherwise the most accurate one."""
     sufficient = [point for point in points if comparable_error(point) <= tolerance]
     if sufficient:

@@ -33,28 +33,18 @@ class Timing:
 
 @dataclass(frozen=True)
 class Reference:
-    """Reference solution for the errors of stepping: central differences in f64, extrapolated.
+    """Reference solution for the errors of stepping: central differences in f64, extrapolated."""
 
-    Attributes:
-        steps_per_frame: of its finest run.
-        error: of the reference itself, estimated by halving the step, as a fraction of the largest displacement.
-        largest: largest displacement of any mass point at any frame [m].
-    """
-
-    steps_per_frame: int
-    error: float
-    largest: float
+    steps_per_frame: int  # of its finest run
+    error: float  # of the reference itself, estimated by halving the step, as a fraction of the largest displacement
+    largest: float  # largest displacement of any mass point at any frame [m]
 
 
 @dataclass
 class Measurement:
-    """Measurement of one setting.
+    """Measurement of one setting."""
 
-    Attributes:
-        samples: times of repeated runs [s].
-    """
-
-    samples: list[float] = field(default_factory=list, kw_only=True)
+    samples: list[float] = field(default_factory=list, kw_only=True)  # times of repeated runs [s]
 
     @property
     def seconds(self) -> Timing:
@@ -64,26 +54,16 @@ class Measurement:
 
 @dataclass
 class SteppingMeasurement(Measurement):
-    """Measurement of stepping through the whole scene with one method and step, without compilation.
+    """Measurement of stepping through the whole scene with one method and step, without compilation."""
 
-    Attributes:
-        precision: f32 or f64.
-        damping_difference: central or backward.
-        steps_per_frame: number of steps per frame.
-        step: time step h [s].
-        error: largest error of any mass point at any frame, as a fraction of the largest displacement; None if the
-            simulation diverged.
-        rounding: difference from f64 with the same step, as a fraction of the largest displacement; None if not known.
-        known: whether the reference is accurate enough for this error; otherwise `error` is an approximate bound.
-    """
-
-    precision: str
-    damping_difference: str
+    precision: str  # f32 or f64
+    damping_difference: str  # central or backward
     steps_per_frame: int
-    step: float
+    step: float  # time step h [s]
+    # Largest error of any mass point at any frame, as a fraction of the largest displacement; None if it diverged.
     error: float | None = None
-    rounding: float | None = None
-    known: bool = False
+    rounding: float | None = None  # difference from f64 with the same step, the same fraction; None if not known
+    known: bool = False  # whether the reference is accurate enough for this error; otherwise it is an approximate bound
 
     @property
     def method(self) -> str:
@@ -92,58 +72,24 @@ class SteppingMeasurement(Measurement):
 
 
 @dataclass
-class PeerMeasurement(Measurement):
-    """Measurement of SciPy's DOP853 on the same equations, for the whole scene.
-
-    Attributes:
-        rtol: relative tolerance; the absolute one is rtol x the largest displacement / 10.
-        error: as in `SteppingMeasurement`.
-        known: as in `SteppingMeasurement`.
-        evaluations: number of evaluations of the forces.
-    """
-
-    rtol: float
-    error: float
-    known: bool
-    evaluations: int
-
-
-@dataclass
 class DrawingMeasurement(Measurement):
-    """Measurement of drawing the most deformed frame.
-
-    Attributes:
-        refine: refinement of the surface.
-        supersample: samples per pixel along each axis.
-        psnr: against a picture of high refinement and supersampling [dB]; None if both are equal.
-        largest_error: largest error of any colour channel of any pixel, 0 to 255.
-    """
+    """Measurement of drawing the most deformed frame."""
 
     refine: int
     supersample: int
-    psnr: float | None
-    largest_error: int
+    psnr: float | None  # against a picture of high refinement and supersampling [dB]; None if both are equal
+    largest_error: int  # of any colour channel of any pixel, 0 to 255
 
 
 @dataclass
 class MeshMeasurement(Measurement):
-    """Measurement of stepping tissue with another mesh through the whole scene, in f64.
-
-    Attributes:
-        rows: rows of mass points.
-        cols: columns of mass points.
-        steps_per_frame: of the automatic step on this mesh.
-        error: discretisation error of the mesh, at the mass points and between them, as in `SteppingMeasurement`.
-        known: as in `SteppingMeasurement`.
-        estimate: of this error by the companion run of `run`; None if unknown.
-    """
+    """Measurement of stepping tissue with another mesh through the whole scene, in f64."""
 
     rows: int
     cols: int
-    steps_per_frame: int
-    error: float | None = None
-    known: bool = False
-    estimate: float | None = None
+    steps_per_frame: int  # of the automatic step on this mesh
+    error: float | None = None  # discretisation error, at the mass points and between them, as in `SteppingMeasurement`
+    known: bool = False  # as in `SteppingMeasurement`
 
     @property
     def name(self) -> str:
@@ -152,49 +98,20 @@ class MeshMeasurement(Measurement):
 
 
 @dataclass
-class TermMeasurement(Measurement):
-    """Measurement of a step without one term of the model.
-
-    Attributes:
-        without: key of the term; empty for the full model.
-    """
-
-    without: str
-
-
-@dataclass
 class Study:
-    """Results of a study: speed against error of a scene on a machine.
+    """Results of a study: speed against error of a scene on a machine."""
 
-    Attributes:
-        scene: name of the scene.
-        settings: the scene with its defaults filled in.
-        status: complete or interrupted.
-        tolerance: largest allowed error, as a fraction of the largest displacement.
-        machine: CPU, cores, arch, threads, bits of a vector, and versions.
-        reference: reference solution; None if the study was interrupted before it was computed.
-        stepping: measurements of stepping, by method and then by decreasing step.
-        orders: of convergence, as returned by `observed_orders`.
-        peers: measurements of DOP853.
-        drawing: measurements of drawing, by supersampling and refinement; empty without a picture.
-        points: measurements of meshes, from coarse to fine; empty for springs.
-        terms: measurements without single terms; the first is of the full model.
-        notes: remarks for the reader, such as omitted parts and the reason.
-    """
-
-    scene: str
-    settings: dict[str, Any]
-    status: str
-    tolerance: float
-    machine: dict[str, Any]
-    reference: Reference | None = None
-    stepping: list[SteppingMeasurement] = field(default_factory=list)
-    orders: dict[str, float | None] = field(default_factory=dict)
-    peers: list[PeerMeasurement] = field(default_factory=list)
-    drawing: list[DrawingMeasurement] = field(default_factory=list)
-    points: list[MeshMeasurement] = field(default_factory=list)
-    terms: list[TermMeasurement] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
+    scene: str  # name of the scene
+    settings: dict[str, Any]  # the scene with its defaults filled in
+    status: str  # complete or interrupted
+    tolerance: float  # largest allowed error, as a fraction of the largest displacement
+    machine: dict[str, Any]  # CPU, cores, arch, threads, bits of a vector, and versions
+    reference: Reference | None = None  # None if the study was interrupted before it was computed
+    stepping: list[SteppingMeasurement] = field(default_factory=list)  # by method and then by decreasing step
+    orders: dict[str, float | None] = field(default_factory=dict)  # of convergence, as from `observed_orders`
+    drawing: list[DrawingMeasurement] = field(default_factory=list)  # by supersampling and refinement
+    points: list[MeshMeasurement] = field(default_factory=list)  # from coarse to fine; empty for springs
+    notes: list[str] = field(default_factory=list)  # remarks for the reader, such as omitted parts and the reason
 
     def finish(self) -> None:
         """Remove measurements without timings, sort those of stepping, and fit the orders of convergence."""
@@ -205,7 +122,6 @@ class Study:
         self.orders = observed_orders(self.stepping)
         self.drawing = [drawing for drawing in self.drawing if drawing.samples]
         self.points = [mesh for mesh in self.points if mesh.samples]
-        self.terms = [term for term in self.terms if term.samples]
 
     @property
     def has_contact(self) -> bool:
@@ -264,7 +180,10 @@ class Study:
     @property
     def best_drawing(self) -> DrawingMeasurement | None:
         """Fastest sufficient refinement at the scene's own supersampling; None if not measured."""
-        supersample = self.settings["render"]["supersample"]
+        return self.best_refinement(self.settings["render"]["supersample"])
+
+    def best_refinement(self, supersample: int) -> DrawingMeasurement | None:
+        """Return the fastest sufficient refinement at a supersampling; None if not measured."""
         decibels = [
             (math.inf if drawing.psnr is None else drawing.psnr, drawing)
             for drawing in self.drawing

@@ -1,12 +1,10 @@
-"""Study of a scene: stepping, SciPy for comparison, drawing, meshes and terms."""
+"""Study of a scene: stepping, drawing and meshes."""
 
 from __future__ import annotations
 
 import os
-import time
-from contextlib import closing
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 from taichi_msm.errors import SceneError, StageProgressCallback
 from taichi_msm.load.check import check_scene
@@ -15,43 +13,14 @@ from taichi_msm.model.sheet import rest_positions
 from taichi_msm.render.texture import load_texture
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.planning import choose_precision, plan_variant, with_time
-from taichi_msm.study.measurements import (
-    IntegrationError,
-    MeshStudy,
-    SteppingStudy,
-    TimeLimitError,
-    measure_pictures,
-    measure_terms,
-    solve_with_dop853,
-)
-from taichi_msm.study.result import PeerMeasurement, Study
+from taichi_msm.study.measurements import MeshStudy, SteppingStudy, measure_pictures
+from taichi_msm.study.result import Study
 from taichi_msm.system import process, runtime
 from taichi_msm.system.compiler import versions
 from taichi_msm.system.runtime import Device
 
-# Beginning and end of the notes about DOP853.
-DOP853_SUBJECT = "DOP853, SciPy's general integrator, which the study compares its own steps with,"
-DOP853_INDEPENDENCE = "no other figure depends on it"
-
-
-class TimeBudget(NamedTuple):
-    """Time budget of the parts of a study.
-
-    Attributes:
-        longest_run: limit of a run of the whole scene [s].
-        peer: limit of DOP853 for each of its tolerances [s].
-        peer_rtols: relative tolerances of DOP853.
-        sample: time of one measurement of a step [s].
-    """
-
-    longest_run: float
-    peer: float
-    peer_rtols: tuple[float, ...]
-    sample: float
-
-
-QUICK = TimeBudget(longest_run=0.25, peer=10.0, peer_rtols=(1e-4,), sample=0.02)
-FULL = TimeBudget(longest_run=2.0, peer=30.0, peer_rtols=(1e-3, 1e-5, 1e-7), sample=0.1)
+# Approximate time limit of a run of the whole scene [s].
+QUICK_RUN_S, FULL_RUN_S = 0.25, 2.0
 
 
 def run_study(
@@ -94,24 +63,19 @@ def run_study(
         tolerance=tolerance or scene.time.tolerance or 1e-3,
         machine=machine_record(device),
     )
-    budget = QUICK if quick else FULL
+    longest_run = QUICK_RUN_S if quick else FULL_RUN_S
     # The study itself varies the step.
     plan = choose_precision(plan_variant(plan, with_time(scene, tolerance=None)), device.arch)
     scene = plan.scene
     try:
-        stepping = SteppingStudy(plan, device, budget.longest_run, results, partial(progress, "stepping"))
-        with closing(stepping):
-            stepping.run()
-        _measure_peer(plan, stepping, budget, results, progress)
+        frames = SteppingStudy(plan, device, longest_run, results, partial(progress, "stepping")).run()
         if texture is None:
             results.notes.append("drawing was left out: the scene names no image")
         else:
-            assert stepping.frames is not None
-            deformed = max(stepping.frames, key=lambda frame: (frame**2).sum(axis=-1).max())
+            deformed = max(frames, key=lambda frame: (frame**2).sum(axis=-1).max())
             position = rest_positions(scene.sheet) + deformed
             measure_pictures(scene, position, texture, quick, results, partial(progress, "drawing"))
-        MeshStudy(plan, device, budget.longest_run, results, partial(progress, "points")).run()
-        measure_terms(plan, device, budget.sample, results, partial(progress, "terms"))
+        MeshStudy(plan, device, longest_run, results, partial(progress, "points")).run()
     except KeyboardInterrupt:
         results.status = "interrupted"
         results.notes.append("interrupted: the measurements until then")
@@ -142,37 +106,3 @@ def _require_memory(scene: Scene) -> None:
             f"{available / 2**30:.3g} GiB is free; study a shorter time.duration or fewer sheet.points"
         )
         raise SceneError([fault])
-
-
-def _measure_peer(
-    plan: Plan, stepping: SteppingStudy, budget: TimeBudget, results: Study, progress: StageProgressCallback
-) -> None:
-    """Measure DOP853 at several tolerances, at most five times each, within the time budget."""
-    assert results.reference is not None
-    if plan.tools:
-        results.notes.append(f"{DOP853_SUBJECT} is left out, as it knows no contact; {DOP853_INDEPENDENCE}")
-        return
-    for index, rtol in enumerate(budget.peer_rtols):
-        samples: list[float] = []
-        deadline = time.perf_counter() + budget.peer
-        atol = rtol * (results.reference.largest or 1.0) / 10
-        tick = partial(progress, "dop853", index, len(budget.peer_rtols))
-        try:
-            while len(samples) < 5:
-                start = time.perf_counter()
-                frames, evaluations = solve_with_dop853(plan, rtol, atol, deadline, tick)
-                samples.append(time.perf_counter() - start)
-        except TimeLimitError:
-            if not samples:
-                reason = f"takes more than {budget.peer:g} s at rtol {rtol:g} and was stopped"
-                results.notes.append(f"{DOP853_SUBJECT} {reason}; {DOP853_INDEPENDENCE}")
-                return
-        except IntegrationError as failure:
-            reason = (
-                f"finds no step small enough {failure}, at rtol {rtol:g}: forces change too suddenly for it there, as "
-                "where a spring is pressed to a point or the sheet runs away"
-            )
-            results.notes.append(f"{DOP853_SUBJECT} {reason}; {DOP853_INDEPENDENCE}")
-            return
-        error = stepping.relative_error(frames)
-        results.peers.append(PeerMeasurement(rtol, error, stepping.determines(error), evaluations, samples=samples))

@@ -13,18 +13,18 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from concurrent.futures import CancelledError, Executor, Future
+from concurrent.futures import BrokenExecutor, CancelledError, Future
 from contextlib import contextmanager, suppress
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-from distributed import Client, KilledWorker, Reschedule, Security, WorkerPlugin, get_worker
+from distributed import Client, Reschedule, Security, WorkerPlugin, get_worker
+from distributed.cfexecutor import ClientExecutor
 from distributed.client import ClosedClientError
 from distributed.comm import connect
 from distributed.utils import LoopRunner, silence_logging_cmgr
 
-from taichi_msm.errors import ExecutorError, LostExecutorError, MsmError, StageProgressCallback
+from taichi_msm.errors import ExecutorError, LostExecutorError, StageProgressCallback
 from taichi_msm.images import use_copies
 from taichi_msm.scene.outputs import SWEEP_RECORD
 from taichi_msm.sweeps.runs import Outcome, RunTask, execute_run
@@ -34,21 +34,9 @@ from taichi_msm.system.compiler import result_versions, versions
 # Time limit for the answer of a scheduler [s].
 MAX_WAIT_S = 10
 
-# Further requirements of transports.
-_CERTIFICATES = "certificates; name them in dask's configuration, under distributed.comm.tls"
-TRANSPORT_REQUIREMENTS = {
-    "tls": _CERTIFICATES,
-    "wss": _CERTIFICATES,
-    "ucx": "UCX, which is not installed; pip install distributed-ucxx, or use tcp://",
-}
-
 
 class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
     """Worker plugin with the common inputs of all runs of a sweep.
-
-    Args:
-        sweep: has the scene and the files.
-        directory: of the sweep.
 
     Attributes:
         error: reason why the worker cannot execute runs; empty if it can.
@@ -111,57 +99,23 @@ class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
         return ""
 
 
-class Cluster(Executor):
-    """Executor for the workers of a scheduler, which sends only the number and the overrides of each run."""
+class Cluster(ClientExecutor):  # type: ignore[misc]
+    """Executor for the workers of a scheduler, which sends only the number, overrides and directory of each run."""
 
     def __init__(self, client: Any, name: str) -> None:
-        self._executor, self._name = client.get_executor(pure=False), name
+        super().__init__(client, pure=False)
+        self._name = name
 
-    def submit(self, function: Callable[..., Any], /, *arguments: Any, **_: Any) -> Future[Any]:
-        """Schedule a call in an idle worker.
-
-        Args:
-            function: an importable function.
-            *arguments: its positional arguments; named ones are not supported.
-        """
-        result: Future[Any] = Future()
+    def submit(self, function: Callable[..., Any], /, *arguments: Any) -> Future[Any]:
+        """Schedule a call of an importable function in an idle worker."""
+        call: tuple[Any, ...] = (_call, self._name, function, *arguments)
+        if function is execute_run:
+            (task,) = arguments
+            call = (_execute_run, self._name, task.run, task.overrides, task.directory.absolute())
         try:
-            if function is execute_run:
-                (task,) = arguments
-                dask_future = self._executor.submit(_execute_run, self._name, task.run, task.overrides)
-            else:
-                dask_future = self._executor.submit(_call, self._name, function, *arguments)
-        except ClosedClientError:
-            _cancel(result)
-        else:
-            dask_future.add_done_callback(partial(_forward_result, result))
-        return result
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Shut down the executor.
-
-        Args:
-            wait: whether to wait for all calls.
-            cancel_futures: whether to cancel pending calls, without waiting for running ones.
-        """
-        self._executor.shutdown(wait and not cancel_futures)
-
-
-def _forward_result(result: Future[Any], dask_future: Future[Any]) -> None:
-    """Forward the result of a call, with a reproducible message for dead workers."""
-    if dask_future.cancelled():
-        _cancel(result)
-    elif isinstance(error := dask_future.exception(), KilledWorker):
-        result.set_exception(MsmError(f"its workers died, {error.allowed_failures + 1} one after another"))
-    elif error is not None:
-        result.set_exception(error)
-    else:
-        result.set_result(dask_future.result())
-
-
-def _cancel(result: Future[Any]) -> None:
-    result.cancel()
-    result.set_running_or_notify_cancel()
+            return super().submit(*call)
+        except ClosedClientError as error:
+            raise BrokenExecutor(str(error)) from error
 
 
 def _call(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
@@ -170,10 +124,10 @@ def _call(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
         return function(*arguments)
 
 
-def _execute_run(name: str, run: int, overrides: tuple[str, ...]) -> Outcome:
+def _execute_run(name: str, run: int, overrides: tuple[str, ...], directory: Path) -> Outcome:
     inputs = _inputs(name)
     with suppress(KeyboardInterrupt):
-        task = RunTask(run, inputs.scene, overrides, inputs.directory, inputs.home)
+        task = RunTask(run, inputs.scene, overrides, directory, inputs.home)
         outcome: Outcome = _call(name, execute_run, task, inputs.pause)
         inputs.pause("", 0, 0)
         return outcome
@@ -218,14 +172,14 @@ def cluster_connection(
             yield cluster
         except ExecutorError as error:
             # Within the block, runs are cancelled only by a lost connection.
-            if lost := isinstance(error.__cause__, (CancelledError, OSError)):
+            if lost := isinstance(error.__cause__, (BrokenExecutor, CancelledError, OSError)):
                 raise LostExecutorError(f"lost the scheduler at {address}") from error
             raise
         finally:
             if not lost:
                 # The connection may be lost, or another command for this directory may have removed the plugin.
                 with suppress(OSError, ValueError):
-                    cluster.shutdown(cancel_futures=True)
+                    cluster.shutdown(wait=False)
                     client.unregister_worker_plugin(name)
             client.close()
 
@@ -240,9 +194,9 @@ def _client(address: str) -> Any:
             return Client(address, timeout=MAX_WAIT_S, set_as_default=False)
     except (OSError, asyncio.TimeoutError):
         raise ExecutorError(f"{address}: no dask scheduler answers; {remedy}") from None
-    except TypeError as error:  # raised by a transport whose requirements are not installed
-        needs = TRANSPORT_REQUIREMENTS.get(address.partition("://")[0], " ".join(str(error).split()))
-        raise ExecutorError(f"{address}: needs {needs}") from None
+    except TypeError:  # raised by a transport whose requirements are not installed
+        needs = "tls needs certificates in dask's configuration, under distributed.comm.tls; ucx needs distributed-ucxx"
+        raise ExecutorError(f"{address}: the transport is not set up; {needs}") from None
     except Exception as error:
         raise ExecutorError(f"{address}: {' '.join(str(error).split())}; {remedy}") from None
 

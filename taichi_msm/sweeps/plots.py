@@ -32,19 +32,14 @@ from taichi_msm.errors import FilesError, StageProgressCallback, printable
 from taichi_msm.plot_style import BLUE, DPI, GREY, INK, ONE_COLUMN_WIDTH, ORANGE, PALE, STYLE, VERMILION
 from taichi_msm.runs.directory import replacing
 from taichi_msm.runs.finished import read_run, reading
-from taichi_msm.sweeps.runs import CONTACT, POLL_INTERVAL_S, SweepResult
-from taichi_msm.sweeps.spec import Distribution
+from taichi_msm.sweeps.runs import POLL_INTERVAL_S, SweepState
+from taichi_msm.sweeps.spec import Distribution, spread
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-PANEL_WIDTH_IN = 1.75
-
-CHARACTERS_PER_INCH = 17
-
-# Margin at the ends of an axis, as a fraction of its length.
-AXIS_MARGIN = 0.05
+PANEL_WIDTH_IN, CHARACTERS_PER_INCH = 1.75, 17
 
 UNITS = {"max_displacement": " [m]", "force": " [N]", "greatest": " [N]"}
 
@@ -60,15 +55,7 @@ class PlotData(NamedTuple):
 
 
 def plot(data: PlotData, file: BinaryIO) -> None:
-    """Plot sweep.png, with a panel for each result and each of the most sensitive parameters.
-
-    Args:
-        data: results and parameters of the runs.
-        file: receives the PNG.
-
-    Raises:
-        ImportError: when Matplotlib is not installed.
-    """
+    """Plot sweep.png, with a panel for each result and each of the most sensitive parameters, to a file."""
     from matplotlib import style
 
     with style.context(STYLE, after_reset=True), warnings.catch_warnings():
@@ -82,7 +69,6 @@ def _figure(data: PlotData) -> Figure:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
-    from matplotlib.ticker import FuncFormatter
 
     indices = {(index.result, index.parameter): index for index in data.indices}
     parameters = _most_sensitive(data)
@@ -99,7 +85,7 @@ def _figure(data: PlotData) -> Figure:
         if is_wide_range(numbers):
             row[0].set_yscale("log")
         else:
-            row[0].yaxis.set_major_formatter(FuncFormatter(_tick_label))
+            row[0].yaxis.set_major_formatter(_tick_label)
         for axes, parameter in zip(row, parameters, strict=True):
             _plot_runs(axes, parameter, numbers, data.failed)
             if index := indices.get((name, parameter.name)):
@@ -114,8 +100,7 @@ def _most_sensitive(data: PlotData) -> list[VariedParameter]:
     largest = dict.fromkeys((parameter.name for parameter in data.parameters), -math.inf)
     for index in data.indices:
         largest[index.parameter] = max(index.first_order, largest[index.parameter])
-    ranked = sorted(data.parameters, key=lambda parameter: -largest[parameter.name])
-    chosen = {parameter.name for parameter in ranked[:8]}
+    chosen = sorted(largest, key=lambda name: -largest[name])[:8]
     return [parameter for parameter in data.parameters if parameter.name in chosen]
 
 
@@ -125,9 +110,9 @@ def _legend(data: PlotData, drawn: Sequence[VariedParameter]) -> Iterator[str]:
         yield "parameter alone, with its 95 % interval (RBD-FAST)."
     if data.failed.any():
         yield "x: a run that failed."
-    drawn_names = {parameter.name for parameter in drawn}
-    if rest := [parameter.name for parameter in data.parameters if parameter.name not in drawn_names]:
-        yield f"Not shown, as less sensitive: {', '.join(rest)}." if data.indices else f"Not shown: {', '.join(rest)}."
+    shown = {parameter.name for parameter in drawn}
+    if rest := [parameter.name for parameter in data.parameters if parameter.name not in shown]:
+        yield f"Not shown{', as less sensitive' if data.indices else ''}: {', '.join(rest)}."
 
 
 def _plot_runs(axes: Axes, parameter: VariedParameter, numbers: NDArray[np.float64], failed: NDArray[np.bool_]) -> None:
@@ -144,10 +129,7 @@ def _plot_runs(axes: Axes, parameter: VariedParameter, numbers: NDArray[np.float
 
 def _plot_index(axes: Axes, index: SensitivityIndex) -> None:
     """Plot the index as a bar above a panel, whose width is 1."""
-    low, middle, high = (
-        min(max(value, 0.0), 1.0)
-        for value in (index.first_order - index.confidence, index.first_order, index.first_order + index.confidence)
-    )
+    low, middle, high = np.clip(index.first_order + index.confidence * np.array([-1, 0, 1]), 0, 1)
     line_style: dict[str, Any] = {"transform": axes.transAxes, "clip_on": False, "solid_capstyle": "butt"}
     for left, right, colour, width in ((0, 1, PALE, 5), (0, middle, ORANGE, 5), (low, high, INK, 0.8)):
         axes.plot([left, right], [1.06, 1.06], color=colour, linewidth=width, **line_style)
@@ -156,16 +138,15 @@ def _plot_index(axes: Axes, index: SensitivityIndex) -> None:
 
 
 def _format_axis(axes: Axes, parameter: VariedParameter) -> None:
-    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
     name = textwrap.fill(printable(parameter.name), round(CHARACTERS_PER_INCH * PANEL_WIDTH_IN))
     axes.set_xlabel(name, parse_math=False)
     if parameter.labels:
         labels = [textwrap.shorten(printable(label), 12, placeholder="…") for label in parameter.labels]
         # A panel has space for 20 characters.
-        rotated: dict[str, Any] = (
-            {"rotation": 30, "ha": "right", "rotation_mode": "anchor"} if sum(map(len, labels)) > 20 else {}
-        )
+        is_long = sum(map(len, labels)) > 20
+        rotated: dict[str, Any] = {"rotation": 30, "ha": "right", "rotation_mode": "anchor"} if is_long else {}
         axes.set_xticks(range(len(labels)), labels, parse_math=False, **rotated)
         return
     if parameter.is_logarithmic:
@@ -174,20 +155,13 @@ def _format_axis(axes: Axes, parameter: VariedParameter) -> None:
         axes.xaxis.set_minor_formatter(NullFormatter())
     else:
         axes.xaxis.set_major_locator(MaxNLocator(3))
-    axes.xaxis.set_major_formatter(FuncFormatter(_tick_label))
+    axes.xaxis.set_major_formatter(_tick_label)
     # The limits include failed runs.
-    axes.set_xlim(*_axis_limits(parameter))
+    axes.update_datalim([(number, 1) for number in parameter.numbers], updatey=False)
+    axes.autoscale(axis="x")
 
 
-def _axis_limits(parameter: VariedParameter) -> tuple[float, float]:
-    low, high = float(parameter.numbers.min()), float(parameter.numbers.max())
-    if parameter.is_logarithmic:
-        factor = (high / low) ** AXIS_MARGIN
-        return low / factor, high * factor
-    return low - AXIS_MARGIN * (high - low), high + AXIS_MARGIN * (high - low)
-
-
-def _tick_label(number: float, _: int) -> str:
+def _tick_label(number: float, _: float) -> str:
     """Format a number with its exponent, as a common one above the axis would overlap the sensitivity bar."""
     if number == 0 or 1e-3 <= abs(number) < 1e5:
         return f"{number:.10g}"
@@ -195,11 +169,9 @@ def _tick_label(number: float, _: int) -> str:
     return f"{float(digits):g}e{int(exponent)}"
 
 
-WITHOUT_PICTURES = f"{CONTACT} needs pictures of the runs; take set: {{output: [png]}}, or trajectory, and an image"
+WITHOUT_PICTURES = "contact.jpg needs pictures of the runs; take set: {output: [png]}, or trajectory, and an image"
 
-GAP_PX, LINE_HEIGHT_PX = 20, 23
-
-MAX_CAPTION_LINES = 8
+GAP_PX, LINE_HEIGHT_PX, MAX_CAPTION_LINES = 20, 23, 8
 
 
 class Tile(NamedTuple):
@@ -210,41 +182,31 @@ class Tile(NamedTuple):
     caption: list[str]  # unbreakable parts
 
 
-def write_contact_sheet(
-    result: SweepResult, executor: Executor, progress: StageProgressCallback
-) -> tuple[list[str], list[str]]:
-    """Write the contact sheet, if any run has a frame.
-
-    Args:
-        result: the finished sweep.
-        executor: draws the runs that have a trajectory but no pictures.
-        progress: called with the stage, the drawn and the total number of frames.
-
-    Returns:
-        Names of the written files, and warnings.
-    """
-    runs = result.sample_runs(36)
-    complete = [run for run in runs if result.outcomes[run].status == "complete"]
-    frames, errors = _largest_frames({run: result.run_directory(run) for run in complete}, executor, progress)
+def write_contact_sheet(state: SweepState, executor: Executor, progress: StageProgressCallback) -> list[str]:
+    """Write contact.jpg, if any run has a frame; arguments as of `tables.write_reports`; return warnings."""
+    runs = spread(len(state.outcomes), 36)
+    complete = [run for run in runs if state.outcomes[run].status == "complete"]
+    frames, errors = _largest_frames({run: state.run_directory(run) for run in complete}, executor, progress)
     if not frames:
-        reason = WITHOUT_PICTURES if complete else f"{CONTACT} needs a complete run"
-        return [], [f"no {CONTACT}: {errors[0]}" if errors else reason]
-    names = abbreviate_keys(result.sweep.keys)
+        reason = WITHOUT_PICTURES if complete else "contact.jpg needs a complete run"
+        return [f"no contact.jpg: {errors[0]}" if errors else reason]
+    names = abbreviate_keys(state.sweep.keys)
     tiles = []
     for run in runs:
-        values = [f"{name} = {format_short(value)}" for name, value in zip(names, result.values[run], strict=True)]
-        outcome = result.outcomes[run]
-        largest = outcome.max_displacement
-        displacement = [] if largest is None else [f"max_displacement = {format_short(largest)}"]
-        tiles.append(Tile(frames.get(run), outcome.status, [f"run {run}", *displacement, *map(printable, values)]))
-    total = len(result.outcomes)
+        outcome = state.outcomes[run]
+        caption = [f"run {run}"]
+        if outcome.max_displacement is not None:
+            caption.append(f"max_displacement = {format_short(outcome.max_displacement)}")
+        for name, value in zip(names, state.values[run], strict=True):
+            caption.append(printable(f"{name} = {format_short(value)}"))
+        tiles.append(Tile(frames.get(run), outcome.status, caption))
+    total = len(state.outcomes)
     subset = f"{total} runs" if len(runs) == total else f"{len(runs)} of {total} runs, evenly spread"
-    heading = printable(f"{result.sweep.scene.name}: the frames with the largest displacement of {subset}")
-    sheet = _draw_tiles(tiles, _column_count(result, len(runs)), heading)
-    with replacing(result.directory / CONTACT) as file:
+    heading = printable(f"{state.sweep.scene.name}: the frames with the largest displacement of {subset}")
+    sheet = _draw_tiles(tiles, _column_count(state, len(runs)), heading)
+    with replacing(state.directory / "contact.jpg") as file:
         sheet.save(file, "JPEG", quality=90)
-    lacks = f"{CONTACT} lacks the frames of {len(errors)} runs, for example: {errors[0]}" if errors else ""
-    return [CONTACT], [lacks] if lacks else []
+    return [f"contact.jpg lacks the frames of {len(errors)} runs, for example: {errors[0]}"] if errors else []
 
 
 def draw_largest_frame(directory: Path) -> NDArray[np.uint8]:
@@ -298,10 +260,10 @@ def read_gif_frame(path: Path, time: float) -> Image.Image:
         return film.convert("RGB")
 
 
-def _column_count(result: SweepResult, tiles: int) -> int:
+def _column_count(state: SweepState, tiles: int) -> int:
     """Choose the number of columns: that of the values of a grid's last key, otherwise about that of the rows."""
-    last = list(result.sweep.settings.distributions.values())[-1]
-    if tiles == len(result.outcomes) and last.kind == "grid" and 1 < len(last.values) <= 8:
+    last = list(state.sweep.settings.distributions.values())[-1]
+    if tiles == len(state.outcomes) and last.kind == "grid" and 1 < len(last.values) <= 8:
         return len(last.values)
     square = math.ceil(math.sqrt(tiles))
     return min(square, square + 1, key=lambda columns: -tiles % columns)
@@ -353,7 +315,18 @@ def _wrap(parts: Iterable[str], fits: Callable[[str], bool]) -> list[str]:
 
 def abbreviate_keys(keys: Sequence[str]) -> list[str]:
     """Abbreviate dotted keys to their shortest unambiguous suffix that starts with a word."""
-    return [next(name for name in _suffixes(key) if _is_unambiguous(name, key, keys)) for key in keys]
+    names = []
+    for key in keys:
+        parts = key.split(".")
+        suffixes = (".".join(parts[start:]) for start in reversed(range(1, len(parts))))
+        rivals = [f".{rival}" for rival in keys if rival != key]
+        unambiguous = (
+            name
+            for name in suffixes
+            if not name[0].isdigit() and not any(rival.endswith(f".{name}") for rival in rivals)
+        )
+        names.append(next(unambiguous, key))
+    return names
 
 
 def format_short(value: Any) -> str:
@@ -369,58 +342,38 @@ def format_short(value: Any) -> str:
     return json.dumps(value)
 
 
-def _suffixes(key: str) -> Iterable[str]:
-    """Return the suffixes of a dotted key, from short to long."""
-    parts = key.split(".")
-    return (".".join(parts[start:]) for start in reversed(range(len(parts))))
-
-
-def _is_unambiguous(name: str, key: str, keys: Sequence[str]) -> bool:
-    return name == key or not (
-        name[0].isdigit() or any(f".{rival}".endswith(f".{name}") for rival in keys if rival != key)
-    )
-
-
-# Largest number of labels of a parameter; with more values, it has none.
-MAX_LABELS = 8
-
-
 class VariedParameter(NamedTuple):
     """Parameter that differs between runs."""
 
     name: str  # abbreviated key, with the index of a list's component
     numbers: NDArray[np.float64]  # values, or indices of non-numeric values; shape (runs,)
     is_logarithmic: bool = False
-    labels: Sequence[str] = ()  # of at most MAX_LABELS non-numeric values
+    labels: Sequence[str] = ()  # of at most eight non-numeric values
 
 
-def varied_parameters(result: SweepResult, runs: Sequence[int]) -> list[VariedParameter]:
+def varied_parameters(state: SweepState, runs: Sequence[int]) -> list[VariedParameter]:
     """Return the parameters that differ between the numbered runs, in the order of the keys."""
-    names = abbreviate_keys(result.sweep.keys)
-    candidates = [
+    names = abbreviate_keys(state.sweep.keys)
+    columns = zip(*(state.values[run] for run in runs), strict=True)
+    return [
         parameter
-        for column, (name, distribution) in enumerate(
-            zip(names, result.sweep.settings.distributions.values(), strict=True)
-        )
-        for parameter in _parameters(name, distribution, [result.values[run][column] for run in runs])
+        for key in zip(names, state.sweep.settings.distributions.values(), columns, strict=True)
+        for parameter in _parameters(*key)
+        if len(np.unique(parameter.numbers)) > 1
     ]
-    return [parameter for parameter in candidates if len(np.unique(parameter.numbers)) > 1]
 
 
-def varied_results(result: SweepResult, runs: Sequence[int]) -> dict[str, NDArray[np.float64]]:
-    """Return the results that differ between the numbered runs.
+def varied_results(state: SweepState, runs: Sequence[int]) -> dict[str, NDArray[np.float64]]:
+    """Return the results that differ between the numbered runs: columns of the table, shape (runs,).
 
-    Returns:
-        Columns of the table by name, shape (runs,); NaN where a run is incomplete or lacks the result.
+    They have NaN where a run is incomplete or lacks the result.
     """
-    outcomes = [result.outcomes[run] for run in runs]
+    complete = [state.outcomes[run].status == "complete" for run in runs]
     columns = {}
-    for name, values in result.columns().items():
+    for name, values in state.columns().items():
         if name in ("status", "error", "seconds"):
             continue
-        numbers = [
-            values[run] if outcome.status == "complete" else None for run, outcome in zip(runs, outcomes, strict=True)
-        ]
+        numbers = [values[run] if is_complete else None for run, is_complete in zip(runs, complete, strict=True)]
         column = np.array(numbers, dtype=np.float64)
         if len(np.unique(column[np.isfinite(column)])) > 1:
             columns[name] = column
@@ -432,12 +385,14 @@ def is_wide_range(numbers: NDArray[np.float64]) -> bool:
     return bool(np.nanmin(numbers) > 0 and np.nanmax(numbers) > 50 * np.nanmin(numbers))
 
 
-def _parameters(name: str, distribution: Distribution, values: list[Any]) -> Iterator[VariedParameter]:
+def _parameters(name: str, distribution: Distribution, values: Sequence[Any]) -> Iterator[VariedParameter]:
     """Yield the parameters of a key, one for each component of a list of numbers."""
     if distribution.kind not in ("choice", "grid"):
-        is_logarithmic = distribution.kind == "log_uniform"
-        for suffix, *components in zip(_component_indices(values[0]), *map(_flatten, values), strict=True):
-            yield VariedParameter(name + suffix, np.array(components, dtype=np.float64), is_logarithmic)
+        components = np.array(values, dtype=np.float64)
+        columns = components.reshape(len(values), -1).T
+        for index, numbers in zip(np.ndindex(components.shape[1:]), columns, strict=True):
+            suffix = "".join(f"[{n}]" for n in index)
+            yield VariedParameter(name + suffix, numbers, distribution.kind == "log_uniform")
         return
     if all(type(value) in (int, float) for value in distribution.values):
         numbers = np.array(values, dtype=np.float64)
@@ -445,31 +400,10 @@ def _parameters(name: str, distribution: Distribution, values: list[Any]) -> Ite
         return
     ranks = {text: rank for rank, text in enumerate(dict.fromkeys(map(json.dumps, distribution.values)))}
     numbers = np.array([ranks[json.dumps(value)] for value in values], dtype=np.float64)
-    if len(ranks) <= MAX_LABELS:
+    if len(ranks) <= 8:
         yield VariedParameter(name, numbers, labels=[format_short(json.loads(text)) for text in ranks])
     else:
         yield VariedParameter(f"{name} ({len(ranks)} values)", numbers)
-
-
-def _flatten(value: Any) -> Iterator[float]:
-    if isinstance(value, list):
-        for item in value:
-            yield from _flatten(item)
-    else:
-        yield value
-
-
-def _component_indices(value: Any) -> Iterator[str]:
-    """Yield the index of each number in a nested list, such as [0] and [1]."""
-    if isinstance(value, list):
-        for index, item in enumerate(value):
-            yield from (f"[{index}]{rest}" for rest in _component_indices(item))
-    else:
-        yield ""
-
-
-# With fewer runs, indices are too inaccurate to rank parameters.
-MIN_RUNS = 64
 
 
 class SensitivityIndex(NamedTuple):
@@ -484,10 +418,10 @@ class SensitivityIndex(NamedTuple):
 def estimate_sensitivity(
     parameters: Sequence[VariedParameter], results: Mapping[str, NDArray[np.float64]]
 ) -> list[SensitivityIndex]:
-    """Estimate the first-order sensitivities of results in at least `MIN_RUNS` runs.
+    """Estimate the first-order sensitivities of results in at least 64 runs.
 
     Args:
-        parameters: the parameters, with numbers of shape (runs,).
+        parameters: the parameters.
         results: by name, shape (runs,); NaN where a run lacks the result.
 
     Raises:
@@ -496,7 +430,7 @@ def estimate_sensitivity(
     indices = []
     for name, column in results.items():
         known = np.isfinite(column)
-        if np.count_nonzero(known) >= MIN_RUNS:
+        if np.count_nonzero(known) >= 64:  # With fewer, indices are too inaccurate to rank parameters.
             indices += [
                 SensitivityIndex(name, parameter.name, *first_order_index(parameter.numbers[known], column[known]))
                 for parameter in parameters

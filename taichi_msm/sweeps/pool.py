@@ -16,8 +16,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import suppress
-from queue import SimpleQueue
-from threading import Thread
+from threading import Lock, Thread, get_ident
 from typing import Any
 
 from taichi_msm.errors import MsmError
@@ -35,102 +34,75 @@ class Pool(Executor):
 
     def __init__(self, workers: int) -> None:
         self._threads = ThreadPoolExecutor(workers)
-        self._idle: SimpleQueue[_Process | None] = SimpleQueue()
-        self._live: set[_Process] = set()
-        self._closed = False
-        for _ in range(workers):
-            self._idle.put(None)
+        self._processes: dict[int, subprocess.Popen[bytes]] = {}  # by thread
+        self._lock, self._closed = Lock(), False
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
-        """Schedule a call in an idle process.
-
-        Args:
-            function: an importable function.
-            *arguments: its positional arguments.
-            **named: its named arguments.
-        """
-        return self._threads.submit(self._call, (function, arguments, named))
+        """Schedule a call of an importable function in an idle process."""
+        return self._threads.submit(self._call, function, arguments, named)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the processes.
-
-        Args:
-            wait: whether to wait for the end of all calls.
-            cancel_futures: whether to cancel pending calls and kill the processes at once.
-        """
+        """End the processes after their calls, or with `cancel_futures` at once."""
         self._threads.shutdown(wait=False, cancel_futures=cancel_futures)
         if cancel_futures:
-            self._closed = True
-            for process in list(self._live):
-                process.kill()
+            with self._lock:
+                self._closed = True
+                for process in self._processes.values():
+                    process.kill()
         self._threads.shutdown(wait)
-        for process in list(self._live):
-            process.close()
+        for process in list(self._processes.values()):
+            _close(process)
 
-    def _call(self, call: tuple[Any, ...]) -> Any:
-        process = self._idle.get()
+    def _call(self, *call: Any) -> Any:
+        thread = get_ident()
+        with self._lock:
+            if self._closed:
+                raise DiedError("the pool was shut down")
+            if thread not in self._processes:
+                self._processes[thread] = _start_process()
+            process = self._processes[thread]
+        assert process.stdin
+        assert process.stdout
         try:
-            if process is None:
-                if self._closed:
-                    raise DiedError("the pool was shut down")
-                process = _Process()
-                self._live.add(process)
-            success, value = process.call(call)
+            pickle.dump(call, process.stdin)
+            process.stdin.flush()
+            success, value = pickle.load(process.stdout)
         except (EOFError, OSError, pickle.UnpicklingError) as error:
-            code = process.close() if process else None
-            self._live.discard(process)
-            process = None
-            raise DiedError(_exit_reason(code)) from error
-        finally:
-            self._idle.put(process)
+            with self._lock:
+                del self._processes[thread]
+            raise DiedError(_exit_reason(_close(process))) from error
         if not success:
             raise value
         return value
 
 
-class _Process:
-    """A process that executes calls, one at a time."""
-
-    def __init__(self) -> None:
-        code = f"import sys; sys.path[:] = {sys.path!r}; from taichi_msm.sweeps.pool import serve; serve()"
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", code],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            # Ctrl-C must reach the parent process only.
-            start_new_session=True,
-            creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
-        )
-
-    def call(self, call: tuple[Any, ...]) -> Any:
-        """Execute a call; return whether it succeeded, and its value or exception."""
-        assert self._process.stdin
-        assert self._process.stdout
-        pickle.dump(call, self._process.stdin)
-        self._process.stdin.flush()
-        return pickle.load(self._process.stdout)
-
-    def kill(self) -> None:
-        """End the process at once."""
-        self._process.kill()
-
-    def close(self) -> int:
-        """End the process after its call; return its exit code."""
-        assert self._process.stdin
-        assert self._process.stdout
-        with suppress(BrokenPipeError):
-            self._process.stdin.close()
-        code = self._process.wait()
-        self._process.stdout.close()
-        return code
+def _start_process() -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        [sys.executable, "-c", f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve; serve()"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        # Ctrl-C must reach the parent process only.
+        start_new_session=True,
+        creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
+    )
 
 
-def _exit_reason(code: int | None) -> str:
-    if code is not None and code < 0:
-        name = signal.Signals(-code).name
-        hint = ", as the system does when memory runs out; take fewer --workers" if -code == signal.SIGKILL else ""
-        return f"its process was ended by {name}{hint}"
-    return f"its process ended with exit code {code}"
+def _close(process: subprocess.Popen[bytes]) -> int:
+    """End a process after its call; return its exit code."""
+    assert process.stdin
+    assert process.stdout
+    with suppress(BrokenPipeError):
+        process.stdin.close()
+    code = process.wait()
+    process.stdout.close()
+    return code
+
+
+def _exit_reason(code: int) -> str:
+    if code >= 0:
+        return f"its process ended with exit code {code}"
+    hint = ", as the system does when memory runs out; take fewer --workers" if -code == signal.SIGKILL else ""
+    return f"its process was ended by {signal.Signals(-code).name}{hint}"
 
 
 def serve() -> None:

@@ -5,28 +5,20 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import Any, ClassVar, Literal, NamedTuple, get_args
+from typing import Any, BinaryIO, ClassVar, Literal, NamedTuple, get_args
 
 from pydantic import ConfigDict, TypeAdapter
 
-from taichi_msm.errors import (
-    ExecutorError,
-    FilesError,
-    ForeignError,
-    LostExecutorError,
-    MsmError,
-    Pause,
-    SceneError,
-    StageProgressCallback,
-    writing,
-)
+from taichi_msm import errors
+from taichi_msm.errors import FilesError, LostExecutorError, SceneError, StageProgressCallback
+from taichi_msm.load import cost
 from taichi_msm.load.scene_file import ParsedFile, plan_file
 from taichi_msm.runs.directory import (
     FILE,
@@ -42,32 +34,24 @@ from taichi_msm.scene.outputs import RUN_RECORD, RUNS_FOLDER, SWEEP_RECORD, zero
 from taichi_msm.sweeps.pool import DiedError
 from taichi_msm.sweeps.spec import RESULT_COLUMNS, Sweep
 from taichi_msm.system.compiler import result_versions, versions
+from taichi_msm.system.files import read_regular
+
+# Reports written at the end of a sweep.
+REPORT_FILES = ("table.csv", "table.parquet", "dataset.json", "contact.jpg", "sensitivity.csv", "sweep.png")
 
 # Statuses of runs that are not repeated.
 FINAL_STATUSES = ("complete", "diverged")
 
 
-def register_sweep(directory: Path, sweep: Sweep) -> list[list[Any]]:
-    """Write the description of a sweep to its directory, or check that the directory contains the same sweep.
-
-    Args:
-        directory: of the sweep.
-        sweep: the sweep.
-
-    Returns:
-        Values of the varied keys for each run.
-
-    Raises:
-        SceneError: when the directory contains another sweep, or versions with other results.
-        FilesError: when the directory cannot be read or written, contains foreign files, or is damaged.
-    """
+def _register(sweep: Sweep, directory: Path) -> list[list[Any]]:
+    """Write the description of a sweep to its directory, or check it there; return the values of the runs."""
     record = require_kind(directory / SWEEP_RECORD, FILE)
     require_kind(directory / RUNS_FOLDER, FOLDER)
     description, values = sweep.description(), sweep.values()
     if not record.exists():
         for name in (RUNS_FOLDER, *REPORT_FILES, RUN_RECORD):
             if (directory / name).exists():
-                raise ForeignError.at(directory / name, "something")
+                raise errors.ForeignError.at(directory / name, "something")
         content = {
             "scene": sweep.settings.scene,
             **description,
@@ -75,15 +59,14 @@ def register_sweep(directory: Path, sweep: Sweep) -> list[list[Any]]:
             "versions": versions(),
             "values": values,
         }
-        with writing(directory), hidden_folder(directory) as hidden:
+        with errors.writing(directory), hidden_folder(directory) as hidden:
             (hidden / SWEEP_RECORD).write_text(json.dumps(content) + "\n", encoding="utf-8", errors="backslashreplace")
             link_without_replacing(hidden / SWEEP_RECORD, record)  # unless another shard was faster
     # Values are compared as text: 1 differs from 1.0, and NaN equals itself.
     expected_values = json.dumps(values)
     try:
-        with record.open("rb") as file:
-            # Bounds the memory for a foreign file.
-            stored = json.loads(file.read(max(1 << 28, 2 * len(expected_values))))
+        # Bounds the memory for a foreign file.
+        stored = json.loads(read_regular(record, max(1 << 28, 2 * len(expected_values))))
         earlier = {name: stored.get(name) for name in description}
         stored_values, stored_versions = json.dumps(stored["values"]), result_versions(stored["versions"], "cpu")
     except OSError as error:
@@ -91,8 +74,11 @@ def register_sweep(directory: Path, sweep: Sweep) -> list[list[Any]]:
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise FilesError(f"{record}: damaged; choose another --out") from None
     if changed := [name for name, value in json.loads(json.dumps(description)).items() if value != earlier[name]]:
-        nouns = {"digest": "the scene file", "files": _changed_file(description["files"], earlier["files"])}
-        message = f"holds the runs of another sweep: {nouns.get(changed[0], changed[0])} differs"
+        noun = {"digest": "the scene file", "files": "a file"}.get(changed[0], changed[0])
+        if changed[0] == "files" and isinstance(earlier["files"], dict):
+            other = (path for path, digest in description["files"].items() if earlier["files"].get(path) != digest)
+            noun = next(other, noun)
+        message = f"holds the runs of another sweep: {noun} differs"
         raise SceneError([f"{directory}: {message}; choose another --out"])
     current = result_versions(versions(), "cpu")
     if required := [f"{name} {version}" for name, version in stored_versions.items() if version != current.get(name)]:
@@ -105,31 +91,29 @@ def register_sweep(directory: Path, sweep: Sweep) -> list[list[Any]]:
     return values
 
 
-def _changed_file(files: dict[str, str], earlier: Any) -> str:
-    """Return the path of a changed file."""
-    known = earlier if isinstance(earlier, dict) else files
-    return next((path for path, digest in files.items() if known.get(path) != digest), "a file")
-
-
 @dataclass
 class SweepState:
-    """A sweep, or a shard of it, in its directory.
-
-    Attributes:
-        directory: of the sweep.
-        sweep: scene and variation.
-        values: of the varied keys, for each run of the sweep.
-        done: outcomes of the finished runs; grows while the sweep runs.
-        missing: unfinished runs at the beginning.
-        total: number of runs of the sweep or shard.
-    """
+    """A sweep, or a shard of it, in its directory."""
 
     directory: Path
     sweep: Sweep
-    values: list[list[Any]]
-    done: list[Outcome]
-    missing: list[RunTask]
-    total: int
+    values: list[list[Any]]  # of the varied keys, for each run of the sweep
+    outcomes: list[Outcome]  # of the finished runs; grows while the sweep runs
+    missing: list[RunTask] = field(default_factory=list)  # unfinished runs at the beginning
+
+    def columns(self) -> dict[str, list[Any]]:
+        """Return the result columns of the table by name."""
+        columns = {name: [getattr(outcome, name) for outcome in self.outcomes] for name in RESULT_COLUMNS}
+        for n in range(max((len(outcome.forces) for outcome in self.outcomes), default=0)):
+            name = f"probes.{n}.force"
+            # The sweep may vary a key of this name.
+            name += ".greatest" if name in self.sweep.keys else ""
+            columns[name] = [outcome.forces[n] if n < len(outcome.forces) else None for outcome in self.outcomes]
+        return columns | {"seconds": [outcome.seconds for outcome in self.outcomes]}
+
+    def run_directory(self, run: int) -> Path:
+        """Return the directory of a run."""
+        return self.directory / RUNS_FOLDER / zero_padded(run)
 
 
 def begin_sweep(sweep: Sweep, directory: Path, shard: tuple[int, int] = (1, 1)) -> SweepState:
@@ -141,71 +125,58 @@ def begin_sweep(sweep: Sweep, directory: Path, shard: tuple[int, int] = (1, 1)) 
         shard: part I of N as (I, N), 1 <= I <= N.
 
     Raises:
-        SceneError, FilesError: as `register_sweep`.
+        SceneError: when the directory contains another sweep, or versions with other results.
+        FilesError: when the directory cannot be read or written, contains foreign files, or is damaged.
     """
-    values = register_sweep(directory, sweep)
+    state = SweepState(directory, sweep, _register(sweep, directory), [])
     part, parts = shard
     home = Path.cwd()
-    done, missing = [], []
-    for run in range(part - 1, len(values), parts):
-        task = RunTask(run, sweep.scene, sweep.overrides(values[run]), directory, home)
-        require_kind(task.directory, FOLDER)
+    for run in range(part - 1, len(state.values), parts):
+        folder = require_kind(state.run_directory(run), FOLDER)
+        task = RunTask(run, sweep.scene, sweep.overrides(state.values[run]), folder, home)
         if outcome := read_outcome(task, sweep):
-            done.append(outcome)
+            state.outcomes.append(outcome)
         else:
-            missing.append(task)
-    return SweepState(directory, sweep, values, done, missing, len(done) + len(missing))
+            state.missing.append(task)
+    return state
 
 
 def read_outcome(task: RunTask, sweep: Sweep) -> Outcome | None:
-    """Read the outcome of a finished run.
-
-    Args:
-        task: the run.
-        sweep: its sweep.
-
-    Returns:
-        The outcome; None if the run is missing, was interrupted, or belongs to another task.
-    """
+    """Read the outcome of a finished run; None if it is missing, was interrupted, or belongs to another task."""
     # A run with a damaged record is repeated.
     with suppress(OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         if entry_kind(task.directory / RUN_RECORD) == FILE:
-            with (task.directory / RUN_RECORD).open("rb") as file:
-                record = json.loads(file.read(MAX_RECORD_BYTES))
+            record = json.loads(read_regular(task.directory / RUN_RECORD, MAX_RECORD_BYTES))
             has_same_overrides = tuple(record["overrides"]) == task.overrides
             has_same_files = sweep.digests.issuperset(record["sha256"].values())
             if record["status"] in FINAL_STATUSES and has_same_overrides and has_same_files:
-                return outcome_from_record(task.run, record)
+                return _outcome_from_record(task.run, record)
     return None
 
 
-@contextmanager
-def report_lock(directory: Path, pause: Pause) -> Iterator[None]:
-    """Hold the lock of a sweep's reports; `pause` is called while another command holds it."""
-    with ExitStack() as stack:
-        while True:
-            try:
-                stack.enter_context(lock_file(directory / SWEEP_RECORD))
-                break
-            except BlockingIOError:
-                pause()
-                time.sleep(0.1)
-        yield
+def lock_reports(directory: Path, pause: errors.Pause) -> BinaryIO:
+    """Lock a sweep's reports until the file is closed; `pause` is called while another command holds the lock."""
+    while True:
+        try:
+            return lock_file(directory / SWEEP_RECORD)
+        except BlockingIOError:
+            pause()
+            time.sleep(POLL_INTERVAL_S)
 
 
 # Interval between calls of `pause` or `progress` while all workers are busy [s].
 POLL_INTERVAL_S = 0.1
 
 
-def execute_tasks(tasks: Iterable[RunTask], executor: Executor, pause: Pause) -> Iterator[Outcome]:
-    """Execute runs, and yield their outcomes in order of completion.
+def run_missing(state: SweepState, executor: Executor, progress: StageProgressCallback) -> Iterator[Outcome]:
+    """Execute the missing runs of a sweep, and yield their outcomes in order of completion.
 
     A run whose process in `Pool` ended early is executed once more.
 
     Args:
-        tasks: the runs.
+        state: the sweep; outcomes are appended.
         executor: executes the runs.
-        pause: called several times a second; an exception from it ends the sweep.
+        progress: called several times a second; an exception from it ends the sweep.
 
     Raises:
         LostExecutorError: when the executor accepts no more runs.
@@ -213,21 +184,25 @@ def execute_tasks(tasks: Iterable[RunTask], executor: Executor, pause: Pause) ->
     done: SimpleQueue[Future[Outcome]] = SimpleQueue()
     pending: dict[Future[Outcome], RunTask] = {}
     died: set[int] = set()
+    total = len(state.outcomes) + len(state.missing)
+
+    def lost(error: Exception) -> LostExecutorError:
+        return LostExecutorError(f"{type(executor).__name__} takes no more runs: {error}; start the sweep again")
 
     def submit(task: RunTask) -> None:
         try:
             future = executor.submit(execute_run, task)
         except RuntimeError as error:  # such as BrokenExecutor
-            raise _executor_error(executor, error) from error
+            raise lost(error) from error
         pending[future] = task
         future.add_done_callback(done.put)
 
-    remaining = iter(tasks)
+    remaining = iter(state.missing)
     # The number of submitted runs is limited, to bound the memory of the executor.
     for task in islice(remaining, 4096):
         submit(task)
     while pending:
-        pause()
+        progress("runs", len(state.outcomes), total)
         try:
             future = done.get(timeout=POLL_INTERVAL_S)
         except Empty:
@@ -235,10 +210,10 @@ def execute_tasks(tasks: Iterable[RunTask], executor: Executor, pause: Pause) ->
         task = pending.pop(future)
         try:
             outcome = future.result()
-        except ExecutorError as error:
+        except errors.ExecutorError as error:
             raise LostExecutorError(str(error)) from error
         except (BrokenExecutor, CancelledError) as error:
-            raise _executor_error(executor, error) from error
+            raise lost(error) from error
         except DiedError as error:
             if task.run not in died:
                 died.add(task.run)
@@ -247,14 +222,13 @@ def execute_tasks(tasks: Iterable[RunTask], executor: Executor, pause: Pause) ->
             outcome = Outcome(task.run, "died", f"{error}, twice")
         except Exception as error:
             # `execute_run` raises nothing: the worker has died. Other executors have their own retries.
-            outcome = Outcome(task.run, "died", " ".join(str(error).split()))
+            failures = getattr(error, "allowed_failures", None)  # of dask's KilledWorker, whose text has an address
+            reason = str(error) if failures is None else f"its workers died, {failures + 1} one after another"
+            outcome = Outcome(task.run, "died", " ".join(reason.split()))
+        state.outcomes.append(outcome)
         yield outcome
         for task in islice(remaining, 1):
             submit(task)
-
-
-def _executor_error(executor: Executor, error: Exception) -> LostExecutorError:
-    return LostExecutorError(f"{type(executor).__name__} takes no more runs: {error}; start the sweep again")
 
 
 class RunTask(NamedTuple):
@@ -263,13 +237,8 @@ class RunTask(NamedTuple):
     run: int  # number of the run, from 0
     scene: ParsedFile
     overrides: tuple[str, ...]
-    folder: Path  # directory of the sweep
+    directory: Path  # of the results
     home: Path  # base of relative paths
-
-    @property
-    def directory(self) -> Path:
-        """Directory of the run's results."""
-        return self.folder / RUNS_FOLDER / zero_padded(self.run)
 
 
 def execute_run(task: RunTask, progress: StageProgressCallback = lambda stage, done, total: None) -> Outcome:
@@ -283,35 +252,27 @@ def execute_run(task: RunTask, progress: StageProgressCallback = lambda stage, d
         The outcome, also of a run that fails.
     """
     os.chdir(task.home)
+    status: Status
     try:
         plan = plan_file(task.scene, task.overrides)
-    except SceneError as error:
-        return _without_results(task, "refused", "; ".join(error.lines))
+        try:
+            cost.require_disk(plan, task.directory)
+        except SceneError as error:
+            raise FilesError(str(error)) from None
+        from taichi_msm.runs import run as run_module
 
-    from taichi_msm.load import cost
-    from taichi_msm.runs import run as run_module
-
-    try:
-        cost.require_disk(plan, task.directory)
-    except SceneError as error:
-        return _without_results(task, "failed", str(error))
-    try:
         record = run_module.run(
             plan, task.directory, threads=1, overrides=task.overrides, started=time.perf_counter(), progress=progress
         )
-    except SceneError as error:  # such as for a picture that cannot be decoded
-        return _without_results(task, "refused", "; ".join(error.lines))
-    except MsmError as error:
-        return _without_results(task, "failed", str(error))
+        return _outcome_from_record(task.run, record)
+    except SceneError as error:  # also for a picture that cannot be decoded
+        status, reason = "refused", "; ".join(error.lines)
+    except errors.MsmError as error:
+        status, reason = "failed", str(error)
     except Exception as error:
-        return _without_results(task, "failed", f"a bug, please report it: {type(error).__name__}: {error}")
-    return outcome_from_record(task.run, record)
-
-
-def _without_results(task: RunTask, status: Status, reason: str) -> Outcome:
-    """Build the outcome of a run without results, with a reason that is independent of absolute paths."""
+        status, reason = "failed", f"a bug, please report it: {type(error).__name__}: {error}"
+    # The reason is independent of absolute paths. The path of a picture follows a space.
     reason = " ".join(reason.split()).replace(str(task.directory), task.directory.name)
-    # The path of a picture follows a space.
     return Outcome(task.run, status, reason.replace(f" {task.scene.folder / '_'}"[:-1], " "))
 
 
@@ -341,16 +302,8 @@ class Outcome:
 _OUTCOME = TypeAdapter(Outcome)
 
 
-def outcome_from_record(run: int, record: Mapping[str, Any]) -> Outcome:
-    """Extract the outcome of a run from its record.
-
-    Args:
-        run: number of the run.
-        record: content of run.json.
-
-    Raises:
-        ValueError: when the record was not written by a run.
-    """
+def _outcome_from_record(run: int, record: Mapping[str, Any]) -> Outcome:
+    """Extract the outcome of a run from its run.json; ValueError, KeyError, ...: it was not written by a run."""
     estimate = record["error_estimate"] or {}
     return _OUTCOME.validate_python(
         {
@@ -366,44 +319,3 @@ def outcome_from_record(run: int, record: Mapping[str, Any]) -> Outcome:
             "seconds": record["timings"]["total"],
         }
     )
-
-
-# Reports written at the end of a sweep.
-REPORT_FILES = TABLE, PARQUET, DATASET, CONTACT, PLOT, SENSITIVITY = (
-    "table.csv",
-    "table.parquet",
-    "dataset.json",
-    "contact.jpg",
-    "sweep.png",
-    "sensitivity.csv",
-)
-
-
-@dataclass(frozen=True)
-class SweepResult:
-    """Outcomes of all runs of a sweep."""
-
-    directory: Path
-    sweep: Sweep
-    values: list[list[Any]]  # of the varied keys, for each run
-    outcomes: list[Outcome]  # for each run, in the order of their numbers
-
-    def columns(self) -> dict[str, list[Any]]:
-        """Return the result columns of the table by name."""
-        outcomes = self.outcomes
-        columns = {name: [getattr(outcome, name) for outcome in outcomes] for name in RESULT_COLUMNS}
-        for n in range(max((len(outcome.forces) for outcome in outcomes), default=0)):
-            name = f"probes.{n}.force"
-            # The sweep may vary a key of this name.
-            name += ".greatest" if name in self.sweep.keys else ""
-            columns[name] = [outcome.forces[n] if n < len(outcome.forces) else None for outcome in outcomes]
-        return columns | {"seconds": [outcome.seconds for outcome in outcomes]}
-
-    def run_directory(self, run: int) -> Path:
-        """Return the directory of a run."""
-        return self.directory / RUNS_FOLDER / zero_padded(run)
-
-    def sample_runs(self, limit: int) -> list[int]:
-        """Return the numbers of at most `limit` runs, evenly spaced."""
-        total, count = len(self.outcomes), min(len(self.outcomes), limit)
-        return [(2 * n + 1) * total // (2 * count) for n in range(count)]

@@ -10,6 +10,7 @@ import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import cached_property, partial
 from glob import glob
@@ -21,19 +22,8 @@ from typing_extensions import Self
 
 from taichi_msm.errors import ArgumentError, Key, Problem, SceneError, truncate
 from taichi_msm.images import PICTURE_SUFFIXES, PictureError, file_sha256
+from taichi_msm.load import scene_file
 from taichi_msm.load.check import parse_model
-from taichi_msm.load.scene_file import (
-    PICTURE_KEYS,
-    SCENE_KIND,
-    Draft,
-    FileKind,
-    ParsedFile,
-    is_below,
-    names_file,
-    parse_key,
-    parse_override,
-    read_file,
-)
 from taichi_msm.load.yaml_reader import UnreadableError, read_yaml
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import (
@@ -55,6 +45,140 @@ MAX_RUNS = 10**7
 
 # Limit of SciPy's Sobol sequences.
 MAX_DIMENSIONS = 21201
+
+
+RANGE = "[low, high]: numbers, or lists of one shape"
+LIST = "a list of values that is not empty"
+NonEmptyList = Annotated[list[Any], Field(min_length=1)]
+
+
+class Distribution(Section):
+    """Distribution of a varied key: exactly one of its fields. Lists of numbers vary componentwise."""
+
+    model_config = ConfigDict(validate_default=False)
+
+    uniform: Any = key(None, "between two numbers", RANGE)
+    log_uniform: Any = key(None, "between two numbers above 0, uniform in the logarithm", RANGE)
+    normal: Any = key(None, "normally distributed", "[mean, standard deviation]: numbers, or lists of one shape")
+    choice: NonEmptyList = key(
+        None, "one of some values, all equally likely; of a picture also a pattern of files", LIST
+    )
+    grid: NonEmptyList = key(None, "every one of some values, with every combination of the other keys'", LIST)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _is_flat(cls, data: Any) -> Any:
+        if not isinstance(data, dict):
+            raise scene_fault(
+                f"{format_value(data)} is no way to vary; take one, such as {{uniform: [1, 2]}} or {{choice: [1, 2]}}"
+            )
+        if data.keys().isdisjoint(cls.model_fields) and any(isinstance(value, dict) for value in data.values()):
+            raise scene_fault("give each key by its dotted path, such as tissue.young: {uniform: [1e4, 3e4]}")
+        return data
+
+    @field_validator("uniform", "log_uniform", "normal")
+    @classmethod
+    def _is_pair(cls, value: Any) -> Any:
+        is_pair = isinstance(value, list) and len(value) == 2 and all(map(_numbers, value))
+        if not is_pair or _shape(value[0]) != _shape(value[1]):
+            raise ValueError
+        return value
+
+    @field_validator("uniform", "log_uniform")
+    @classmethod
+    def _is_ordered(cls, value: Any) -> Any:
+        for low, high in zip(_numbers(value[0]), _numbers(value[1]), strict=True):
+            if low > high:
+                raise scene_fault(f"{low:g} is above {high:g}; give the lower number first")
+        return value
+
+    @field_validator("log_uniform")
+    @classmethod
+    def _is_positive(cls, value: Any) -> Any:
+        if (low := min(_numbers(value[0]))) <= 0:
+            raise scene_fault(f"{low:g} has no logarithm; take numbers above 0, or uniform")
+        return value
+
+    @field_validator("normal")
+    @classmethod
+    def _has_deviation(cls, value: Any) -> Any:
+        if (deviation := min(_numbers(value[1]))) < 0:
+            raise scene_fault(f"a standard deviation of {deviation:g} is not possible; take 0 or more")
+        return value
+
+    @field_validator("choice", "grid")
+    @classmethod
+    def _is_finite(cls, value: Any) -> Any:
+        try:
+            json.dumps(value, allow_nan=False)
+        except ValueError:
+            raise scene_fault(f"{format_value(value)} has a number that is not finite; take others") from None
+        return value
+
+    @model_validator(mode="after")
+    def _is_one(self) -> Self:
+        if len(self.model_fields_set) != 1:
+            raise scene_fault(f"expected one of {', '.join(type(self).model_fields)}")
+        return self
+
+    @property
+    def kind(self) -> str:
+        """Name of the field that is set."""
+        return next(iter(self.model_fields_set))
+
+    @property
+    def values(self) -> Any:
+        """Parameters of the distribution, or values of a choice or grid."""
+        return getattr(self, self.kind)
+
+    @property
+    def dimensions(self) -> int:
+        """Number of fractions for `value`: one per number, 1 for a choice, 0 for a grid."""
+        if self.kind in ("choice", "grid"):
+            return int(self.kind == "choice")
+        return len(_numbers(self.values[0]))
+
+    def value(self, fractions: Sequence[float]) -> Any:
+        """Apply the quantile function to fractions in [0, 1), shape (dimensions,)."""
+        if self.kind == "choice":
+            return self.values[int(fractions[0] * len(self.values))]
+        remaining = iter(fractions)
+        return _map_pairs(lambda first, second: _quantile(self.kind, first, second, next(remaining)), *self.values)
+
+
+def _quantile(kind: str, first: float, second: float, fraction: float) -> float:
+    """Apply the quantile function of a distribution with two parameters."""
+    if kind == "normal":
+        from scipy.special import ndtri
+
+        # Sobol points are multiples of 2^-30 and include 0, where the quantile is infinite.
+        return first + second * float(ndtri(max(fraction, 2.0**-31)))
+    if kind == "log_uniform":
+        low, high = math.log(first), math.log(second)
+        # Rounding could leave the interval.
+        return min(max(math.exp(low + (high - low) * fraction), first), second)
+    return first + (second - first) * fraction
+
+
+def _map_pairs(function: Callable[[float, float], float], first: Any, second: Any) -> Any:
+    """Apply a function to the pairs of numbers in two values of one shape."""
+    if isinstance(first, list):
+        return list(map(partial(_map_pairs, function), first, second))
+    return float(function(first, second))
+
+
+def _numbers(value: Any) -> list[float]:
+    """Return the flattened numbers of a value; empty if it contains anything else."""
+    if isinstance(value, list):
+        parts = [_numbers(item) for item in value]
+        return [number for part in parts for number in part] if all(parts) else []
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= MAX_MAGNITUDE
+    return [value] if is_number else []
+
+
+def _shape(value: Any) -> Any:
+    """Return nested lists of numbers with None for each number."""
+    return [_shape(item) for item in value] if isinstance(value, list) else None
 
 
 class SweepSettings(Section):
@@ -92,11 +216,11 @@ class SweepSettings(Section):
         return {**self.variables, **self.vary}
 
     @property
-    def expressions(self) -> list[str]:
-        """Keys of `set` whose values contain expressions."""
-        found: dict[str, None] = {}
-        replace_expressions(self.set, lambda path, _: found.setdefault(str(path[0])))
-        return list(found)
+    def runs(self) -> int:
+        """Number of runs."""
+        if self.samples is not None:
+            return self.samples
+        return math.prod(len(distribution.values) for distribution in self.distributions.values())
 
     @field_validator("variables")
     @classmethod
@@ -133,9 +257,9 @@ class SweepSettings(Section):
             )
         if self.samples is None and len(grids) < len(varied):
             raise scene_fault("missing; expected the number of runs, as not every key is a grid", "samples")
-        if (runs := count_runs(varied, self.samples)) > MAX_RUNS:
+        if self.runs > MAX_RUNS:
             raise scene_fault(
-                f"{runs} combinations, more than the {MAX_RUNS} that can be run; take smaller grids", "vary"
+                f"{self.runs} combinations, more than the {MAX_RUNS} that can be run; take smaller grids", "vary"
             )
         if (numbers := sum(distribution.dimensions for distribution in varied.values())) > MAX_DIMENSIONS:
             raise scene_fault(f"{numbers} numbers, more than the {MAX_DIMENSIONS} that can vary; take fewer", "vary")
@@ -149,11 +273,17 @@ class SweepSettings(Section):
         return self
 
 
+def spread(total: int, limit: int) -> list[int]:
+    """Return the numbers of all runs, or of `limit` evenly spaced ones."""
+    count = min(total, limit)
+    return [(2 * n + 1) * total // (2 * count) for n in range(count)]
+
+
 @dataclass(frozen=True)
 class Sweep:
     """Scene file and the variation of its keys; paths in the values are relative to the scene file."""
 
-    scene: ParsedFile
+    scene: scene_file.ParsedFile
     settings: SweepSettings
 
     @property
@@ -164,15 +294,44 @@ class Sweep:
     @property
     def runs(self) -> int:
         """The number of runs."""
-        return count_runs(self.settings.distributions, self.settings.samples)
+        return self.settings.runs
 
-    def values(self) -> list[list[Any]]:
-        """Return the values of the variables and the varied keys, for every run."""
-        return run_values(self.settings.distributions, self.settings.samples, self.settings.seed)
+    def values(self, limit: int = MAX_RUNS) -> list[list[Any]]:
+        """Compute the values of the variables and the varied keys, in their order, for each run.
 
-    def sample_values(self, limit: int) -> list[list[Any]]:
-        """Return the values of the variables and the varied keys for at most `limit` runs, evenly spaced."""
-        return sample_run_values(self.settings.distributions, self.settings.samples, self.settings.seed, limit)
+        Without `samples` the runs are all combinations of the grids, the last key varying fastest. Otherwise they are
+        the first points of a scrambled Sobol sequence, with a dimension for every number and choice.
+
+        Args:
+            limit: number of runs, if there are more: the first ones of the sequence, or evenly spaced combinations.
+
+        Source: Owen, "Randomly permuted (t,m,s)-nets and (t,s)-sequences", 1995; SciPy's `qmc.Sobol`.
+        """
+        distributions = self.settings.distributions.values()
+        if self.settings.samples is None:
+            return [self._combination(run) for run in spread(self.runs, limit)]
+        import numpy as np
+        from scipy.stats import qmc
+
+        counts = [distribution.dimensions for distribution in distributions]
+        # A generator is passed, as versions of SciPy derive different ones from an integer. Other numbers of points
+        # than powers of two would cause a warning of SciPy.
+        sequence = qmc.Sobol(sum(counts), scramble=True, seed=np.random.default_rng(self.settings.seed))
+        count = min(self.runs, limit)
+        points = sequence.random_base2(math.ceil(math.log2(count)))[:count]
+        columns = [
+            [distribution.value(fractions) for fractions in block.tolist()]
+            for distribution, block in zip(distributions, np.split(points, np.cumsum(counts)[:-1], axis=1), strict=True)
+        ]
+        return [list(values) for values in zip(*columns, strict=True)]
+
+    def _combination(self, run: int) -> list[Any]:
+        """Return the combination of grid values of a run."""
+        values = []
+        for distribution in reversed(self.settings.distributions.values()):
+            run, index = divmod(run, len(distribution.values))
+            values.append(distribution.values[index])
+        return values[::-1]
 
     def overrides(self, values: list[Any]) -> tuple[str, ...]:
         """Return the arguments of `run --set` for a run.
@@ -200,15 +359,12 @@ class Sweep:
             names.append(text)
             return text
 
-        varied = [
-            (name, value)
-            for name, distribution in self.settings.vary.items()
-            if distribution.kind in ("choice", "grid")
-            for value in distribution.values
-        ]
         _map_files((), self.scene.document.data, collect)
-        for name, value in [*self.settings.set.items(), *varied]:
+        for name, value in self.settings.set.items():
             _map_files(_split_key(name), value, collect)
+        for name, distribution in self.settings.vary.items():
+            for value in distribution.values if distribution.kind in ("choice", "grid") else ():
+                _map_files(_split_key(name), value, collect)
         digests = {}
         for path in dict.fromkeys(str(self.scene.folder / name) for name in names):
             with suppress(PictureError):  # The run that needs the file reports the error.
@@ -222,15 +378,18 @@ class Sweep:
 
     def description(self) -> dict[str, Any]:
         """Return all settings that determine the results as JSON data; equal sweeps have equal descriptions."""
-        settings = self.settings.model_dump(mode="json", exclude={"scene", "vary", "variables"})
+        settings = self.settings
         variables, vary = (
             {name: {distribution.kind: distribution.values} for name, distribution in section.items()}
-            for section in (self.settings.variables, self.settings.vary)
+            for section in (settings.variables, settings.vary)
         )
-        scene = json.dumps(self.scene.document.data).encode()
-        files = {os.path.relpath(path, self.scene.folder): digest for path, digest in self.files.items()}
-        settings |= {"variables": variables} if variables else {}  # Sweeps without them keep their description.
-        return {**settings, "vary": vary, "digest": hashlib.sha256(scene).hexdigest(), "files": files}
+        return {
+            **settings.model_dump(include={"samples", "seed", "set"}),
+            **({"variables": variables} if variables else {}),  # Sweeps without them keep their description.
+            "vary": vary,
+            "digest": hashlib.sha256(json.dumps(self.scene.document.data).encode()).hexdigest(),
+            "files": {os.path.relpath(path, self.scene.folder): digest for path, digest in self.files.items()},
+        }
 
 
 def load_sweep(path: str | Path) -> Sweep:
@@ -239,7 +398,7 @@ def load_sweep(path: str | Path) -> Sweep:
     Raises:
         SceneError: with a line for each error of the file, in the order of the file.
     """
-    draft = Draft(read_file(str(path), FileKind("sweep", "scene and vary")))
+    draft = scene_file.Draft(scene_file.read_file(str(path), scene_file.FileKind("sweep", "scene and vary")))
     if "sheet" in draft.data and not {"vary", "variables"} & draft.data.keys():
         raise SceneError([f"{path}:1:1: a scene; use `taichi-msm run`, or name it by `scene:` in a sweep file"])
     sweep, problems = _checked(draft.data, Path(path).parent)
@@ -263,7 +422,7 @@ def make_sweep(scene: str | Path, settings: Mapping[str, Any]) -> Sweep:
     try:
         data = json.loads(json.dumps({**settings, "scene": Path(scene).name}))
     except (TypeError, ValueError) as error:
-        raise ArgumentError(f"vary, overrides: {error}; use numbers, text, lists, dicts") from None
+        raise ArgumentError(f"vary, variables, overrides: {error}; use numbers, text, lists, dicts") from None
     sweep, problems = _checked(data, Path(scene).parent)
     if sweep is None or problems:
         raise SceneError([str(problem) for problem in problems])
@@ -273,25 +432,26 @@ def make_sweep(scene: str | Path, settings: Mapping[str, Any]) -> Sweep:
 def _checked(data: dict[str, Any], folder: Path) -> tuple[Sweep | None, list[Problem]]:
     """Check the content of a sweep file in a folder, and read its scene; return the sweep and all errors."""
     problems: list[Problem] = []
+    sections = (data.get(name) for name in ("variables", "vary", "set"))
+    variables, vary, fixed = (section if isinstance(section, dict) else {} for section in sections)
     file, name = None, data.get("scene")
     if isinstance(name, str) and name:
         path = folder / name
-        problems += _relocate(data, folder, path.parent)
+        problems += _relocate(vary, fixed, folder, path.parent)
         try:
             # Without its folder, as errors of runs must not depend on the current directory.
-            file = read_file(_normalised(path), SCENE_KIND)._replace(name=path.name)
-            problems += _unknown_keys(file, data)
+            file = scene_file.read_file(_normalised(path), scene_file.SCENE_KIND)._replace(name=path.name)
+            problems += _unknown_keys(file, vary, fixed)
         except SceneError as error:
             problems.append(Problem(("scene",), error.lines[0]))
-    problems += _expression_problems(data)
+    problems += _expression_problems(variables, fixed)
     settings, setting_problems = parse_model(SweepSettings, data)
     return (None if settings is None or file is None else Sweep(file, settings)), [*problems, *setting_problems]
 
 
-def _expression_problems(data: dict[str, Any]) -> list[Problem]:
+def _expression_problems(variables: dict[str, Any], fixed: dict[str, Any]) -> list[Problem]:
     """Check the expressions in `set`, with NaN for all variables, for which those of single runs have no problems."""
-    variables = data.get("variables")
-    names = dict.fromkeys(variables if isinstance(variables, dict) else (), math.nan)
+    names = dict.fromkeys(variables, math.nan)
     problems = []
 
     def check(path: Key, text: str) -> None:
@@ -300,7 +460,7 @@ def _expression_problems(data: dict[str, Any]) -> list[Problem]:
         except ExpressionError as error:
             problems.append(Problem(("set", *path), str(error)))
 
-    replace_expressions(_mappings(data)[1], check)
+    replace_expressions(fixed, check)
     return problems
 
 
@@ -323,61 +483,53 @@ def format_override(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-def _relocate(data: dict[str, Any], folder: Path, home: Path) -> Iterator[Problem]:
+def _relocate(vary: dict[str, Any], fixed: dict[str, Any], folder: Path, home: Path) -> Iterator[Problem]:
     """Expand file patterns, and convert paths from the base `folder` to the base `home`, the scene's folder."""
-    vary, fixed = _mappings(data)
+    places: list[tuple[Key, Any]] = []  # of values, and the list or mapping that contains them
     for name, distribution in vary.items():
         for kind in {"choice", "grid"} & set(distribution if isinstance(distribution, dict) else ()):
-            path: Key = ("vary", name, kind)
-            if isinstance(pattern := distribution[kind], str) and names_file(_split_key(name)):
-                noun, suffixes = _kind_of_file(_split_key(name))
-                names = sorted(glob(pattern, root_dir=folder))  # noqa: PTH207  # Path.glob refuses absolute patterns
-                distribution[kind] = [
-                    text for text in names if text.lower().endswith(suffixes) and (folder / text).is_file()
-                ]
+            key = _split_key(name)
+            if isinstance(pattern := distribution[kind], str) and scene_file.names_file(key):
+                distribution[kind] = _matches(pattern, folder, key)
                 if not distribution[kind]:
+                    noun = _file_noun(key)
                     message = f"{format_value(pattern)} matches no {noun}; give a pattern relative to the sweep file"
-                    yield Problem(path, message)
-            if isinstance(distribution[kind], list):
-                for index, value in enumerate(distribution[kind]):
-                    distribution[kind][index], errors = _relocated(name, value, folder, home)
-                    yield from (Problem((*path, index), error) for error in errors)
-    for name, value in fixed.items():
-        fixed[name], errors = _relocated(name, value, folder, home)
-        yield from (Problem(("set", name), error) for error in errors)
+                    yield Problem(("vary", name, kind), message)
+            if isinstance(values := distribution[kind], list):
+                places += [(("vary", name, kind, index), values) for index in range(len(values))]
+    places += [(("set", name), fixed) for name in fixed]
+    problems = []
 
-
-def _relocated(name: str, value: Any, folder: Path, home: Path) -> tuple[Any, list[str]]:
-    """Relocate the files in the value of a key; return the value and the errors."""
-    errors = []
-
-    def relocated(key: Key, text: str) -> str:
-        noun, _ = _kind_of_file(key)
-        path = folder / text
-        try:
-            is_file = path.is_file()
-        except (OSError, ValueError):
-            is_file = False
-        if not (is_below(path, folder) or is_below(path, home)):
-            errors.append(
-                f"{text} is neither below the sweep file's folder nor below the scene's; put the {noun} there"
-            )
-        elif not is_file:
-            errors.append(f"{truncate(text)}: no such file; name a {noun} relative to the sweep file")
+    def relocated(place: Key, key: Key, text: str) -> str:
+        path, noun = folder / text, _file_noun(key)
+        if not (scene_file.is_below(path, folder) or scene_file.is_below(path, home)):
+            message = f"{text} is neither below the sweep file's folder nor below the scene's; put the {noun} there"
+            problems.append(Problem(place, message))
+        elif not os.path.isfile(path):  # noqa: PTH113  # Path.is_file raises an error for a long name
+            message = f"{truncate(text)}: no such file; name a {noun} relative to the sweep file"
+            problems.append(Problem(place, message))
         # Resolved first, as .. after a symbolic link is the parent of its target.
         return Path(os.path.relpath(path.parent.resolve() / path.name, home.resolve())).as_posix()
 
-    return _map_files(_split_key(name), value, relocated), errors
+    for place, container in places:
+        container[place[-1]] = _map_files(_split_key(str(place[1])), container[place[-1]], partial(relocated, place))
+    yield from problems
 
 
-def _kind_of_file(key: Key) -> tuple[str, tuple[str, ...]]:
-    """Return the noun for the file of a key, and its allowed suffixes."""
-    return ("picture", PICTURE_SUFFIXES) if key in PICTURE_KEYS else ("file", ("",))
+def _matches(pattern: str, folder: Path, key: Key) -> list[str]:
+    """Return the files of a key that match a pattern relative to a folder."""
+    suffixes = PICTURE_SUFFIXES if key in scene_file.PICTURE_KEYS else ("",)
+    names = sorted(glob(pattern, root_dir=folder))  # noqa: PTH207  # Path.glob refuses absolute patterns
+    return [text for text in names if text.lower().endswith(suffixes) and (folder / text).is_file()]
+
+
+def _file_noun(key: Key) -> str:
+    return "picture" if key in scene_file.PICTURE_KEYS else "file"
 
 
 def _map_files(path: Key, value: Any, change: Callable[[Key, str], str]) -> Any:
     """Apply a function to the file paths in the value of a key."""
-    if names_file(path):
+    if scene_file.names_file(path):
         return change(path, value) if isinstance(value, str) and 0 < len(value) <= MAX_PATH else value
     if isinstance(value, dict):
         return {name: _map_files((*path, name), item, change) for name, item in value.items()}
@@ -386,246 +538,35 @@ def _map_files(path: Key, value: Any, change: Callable[[Key, str], str]) -> Any:
 
 def _split_key(name: str) -> Key:
     """Split a dotted key; empty if `--set` does not accept it."""
-    return parse_key(name.strip()) if "=" not in name else ()
+    return scene_file.parse_key(name.strip()) if "=" not in name else ()
 
 
-def _unknown_keys(scene: ParsedFile, data: dict[str, Any]) -> Iterator[Problem]:
+def _unknown_keys(scene: scene_file.ParsedFile, vary: dict[str, Any], fixed: dict[str, Any]) -> Iterator[Problem]:
     """Check that a scene has the keys, by trying one value of each."""
-    vary, fixed = _mappings(data)
     trials: dict[Key, Any] = {("set", name): value for name, value in fixed.items()}
     for name, distribution in vary.items():
         values = next(iter(distribution.values()), None) if isinstance(distribution, dict) else None
         trials["vary", name] = values[0] if isinstance(values, list) and values else None
-    draft = Draft(scene)
-    for path in [path for path in trials if not _split_key(str(path[1]))]:
-        yield Problem(path, "not a key; expected a dotted path such as sheet.points")
-        del trials[path]
+    draft = scene_file.Draft(scene)
+    keys = {}
     for path, value in trials.items():
+        if not (key := _split_key(str(path[1]))):
+            yield Problem(path, "not a key; expected a dotted path such as sheet.points")
+            continue
+        keys[path] = key
         known = len(draft.problems)
-        draft.override(parse_override(f"{path[1]}={format_override(value)}"))
+        # Copied, as later overrides may change a part of the value.
+        draft.override(scene_file.Override("", key, deepcopy(value)))
         yield from (Problem(path, problem.message) for _, problem in draft.problems[known:])
     for problem in parse_model(Scene, draft.data)[1]:
         if not problem.message.startswith("unknown key"):
             continue
         # The unknown key may be above a tried key, in the section that is its value, or in the scene file.
-        related = [path for path in trials if _is_prefix(_split_key(str(path[1])), problem.path)]
+        related = [
+            path
+            for path, key in keys.items()
+            if all(part == counterpart for part, counterpart in zip(key, problem.path, strict=False))
+        ]
         for path in related or [("scene",)]:
-            prefix = f"{problem.key}: " if problem.path != _split_key(str(path[-1])) else ""
+            prefix = f"{problem.key}: " if problem.path != keys.get(path) else ""
             yield Problem(path, f"{prefix}{problem.message}")
-
-
-def _is_prefix(first: Key, second: Key) -> bool:
-    """Return whether one of two keys is a prefix of the other."""
-    return all(part == counterpart for part, counterpart in zip(first, second, strict=False))
-
-
-def _mappings(data: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the sections `vary` and `set`; empty where not a mapping."""
-    vary, fixed = (data.get(name) for name in ("vary", "set"))
-    return vary if isinstance(vary, dict) else {}, fixed if isinstance(fixed, dict) else {}
-
-
-def run_values(vary: Mapping[str, Distribution], samples: int | None, seed: int) -> list[list[Any]]:
-    """Compute the values of the varied keys, in their order, for every run.
-
-    Without `samples` the runs are all combinations of the grids, the last key varying fastest. Otherwise they are the
-    first points of a scrambled Sobol sequence, with a dimension for every number and choice, in the order of the keys.
-
-    Args:
-        vary: distributions by key.
-        samples: number of runs, or None for grids.
-        seed: of the scrambling.
-
-    Source: Owen, "Randomly permuted (t,m,s)-nets and (t,s)-sequences", 1995; SciPy's `qmc.Sobol`.
-    """
-    if samples is None:
-        return [_combination(vary, run) for run in range(count_runs(vary, None))]
-    import numpy as np
-    from scipy.stats import qmc
-
-    counts = [distribution.dimensions for distribution in vary.values()]
-    # A generator is passed, as versions of SciPy derive different ones from an integer. Other numbers of points than
-    # powers of two would cause a warning of SciPy.
-    sequence = qmc.Sobol(sum(counts), scramble=True, seed=np.random.default_rng(seed))
-    points = sequence.random_base2(math.ceil(math.log2(samples)))[:samples]
-    columns = [
-        [distribution.value(fractions) for fractions in block.tolist()]
-        for distribution, block in zip(vary.values(), np.split(points, np.cumsum(counts)[:-1], axis=1), strict=True)
-    ]
-    return [list(values) for values in zip(*columns, strict=True)]
-
-
-def sample_run_values(vary: Mapping[str, Distribution], samples: int | None, seed: int, limit: int) -> list[list[Any]]:
-    """Compute the values of at most `limit` runs, spread over all runs; other arguments as for `run_values`."""
-    if samples is not None:
-        # The first points of a Sobol sequence cover the range.
-        return run_values(vary, min(samples, limit), seed)
-    total = count_runs(vary, None)
-    return [_combination(vary, run) for run in sorted({(2 * n + 1) * total // (2 * limit) for n in range(limit)})]
-
-
-def count_runs(vary: Mapping[str, Distribution], samples: int | None) -> int:
-    """Count the runs; arguments as for `run_values`."""
-    return math.prod(len(distribution.values) for distribution in vary.values()) if samples is None else samples
-
-
-def _combination(vary: Mapping[str, Distribution], run: int) -> list[Any]:
-    """Return the combination of grid values of a run."""
-    values = []
-    for distribution in reversed(list(vary.values())):
-        run, index = divmod(run, len(distribution.values))
-        values.append(distribution.values[index])
-    return values[::-1]
-
-
-RANGE = "[low, high]: numbers, or lists of one shape"
-LIST = "a list of values that is not empty"
-
-
-class Distribution(Section):
-    """Distribution of a varied key: exactly one of its fields. Lists of numbers vary componentwise."""
-
-    model_config = ConfigDict(validate_default=False)
-
-    uniform: Any = key(None, "between two numbers", RANGE)
-    log_uniform: Any = key(None, "between two numbers above 0, uniform in the logarithm", RANGE)
-    normal: Any = key(None, "normally distributed", "[mean, standard deviation]: numbers, or lists of one shape")
-    choice: Any = key(None, "one of some values, all equally likely; of a picture also a pattern of files", LIST)
-    grid: Any = key(None, "every one of some values, with every combination of the other keys'", LIST)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _is_flat(cls, data: Any) -> Any:
-        if not isinstance(data, dict):
-            raise scene_fault(
-                f"{format_value(data)} is no way to vary; take one, such as {{uniform: [1, 2]}} or {{choice: [1, 2]}}"
-            )
-        if data.keys().isdisjoint(cls.model_fields) and any(isinstance(value, dict) for value in data.values()):
-            raise scene_fault("give each key by its dotted path, such as tissue.young: {uniform: [1e4, 3e4]}")
-        return data
-
-    @field_validator("uniform", "log_uniform", "normal")
-    @classmethod
-    def _is_pair(cls, value: Any) -> Any:
-        if not (isinstance(value, list) and len(value) == 2 and all(map(_numbers, value))):
-            raise scene_fault(
-                f"{format_value(value)} is not allowed; expected two numbers, or two lists of numbers of one shape"
-            )
-        if _shape(value[0]) != _shape(value[1]):
-            raise scene_fault(
-                f"{format_value(value[0])} and {format_value(value[1])} differ in shape; give both as many numbers"
-            )
-        return value
-
-    @field_validator("uniform", "log_uniform")
-    @classmethod
-    def _is_ordered(cls, value: Any) -> Any:
-        for low, high in zip(_numbers(value[0]), _numbers(value[1]), strict=True):
-            if low > high:
-                raise scene_fault(f"{low:g} is above {high:g}; give the lower number first")
-        return value
-
-    @field_validator("log_uniform")
-    @classmethod
-    def _is_positive(cls, value: Any) -> Any:
-        if (low := min(_numbers(value[0]))) <= 0:
-            raise scene_fault(f"{low:g} has no logarithm; take numbers above 0, or uniform")
-        return value
-
-    @field_validator("normal")
-    @classmethod
-    def _has_deviation(cls, value: Any) -> Any:
-        if (deviation := min(_numbers(value[1]))) < 0:
-            raise scene_fault(f"a standard deviation of {deviation:g} is not possible; take 0 or more")
-        return value
-
-    @field_validator("choice", "grid")
-    @classmethod
-    def _is_list(cls, value: Any) -> Any:
-        if not isinstance(value, list) or not value:
-            raise scene_fault(f"{format_value(value)} is not allowed; expected {LIST}")
-        if not _is_finite(value):
-            raise scene_fault(f"{format_value(value)} has a number that is not finite; take others")
-        return value
-
-    @model_validator(mode="after")
-    def _is_one(self) -> Self:
-        if len(self.model_fields_set) != 1:
-            raise scene_fault(f"expected one of {', '.join(type(self).model_fields)}")
-        return self
-
-    @property
-    def kind(self) -> str:
-        """Name of the field that is set."""
-        return next(iter(self.model_fields_set))
-
-    @property
-    def values(self) -> Any:
-        """Parameters of the distribution, or values of a choice or grid."""
-        return getattr(self, self.kind)
-
-    @property
-    def dimensions(self) -> int:
-        """Number of fractions for `value`: one per number, 1 for a choice, 0 for a grid."""
-        if self.kind in ("choice", "grid"):
-            return int(self.kind == "choice")
-        return len(_numbers(self.values[0]))
-
-    def value(self, fractions: Sequence[float]) -> Any:
-        """Apply the quantile function to fractions in [0, 1), shape (dimensions,)."""
-        if self.kind == "choice":
-            return self.values[int(fractions[0] * len(self.values))]
-        remaining = iter(fractions)
-        return _map_pairs(lambda first, second: _QUANTILES[self.kind](first, second, next(remaining)), *self.values)
-
-
-def _uniform(low: float, high: float, fraction: float) -> float:
-    return low + (high - low) * fraction
-
-
-def _log_uniform(low: float, high: float, fraction: float) -> float:
-    # Rounding could leave the interval.
-    return min(max(math.exp(_uniform(math.log(low), math.log(high), fraction)), low), high)
-
-
-def _normal(mean: float, deviation: float, fraction: float) -> float:
-    from scipy.special import ndtri
-
-    # Sobol points are multiples of 2^-30 and include 0, where the quantile is infinite.
-    return mean + deviation * float(ndtri(max(fraction, 2.0**-31)))
-
-
-_QUANTILES: dict[str, Callable[[float, float, float], float]] = {
-    "uniform": _uniform,
-    "log_uniform": _log_uniform,
-    "normal": _normal,
-}
-
-
-def _map_pairs(function: Callable[[float, float], float], first: Any, second: Any) -> Any:
-    """Apply a function to the pairs of numbers in two values of one shape."""
-    if isinstance(first, list):
-        return list(map(partial(_map_pairs, function), first, second))
-    return float(function(first, second))
-
-
-def _numbers(value: Any) -> list[float]:
-    """Return the flattened numbers of a value; empty if it contains anything else."""
-    if isinstance(value, list):
-        parts = [_numbers(item) for item in value]
-        return [number for part in parts for number in part] if all(parts) else []
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= MAX_MAGNITUDE
-    return [value] if is_number else []
-
-
-def _is_finite(value: Any) -> bool:
-    if isinstance(value, (list, dict)):
-        return all(map(_is_finite, value.values() if isinstance(value, dict) else value))
-    return not isinstance(value, float) or math.isfinite(value)
-
-
-def _shape(value: Any) -> Any:
-    """Return a value with its numbers replaced by None."""
-    if isinstance(value, list):
-        return [_shape(item) for item in value]
-    return None if _numbers(value) else value

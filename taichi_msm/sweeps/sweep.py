@@ -20,12 +20,11 @@ from taichi_msm.sweeps.pool import Pool
 from taichi_msm.sweeps.runs import (
     FINAL_STATUSES,
     Outcome,
-    SweepResult,
     SweepState,
     begin_sweep,
-    execute_tasks,
+    lock_reports,
     read_outcome,
-    report_lock,
+    run_missing,
 )
 from taichi_msm.sweeps.spec import make_sweep
 from taichi_msm.sweeps.tables import choose_worker_count, estimate_cost, write_reports
@@ -36,6 +35,7 @@ def sweep(
     vary: Mapping[str, Mapping[str, Any]],
     directory: str | Path,
     *,
+    variables: Mapping[str, Mapping[str, Any]] | None = None,
     samples: int | None = None,
     seed: int = 1,
     overrides: Mapping[str, Any] | None = None,
@@ -53,9 +53,10 @@ def sweep(
         vary: distributions by dotted key, as in a sweep file. Paths of files are relative to the scene file, and below
             its folder.
         directory: receives runs/, table.csv and the other reports.
+        variables: distributions of the numbers in expressions of `overrides`, by name, as in a sweep file.
         samples: number of runs; None: every combination of the keys' grids.
         seed: seed of the samples.
-        overrides: values of keys in all runs, by dotted key.
+        overrides: values of keys in all runs, by dotted key; texts that begin with = are expressions of the variables.
         executor: executes the runs; None: processes on this machine. Its workers must be processes with one thread,
             with scene and directory at the same paths. A string is the address of a dask.distributed scheduler.
         workers: number of processes on this machine; None: one per core, limited by the free memory.
@@ -84,7 +85,8 @@ def sweep(
         raise ArgumentError(f"scene: {scene!r}; take the path of a scene file")
     if workers is not None and not (type(workers) is int and 1 <= workers <= MAX_WORKERS):
         raise ArgumentError(f"workers: {workers!r}; take a whole number, 1 to {MAX_WORKERS}, or None")
-    settings = {"vary": vary, "seed": seed, "set": overrides or {}} | ({} if samples is None else {"samples": samples})
+    settings = {"variables": variables or {}, "vary": vary, "seed": seed, "set": overrides or {}}
+    settings |= {} if samples is None else {"samples": samples}
     spec = make_sweep(scene, settings)
     # The caller may change the current directory meanwhile.
     state = begin_sweep(spec, Path(directory).absolute())
@@ -92,7 +94,7 @@ def sweep(
 
     def execute() -> Iterator[Outcome]:
         with open_executor(executor, worker_count, state, progress) as opened:
-            yield from list(state.done)
+            yield from list(state.outcomes)
             yield from run_missing(state, opened, progress)
             finish_sweep(state, opened, progress)
 
@@ -123,56 +125,26 @@ def open_executor(
             raise NotInstalledError(message) from None
         with cluster_connection(executor, state.sweep, state.directory, progress) as cluster:
             yield cluster
-        return
-    if executor is not None:
+    elif executor is not None:
         yield executor
-        return
-    pool = Pool(workers)
-    try:
-        yield pool
-    except BaseException:
-        pool.shutdown(cancel_futures=True)
-        raise
-    pool.shutdown()
-
-
-def run_missing(state: SweepState, executor: Executor, progress: StageProgressCallback) -> Iterator[Outcome]:
-    """Execute the missing runs of a sweep, and yield their outcomes in order of completion.
-
-    Args:
-        state: the sweep; outcomes are appended to `state.done`.
-        executor: executes the runs.
-        progress: called several times a second; an exception from it ends the sweep.
-
-    Raises:
-        LostExecutorError: when the executor accepts no more runs.
-    """
-    done = state.done
-    for outcome in execute_tasks(state.missing, executor, lambda: progress("runs", len(done), state.total)):
-        done.append(outcome)
-        yield outcome
+    else:
+        pool = Pool(workers)
+        try:
+            yield pool
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+        pool.shutdown()
 
 
 def finish_sweep(state: SweepState, executor: Executor, progress: StageProgressCallback) -> tuple[list[str], list[str]]:
-    """Write the table and the other reports of a sweep.
-
-    Args:
-        state: the sweep, after all its runs have ended.
-        executor: draws frames for the contact sheet.
-        progress: called several times a second.
-
-    Returns:
-        Names of the written files, and warnings.
-
-    Raises:
-        FilesError: when the table cannot be written.
-    """
-    directory, total, sweep = state.directory, state.total, state.sweep
-    with writing(directory), report_lock(directory, lambda: progress("runs", total, total)):
+    """Write the table and the other reports of a sweep whose runs have ended, as `tables.write_reports`."""
+    directory, total = state.directory, len(state.values)
+    with writing(directory), lock_reports(directory, lambda: progress("runs", total, total)):
         # A run that was locked by another command may be finished now.
         tasks = {task.run: task for task in state.missing}
-        rows = [
-            (None if row.status in FINAL_STATUSES else read_outcome(tasks[row.run], sweep)) or row
-            for row in sorted(state.done, key=lambda row: row.run)
+        state.outcomes[:] = [
+            (None if row.status in FINAL_STATUSES else read_outcome(tasks[row.run], state.sweep)) or row
+            for row in sorted(state.outcomes, key=lambda row: row.run)
         ]
-        return write_reports(SweepResult(directory, sweep, state.values, rows), executor, progress)
+        return write_reports(state, executor, progress)

@@ -13,7 +13,7 @@ import io
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from functools import partial
 from pathlib import Path
@@ -23,50 +23,31 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from taichi_msm.errors import SceneError, StageProgressCallback, writing
-from taichi_msm.load import cost as cost_module
-from taichi_msm.load.cost import format_rough_time
+from taichi_msm.load import cost
 from taichi_msm.load.scene_file import plan_file
 from taichi_msm.model.plan import Plan
 from taichi_msm.runs.directory import MAX_RECORD_BYTES, replacing
 from taichi_msm.scene.outputs import RUN_RECORD
-from taichi_msm.sweeps.plots import (
-    PlotData,
-    estimate_sensitivity,
-    plot,
-    varied_parameters,
-    varied_results,
-    write_contact_sheet,
-)
-from taichi_msm.sweeps.runs import (
-    CONTACT,
-    DATASET,
-    PARQUET,
-    PLOT,
-    REPORT_FILES,
-    SENSITIVITY,
-    STATUSES,
-    TABLE,
-    Outcome,
-    SweepResult,
-)
-from taichi_msm.sweeps.spec import Sweep, format_override
+from taichi_msm.sweeps import plots
+from taichi_msm.sweeps.expressions import replace_expressions
+from taichi_msm.sweeps.runs import REPORT_FILES, STATUSES, Outcome, SweepState
+from taichi_msm.sweeps.spec import Sweep, format_override, spread
 from taichi_msm.system.compiler import versions
 from taichi_msm.system.files import read_regular
 from taichi_msm.system.process import available_memory, available_threads
 from taichi_msm.version import commit
 
-WITHOUT_MATPLOTLIB = f"{PLOT} needs matplotlib: pip install matplotlib"
-WITHOUT_SALIB = f"{SENSITIVITY} needs SALib: pip install SALib"
-
-# Names of the written files, and warnings.
-WrittenFiles = tuple[list[str], list[str]]
+WITHOUT_MATPLOTLIB = "sweep.png needs matplotlib: pip install matplotlib"
+WITHOUT_SALIB = "sensitivity.csv needs SALib: pip install SALib"
 
 
-def write_reports(result: SweepResult, executor: Executor, progress: StageProgressCallback) -> WrittenFiles:
+def write_reports(
+    state: SweepState, executor: Executor, progress: StageProgressCallback
+) -> tuple[list[str], list[str]]:
     """Write the reports of a sweep, each atomically, and remove outdated ones.
 
     Args:
-        result: the finished sweep.
+        state: the finished sweep.
         executor: draws the last frames of runs without pictures.
         progress: called with the stage, the drawn and the total number of frames.
 
@@ -76,88 +57,94 @@ def write_reports(result: SweepResult, executor: Executor, progress: StageProgre
     Raises:
         FilesError: when the table cannot be written.
     """
-    writers: dict[str, Callable[[SweepResult], WrittenFiles]] = {
-        PARQUET: write_parquet,
-        DATASET: write_dataset,
-        CONTACT: partial(write_contact_sheet, executor=executor, progress=progress),
-        PLOT: _write_plots,
+    writers: dict[str, Callable[[SweepState], list[str]]] = {
+        "table.parquet": write_parquet,
+        "dataset.json": write_dataset,
+        "contact.jpg": partial(plots.write_contact_sheet, executor=executor, progress=progress),
+        "sweep.png": _write_plots,
     }
-    with writing(result.directory):
-        write_table(result)
-        names, notes = [TABLE], list[str]()
+    notes = []
+    with writing(state.directory):
+        write_table(state)
+        for name in REPORT_FILES[1:]:
+            (state.directory / name).unlink(missing_ok=True)
         for name, write in writers.items():
             try:
-                new_names, new_notes = write(result)
+                notes += write(state)
             except Exception as error:
                 # A failing report must not discard hours of runs.
-                new_names, new_notes = [], [f"{name} could not be made: {type(error).__name__}: {error}"]
-            names += new_names
-            notes += new_notes
-        for name in set(REPORT_FILES).difference(names):
-            (result.directory / name).unlink(missing_ok=True)
-    return names, notes
+                notes.append(f"{name} could not be made: {type(error).__name__}: {error}")
+    return [name for name in REPORT_FILES if (state.directory / name).exists()], notes
 
 
-def _write_plots(result: SweepResult) -> WrittenFiles:
-    """Write sensitivity.csv if there are enough runs, and sweep.png if complete runs differ."""
+def _write_plots(state: SweepState) -> list[str]:
+    """Write sensitivity.csv if there are enough runs, and sweep.png if complete runs differ; return warnings."""
     # More runs would slow down the plots without changing them visibly.
-    runs = result.sample_runs(4096)
-    varied, columns = varied_parameters(result, runs), varied_results(result, runs)
-    names: list[str] = []
-    notes: list[str] = []
+    runs = spread(len(state.outcomes), 4096)
+    varied, columns = plots.varied_parameters(state, runs), plots.varied_results(state, runs)
     if not (varied and columns):
-        return names, [f"no {PLOT}: it needs complete runs with results that differ"]
-    failed = np.array([result.outcomes[run].status != "complete" for run in runs])
+        return ["no sweep.png: it needs complete runs with results that differ"]
+    notes, indices = [], list[plots.SensitivityIndex]()
+    failed = np.array([state.outcomes[run].status != "complete" for run in runs])
     try:
-        indices = estimate_sensitivity(varied, columns)
+        indices = plots.estimate_sensitivity(varied, columns)
     except ImportError:
-        indices = []
         notes.append(WITHOUT_SALIB)
     if indices:
-        with replacing(result.directory / SENSITIVITY) as file:
-            for row in [indices[0]._fields, *indices]:
-                file.write(f"{csv_line(row)}\n".encode("utf-8", "backslashreplace"))
-        names.append(SENSITIVITY)
+        _write_csv(state.directory / "sensitivity.csv", [indices[0]._fields, *indices])
     try:
         import matplotlib  # noqa: F401
     except ImportError:
-        return names, [*notes, WITHOUT_MATPLOTLIB]
-    complete = sum(outcome.status == "complete" for outcome in result.outcomes)
-    subset = f", {len(runs)} of them shown" if len(runs) < len(result.outcomes) else ""
-    title = f"{result.sweep.scene.name}: {complete} of {len(result.outcomes)} runs complete{subset}"
-    with replacing(result.directory / PLOT) as file:
-        plot(PlotData(title, varied, columns, failed, indices), file)
-    return [*names, PLOT], notes
+        return [*notes, WITHOUT_MATPLOTLIB]
+    complete = count_statuses(state.outcomes)["complete"]
+    subset = f", {len(runs)} of them shown" if len(runs) < len(state.outcomes) else ""
+    title = f"{state.sweep.scene.name}: {complete} of {len(state.outcomes)} runs complete{subset}"
+    with replacing(state.directory / "sweep.png") as file:
+        plots.plot(plots.PlotData(title, varied, columns, failed, indices), file)
+    return notes
 
 
-def write_table(result: SweepResult) -> None:
+def write_table(state: SweepState) -> None:
     """Write table.csv, with a row for each run."""
-    with replacing(result.directory / TABLE) as file:
-        for row in [_names(result), *_rows(result, format_override)]:
-            file.write(f"{csv_line(row)}\n".encode("utf-8", "backslashreplace"))
+    columns = _columns(state)
+    for name in state.sweep.keys:
+        columns[name] = list(map(format_override, columns[name]))
+    _write_csv(state.directory / "table.csv", [list(columns), *zip(*columns.values(), strict=True)])
 
 
-def write_parquet(result: SweepResult) -> WrittenFiles:
-    """Write table.parquet if pyarrow is installed."""
+def write_parquet(state: SweepState) -> list[str]:
+    """Write table.parquet if pyarrow is installed; return no warnings."""
     try:
         import pyarrow
         from pyarrow import parquet
     except ImportError:
-        return [], []
-    rows = zip(*_rows(result, lambda value: value), strict=True)
-    columns: dict[str, Any] = dict(zip(_names(result), map(list, rows), strict=True))
-    for name in result.sweep.keys:
+        return []
+    columns: dict[str, Any] = _columns(state)
+    for name in state.sweep.keys:
         # Columns of mixed types, such as numbers and lists, become text.
         try:
             pyarrow.array(columns[name])
         except pyarrow.ArrowException:
             columns[name] = list(map(format_override, columns[name]))
-    for name in result.columns():  # explicit types, for columns without values
+    for name in state.columns():  # explicit types, for columns without values
         kind = pyarrow.string() if name in ("status", "error") else pyarrow.float64()
         columns[name] = pyarrow.array(columns[name], kind)
-    with replacing(result.directory / PARQUET) as file:
+    with replacing(state.directory / "table.parquet") as file:
         parquet.write_table(pyarrow.table(columns), file)
-    return [PARQUET], []
+    return []
+
+
+def _columns(state: SweepState) -> dict[str, list[Any]]:
+    """Return the columns of the table by name."""
+    values = map(list, zip(*state.values, strict=True))
+    runs = [outcome.run for outcome in state.outcomes]
+    return {"run": runs, **dict(zip(state.sweep.keys, values, strict=True)), **state.columns()}
+
+
+def _write_csv(path: Path, rows: Iterable[Iterable[Any]]) -> None:
+    with replacing(path) as file:
+        for row in rows:
+            file.write(f"{csv_line(row)}\n".encode("utf-8", "backslashreplace"))
 
 
 def csv_line(row: Iterable[Any]) -> str:
@@ -167,58 +154,39 @@ def csv_line(row: Iterable[Any]) -> str:
     return text.getvalue()
 
 
-def _names(result: SweepResult) -> list[str]:
-    return ["run", *result.sweep.keys, *result.columns()]
-
-
-def _rows(result: SweepResult, write: Callable[[Any], Any]) -> Iterator[list[Any]]:
-    """Yield the rows of the table, with the values of the keys converted by `write`."""
-    columns = zip(*result.columns().values(), strict=True)
-    for values, outcome, results in zip(result.values, result.outcomes, columns, strict=True):
-        yield [outcome.run, *map(write, values), *results]
-
-
-def write_dataset(result: SweepResult) -> WrittenFiles:
-    """Write dataset.json, with a line for every complete run."""
-    sweep, complete = result.sweep, [outcome.run for outcome in result.outcomes if outcome.status == "complete"]
-    common = _output_format(result.run_directory(complete[0])) if complete else {}
+def write_dataset(state: SweepState) -> list[str]:
+    """Write dataset.json, with a line for every complete run; return no warnings."""
+    sweep, complete = state.sweep, [outcome.run for outcome in state.outcomes if outcome.status == "complete"]
+    common = _output_format(state.run_directory(complete[0])) if complete else {}
     # The sections of a scene that determine the output format.
     settings = sweep.settings
-    differ = any(key.split(".")[0] in ("output", "render", "time") for key in (*settings.vary, *settings.expressions))
-    splits = assign_splits(len(result.outcomes), settings.seed)
+    expressions = (key for key, value in settings.set.items() if replace_expressions(value, lambda *_: None) != value)
+    differ = any(key.split(".")[0] in ("output", "render", "time") for key in (*settings.vary, *expressions))
+    splits = assign_splits(len(state.outcomes), settings.seed)
     head = {"scene": settings.scene, **sweep.description(), "versions": versions(), "commit": commit(), **common}
-    with replacing(result.directory / DATASET) as file:
+    with replacing(state.directory / "dataset.json") as file:
         file.write(b"{\n")
         for name, value in head.items():
             file.write(f'"{name}": '.encode() + _json(value) + b",\n")
         file.write(b'"runs": [')
         for run in complete:
-            directory = result.run_directory(run)
-            folder = directory.relative_to(result.directory).as_posix()
-            values = dict(zip(sweep.keys, result.values[run], strict=True))
+            directory = state.run_directory(run)
+            folder = directory.relative_to(state.directory).as_posix()
+            values = dict(zip(sweep.keys, state.values[run], strict=True))
             outputs = _output_format(directory) if differ else {}
             row = {"run": run, "folder": folder, "part": splits[run], "values": values, **outputs}
             file.write((b"" if run == complete[0] else b",") + b"\n" + _json(row))
         file.write(b"\n]\n}\n")
-    return [DATASET], []
+    return []
 
 
 def assign_splits(runs: int, seed: int) -> list[str]:
-    """Assign every run to a split of the data set.
-
-    Args:
-        runs: number of runs.
-        seed: of the assignment.
-
-    Returns:
-        "train", "val" or "test" for each run.
-    """
+    """Return the split of the data set for each of a number of runs: "train", "val" or "test"."""
     order = sorted(range(runs), key=lambda run: hashlib.sha256(f"{seed} {run}".encode()).digest())
     tenth = (runs + 5) // 10
     splits = ["train"] * runs
-    for name, chosen in (("test", order[:tenth]), ("val", order[tenth : 2 * tenth])):
-        for run in chosen:
-            splits[run] = name
+    for rank, run in enumerate(order[: 2 * tenth]):
+        splits[run] = "test" if rank < tenth else "val"
     return splits
 
 
@@ -238,22 +206,18 @@ def _json(value: Any) -> bytes:
     return json.dumps(value, ensure_ascii=False).encode("utf-8", "backslashreplace")
 
 
-def cost_line(runs: int, cost: SweepCost, workers: WorkerCount | None) -> str:
-    """Format the cost of runs as a line.
-
-    Args:
-        runs: number of runs.
-        cost: of the runs.
-        workers: processes on this machine; None if the runs are executed elsewhere.
-    """
-    if workers is None:
-        location = "if they were run here"
-    else:
+def cost_line(runs: int, expected: SweepCost, workers: WorkerCount | None) -> str:
+    """Format the cost of a number of runs, in processes of this machine or (None) elsewhere, as a line."""
+    location = "if they were run here"
+    if workers is not None:
         processes = f"{workers.number} {'process' if workers.number == 1 else 'processes'}"
         location = f"in {processes} ({workers.cores} cores; memory for {workers.memory_limit})"
-    disk = f"at most {cost.disk_bytes / 2**20:.1f} MiB on disk"
-    refused = f"; of {cost.looked_at} that were checked, {cost.refused} will be refused, for example: {cost.example}"
-    return f"{_runs(runs)}: about {format_rough_time(cost.seconds)} {location}, {disk}{refused if cost.refused else ''}"
+    line = f"{_runs(runs)}: about {cost.format_rough_time(expected.seconds)} {location}"
+    line += f", at most {expected.disk_bytes / 2**20:.1f} MiB on disk"
+    if expected.refused:
+        line += f"; of {expected.looked_at} that were checked, {expected.refused} will be refused"
+        line += f", for example: {expected.example}"
+    return line
 
 
 def summary_lines(
@@ -281,18 +245,14 @@ def summary_lines(
             largest, run = max(errors)
             statistics = f"median {median(error for error, _ in errors):.2g}, largest {largest:.2g} (run {run:06})"
             lines.append(f"error, as a fraction of the largest displacement, due to {cause}: {statistics}")
-    lines += _note_examples(outcomes)
-    return [*lines, "without --shard, the same command writes the table" if shard else ", ".join(files), *notes]
-
-
-def _note_examples(outcomes: Sequence[Outcome]) -> Iterator[str]:
-    """Yield an example of the five most frequent warnings, where numbers are ignored."""
+    # An example of the five most frequent warnings, where numbers are ignored.
     groups: dict[str, list[str]] = {}
     for outcome in outcomes:
         for note in outcome.notes:
             groups.setdefault(re.sub(r"[0-9.e+-]+", "", note), []).append(f"run {outcome.run:06}: {note}")
-    for notes in sorted(groups.values(), key=len, reverse=True)[:5]:
-        yield f"{_runs(len(notes))} with a note, for example {notes[0]}"
+    for group in sorted(groups.values(), key=len, reverse=True)[:5]:
+        lines.append(f"{_runs(len(group))} with a note, for example {group[0]}")
+    return [*lines, "without --shard, the same command writes the table" if shard else ", ".join(files), *notes]
 
 
 def _runs(number: int) -> str:
@@ -337,15 +297,13 @@ class WorkerCount(NamedTuple):
 
 def estimate_cost(sweep: Sweep) -> SweepCost:
     """Estimate the cost of a sweep from at most 64 of its runs."""
-    plans: list[Plan] = []
-    errors: list[str] = []
-    for values in sweep.sample_values(64):
+    plans, errors = list[Plan](), list[str]()
+    for values in sweep.values(64):
         try:
             plans.append(plan_file(sweep.scene, sweep.overrides(values)))
         except SceneError as error:
             errors.append(error.lines[0])
-    durations = list(map(cost_module.estimate_duration, plans))
-    budgets = list(map(cost_module.estimate_budget, plans))
+    durations, budgets = list(map(cost.estimate_duration, plans)), list(map(cost.estimate_budget, plans))
     looked_at = len(plans) + len(errors)
     scale, cores = sweep.runs / looked_at, available_threads()
     seconds = sum(duration.seconds - duration.start for duration in durations)
@@ -357,17 +315,14 @@ def estimate_cost(sweep: Sweep) -> SweepCost:
         memory_bytes=PROCESS_BYTES + max((budget.memory_bytes for budget in budgets), default=0),
         looked_at=looked_at,
         refused=len(errors),
-        example=next(iter(errors), ""),
+        example=errors[0] if errors else "",
     )
 
 
-def choose_worker_count(cost: SweepCost, runs: int, requested: int | None = None) -> WorkerCount:
+def choose_worker_count(expected: SweepCost, runs: int, requested: int | None = None) -> WorkerCount:
     """Choose the number of processes: one per core, limited by the free memory and the number of runs.
 
-    Args:
-        cost: of the sweep.
-        runs: number of runs.
-        requested: number chosen by the user, which is not limited.
+    A number that the user has requested is not limited.
     """
-    cores, memory_limit = available_threads(), available_memory() // cost.memory_bytes
+    cores, memory_limit = available_threads(), available_memory() // expected.memory_bytes
     return WorkerCount(requested or max(1, min(cores, memory_limit, runs)), cores, memory_limit)

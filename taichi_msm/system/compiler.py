@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import ast
-import inspect
-import linecache
 import os
 import platform
-import re
 import sys
 import textwrap
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib import import_module
 from pathlib import Path
-from types import FrameType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 
 from taichi_msm.errors import DeviceError, NotInstalledError, did_you_mean
@@ -32,27 +28,17 @@ Patches = list[tuple[Any, str, Any]]
 
 @dataclass(frozen=True)
 class Compiler:
-    """A supported compiler, which may not be installed.
+    """A supported compiler, which may not be installed."""
 
-    Attributes:
-        name: name of its package, also in run.json.
-        title: name in messages.
-        prefix: prefix of its environment variables.
-        cache: directory of compiled kernels, relative to the home directory.
-        lock: lock file of the cache, relative to that directory.
-        tested_version: version whose results on a CPU have the same bits as those of the other compiler.
-        python_versions: python versions for which it can be installed.
-        poll_s: time to poll a counter that another thread writes [s], measured on Zen 4; Taichi fences the read by
-            `mfence`, Quadrants by a locked `or`.
-    """
-
-    name: str
-    title: str
-    prefix: str
-    cache: str
-    lock: str
-    tested_version: str
-    python_versions: str
+    name: str  # name of its package, also in run.json
+    title: str  # name in messages
+    prefix: str  # prefix of its environment variables
+    cache: str  # directory of compiled kernels, relative to the home directory
+    lock: str  # lock file of the cache, relative to that directory
+    tested_version: str  # version whose results on a CPU have the same bits as those of the other compiler
+    python_versions: str  # python versions for which it can be installed
+    # Time to poll a counter that another thread writes [s], measured on Zen 4; Taichi fences the read by `mfence`,
+    # Quadrants by a locked `or`.
     poll_s: float
 
     @property
@@ -76,11 +62,7 @@ class Compiler:
         return f"{self.prefix}_OFFLINE_CACHE_FILE_PATH"
 
     def folder(self) -> Path:
-        """Return the directory of compiled kernels.
-
-        Raises:
-            RuntimeError: when there is no home directory.
-        """
+        """Return the directory of compiled kernels."""
         return Path(os.environ.get(self.folder_variable) or Path.home() / self.cache)
 
     def load(self) -> Any:
@@ -102,12 +84,7 @@ class Compiler:
         before = os.environ.get(level)
         os.environ[level] = "error"
         try:
-            with _fast_frames():
-                package = import_module(self.name)
-            if self.name == "taichi" and self.version == self.tested_version:
-                decorators: Any = import_module("taichi.lang.kernel_impl")
-                decorators._inside_class = _is_in_class
-            return package
+            return import_module(self.name)
         except ImportError as error:
             raise NotInstalledError(f"{self.title} cannot be imported: {error}; {self.remedy}") from error
         finally:
@@ -156,58 +133,29 @@ class Compiler:
         ]
 
 
-# Taichi's decorators look at the line around them, to find out whether it begins a class. `inspect.getframeinfo` also
-# searches all modules for it, which takes a third of Taichi's import.
-
-
-def _frame_info(frame: FrameType, context: int = 1) -> inspect.Traceback:  # noqa: ARG001
-    file, line = frame.f_code.co_filename, frame.f_lineno
-    return inspect.Traceback(file, line, frame.f_code.co_name, [linecache.getline(file, line)], 0)
-
-
-@contextmanager
-def _fast_frames() -> Iterator[None]:
-    """Replace `inspect.getframeinfo` within the block."""
-    original = inspect.getframeinfo
-    inspect.getframeinfo = _frame_info  # type: ignore[assignment]
-    try:
-        yield
-    finally:
-        inspect.getframeinfo = original
-
-
-def _is_in_class(level_of_class_stackframe: int) -> bool:
-    """Return whether the line of a frame of the stack begins a class, as Taichi's function does."""
-    try:
-        (line,) = _frame_info(sys._getframe(level_of_class_stackframe)).code_context or [""]
-    except ValueError:
-        return False
-    return re.match(r"\s*(class |@(\w+\.)?data_oriented)", line) is not None
-
-
-_TAICHI = Compiler(
-    name="taichi",
-    title="Taichi",
-    prefix="TI",
-    cache=".cache/taichi/ticache",
-    lock="ticache.lock",
-    tested_version="1.7.4",
-    python_versions="Python 3.10 to 3.13",
-    poll_s=33e-9,
-)
-_QUADRANTS = Compiler(
-    name="quadrants",
-    title="Quadrants",
-    prefix="QD",
-    cache=".cache/quadrants/qdcache",
-    lock="kernel_compilation_manager/qdcache.lock",
-    tested_version="1.4.0",
-    python_versions="Python 3.12 to 3.14",
-    poll_s=3.4e-9,
-)
-
 # Supported compilers, in the order of preference.
-COMPILERS = {compiler.name: compiler for compiler in (_TAICHI, _QUADRANTS)}
+COMPILERS = {
+    "taichi": Compiler(
+        name="taichi",
+        title="Taichi",
+        prefix="TI",
+        cache=".cache/taichi/ticache",
+        lock="ticache.lock",
+        tested_version="1.7.4",
+        python_versions="Python 3.10 to 3.13",
+        poll_s=33e-9,
+    ),
+    "quadrants": Compiler(
+        name="quadrants",
+        title="Quadrants",
+        prefix="QD",
+        cache=".cache/quadrants/qdcache",
+        lock="kernel_compilation_manager/qdcache.lock",
+        tested_version="1.4.0",
+        python_versions="Python 3.12 to 3.14",
+        poll_s=3.4e-9,
+    ),
+}
 
 
 @cache

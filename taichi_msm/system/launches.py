@@ -33,7 +33,7 @@ PROOF_ROUNDS = 2
 class Launches:
     """Launches of the kernels of one picture or of one tracking query, with their device arrays.
 
-    Attributes:
+    Args:
         bounded: whether loops are bounded and finished indices are counted, as on a GPU. Otherwise every kernel is one
             launch, and arrays are NumPy arrays.
     """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import errno
 import os
@@ -27,6 +28,9 @@ from taichi_msm.system.process import discarded_output
 
 ti = active_compiler().load()
 
+# The destructor of arrays that exist at exit would raise, as Taichi's modules are gone; their memory ends anyway.
+atexit.register(setattr, ti.lang._ndarray.ScalarNdarray, "__del__", lambda array: None)
+
 _core: Any = getattr(np, "_core", None) or np.core  # NumPy 2, or 1
 _features: dict[str, bool] = _core._multiarray_umath.__cpu_features__
 
@@ -38,26 +42,17 @@ MAX_THREADS = 1024
 # Address space that Taichi needs: it reserves 1 GiB, and its libraries need nearly the same amount.
 MIN_ADDRESS_SPACE_BYTES = 1900 << 20
 
-# The name of the GPU in Taichi's log.
-GPU_NAME_PATTERN = re.compile(r'Vulkan Device "(.+)" supports|CUDA device \[id=\d+\]: (.+)')
-
 # Smallest number of iterations of a parallel loop in a CPU thread, from make_cpu_multithreaded_range_for.cpp.
 ITERATIONS_PER_THREAD = 512
 
 
 @dataclass(frozen=True)
 class Device:
-    """Device on which kernels run.
+    """Device on which kernels run."""
 
-    Attributes:
-        arch: cpu, cuda or vulkan.
-        threads: number of CPU threads.
-        name: name of the processor or the GPU; empty if unknown.
-    """
-
-    arch: str
-    threads: int
-    name: str = field(default="", compare=False)
+    arch: str  # cpu, cuda or vulkan
+    threads: int  # number of CPU threads
+    name: str = field(default="", compare=False)  # name of the processor or the GPU; empty if unknown
 
 
 class Memory:
@@ -88,12 +83,7 @@ class Memory:
 
 
 def write_vectors(array: Any, values: NDArray[Any]) -> None:
-    """Write the first entries of an array of vectors, and set the remaining entries to zero.
-
-    Args:
-        array: vectors with `lanes` components.
-        values: shape (entries, lanes).
-    """
+    """Write vectors, shape (entries, lanes), to the first entries of an array, and zeros to the remaining ones."""
     real = np.float32 if array.dtype == ti.f32 else np.float64
     array.from_numpy(np.pad(values.astype(real), ((0, array.shape[0] - len(values)), (0, 0))))
 
@@ -143,6 +133,7 @@ def start(arch: str = "cpu", threads: int | None = None) -> Device:
         DeviceError: when the arch is not supported or not available, or Taichi already runs on another device.
         MsmError: as `require_start_thread`.
     """
+    global _device, _start_thread
     if threads is not None and not (type(threads) is int and 1 <= threads <= MAX_THREADS):
         raise ArgumentError(f"threads: {threads!r}; take a whole number, 1 to {MAX_THREADS}, or None for every core")
     if arch not in ARCHS:
@@ -150,21 +141,15 @@ def start(arch: str = "cpu", threads: int | None = None) -> Device:
         raise DeviceError(f"--arch {arch}: not supported; take one of: {', '.join(ARCHS)}{near}")
     wanted = Device(arch, process_module.available_threads() if threads is None else threads)
     with _starting:
-        return _start(wanted)
-
-
-def _start(wanted: Device) -> Device:
-    global _device, _start_thread
-    if _device is None:
-        _device = replace(wanted, name=_initialise(wanted))
-        _start_thread = os.getpid(), threading.get_ident()
-    require_start_thread()
-    if wanted != _device:
-        raise DeviceError(
-            f"{active_compiler().title} already runs on {_device.arch} with {_device.threads} threads in this process; "
-            f"start another process for {wanted.arch} with {wanted.threads}"
-        )
-    return _device
+        if _device is None:
+            _device = replace(wanted, name=_initialise(wanted))
+            _start_thread = os.getpid(), threading.get_ident()
+        require_start_thread()
+        if wanted != _device:
+            running = f"already runs on {_device.arch} with {_device.threads} threads in this process"
+            remedy = f"start another process for {wanted.arch} with {wanted.threads}"
+            raise DeviceError(f"{active_compiler().title} {running}; {remedy}")
+        return _device
 
 
 def stop() -> None:
@@ -214,7 +199,6 @@ def compilation_options(*, optimised: bool = True) -> contextlib.AbstractContext
 
 @contextlib.contextmanager
 def _patched(patches: Patches) -> Iterator[None]:
-    """Patch attributes of objects within the block."""
     originals = [(owner, name, getattr(owner, name)) for owner, name, _ in patches]
     for owner, name, value in patches:
         setattr(owner, name, value)
@@ -226,7 +210,6 @@ def _patched(patches: Patches) -> Iterator[None]:
 
 
 def _cache() -> dict[str, Any]:
-    """Return Taichi's options for the cache of compiled kernels."""
     try:
         folder = active_compiler().folder()
         folder.mkdir(parents=True, exist_ok=True)
@@ -251,7 +234,6 @@ def _cache() -> dict[str, Any]:
 
 
 def _require_address_space() -> None:
-    """Check that the limit on address space permits the start of Taichi."""
     try:
         import resource
     except ImportError:  # Windows
@@ -265,17 +247,12 @@ def _require_address_space() -> None:
 
 
 def _threads() -> list[int]:
-    """Return the ids of the threads of this process, mostly in the order of their start; empty if unknown."""
-    with contextlib.suppress(OSError):
-        return sorted(int(task.name) for task in Path("/proc/self/task").iterdir())
-    return []
+    """Return the ids of the threads of this process, mostly in the order of their start; empty without /proc."""
+    return sorted(int(task.name) for task in Path("/proc/self/task").glob("*"))
 
 
 def _pin(pool: list[int]) -> None:
-    """Pin every thread of Taichi's pool to a core, if the pool has one thread per available core.
-
-    Without pinning, two threads may share a core for about 10 ms, while one of them spins and waits for the other.
-    """
+    """Pin the threads of Taichi's pool to a core each, if it has one per core; shared ones spin and wait for 10 ms."""
     if hasattr(os, "sched_setaffinity") and len(pool) == len(os.sched_getaffinity(0)):
         for thread, core in zip(pool, sorted(os.sched_getaffinity(0)), strict=True):
             with contextlib.suppress(OSError):
@@ -289,19 +266,16 @@ def _isolated_environment() -> Iterator[None]:
     stdout itself is not redirected, because other threads may print meanwhile.
     """
     prefix, namespace = f"{active_compiler().prefix}_", vars(ti.lang.misc)
-    hidden = {name: os.environ.pop(name) for name in list(os.environ) if _overrides(name.removeprefix(prefix), name)}
+    # Directories and the choice of a GPU are no arguments.
+    kept = tuple(prefix + name for name in ("OFFLINE_CACHE_FILE_PATH", "VISIBLE_DEVICE", "LIB_DIR", "SKIP_"))
+    names = [name for name in os.environ if name.startswith(prefix) and not name.startswith(kept)]
+    hidden = {name: os.environ.pop(name) for name in names}
     namespace["print"] = lambda *_: None
     try:
         yield
     finally:
         del namespace["print"]
         os.environ.update(hidden)
-
-
-def _overrides(setting: str, name: str) -> bool:
-    """Return whether an environment variable overrides an argument of `ti.init`; directories and the GPU do not."""
-    kept = "OFFLINE_CACHE_FILE_PATH", "VISIBLE_DEVICE", "LIB_DIR", "SKIP_"
-    return setting != name and not setting.startswith(kept)
 
 
 def _initialise(device: Device) -> str:
@@ -324,7 +298,7 @@ def _initialise(device: Device) -> str:
                     log_level=ti.ERROR if on_cpu else ti.TRACE,
                 )
                 ti.set_logging_level(ti.ERROR)
-            gpu_name = GPU_NAME_PATTERN.search(log.read())
+            gpu_name = re.search(r'Vulkan Device "(.+)" supports|CUDA device \[id=\d+\]: (.+)', log.read())
     except Exception as error:
         remedy = f"{active_compiler().title} says: {' '.join(str(error).split())}" if on_cpu else "take --arch cpu"
         raise DeviceError(f"--arch {device.arch}: not available on this machine; {remedy}") from error

@@ -37,12 +37,7 @@ TERMS: tuple[type[Term], ...] = (
 
 
 def derive_material(scene: Scene, maps: Maps) -> Material:
-    """Derive the coefficients of the sheet of a scene.
-
-    Args:
-        scene: a scene without `material_key_problems`.
-        maps: images of its stiffness maps, by key; missing keys are ignored.
-    """
+    """Derive the coefficients of a scene without `material_key_problems`; missing images of `maps` are ignored."""
     (dx, dy), mass = spacing(scene.sheet), scene.sheet.mass
     readable = {key: (keys, maps[key], scene.sheet) for key, keys in scene.maps.items() if key in maps}
     if scene.tissue is not None:

@@ -83,16 +83,7 @@ class Term(ABC):
         return len(self.memory)
 
     def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
-        """Compute the term's columns of the load table.
-
-        Args:
-            plan: the plan.
-            loads: loads of consecutive steps.
-            first: number of the first step.
-
-        Returns:
-            Columns, shape (steps, column_count).
-        """
+        """Compute the term's columns of the load table from step `first` on, shape (steps, column_count)."""
         return np.empty((len(loads.active), 0))
 
     def fields(self, plan: Plan) -> NDArray[Any]:
@@ -100,15 +91,7 @@ class Term(ABC):
         return np.zeros((self.field_count, *plan.scene.sheet.points))
 
     def energy(self, sums: NDArray[Any], plan: Plan) -> float:
-        """Compute twice the term's energy.
-
-        Args:
-            sums: the term's measures, reduced over the sheet, shape (measures,).
-            plan: the plan.
-
-        Returns:
-            Twice the energy [J].
-        """
+        """Compute twice the term's energy [J] from its measures, reduced over the sheet."""
         return 0.0
 
     def build_forces(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
@@ -145,11 +128,8 @@ class Term(ABC):
     def mark_update(self, columns: NDArray[Any]) -> bool:
         """Mark the columns of a frame at rest, if the term changes its memory once the frame is in equilibrium.
 
-        Args:
-            columns: row of the load table, from the first column of the term on.
-
-        Returns:
-            Whether the term changes its memory in the next evaluation of the forces.
+        `columns` is a row of the load table, from the first column of the term on. Returns whether the term changes its
+        memory in the next evaluation of the forces.
         """
         return False
 

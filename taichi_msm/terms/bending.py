@@ -41,7 +41,6 @@ class BendingTerm(Term):
 
     @classmethod
     def from_plan(cls, plan: Plan) -> Self | None:
-        """Return the term's configuration; None without bending stiffness."""
         return cls() if plan.material.bending > 0 else None
 
     @staticmethod
@@ -51,11 +50,9 @@ class BendingTerm(Term):
         return material.bending * (4 / dx**2 + 4 / dy**2) ** 2
 
     def constants(self, plan: Plan) -> tuple[float, ...]:
-        """Return D dx dy [N m3]."""
         return (plan.material.bending,)
 
     def energy(self, sums: NDArray[Any], plan: Plan) -> float:
-        """Compute twice the energy [J], see `Term.energy`."""
         return plan.material.bending * float(sums[0])
 
     def build_store_moment(self, config: KernelConfig) -> Callable[..., None]:
@@ -79,7 +76,6 @@ class BendingTerm(Term):
         return store_moment
 
     def build_forces(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
-        """Build the function that adds -Laplacian(M)."""
         ti = config.ti
         laplacian = build_laplacian(config)
 
@@ -95,11 +91,9 @@ class BendingTerm(Term):
         return (add,)
 
     def build_tangents(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
-        """Return `build_forces`, because the force is linear in the displacements."""
         return self.build_forces(config)
 
     def build_measures(self, config: KernelConfig) -> Sequence[Callable[..., None]]:
-        """Build the function that sums the squared Laplacian, which is 0 at edges."""
         ti = config.ti
         real, vector, first = config.real, config.vector, config.first_measure(BendingTerm)
         laplacian = build_laplacian(config)

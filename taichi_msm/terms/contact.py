@@ -12,6 +12,12 @@ A grip holds the mass points that are within 1.5 radii of the tip's centre when 
 clamp, a tool of radius 0, holds its mass points from the start: u = c. In a step, a correction has the effect of the
 force m (1 + g h / 2) / h^2 times the correction (see `damping`). The sum of all corrections therefore yields the force
 of the tool.
+
+At rest a tool can push a mass point that touches it but cannot pull it. Of the force F on the mass point, the tool
+therefore carries the part into the shape, min(F . n, 0) n; the remainder, tangential or outward, must vanish in
+equilibrium. The normals n are stored in the fields of corrections and are 0 where a mass point touches no tool. Held
+mass points, also those that stick to a rough tool, move with their tool, which carries their whole force. A mass point
+may touch several tools: their contact forces and corrections are found by projected Gauss-Seidel iteration.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -30,6 +36,7 @@ from taichi_msm.model.loads import Schedule
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.tools import GRIP_RADII, Clamp
 from taichi_msm.scene.section import FRAME_TOLERANCE
+from taichi_msm.shapes import SHAPES
 from taichi_msm.shapes.shape import MIN_DISTANCE_M
 from taichi_msm.terms.base import (
     DY,
@@ -42,28 +49,21 @@ from taichi_msm.terms.base import (
     Term,
     build_max_lane,
 )
-from taichi_msm.terms.contact_layout import (
-    AXIS,
-    COLUMNS,
-    CORRECTIONS,
-    FRICTION,
-    GRIP_BEGINS,
-    GRIP_CONTINUES,
-    GRIP_SHIFT,
-    GRIP_STATE,
-    HOLD_DISPLACEMENT,
-    HOLDER,
-    INVERSE_AXIS,
-    LENGTH,
-    RADIUS,
-    TIP_AFTER,
-    TIP_BEFORE,
-    TOOL_COLUMNS,
-    WEIGHT,
-    ContactLayout,
-    build_penetration,
-)
-from taichi_msm.terms.contact_rest import build_project_out, build_remove_contact
+
+# Columns of the load table. For all tools: the weight of the step's corrections. For each tool: the tip's centre after
+# and before the step; the state of its grip, and the tool's displacement since the grip began; axis, length, radius and
+# friction; the inverse y and z components of the axis.
+WEIGHT, COLUMNS = 0, 1
+TIP_AFTER, TIP_BEFORE, GRIP_STATE, GRIP_SHIFT, AXIS = 0, 3, 6, 7, 10
+LENGTH, RADIUS, FRICTION, INVERSE_AXIS, TOOL_COLUMNS = 13, 14, 15, 16, 18
+
+# States of a grip in a step.
+GRIP_IDLE, GRIP_BEGINS, GRIP_CONTINUES = 0.0, 1.0, 2.0
+
+# Fields: for every tool the three components of the summed corrections; with grips, the index of the tool that holds a
+# mass point plus 1, and the displacement of the mass point when the grip began. Of mass points that stick to a rough
+# tool (`contact_rest`) the index is larger by the number of tools, and the displacement is that relative to the tool.
+CORRECTIONS, HOLDER, HOLD_DISPLACEMENT = 3, 0, 1
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,6 @@ class ContactTerm(Term):
 
     @classmethod
     def from_plan(cls, plan: Plan) -> Self | None:
-        """Return the term's configuration; None without position-controlled tools."""
         tools = plan.tools
         grips = any(tool.grips or tool.rough or isinstance(tool, Clamp) for tool in tools)
         shapes = tuple(tool.shape.name for tool in tools)
@@ -84,12 +83,10 @@ class ContactTerm(Term):
 
     @property
     def memory(self) -> tuple[str, ...]:
-        """The corrections of every tool, and with grips the held mass points."""
         names = tuple(f"correction {tool} {axis}" for tool in range(len(self.shapes)) for axis in "xyz")
         return (*names, "holder", *(f"held {axis}" for axis in "xyz")) if self.grips else names
 
     def fields(self, plan: Plan) -> NDArray[Any]:
-        """Return the initial values of the fields, in which clamps hold their mass points."""
         fields = super().fields(plan)
         for n, tool in enumerate(plan.tools):
             if isinstance(tool, Clamp):
@@ -98,11 +95,9 @@ class ContactTerm(Term):
 
     @property
     def column_count(self) -> int:
-        """Number of columns: the weight, and the columns of each tool."""
         return COLUMNS + TOOL_COLUMNS * len(self.shapes)
 
     def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
-        """Compute the positions of the tools before and after every step and the states of their grips."""
         grid, steps = plan.grid, first + np.arange(len(loads.active) + 1)
         t, frame = steps / grid.steps_per_second, 1 / grid.frames_per_second
         _, gain, first_gain = verlet.coefficients(plan)
@@ -130,7 +125,6 @@ class ContactTerm(Term):
         return columns
 
     def supports(self, compiled: Self) -> str:
-        """Return the reason why kernels compiled for other tools do not support these tools."""
         if self.shapes != compiled.shapes:
             return "the shape of an instrument cannot change; restart with the new scene"
         friction = zip(self.has_friction, compiled.has_friction, strict=True)
@@ -142,28 +136,22 @@ class ContactTerm(Term):
         )
 
     def build_correction(self, config: KernelConfig) -> Correction:
-        """Build the functions that project mass points out of the tools, and move held ones, after a step."""
         return Correction(self._build_reaches(config), self._build_resolve(config))
 
     def build_rest_correction(self, config: KernelConfig) -> RestCorrection:
-        """Build the functions that remove the forces carried by tools, and project mass points out of them."""
-        layout = self.layout(config)
-        return RestCorrection(build_remove_contact(config, layout), build_project_out(config, layout))
+        return RestCorrection(self._build_remove(config), self._build_project(config))
 
-    def layout(self, config: KernelConfig) -> ContactLayout:
-        """Return the columns and fields of the term."""
-        first_field, first_column = config.first_field(ContactTerm), config.first_column(ContactTerm)
-        return ContactLayout(self.shapes, self.has_friction, self.grips, first_field, first_column)
+    def _places(self, config: KernelConfig) -> tuple[int, int, list[int]]:
+        """Return the indices of the first field, of the first field of grips, and of the first column of each tool."""
+        field, column = config.first_field(ContactTerm), config.first_column(ContactTerm) + COLUMNS
+        tools = len(self.shapes)
+        return field, field + CORRECTIONS * tools, [column + TOOL_COLUMNS * tool for tool in range(tools)]
 
     def _build_reaches(self, config: KernelConfig) -> Callable[..., Any]:
-        """Build the Taichi function reaches(sheet, i, low, high, now).
-
-        It returns whether a tool may touch or hold mass points of row `i`. In it `low` and `high` bound the
-        displacements of the row along y and z, two numbers each, and `now` is a row of the load table.
-        """
         ti, real, vector, tools, grips = config.ti, config.real, config.vector, len(self.shapes), self.grips
         max_lane = build_max_lane(config)
-        bases, holding = self.layout(config).bases, self.layout(config).grip_field + HOLDER
+        _, grip_field, bases = self._places(config)
+        holding = grip_field + HOLDER
 
         @ti.func
         def cut(low, high, begin, end, start, inverse):
@@ -198,21 +186,10 @@ class ContactTerm(Term):
         return reaches
 
     def _build_resolve(self, config: KernelConfig) -> Callable[..., None]:
-        """Build the Taichi function resolve(sheet, i, kind, at, b, now), which corrects entry b of row i.
-
-        It is called after the step of the row. In it `kind` is that of a `KernelRow`, `at` the row of u, and `now` a
-        row of the load table.
-        """
-        ti, vector, tools, has_friction, grips = (
-            config.ti,
-            config.vector,
-            len(self.shapes),
-            self.has_friction,
-            self.grips,
-        )
-        layout, penetrations = self.layout(config), [build_penetration(config, shape) for shape in self.shapes]
-        first_field, first, grip_field, base = layout.first_field, layout.first_column, layout.grip_field, layout.bases
-        max_lane = build_max_lane(config)
+        ti, vector, tools, has_friction = config.ti, config.vector, len(self.shapes), self.has_friction
+        (first_field, grip_field, base), grips = self._places(config), self.grips
+        weight, max_lane = config.first_column(ContactTerm) + WEIGHT, build_max_lane(config)
+        penetrations = [_build_penetration(config, shape) for shape in self.shapes]
 
         @ti.func
         def resolve(sheet: ti.template(), i, kind, at, b, now: ti.template()):
@@ -284,6 +261,99 @@ class ContactTerm(Term):
                         sheet.u[c][entry], sheet.d[c][point] = u[c], d[c]
                         index = (first_field + CORRECTIONS * tool + c) * rows * sheet.width + point
                         # `+=` would be atomic, which does not compile for vectors.
-                        sheet.fields[index] = sheet.fields[index] + correction[c] * now[first + WEIGHT]
+                        sheet.fields[index] = sheet.fields[index] + correction[c] * now[weight]
 
         return resolve
+
+    def _build_remove(self, config: KernelConfig) -> Callable[..., None]:
+        ti, vector, tools, grips = config.ti, config.vector, len(self.shapes), self.grips
+        first_field, grip_field, _ = self._places(config)
+        holding, iterations = grip_field + HOLDER, self._iterations
+
+        @ti.func
+        def remove(force: ti.template(), sheet: ti.template(), at):
+            field = sheet.rows * sheet.width
+            carried = [vector(0) for _ in ti.static(range(tools))]
+            for _ in range(iterations):
+                for tool in ti.static(range(tools)):
+                    normal = [
+                        sheet.fields[(first_field + CORRECTIONS * tool + c) * field + at] for c in ti.static(range(3))
+                    ]
+                    along = force[0] * normal[0] + force[1] * normal[1] + force[2] * normal[2]
+                    total = ti.max(carried[tool] - along, 0)
+                    change = total - carried[tool]
+                    carried[tool] = total
+                    for c in ti.static(range(3)):
+                        force[c] += change * normal[c]
+            if ti.static(grips):
+                for c in ti.static(range(3)):
+                    force[c] = ti.select(sheet.fields[holding * field + at] > 0, vector(0), force[c])
+
+        return remove
+
+    def _build_project(self, config: KernelConfig) -> Callable[..., None]:
+        """Build the function that projects mass points and their momenta out of the tools, and moves held ones."""
+        ti, vector, tools, grips = config.ti, config.vector, len(self.shapes), self.grips
+        (first_field, grip_field, base), iterations = self._places(config), self._iterations
+        penetrations = [_build_penetration(config, shape) for shape in self.shapes]
+        # Holders, and the columns with the shift of their mass points: of grips, and of rough tools.
+        holders = [(tool + 1, base[tool] + GRIP_SHIFT) for tool in range(tools)]
+        holders += [(tools + tool + 1, base[tool] + TIP_AFTER) for tool in range(tools) if self.has_friction[tool]]
+
+        @ti.func
+        def project(sheet: ti.template(), i, kind, b, now: ti.template()):
+            field, at = sheet.rows * sheet.width, i * sheet.width + b
+            rest = [
+                sheet.by_column[REST_X * sheet.width + b],
+                vector(sheet.constants[TOP_Y] - i * sheet.constants[DY]),
+                vector(0),
+            ]
+            u, q = [sheet.u[c][at] for c in ti.static(range(3))], [sheet.q[c][at] for c in ti.static(range(3))]
+            free = ti.select(sheet.by_column[(MOBILITY + kind) * sheet.width + b] > 0, vector(1), vector(0))
+            if ti.static(grips):
+                held = sheet.fields[(grip_field + HOLDER) * field + at]
+                for holder, shift in ti.static(holders):
+                    for c in ti.static(range(3)):
+                        target = sheet.fields[(grip_field + HOLD_DISPLACEMENT + c) * field + at] + now[shift + c]
+                        u[c] = ti.select(held == holder, target, u[c])
+                        q[c] = ti.select(held == holder, vector(0), q[c])
+                free = ti.select(held > 0, vector(0), free)
+            for tool in ti.static(range(tools)):
+                for c in ti.static(range(3)):
+                    sheet.fields[(first_field + CORRECTIONS * tool + c) * field + at] = vector(0)
+            for _ in range(iterations):
+                for tool in ti.static(range(tools)):
+                    depth, x, y, z = penetrations[tool](rest, u, now, base[tool])
+                    normal = [x, y, z]
+                    touches = ti.select(depth > 0, free, vector(0))
+                    inward = ti.min(q[0] * x + q[1] * y + q[2] * z, 0) * touches
+                    for c in ti.static(range(3)):
+                        u[c] += touches * depth * normal[c]
+                        q[c] = q[c] - inward * normal[c]
+                        index = (first_field + CORRECTIONS * tool + c) * field + at
+                        sheet.fields[index] = ti.select(touches > 0, normal[c], sheet.fields[index])
+            for c in ti.static(range(3)):
+                sheet.u[c][at] = u[c]
+                sheet.q[c][at] = q[c]
+
+        return project
+
+    @property
+    def _iterations(self) -> int:
+        return 8 if len(self.shapes) > 1 else 1
+
+
+def _build_penetration(config: KernelConfig, shape: str) -> Callable[..., Any]:
+    """Build penetration(rest, u, now, base), the depth in a tool with first column `base`, and the outward normal."""
+    ti = config.ti
+    depth = ti.func(SHAPES[shape].build_depth(config.operations))
+
+    @ti.func
+    def penetration(rest: ti.template(), u: ti.template(), now: ti.template(), base: ti.template()):
+        r = [rest[c] - now[base + TIP_AFTER + c] + u[c] for c in ti.static(range(3))]
+        return depth(
+            r[0], r[1], r[2], now[base + AXIS], now[base + AXIS + 1], now[base + AXIS + 2], now[base + LENGTH],
+            now[base + RADIUS],
+        )  # fmt: skip
+
+    return penetration

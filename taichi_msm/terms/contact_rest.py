@@ -1,141 +1,47 @@
-"""Contact in quasi-static equilibrium: contact forces of tools, and projection of mass points out of their shapes.
+"""Contact in quasi-static equilibrium: tools between two shapes, the beginning and end of grips, and rough tools.
 
-A tool can push a mass point that touches it but cannot pull it. Of the force F on the mass point, the tool therefore
-carries the part into the shape, min(F . n, 0) n; the remainder, tangential or outward, must vanish in equilibrium.
-The normals n are stored in the fields of corrections and are 0 where a mass point touches no tool. Held mass points,
-also those that stick to a rough tool, move with their tool, which carries their whole force.
+Scene: `friction: rough`. Between two shapes tools and mass points move along straight lines. A mass point with the
+displacement u' that a rough tool reaches when its tip is at c' sticks to it: with the tip at c, u = u' + c - c'. It is
+held as by a grip until the tool would pull it, that is, until the sum F of all other forces on it points out of the
+tool, F . n > 0.
 
-A mass point may touch several tools. Their contact forces and corrections are then found by projected Gauss-Seidel
-iteration.
+In all functions `memory` is that of the term, shape (numbers, rows, cols), and displacements x - X [m] and forces [N]
+have the shape (rows, cols, 3).
 """
 
-# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
+from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.arithmetic import NUMPY
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.tools import GRIP_RADII, Clamp, Tool, grip_frames
-from taichi_msm.terms.base import DY, MOBILITY, REST_X, TOP_Y, KernelConfig
-from taichi_msm.terms.contact_layout import (
+from taichi_msm.terms.contact import (
     COLUMNS,
     CORRECTIONS,
     GRIP_SHIFT,
     HOLD_DISPLACEMENT,
     HOLDER,
+    RADIUS,
     TIP_AFTER,
     TOOL_COLUMNS,
-    ContactLayout,
-    build_penetration,
 )
 
 Array = NDArray[np.float64]
 
+# A mass point within this share of the radius above the surface of a tool touches it.
+TOUCH_TOLERANCE = 1e-9
 
-def build_remove_contact(config: KernelConfig, layout: ContactLayout) -> Callable[..., None]:
-    """Build the Taichi function remove_contact(force, sheet, at), which removes contact forces at an entry."""
-    ti, vector, tools, grips, first_field = (
-        config.ti,
-        config.vector,
-        len(layout.shapes),
-        layout.grips,
-        layout.first_field,
-    )
-    holding, iterations = layout.grip_field + HOLDER, _iterations(tools)
-
-    @ti.func
-    def remove_contact(force: ti.template(), sheet: ti.template(), at):
-        field = sheet.rows * sheet.width
-        carried = [vector(0) for _ in ti.static(range(tools))]
-        for _ in range(iterations):
-            for tool in ti.static(range(tools)):
-                normal = [
-                    sheet.fields[(first_field + CORRECTIONS * tool + c) * field + at] for c in ti.static(range(3))
-                ]
-                along = force[0] * normal[0] + force[1] * normal[1] + force[2] * normal[2]
-                total = ti.max(carried[tool] - along, 0)
-                change = total - carried[tool]
-                carried[tool] = total
-                for c in ti.static(range(3)):
-                    force[c] += change * normal[c]
-        if ti.static(grips):
-            for c in ti.static(range(3)):
-                force[c] = ti.select(sheet.fields[holding * field + at] > 0, vector(0), force[c])
-
-    return remove_contact
-
-
-def build_project_out(config: KernelConfig, layout: ContactLayout) -> Callable[..., None]:
-    """Build the Taichi function project_out(sheet, i, kind, b, now) for entry b of row i of a `RestSheet`.
-
-    It projects mass points out of the tools, removes their momentum into the tools, and moves held mass points with
-    their tool.
-    """
-    ti, vector, tools, grips = config.ti, config.vector, len(layout.shapes), layout.grips
-    first_field, grip_field, base = layout.first_field, layout.grip_field, layout.bases
-    penetrations = [build_penetration(config, shape) for shape in layout.shapes]
-    iterations = _iterations(tools)
-    # Holders, and the columns with the shift of their mass points: of grips, and of rough tools.
-    holders = [(tool + 1, base[tool] + GRIP_SHIFT) for tool in range(tools)]
-    holders += [(tools + tool + 1, base[tool] + TIP_AFTER) for tool in range(tools) if layout.has_friction[tool]]
-
-    @ti.func
-    def project_out(sheet: ti.template(), i, kind, b, now: ti.template()):
-        field, at = sheet.rows * sheet.width, i * sheet.width + b
-        rest = [
-            sheet.by_column[REST_X * sheet.width + b],
-            vector(sheet.constants[TOP_Y] - i * sheet.constants[DY]),
-            vector(0),
-        ]
-        u, q = [sheet.u[c][at] for c in ti.static(range(3))], [sheet.q[c][at] for c in ti.static(range(3))]
-        free = ti.select(sheet.by_column[(MOBILITY + kind) * sheet.width + b] > 0, vector(1), vector(0))
-        if ti.static(grips):
-            held = sheet.fields[(grip_field + HOLDER) * field + at]
-            for holder, shift in ti.static(holders):
-                for c in ti.static(range(3)):
-                    target = sheet.fields[(grip_field + HOLD_DISPLACEMENT + c) * field + at] + now[shift + c]
-                    u[c] = ti.select(held == holder, target, u[c])
-                    q[c] = ti.select(held == holder, vector(0), q[c])
-            free = ti.select(held > 0, vector(0), free)
-        for tool in ti.static(range(tools)):
-            for c in ti.static(range(3)):
-                sheet.fields[(first_field + CORRECTIONS * tool + c) * field + at] = vector(0)
-        for _ in range(iterations):
-            for tool in ti.static(range(tools)):
-                depth, x, y, z = penetrations[tool](rest, u, now, base[tool])
-                normal = [x, y, z]
-                touches = ti.select(depth > 0, free, vector(0))
-                inward = ti.min(q[0] * x + q[1] * y + q[2] * z, 0) * touches
-                for c in ti.static(range(3)):
-                    u[c] += touches * depth * normal[c]
-                    q[c] = q[c] - inward * normal[c]
-                    index = (first_field + CORRECTIONS * tool + c) * field + at
-                    sheet.fields[index] = ti.select(touches > 0, normal[c], sheet.fields[index])
-        for c in ti.static(range(3)):
-            sheet.u[c][at] = u[c]
-            sheet.q[c][at] = q[c]
-
-    return project_out
-
-
-def _iterations(tools: int) -> int:
-    """Return the number of Gauss-Seidel iterations."""
-    return 8 if tools > 1 else 1
+# Mass points are released together if the pulls on them exceed this share of the largest pull.
+RELEASE_SHARE = 0.5
 
 
 def touched_points(tools: int, memory: Array) -> NDArray[np.bool_]:
-    """Return whether each tool touches or holds each mass point.
-
-    Args:
-        tools: number of tools.
-        memory: memory of the term, shape (numbers, rows, cols).
-
-    Returns:
-        Shape (tools, rows, cols).
-    """
+    """Return whether each of a number of tools touches or holds each mass point, shape (tools, rows, cols)."""
     normals = memory[: CORRECTIONS * tools].reshape(tools, CORRECTIONS, *memory.shape[1:])
     touched = (normals != 0).any(axis=1)
     if len(memory) > CORRECTIONS * tools:
@@ -144,8 +50,8 @@ def touched_points(tools: int, memory: Array) -> NDArray[np.bool_]:
     return np.asarray(touched)
 
 
-def grips(tools: Sequence[Tool], memory: Array) -> bool:
-    """Return whether the tip of any tool holds a mass point; see `touched_points`."""
+def is_gripping(tools: Sequence[Tool], memory: Array) -> bool:
+    """Return whether the tip of any tool holds a mass point."""
     touching = [n + 1 for n, tool in enumerate(tools) if not isinstance(tool, Clamp)]
     begin = CORRECTIONS * len(tools) + HOLDER
     return bool(np.isin(memory[begin : begin + 1], touching).any())
@@ -164,14 +70,7 @@ def set_tools(plan: Plan, frame: int, time: float, columns: Array) -> None:
 
 
 def memory_after_grips(plan: Plan, frame: int, displacement: Array, before: Array) -> Array:
-    """Return the memory at the start of a frame, after grips have ended and begun.
-
-    Args:
-        plan: the plan.
-        frame: number of the frame.
-        displacement: x - X at the frame before [m], shape (rows, cols, 3).
-        before: memory of the term at the frame before, shape (numbers, rows, cols).
-    """
+    """Return the memory at a frame, after grips ended and began, from memory and displacements at the frame before."""
     tools, memory = plan.tools, before.copy()
     if len(memory) == CORRECTIONS * len(tools):
         return memory
@@ -204,3 +103,73 @@ def _grip_start(plan: Plan, tool: Tool, frame: int) -> int | None:
 def _centre_at_grip(plan: Plan, tool: Tool, frame: int) -> Array:
     """Return the tip's centre [m] at the frame before a grip begins, whose displacements the grip stores."""
     return tool.tip_centre(np.array([max(0, frame - 1) / plan.grid.frames_per_second]))[0]
+
+
+def stick(plan: Plan, memory: Array, start: Array, end: Array, times: tuple[float, float]) -> Array:
+    """Return the memory after rough tools have taken the mass points that they reach between two times [s].
+
+    `start` and `end` are the displacements at these times, `end` without further contact.
+    """
+    tools, memory, rest = plan.tools, memory.copy(), rest_positions(plan.scene.sheet)
+    fields = memory[CORRECTIONS * len(tools) :]
+    free, earliest = ~plan.fixed & (fields[HOLDER] == 0), np.full(plan.fixed.shape, np.inf)
+    for n, tool in enumerate(tools):
+        if tool.rough:
+            first, last = tool.tip_centre(np.array(times))
+            share = _first_touch(tool, rest + start - first, end - start - (last - first))
+            touched = free & (share <= 1) & (share < earliest)
+            earliest[touched] = share[touched]
+            by = share[touched, None]
+            fields[HOLDER, touched] = len(tools) + n + 1
+            shift = by * (end[touched] - start[touched] - (last - first))
+            fields[HOLD_DISPLACEMENT:, touched] = (start[touched] - first + shift).T
+    return memory
+
+
+def stuck_points(plan: Plan, memory: Array) -> NDArray[np.bool_]:
+    """Return whether each mass point sticks to a rough tool, shape (rows, cols)."""
+    tools = len(plan.tools)
+    return np.asarray((memory[CORRECTIONS * tools + HOLDER :][:1] > tools).any(axis=0))
+
+
+def without_rough_tools(plan: Plan, row: Array, first_column: int) -> Array:
+    """Return a row of the load table in which rough tools touch nothing, because their radius is 0."""
+    row = row.copy()
+    for n, tool in enumerate(plan.tools):
+        if tool.rough:
+            row[0, first_column + COLUMNS + TOOL_COLUMNS * n + RADIUS] = 0
+    return row
+
+
+def compute_pulls(plan: Plan, memory: Array, displacement: Array, force: Array, time: float) -> Array:
+    """Compute the pull of rough tools on the mass points that stick to them, 0 where they push [N], shape (rows, cols).
+
+    `force` is the sum of all forces but those of tools, and `time` that of the tools [s].
+    """
+    tools, position = plan.tools, rest_positions(plan.scene.sheet) + displacement
+    holder, pulls = memory[CORRECTIONS * len(tools) + HOLDER], np.zeros(plan.fixed.shape)
+    for n, tool in enumerate(tools):
+        stuck = holder == len(tools) + n + 1
+        r = position[stuck] - tool.tip_centre(np.array([time]))[0]
+        _, *normal = tool.shape.build_depth(NUMPY)(*r.T, *tool.axis, tool.length, tool.radius)
+        pulls[stuck] = np.maximum((force[stuck].T * normal).sum(axis=0), 0)
+    return pulls
+
+
+def release(plan: Plan, memory: Array, pulls: Array) -> Array:
+    """Return the memory without the mass points of the largest pulls, as each release relieves others."""
+    memory = memory.copy()
+    memory[CORRECTIONS * len(plan.tools) + HOLDER, pulls > RELEASE_SHARE * pulls.max()] = 0
+    return memory
+
+
+def _first_touch(tool: Tool, r: Array, motion: Array) -> Array:
+    """Return the first share of a motion relative to a tool, from r, at which points touch it; infinite if not."""
+    distance = np.linalg.norm(motion, axis=-1)
+    direction = motion / np.maximum(distance, np.finfo(float).tiny)[..., None]
+    products = direction @ tool.axis, r @ tool.axis, (r * direction).sum(axis=-1), (r * r).sum(axis=-1)
+    t, enters, *_ = tool.shape.build_ray(NUMPY)(1.0, *products, tool.length, tool.radius)
+    depth, *_ = tool.shape.build_depth(NUMPY)(*np.moveaxis(r, -1, 0), *tool.axis, tool.length, tool.radius)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first = np.where(enters & (t >= 0) & (distance > 0), t / distance, np.inf)
+    return np.asarray(np.where(depth >= -TOUCH_TOLERANCE * tool.radius, 0.0, first))

@@ -35,15 +35,12 @@ class DampingTerm(Term):
 
     @classmethod
     def from_plan(cls, plan: Plan) -> Self | None:
-        """Return the term's configuration; None without damping."""
         return cls() if plan.material.drag > 0 else None
 
     def constants(self, plan: Plan) -> tuple[float, ...]:
-        """Return the factor `keep`."""
         return (coefficients(plan).keep,)
 
     def build_damping(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
-        """Build the function that multiplies the last difference by `keep`."""
         ti, keep = config.ti, config.first_constant(DampingTerm)
 
         @ti.func

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from taichi_msm.arithmetic import NUMPY
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import area_shares, spacing
-from taichi_msm.terms.law import LawFunctions
-from taichi_msm.terms.locking import law_numbers
+from taichi_msm.terms.law import LawFunctions, law_numbers
 from taichi_msm.terms.springs import MIN_SQUARED_LENGTH, spring_law, spring_stiffness
 
 Array = NDArray[np.float64]
@@ -112,15 +111,7 @@ def spring_families(plan: Plan) -> Iterator[SpringFamily]:
 
 
 def elastic_force(families: Sequence[SpringFamily], displacement: Array) -> Array:
-    """Sum the forces of the springs of every mass point (eq. 2), without the tension at rest.
-
-    Args:
-        families: all springs, from `spring_families`.
-        displacement: x - X [m], shape (rows, cols, 3).
-
-    Returns:
-        Force on every mass point [N], shape (rows, cols, 3).
-    """
+    """Sum the forces of the springs (eq. 2), without the tension at rest [N], shape (rows, cols, 3)."""
     force = np.zeros_like(displacement)
     for family in families:
         forward = family.force(displacement)
@@ -130,17 +121,10 @@ def elastic_force(families: Sequence[SpringFamily], displacement: Array) -> Arra
 
 
 def energy_density(plan: Plan, displacement: Array) -> Array:
-    """Compute the energy density of the springs relative to the state at rest, without bending and foundation.
+    """Compute the energy density of the springs, without bending and foundation [J/m2], shape (rows, cols).
 
     Each end of a spring has half of its energy. The sum of density times `area_shares` times the area of a cell is
-    therefore the energy of all springs.
-
-    Args:
-        plan: the plan.
-        displacement: x - X [m], shape (rows, cols, 3).
-
-    Returns:
-        Energy per area at rest [J/m2], shape (rows, cols).
+    therefore the energy of all springs, relative to the state at rest.
     """
     by_point, (dx, dy) = np.zeros(displacement.shape[:2]), spacing(plan.scene.sheet)
     for family in spring_families(plan):

@@ -1,6 +1,6 @@
 """The elastic (Winkler) foundation, or virtual springs: the force -K u pulls each mass point to its rest position.
 
-A foundation that locks resists the depth w = -u_z > 0 by K f(w) instead of K w, see `terms.locking`.
+A foundation that locks resists the depth w = -u_z > 0 by K f(w) instead of K w, see `terms.law`.
 
 Scene: `springs.virtual` and `virtual_active`, or `tissue.foundation`, `foundation_active` and `foundation_map`.
 """
@@ -23,7 +23,7 @@ from taichi_msm.model.sheet import Material, area_shares, spacing
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Foundation, Sheet
 from taichi_msm.terms.base import AREA_SHARE, KernelConfig, Term
-from taichi_msm.terms.locking import LockingLaw, build_locking, law_numbers, make_stiffening
+from taichi_msm.terms.law import LockingLaw, build_locking, law_numbers, make_stiffening
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,6 @@ class FoundationTerm(Term):
 
     @classmethod
     def from_plan(cls, plan: Plan) -> Self | None:
-        """Return the term's configuration; None if the foundation is never active."""
         material = plan.material
         mapped = material.virtual_factors is not None
         if material.virtual == 0:
@@ -61,73 +60,51 @@ class FoundationTerm(Term):
 
     @staticmethod
     def stiffness_bound(material: Material, sheet: Sheet) -> float:
-        """Return the largest K [N/m]."""
         factors = material.virtual_factors
         return _steepest(material) * (1.0 if factors is None else float(factors.max()))
 
     @classmethod
     def node_stiffness_bounds(cls, plan: Plan) -> NDArray[Any] | float:
-        """Return K at each mass point without the reduction at edges [N/m]."""
         factors = plan.material.virtual_factors
         return _steepest(plan.material) * (1.0 if factors is None else factors)
 
     @property
     def column_count(self) -> int:
-        """One column: K times its active share."""
         return 1
 
     def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
-        """Return K times its active share at every step [N/m], shape (steps, 1)."""
         return plan.material.virtual * loads.active[:, None]
 
     @property
     def field_count(self) -> int:
-        """One field if the foundation has a map."""
         return int(self.mapped)
 
     def fields(self, plan: Plan) -> NDArray[Any]:
-        """Return the factors of K at the mass points, shape (1, rows, cols)."""
         return point_shares(plan)[None] if self.mapped else super().fields(plan)
 
     @property
     def constant_count(self) -> int:  # type: ignore[override]
-        """The numbers of the law."""
         return LockingLaw.number_count if self.locks else 0
 
     def constants(self, plan: Plan) -> tuple[float, ...]:
-        """Return the numbers of the law for a depth in metres."""
         return law_numbers(plan.material.virtual_stiffening, 1.0)
 
     def build_forces(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
-        """Build the Taichi function that adds -K u, or with a law -K u_x, -K u_y and K f(-u_z)."""
-        ti, (secant, _) = config.ti, self._build_law(config)
-
-        @ti.func
-        def ratio(sheet: ti.template(), entry: ti.template()):
-            return secant(sheet, entry.u[2])
-
-        return (self._build_add(config, ratio),)
+        return (self._build_add(config, tangent=False),)
 
     def build_tangents(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
-        """Build the Taichi function that adds the linearised change of the force."""
-        ti, (_, tangent) = config.ti, self._build_law(config)
+        return (self._build_add(config, tangent=True),)
 
-        @ti.func
-        def ratio(sheet: ti.template(), entry: ti.template()):
-            return tangent(sheet, entry.shape[2])
-
-        return (self._build_add(config, ratio),)
-
-    def _build_add(self, config: KernelConfig, ratio: Callable[..., Any]) -> Callable[..., Any]:
-        """Build the Taichi function that adds -K u, along z times ratio(sheet, entry) if the foundation locks."""
+    def _build_add(self, config: KernelConfig, *, tangent: bool) -> Callable[..., Any]:
         ti, locks, column, share = config.ti, self.locks, config.first_column(FoundationTerm), self.build_share(config)
+        ratio = self._build_law(config)[tangent]
 
         @ti.func
         def add(force: ti.template(), sheet: ti.template(), entry: ti.template(), now: ti.template()):
-            k = share(sheet, entry, now[column])
+            k, shape = share(sheet, entry, now[column]), ti.static(entry.shape if tangent else entry.u)
             for c in ti.static(range(3)):
                 if ti.static(locks and c == 2):
-                    force[c] = force[c] - k * (entry.u[c] * ratio(sheet, entry))
+                    force[c] = force[c] - k * (entry.u[c] * ratio(sheet, shape[2]))
                 else:
                     force[c] = force[c] - k * entry.u[c]
 
@@ -173,17 +150,17 @@ class FoundationTerm(Term):
     def _build_law(self, config: KernelConfig) -> tuple[Callable[..., Any], Callable[..., Any]]:
         """Build the Taichi functions secant(sheet, u_z) and tangent(sheet, u_z) of a foundation that locks."""
         ti, first, law = config.ti, config.first_constant(FoundationTerm), build_locking(config.operations)
-        secant_of, tangent_of = ti.func(law.secant), ti.func(law.tangent)
 
-        @ti.func
-        def secant(sheet: ti.template(), u):
-            return secant_of(0 - u * sheet.constants[first], sheet.constants[first + 1])
+        def of_depth(function: Callable[..., Any]) -> Callable[..., Any]:
+            law_function = ti.func(function)
 
-        @ti.func
-        def tangent(sheet: ti.template(), u):
-            return tangent_of(0 - u * sheet.constants[first], sheet.constants[first + 1])
+            @ti.func
+            def at(sheet: ti.template(), u):
+                return law_function(0 - u * sheet.constants[first], sheet.constants[first + 1])
 
-        return secant, tangent
+            return at
+
+        return of_depth(law.secant), of_depth(law.tangent)
 
 
 def _steepest(material: Material) -> float:
@@ -193,16 +170,7 @@ def _steepest(material: Material) -> float:
 
 
 def foundation_force(material: Material, k: NDArray[Any] | float, displacement: NDArray[Any]) -> NDArray[Any]:
-    """Compute the force of the foundation.
-
-    Args:
-        material: coefficients of the sheet.
-        k: stiffness at the mass points [N/m], shape (rows, cols) or one number.
-        displacement: x - X [m], shape (rows, cols, 3).
-
-    Returns:
-        Forces [N], shape (rows, cols, 3).
-    """
+    """Compute the force of the foundation [N], for its stiffness k [N/m] at all or at each of the mass points."""
     force = -np.asarray(k)[..., None] * displacement
     if material.virtual_stiffening is not None:
         scale, end, _ = law_numbers(material.virtual_stiffening, 1.0)

@@ -36,18 +36,15 @@ class ProbeTerm(Term):
 
     @classmethod
     def from_plan(cls, plan: Plan) -> Self:
-        """Return the term's configuration."""
         probes = plan.scene.probes
         by_area = tuple(plan.open_edges and probes[slot.probe].total is not None for slot in plan.slots)
         return cls(tuple(slot.moves for slot in plan.slots), by_area)
 
     @property
     def column_count(self) -> int:
-        """Number of columns of all slots."""
         return SLOT_COLUMNS * len(self.moves)
 
     def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
-        """Compute the columns of all slots."""
         slots = np.empty((len(loads.active), len(self.moves), SLOT_COLUMNS))
         slots[..., FORCE:POINT] = loads.strength
         slots[..., POINT:FALLOFF] = loads.point
@@ -58,17 +55,14 @@ class ProbeTerm(Term):
 
     @property
     def field_count(self) -> int:
-        """One field for each slot with a stationary control point."""
         return self.moves.count(False)
 
     def fields(self, plan: Plan) -> NDArray[Any]:
-        """Compute the decay factors of the stationary slots, shape (field_count, rows, cols)."""
         scene = plan.scene
         decays = [decay(scene.probes[slot.probe], scene.sheet) for slot in plan.slots if not slot.moves]
         return np.array(decays).reshape(-1, *scene.sheet.points)
 
     def build_forces(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
-        """Build the function that adds the forces of all slots."""
         ti = config.ti
         moves, by_area, first = self.moves, self.by_area, config.first_column(ProbeTerm)
         vector, lanes = config.vector, config.lanes
@@ -96,7 +90,6 @@ class ProbeTerm(Term):
         return (add,)
 
     def supports(self, compiled: Self) -> str:
-        """Return the reason why kernels compiled for other probes do not support these probes."""
         if self.moves != compiled.moves:
             return (
                 f"which control points move or jump cannot change (before: {_format_flags(compiled.moves)}; now: "
@@ -107,11 +100,7 @@ class ProbeTerm(Term):
         return ""
 
     def decay_gradients(self, plan: Plan) -> NDArray[Any]:
-        """Differentiate the decay factors of the stationary slots by x and y of the control point.
-
-        Returns:
-            Derivatives [1/m], shape (field_count, 2, rows, cols).
-        """
+        """Differentiate the fields by x and y of the control point [1/m], shape (field_count, 2, rows, cols)."""
         scene = plan.scene
         gradients = [decay_gradient(scene.probes[slot.probe], scene.sheet) for slot in plan.slots if not slot.moves]
         return np.array(gradients).reshape(-1, 2, *scene.sheet.points)
@@ -119,13 +108,9 @@ class ProbeTerm(Term):
     def build_load_adjoint(self, config: KernelConfig, first_slope: int) -> Callable[..., None]:
         """Build the function add_adjoint(sums, sheet, entry, now), the adjoint of the loads.
 
-        It differentiates the product of the force of each slot and `entry.u`, by the force (3) and by the control
-        point (2), and adds these derivatives to the list `sums`.
-
-        Args:
-            config: compile-time configuration.
-            first_slope: index of the first array of `decay_gradients` in `sheet.derivatives`, counted in arrays of the
-                sheet.
+        It differentiates the product of the force of each slot and `entry.u`, by the force (3) and by the control point
+        (2), and adds these derivatives to the list `sums`. `first_slope` is the index of the first array of
+        `decay_gradients` in `sheet.derivatives`, counted in arrays of the sheet.
         """
         ti = config.ti
         moves, by_area, first = self.moves, self.by_area, config.first_column(ProbeTerm)

@@ -13,11 +13,7 @@ so that the lattice approximates an isotropic sheet in plane stress. Springs imp
 contains the derivation.
 
 Under a pretension S each spring has the tension tau L at rest, with tau = k1 e, its stiffness k1 for f = 1 and
-e = S / (3/2 E t). The tensions at rest cancel at every mass point. Without them, the force of a spring is
-
-    (k - tau) (1 - L0 / L) (o + q) + tau q
-
-and its energy is ((k - tau) (L - L0)^2 + tau q^2) / 2.
+e = S / (3/2 E t).
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -36,8 +32,7 @@ from taichi_msm.model.sheet import Material, largest_mean, spacing
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.terms.base import AREA_SHARE, DX, DY, HAS_LEFT, HAS_RIGHT, KernelConfig, Term
-from taichi_msm.terms.law import LINEAR, Law
-from taichi_msm.terms.locking import LockingLaw, law_numbers, make_stiffening
+from taichi_msm.terms.law import LINEAR, Law, LockingLaw, law_numbers, make_stiffening
 
 # Families of springs.
 ALONG_ROW, ALONG_COLUMN, DIAGONAL = range(3)
@@ -74,18 +69,11 @@ class SpringTerm(Term):
         return self.tense and self.open_edges
 
     @property
-    def masks_edges(self) -> bool:
-        """Whether the forces of springs need to know which springs exist."""
-        return self.open_edges and (self.tense or not self.mapped)
-
-    @property
     def constant_count(self) -> int:  # type: ignore[override]
-        """Number of the sheet's constants that belong to the term."""
         return FIRST_NUMBER + 3 * self.law.number_count
 
     @staticmethod
     def derive(scene: Scene) -> dict[str, Any]:
-        """Return the coefficients of `springs`, or derive those of `tissue` as above."""
         tissue, springs = scene.tissue, scene.springs
         if tissue is None:
             assert springs is not None
@@ -103,7 +91,6 @@ class SpringTerm(Term):
 
     @classmethod
     def from_plan(cls, plan: Plan) -> Self:
-        """Return the term's configuration, without families of stiffness 0."""
         material, open_edges = plan.material, plan.open_edges
         return cls(
             structural=max(material.across, material.down) > 0,
@@ -148,7 +135,6 @@ class SpringTerm(Term):
         return _unmapped_bound(material) * shares
 
     def constants(self, plan: Plan) -> tuple[float, ...]:
-        """Return k - tau and tau of each family [N/m], for a factor of 1, and the numbers of the law."""
         material, (dx, dy) = plan.material, spacing(plan.scene.sheet)
         remainder = 1 - material.tension
         stiffness = material.across * remainder, material.down * remainder, material.shear * remainder
@@ -157,7 +143,6 @@ class SpringTerm(Term):
         return *stiffness, *material.tensions, *numbers
 
     def energy(self, sums: NDArray[Any], plan: Plan) -> float:
-        """Compute twice the energy [J], see `Term.energy`."""
         dx, dy = spacing(plan.scene.sheet)
         squares = np.array([dx**2, dy**2, dx**2 + dy**2])
         return float((sums[STRETCH_SUMS:TENSION_SUMS] + plan.material.tensions * sums[TENSION_SUMS:]) @ squares)
@@ -197,15 +182,14 @@ class SpringTerm(Term):
         return share_of_row, share_of_column
 
     def build_spring_forces(self, config: KernelConfig) -> tuple[Callable[..., Any], ...]:
-        """Build the Taichi functions that compute the forces of springs and their stiffness.
+        """Build the Taichi functions of springs.
 
-        Returns:
-            The functions along and to_other_row, the forces within a row and between two rows; of_row, of_column and
-            of_diagonal, the stiffness of a spring of each family.
+        They are along and to_other_row, the forces within a row and between two rows; and of_row, of_column and
+        of_diagonal, the stiffness of a spring of each family.
         """
         ti = config.ti
         tense, mapped, by_area = self.tense, self.mapped, self.by_area and not self.mapped
-        masks_edges, real, first = self.masks_edges, config.real, config.first_constant(SpringTerm)
+        open_edges, real, first = self.open_edges, config.real, config.first_constant(SpringTerm)
         tense_edges, vector = self.tense_edges, config.vector
         first_tension, numbers_of = first + FIRST_TENSION, self.build_numbers(config)
         pull = config.compile_law(self.law, tense=self.tense).pull
@@ -214,7 +198,7 @@ class SpringTerm(Term):
         def masked(k, exists):
             if ti.static(tense_edges):
                 return ti.select(exists > 0, k, vector(0))
-            elif ti.static(masks_edges):  # noqa: RET505
+            elif ti.static(open_edges):  # noqa: RET505
                 return k * exists
             else:
                 return k
@@ -379,7 +363,6 @@ class SpringTerm(Term):
         return max_force
 
     def build_measures(self, config: KernelConfig) -> Sequence[Callable[..., None]]:
-        """Build the function that measures the springs to the right of an entry and to the row below it."""
         ti = config.ti
         tense, open_edges, vector, first = self.tense, self.open_edges, config.vector, config.first_measure(SpringTerm)
         _, _, of_row, of_column, of_diagonal = self.build_spring_forces(config)
@@ -465,7 +448,6 @@ def spring_law(material: Material) -> Law:
 
 
 def _unmapped_bound(material: Material) -> float:
-    """Return `SpringTerm.stiffness_bound` for factors of 1 [N/m]."""
     across, down, shear = material.across, material.down, material.shear
     steepest = 1.0 if material.stiffening is None else material.stiffening.factor
     return steepest * 4 * max(across + down, across + 2 * shear, down + 2 * shear)

@@ -41,28 +41,23 @@ class ViscoelasticTerm(Term):
 
     @staticmethod
     def derive(scene: Scene) -> dict[str, Any]:
-        """Derive the share and the time [s] of every branch."""
         branches = () if scene.tissue is None else scene.tissue.relaxation
         return {"relaxation": tuple((branch.share, branch.time) for branch in branches)}
 
     @classmethod
     def from_plan(cls, plan: Plan) -> Self | None:
-        """Return the term's configuration; None without relaxation."""
         branches = len(plan.material.relaxation)
         return cls(branches, plan.scene.time.at_rest) if branches else None
 
     @property
     def memory(self) -> tuple[str, ...]:
-        """Three components of s for every branch."""
         return tuple(f"relaxation {n} {axis}" for n in range(self.branches) for axis in "xyz")
 
     @property
     def column_count(self) -> int:
-        """The columns of all branches, and two more."""
         return BRANCHES + BRANCH_COLUMNS * self.branches
 
     def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
-        """Compute the factors of every step, or of the frame; see `Term.columns`."""
         h = 1 / plan.grid.frames_per_second if self.at_rest else plan.grid.step
         shares, times = np.array(plan.material.relaxation).T
         decrease = -np.expm1(-h / times)
@@ -75,12 +70,10 @@ class ViscoelasticTerm(Term):
         return columns
 
     def mark_update(self, columns: NDArray[Any]) -> bool:
-        """Let the next evaluation change the memory; see `Term.mark_update`."""
         columns[UPDATE] = 1
         return True
 
     def build_forces(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
-        """Build the Taichi function that relaxes the sum of the elastic forces."""
         ti, first, branches, at_rest = config.ti, config.first_column(ViscoelasticTerm), self.branches, self.at_rest
         first_field = config.first_field(ViscoelasticTerm)
 

@@ -38,13 +38,7 @@ def material_values(scene: Scene) -> dict[str, float]:
 
 
 def with_value(section: Any, key: str, value: float) -> Any:
-    """Return a copy of a section.
-
-    Args:
-        section: the scene, or one of its sections.
-        key: dotted path of a key in it.
-        value: its new value.
-    """
+    """Return a copy of a scene or a section with a new value of a key, given by its dotted path."""
     name, _, rest = key.partition(".")
     below: Section | float = with_value(getattr(section, name), rest, value) if rest else value
     return section.model_copy(update={name: below})

@@ -45,13 +45,14 @@ def write_text(
 
     Args:
         picture: shape (height, width, 3).
-        above: lines in the upper left corner.
+        above: lines in the upper left corner, above the bar and the two columns of the table.
         below: text at the bottom, which is wrapped.
-        table: two columns, below the lines and the bar.
-        bar: below the lines.
+        table: names and their meanings.
+        bar: a value.
     """
     height, width = picture.shape[:2]
-    size = _letter_size(picture)
+    # Height of letters [px].
+    size = int(min(22, max(11, height * (1 / 36))))
     top = edge = size // 2
     bar_panel = (
         _bar(size, round(BAR_LENGTH_LETTERS * size * bar.value / bar.end), f"{bar.end:g} {bar.unit}") if bar else None
@@ -66,13 +67,7 @@ def write_text(
 
 
 def mark_tool(picture: Picture, pixel: tuple[float, float], *, pulls: bool) -> None:
-    """Draw a ring around the tool, in place.
-
-    Args:
-        picture: shape (height, width, 3).
-        pixel: position of the tool (x, y).
-        pulls: whether to use the colour of a pulling tool.
-    """
+    """Draw a ring around the pixel (x, y) of a tool into a picture, shape (height, width, 3)."""
     radius = picture.shape[0] * (1 / 50)
     reach = int(radius) + 4
     left, top = max(0, int(pixel[0]) - reach), max(0, int(pixel[1]) - reach)
@@ -129,8 +124,3 @@ def _bar(size: int, filled: int, end: str) -> NDArray[np.uint8]:
     panel[top + 1 : top + height - 1, edge + 1 : edge + width - 1] = 0
     panel[top : top + height, edge : edge + min(filled, width)] = 255
     return panel
-
-
-def _letter_size(picture: Picture) -> int:
-    """Return the height of letters [px] for the size of the picture."""
-    return int(min(22, max(11, picture.shape[0] * (1 / 36))))

@@ -12,12 +12,12 @@ from typing import Any
 import yaml
 from PIL import Image
 
-from taichi_msm.errors import FilesError, Pause, printable, writing
+from taichi_msm.errors import FilesError, printable, writing
 from taichi_msm.load.scene_file import MAX_BYTES
 from taichi_msm.load.yaml_reader import MAX_NODES
 from taichi_msm.runs.directory import hidden_folder, move_to_free_name
-from taichi_msm.runs.encoder import Encoder
-from taichi_msm.runs.media import EncodingJob, Picture
+from taichi_msm.runs.encoder import Encoder, EncodingJob
+from taichi_msm.runs.media import Picture
 from taichi_msm.scene.outputs import OUTPUTS
 from taichi_msm.scene.render import Render
 from taichi_msm.scene.scene import Scene
@@ -32,64 +32,39 @@ class Film:
     The constructor and the methods raise a FilesError when the film cannot be written.
 
     Args:
-        folder: parent of the hidden folder.
+        path: the film, .gif or .mp4, beside which the folder is.
+        option: name of the option in messages.
         render: has the size and background of the pictures.
-        rate: pictures per second.
+        rate: frames of the session per second.
         subframes: frames of the session per picture.
         begin: first frame of the session.
-        option: name of the option in messages.
-        suffix: .gif or .mp4.
-
-    Attributes:
-        pictures: number of pictures so far.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        render: Render,
-        rate: float,
-        subframes: int,
-        begin: int = 0,
-        option: str = "--out",
-        suffix: str = ".gif",
-    ) -> None:
+    def __init__(self, path: Path, option: str, render: Render, rate: float, subframes: int, begin: int) -> None:
         self.pictures = 0
-        self._format = suffix.lower().removeprefix(".")
-        self._subframes, self._begin, self._location = subframes, begin, (folder, option)
+        self._format = path.suffix.lower().removeprefix(".")
+        self._subframes, self._begin, self._location = subframes, begin, (path.parent, option)
         with writing(*self._location), ExitStack() as opened:
-            self._hidden = opened.enter_context(hidden_folder(folder))
+            self._hidden = opened.enter_context(hidden_folder(path.parent))
+            formats = (self._format,)
             job = EncodingJob(
-                (self._hidden,),
-                render.size,
-                rate,
-                png=False,
-                gif=self._format == "gif",
-                background=render.background,
-                mp4=self._format == "mp4",
-                quality=render.quality,
+                (self._hidden,), render.size, rate / subframes, formats, render.background, render.quality
             )
             self._encoder = Encoder(job)
             opened.callback(self._encoder.abort)
             self._opened = opened.pop_all()
 
-    def add_frame(self, picture: Picture, frame: int, pause: Pause = lambda: None) -> None:
-        """Append a picture, repeated in place of missing earlier ones.
-
-        Args:
-            picture: shape (height, width, 3).
-            frame: number of the session's frame.
-            pause: called while the encoder is busy.
-        """
+    def add_frame(self, picture: Picture, frame: int) -> None:
+        """Append the picture of a frame, shape (height, width, 3), repeated in place of missing earlier ones."""
         with writing(*self._location):
             while self.pictures * self._subframes <= frame - self._begin:
-                self._encoder.add(picture[None], pause)
+                self._encoder.add(picture[None])
                 self.pictures += 1
 
-    def finish(self, pause: Pause = lambda: None) -> Path:
+    def finish(self) -> Path:
         """Finish a film with at least one picture; return its file, which the caller must move."""
         with writing(*self._location):
-            self._encoder.finish(pause)
+            self._encoder.finish()
         return self._hidden / OUTPUTS[self._format].path()
 
     def close(self) -> None:
@@ -100,14 +75,11 @@ class Film:
 class Captures:
     """Directory of the files saved by a session, created with the first file.
 
-    The methods raise a FilesError when the directory cannot be written.
+    The methods raise a FilesError when the directory cannot be written. `saved` has the paths of the files, in order.
 
     Args:
         folder: path of the directory.
         name: name of the scene, for comments.
-
-    Attributes:
-        saved: paths of the saved files, in order.
     """
 
     def __init__(self, folder: Path, name: str) -> None:
@@ -126,9 +98,8 @@ class Captures:
         with writing(self.folder), hidden_folder(self.folder) as hidden:
             scene = scene.with_pictures(lambda path: self._copy_picture(Path(path)).name)
             data = scene.model_dump(mode="json", exclude_none=True)
-            text = yaml.dump(
-                data, Dumper=_DUMPER, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True
-            )
+            style: dict[str, Any] = {"sort_keys": False, "default_flow_style": None, "width": 120}
+            text = yaml.dump(data, Dumper=_DUMPER, allow_unicode=True, **style)
             text = f"# What was done in a live session of {printable(self._name)}; `run` repeats it.\n{text}"
             # Without the keyframes of its probes, a scene has at most 1000 values.
             if len(text.encode()) > MAX_BYTES or count_probe_values(scene) + 1000 > MAX_NODES:
@@ -137,12 +108,7 @@ class Captures:
             return self._move_to_free_name(hidden / "session", "session", ".yaml")
 
     def save_film(self, film: Film, path: Path | None = None) -> Path:
-        """Finish and save a film with at least one picture; return its path.
-
-        Args:
-            film: the film.
-            path: replaces an earlier file; None: a free name in the folder.
-        """
+        """Finish and save a film with at least one picture under a path, or a free name in the folder; return it."""
         with closing(film), writing(path or self.folder):
             if path is None:
                 return self._move_to_free_name(film.finish(), "film", ".gif")

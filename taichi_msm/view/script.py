@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -122,7 +121,6 @@ def load_script(path: str | Path, size: tuple[int, int]) -> Script:
 
 
 def _outside(script: Script, size: tuple[int, int]) -> Iterator[Problem]:
-    """Yield the presses outside the picture."""
     width, height = size
     for n, entry in enumerate(script.events):
         if entry.do in ("press", "pull") and entry.at is not None:
@@ -195,8 +193,7 @@ def record_film(
     upcoming = next(events, None)
     failures: list[FilesError] = []
     notice = ""
-    rate, subframes = session.frame_rate / session.subframes, session.subframes
-    with closing(Film(path.parent, session.scene.render, rate, subframes, 0, OPTION, path.suffix)) as film:
+    with closing(Film(path, OPTION, session.scene.render, session.frame_rate, session.subframes, 0)) as film:
         for frame in range(frames + 1):
             progress(frame, frames)
             while upcoming is not None and upcoming[0] <= frame:
@@ -208,8 +205,8 @@ def record_film(
                     notify(f"{frame / session.frame_rate:g} s: {session.notice}")
                 notice = session.notice
                 upcoming = next(events, None)
-            if frame % subframes == 0:
-                film.add_frame(session.picture(), frame, partial(progress, frame, frames))
+            if frame % session.subframes == 0:
+                film.add_frame(session.picture(), frame)
             if frame < frames:
                 session.advance()
             if session.divergence_error:
@@ -218,6 +215,6 @@ def record_film(
         if upcoming is not None:
             notify(f"the film ends at {frame / session.frame_rate:g} s, before some of the script's events")
         with writing(path, OPTION):
-            film.finish(partial(progress, frames, frames)).replace(path)
+            film.finish().replace(path)
     if failures:
         raise failures[0]

@@ -15,7 +15,7 @@ import secrets
 import socket
 import time
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Iterator
 from importlib.resources import files
 from typing import Any
 from urllib.parse import urlsplit
@@ -29,15 +29,12 @@ from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from taichi_msm.errors import DeviceError, FilesError, Pause
 from taichi_msm.runs.media import Picture
-from taichi_msm.view.events import COMPILING, KEYS, POINTER, QUIT, STRENGTH_STEP, SWITCH_TOOL, Event, Release
+from taichi_msm.view import events
 from taichi_msm.view.material import MATERIAL, MAX_FACTOR
-from taichi_msm.view.messages import MAX_BYTES, parse_message
-from taichi_msm.view.pacing import Pacing
 from taichi_msm.view.session import Session
 from taichi_msm.view.tools import PositionControlledTool
 
 ADDRESS = "127.0.0.1"
-LOOPBACK_NAMES = {ADDRESS, "localhost", "::1"}
 
 # The files of the page, by their path below the token, and their types.
 PAGE = {
@@ -55,21 +52,22 @@ HEADERS = {
     "X-Content-Type-Options": "nosniff",
 }
 
-# Quality of the JPEGs; at 85, 512 x 512 pixels of tissue take 2 ms and 33 kB.
-JPEG_QUALITY = 85
-
 # Number of pictures on the way to a page, so that a slow connection lags by no more than these.
 MAX_UNREAD_PICTURES = 3
 
 MAX_PAGES = 16
 
-# Number of events that the page that steers may send within a frame, and of readings kept for a page.
+# Number of events that the page that steers may send within a frame.
 MAX_EVENTS = 500
-MAX_READINGS = 1000
 
-# Shortest wait for events between two pictures, and wait while no page is open [s].
+# Shortest wait for events between two pictures [s].
 MIN_WAIT_S = 0.001
-IDLE_WAIT_S = 0.05
+
+# Longer delays are not caught up [s].
+MAX_DELAY_S = 0.1
+
+# After this time of stepping the next picture follows, although frames are due [s].
+MAX_STEPPING_S = 0.03
 
 
 def listen(port: int) -> socket.socket:
@@ -95,10 +93,6 @@ class Server:
         listener: see `listen`.
         title: of the page.
         origins: of pages behind a proxy, in addition to the loopback interface's own.
-
-    Attributes:
-        url: address of the page, with a random token.
-        pages: connected pages, in the order of their connection.
     """
 
     def __init__(self, session: Session, listener: socket.socket, title: str, origins: Collection[str] = ()) -> None:
@@ -106,7 +100,7 @@ class Server:
         self._port, self._token = listener.getsockname()[1], secrets.token_urlsafe(24)
         self.url = f"http://{ADDRESS}:{self._port}/{self._token}/"
         self.pages: list[_Connection] = []
-        self._events: deque[Event] = deque()
+        self._events: deque[events.Event] = deque()
         self._handled = 0
         # The last picture, as it was drawn and as it was sent.
         self._picture: Picture | None = None
@@ -122,10 +116,10 @@ class Server:
         application = Application(
             handlers,
             log_function=lambda handler: None,
-            websocket_max_message_size=MAX_BYTES,
+            websocket_max_message_size=events.MAX_BYTES,
             websocket_ping_interval=20,
         )
-        http = HTTPServer(application, max_body_size=MAX_BYTES)
+        http = HTTPServer(application, max_body_size=events.MAX_BYTES)
         http.add_socket(self._listener)
         try:
             await self._run(pause)
@@ -149,7 +143,7 @@ class Server:
         try:
             parts, forwarded = urlsplit(origin), urlsplit(f"//{host}").port
             own = f"{parts.scheme}://{parts.netloc}" == origin and parts.scheme == "http"
-            return own and parts.hostname in LOOPBACK_NAMES and parts.port in (self._port, forwarded)
+            return own and parts.hostname in {ADDRESS, "localhost", "::1"} and parts.port in (self._port, forwarded)
         except ValueError:
             return False
 
@@ -164,23 +158,23 @@ class Server:
         description = {
             "title": self._title,
             "size": session.viewport.render.size,
-            "strength_step": STRENGTH_STEP,
+            "strength_step": events.STRENGTH_STEP,
             "material": material,
             "max_factor": MAX_FACTOR,
-            "keys": POINTER | KEYS,
+            "keys": events.POINTER | events.KEYS,
         }
         page.send(json.dumps(description))
 
     def disconnect(self, page: _Connection) -> None:
         """Remove a page; if it steered, the tool lets go, and the next page steers."""
         if page is self.pages[0]:
-            self._events.append(Release())
+            self._events.append(events.Release())
         self.pages.remove(page)
 
     def receive(self, page: _Connection, message: str | bytes) -> None:
         """Process a message of a page; describe the fault of a message that is not valid to it."""
         try:
-            event = parse_message(message)
+            event = events.parse_message(message)
         except (ValueError, RecursionError) as error:
             page.send(json.dumps({"error": str(error)}))
             return
@@ -197,13 +191,13 @@ class Server:
         pacing = Pacing(session.frame_rate, time.perf_counter)
         while True:
             pause()
-            await asyncio.sleep(max(MIN_WAIT_S, pacing.delay_s()) if self.pages else IDLE_WAIT_S)
+            await asyncio.sleep(max(MIN_WAIT_S, pacing.delay_s()) if self.pages else 0.05)
             while self._events:
                 event = self._events.popleft()
-                if event == QUIT:
+                if event == events.QUIT:
                     return
-                if event == SWITCH_TOOL:
-                    await self._announce(COMPILING)
+                if event == events.SWITCH_TOOL:
+                    await self._announce(events.COMPILING)
                 try:
                     session.handle(event)
                 except FilesError as error:
@@ -215,7 +209,7 @@ class Server:
             for _ in pacing.due_frames():
                 self._advance()
             if not session.viewport.is_compiled:
-                await self._announce(COMPILING)
+                await self._announce(events.COMPILING)
             self._show(pacing.status())
 
     def _advance(self) -> None:
@@ -247,7 +241,6 @@ class Server:
             page.readings.clear()
 
     def _state(self, pacing: str) -> dict[str, Any]:
-        """Return the state of the session for a page."""
         session, tool = self._session, self._session.tool
         return {
             "handled": self._handled,
@@ -271,10 +264,55 @@ class Server:
         await asyncio.sleep(MIN_WAIT_S)
 
 
+class Pacing:
+    """Scheduler that synchronises simulated with real time.
+
+    Args:
+        rate: frames per second of the session.
+        clock: returns the current time [s].
+    """
+
+    def __init__(self, rate: float, clock: Callable[[], float]) -> None:
+        self._rate = rate
+        self._clock = clock
+        self._next = clock()
+        # Start [s] and number of simulated frames of each recent picture.
+        self._pictures: deque[tuple[float, int]] = deque()
+
+    def delay_s(self) -> float:
+        """Return the time until the next frame is due [s]."""
+        return max(0.0, self._next - self._clock())
+
+    def due_frames(self) -> Iterator[int]:
+        """Yield the number of each due frame, until none is due or they took `MAX_STEPPING_S`."""
+        start = self._clock()
+        self._next = max(self._next, start - MAX_DELAY_S)
+        count = 0
+        while self._next <= self._clock() and (count == 0 or self._clock() < start + MAX_STEPPING_S):
+            self._next += 1 / self._rate
+            yield count
+            count += 1
+        self._pictures.append((start, count))
+        # The speed is averaged over 1 s.
+        while start - self._pictures[0][0] > 1.0:
+            self._pictures.popleft()
+
+    def status(self) -> str:
+        """Format the pictures per second, and the speed relative to real time if it is below 95 %."""
+        if len(self._pictures) < 2:
+            return ""
+        seconds = self._pictures[-1][0] - self._pictures[0][0]
+        rate = f"{(len(self._pictures) - 1) / seconds:.0f} pictures/s"
+        # The last picture is excluded, as its duration is not known yet.
+        speed = sum(count for _, count in list(self._pictures)[:-1]) / self._rate / seconds
+        return rate if speed >= 0.95 else f"{rate}  ·  too slow: {speed:.2f} x real time"
+
+
 def encode_jpeg(picture: Picture) -> bytes:
     """Encode a picture, shape (height, width, 3), as JPEG."""
     file = io.BytesIO()
-    Image.fromarray(picture).save(file, "JPEG", quality=JPEG_QUALITY)
+    # 512 x 512 pixels of tissue take 2 ms and 33 kB.
+    Image.fromarray(picture).save(file, "JPEG", quality=85)
     return file.getvalue()
 
 
@@ -319,7 +357,7 @@ class _Connection(_Guarded, WebSocketHandler):
 
     def open(self) -> None:
         self.unread = 0
-        self.readings: deque[list[float]] = deque(maxlen=MAX_READINGS)
+        self.readings: deque[list[float]] = deque(maxlen=1000)
         self.jpeg = b""
         self.set_nodelay(True)
         if len(self.server.pages) < MAX_PAGES:

@@ -19,6 +19,7 @@ from taichi_msm.model.plan import Plan
 from taichi_msm.model.surface import place_instrument, place_instruments, surface_point
 from taichi_msm.model.tool_force import probe_force
 from taichi_msm.model.tools import path_problems, path_warnings
+from taichi_msm.render.picking import intersect_rest_plane
 from taichi_msm.render.texture import load_texture
 from taichi_msm.runs.media import Picture
 from taichi_msm.runs.simulation import Simulation
@@ -28,10 +29,10 @@ from taichi_msm.solver.planning import plan_variant, with_time
 from taichi_msm.system import runtime
 from taichi_msm.system.process import available_threads
 from taichi_msm.view import events, overlay
-from taichi_msm.view.controller import Controller, Viewport
 from taichi_msm.view.material import MAX_FACTOR, material_values, with_value
 from taichi_msm.view.recording import Captures, Film, count_probe_values
 from taichi_msm.view.tools import ForceControlledTool, PositionControlledTool, SheetPosition
+from taichi_msm.view.viewport import Viewport
 
 # Largest frame rate of a session, that of common screens [1/s].
 MAX_FRAME_RATE = 60.0
@@ -67,7 +68,7 @@ class Session:
     instrument. The first of these probes determines which one is the initial tool. Clamps always hold the sheet.
 
     Args:
-        scene: the scene.
+        scene: the scene; the attribute has the frames and the time step of the session.
         captures: receives saved files.
         arch: cpu, cuda or vulkan.
         threads: number of CPU threads; None: one per core.
@@ -79,13 +80,8 @@ class Session:
         DeviceError: when the arch is not available.
 
     Attributes:
-        scene: the scene, with the frames and the time step of the session.
-        tool: the current tool.
-        viewport: camera, light and mesh display.
         subframes: frames of the session per frame of the given scene.
-        paused: whether the simulation is paused.
         divergence_error: message of a divergence, which stops the simulation; otherwise empty.
-        frame_time_s: moving average of the time to simulate a frame [s].
     """
 
     def __init__(
@@ -124,7 +120,8 @@ class Session:
         self._elapsed = 0
         self._notice, self._notice_until = "", 0
         self.divergence_error = ""
-        self.frame_time_s = 0.0
+        # Moving average of the time to simulate a frame [s].
+        self._frame_time_s = 0.0
         # Since the last reset [N].
         self._max_felt_force = 0.0
         progress("compile")
@@ -133,7 +130,10 @@ class Session:
         self._simulation.compile(lambda: progress("compile"))
         self._scene_material = material_values(scene)
         self.viewport = Viewport(self._simulation.renderer, play=play)
-        self._controller = Controller(self.tool, self.viewport, self._simulation)
+        self._pointer = (0.0, 0.0)
+        self._hover_pixel: tuple[float, float] | None = None
+        # Start of a drag: position of the tool, and point of the rest plane under the pointer [m].
+        self._drag_start: tuple[SheetPosition, NDArray[np.floating] | None] | None = None
         self._draw()
 
     @property
@@ -189,23 +189,24 @@ class Session:
         """
         match event:
             case events.Hover(x, y):
-                self._controller.hover(x, y)
+                self._hover_pixel = x, y
+                if isinstance(self.tool, PositionControlledTool) and (position := self._rest_position(x, y)):
+                    self.tool.move(position)
             case events.Press(x, y, pull):
-                if self._controller.press(x, y, -1 if pull else 1):
-                    self._notice_until = 0
-                else:
-                    self.show_notice(f"no tissue at pixel {x:g}, {y:g}")
+                self._press(x, y, -1 if pull else 1)
             case events.Drag(x, y):
-                self._controller.drag(x, y)
+                self._drag(x, y)
             case events.Release():
-                self._controller.release()
+                self._forget_pointer()
+                if self.tool.engaged:
+                    self.tool.release()
             case events.Turn(right, down):
                 self.viewport.turn(right, down)
-                self._controller.rebase_drag()
+                self._rebase_drag()
             case events.Strength(percent):
                 self.tool.set_strength(percent)
             case events.StrengthChange(percent):
-                self.handle(events.Strength(self.tool.strength + percent))
+                self.tool.set_strength(self.tool.strength + percent)
             case events.Key(name):
                 self._handle_key(name)
             case events.Material(key, value):
@@ -217,23 +218,24 @@ class Session:
         if (self.paused and not self._single_step) or self.divergence_error:
             return
         self._single_step = False
-        if self.frame % 200 == 0 and not self._has_warned_of_length and self._is_nearly_too_long():
-            self._has_warned_of_length = True
-            self.show_notice("this session will soon be too long for a scene: save it now (w), then reset it (r)")
+        # At three quarters of the limit.
+        if self.frame % 200 == 0 and not self._has_warned_of_length:
+            self._has_warned_of_length = count_probe_values(self.recorded_scene()) > 0.75 * MAX_NODES
+            if self._has_warned_of_length:
+                self.show_notice("this session will soon be too long for a scene: save it now (w), then reset it (r)")
         start = time.perf_counter()
         try:
-            if probe := self.tool.advance(self.frame):
-                self._simulation.steer((*self._scene_probes, probe))
+            self._simulation.steer((*self._scene_probes, self.tool.advance(self.frame)))
             self._simulation.advance()
             self._max_felt_force = max(self._max_felt_force, self.felt_force())
             if self.viewport.set_time(self._simulation.time):
-                self._controller.rebase_drag()
+                self._rebase_drag()
         except DivergedError as error:
             self.divergence_error = str(error)
         duration = time.perf_counter() - start
         # Exponential moving average over about 20 frames.
-        weight = 1 / 20 if self.frame_time_s else 1.0
-        self.frame_time_s += weight * (duration - self.frame_time_s)
+        weight = 1 / 20 if self._frame_time_s else 1.0
+        self._frame_time_s += weight * (duration - self._frame_time_s)
 
     @property
     def filming(self) -> bool:
@@ -241,35 +243,22 @@ class Session:
         return self._film is not None
 
     def start_film(self, path: Path | None = None) -> None:
-        """Start a film.
-
-        Args:
-            path: where it is saved at its end, replacing an earlier file; None: a free name in the folder of captures.
+        """Start a film, which is saved at its end under a path, or a free name in the folder of captures.
 
         Raises:
             FilesError: when it cannot be written.
         """
-        folder, option, suffix = (
-            (self._captures.folder, "--out", ".gif") if path is None else (path.parent, "--record", path.suffix)
-        )
-        rate = self.frame_rate / self.subframes
-        self._film = Film(folder, self.scene.render, rate, self.subframes, self._elapsed, option, suffix)
+        place, option = (self._captures.folder / "film.gif", "--out") if path is None else (path, "--record")
+        self._film = Film(place, option, self.scene.render, self.frame_rate, self.subframes, self._elapsed)
         self._film_path = path
         if path is not None:
             # A session that ends at once has a film, too.
             self._film.add_frame(self._draw(), self._elapsed)
 
-    def picture(self, pacing: str = "") -> Picture:
-        """Draw the tissue and the overlay; append the picture without text to a running film.
-
-        Args:
-            pacing: text about the speed of the session.
-
-        Returns:
-            The picture, shape (height, width, 3).
-        """
+    def picture(self) -> Picture:
+        """Draw the tissue and the overlay, shape (height, width, 3); a running film has the picture without text."""
         picture = self.bare_picture()
-        above = self._figure_lines(pacing) if self._show_figures else ["paused"] if self.paused else []
+        above = self._figure_lines() if self._show_figures else ["paused"] if self.paused else []
         keys, bar = (events.POINTER | events.KEYS if self._show_keys else None), None
         # A small picture has no space for both.
         if self._show_figures and self._max_felt_force > 0 and keys is None:
@@ -278,11 +267,7 @@ class Session:
         return picture
 
     def bare_picture(self) -> Picture:
-        """Draw the tissue, with a mark at a tool without an instrument; append the picture to a running film.
-
-        Returns:
-            The picture, shape (height, width, 3).
-        """
+        """Draw the tissue, with a mark at a tool without an instrument, also for a running film."""
         picture = self._draw()
         tool = self.tool
         hidden = isinstance(tool, PositionControlledTool) or tool.percent == 0 or tool.probe.instrument is not None
@@ -322,12 +307,11 @@ class Session:
         positions, scene = self.positions(), self._simulation.scene
         instruments = place_instruments(scene, positions, self._simulation.time)
         instrument = scene.probes[-1].instrument
-        if instrument is not None and (position := self._controller.hover_position()):
+        if instrument is not None and (position := self._hover_position()):
             instruments[-1] = place_instrument(instrument, scene, positions, self._rest_point(position))
         return self.viewport.draw(positions, instruments)
 
     def _rest_point(self, position: SheetPosition) -> NDArray[np.float64]:
-        """Return x and y of a position on the sheet at rest [m]."""
         (across, down), (height, width) = position, self.scene.sheet.size
         return np.array([(across - 0.5) * width, (0.5 - down) * height])
 
@@ -335,6 +319,58 @@ class Session:
         """Return the point of the sheet at which the tool acts [m], shape (3,)."""
         rest = self._rest_point(self.tool.position)
         return surface_point(self.positions(), self.scene.render.refine, self.scene.sheet, rest)[0]
+
+    def _press(self, x: float, y: float, direction: int) -> None:
+        """Press, or in direction -1 pull or grip, the tissue that is visible at a pixel.
+
+        A force-controlled tool acts on the material that is visible there. The tip of a position-controlled tool is
+        above or below the point of the rest plane.
+        """
+        position = self._simulation.pick((x, y), self.viewport.view)
+        if position is None:
+            self.show_notice(f"no tissue at pixel {x:g}, {y:g}")
+            return
+        if isinstance(self.tool, PositionControlledTool):
+            position = self._rest_position(x, y) or self.tool.target
+        self.tool.press(position, direction)
+        self._pointer = x, y
+        self._drag_start = position, intersect_rest_plane(self.viewport.view, self._pointer)
+        self._notice_until = 0
+
+    def _drag(self, x: float, y: float) -> None:
+        """Move the pressing tool by the displacement of the pointer on the rest plane.
+
+        Picking the deformed sheet would feed back, as it moves with the tool.
+        """
+        if self._drag_start is None:
+            return
+        self._pointer = x, y
+        ((across, down), start), end = self._drag_start, intersect_rest_plane(self.viewport.view, self._pointer)
+        if start is None or end is None:
+            return
+        (right, up), (height, width) = end - start, self.scene.sheet.size
+        self.tool.move((across + right / width, down - up / height))
+
+    def _rebase_drag(self) -> None:
+        """Restart a drag at the current position of the tool, after the camera has moved."""
+        if self._drag_start is not None:
+            self._drag_start = self.tool.target, intersect_rest_plane(self.viewport.view, self._pointer)
+
+    def _forget_pointer(self) -> None:
+        self._drag_start = self._hover_pixel = None
+
+    def _hover_position(self) -> SheetPosition | None:
+        """Return the position at which a force-controlled tool would press; None if it presses, or for other tools."""
+        if isinstance(self.tool, PositionControlledTool) or self.tool.engaged or self.tool.percent != 0:
+            return None
+        return None if self._hover_pixel is None else self._simulation.pick(self._hover_pixel, self.viewport.view)
+
+    def _rest_position(self, x: float, y: float) -> SheetPosition | None:
+        """Return the position on the rest plane at a pixel; None if the plane is not visible there."""
+        if (point := intersect_rest_plane(self.viewport.view, (x, y))) is None:
+            return None
+        height, width = self.scene.sheet.size
+        return float(point[0]) / width + 0.5, 0.5 - float(point[1]) / height
 
     def _handle_key(self, key: str) -> None:
         match key:
@@ -344,7 +380,7 @@ class Session:
                 self.handle(events.StrengthChange(-events.STRENGTH_STEP))
             case "c" | "t" | "o":
                 self.viewport.set_camera({"c": self.scene.render.main_camera, "t": "top", "o": "oblique"}[key])
-                self._controller.rebase_drag()
+                self._rebase_drag()
             case "m":
                 self.viewport.toggle_mesh()
             case "l":
@@ -354,7 +390,8 @@ class Session:
             case ".":
                 self._single_step = self.paused
             case "r":
-                self._controller.reset()
+                self.tool.reset()
+                self._forget_pointer()
                 self._simulation.restart(self._with_tool(self.tool))
                 self.viewport.set_time(0.0)
                 self._reset_figures()
@@ -387,7 +424,6 @@ class Session:
         return plan
 
     def _switch(self) -> None:
-        """Switch to the other tool, and reset the tissue."""
         tool = self._position_tool if isinstance(self.tool, ForceControlledTool) else self._force_tool
         if tool is None:
             needs = "an instrument" if isinstance(self.tool, ForceControlledTool) else "a force"
@@ -398,11 +434,12 @@ class Session:
         except SceneError as error:
             self.show_notice(error.lines[0])
             return
-        self._controller.reset()
+        self.tool.reset()
+        self._forget_pointer()
         self._simulation.restart(plan)
         self._simulation.compile()
-        self.tool = self._controller.tool = tool
-        self.frame_time_s = 0.0
+        self.tool = tool
+        self._frame_time_s = 0.0
         self._reset_figures()
         session_tools = [tool for tool in plan.tools if tool.probe == len(self._scene_probes)]
         self.show_notice("; ".join(path_warnings(plan.scene, session_tools)))
@@ -433,7 +470,6 @@ class Session:
         self._max_felt_force, self.divergence_error = 0.0, ""
 
     def _end_film(self) -> None:
-        """End a running film, and save it if it has a picture."""
         film, self._film = self._film, None
         if film is None:
             return
@@ -442,10 +478,6 @@ class Session:
         else:
             film.close()
             self.show_notice("no film was saved: it had no picture yet")
-
-    def _is_nearly_too_long(self) -> bool:
-        """Return whether the recorded scene has reached three quarters of the size limit."""
-        return count_probe_values(self.recorded_scene()) > 0.75 * MAX_NODES
 
     @property
     def _pulls(self) -> bool:
@@ -456,13 +488,10 @@ class Session:
             and tool.percent * probe_force(tool.probe, self.scene.sheet).force[2] > 0
         )
 
-    def _figure_lines(self, pacing: str) -> list[str]:
-        speed = ""
-        if self.frame_time_s > 0:
-            speed = f"steps {1 / self.frame_rate / self.frame_time_s:.2g} x real time"
-        state = [word for word, on in (("paused", self.paused), ("film", self._film is not None)) if on]
-        lines = self._tool_figures(), [pacing, speed, *state]
-        return ["  ·  ".join(part for part in line if part) for line in lines]
+    def _figure_lines(self) -> list[str]:
+        speed = f"steps {1 / self.frame_rate / self._frame_time_s:.2g} x real time" if self._frame_time_s > 0 else ""
+        state = [speed, "paused" if self.paused else "", "film" if self.filming else ""]
+        return ["  ·  ".join(filter(None, line)) for line in (self._tool_figures(), state)]
 
     def _tool_figures(self) -> list[str]:
         tool = self.tool

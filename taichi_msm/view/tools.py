@@ -35,8 +35,6 @@ class ForceControlledTool:
     Attributes:
         strength: force of a press [% of the full force].
         percent: current force [% of the full force]; negative when pulling.
-        position: current control point.
-        probe: the given probe.
     """
 
     def __init__(self, probe: Probe, frame_rate: float) -> None:
@@ -53,8 +51,6 @@ class ForceControlledTool:
         self._direction = 0
         # Presses, with position and direction (1 to push, -1 to pull), and releases (None).
         self._pending: deque[tuple[SheetPosition, int] | None] = deque()
-        # Percentage and position of the last probe.
-        self._last_returned: tuple[float, SheetPosition] | None = None
         self._load: list[tuple[float, float]] = [(0.0, 0.0)]
         self._at: list[tuple[float, float, float]] = [(0.0, *self.position)]
 
@@ -73,12 +69,7 @@ class ForceControlledTool:
         self.strength = min(100.0, max(0.0, strength))
 
     def press(self, position: SheetPosition, direction: int) -> None:
-        """Press or pull; an engaged tool is released first.
-
-        Args:
-            position: where to press.
-            direction: 1 to press, -1 to pull.
-        """
+        """Press in direction 1, or pull in direction -1; an engaged tool is released first."""
         if len(self._pending) > 1 and self._pending[-1] is None:
             # Discard an earlier click without effect yet, such as in a paused session.
             self._pending.pop()
@@ -99,12 +90,8 @@ class ForceControlledTool:
         """Release the tissue."""
         self._pending.append(None)
 
-    def advance(self, frame: int) -> Probe | None:
-        """Apply the pending action in the frame interval that begins at `frame`.
-
-        Returns:
-            The probe with the keyframes of this interval; None if it has not changed.
-        """
+    def advance(self, frame: int) -> Probe:
+        """Apply the pending action in the frame interval that begins at `frame`; return its probe for `steer`."""
         begin, end = frame / self._frame_rate, (frame + 1) / self._frame_rate
         if self._pending:
             if (press := self._pending.popleft()) is None:
@@ -116,26 +103,19 @@ class ForceControlledTool:
             self.percent = 0.0
             self._load.append((begin, 0.0))
         if self._direction != 0:
-            self.percent = self._approach(self._direction * self.strength)
+            limit = 100 / (RISE_TIME_S * self._frame_rate)
+            target = self._direction * self.strength
+            change = target - self.percent
+            self.percent = target if abs(change) <= limit else self.percent + math.copysign(limit, change)
             self._move_to_target(end)
         extend(self._load, (end, self.percent))
-        if self._last_returned == (self.percent, self.position):
-            return None
-        self._last_returned = self.percent, self.position
         return self._as_probe(self._load[-ACTIVE_KEYFRAMES:], self._at[-ACTIVE_KEYFRAMES:], end)
 
     def recorded_probe(self, frame: int) -> Probe:
         """Return the probe with all keyframes up to a frame."""
         return self._as_probe(self._load, self._at, frame / self._frame_rate)
 
-    def _approach(self, target: float) -> float:
-        """Return the percentage after a frame of rising towards a target."""
-        limit = 100 / (RISE_TIME_S * self._frame_rate)
-        change = target - self.percent
-        return target if abs(change) <= limit else self.percent + math.copysign(limit, change)
-
     def _move_to_target(self, time: float) -> None:
-        """Add a keyframe at the target."""
         self.position = self._target
         if self._at[-1][0] == time:
             self._at.pop()
@@ -175,8 +155,6 @@ DEFAULT_FRICTION = 0.5
 # Interval before the start, without effect, for which the kernel is compiled with grips.
 NO_GRIP = (-2.0, -1.0)
 
-PathKey = tuple[float, float, float, float]
-
 
 class PositionControlledTool:
     """A tool whose tip follows the pointer, above the sheet or at a given depth while it presses.
@@ -191,9 +169,6 @@ class PositionControlledTool:
     Attributes:
         strength: depth of a press [% of the largest depth]; negative to lift a grip.
         height: current height of the lowest point of the tip above the sheet at rest [m].
-        position: current position of the tip.
-        target: position to which the tip moves.
-        engaged: whether the tool presses or grips.
         grid: of the session; a change of the material changes its step.
     """
 
@@ -221,7 +196,7 @@ class PositionControlledTool:
         # Start of the current grip, and intervals of earlier grips [s].
         self._grip_start: float | None = None
         self._grips: list[tuple[float, float]] = []
-        self._path: list[PathKey] = [(0.0, *self.position, self.height)]
+        self._path: list[tuple[float, float, float, float]] = [(0.0, *self.position, self.height)]
 
     @property
     def depth(self) -> float:
@@ -243,12 +218,7 @@ class PositionControlledTool:
         self.strength = min(100.0, max(-100.0 if self._grip_requested else 0.0, strength))
 
     def press(self, position: SheetPosition, direction: int) -> None:
-        """Press or grip.
-
-        Args:
-            position: where to press.
-            direction: 1 to press, -1 to grip.
-        """
+        """Press in direction 1, or grip in direction -1."""
         self.release()
         self.engaged, self._grip_requested, self._press_strength = True, direction < 0, self.strength
         self.move(position)

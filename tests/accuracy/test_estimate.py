@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from taichi_msm import load_scene, resume, run
@@ -73,16 +72,10 @@ def test_an_estimate_can_be_left_out_or_asked_for(
     assert record["error_estimate"] is None
     message(record["error_estimate_reason"], "two fifths")
     assert record["notes"][0] == f"error not estimated: {record['error_estimate_reason']}"
-    record = run(made, "out", threads=device.threads, estimate_error=True)
+    record = run(made, "with", threads=device.threads, estimate_error=True)
     assert told(record) < 0.1
-
-
-def test_an_estimate_does_not_change_the_run(small: Path, device: Device) -> None:
-    made = load_scene("small.yaml", SHORT)
-    for name, wanted in (("with", True), ("without", False)):
-        run(made, name, threads=device.threads, estimate_error=wanted)
-    one, other = (np.load(f"{name}/trajectory.npz")["position"] for name in ("with", "without"))
-    np.testing.assert_array_equal(one, other)
+    # It does not change the run.
+    assert Path("out/trajectory.npz").read_bytes() == Path("with/trajectory.npz").read_bytes()
 
 
 def test_a_resumed_run_has_the_same_estimate(small: Path, device: Device) -> None:
@@ -189,8 +182,7 @@ def test_a_finer_pilot_follows_an_error_that_matters(
     assert record["notes"][0].startswith("error: time step at least ")
 
 
-@pytest.mark.parametrize("output", ["[]"])
-def test_ctrl_c_in_the_finer_pilot_leaves_a_complete_run(output: str, small: Path, device: Device) -> None:
+def test_ctrl_c_in_the_finer_pilot_leaves_a_complete_run(small: Path, device: Device) -> None:
     asked: list[str] = []
 
     def stop(stage: str, done: int, total: int) -> None:
@@ -199,7 +191,7 @@ def test_ctrl_c_in_the_finer_pilot_leaves_a_complete_run(output: str, small: Pat
         if asked and stage != "write":
             raise KeyboardInterrupt
 
-    made = load_scene("small.yaml", [*WRONG, f"output={output}"])
+    made = load_scene("small.yaml", [*WRONG, "output=[]"])
     record = run(made, "out", threads=device.threads, progress=stop)
     assert (asked, record["status"], record["frames"]) == (["pilot"], "complete", 5)
     found: Any = record["error_estimate"]

@@ -132,7 +132,7 @@ cam1:
   resolution: [40, 30]
   rostopic: /cam1/image_raw
 """
-OMNI_KALIBR = KALIBR.replace("pinhole", "omni").replace("radtan", "equidistant").replace("[61", "[1.25, 61")
+OMNI_KALIBR = KALIBR.replace("pinhole", "omni").replace("intrinsics: [", "intrinsics: [1.25, ")
 _SECTION = """\
 [Stereo{}]
 res_x = 40
@@ -276,8 +276,7 @@ def test_an_omnidirectional_calibration_is_read(small: Path) -> None:
     storage.write("xi", np.array([[1.25]]))
     storage.write("image_size", np.array([[40, 30]]))
     storage.release()
-    kalibr = KALIBR.replace("pinhole", "omni").replace("[61.5", "[1.25, 61.5")
-    Path("chain.yml").write_text(kalibr)
+    Path("chain.yml").write_text(OMNI_KALIBR)
     expected = dict(zip(("xi", "k1", "k2", "p1", "p2"), [1.25, *COEFFICIENTS], strict=False))
     for path in ("omni.yml", "chain.yml"):
         calibration = read_calibration(path)
@@ -361,20 +360,14 @@ D = "D: [-0.3, 0.1, 0.001, -0.002, 0.03]\n"
         pytest.param("a: &a [1]\nb: *a", id="alias"),
         pytest.param('<!DOCTYPE a [<!ENTITY b "c">]><a/>', id="entity"),
         pytest.param('width: !!int ""', id="tag"),
-        pytest.param("K: !!python/object:numpy.ndarray {}", id="tag of an object"),
         pytest.param("K: " + 400 * "[" + 400 * "]", id="nested"),
-        pytest.param('{"K": ' + 600 * "[" + "1" + 600 * "]" + "}", id="nested JSON"),
         pytest.param(f"{K}{D}x: [{'1,' * 300_000}]", id="many values"),
         pytest.param(f"{K}{D}? [1, 2]\n: 3", id="key that is no text"),
         pytest.param("", id="empty"),
         pytest.param("f: 3", id="no matrix"),
-        pytest.param("K: 3", id="number as matrix"),
-        pytest.param("K: [x]", id="text as matrix"),
         pytest.param("K: [1, 0, 1, 2, 1, 1, 0, 0, 1]", id="skew matrix"),
         pytest.param("K: [1, 0, 1e9, 0, 1, 1, 0, 0, 1]", id="large number"),
-        pytest.param(f"K: [1{400 * '0'}]", id="huge number"),
         pytest.param(K.replace("60.5", "1e-300") + D, id="no focal length"),
-        pytest.param(K + D + "width: 0\nheight: 0", id="no pixels"),
         pytest.param(K + D + "width: 40", id="width alone"),
         pytest.param(K + D + "width: 40\nheight: 30\nimage_size: [80, 60]", id="two sizes"),
         pytest.param(K + "note: 3", id="no distortion"),
@@ -384,37 +377,23 @@ D = "D: [-0.3, 0.1, 0.001, -0.002, 0.03]\n"
         pytest.param(K + "D: {rows: 1, cols: 4, dta: [0.1, 0, 0, 0]}", id="no matrix of OpenCV"),
         pytest.param(K + D + "dist: [-0.31, 0.1, 0.001, -0.002, 0.03]", id="two distortions"),
         pytest.param(K + "dist: [0, 0, 0, 0]\ndist: [1, 0, 0, 0]\n", id="key twice"),
-        pytest.param('{"dist": [0, 0, 0, 0], "dist": [1, 0, 0, 0]}', id="key twice in JSON"),
-        pytest.param("<a><K><data>1</data></K><dist>0</dist><dist>1</dist></a>", id="key twice in XML"),
         pytest.param(K + "distortion_model: fov", id="unknown model"),
-        pytest.param(K + D + "camera_model: ds", id="unknown model of the camera"),
         pytest.param(K + D + "distortion_model: none", id="coefficients of no model"),
         pytest.param(K + "D: [0, 0, 0, 0]\nfisheye_model: 1\ndistortion_model: plumb_bob", id="two models"),
         pytest.param(K + D + "xi: 1.27", id="omnidirectional with k3"),
         pytest.param(K + "D: [0, 0, 0, 0]\nxi: -1", id="coefficient out of range"),
         pytest.param(K + "D: [0, 0, 0, 0]\nmodel: omnidir", id="omnidirectional without xi"),
         pytest.param(K + "D: [0, 0, 0, 0]\nfisheye: 1\nxi: 1", id="omnidirectional and fisheye"),
-        pytest.param(
-            KALIBR.replace("pinhole", "omni").replace("radtan", "equidistant").replace("[61", "[1.25, 61"),
-            id="omnidirectional of Kalibr",
-        ),
+        pytest.param(OMNI_KALIBR.replace("radtan", "equidistant"), id="omnidirectional of Kalibr"),
         pytest.param(OCAMCALIB.replace("-1.2e+02 0.0", "-1.2e+02 1.0"), id="OCamCalib"),
         pytest.param(K + D + "radial_distortion: [0.1]\nrms: 0.2", id="other distortion"),
         pytest.param(K + D + "image_shape: [30, 40]", id="size of unknown order"),
-        pytest.param(K + D + "roi: [10, 10, 40, 40]", id="region"),
-        pytest.param(K + D + "binning: 2", id="binning"),
-        pytest.param(K + D + "undistorted: true", id="undistorted"),
         pytest.param(PRINTED.replace("g_x: 0", "g_x: 2"), id="binning of ROS"),
-        pytest.param(PRINTED.replace("x_offset: 0", "x_offset: 4"), id="offset of ROS"),
-        pytest.param(PRINTED.replace("width: 0", "width: 20"), id="width of ROS"),
         pytest.param(K.replace("K", "M1") + K.replace("K", "M2") + "D1: 3\nD2: [0, 0, 0, 0]", id="stereo pair"),
         pytest.param(KALIBR.replace("distortion_coeffs: [-0.3, 0.1, 0.001, -0.002]", "x: 1"), id="Kalibr"),
-        pytest.param(KALIBR.replace("pinhole", "ds", 1), id="projection of Kalibr"),
         pytest.param(KALIBR.replace("[61.5", "[1.25, 61.5", 1), id="intrinsics of Kalibr"),
         pytest.param("StereoLeft:\nStereoRight:\n", id="StereoMIS without keys"),
         pytest.param("K: [60, 0, 20, 0, 60, 15, 0, 0, 1]\nD: [0, 0, 0, 0]\nfx: 50\n", id="another focal length"),
-        pytest.param("K: [60, 0, 20, 0, 60, 15, 0, 0, 1]\nD: [0, 0, 0, 0]\nalpha_c: 0.01\n", id="skew of Bouguet"),
-        pytest.param(KALIBR.replace("radtan", "fov"), id="distortion of Kalibr"),
         pytest.param("; of two\n[StereoLeft]\nfc_x = 3\n", id="StereoMIS"),
         pytest.param("[Camera]\nfc_x = 3\n", id="ini file"),
         pytest.param("# Camera list\n1 FOV 40 30 5e2 5e2 3e2 2e2 0.1\n", id="COLMAP"),
@@ -433,16 +412,9 @@ def test_what_is_no_calibration_is_refused(text: str, small: Path, message: Mess
     [
         *(
             f"{K}{name}: [[-0.3, 0.1, 0.001, -0.002, 0.03]]"
-            for name in (
-                *("dist_coeff", "DistCoeff", "distortion_coeffs", "distortion_coeff", "distortion_coefs", "dist", "d"),
-                *("dist_coefs", "distCoeffs", "distortion", "DISTORTION_PARAMETERS", "dist-coefficients"),
-                "distortion_vector",
-            )
+            for name in ("DistCoeff", "distortion_coefs", "dist", "d", "DISTORTION_PARAMETERS", "distortion_vector")
         ),
-        *(
-            K.replace("K", name) + D
-            for name in ("mtx", "camera_mtx", "intrinsic_matrix", "cameraMatrix", "M", "intrinsics")
-        ),
+        *(K.replace("K", name) + D for name in ("mtx", "camera_mtx", "intrinsic_matrix", "cameraMatrix", "M")),
         # Twice, and the same but for rounding.
         K + D + "mtx: [61.5, 0, 19.25, 0, 60.50000001, 14.75, 0, 0, 1]\ndist: [[-0.3, 0.1, 0.001, -0.002, 0.03]]",
     ],
@@ -504,6 +476,14 @@ def test_check_prints_what_was_read(small: Path, capsys: pytest.CaptureFixture[s
     # 20 px on both sides of the centre are 45 degrees at a focal length of 20 px.
     assert "fov 90.0 x 90.0 degrees" in lines[1]
     message(lines, "render.cameras.left: pinhole, 40 x 30 px", "k1 -0.3")
+
+
+def test_a_field_of_view_beyond_the_limit_is_that_of_the_lens(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The left and right edges are 104 degrees from the axis, the upper and lower ones 78."""
+    Path("camera.yml").write_text("K: [11, 0, 19.5, 0, 11, 14.5, 0, 0, 1]\nD: [0, 0, 0, 0]\nfisheye: true\n")
+    camera = READ.replace("FILE", "camera.yml, outside: background")
+    assert not main(["check", "small.yaml", "--set", camera, "--set", "output=[]"])
+    assert "40 x 30 px, fov (the lens's) x 156.3 degrees" in capsys.readouterr().out
 
 
 def test_files_are_in_the_folder_of_the_scene(small: Path, message: Messages) -> None:

@@ -55,10 +55,18 @@ MILLISECONDS = """\
 """
 
 
+SUFFIXES = """\
+t_ms,x_mm,y_mm,z_mm,qx,qy,qz,qw
+0,0,0,400,1,0,0,0
+200,100,0,400,1,0,0,0
+400,100,0,500,0.6,0.8,0,0
+"""
+
+
 @pytest.mark.parametrize(
     "text",
-    [EUROC, MILLISECONDS, TABLE, TABLE.replace(",", ";").replace(".", ",").replace("time", '"t"')],
-    ids=["EuRoC", "milliseconds", "table", "table of a spreadsheet"],
+    [EUROC, MILLISECONDS, SUFFIXES, TABLE, TABLE.replace(",", ";").replace(".", ",").replace("time", '"t"')],
+    ids=["EuRoC", "milliseconds", "suffixes", "table", "table of a spreadsheet"],
 )
 def test_a_header_decides_on_the_columns(text: str, small: Path) -> None:
     Path("tum.txt").write_text(TUM)
@@ -148,6 +156,7 @@ HEADER = "# timestamp tx ty tz qx qy qz qw"
         pytest.param(TUM.partition("\n")[2].replace(" ", ","), "poses.txt:1", id="commas without a header"),
         pytest.param(TUM.replace("qx qy qz qw", "w x y z"), "poses.txt:1", id="unknown columns"),
         pytest.param(EUROC.replace("x [m]", "x [mm]"), "poses.txt:1", id="unknown units"),
+        pytest.param(SUFFIXES.replace("z_mm", "z_m"), "poses.txt:1", id="two units"),
         pytest.param("# nothing\n", "poses.txt", id="no poses"),
         pytest.param(TUM.replace("0.2 0.1", "2e8 0.1").replace("0.4 0.1", "4e8 0.1"), "", id="nanoseconds"),
         pytest.param(TUM.replace("0.0 0.0 0.0 0.4", "0.0 0.0 0.0 0.0"), "", id="eye on the sheet"),

@@ -15,11 +15,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from taichi_msm.cli import console
 from taichi_msm.errors import FilesError, ForeignError
 from taichi_msm.exports import obj
 from taichi_msm.exports.export import export
-from taichi_msm.runs import directory
 from taichi_msm.runs.finished import read_run
 from taichi_msm.runs.run import run
 from taichi_msm.system.runtime import Device
@@ -177,28 +175,6 @@ def test_a_record_that_was_made_up_takes_no_file_of_the_user(results: Path, mess
             exported(results, out)
 
 
-def test_many_files_are_compared_in_time_proportional_to_their_number(
-    results: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out, count = results / "here", 300
-    names = [f"{number:04}.obj" for number in range(count)]
-    out.mkdir()
-    for name in names:
-        (out / name).write_text("of an earlier export")
-    (out / "export.json").write_text(json.dumps({"files": names}))
-    calls: list[str] = []
-    kind = directory.entry_kind
-
-    def counted(path: Path) -> str | None:
-        calls.append(path.name)
-        return kind(path)
-
-    monkeypatch.setattr(directory, "entry_kind", counted)
-    assert len(exported(results, out)) == 8
-    # A name is looked up some times, and never beside each of the others.
-    assert count < len(calls) < 10 * count < count**2
-
-
 @pytest.mark.parametrize("moment", [0, 2])
 def test_a_run_that_publishes_meanwhile_is_noticed(
     moment: int, results: Path, device: Device, message: Messages
@@ -239,7 +215,6 @@ def secret(results: Path) -> str:
 def test_a_record_that_names_a_picture_elsewhere_gets_nothing_of_it(
     name: str, results: Path, message: Messages
 ) -> None:
-    pytest.importorskip("vtkmodules" if name == "vtk" else "numpy")
     change_scene(results, image=secret(results))
     for digests in ({"image": "0" * 64}, {}):
         change(results, sha256=digests)
@@ -249,7 +224,6 @@ def test_a_record_that_names_a_picture_elsewhere_gets_nothing_of_it(
 
 
 def test_a_record_that_names_a_map_elsewhere_gets_nothing_of_it_for_vtk(results: Path, message: Messages) -> None:
-    pytest.importorskip("vtkmodules")
     change_scene(results, springs={"map": {"image": secret(results), "range": [1.0, 2.0]}})
     with message.raises(FilesError, "springs.map.image", "secret.png"):
         export(results, "vtk")
@@ -267,7 +241,6 @@ def test_results_that_are_links_get_nothing_of_what_they_lead_to(name: str, resu
 
 @pytest.mark.parametrize("name", ["gltf", "obj", "vtk"])
 def test_positions_that_no_run_reaches_are_damage(name: str, results: Path, message: Messages) -> None:
-    pytest.importorskip("vtkmodules" if name == "vtk" else "numpy")
     rewrite(results, edit=lambda position: position * np.array([1, 1, 1e300, 1e300, 1])[:, None, None, None])
     with message.raises(FilesError, "trajectory.npz"):
         export(results, name)
@@ -334,7 +307,6 @@ def test_an_export_that_fails_leaves_the_earlier_one(
 
 @pytest.mark.parametrize("name", ["gltf", "obj", "vtk"])
 def test_an_interrupted_export_changes_nothing(name: str, results: Path) -> None:
-    pytest.importorskip("vtkmodules" if name == "vtk" else "numpy")
     out = results / "here"
     export(results, name, out)
     before, calls = files(out), []
@@ -363,9 +335,3 @@ def test_the_command_says_that_it_was_interrupted(
     assert done.returncode == 130
     message(done.stderr)
     assert json.loads(done.stdout)["status"] == "interrupted"
-
-
-def test_a_long_export_says_how_far_it_is(results: Path, program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(console, "LINE_INTERVAL_S", 0.0)
-    assert "exporting: 3 of 5 done, about " in program("export", str(results), "--format", "obj").stderr
-    assert program("export", str(results), "--format", "obj", "--quiet").stderr == ""

@@ -26,6 +26,7 @@ def test_without_rerun_the_package_is_named(
     labelled_in_motion: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, message: Messages
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
+    monkeypatch.delitem(sys.modules, "taichi_msm.exports.rerun", raising=False)
     with message.raises(NotInstalledError):
         export(labelled_in_motion, "rerun", tmp_path / "out")
     assert not (tmp_path / "out").exists()

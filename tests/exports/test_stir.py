@@ -31,7 +31,7 @@ from scipy import ndimage
 
 from taichi_msm import ArgumentError, FilesError, NotInstalledError, export
 from taichi_msm.scene import outputs
-from tests.exports.test_cameras import alone, describe
+from tests.exports.test_cameras import alone, describe, tracks
 from tests.golden import Messages
 
 av: Any = pytest.importorskip("av")
@@ -59,11 +59,6 @@ def centres(sequence: Path, part: str) -> NDArray[np.int64]:
     assert set(np.unique(mask)) == {0, 255}
     boxes = ndimage.find_objects(ndimage.label(mask, np.ones((3, 3)))[0])
     return np.array([[each.start + (each.stop - each.start) // 2 for each in (box[1], box[0])] for box in boxes])
-
-
-def tracks(folder: Path) -> dict[str, Any]:
-    with np.load(folder / "tracks.npz") as archive:
-        return dict(archive)
 
 
 @pytest.fixture

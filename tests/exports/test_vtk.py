@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -11,13 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm.errors import NotInstalledError
 from taichi_msm.exports.export import export
 from taichi_msm.exports.vtk import speed
 from taichi_msm.model.sheet import area_shares, rest_positions
 from taichi_msm.runs.finished import read_run
 from tests import reference
-from tests.golden import Messages
 
 
 @pytest.fixture(scope="module")
@@ -105,12 +102,3 @@ def test_the_speed_is_of_order_2() -> None:
     # h^2 / 6 times the third derivative, 20 at most.
     assert errors[0] < 20 / 20**2 / 6
     assert np.log2(np.divide(errors[:-1], errors[1:])) == pytest.approx([2, 2], abs=0.05)
-
-
-def test_without_vtk_there_is_one_line(
-    ran: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, message: Messages
-) -> None:
-    monkeypatch.setitem(sys.modules, "vtkmodules.vtkIOXML", None)
-    with message.raises(NotInstalledError, "VTK"):
-        export(ran, "vtk", tmp_path / "out")
-    assert not (tmp_path / "out").exists()

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
@@ -14,3 +16,15 @@ def one_device(device: Device) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(process, "available_threads", lambda: device.threads)
         yield
+
+
+def with_keys(data: dict[str, Any], **keys: Any) -> dict[str, Any]:
+    """The data of a scene with other values, by their dotted paths with __ for the dots."""
+    data = json.loads(json.dumps(data))
+    for key, value in keys.items():
+        *sections, name = key.split("__")
+        holder: Any = data
+        for section in sections:
+            holder = holder[int(section) if section.isdigit() else section]
+        holder[name] = value
+    return data

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import io
 import json
-import os
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from scipy.stats import t as student
 from taichi_msm import ArgumentError, SceneError, Simulation, fit, load_scene, run
 from taichi_msm.fitting.archive import read_observations
 from taichi_msm.fitting.checks import faults
-from taichi_msm.fitting.force_table import read_forces
+from taichi_msm.fitting.forces import read_forces
 from taichi_msm.fitting.observation import ErrorCorrelation
 from taichi_msm.fitting.parameters import Method, make_parameters
 from taichi_msm.fitting.points import MIN_MOTION_SIGMAS, Pixels
@@ -27,6 +27,7 @@ from taichi_msm.model.surface import surface_positions
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
+from tests.fitting.conftest import with_keys
 from tests.golden import Messages
 
 Array = NDArray[np.float64]
@@ -57,15 +58,8 @@ PLACES = np.stack([axis.ravel() for axis in np.meshgrid(GRID, GRID)], axis=1)
 
 
 def changed(**keys: Any) -> Scene:
-    """The truth with other values, by their dotted paths with __ for the dots."""
-    data = json.loads(json.dumps(TRUTH))
-    for key, value in keys.items():
-        *sections, name = key.split("__")
-        holder = data
-        for section in sections:
-            holder = holder[int(section) if section.isdigit() else section]
-        holder[name] = value
-    return Scene.model_validate(data)
+    """The truth with other values."""
+    return Scene.model_validate(with_keys(TRUTH, **keys))
 
 
 def positions_in(made: Scene, device: Device) -> Array:
@@ -243,19 +237,23 @@ def test_a_number_that_can_change_to_one_side_only_is_found(tracks: dict[str, Ar
     assert values(found) == pytest.approx([0.2], abs=1e-4)
 
 
-def test_what_a_mask_hides_is_not_seen(tracks: dict[str, Array]) -> None:
-    pixel = np.ma.masked_equal(tracks["pixel"].copy(), 5000)
-    pixel[3] = np.ma.masked
-    seen = read_observations({**tracks, "pixel": pixel}, 25)
-    np.testing.assert_array_equal(np.flatnonzero(~seen.is_observed.any(axis=1)), [3])
-
-
-def test_an_occluded_track_is_not_used() -> None:
+def test_an_occluded_track_is_not_used(tracks: dict[str, Array], message: Messages) -> None:
     points, occluded = np.zeros((2, 3, 2), np.float32), np.zeros((2, 3), np.bool_)
     occluded[1, 2] = True
     seen = read_observations({"coordinates": [[0.5, 0.5], [0.2, 0.7]], "points": points, "occluded": occluded}, 25)
     assert seen.time.tolist() == [0, 0.04, 0.08]
     assert (seen.is_observed != occluded).all()
+    # Nor one that is masked, or not visible.
+    visible = np.random.default_rng(0).random(tracks["pixel"].shape[:2]) < 0.5
+    masked = np.ma.masked_array(tracks["pixel"], np.repeat(~visible[..., None], 2, axis=2))
+    for seen in (
+        read_observations({**tracks, "pixel": masked}, 25),
+        read_observations(tracks | {"visible": visible}, 25),
+    ):
+        np.testing.assert_array_equal(seen.is_observed, visible)
+    for name, array in (("visible", 0.9 * visible), ("validity", visible)):
+        with message.raises(SceneError, name):
+            read_observations({**tracks, name: array}, 25)
 
 
 def test_a_number_that_nothing_shows_is_not_identifiable(motion: Array) -> None:
@@ -291,14 +289,16 @@ def test_depths_and_forces_of_a_tool_tell_the_foundation(device: Device, tmp_pat
     assert record["residual_force"] < 0.001
 
 
-@pytest.mark.slow
-def test_what_is_far_off_counts_less_in_a_robust_fit(tracks: dict[str, Array]) -> None:
-    seen, free = noisy(tracks, 0.1), ["tissue.foundation"]
+def test_what_is_far_off_counts_less_in_a_robust_fit(tracks: dict[str, Array], message: Messages) -> None:
+    """But in full for its rejection."""
+    seen, free = noisy(tracks, 0.1, sigma=0.1), ["tissue.foundation"]
+    assert not fit(changed(), seen, free, robust=True, workers=1).model_rejected
     seen["pixel"][[7, 20]] += np.linspace(0, 40, 11)[:, None]
     plain, robust = fit(changed(), seen, free, workers=1), fit(changed(), seen, free, robust=True, workers=1)
     errors = [abs(values(one)[0] / 3e5 - 1) for one in (plain, robust)]
     assert errors[1] < 0.1 * errors[0]
     assert errors[1] < 3 * robust.parameters["tissue.foundation"].standard_error / 3e5
+    message(robust.summary()[0], "the model is rejected: ", hide=r"\d[\d.]*")
 
 
 def test_a_robust_fit_of_good_tracks_is_nearly_the_same(tracks: dict[str, Array]) -> None:
@@ -307,17 +307,6 @@ def test_a_robust_fit_of_good_tracks_is_nearly_the_same(tracks: dict[str, Array]
     plain, robust = (fit(changed(), seen, [key], robust=one, profile=one).parameters[key] for one in (False, True))
     assert robust.standard_error == pytest.approx(plain.standard_error, rel=0.01)
     np.testing.assert_allclose(np.array(robust.interval, float), np.array(plain.interval, float), rtol=1e-3)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("robust", [False, True])
-def test_tracks_that_are_far_apart_for_their_errors_are_independent(tracks: dict[str, Array], robust: bool) -> None:
-    errors = []
-    for correlation in (None, 1e-6):
-        given, free = noisy(tracks, 0.1, sigma=0.1), ["tissue.young", "tissue.foundation"]
-        found = fit(changed(), given, free, robust=robust, correlation=correlation, workers=1)
-        errors.append([one.standard_error for one in found.parameters.values()])
-    np.testing.assert_allclose(errors[0], errors[1], rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -426,8 +415,9 @@ def bad(tracks: dict[str, Array], motion: Array) -> dict[str, dict[str, Any]]:
     """What cannot be used."""
     pixel, time, still = tracks["pixel"], tracks["time"], np.repeat(tracks["pixel"][:, :1], 11, axis=1)
     hidden, mass = np.full_like(pixel, np.nan), {"time": time, "position": motion}
-    lone = hidden.copy()
-    lone[0, 3] = pixel[0, 3]
+    lone, zeros, marked = hidden.copy(), pixel.copy(), pixel.copy()
+    lone[0, 3], zeros[3, 4:], marked[3, 4:] = pixel[0, 3], 0, -9999
+    seen = noisy(tracks, 0.1)
     return {
         "few": {**tracks, "pixel": lone},
         "hidden": {**tracks, "pixel": hidden},
@@ -447,6 +437,17 @@ def bad(tracks: dict[str, Array], motion: Array) -> dict[str, dict[str, Any]]:
         "turned": {**tracks, "pixel": pixel.swapaxes(0, 1)},
         "lacks": {"time": time, "pixel": pixel},
         "both": {**tracks, "position": np.zeros((36, 11, 3))},
+        # Conventions of other programs.
+        "zeros": {**tracks, "pixel": zeros},
+        "marked": {**tracks, "pixel": marked},
+        "fractions": {**tracks, "pixel": pixel / 512},
+        "numbers": {**tracks, "time": np.arange(11)},
+        "from 0": {**seen, "pixel": seen["pixel"] - 0.5},
+        "from 1": {**seen, "pixel": seen["pixel"] + 0.5},
+        "from 1 in x": {**seen, "pixel": seen["pixel"] + [0.5, 0]},
+        "upward": {**seen, "pixel": [0, 512] + seen["pixel"] * [1, -1]},
+        "downward": {**mass, "position": motion * [1, -1, 1]},
+        "away": {**mass, "position": motion * [1, 1, -1]},
     }
 
 
@@ -468,19 +469,6 @@ def test_motion_of_many_tracks_is_seen_though_it_is_smaller_than_their_errors(tr
         seen = read_observations({**tracks, "pixel": pixel, "sigma": 1.0}, 25)
         assert seen.signal(changed()) < MIN_MOTION_SIGMAS
         assert bool(list(faults([seen], changed(), 1))) != moving
-
-
-def test_values_that_make_no_scene_give_no_run(device: Device, tracks: dict[str, Array]) -> None:
-    scene = changed(tissue__damping=0)
-    free = ["tissue.damping", "tissue.young"]
-    parameters = make_parameters(scene, free, {"tissue.damping": (-100, 100)})
-    job = FitProblem("token", without_outputs(scene), parameters, (read_observations(tracks, 25),))
-    predictor = ForwardModel(job, device.threads)
-    # Less than no damping; springs without length, as a tenth of young does not bear the pretension.
-    assert predictor.try_predict(np.array([-0.1, 0.0])) is None
-    assert predictor.try_predict(np.array([0.0, -np.log(10)])) is None
-    assert predictor.try_predict(np.array([0.0, 0.0])) is not None
-    predictor.close()
 
 
 @pytest.mark.parametrize(
@@ -513,9 +501,18 @@ def test_wrong_arguments_are_answered_in_a_line(
     assert not (small / "output").exists()
 
 
-@pytest.mark.parametrize("text", [b"", b"nothing", b"PK\x05\x06" + bytes(18)], ids=["empty", "text", "no arrays"])
-def test_a_file_that_is_none_is_refused(tmp_path: Path, text: bytes, message: Messages) -> None:
-    (tmp_path / "seen.npz").write_bytes(text)
+def saved(array: Array) -> bytes:
+    file = io.BytesIO()
+    np.save(file, array)
+    return file.getvalue()
+
+
+FILES = {"empty": b"", "text": b"nothing", "no arrays": b"PK\x05\x06" + bytes(18), "single array": saved(np.ones(3))}
+
+
+@pytest.mark.parametrize("case", FILES)
+def test_a_file_that_is_none_is_refused(tmp_path: Path, case: str, message: Messages) -> None:
+    (tmp_path / "seen.npz").write_bytes(FILES[case])
     with message.raises(SceneError, "seen.npz: "):
         fit(changed(), tmp_path / "seen.npz", ["tissue.young"])
 
@@ -525,20 +522,14 @@ UNREADABLE: dict[str, str | bytes] = {
     "empty": "",
     "no row": FORCES,
     "no force": f"{FORCES}0.1,0,,,\n",
-    "only empty cells": f"{FORCES},,,,\n",
     "no time": f"{FORCES},0,0,0,1\n",
-    "one column": FORCES.replace(",", " "),
-    "unit in a cell": f"{ZEROS}0.1,0,0,0,-0.5 N\n",
+    "no force_z": "time,probe,force_x,force_y\n0,0,0,0\n",
     "word": f"{ZEROS}0.1,0,n/a,0,0\n",
-    "infinite": f"{ZEROS}0.1,0,0,inf,0\n",
     "huge": f"{ZEROS}0.1,0,0,1e308,0\n",
-    "decimal comma": f'{ZEROS}"0,1",0,0,0,0\n',
     "twice": f"{ZEROS}0,0,0,0,1\n",
     "decimal commas": f"{ZEROS}0,1,0,0,0,0,0,-0,5\n",
     # A German -1.234 is a thousand times as much.
     "both decimal marks": FORCES.replace(",", ";") + "0,2;0;0;0;-1.234\n",
-    "workbook": b"PK\x03\x04",
-    "utf-16 without a mark": FORCES.encode("utf-16-le"),
     "millinewtons": f"{FORCES}s,-,mN,mN,mN\n0,0,0,0,1\n",
     "column twice": f"{FORCES.strip()},force_z [N]\n0,0,0,0,1,2\n",
 }
@@ -555,30 +546,18 @@ def test_a_table_of_forces_that_cannot_be_read_is_refused(tmp_path: Path, case: 
 @pytest.mark.parametrize(
     "data",
     [
-        ("\ufeff" + FORCES + "0.1,0,,nan,-0.5\n").encode(),
-        (FORCES + "0.1,0,,,-0.5\n").encode("utf-16"),
-        (FORCES + "0.1,0,,,\u22120.5\n").encode(),
         b'# a rig\n"time","probe","force_x","force_y","force_z"\ns,-,N,N,N\n# it begins\n"0.1","0","","","-0.5"\n',
         b"time [s];probe;force_x [N];force_y [N];force_z [N]\n0,1;0;;;-0,5\n",
         b"# time,probe,force_x,force_y,force_z\n0.1,0,,,-0.5\n",
         b"sep=;\nA rig; of a lab\nTime;Probe;Force_X;Force_Y;Force_Z\n[s];[-];[N];[N];[N]\n0,1;0;;;-0,5\n% end\n;;;;\n",
     ],
-    ids=["mark", "utf-16", "minus", "quotes, units, comments", "decimal commas", "commented header", "titles"],
+    ids=["quotes, units, comments", "decimal commas", "commented header", "titles"],
 )
 def test_tables_of_other_programs_are_understood(tmp_path: Path, data: bytes) -> None:
     (tmp_path / "forces.csv").write_bytes(data)
     read = read_forces(tmp_path / "forces.csv", 0.1, 1)
     assert (read.time.tolist(), read.probe.tolist()) == ([0.1], [0])
     np.testing.assert_array_equal(read.values, [[np.nan, np.nan, -0.5]])
-
-
-def test_forces_of_a_pipe_or_a_huge_file_are_refused(tmp_path: Path, message: Messages) -> None:
-    os.mkfifo(tmp_path / "pipe")
-    with (tmp_path / "huge").open("wb") as file:
-        file.truncate(20 * 10**9)
-    for name in ("pipe", "huge"):
-        with message.raises(SceneError, name):
-            read_forces(tmp_path / name, 0.1, 1)
 
 
 def test_arrays_that_are_not_needed_are_left_unread(
@@ -598,13 +577,11 @@ HEADER = b"\x93NUMPY\x01\x00"
     ("data", "method", "changes"),
     [
         (HEADER + bytes(200), zipfile.ZIP_DEFLATED, {38: 0xFF}),
-        (HEADER + bytes(200), zipfile.ZIP_LZMA, {48: 0xFF}),
         (HEADER + bytes(200), zipfile.ZIP_STORED, {6: 1, -22 - 54 + 8: 1}),
         (HEADER + b"\x04\x00((\n(", zipfile.ZIP_STORED, {}),
-        (b"raw", zipfile.ZIP_STORED, {}),
         (HEADER + b"\x40\x1f" + b"-" * 8000, zipfile.ZIP_STORED, {}),
     ],
-    ids=["deflate", "lzma", "encrypted", "tokens", "raw", "deep"],
+    ids=["deflate", "encrypted", "tokens", "deep"],
 )
 def test_an_array_that_cannot_be_read_is_named(
     tmp_path: Path, data: bytes, method: int, changes: dict[int, int], message: Messages
@@ -619,27 +596,6 @@ def test_an_array_that_cannot_be_read_is_named(
         read_observations(tmp_path / "seen.npz", 25)
     assert "\n" not in str(caught.value)
     assert "ZipInfo" not in str(caught.value)
-
-
-def test_what_is_visible_is_seen(tracks: dict[str, Array], message: Messages) -> None:
-    visible = np.random.default_rng(0).random(tracks["pixel"].shape[:2]) < 0.5
-    np.testing.assert_array_equal(read_observations({**tracks, "visible": visible}, 25).is_observed, visible)
-    for name, array in (("visible", 0.9 * visible), ("validity", visible)):
-        with message.raises(SceneError, name):
-            read_observations({**tracks, name: array}, 25)
-
-
-def test_conventions_of_other_programs_are_asked_about(tracks: dict[str, Array], message: Messages) -> None:
-    def answer(**more: Any) -> list[str]:
-        return list(faults([read_observations({**tracks, **more}, 25)], changed(), 2))
-
-    assert answer() == []
-    for mark in (0, -9999):
-        pixel = tracks["pixel"].copy()
-        pixel[3, 4:] = mark
-        message(answer(pixel=pixel), f"{mark} in all numbers of 7 points")
-    message(answer(pixel=tracks["pixel"] / changed().render.size), "fractions")
-    message(answer(time=np.arange(11)), "frame numbers")
 
 
 @pytest.mark.parametrize("factor", [1, 1.1, -1, 1000, 101.97, 0.001])
@@ -662,18 +618,6 @@ def test_units_and_signs_of_forces_are_asked_about(
     found = fit(*given, forces=(forces[0], 0.01), workers=1)
     assert not any("times those of the scene" in note for note in found.notes)
     assert (", mostly of the forces, which are 1.1 times the predicted ones" in found.summary()[0]) == (factor == 1.1)
-
-
-def test_offsets_of_half_a_pixel_and_turned_axes_are_asked_about(
-    tracks: dict[str, Array], motion: Array, message: Messages
-) -> None:
-    seen = noisy(tracks, 0.1)
-    pixel, turned = seen["pixel"], motion * [1, -1, 1]
-    changes = [{"pixel": pixel + offset} for offset in (-0.5, 0.5, np.array([0.5, 0]))]
-    arrays = [{**seen, **change} for change in (*changes, {"pixel": [0, 512] + pixel * [1, -1]})]
-    for one in (*arrays, *({"time": seen["time"], "position": each} for each in (turned, motion * [1, 1, -1]))):
-        with message.raises(SceneError, "pixel" if "pixel" in one else "position"):
-            fit(changed(), one, ["tissue.young"], workers=1)
 
 
 @pytest.mark.parametrize("robust", [False, True])
@@ -753,26 +697,14 @@ def test_a_number_of_a_named_camera_is_found(tracks: dict[str, Array]) -> None:
     np.testing.assert_allclose(values(found), [0], atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["seen.npy", "seen.npz"])
-def test_a_single_array_is_refused(tracks: dict[str, Array], tmp_path: Path, name: str, message: Messages) -> None:
-    np.save(tmp_path / "seen.npy", tracks["pixel"])
-    (tmp_path / "seen.npy").rename(tmp_path / name)
-    with message.raises(SceneError, name):
-        fit(changed(), tmp_path / name, ["tissue.young"])
-
-
 WRONG_TYPES: dict[str, dict[str, Any]] = {
     "free, text": {"free": "tissue.young"},
-    "free, numbers": {"free": [0]},
     "observed": {"observed": 5},
     "scene": {"scene": 5},
     "bounds, list": {"bounds": [("tissue.young", 1, 2)]},
-    "bounds, text": {"bounds": {"tissue.young": ("1", 2)}},
     "forces": {"forces": "forces.csv"},
-    "directory": {"directory": 5},
     "workers": {"workers": 0},
     "sigma": {"sigma": "0.5"},
-    "resolution": {"resolution": 4.0},
     "robust": {"robust": "yes"},
     "unknown": {"profiles": True},
 }
@@ -807,38 +739,16 @@ def test_tracks_that_drift_widen_the_intervals(tracks: dict[str, Array]) -> None
     assert 1.2 < widening < 11**0.5
 
 
-def test_a_scene_that_cannot_move_as_was_seen_is_rejected_first_of_all(
-    tracks: dict[str, Array], message: Messages
-) -> None:
-    """With another damping, and none that is free."""
-    seen = noisy(tracks, 0.05, sigma=0.05)
+@pytest.mark.parametrize("case", ["sigma", "no sigma", "two times"])
+def test_a_wrong_scene_is_rejected_first_of_all(tracks: dict[str, Array], case: str, message: Messages) -> None:
+    """By another damping; without sigma by the pattern of what is left, also at two times."""
+    seen = noisy(tracks, 0.05, sigma=0.05) if case == "sigma" else noisy(tracks, 0.02)
+    if case == "two times":
+        seen |= {"time": seen["time"][5:7], "pixel": seen["pixel"][:, 5:7]}
     wrong, right = (fit(changed(tissue__damping=g), seen, ["tissue.foundation"], workers=1) for g in (600, 200))
     assert (wrong.as_json()["model_rejected"], right.as_json()["model_rejected"]) == (True, False)
     message(wrong.summary()[0], "the model is rejected: ", hide=r"\d[\d.]*")
     assert "rejected" not in right.summary()[0]
-
-
-@pytest.mark.parametrize("few", [False, True])
-def test_a_wrong_scene_is_rejected_by_what_is_left_alone(
-    tracks: dict[str, Array], few: bool, message: Messages
-) -> None:
-    """By a wrong damping, also where two times tell nothing of time."""
-    seen = noisy(tracks, 0.02)
-    if few:
-        seen |= {"time": seen["time"][5:7], "pixel": seen["pixel"][:, 5:7]}
-    wrong = fit(changed(tissue__damping=600), seen, ["tissue.foundation"], workers=1)
-    message(wrong.summary()[0], "the model is rejected: ", hide=r"\d[\d.]*")
-    assert not fit(changed(), seen, ["tissue.foundation"], workers=1).model_rejected
-
-
-def test_what_is_far_off_counts_in_full_for_the_rejection_of_a_robust_fit(
-    tracks: dict[str, Array], message: Messages
-) -> None:
-    seen = noisy(tracks, 0.1, sigma=0.1)
-    assert not fit(changed(), seen, ["tissue.foundation"], robust=True, workers=1).model_rejected
-    seen["pixel"][[7, 20]] += np.linspace(0, 40, 11)[:, None]
-    found = fit(changed(), seen, ["tissue.foundation"], robust=True, workers=1)
-    message(found.summary()[0], "the model is rejected: ", hide=r"\d[\d.]*")
 
 
 NOISE = [ErrorCorrelation(None, None), ErrorCorrelation(5.0, None), ErrorCorrelation(None, 1.0)]

@@ -88,10 +88,8 @@ EXPORTS: dict[str, tuple[str, list[str], float]] = {
     "spaces": (TABLE.replace(";", " "), [], 1),
     "aligned": ("# Temps d'essai (s)   Weg (mm)  Kraft (N)\n" + rows("    "), [], 1),
     "commented names": ("# Time(s) Depth(mm) Force(N)\n" + rows(" "), [], 1),
-    "aligned commas": ("Time, s   Position (z), mm   Fz, N\n" + rows("   "), [], 1),
     "aligned decimal commas": ("Time, s   Position (z), mm   Fz, N\n" + comma(rows("   ")), [], 1),
     "commas and spaces": ("Time (s),  Depth (mm),  Force (N)\n" + rows(",  "), [], 1),
-    "commas in names": ("Time, s;Depth, mm;Force, N\n" + comma(rows()), [], 1),
     "decimal commas": (TABLE.splitlines()[0] + "\n" + comma(rows()), [], 1),
     "quoted decimal commas": (
         '"Time, s","Depth, mm","Force, N"\n' + comma(rows(";", '"{t:.1f}"{s}"{d:.2f}"{s}"{f:.3f}"')).replace(";", ","),
@@ -145,58 +143,43 @@ def test_exports_of_machines_are_read(name: str, read: Read) -> None:
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "cp1252"])
-@pytest.mark.parametrize("suffix", [".csv", ".tsv", ".txt", ".TXT"])
-def test_encodings_are_detected(encoding: str, suffix: str, tmp_path: Path) -> None:
-    path = tmp_path / f"test{suffix}"
-    path.write_bytes(ZWICK.encode(encoding))
-    assert_is_test(read_machine_test(str(path)))
+def test_encodings_are_detected(encoding: str, tmp_path: Path) -> None:
+    for suffix in (".csv", ".tsv", ".txt", ".TXT"):
+        path = tmp_path / f"test{suffix}"
+        path.write_bytes(ZWICK.encode(encoding))
+        assert_is_test(read_machine_test(str(path)))
 
 
-@pytest.mark.parametrize(
-    ("quantity", "unit", "scale"),
-    [
-        *(("time", *unit) for unit in (("s", 1), ("ms", 1e-3), ("min", 60), ("sec", 1))),
-        *(
-            ("depth", *unit)
-            for unit in (("m", 1), ("cm", 1e-2), ("mm", 1e-3), ("um", 1e-6), ("µm", 1e-6), ("μm", 1e-6))
-        ),
-        *(
-            ("force", *unit)
-            for unit in (("N", 1), ("mN", 1e-3), ("kN", 1e3), ("gf", GF), ("kgf", 1e3 * GF), ("KN", 1e3))
-        ),
-    ],
-)
-def test_units_are_converted(quantity: str, unit: str, scale: float, read: Read) -> None:
+UNITS = {
+    "time": {"s": 1, "ms": 1e-3, "min": 60, "sec": 1},
+    "depth": {"m": 1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "\N{GREEK SMALL LETTER MU}m": 1e-6},
+    "force": {"N": 1, "mN": 1e-3, "kN": 1e3, "gf": GF, "kgf": 1e3 * GF, "KN": 1e3},
+}
+
+
+@pytest.mark.parametrize(("quantity", "unit"), [(quantity, unit) for quantity in UNITS for unit in UNITS[quantity]])
+def test_units_are_converted(quantity: str, unit: str, read: Read) -> None:
     units = {"time": "s", "depth": "mm", "force": "N"} | {quantity: unit}
-    values = {"time": TIME, "depth": 1e3 * DEPTH * (1 if quantity == "depth" else 1e-3), "force": FORCE}
-    values[quantity] = values[quantity] * scale
+    scales = {key: UNITS[key][name] for key, name in units.items()}
     in_header = "Time [{time}];depth, {depth};FORCE ({force})\n".format(**units)
     in_row = "Time;depth;FORCE\n[{time}];{depth};({force})\n".format(**units)
-    chosen = [f"{key}={name}, {units[key]}" for key, name in (("time", "time"), ("depth", "Depth"), ("force", "Force"))]
+    chosen = [f"{key}={key.title()}, {unit}" for key, unit in units.items()]
     for test in (read(in_header + rows()), read(in_row + rows()), read("Time;depth;FORCE\n" + rows(), *chosen)):
-        for name, expected in values.items():
-            np.testing.assert_allclose(getattr(test, name), expected, rtol=1e-14, atol=1e-16)
+        for name, numbers in {"time": TIME, "depth": 1e3 * DEPTH, "force": FORCE}.items():
+            np.testing.assert_allclose(getattr(test, name), numbers * scales[name], rtol=1e-14, atol=1e-16)
 
 
-@pytest.mark.parametrize("name", ["Time", "temps d'essai", "ZEIT", "Prüfzeit", "Test time"])
-def test_names_of_time(name: str, read: Read) -> None:
-    assert_is_test(read(TABLE.replace("Time", name)))
+DEPTHS = "Displacement indentation Extension Elongation Allongement Stroke Position Travel Distance Weg Standardweg"
+NAMES = {
+    "Time": ["temps d'essai", "ZEIT", "Prüfzeit", "Test time"],
+    "Depth": [*DEPTHS.split(), "Position (z)", "Compressive extension"],
+    "Force": ["force", "Load", "Fz", "Kraft", "Force standard", "Standardkraft", "Indentation force"],
+}
 
 
-NAMES_OF_DEPTH = """Depth Displacement indentation Extension Elongation Allongement Stroke Position Travel Weg
-Standardweg Distance"""
-
-
-@pytest.mark.parametrize("name", [*NAMES_OF_DEPTH.split(), "Position (z)", "Compressive extension"])
-def test_names_of_depth(name: str, read: Read) -> None:
-    assert_is_test(read(TABLE.replace("Depth", name)))
-
-
-@pytest.mark.parametrize(
-    "name", ["force", "Load", "Fz", "Kraft", "Force standard", "Standardkraft", "Indentation force"]
-)
-def test_names_of_force(name: str, read: Read) -> None:
-    assert_is_test(read(TABLE.replace("Force", name)))
+@pytest.mark.parametrize(("quantity", "name"), [(quantity, name) for quantity in NAMES for name in NAMES[quantity]])
+def test_names_of_quantities(quantity: str, name: str, read: Read) -> None:
+    assert_is_test(read(TABLE.replace(quantity, name)))
 
 
 def test_of_two_candidates_the_one_nearest_0_is_taken_and_named(read: Read, message: Messages) -> None:
@@ -313,27 +296,20 @@ def test_a_window_needs_rows(read: Read, message: Messages) -> None:
 HEADER = TABLE.splitlines()[0]
 FAULTS: dict[str, tuple[str | bytes, list[str], list[str]]] = {
     "empty": ("", [], ["empty"]),
-    "blank": ("\n \n\t\n", [], ["empty"]),
     "no names": (rows(), [], ["--columns"]),
     "no depth": (TABLE.replace("Depth", "Traverse"), [], ["csv:1", "depth", "Traverse"]),
     "names in one cell": ("time/depth/force\n" + rows(), [], ["csv:1"]),
     "no unit": (TABLE.replace(" [mm]", ""), [], ["csv:1", "Depth", '--columns "depth=Depth, mm"']),
     "other unit": (TABLE.replace("[N]", "[lbf]"), [], ["Force [lbf]", "kgf"]),
     "megaunit": (TABLE.replace("[N]", "[MN]"), [], ["Force [MN]"]),
-    "unit of another quantity": (TABLE.replace("[N]", "[mm]"), [], ["Force [mm]", "unit"]),
     "repeated name": (HEADER + ";Force [N]\n" + rows(";", "{t}{s}{d}{s}{f}{s}{f}"), [], ["csv:1", "Force [N]", "2"]),
     "gap": (TABLE.replace("0.5;0.50;0.250", "0.5;;0.250"), [], ["csv:7", "Depth [mm]", "empty"]),
-    "gap at the end": (TABLE.replace("0.5;0.50;0.250", "0.5;0.50;"), [], ["csv:7", "Force [N]", "empty"]),
     "NaN": (TABLE.replace("0.250", "NaN"), [], ["csv:7", "Force [N]", "NaN"]),
-    "row of NaN": (TABLE.replace("1.1;1.10;0.550", "nan;nan;nan"), [], ["csv:13", "nan"]),
-    "infinity": (TABLE.replace("0.250", "-inf"), [], ["csv:7", "Force [N]", "-inf"]),
     "too large": (TABLE.replace("0.250", "1e31"), [], ["csv:7", "Force [N]", "1e31"]),
     "word": (TABLE.replace("0.250", "over"), [], ["csv:7", "Force [N]", "over"]),
     "row of words": (TABLE.replace("0.5;0.50;0.250", "a;b;c"), [], ["csv:7", "a, b, c"]),
-    "first row of words": (TABLE.replace("0.0;0.00;0.000", "a;b;c"), [], ["csv:2", "a, b, c"]),
     "time of day": (TABLE.replace("\n0.5", "\n12:00:05"), [], ["csv:7", "Time [s]", "12:00:05"]),
     "same time": (TABLE.replace("\n0.5", "\n0.4"), [], ["csv:7", "Time [s]", "0.4"]),
-    "earlier time": (TABLE.replace("\n0.5", "\n0.05"), [], ["csv:7", "Time [s]", "0.05"]),
     "few rows": (HEADER + "\n" + rows(count=9), [], ["csv:1", "9", "10"]),
     "no rows": (HEADER, [], ["csv:1", "0", "10"]),
     "decimal commas between commas": (HEADER.replace(";", ",") + "\n" + comma(rows(",")), [], ["csv:2", "6", "3"]),
@@ -344,7 +320,6 @@ FAULTS: dict[str, tuple[str | bytes, list[str], list[str]]] = {
     "workbook by another name": (b"PK\x03\x04\0\0", [], [".xlsx"]),
     "old workbook": (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", [], [".xlsx"]),
     "binary": (b"\xff\xfe\x00", [], ["text"]),
-    "zeros": (b"\0" * 64, [], ["text"]),
     "column of no quantity": (TABLE, ["strain=Strain, mm"], ["--columns", "strain"]),
     "column without a name": (TABLE, ["depth="], ["--columns", "depth="]),
     "column chosen twice": (TABLE, ["depth=Depth", "depth=Time"], ["--columns", "depth"]),
@@ -363,12 +338,16 @@ def test_a_fault_is_one_line_with_its_place(name: str, read: Read, message: Mess
 
 
 def test_a_file_that_cannot_be_read_is_one_line(tmp_path: Path, message: Messages) -> None:
+    pytest.importorskip("openpyxl")
     with (tmp_path / "large.csv").open("wb") as file:
         file.truncate(1 << 30)
     for path in (tmp_path / "missing.csv", tmp_path, tmp_path / "large.csv", "a\0b"):
         with message.raises(SceneError):
             read_machine_test(path)
-    (tmp_path / "text.csv").write_text(TABLE)
+    for name in ("text.csv", "damaged.xlsx"):
+        (tmp_path / name).write_text(TABLE)
+    with message.raises(SceneError, "damaged.xlsx"):
+        read_machine_test(tmp_path / "damaged.xlsx")
     with message.raises(SceneError, "--sheet"):
         read_machine_test(tmp_path / "text.csv", sheet="FF2")
 
@@ -386,11 +365,6 @@ def add_chart_sheet(book: Any) -> None:
     from openpyxl.chart import LineChart
 
     book.create_chartsheet("Chart").add_chart(LineChart())
-
-
-def leave_chart_sheet(book: Any) -> None:
-    add_chart_sheet(book)
-    del book["FF2"]
 
 
 @pytest.fixture
@@ -429,22 +403,17 @@ def test_a_workbook_is_read(save: Save, message: Messages) -> None:
     assert_is_test(read_machine_test(path.rename(path.with_suffix(".XLSX"))))
 
 
-def test_a_sheet_is_chosen(save: Save, message: Messages) -> None:
-    path = save({"notes": [["x"]], "FF1": SHEET, "FF2": SHEET}, add_chart_sheet)
+def test_a_sheet_and_a_block_are_chosen(save: Save, message: Messages) -> None:
+    path = save({"notes": [["x"]], "FF1": SHEET, "FF2": [*SHEET, [], *SHEET[1:]]}, add_chart_sheet)
     with message.raises(SceneError, "--sheet", "FF1, FF2"):
         read_machine_test(path)
-    for name in ("FF2", "ff2"):
-        assert_is_test(read_machine_test(path, sheet=name))
+    assert_is_test(read_machine_test(path, sheet="ff1"))
     for name in ("FF3", "notes", "Chart"):
         with message.raises(SceneError, name):
             read_machine_test(path, sheet=name)
-
-
-def test_blocks_of_a_sheet_are_chosen(save: Save, message: Messages) -> None:
-    path = save({"FF2": [*SHEET, [], *SHEET[1:]]})
     with message.raises(SceneError, "--block"):
-        read_machine_test(path)
-    assert_is_test(read_machine_test(path, block=2))
+        read_machine_test(path, sheet="FF2")
+    assert_is_test(read_machine_test(path, sheet="FF2", block=2))
 
 
 def put(cell: str, value: object) -> Callable[[Any], None]:
@@ -456,7 +425,6 @@ def put(cell: str, value: object) -> Callable[[Any], None]:
 
 SHEET_FAULTS: dict[str, tuple[list[list[Any]], Callable[[Any], object], list[str]]] = {
     "empty sheet": ([], lambda book: None, ["FF2", "empty"]),
-    "chart sheet": ([], leave_chart_sheet, ["Chart"]),
     "several sheets without a table": ([], lambda book: book.create_sheet("FF3"), ["FF2, FF3"]),
     "merged names": (SHEET, lambda book: book["FF2"].merge_cells("B2:C2"), ["FF2!B2", "merged"]),
     "names merged with an unnamed column": (SHEET, lambda book: book["FF2"].merge_cells("C2:D2"), ["FF2!C2", "merged"]),
@@ -467,12 +435,9 @@ SHEET_FAULTS: dict[str, tuple[list[list[Any]], Callable[[Any], object], list[str
         ["FF2!C4", "=A4"],
     ),
     "gap": (SHEET, put("B14", None), ["FF2!B14", "Force standard", "empty"]),
-    "two decimal marks": (SHEET, put("B14", "0,5"), ["FF2!B14", "0,5"]),
     "error": (SHEET, put("B14", "#DIV/0!"), ["FF2!B14", "#DIV/0!"]),
-    "row of errors": ([*SHEET[:-1], ["#N/A"] * 4], lambda book: None, ["FF2!A15", "#N/A"]),
     "row of formulas": ([*SHEET[:-1], ["=A14"] * 4], lambda book: None, ["FF2!A15", "=A14"]),
     "date": (SHEET, put("A14", datetime(2023, 4, 3)), ["FF2!A14", "date"]),
-    "word": (SHEET, put("B14", "over"), ["FF2!B14", "over"]),
     "time again": (SHEET, put("A14", 0.5), ["FF2!A14", "0.5"]),
     "no unit": (SHEET, put("C3", None), ["FF2!C2", "Allongement", "--columns"]),
     "cell far away": (SHEET, put("XFD1048576", 1), ["FF2", "cells"]),
@@ -485,13 +450,6 @@ def test_a_fault_of_a_sheet_is_one_line_with_its_cell(name: str, save: Save, mes
     with message.raises(SceneError, *words) as caught:
         read_machine_test(save({"FF2": cells}, change))
     assert len(caught.value.lines) == 1
-
-
-def test_a_damaged_workbook_is_one_line(tmp_path: Path, message: Messages) -> None:
-    pytest.importorskip("openpyxl")
-    (tmp_path / "tests.xlsx").write_text(TABLE)
-    with message.raises(SceneError, "tests.xlsx"):
-        read_machine_test(tmp_path / "tests.xlsx")
 
 
 def test_without_openpyxl_the_error_is_how_to_install_it(monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from taichi_msm import SceneError, Simulation, fit, load_scene
 from taichi_msm.cli.fit import parse_window
-from taichi_msm.fitting.machine_curve import relax
+from taichi_msm.fitting.machine_curve import CurveRuns, relax
 from taichi_msm.fitting.machine_fit import FittedTest, explanations, unknown_notes
+from taichi_msm.fitting.machine_model import read_machine_problem
 from taichi_msm.fitting.machine_tables import MachineTest
 from taichi_msm.fitting.machine_test import (
     CONTACT_NOISES,
@@ -28,6 +29,7 @@ from taichi_msm.load.check import check_scene
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
+from tests.fitting.conftest import with_keys
 from tests.golden import Messages
 
 Array = NDArray[np.float64]
@@ -55,15 +57,7 @@ def scene(**tissue: Any) -> Scene:
 
 
 def changed(initial: Scene, **keys: Any) -> dict[str, Any]:
-    """The data of a scene with other values, by their dotted paths with __ for the dots."""
-    data = json.loads(initial.model_dump_json(exclude_none=True))
-    for key, value in keys.items():
-        *sections, name = key.split("__")
-        holder = data
-        for section in sections:
-            holder = holder[int(section) if section.isdigit() else section]
-        holder[name] = value
-    return data
+    return with_keys(initial.model_dump(mode="json", exclude_none=True), **keys)
 
 
 def ramp() -> tuple[Array, Array]:
@@ -112,18 +106,13 @@ def test_frames_are_means_of_the_rows_near_them_and_the_last_row_is_held() -> No
     np.testing.assert_allclose([loading.depth[0], loading.depth[-1]], [0.025, 2.25], atol=1e-12)
 
 
-def test_frames_between_few_rows_are_interpolated() -> None:
-    time = np.arange(0, 12.5, 0.5)
-    loading = build_loading(machine_test(time, time, np.maximum(time - 6, 0)), scene(relaxation=[BRANCH]), rate=4)
+def test_frames_between_few_rows_are_interpolated_and_200_unless_a_rate_is_given() -> None:
+    time, relaxing = np.arange(0, 12.5, 0.5), scene(relaxation=[BRANCH])
+    loading = build_loading(machine_test(time, time, np.maximum(time - 6, 0)), relaxing, rate=4)
     np.testing.assert_allclose(loading.depth, np.arange(49) / 4, atol=1e-12)
-
-
-def test_long_tests_have_200_frames_unless_a_rate_is_given() -> None:
     time = np.arange(0, 400.0, 0.5)
     test = machine_test(time, time, np.maximum(time - 100, 0))
-    relaxing = scene(relaxation=[BRANCH])
-    assert len(build_loading(test, relaxing).depth) == MAX_FRAMES + 1
-    assert len(build_loading(test, relaxing, rate=1).depth) == 401
+    assert [len(build_loading(test, relaxing, rate).depth) for rate in (None, 1)] == [MAX_FRAMES + 1, 401]
 
 
 def test_frames_without_relaxation_are_even_in_depth_up_to_the_deepest_row() -> None:
@@ -157,14 +146,10 @@ def test_contact_is_the_last_row_without_a_force_before_the_peak() -> None:
     falling = np.r_[50.0 - np.arange(10), np.arange(100, 200)]
     at_once = build_loading(machine_test(time[:110], time[:110], falling, 0.1), scene())
     assert at_once.contact == time[9]
-
-
-def test_a_contact_is_found_with_the_noise_of_the_table() -> None:
-    """Also where the noise is far below the accuracy of predicted forces."""
-    time = np.linspace(0, 10, 1001)
-    loading = build_loading(machine_test(time, time, np.maximum(time - 5, 0) ** 3, 1e-9), scene())
-    assert loading.noise == 1e-9
-    assert loading.contact == pytest.approx(5)
+    # The noise of the table counts, also far below the accuracy of predicted forces.
+    quiet = build_loading(machine_test(time, time, np.maximum(time - 5, 0) ** 3, 1e-9), scene())
+    assert quiet.noise == 1e-9
+    assert quiet.contact == pytest.approx(5)
 
 
 def test_a_force_that_rises_in_the_rows_of_the_noise_is_noted(message: Messages) -> None:
@@ -213,10 +198,10 @@ def test_a_tool_starts_where_it_touches_the_sheet(shaft: list[float], tip: str) 
     if tip == "radius":
         assert approach.start[2] == pytest.approx(RADIUS, rel=1e-8)
     np.testing.assert_allclose(approach.direction, np.array([0.004, 0.002, -0.006]) / np.sqrt(56e-6), rtol=1e-9)
-    path = approach.keyframes(np.array([0.0, 1.0]), np.array([0.0, 1e-3]))
+    data = approach.place(data, np.array([0.0, 1e-3]), rate=1.0)
+    path = data["probes"][0]["path"]
     # The gap of a tilted plate is approximate, but the scene is not refused.
     assert path[0][3] == pytest.approx(0, abs=1e-8 if tip == "radius" else 5e-6)
-    data["probes"][0]["path"] = path
     check_scene(data)
     lengths = (np.array(path[1][1:]) - path[0][1:]) * [0.02, 0.02, 1]
     assert np.linalg.norm(lengths) == pytest.approx(1e-3)
@@ -268,13 +253,13 @@ def test_the_parameters_of_a_tissue_that_relaxes_come_back_and_its_scene_runs_al
     )
 
 
-@pytest.mark.slow
-def test_the_depth_of_contact_is_found_within_bounds(pressed: str) -> None:
-    true = scene(relaxation=[BRANCH])
-    result = fit(true, pressed, ["contact"], rate=RATE, contact=[1.3e-3], bounds={"contact": (0.8e-3, 2e-3)}, workers=1)
-    contact = result.parameters["contact"]
-    assert contact.value == pytest.approx(CONTACT, abs=4 * contact.standard_error + 1e-6)
-    assert result.tests[0].contact == contact.value
+def test_a_contact_at_the_greatest_depth_gives_no_run(pressed: str, message: Messages) -> None:
+    """As in a profile, which goes to the bounds."""
+    problem = read_machine_problem([pressed], scene(), ["contact"], {}, None, {"contact": [CONTACT]})
+    with CurveRuns(problem, 1, lambda stage, done, total: None) as runs:
+        assert runs.predict_coarse(problem.limits[1], 0) is None
+        with message.raises(SceneError, "contact"):
+            runs.run_curve(problem.limits[1])
 
 
 @pytest.mark.slow
@@ -378,12 +363,9 @@ def test_a_window_is_two_numbers(message: Messages) -> None:
         parse_window("0.5")
 
 
-def test_several_files_that_are_not_tables_are_refused(message: Messages) -> None:
+def test_tables_and_points_are_not_mixed(message: Messages) -> None:
     with message.raises(SceneError, "tracks.npz"):
         fit(scene(), ["tracks.npz", "press.csv"], ["tissue.young"])
-
-
-def test_options_of_tables_are_refused_for_points(message: Messages) -> None:
     observed = {"time": [0.0], "coordinates": [[0.5, 0.5]], "position": [[[0.0, 0.0, 0.0]]]}
     with message.raises(SceneError, "rate"):
         fit(scene(), observed, ["tissue.young"], rate=5.0)

@@ -17,16 +17,16 @@ from pydantic import BaseModel
 
 from taichi_msm import Scene, Simulation, gradient
 from taichi_msm.errors import ArgumentError, MsmError, SceneError
-from taichi_msm.gradients import motion, rest
+from taichi_msm.gradients import kernel_motion, motion, rest
 from taichi_msm.gradients.chain_rule import Derivatives
 from taichi_msm.gradients.gradient import Adjoint, with_stiffness_map
-from taichi_msm.gradients.kernel_motion import adjoint_kernels
+from taichi_msm.gradients.kernel_motion import build_sweep
 from taichi_msm.gradients.motion import MotionAdjoint
 from taichi_msm.model.loads import average_loads
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.solver import backoff
-from taichi_msm.solver.dynamics import choose_layout
+from taichi_msm.solver.sheet_solver import choose_layout
 from taichi_msm.system.runtime import Device
 from taichi_msm.terms.base import KernelConfig
 from tests import reference
@@ -229,9 +229,8 @@ def test_a_map_of_the_stiffness_has_its_slope_wherever_it_is(kind: str, image: s
     # Without factors it is the scene's own again.
     own = Adjoint(plan, device)
     assert (adjoint.run() == own.run()).all()
-    assert (
-        adjoint.backward(slope).maps[f"{plan.scene.kind}.map"] == own.backward(slope).maps[f"{plan.scene.kind}.map"]
-    ).all()
+    maps = [each.backward(slope).maps[f"{plan.scene.kind}.map"] for each in (adjoint, own)]
+    assert (maps[0] == maps[1]).all()
 
 
 @pytest.mark.parametrize("steps", [1, 2, 3, 10_000])
@@ -241,11 +240,8 @@ def test_any_number_of_steps(steps: int, image: str, device: Device) -> None:
     adjoint = Adjoint(plan_of(Scene.model_validate(made)), device)
     known, slope = loss(adjoint.run())
     found = adjoint.backward(slope)
-    for name, index, step in (
-        ("probes.0.total", (2,), 0.2),
-        ("tissue.thickness", (), 4e-4),
-        ("probes.0.load", (3,), 5.0),
-    ):
+    numbers = ("probes.0.total", (2,), 0.2), ("tissue.thickness", (), 4e-4), ("probes.0.load", (3,), 5.0)
+    for name, index, step in numbers:
 
         def changed(by: float, name: str = name, index: tuple[int, ...] = index) -> float:
             other = Scene.model_validate(put_in(made, name.split("."), index, by))
@@ -289,9 +285,9 @@ def test_the_bits_depend_neither_on_workers_nor_on_segments(
 
     def counted(config: KernelConfig, *, parallel: bool) -> Any:
         launches.append(parallel)
-        return adjoint_kernels(config, parallel=parallel)
+        return build_sweep(config, parallel=parallel)
 
-    monkeypatch.setattr(motion, "adjoint_kernels", counted)
+    monkeypatch.setattr(kernel_motion, "build_sweep", counted)
     assert bits(3) == alone
     assert not any(launches[launches.index(False) :])
 
@@ -315,14 +311,8 @@ def test_positions_are_those_of_a_simulation(image: str, device: Device) -> None
 
 REST = {
     "sheet": {"points": [6, 7], "size": [0.1, 0.12]},
-    "tissue": {
-        "young": 3e4,
-        "thickness": 3e-3,
-        "foundation": 1e5,
-        "foundation_active": "always",
-        "pretension": 15,
-        "bending": 1e-3,
-    },
+    "tissue": {"young": 3e4, "thickness": 3e-3, "foundation": 1e5, "foundation_active": "always"}
+    | {"pretension": 15, "bending": 1e-3},
     "probes": [
         {"at": [0.43, 0.52], "total": [0.1, 0.2, -1], "radius": 0.01, "falloff": 200, "load": [[0, 0], [2, 100]]},
         {"at": [[0, 0.31, 0.3], [2, 0.6, 0.35]], "total": [0, 0, 0.3], "falloff": 60, "load": [[1, 60]]},

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import math
 import os
 import shutil
@@ -10,37 +11,30 @@ from typing import Any
 import pytest
 from PIL import Image
 
+from taichi_msm.accuracy.companions import choose_companion_runs
 from taichi_msm.errors import SceneError
 from taichi_msm.load import cost
-from taichi_msm.load.cost import FORCE_ROW_BYTES, Budget, require_disk, size_problems
+from taichi_msm.load.cost import CALIBRATION_S, FORCE_ROW_BYTES, WORK_UNIT_S, Budget, require_disk, size_problems
 from taichi_msm.runs.run import run
 from taichi_msm.scene.outputs import ENTRIES
 from taichi_msm.scene.scene import Scene
+from taichi_msm.solver.planning import START_WORK, count_work
 from taichi_msm.system import process
 from taichi_msm.system.process import available_memory, available_threads
 from taichi_msm.system.runtime import Device
+from tests.conftest import Program
 from tests.golden import Messages
 from tests.scenes import plan_of, speckle
 
 TIME = {"duration": 2, "frames_per_second": 10, "step": 0.025, "precision": "f32"}
 PROBE = {"force": [0, 0, 1]}
 
-# The most that a frame of 50 x 60 pixels takes.
-PNG, GIF = 3.01 * 50 * 60 + 60 + 1024, 1.51 * 50 * 60 + 60 + 1024
-
 
 def scene(**keys: Any) -> Scene:
     """20 frames of 4 steps of a small sheet that draws nothing, unless the keys say otherwise."""
-    return Scene.model_validate(
-        {
-            "image": "none.png",
-            "sheet": {"points": [30, 40], "size": [1, 1], "mass": 1},
-            "springs": {},
-            "output": [],
-            **keys,
-            "time": {**TIME, **keys.get("time", {})},
-        }
-    )
+    sheet = {"points": [30, 40], "size": [1, 1], "mass": 1}
+    own = {"image": "none.png", "sheet": sheet, "springs": {}, "output": []}
+    return Scene.model_validate({**own, **keys, "time": {**TIME, **keys.get("time", {})}})
 
 
 def estimate(scene: Scene) -> Budget:
@@ -55,7 +49,7 @@ def test_simulation() -> None:
     need = estimate(scene())
     assert (need.points, need.steps, need.frames) == (1200, 80, 21)
     # With a pilot, which is two sheets in f64.
-    assert estimate(scene()).simulation_bytes == 1200 * (4 + 8 + 8) * 21
+    assert need.simulation_bytes == 1200 * (4 + 8 + 8) * 21
     assert estimate(scene(probes=[PROBE, PROBE])).simulation_bytes == 1200 * (4 + 8 + 8) * 23
     assert estimate(scene(time={"precision": "f64"})).simulation_bytes == 1200 * (8 + 8 + 8) * 21
     large = {"sheet": {"points": [2000, 2000], "size": [1, 1], "mass": 1}, "time": {"step": 1e-4}}
@@ -70,29 +64,12 @@ def test_drawing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     need = estimate(scene(render=render, output=["gif"]))
     assert need.drawing_bytes == 1200 * 36 + 2 * 16 * 150 * 48 + 50 * 60 * 36
     assert need.memory_bytes == need.simulation_bytes + need.drawing_bytes
-
-    plain = estimate(scene(output=["trajectory"]))
-    assert (plain.drawing_bytes, plain.memory_bytes) == (0, plain.simulation_bytes)
-
+    assert estimate(scene(output=["trajectory"])).drawing_bytes == 0
     Image.new("RGB", (70, 80)).save(tmp_path / "a.png")
     pictured = scene(image=str(tmp_path / "a.png"), render=render, output=["gif"])
     assert estimate(pictured).drawing_bytes == need.drawing_bytes + 70 * 80 * 20
     cut = scene(image=str(tmp_path / "a.png"), region=[1, 2, 3, 4], render=render, output=["gif"])
     assert estimate(cut).drawing_bytes == need.drawing_bytes + 70 * 80 * 20, "all of it is decoded"
-
-
-@pytest.mark.parametrize(
-    ("output", "of_a_frame"),
-    [
-        ([], 0),
-        (["trajectory"], 1200 * 3 * 4 + 8),
-        (["png", "gif", "trajectory", "gif"], 1200 * 3 * 4 + 8 + PNG + GIF),
-    ],
-)
-def test_disk(output: list[str], of_a_frame: float) -> None:
-    made = scene(render={"size": [50, 60]}, output=output)
-    need, record = estimate(made), 2 * len(made.model_dump_json(indent=2)) + 2**16
-    assert need.disk_bytes == pytest.approx(21 * of_a_frame + 1024 * ("trajectory" in output) + record, abs=1)
 
 
 @pytest.mark.parametrize("size", [(65, 47), (1, 90), (90, 1)])
@@ -119,28 +96,9 @@ def test_a_run_takes_no_more_disk_than_was_said(size: tuple[int, int], device: D
     assert pictures > 2 * 11 * width * height, "noise is hard to compress"
 
 
-def test_tracks() -> None:
-    # Of 10 x 10 points in 21 frames: two coordinates in f32, and whether it is hidden.
-    need = estimate(scene(render={"tracks": 10}, output=["tracks"]))
-    assert need.track_bytes == 100 * (21 * 21 + 16) + 1024
-    assert need.disk_bytes == need.track_bytes + need.record_bytes
-
-
 def test_forces() -> None:
     # A row has a number of a probe, and seven others of up to 24 characters.
-    longest = ",".join([repr(-math.pi * 1e-100)] * 7 + ["15"])
-    assert len(longest) < FORCE_ROW_BYTES
-    need = estimate(scene(probes=[PROBE, PROBE], output=["forces"]))
-    assert need.disk_bytes == 21 * 2 * FORCE_ROW_BYTES + 1024 + need.record_bytes
-    alone = estimate(scene(probes=[PROBE, PROBE], output=["gif"]))
-    assert need.working_bytes == alone.working_bytes + 21 * 2 * 48
-    tool = {"path": [[0, 0, 0, 1]], "instrument": {"radius": 1, "shaft": [0, 0, 1], "length": 1}, "grip": [[0, 1]]}
-    pushed = estimate(scene(probes=[PROBE, tool], output=["gif"]))
-    assert pushed.simulation_bytes == alone.simulation_bytes + 1200 * (4 + 8 + 8) * 6
-
-
-def test_an_ordinary_scene_has_no_problems() -> None:
-    assert faults(scene(output=["png", "gif", "trajectory"])) == []
+    assert len(",".join([repr(-math.pi * 1e-100)] * 7 + ["15"])) < FORCE_ROW_BYTES
 
 
 @pytest.mark.parametrize(
@@ -177,10 +135,6 @@ def test_too_many_steps(message: Messages) -> None:
     message(faults(scene(time=time | {"step": 1e-7})), "time.step", "1e+13 steps")
     # The step limit is 2 / sqrt(8 * 1e14 / 1) s, half of it the step of `auto`: 1 / 28284271.2 s.
     message(faults(scene(springs={"structural": 1e14}, time=time)), "time.duration", "2.83e+13 steps")
-
-
-def test_available_memory() -> None:
-    assert 2**20 < available_memory() <= sys.maxsize
 
 
 def test_free_memory(tmp_path: Path) -> None:
@@ -275,3 +229,31 @@ def test_results_that_do_not_fit_on_the_disk_are_refused(
         require_disk(plan_of(made), below)
     with message.raises(SceneError, "render.size", "500 x 600"):
         require_disk(plan_of(scene(render={"size": [500, 600]}, output=["png"])), below)
+
+
+def test_the_calibration_is_soon_done() -> None:
+    cost._calibrate.cache_clear()
+    assert 0 < cost._calibrate() < 1
+
+
+@pytest.mark.parametrize("cores", [1, 64])
+def test_the_estimate_is_the_work_at_the_speed_of_the_machine(cores: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cost, "_calibrate", lambda: 2 * CALIBRATION_S)
+    monkeypatch.setattr(process, "available_threads", lambda: cores)
+    plan = plan_of(scene(image="none.png", output=["gif"]))
+    parts = count_work(plan, choose_companion_runs(plan).cost)
+    assert min(parts) > 0
+    assert cost.estimate_duration(plan) == pytest.approx((2 * WORK_UNIT_S * sum(parts), 2 * WORK_UNIT_S * START_WORK))
+
+
+def test_check_estimates_the_duration_of_a_run(small: Path, program: Program, message: Messages) -> None:
+    def line(*options: str) -> str:
+        (found,) = (line for line in program("check", "small.yaml", *options).stdout.splitlines() if " to run" in line)
+        return found
+
+    message(line(), hide=r"^\D*[\d.]+ \w+")
+    message(line("--set", "time.step=auto", "--set", "time.tolerance=0.01"), "time.tolerance", hide=r"^\D*[\d.]+ \w+")
+    before = program("check", "small.yaml", "--json").stdout
+    assert program("run", "small.yaml", "--quiet").returncode == 0
+    after = program("check", "small.yaml", "--json").stdout
+    assert json.loads(after)["estimated_seconds"] == json.loads(before)["estimated_seconds"], "nothing is learnt"

@@ -3,7 +3,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import random
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -11,11 +10,9 @@ from typing import Any
 
 import jsonschema
 import pytest
-import yaml
 from PIL import Image
 
 from taichi_msm.errors import SceneError, printable
-from taichi_msm.load import yaml_reader
 from taichi_msm.load.scene_file import MAX_LINES, load_scene, parse_override, schema
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_PROBES
@@ -70,16 +67,12 @@ def load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Load:
     [
         ("sheet.fixed=boarder", True),
         ("sheet.fixed=[rigt]", True),
-        ("springs.virtual_active=load", True),
         ("render.camera=tpo", True),
-        ("render.shading=Headlght", True),
         ("output=[png, gfi]", True),
         ("time.step=atuo", True),
-        ("time.precision=f23", True),
         ("sheet.fixed=all", False),
         ("sheet.fixed=[boarder]", False),
         ("output=png", False),
-        ("time.step=[auto]", False),
     ],
 )
 def test_only_a_similar_word_that_is_allowed_there_is_suggested(
@@ -92,12 +85,8 @@ def test_only_a_similar_word_that_is_allowed_there_is_suggested(
 
 def test_a_scene_and_its_defaults(load: Load) -> None:
     scene = load(GOOD)
-    assert scene.sheet.points == (4, 5)
-    assert scene.sheet.mass == 1e-3
-    assert scene.sheet.fixed == "border"
-    assert scene.time.frames == 10
-    assert scene.probes == ()
-    assert scene.render.camera == "top"
+    assert (scene.sheet.points, scene.sheet.mass, scene.time.frames) == ((4, 5), 1e-3, 10)
+    assert (scene.sheet.fixed, scene.probes, scene.render.camera) == ("border", (), "top")
 
 
 def test_frames_are_counted_in_spite_of_rounding(load: Load) -> None:
@@ -110,17 +99,14 @@ FAULTS = {
     "near key": (GOOD.replace("shear", "shaer"), "7:3: springs.shaer"),
     "unknown key": (GOOD + "xyz: 1\n", "11:1: xyz"),
     "key in a flow mapping of a list": (GOOD + "probes: [{force: [0, 0, 1], fallof: 3}]\n", "11:29: probes.0.fallof"),
-    "key in a camera": (GOOD + "render: {camera: {eye: [0, 0, 1], uup: [0, 1, 0]}}\n", "11:35: render.camera.uup"),
     "key named as the kind of value": (
         GOOD + "render: {camera: {Camera: {eye: 1}}}\n",
         "11:10: render.camera.eye",
         "11:19: render.camera.Camera",
     ),
     "missing": (GOOD.replace("  mass: 1.0e-3\n", ""), "1:1: sheet.mass"),
-    "missing section": (GOOD.replace("time:\n  duration: 0.4\n", ""), "1:1: time"),
     "missing in an item of a list": (GOOD + "probes:\n  - at: [0, 0]\n", "12:5: probes.0.force"),
     "duplicate": (GOOD.replace("size:", "mass: 1\n  size:"), "5:3: sheet.mass"),
-    "duplicate section": (GOOD + "time:\n  step: 1\n", "11:1: time"),
     "key that is no text": (GOOD + "1: x\n", "11:1: 1"),
     "key that is a list": (GOOD + "? [a]\n: x\n", "11:3"),
     "merge key": (GOOD + "<<: {damping: 1}\n", "11:1: <<"),
@@ -128,12 +114,7 @@ FAULTS = {
     "long key": (GOOD + f"{'k' * 900}: 1\n", f"11:1: {'k' * 60}..."),
     "key with a line break": (GOOD + '"a\\nb": 1\n', "11:1: a\\nb"),
     "mass 0": (GOOD.replace("1.0e-3", "0"), "4:3: sheet.mass: 0"),
-    "value in a flow mapping": (
-        "sheet: {points: [4, 5], size: [1, 1], mass: -1}\n" + GOOD[GOOD.index("springs") :],
-        "1:39: sheet.mass: -1",
-    ),
     "number as text": (GOOD.replace("1.0e-3", "'1'"), '4:3: sheet.mass: "1"'),
-    "number as truth": (GOOD + "damping: true\n", "11:1: damping: true"),
     "nothing": (GOOD.replace("1.0e-3", ""), "4:3: sheet.mass"),
     "infinite by its exponent": (GOOD + "damping: 1e999\n", "11:1: damping: Infinity"),
     "not a number": (GOOD + "damping: .nan\n", "11:1: damping: NaN"),
@@ -141,7 +122,6 @@ FAULTS = {
     "too small": (GOOD.replace("1.0e-3", "1e-31"), "4:3: sheet.mass: 1e-31"),
     "more digits than Python reads": (GOOD + f"damping: {'1' * 5000}\n", '11:1: damping: "1'),
     "item of a list": (GOOD.replace("[4, 5]", "[4, 1]"), "2:15: sheet.points.1: 1"),
-    "not a whole number": (GOOD.replace("[4, 5]", "[4, 5.0]"), "2:15: sheet.points.1: 5.0"),
     "short list": (GOOD.replace("[4, 5]", "[4]"), "2:3: sheet.points: [4]"),
     "short list with a wrong item": (GOOD.replace("[4, 5]", "[1]"), "2:12: sheet.points.0: 1"),
     "section that is none": (
@@ -151,35 +131,24 @@ FAULTS = {
     "long value": (GOOD + f"region: {'x' * 100}\n", '11:1: region: "x'),
     "control character": (GOOD + 'render: {shading: "\\e[31m"}\n', '11:10: render.shading: "\\u001b[31m"'),
     "yes, which is text in YAML 1.2": (GOOD + "render: {wireframe: yes}\n", '11:10: render.wireframe: "yes"'),
-    "item of a list that may be left out": (GOOD + "region: [0, 0, 1.5, 1]\n", "11:16: region.2: 1.5"),
-    "unknown output": (GOOD.replace("[]", "[trajectory, avi]"), '10:22: output.1: "avi"'),
     "instrument without a direction": (
         GOOD + "probes: [{force: [0, 0, 1], instrument: {radius: 0.01, shaft: [0, 0, 0], length: 0.1}}]\n",
         "11:56: probes.0.instrument.shaft",
     ),
-    "light beyond its range": (
-        GOOD + "render: {shading: tissue, light: {ambient: 2}}\n",
-        "11:35: render.light.ambient: 2",
-    ),
-    "tracks of no point": (GOOD + "render: {tracks: 0}\n", "11:10: render.tracks: 0"),
     "too many probes": (GOOD + "probes:\n" + "  - {force: [0, 0, 1]}\n" * (MAX_PROBES + 1), "11:1: probes"),
     "nothing to draw": (GOOD.replace("[]", "[png]"), "1:1: image"),
     "image without a name": (GOOD + "image: ''\n", '11:1: image: ""'),
     "image of a name that no file can have": (GOOD + 'image: "a\\0b"\n', "11:1: image"),
     "image of a name longer than any path": (GOOD + f"image: {'../' * 300_000}\n", "11:1: image"),
-    "fixed, neither word nor list": (GOOD.replace("points", "fixed: 3\n  points"), "2:3: sheet.fixed: 3"),
-    "step 0": (GOOD.replace("duration", "step: 0\n  duration"), "9:3: time.step: 0"),
     "camera, a word": (GOOD + "render: {camera: side}\n", '11:10: render.camera: "side"'),
     "camera, a number in it": (GOOD + "render: {camera: {eye: [0, 0, z]}}\n", "11:19: render.camera.eye"),
     "at, one of two numbers": (GOOD + PROBE.replace("0.5, 0.5", "0.5, x"), "13:5: probes.0.at"),
     "at, no key": (GOOD + PROBE.replace("0.5, 0.5", ""), "13:5: probes.0.at: []"),
-    "at, in a key": (GOOD + PROBE.replace("0.5, 0.5", "[0, 0.5, 0.5], [1, 0.5, x]"), "13:34: probes.0.at.1.2"),
     "at, a short key": (GOOD + PROBE.replace("0.5, 0.5", "[0, 0.5, 0.5], [1, 0.5]"), "13:25: probes.0.at.1"),
     "at, back in time": (GOOD + PROBE.replace("0.5, 0.5", "[1, 0, 0], [0, 0, 0]"), "13:21: probes.0.at.1"),
     "load, back in time": (GOOD + PROBE.replace("[1, 100]", "[1, 100], [0.5, 0]"), "14:30: probes.0.load.2"),
     "load, three at a time": (GOOD + PROBE.replace("[1, 100]", "[1, 1], [1, 2], [1, 3]"), "14:36: probes.0.load.3"),
     "load, empty": (GOOD + PROBE.replace("[0, 0], [1, 100]", ""), "14:5: probes.0.load: []"),
-    "load, in a key": (GOOD + PROBE.replace("[1, 100]", "[1, x]"), "14:24: probes.0.load.1.1"),
     "duration of a part of a frame": (GOOD.replace("0.4\noutput", "0.33\noutput"), "9:3: time.duration: 0.33"),
     "duration of too many frames": (GOOD.replace("0.4\noutput", "8e7\noutput"), "9:3: time.duration: 80000000"),
     "step above the limit": (GOOD.replace("duration", "step: 0.02\n  duration"), "9:3: time.step: 0.02"),
@@ -209,7 +178,6 @@ def test_errors(name: str, load: Load, message: Messages) -> None:
     ("text", "place"),
     [
         pytest.param("", "1:1", id="empty"),
-        pytest.param("# later\n", "1:1", id="comment"),
         pytest.param("- a\n", '1:1: ["a"]', id="list"),
         pytest.param("just text", '1:1: "just text"', id="text"),
         pytest.param("a: b\0", "1:5: character U+0000", id="null"),
@@ -219,9 +187,7 @@ def test_errors(name: str, load: Load, message: Messages) -> None:
         pytest.param(b"\xef\xbb\xbfa: \xfc", "1:4", id="Latin-1 after a byte-order mark"),
         pytest.param(GOOD.encode("utf-16"), "1:1", id="UTF-16"),
         pytest.param(GOOD.encode("utf-16-le"), "1:2: character U+0000", id="UTF-16 of low bytes first"),
-        pytest.param(GOOD.encode("utf-16-be"), "1:1: character U+0000", id="UTF-16 of high bytes first"),
         pytest.param("a:\n " + "[" * 21 + "]" * 21, "2:22", id="nested lists"),
-        pytest.param("- " * 1000, "1:43", id="nested blocks"),
         # libyaml's own limit, which it reaches before it gives the first event.
         pytest.param("a: " + "[" * 20_000, "1:1003", id="limit of libyaml"),
         pytest.param("? " * 1000, "1:3", id="nested keys"),
@@ -230,13 +196,11 @@ def test_errors(name: str, load: Load, message: Messages) -> None:
         pytest.param("a" * (2**20 + 1), "", id="large"),
         # Not valid YAML.
         pytest.param("a: [1, 2\nb: 3\n", "2:2", id="open list"),
-        pytest.param("a: 1\n b: 2\n", "2:3", id="indented"),
         pytest.param("a:\n  x: 1\n  b 3\n  c: 4\n", "3:3", id="no colon"),
         pytest.param("a:\n  b 3\n  c: 4\n", "3:4", id="no colon in the line before"),
         pytest.param("a: 1\nsheet", "2:1", id="no colon at the end"),
         pytest.param("a: 'x\n", "2:1", id="open quote"),
         pytest.param('a: "\\U00110000"\n', "1:", id="no character"),
-        pytest.param("a: @x\n", "1:4", id="reserved character"),
         pytest.param("sheet:\n\tmass: 1\n", "2:1", id="tab"),
     ],
 )
@@ -248,12 +212,9 @@ def test_unreadable_files(load: Load, text: str | bytes, place: str, message: Me
 
 def test_what_yaml_has_and_scenes_do_not(load: Load, message: Messages) -> None:
     text = GOOD.replace("1.0e-3", "&m 1.0e-3").replace("0.4\noutput", "!!float 0.4\noutput")
-    with message.raises(SceneError, "4:9: sheet.mass", "9:13: time.duration", "11:10: damping", "12:5: <<", "13:1: "):
-        load(text + "damping: *m\n<<: *m\n---\nmore: 1\n")
-
-
-def test_the_first_thousand_faults_are_enough() -> None:
-    assert len(yaml_reader.read_yaml("- *a\n" * 2000).faults) == yaml_reader.MAX_FAULTS
+    places = "4:9: sheet.mass", "9:13: time.duration", "11:10: damping", "12:5: <<", "13:8: image", "14:1: "
+    with message.raises(SceneError, *places):
+        load(text + "damping: *m\n<<: *m\nimage: !!python/object/apply:os.getcwd []\n---\nmore: 1\n")
 
 
 @pytest.mark.usefixtures("load")
@@ -262,11 +223,6 @@ def test_a_huge_file_is_not_read(message: Messages) -> None:
         file.truncate(10**10)
     with message.raises(SceneError, "huge.yaml"):
         load_scene("huge.yaml")
-
-
-def test_no_object_is_made_of_a_tag(load: Load, message: Messages) -> None:
-    with message.raises(SceneError, "11:8: image: tag !!python/object/apply:os.getcwd"):
-        load(GOOD + "image: !!python/object/apply:os.getcwd []\n")
 
 
 def test_a_billion_laughs_stay_small(load: Load) -> None:
@@ -292,9 +248,8 @@ def test_a_large_wrong_file_is_answered_soon_and_in_short(load: Load, text: str)
     before = time.process_time()
     with pytest.raises(SceneError) as caught:
         load(text)
-    # 0.3 to 0.7 s on the machine that the limits were chosen on, and up to 4 s where PyYAML lacks its C parser; the
-    # rest is for slower machines.
-    assert time.process_time() - before < (3 if yaml.__with_libyaml__ else 20)
+    # 0.3 to 0.7 s on the machine that the limits were chosen on; the rest is for slower machines.
+    assert time.process_time() - before < 3
     assert len(caught.value.lines) == MAX_LINES + 1
     assert caught.value.lines[-1] == "and more"
 
@@ -365,34 +320,44 @@ def test_files_that_cannot_be_opened(name: str, message: Messages) -> None:
         load_scene(name)
 
 
+@pytest.mark.parametrize("name", ["scene.yml", "scene"])
+def test_a_scene_of_another_suffix_is_suggested(name: str, tmp_path: Path, message: Messages) -> None:
+    (tmp_path / "scene.yaml").touch()
+    with message.raises(SceneError, "/scene.yaml"):
+        load_scene(tmp_path / name)
+
+
+def test_all_files_of_a_scene_that_are_missing_are_named_at_once(load: Load, message: Messages) -> None:
+    map_ = "map: {image: map.png, range: [1, 2]}"
+    cameras = "cameras: {left: {calibration: left.yml, poses: left.txt}, right: {beside: left, calibration: right.yml}}"
+    text = GOOD.replace("shear: 20", map_) + f"image: none.png\nrender: {{{cameras}}}\n"
+    with message.raises(SceneError) as caught:
+        load(text)
+    for line, name in zip(
+        caught.value.lines, ("map.png", "none.png", "left.yml", "left.txt", "right.yml"), strict=True
+    ):
+        assert f": {name}: no such file" in line
+
+
+def test_a_trajectory_that_is_shorter_than_the_run_is_named(load: Load, message: Messages) -> None:
+    Path("poses.txt").write_text("0 0 0 1 0 0 0 1\n0.3 0 0 1 0 0 0 1\n")
+    with message.raises(SceneError, "s.yaml:12:12: render.camera.poses: poses.txt: covers"):
+        load(GOOD + "render:\n  camera: {poses: poses.txt}\n")
+
+
 def test_overrides(load: Load) -> None:
-    scene = load(
-        GOOD + PROBE,
-        [
-            "sheet.points=[6, 7]",
-            "probes.0.load=[[0, 100]]",
-            "probes.0.force.2=9",
-            "render.size=[64, 32]",
-            "damping=1e-2",
-        ],
-    )
-    assert scene.sheet.points == (6, 7)
-    assert scene.sheet.size == (0.3, 0.4)
-    assert scene.probes[0].load == ((0, 100),)
-    assert scene.probes[0].force == (0, 0, 9)
-    assert scene.render.size == (64, 32)
-    assert scene.damping == 0.01
+    overrides = ["sheet.points=[6, 7]", "probes.0.load=[[0, 100]]", "probes.0.force.2=9", "damping=1e-2"]
+    scene = load(GOOD + PROBE, overrides)
+    assert (scene.sheet.points, scene.sheet.size, scene.damping) == ((6, 7), (0.3, 0.4), 0.01)
+    assert (scene.probes[0].load, scene.probes[0].force) == (((0, 100),), (0, 0, 9))
+    scene = load(GOOD, {"sheet.points": (6, 7), "probes": [{"force": [0, 0, 1]}], "probes.0.falloff": 3})
+    assert (scene.sheet.points, scene.probes[0].falloff) == ((6, 7), 3)
 
 
-def test_the_last_override_of_a_key_holds(load: Load) -> None:
+def test_the_last_override_of_a_key_holds_and_may_mend_the_file(load: Load) -> None:
     assert load(GOOD, ["damping=1", "damping=2"]).damping == 2
     assert load(GOOD, ["render.camera.eye=[0, 0, 1]", "render={camera: top}"]).render.camera == "top"
-
-
-def test_overrides_from_python(load: Load) -> None:
-    scene = load(GOOD, {"sheet.points": (6, 7), "probes": [{"force": [0, 0, 1]}], "probes.0.falloff": 3})
-    assert scene.sheet.points == (6, 7)
-    assert scene.probes[0].falloff == 3
+    assert load(GOOD.replace("1.0e-3", "0"), ["sheet.mass=1"]).sheet.mass == 1
 
 
 @pytest.mark.parametrize(
@@ -411,15 +376,10 @@ def test_a_long_override_is_named_in_short(
     assert len(str(caught.value)) < 400
 
 
-def test_an_override_mends_a_fault_of_the_file(load: Load) -> None:
-    assert load(GOOD.replace("1.0e-3", "0"), ["sheet.mass=1"]).sheet.mass == 1
-
-
 @pytest.mark.parametrize(
     ("overrides", "place"),
     [
         (["springs.shaer=3"], "springs.shaer"),
-        (["spring.shear=3"], "spring"),
         (["sheet.mass="], "sheet.mass"),
         (["render.camera={fov: 30}"], "render.camera.eye"),
         (["probes.0.load.1=[-1, 0]"], "probes.0.load.1"),
@@ -430,9 +390,7 @@ def test_an_override_mends_a_fault_of_the_file(load: Load) -> None:
         (["damping"], ""),
         (["=1"], ""),
         ([" damping = -1"], "damping"),
-        (["sheet..mass=1"], ""),
         (["damping={a: 1, a: 2}"], "damping.a"),
-        (["damping=&a 1"], "damping"),
         (["damping=[1"], "damping"),
         (["\udcff=1"], ""),
         (["image=\udcff"], "image"),
@@ -450,10 +408,8 @@ def test_errors_in_overrides(load: Load, overrides: Any, place: str, message: Me
     with message.raises(SceneError, hide=OF_PYYAML) as caught:
         load(GOOD + PROBE + "damping: 0.5\n", overrides)
     (line,) = str(caught.value).splitlines()
-    if isinstance(overrides, list):
-        assert line.startswith(f"--set {printable(overrides[-1])}: {place}")
-    else:
-        assert line.startswith(f"override {printable(next(iter(overrides)))}")
+    last = f"--set {overrides[-1]}: {place}" if isinstance(overrides, list) else f"override {next(iter(overrides))}"
+    assert line.startswith(printable(last))
 
 
 def test_an_override_is_split_at_its_first_equals_sign() -> None:
@@ -518,51 +474,15 @@ def test_a_region_of_the_image(load: Load, message: Messages) -> None:
         load(text + "[1, 0, 40, 30]")
 
 
-@pytest.mark.parametrize("parser", ["CSafeLoader", "SafeLoader"])
 @pytest.mark.parametrize("escape", ["\\ud800", "\\U00110000"], ids=["surrogate", "large"])
-def test_escapes_of_what_is_no_character(
-    load: Load, monkeypatch: pytest.MonkeyPatch, parser: str, escape: str, message: Messages
-) -> None:
-    monkeypatch.setattr(yaml_reader, "_LOADER", getattr(yaml, parser, yaml.SafeLoader))
-    with message.raises(SceneError, hide=rf"{OF_PYYAML}|(?<=s\.yaml:)\d+:\d+"):
+def test_escapes_of_what_is_no_character(load: Load, escape: str, message: Messages) -> None:
+    with message.raises(SceneError, "s.yaml:11:", hide=OF_PYYAML):
         load(f'{GOOD}"{escape}": 1\n')
-
-
-@pytest.mark.parametrize("parser", ["CSafeLoader", "SafeLoader"])
-def test_no_text_brings_up_any_other_error(load: Load, monkeypatch: pytest.MonkeyPatch, parser: str) -> None:
-    monkeypatch.setattr(yaml_reader, "_LOADER", getattr(yaml, parser, yaml.SafeLoader))
-    rng = random.Random(1)
-    whole = GOOD + PROBE + "render: {camera: {eye: [0, 0, 1]}, size: [64, 64]}\nimage: a.png\n"
-    pieces = [
-        *"\n\t :-?[]{},&*!|>'\"%@`#=~<.eE019x\\\x85\ud7ff\U0010ffff",
-        "\\ud800",
-        "\\U00110000",
-        "9" * 400,
-    ]
-    pieces += ["!!int", "<<: ", "---\n", "...\n", "1e999", "-1", ".nan", "null", "%YAML 9\n"]
-    outcomes: set[str] = set()
-    for _ in range(200):
-        text = whole
-        for _ in range(rng.randint(1, 4)):
-            start = rng.randrange(len(text))
-            piece = rng.choice(pieces) * rng.choice((1, 1, 30))
-            text = text[:start] + piece + text[start + rng.choice((0, 1, 8)) :]
-        if rng.random() < 0.3:
-            text = f'{text}{rng.choice(pieces)}: "{rng.choice(pieces)}"\n'
-        try:
-            load(text)
-        except SceneError as error:
-            outcomes.update(error.lines)
-    assert len(outcomes) > 100
-    assert all(line.isprintable() for line in outcomes)
 
 
 @pytest.mark.parametrize("value", ["1e30", "1e-30", "-1e30", "0"])
 def test_no_number_brings_up_any_other_error(load: Load, value: str) -> None:
-    Image.new("RGB", (4, 3)).save("a.png")
-    whole = load(
-        GOOD + PROBE + "render: {camera: {eye: [0, 0, 1]}, size: [64, 64]}\nimage: a.png\nregion: [0, 0, 4, 3]\n"
-    )
+    whole = load(GOOD + PROBE + "render: {camera: {eye: [0, 0, 1]}, size: [64, 64]}\nregion: [0, 0, 4, 3]\n")
     count = 0
     for key in number_keys(whole.model_dump(mode="json")):
         for overrides in ([f"{key}={value}"], [f"{key}={value}", "time.step=0.01"]):
@@ -573,12 +493,12 @@ def test_no_number_brings_up_any_other_error(load: Load, value: str) -> None:
     assert count > 0
 
 
-def number_keys(value: Any, above: str = "") -> list[str]:
+def number_keys(value: Any, above: tuple[str, ...] = ()) -> list[str]:
     """Name every number of a scene."""
     if isinstance(value, dict | list):
         parts = value.items() if isinstance(value, dict) else enumerate(value)
-        return [key for name, part in parts for key in number_keys(part, f"{above}.{name}" if above else str(name))]
-    return [above] if isinstance(value, int | float) else []
+        return [key for name, part in parts for key in number_keys(part, (*above, str(name)))]
+    return [".".join(above)] if isinstance(value, int | float) else []
 
 
 @pytest.fixture
@@ -630,10 +550,3 @@ def test_the_schema_rejects_what_is_wrong(validator: jsonschema.Draft202012Valid
         assert not validator.is_valid(good | wrong), wrong
     for key in ("sheet", "springs", "time"):
         assert not validator.is_valid({name: value for name, value in good.items() if name != key})
-
-
-def test_the_schema_says_what_it_is() -> None:
-    described = schema()
-    assert described["$schema"] == "https://json-schema.org/draft/2020-12/schema"
-    assert described["title"] == "Scene"
-    json.dumps(described, allow_nan=False)

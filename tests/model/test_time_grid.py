@@ -66,13 +66,6 @@ def test_a_step_that_a_tolerance_chose_is_written_and_read_again(rate: float, co
     assert written.time.tolerance is None
 
 
-def test_the_step_is_at_most_half_the_limit_unless_it_is_given() -> None:
-    made = scene()
-    grid = plan_of(made).grid
-    assert grid.step <= plan_of(made).stable_step / 2 < replace(grid, steps_per_frame=grid.steps_per_frame - 1).step
-    assert plan_of(scene(time={"step": 0.004})).grid.steps_per_frame == 10
-
-
 def test_a_tolerance_is_met_in_f64_on_a_cpu_whatever_the_work() -> None:
     large = {"points": [1024, 1024], "size": [0.3, 0.3], "mass": 1e-3}
     made = scene(sheet=large, time={"precision": "auto"})

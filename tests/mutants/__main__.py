@@ -34,14 +34,7 @@ class NoVerdictError(Exception):
 
 
 def first_failure(files: Iterable[str], mutant: Mutant | None = None) -> str | None:
-    """Run files of tests in a copy of the project, with one mistake or none.
-
-    Returns:
-        The test that failed; None where all passed.
-
-    Raises:
-        NoVerdictError: when the tests cannot be run to an end.
-    """
+    """Return the test that fails in a copy of the project with one mistake or none; None where all pass."""
     with TemporaryDirectory() as directory:
         # Resolved, as pytest tells its root: a temporary directory may be behind a link.
         copy = Path(directory).resolve()
@@ -55,7 +48,7 @@ def first_failure(files: Iterable[str], mutant: Mutant | None = None) -> str | N
             (copy / mutant.definition().file).write_text(mutant.source(), encoding="utf-8")
         try:
             done = subprocess.run(
-                [*PYTEST, "-p", "tests.mutants.own_package", *(f"tests/{file}" for file in files)],
+                [*PYTEST, *(f"tests/{file}" for file in files)],
                 cwd=copy,
                 # Also for processes that a test starts elsewhere.
                 env={**os.environ, "PYTHONPATH": str(copy)},

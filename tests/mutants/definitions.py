@@ -10,31 +10,17 @@ from pathlib import Path
 from textwrap import dedent, indent
 from typing import NamedTuple
 
-TOKEN = re.compile(r"\w+|[^\w\s]")
-CLOSING = (")", "]", "}")
-
 
 class Definition(NamedTuple):
-    """A function, a method, a class, or a constant of a module or a class.
+    """A function, a method, a class, or a constant of a module or a class."""
 
-    Attributes:
-        name: qualified, with the names of package and modules.
-        file: relative to the root of the project.
-        start: where its source begins in the file [characters].
-        source: its text, decorators included.
-    """
-
-    name: str
-    file: Path
-    start: int
-    source: str
+    name: str  # qualified, with the names of package and modules
+    file: Path  # relative to the root of the project
+    start: int  # of the source in the file [characters]
+    source: str  # with decorators
 
     def spans(self, text: str) -> list[tuple[int, int]]:
-        """Find text in the source, whatever the white space and the commas before closing brackets.
-
-        Returns:
-            Where it begins and ends in the file [characters].
-        """
+        """Find text in the source, whatever the white space and the commas before closing brackets."""
         matches = _pattern(text).finditer(self.source)
         return [(self.start + match.start(), self.start + match.end()) for match in matches]
 
@@ -93,14 +79,7 @@ def _names(node: ast.AST, *, constants: bool) -> Iterator[tuple[str, slice]]:
 
 
 def _pattern(text: str) -> re.Pattern[str]:
-    tokens = TOKEN.findall(text)
-    tokens = [t for t, after in zip(tokens, [*tokens[1:], ""], strict=True) if not (t == "," and after in CLOSING)]
-    parts = [r"\b" if tokens[0][0].isalnum() else ""]
-    for token, after in zip(tokens, [*tokens[1:], ""], strict=True):
-        parts.append(re.escape(token))
-        if after in CLOSING:
-            parts.append(r"\s*,?\s*")
-        elif after:
-            parts.append(r"\s+" if re.match(r"\w", token) and re.match(r"\w", after) else r"\s*")
-    parts.append(r"\b" if re.match(r"\w", tokens[-1]) else "")
-    return re.compile("".join(parts))
+    tokens = re.findall(r"\w+|[^\w\s]", re.sub(r",\s*([)\]}])", r"\1", text))
+    parts = [rf",?\s*{re.escape(token)}" if token in ")]}" else re.escape(token) for token in tokens]
+    first, last = (r"\b" if re.match(r"\w", token) else "" for token in (tokens[0], tokens[-1]))
+    return re.compile(first + r"\s*".join(parts) + last)

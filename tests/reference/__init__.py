@@ -3,42 +3,23 @@
 This is no independent check of the model; it is itself tested against closed forms and SciPy's integrators.
 """
 
-from tests.reference.drawing import draw, refine
-from tests.reference.dynamics import (
-    bending_force,
-    displacements,
-    elastic_force,
-    energy,
-    force,
-    longest_spring,
-    shortest_spring,
-    simulate,
-    steps,
-    surgical_force,
-    tangent,
-)
-from tests.reference.rest import clearance, equilibrium, equilibrium_outside_tool, place, potential, stiffness
-from tests.reference.sheet import sheet
-
-__all__ = [
-    "bending_force",
-    "clearance",
-    "displacements",
-    "draw",
-    "elastic_force",
-    "energy",
-    "equilibrium",
-    "equilibrium_outside_tool",
-    "force",
-    "longest_spring",
-    "place",
-    "potential",
-    "refine",
-    "sheet",
-    "shortest_spring",
-    "simulate",
-    "steps",
-    "stiffness",
-    "surgical_force",
-    "tangent",
-]
+from tests.reference.drawing import draw as draw
+from tests.reference.drawing import refine as refine
+from tests.reference.dynamics import bending_force as bending_force
+from tests.reference.dynamics import displacements as displacements
+from tests.reference.dynamics import elastic_force as elastic_force
+from tests.reference.dynamics import energy as energy
+from tests.reference.dynamics import force as force
+from tests.reference.dynamics import longest_spring as longest_spring
+from tests.reference.dynamics import shortest_spring as shortest_spring
+from tests.reference.dynamics import simulate as simulate
+from tests.reference.dynamics import steps as steps
+from tests.reference.dynamics import surgical_force as surgical_force
+from tests.reference.dynamics import tangent as tangent
+from tests.reference.rest import clearance as clearance
+from tests.reference.rest import equilibrium as equilibrium
+from tests.reference.rest import equilibrium_outside_tool as equilibrium_outside_tool
+from tests.reference.rest import place as place
+from tests.reference.rest import potential as potential
+from tests.reference.rest import stiffness as stiffness
+from tests.reference.sheet import sheet as sheet

@@ -15,10 +15,8 @@ Array = NDArray[np.float64]
 class Contact:
     """What the tools do to the points after each step.
 
-    Attributes:
-        push: by how much each probe has moved each point in the last step [m], shape (probes, rows, cols, 3).
-        force: that it took [N], the same shape.
-        holder: the probe that holds each point, or -1, shape (rows, cols).
+    `push` is by how much each probe has moved each point in the last step [m], shape (probes, rows, cols, 3), `force`
+    what it took [N], and `holder` the probe that holds each point, or -1.
     """
 
     def __init__(self, plan: Plan) -> None:

@@ -66,24 +66,16 @@ def wire_share(scene: Scene, triangle: Array, at: Sampled) -> Array:
 
 
 class Seen(NamedTuple):
-    """What the samples of a picture show; each array has the shape (height, width), counted in samples.
+    """What the samples of a picture show; each array has the shape (height, width), counted in samples."""
 
-    Attributes:
-        depth: along the direction of view [m]; infinite where nothing is.
-        u, v: the material point, fractions of the sheet's width and height from its upper left; NaN where none is.
-        wire: share of the mesh lines in the colour.
-        footprint: the larger of a sample's width and height on the texture, in units of uniforms.SHARP texels.
-        front: 1 where the front of the triangle is seen, else -1.
-        facet: normal of the triangle's front in the world [m^2], shape (height, width, 3); NaN where none is.
-    """
-
-    depth: Array
+    depth: Array  # along the direction of view [m]; infinite where nothing is
+    # u, v: the material point, fractions of the sheet's width and height from its upper left; NaN where none is
     u: Array
     v: Array
-    wire: Array
-    footprint: Array
-    front: Array
-    facet: Array
+    wire: Array  # share of the mesh lines in the colour
+    footprint: Array  # larger of a sample's width and height on the texture, in units of uniforms.SHARP texels
+    front: Array  # 1 where the front of the triangle is seen, else -1
+    facet: Array  # normal of the triangle's front in the world [m^2], shape (height, width, 3); NaN where none is
 
 
 def look(

@@ -147,12 +147,9 @@ def surgical_force(scene: Scene, loads: Schedule, n: int) -> Array:
 def force(scene: Scene, displacement: Array, loads: Schedule, n: int, made: Sheet | None = None) -> Array:
     """Add up all forces except the damping at one step (eq. 1), row n of the schedule; as `elastic_force`."""
     made = made or sheet(scene)
-    return (
-        elastic_force(scene, displacement, made)
-        + bending_force(scene, displacement, made)
-        + surgical_force(scene, loads, n)
-        + loads.active[n] * foundation_force(scene, displacement, made)
-    )
+    springs = elastic_force(scene, displacement, made) + bending_force(scene, displacement, made)
+    # In this order small sheets stay within the roundings of their steps.
+    return springs + surgical_force(scene, loads, n) + loads.active[n] * foundation_force(scene, displacement, made)
 
 
 def internal_force(scene: Scene, displacement: Array, loads: Schedule, n: int, made: Sheet) -> Array:
@@ -215,9 +212,7 @@ def steps(plan: Plan, made: Sheet | None = None) -> Iterator[tuple[Array, Contac
     h, made = plan.grid.step, made or sheet(scene)
     m, g = made.mass[..., None], (made.drag / made.mass)[..., None]
     moves, contact = ~plan.fixed[..., None], Contact(plan)
-    loads = average_loads(plan, 0, plan.grid.steps)
-
-    relaxation = Relaxation(scene, h)
+    loads, relaxation = average_loads(plan, 0, plan.grid.steps), Relaxation(scene, h)
 
     def acceleration(u: Array, n: int) -> Array:
         if scene.tissue is None or not scene.tissue.relaxation:

@@ -21,12 +21,7 @@ TOUCHING = 1e-9
 
 
 def labels(scene: Scene, position: Array, rods: Sequence[Solid] = ()) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Find what each pixel shows at its centre.
-
-    Returns:
-        Coordinates of the material points, shape (height, width, 2), NaN where there is none; depth [m], 0 where there
-        is nothing; whether an instrument is seen.
-    """
+    """Find at each pixel's centre the material point (NaN: none), depth [m] (0: nothing), and whether a rod is seen."""
     seen = look(scene, position)
     depth, _ = meet(rods, view(scene), scene.render.size, 1)
     nearer = depth < seen.depth

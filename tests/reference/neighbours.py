@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import NamedTuple
 
@@ -12,21 +13,14 @@ Window = tuple[slice, slice]
 
 
 class Spring(NamedTuple):
-    """A spring from a point to one of its neighbours.
+    """A spring from a point to one of its neighbours."""
 
-    Attributes:
-        down: rows from the point to its neighbour, i counted down.
-        right: columns from the point to its neighbour.
-        offset: rest vector from the point to its neighbour [m], x right, y up.
-        length: rest length L0 [m].
-        stiffness: k [N/m].
-    """
-
+    # down, right: rows and columns from the point to its neighbour
     down: int
     right: int
-    offset: tuple[float, float]
-    length: float
-    stiffness: float
+    offset: tuple[float, float]  # rest vector from the point to its neighbour [m], x right, y up
+    length: float  # rest length L0 [m]
+    stiffness: float  # k [N/m]
 
     def ends(self, points: tuple[int, int]) -> tuple[Window, Window]:
         """Select the points of a sheet (rows, cols) that have this spring, and the neighbours it connects them to."""
@@ -41,21 +35,12 @@ def _ends(ahead: int, count: int) -> tuple[slice, slice]:
 
 
 def springs(scene: Scene) -> tuple[Spring, ...]:
-    """List the springs from a point to its neighbours, up to 8, in a scene with `springs` and without a map.
-
-    Families of stiffness 0 are left out.
-    """
+    """List the springs from a point to its neighbours, up to 8, without those of stiffness 0."""
     assert scene.springs is not None
-    dx, dy = spacing(scene.sheet)
-    around = [(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1) if (down, right) != (0, 0)]
-    stencil = (
-        Spring(
-            down,
-            right,
-            (right * dx, -down * dy),
-            math.hypot(right * dx, down * dy),
-            scene.springs.shear if down and right else scene.springs.structural,
-        )
-        for down, right in around
-    )
-    return tuple(spring for spring in stencil if spring.stiffness > 0)
+    (dx, dy), stencil = spacing(scene.sheet), []
+    for down, right in itertools.product((-1, 0, 1), repeat=2):
+        stiffness = scene.springs.shear if down and right else scene.springs.structural
+        if (down, right) != (0, 0) and stiffness > 0:
+            offset = right * dx, -down * dy
+            stencil.append(Spring(down, right, offset, math.hypot(*offset), stiffness))
+    return tuple(stencil)

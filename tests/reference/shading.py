@@ -69,12 +69,7 @@ def mean_of_fours(texture: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def minified(texture: NDArray[np.uint8], u: Array, v: Array, footprint: Array) -> tuple[Array, Array]:
     """Filter a texture for samples each of which may show many of its texels, at places as for `sample`.
 
-    Args:
-        footprint: the larger of a sample's width and height on the texture, in units of uniforms.SHARP texels.
-
-    Returns:
-        Colours, shape (*u.shape, 3); and the slope of the grey from texel to texel to the right and down, shape
-        (*u.shape, 2).
+    Gives colours, shape (*u.shape, 3), and the slope of the grey per texel to the right and down, shape (*u.shape, 2).
     """
     levels = [texture]
     while levels[-1].shape[:2] != (1, 1):
@@ -133,9 +128,8 @@ def points(camera: View, factor: int, depth: Array) -> Array:
 def illuminate(camera: View, factor: int, depth: Array, normal: Array) -> tuple[Array, Array, Array, Array]:
     """Find the vectors in space that decide how the samples of a picture are lit; arguments as for `points`.
 
-    Returns:
-        Unit vectors: the normal, the direction to the light, the direction to the eye; and the
-        distance from the light to the point in the middle of the main camera's picture over that to the sample.
+    They are the normal and the directions to the light and to the eye; and, over the distance of the light from the
+    sample, that from the middle of the main camera's picture.
     """
     light_view = camera.light_view or camera
     right, up, toward = light_view.axes
@@ -162,13 +156,7 @@ def tissue(
     place: tuple[Array, Array, Array],
     rods: Sequence[Solid],
 ) -> Array:
-    """Shade wet tissue; see `render/shading.py`. Colours, shape (height, width, 3).
-
-    Args:
-        normal: of the sheet, of any length, shape (height, width, 3).
-        depth: along the direction of view [m], shape (height, width).
-        place: u, v and footprint of the samples, the arguments of `minified`.
-    """
+    """Shade wet tissue, as `render/shading.py`; `place` has the arguments of `minified`."""
     light, factor = scene.render.light, scene.render.supersample
     colour, rises = minified(texture, *place)
     # Where the relief rises, the normal tilts back, along the sheet.
@@ -211,9 +199,7 @@ def metal(camera: View, factor: int, depth: Array, normal: Array) -> Array:
 def meet(rods: Sequence[Solid], camera: View, size: tuple[int, int], factor: int) -> tuple[Array, Array]:
     """Find the instruments that samples show, by search: the distance to a rod is convex along a line of sight.
 
-    Returns:
-        Depths [m], infinite where there is none, shape (height, width); and normals of any length, shape (height,
-        width, 3).
+    Gives depths [m], infinite where there is none, and normals of any length.
     """
     width, height = size[0] * factor, size[1] * factor
     y, x = (np.mgrid[:height, :width] + 0.5) / factor

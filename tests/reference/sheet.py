@@ -19,40 +19,25 @@ Window = tuple[slice, slice]
 
 
 class Springs(NamedTuple):
-    """All springs with the same number of points down and to the right between their ends.
+    """All springs with the same number of points down and to the right between their ends."""
 
-    Attributes:
-        here, there: select the points at their ends; `there` is down or to the right of `here`.
-        offset: vector from here to there at rest [m], x right, y up, z.
-        length: at rest [m].
-        stiffness: k of each [N/m], shape as selected by `here`.
-        unstretched: length at which each has no force [m]; equal to `length`, unless the sheet is under tension.
-    """
-
+    # here, there: select the points at their ends; `there` is down or to the right of `here`
     here: Window
     there: Window
-    offset: Array
-    length: float
-    stiffness: Array
-    unstretched: Array
+    offset: Array  # vector from here to there at rest [m], x right, y up, z
+    length: float  # at rest [m]
+    stiffness: Array  # k of each [N/m], shape as selected by `here`
+    unstretched: Array  # length at which each has no force [m]; equal to `length`, unless the sheet is under tension
 
 
 class Sheet(NamedTuple):
-    """A sheet, point by point and spring by spring.
+    """A sheet, point by point and spring by spring."""
 
-    Attributes:
-        springs: along rows, along columns and along both diagonals, each spring once.
-        mass: of every point [kg], shape (rows, cols).
-        drag: C of every point [N s/m].
-        virtual: K of every point [N/m].
-        bending: D dx dy [N m3].
-    """
-
-    springs: tuple[Springs, ...]
-    mass: Array
-    drag: Array
-    virtual: Array
-    bending: Any
+    springs: tuple[Springs, ...]  # along rows, along columns and along both diagonals, each spring once
+    mass: Array  # of every point [kg], shape (rows, cols)
+    drag: Array  # C of every point [N s/m]
+    virtual: Array  # K of every point [N/m]
+    bending: Any  # D dx dy [N m3]
 
 
 # Points from one end of a spring to the other, down and right.

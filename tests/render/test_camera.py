@@ -53,15 +53,6 @@ def test_pinhole_looks_at_its_target_with_its_angle() -> None:
     np.testing.assert_allclose(pixel(made, list(edge))[0], [80, 30], atol=1e-12)
 
 
-def test_right_is_right_and_up_is_up() -> None:
-    for camera in ("top", "oblique", {"eye": [0, 0, 1]}):
-        made = with_camera(camera)
-        centre = pixel(made, [0, 0, 0])[0]
-        assert pixel(made, [0.01, 0, 0])[0][0] > centre[0]
-        assert pixel(made, [0, 0.01, 0])[0][1] < centre[1]
-        assert pixel(made, [0, 0, 0.01])[1] < pixel(made, [0, 0, 0])[1]
-
-
 @pytest.mark.parametrize("sheet_size", [(0.3, 0.4), (2.0, 0.1), (1e-3, 0.5)])
 @pytest.mark.parametrize("size", [(100, 60), (40, 90), (640, 8), (1, 1)])
 def test_fit_fills_the_picture_up_to_its_margin(sheet_size: tuple[float, float], size: tuple[int, int]) -> None:

@@ -13,16 +13,14 @@ from taichi_msm import Playback, Simulation, run
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.surface import Solid, place_instruments
 from taichi_msm.render.camera import view
-from taichi_msm.render.labels import LABELS, Labels, requested_labels
-from taichi_msm.render.rasterizer import Rasterizer, drawing_config
+from taichi_msm.render.labels import LABELS
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.reference import labels as twin
-from tests.render.test_labels import crumpled, folded
+from tests.render.test_labels import crumpled, folded, look
 from tests.render.test_lens import INTRINSICS, LENSES
 from tests.render.test_rasterizer import NEAR, dented, drawable, with_instruments
 from tests.runs.test_label_files import OBLIQUE, ROD, small_scene
-from tests.scenes import speckle
 
 Array = NDArray[np.float64]
 
@@ -34,13 +32,6 @@ CAMERAS: dict[str, Any] = {
     **{lens: {**PLACE, **LENSES[lens]} for lens in ("endoscope", "rational", "fisheye")},
 }
 EVERY_CAMERA = pytest.mark.parametrize("camera", CAMERAS)
-
-
-def look(made: Scene, position: Array, placed: list[Solid] | None = None, **config: Any) -> Labels:
-    kernel = drawing_config(made, picture=False, labels=LABELS)._replace(**config)
-    found = Rasterizer(made, speckle(9, 9), kernel).look(position, rods=placed or []).labels
-    assert found is not None
-    return found
 
 
 def apart(a: Any, b: Any) -> Array:
@@ -68,7 +59,7 @@ def test_normals_are_those_of_the_twin(shape: Any, camera: str, device: Device) 
     made = with_instruments(drawable(camera=CAMERAS[camera]))
     position = shape(made)
     placed = place_instruments(made, position, 0)
-    (_, depth, _, found), expected = look(made, position, placed), twin.normals(made, position, placed)
+    (_, depth, _, found), expected = look(made, position, LABELS), twin.normals(made, position, placed)
     np.testing.assert_array_equal(np.isnan(found), np.isnan(expected))
     seen = ~np.isnan(found[..., 0])
     error = apart(found, expected)[seen]
@@ -89,7 +80,7 @@ def test_a_tilted_sheet_has_one_normal(camera: str, device: Device) -> None:
     tilt = np.array([[1, 0, 0], [0, np.cos(lean), -np.sin(lean)], [0, np.sin(lean), np.cos(lean)]])
     tilt = np.array([[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]) @ tilt
     for side in (1, -1):  # The front, then the back.
-        found = look(made, rest_positions(made.sheet) * [side, 1, 1] @ tilt.T).normals
+        found = look(made, rest_positions(made.sheet) * [side, 1, 1] @ tilt.T, LABELS, ()).normals
         seen = ~np.isnan(found[..., 0])
         assert seen.mean() > 0.15
         normal = tilt[:, 2] @ axes(made)
@@ -102,7 +93,7 @@ def test_a_rod_has_the_normals_of_its_side_and_of_its_round_tip(camera: str, dev
     made = with_instruments(drawable(camera=CAMERAS[camera]))
     shaft = np.array([0.96, 0.0, 0.28])
     rod = Solid(np.array([-0.03, 0.02, 0.03]), shaft, 0.05, 0.03)
-    found = look(made, rest_positions(made.sheet), [rod])
+    found = look(made, rest_positions(made.sheet), LABELS, [rod])
     tip, along = (rod.tip - view(made).eye) @ axes(made), shaft @ axes(made)
     away = points(made, found.depth) - tip
     place = away @ along
@@ -117,35 +108,11 @@ def test_a_rod_has_the_normals_of_its_side_and_of_its_round_tip(camera: str, dev
     assert apart(found.normals[seen], facing).max() < 1e-4
 
 
-@EVERY_CAMERA
-def test_normals_are_across_the_gradient_of_depth(camera: str, device: Device) -> None:
-    made = with_instruments(drawable((4, 5), camera=CAMERAS[camera], refine=1))
-    position = rest_positions(made.sheet)
-    position[..., 2] = 2 * position[..., 0] ** 2 - position[..., 0] * position[..., 1] + 0.5 * position[..., 1]
-    found = look(made, position)
-    # Where a pixel and its four neighbours show one triangle.
-    place = found.coordinates * np.array([8.0, 6.0])
-    corner = np.floor(place)
-    triangle = corner @ [2.0, 100.0] + (np.diff(place - corner)[..., 0] > 0)
-    middle, around = np.s_[1:-1, 1:-1], [np.s_[1:-1, 2:], np.s_[1:-1, :-2], np.s_[2:, 1:-1], np.s_[:-2, 1:-1]]
-    one = np.all([triangle[middle] == triangle[side] for side in around], axis=0)
-    right, left, below, above = (points(made, found.depth)[side] for side in around)
-    across = np.cross(below - above, right - left)[one]
-    across /= np.linalg.norm(across, axis=-1, keepdims=True)
-    assert one.mean() > 0.2
-    assert len(np.unique(triangle[middle][one])) > 20
-    # 2^-24 of the depth, over the width of two pixels there.
-    assert apart(found.normals[middle][one], across).max() < 1e-4
-
-
 @pytest.mark.slow
 def test_other_labels_keep_their_bits(device: Device) -> None:
     made = with_instruments(drawable(camera=CAMERAS["endoscope"]))
     position = folded(made)
-    labels, without = (
-        look(made, position, place_instruments(made, position, 0), labels=requested_labels(asked))
-        for asked in (LABELS, ())
-    )
+    labels, without = look(made, position, LABELS), look(made, position)
     assert labels.normals.shape == (60, 80, 3)
     assert without.normals.shape == (0, 0, 3)
     for label, other in zip(labels[:3], without[:3], strict=True):

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.render.camera import extrinsics, orbit_camera, pinhole, view
@@ -14,45 +13,29 @@ from taichi_msm.render.picking import intersect_rest_plane, pick
 from taichi_msm.render.rasterizer import Rasterizer
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
-from tests import reference
-from tests.scenes import scene
+from tests.render.test_labels import folded
+from tests.render.test_rasterizer import drawable
 
-SIZE = (96, 80)
-POINTS = (7, 9)
 # Amid the sheet, of which half is behind it, and as wide as to see above the horizon.
 NEAR_EYE = {"eye": [0.02, -0.02, 0.05], "target": [0, 0.15, 0.02], "up": [0, 0, 1], "fov": 90}
-
-
-def place_texture() -> NDArray[np.uint8]:
-    """A picture whose colours tell the place: red the column of 256, green the row, and blue that it is the sheet."""
-    texture = np.full((256, 256, 3), 255, np.uint8)
-    texture[..., 0], texture[..., 1] = np.arange(256), np.arange(256)[:, None]
-    return texture
+CAMERAS = pytest.mark.parametrize("camera", ["top", "oblique", NEAR_EYE], ids=["top", "oblique", "near"])
 
 
 def sheet(camera: Any, refine: int = 2) -> Scene:
-    return scene(
-        sheet={"points": list(POINTS), "size": [0.3, 0.4], "mass": 1e-3},
-        render={"size": list(SIZE), "refine": refine, "camera": camera, "shading": "none"},
-    )
-
-
-def folded() -> NDArray[np.float64]:
-    """A sheet whose right third lies over the middle, rough enough that every quad is twisted."""
-    position = rest_positions(sheet("top").sheet)
-    right = position[..., 0] > 0.05
-    position[..., 2] += np.where(right, 0.06, 0) + np.random.default_rng(3).uniform(-0.006, 0.006, POINTS)
-    position[..., 0] = np.where(right, 0.1 - position[..., 0], position[..., 0])
-    return position
+    return drawable((7, 9), size=[96, 80], camera=camera, refine=refine, shading="none")
 
 
 @pytest.mark.default_cases("oblique-2")
 @pytest.mark.parametrize("refine", [0, 2])
-@pytest.mark.parametrize("camera", ["top", "oblique", NEAR_EYE], ids=["top", "oblique", "near"])
+@CAMERAS
 def test_what_is_picked_is_what_is_drawn(camera: Any, refine: int, device: Device) -> None:
-    shown, position = sheet(camera, refine), folded()
-    picture = Rasterizer(shown, place_texture()).draw(position).astype(int)
-    pixels = [(x, y) for y in range(0, SIZE[1], 3) for x in range(0, SIZE[0], 3)]
+    shown = sheet(camera, refine)
+    position = folded(shown)
+    # Red is the column of 256, green the row, and blue that it is the sheet.
+    texture = np.full((256, 256, 3), 255, np.uint8)
+    texture[..., 0], texture[..., 1] = np.arange(256), np.arange(256)[:, None]
+    picture = Rasterizer(shown, texture).draw(position).astype(int)
+    pixels = [(x, y) for y in range(0, 80, 3) for x in range(0, 96, 3)]
     covered, missed = 0, 0
     for x, y in pixels:
         place = pick(position, refine, view(shown), (x, y))
@@ -68,18 +51,7 @@ def test_what_is_picked_is_what_is_drawn(camera: Any, refine: int, device: Devic
     assert missed <= 2, "outlines are exact but for the pixels that rounding decides"
 
 
-def test_the_nearer_layer_is_picked_and_nothing_outside_the_sheet() -> None:
-    shown, position = sheet("top"), folded()
-    # Pixel of x = 0: the right third, turned over, lies above the middle.
-    place = pick(position, 2, view(shown), (SIZE[0] // 2 - 6, SIZE[1] // 2))
-    assert place is not None
-    assert place[0] > 0.6
-    shown = sheet("oblique")
-    for outside in ((1, 1), (-1000, 5000)):
-        assert pick(rest_positions(shown.sheet), 2, view(shown), outside) is None
-
-
-@pytest.mark.parametrize("camera", ["top", "oblique", NEAR_EYE], ids=["top", "oblique", "near"])
+@CAMERAS
 def test_on_the_rest_plane_is_where_the_sheet_at_rest_is_picked(camera: Any) -> None:
     shown = sheet(camera)
     height, width = shown.sheet.size
@@ -122,12 +94,3 @@ def test_the_pinhole_above_shows_the_sheet_as_large_as_from_the_top() -> None:
     for camera in (shown, above):
         x, y, w, _ = view(camera).matrix @ [*rest[0, 0], 1]
         assert (x / w, y / w) == pytest.approx((0.0, 4.0)), camera.render.camera
-
-
-def test_the_twin_draws_what_is_picked() -> None:
-    shown, position = sheet("oblique"), folded()
-    picture = reference.draw(shown, position, place_texture())
-    for x, y in [(40, 40), (50, 30), (30, 60)]:
-        place = pick(position, 2, view(shown), (x, y))
-        assert place is not None
-        assert np.abs(np.array(place) * 256 - 0.5 - picture[y, x, :2]).max() <= 0.51

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.model.surface import place_instruments
+from taichi_msm.model.surface import Solid, place_instruments
 from taichi_msm.render import bins, gpu, tracking
 from taichi_msm.render.camera import view
 from taichi_msm.render.cpu import Bands
@@ -55,6 +56,21 @@ def difference(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> NDArray[np.int_]:
     return np.abs(a.astype(int) - b.astype(int)).max(axis=-1)
 
 
+def drawn_as_by_the_twin(
+    made: Scene, position: NDArray[Any], texture: NDArray[np.uint8], rods: Sequence[Solid] = ()
+) -> NDArray[np.uint8]:
+    """The picture, which is the twin's.
+
+    A vertex is off by 1/512 px where it is snapped, which moves a silhouette past few pixel centres; elsewhere f32 puts
+    a vertex of a 97-pixel picture at 97 x 2^-24 px, and the speckle changes by at most 255 in 2 px.
+    """
+    drawn = Rasterizer(made, texture).draw(position, rods=rods)
+    apart = difference(drawn, reference.draw(made, position, texture, rods))
+    assert (apart > 1).mean() < 0.005
+    assert (apart == 1).mean() < 0.01
+    return drawn
+
+
 def test_nothing_is_drawn_before_every_mass_point_is_projected(device: Device) -> None:
     """Three rows for two workers: the one that has projected a single row must wait for the other.
 
@@ -93,12 +109,7 @@ def test_nothing_is_drawn_before_every_mass_point_is_projected(device: Device) -
 )
 def test_picture_is_like_the_twin(render: dict[str, Any], device: Device) -> None:
     made = drawable(**render)
-    position, texture = dented(made), speckle(13, 17)
-    apart = difference(draw(made, position, texture), reference.draw(made, position, texture))
-    # A vertex is off by 1/512 px where it is snapped, which moves a silhouette past few pixel centres; elsewhere
-    # f32 puts a vertex of a 97-pixel picture at 97 x 2^-24 px, and the speckle changes by at most 255 in 2 px.
-    assert (apart > 1).mean() < 0.005
-    assert (apart == 1).mean() < 0.01
+    drawn_as_by_the_twin(made, dented(made), speckle(13, 17))
 
 
 @pytest.mark.slow
@@ -162,11 +173,8 @@ def test_launches_do_not_change_the_bits(parts: int, device: Device, monkeypatch
     made = with_instruments(drawable((9, 11), size=[60, 50], refine=2, camera="top", supersample=2))
     rng = np.random.default_rng(6)
     position = rest_positions(made.sheet) + rng.normal(0, 0.03, (9, 11, 3)) * [1, 1, 0]
-    placed, texture, config = (
-        place_instruments(made, position, 0),
-        speckle(30, 20),
-        drawing_config(made)._replace(lanes=1),
-    )
+    placed, texture = place_instruments(made, position, 0), speckle(30, 20)
+    config = drawing_config(made)._replace(lanes=1)
     begun: list[int] = []
     launch = launches.Launches.launch
 
@@ -222,10 +230,7 @@ def test_the_bound_of_a_thread_is_asserted(device: Device, monkeypatch: pytest.M
 def test_instruments_are_like_the_twin(shading: str, camera: Any, device: Device) -> None:
     made = with_instruments(drawable(camera=camera, shading=shading))
     position, texture = dented(made), np.full((9, 9, 3), 120, np.uint8)
-    placed = place_instruments(made, position, 0)
-    drawn = Rasterizer(made, texture).draw(position, rods=placed)
-    apart = difference(drawn, reference.draw(made, position, texture, placed))
-    assert (apart > 1).mean() < 0.005, "but for outlines"
+    drawn = drawn_as_by_the_twin(made, position, texture, place_instruments(made, position, 0))
     bare = reference.draw(made, position, texture)
     assert (difference(drawn, bare) > 30).mean() > 0.02, "instruments are seen"
 
@@ -259,11 +264,8 @@ def test_tissue_is_as_bright_as_its_faces_at_a_fold(device: Device) -> None:
     position[..., 2] = 0.03 * np.sin(position[..., 1] * 100)
     picture = draw(made, position, np.full((4, 4, 3), 255, np.uint8))[..., 0].astype(int)
     inner = picture[1:-1, 1:-1]
-    around = np.array(
-        [picture[1 + i : 149 + i, 1 + j : 199 + j] for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
-    )
-    specks = (inner > 0) & (inner < 0.5 * around.min(axis=0))
-    assert not specks.any(), "no dark pixel in a bright face"
+    around = [picture[1 + i : 149 + i, 1 + j : 199 + j] for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
+    assert not ((inner > 0) & (inner < 0.5 * np.min(around, axis=0))).any(), "no dark pixel in a bright face"
 
 
 def test_tissue_is_nowhere_black(device: Device) -> None:
@@ -271,9 +273,7 @@ def test_tissue_is_nowhere_black(device: Device) -> None:
     position = rest_positions(made.sheet)
     position[..., 2] = position[..., 0] * np.tan(np.radians(85))  # away from the light
     picture = draw(made, position, np.full((4, 4, 3), 200, np.uint8))
-    assert picture.max() > 0
-    lit = picture[picture.any(axis=-1)]
-    assert lit.min() >= 0.2 * 200 - 1, "the ambient share is left"
+    assert picture[picture.any(axis=-1)].min() >= 0.2 * 200 - 1, "the ambient share is left"
 
 
 @pytest.mark.parametrize("lanes", [8, *(pytest.param(lanes, marks=pytest.mark.slow) for lanes in (4, 16))])
@@ -349,50 +349,12 @@ def test_a_sheet_that_passes_through_the_eye_is_seen_in_part(device: Device) -> 
         assert (apart > 1).mean() < 0.002, y
 
 
-def test_of_a_folded_sheet_the_upper_layer_is_seen(device: Device) -> None:
-    # The right half is folded over the left one, once above it and once below; the sides have their own colours.
-    texture = np.zeros((10, 20, 3), np.uint8)
-    texture[:, :10] = [250, 0, 0]
-    texture[:, 10:] = [0, 0, 250]
-    made = drawable((3, 21), shading="none", refine=1)
-    for height, colour in ((0.01, [0, 0, 250]), (-0.01, [250, 0, 0])):
-        position = rest_positions(made.sheet)
-        right = position[..., 0] > 0.01
-        position[right, 0] *= -1
-        position[right, 2] = height
-        picture = draw(made, position, texture)
-        assert (picture[10:50, 5:35] == colour).all()
-        assert not picture[:, 50:].any(), "nothing is left on the right but the background"
-
-
 def test_oblique_shows_the_whole_sheet(device: Device) -> None:
     for size in ([80, 60], [40, 90], [200, 30]):
         made = drawable(size=size, camera="oblique")
         corners = rest_positions(made.sheet)[[0, 0, -1, -1], [0, -1, 0, -1]]
         x, y, w, _ = view(made).matrix @ np.c_[corners, np.ones(4)].T
         assert ((x / w > 0) & (x / w < size[0]) & (y / w > 0) & (y / w < size[1])).all()
-
-
-def test_perspective_is_correct(device: Device) -> None:
-    # Two triangles in steep perspective: without the division by w the texture would bend at the diagonal.
-    made = drawable((2, 2), refine=0, camera={"eye": [0, -0.35, 0.12], "fov": 60}, shading="none")
-    fine = drawable((2, 2), refine=30, camera={"eye": [0, -0.35, 0.12], "fov": 60}, shading="none")
-    ramp = np.linspace(0, 255, 64).astype(np.uint8)
-    texture = np.stack([np.tile(ramp, (64, 1)), np.tile(ramp[:, None], (1, 64)), np.zeros((64, 64), np.uint8)], -1)
-    position = rest_positions(made.sheet)
-    apart = difference(draw(made, position, texture), draw(fine, position, texture))
-    assert (apart > 1).mean() < 0.005
-
-
-def test_wireframe_draws_the_mass_point_mesh(device: Device) -> None:
-    made = drawable((3, 5), size=[80, 60], shading="none", wireframe=True)
-    picture = draw(made, rest_positions(made.sheet), np.zeros((4, 4, 3), np.uint8))[..., 0]
-    # Lines at x = 0, 20, 40, 60, 80 and y = 0, 30, 60: both pixels beside a line carry half of it.
-    lines = picture > 0
-    expected = np.zeros((60, 80), bool)
-    expected[:, [0, 19, 20, 39, 40, 59, 60, 79]] = True
-    expected[[0, 29, 30, 59]] = True
-    np.testing.assert_array_equal(lines, expected)
 
 
 def test_only_what_the_picture_needs_is_compiled(device: Device) -> None:

@@ -15,6 +15,7 @@ from taichi_msm.errors import SceneError
 from taichi_msm.images import read_grey
 from taichi_msm.render.texture import image_problems, image_size, load_texture
 from taichi_msm.scene.scene import Scene
+from tests import scenes
 from tests.golden import Messages
 from tests.scenes import speckle
 
@@ -37,17 +38,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def scene(image: str | None, **keys: Any) -> Scene:
-    return Scene.model_validate(
-        {
-            "image": image,
-            "sheet": {"points": [2, 2], "size": [1, 1], "mass": 1},
-            "springs": {},
-            "time": {"duration": 1},
-            "render": {"background": BACKGROUND},
-            "output": [],
-            **keys,
-        }
-    )
+    return scenes.scene(image=image, render={"background": BACKGROUND}, **keys)
 
 
 def faults(image: str | None, **keys: Any) -> list[str]:
@@ -161,17 +152,6 @@ def test_exif_orientation(name: str, orientation: int, upright: NDArray[np.uint8
     assert_texture(name, upright)
     height, width = upright.shape[:2]
     assert_texture(name, upright[1:, 1:], region=[1, 1, width - 1, height - 1])
-
-
-def test_exif_orientation_of_a_jpeg_turns_its_size() -> None:
-    exif = Image.Exif()
-    exif[ORIENTATION] = 6
-    Image.new("RGB", (16, 8), (200, 100, 50)).save("a.jpg", quality=100, subsampling=0, exif=exif)
-    texture = load_texture(scene("a.jpg"))
-    assert image_size(scene("a.jpg")) == (8, 16)
-    assert texture.shape == (16, 8, 3)
-    # Rounding to whole Y, Cb, Cr and back is within 2 of each colour.
-    assert np.abs(texture.astype(int) - [200, 100, 50]).max() <= 2
 
 
 def test_the_first_of_several_pictures() -> None:

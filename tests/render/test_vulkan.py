@@ -33,9 +33,10 @@ from tests.render.test_rasterizer import dented, drawable, with_instruments
 from tests.scenes import SMALL, speckle
 from tests.terms.test_contact import moved, touching
 
-DRIVERS = sorted(Path("/usr/share/vulkan/icd.d").glob("lvp_icd*.json"))
+# Any driver of Mesa; an empty path without one.
+DRIVER = next(map(str, Path("/usr/share/vulkan/icd.d").glob("lvp_icd*.json")), "")
 
-pytestmark = pytest.mark.skipif(not DRIVERS, reason="needs mesa-vulkan-drivers")
+pytestmark = pytest.mark.skipif(not DRIVER, reason="needs mesa-vulkan-drivers")
 
 SETTINGS = [
     "probes.0.at=[[0, 0.2, 0.5], [0.2, 0.8, 0.5], [0.2, 0.4, 0.4]]",
@@ -78,7 +79,7 @@ def runs(root: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, li
     here = tmp_path_factory.mktemp("vulkan")
     Image.fromarray(speckle(30, 40)).save(here / "speckle.png")
     (here / "small.yaml").write_text(SMALL)
-    done = vulkan(str(DRIVERS[0]), "-c", RUNS, root=root, cwd=here)
+    done = vulkan(DRIVER, "-c", RUNS, root=root, cwd=here)
     assert done.returncode == 0, done.stderr
     return here, json.loads(done.stdout)
 
@@ -249,7 +250,7 @@ def draped(made: Scene) -> NDArray[np.float64]:
     "case", [pytest.param(case, marks=() if case == "pinhole" else pytest.mark.slow) for case in LOOKED_AT]
 )
 def test_pictures_labels_and_tracks_are_those_of_the_cpu(case: str, tmp_path: Path, root: Path, device: Device) -> None:
-    done = vulkan(str(DRIVERS[0]), "-c", LOOKS, str(tmp_path / "seen.npz"), case, root=root)
+    done = vulkan(DRIVER, "-c", LOOKS, str(tmp_path / "seen.npz"), case, root=root)
     assert done.returncode == 0, done.stderr
     there, here = np.load(tmp_path / "seen.npz"), LOOKED_AT[case]()
     # f32 has a place in 512 pixels to 2^-15 px. So of all outlines, some 5,000 px long, less than a pixel's centre lies
@@ -272,7 +273,7 @@ def test_pictures_labels_and_tracks_are_those_of_the_cpu(case: str, tmp_path: Pa
 
 @pytest.mark.slow
 def test_what_a_picture_takes_is_given_back(root: Path) -> None:
-    done = vulkan(str(DRIVERS[0]), "-c", AGAIN, root=root)
+    done = vulkan(DRIVER, "-c", AGAIN, root=root)
     assert done.returncode == 0, done.stderr
     # Bounds and owners of 199 x 199 cells alone are 24 bytes each, and were kept 3 times.
     assert int(done.stdout) < 3 * 24 * 199**2 / 2
@@ -292,7 +293,7 @@ def test_a_kernel_that_is_cut_short_is_an_error_of_one_line(
         f"render={{size: [4, 4], refine: 0, camera: {json.dumps(TINY)}}}",
     ]
     words = ["run", "small.yaml", "--arch", "vulkan", *(word for setting in settings for word in ("--set", setting))]
-    done = vulkan(str(DRIVERS[0]), "-c", CUT_SHORT, *words, root=root)
+    done = vulkan(DRIVER, "-c", CUT_SHORT, *words, root=root)
     assert (done.returncode, done.stdout) == (2, ""), done.stderr
     # A line on the progress of compiling comes before it on a slow machine.
     message(done.stderr.splitlines()[-1], "--arch vulkan", "take --arch cpu", hide=r"(?<=work ).*(?=, so)")
@@ -300,7 +301,7 @@ def test_a_kernel_that_is_cut_short_is_an_error_of_one_line(
 
 
 @pytest.mark.parametrize(
-    ("driver", "precision"), [("/nonexistent", "f32"), (str(DRIVERS[0]), "f64")], ids=["no GPU", "no exp in f64"]
+    ("driver", "precision"), [("/nonexistent", "f32"), (DRIVER, "f64")], ids=["no GPU", "no exp in f64"]
 )
 def test_what_a_gpu_cannot_do_is_one_line(
     driver: str, precision: str, small: Path, root: Path, message: Messages

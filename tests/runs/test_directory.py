@@ -4,12 +4,10 @@ import errno
 import json
 import os
 import re
-import shutil
-import sys
 from collections.abc import Callable, Collection
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import pytest
 
@@ -136,7 +134,6 @@ def test_killed_at_any_moment_the_results_are_all_old_or_all_new(
     assert outcomes.count("new") > 10
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="no lock")
 def test_a_second_run_is_refused_until_the_first_ends(directory: Path, message: Messages) -> None:
     with Publication(directory, RUN_PUBLICATION) as first:
         write(first.new_folder, NEW, "new")
@@ -149,7 +146,6 @@ def test_a_second_run_is_refused_until_the_first_ends(directory: Path, message: 
     assert_tidy(directory)
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="no lock")
 def test_the_lock_of_a_directory_that_was_removed_is_no_lock(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Between opening the lock and locking it, the run that held it may end and remove it."""
     import fcntl
@@ -206,18 +202,6 @@ def test_new_files_that_were_made_up_take_no_file_of_the_user(tmp_path: Path, me
     assert contents(tmp_path) == expected(["animation.gif", "trajectory.npz", "frames/0000.png"], "mine")
 
 
-def test_a_directory_that_is_removed_when_it_was_opened_is_no_endless_loop(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def remove(path: Path) -> BinaryIO:
-        shutil.rmtree(tmp_path / "out", ignore_errors=True)
-        return lock_file(path)
-
-    monkeypatch.setattr("taichi_msm.runs.directory.lock_file", remove)
-    with pytest.raises(FileNotFoundError), Publication(tmp_path / "out", RUN_PUBLICATION):
-        pass
-
-
 def test_what_no_run_has_written_is_neither_replaced_nor_removed(directory: Path, message: Messages) -> None:
     """Files with names like ours, which the record does not list."""
     write(directory, ["frames/0100.png"], "mine")
@@ -229,7 +213,6 @@ def test_what_no_run_has_written_is_neither_replaced_nor_removed(directory: Path
     assert contents(directory) == {**expected(NEW, "new"), "frames/0100.png": "mine", "animation.gif": "mine"}
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="no lock")
 def test_what_a_killed_process_left_is_cleared_by_the_next(tmp_path: Path) -> None:
     """But nothing that is still being written, and nothing of anybody else."""
     names = (*(16 * letter for letter in "abcd"), "mine")
@@ -262,7 +245,6 @@ def test_a_link_among_what_was_left_leads_nowhere(tmp_path: Path) -> None:
     assert not (treasure / "notes.txt").exists()
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="no lock")
 def test_without_locks_nothing_is_taken_for_abandoned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Such as a film that is still being recorded."""
 

@@ -16,8 +16,8 @@ from PIL import Image
 from taichi_msm.errors import FilesError, SceneError
 from taichi_msm.load.scene_file import load_plan, load_scene
 from taichi_msm.model.plan import Plan
+from taichi_msm.runs.checkpoint import input_digests
 from taichi_msm.runs.finished import read_run
-from taichi_msm.runs.manifest import input_digests
 from taichi_msm.runs.playback import Playback
 from taichi_msm.runs.run import resume, run
 from taichi_msm.runs.writer import RunRecord
@@ -120,9 +120,9 @@ DAMAGE: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE)
-def test_a_damaged_record_is_one_line(damage: Callable[[Path], object], results: Path, message: Messages) -> None:
+def test_a_damaged_record_is_one_line(damage: Callable[[Path], object], results: Path) -> None:
     damage(results)
-    with message.raises(FilesError, "run.json"):
+    with pytest.raises(FilesError, match=r"run\.json: damaged"):
         read_run(results)
 
 
@@ -173,11 +173,11 @@ FORGERIES: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("forge", FORGERIES.values(), ids=FORGERIES)
-def test_a_forged_trajectory_is_refused(forge: Callable[[Path], object], results: Path, message: Messages) -> None:
+def test_a_forged_trajectory_is_refused(forge: Callable[[Path], object], results: Path) -> None:
     rewrite(results)
     assert len(read_run(results).positions()) == 5, "NumPy's own files are taken"
     forge(results)
-    with message.raises(FilesError, "trajectory.npz"):
+    with pytest.raises(FilesError, match=r"trajectory\.npz: damaged"):
         read_run(results).positions()
 
 
@@ -243,20 +243,6 @@ def test_a_run_is_repeated_to_the_bit_from_anywhere(
     assert record(mapped / "elsewhere" / "third")["error_estimate_reason"] == "not asked for"
 
 
-def test_results_go_where_they_were(mapped: Path, program: Program) -> None:
-    assert program("run", "small.yaml", "--set", SHORT, "--out", "first").returncode == 0
-    before, told = results(mapped / "first"), record(mapped / "first")
-    (mapped / "first" / "frames" / "0001.png").unlink()
-    done = program("run", "--again", "first")
-    assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.startswith("first: 3 frames")
-    assert results(mapped / "first") == before
-    again = record(mapped / "first")
-    assert again["timings"] != told["timings"]
-    for key in ("scene", "working_directory", "overrides", "sha256"):
-        assert again[key] == told[key]
-
-
 def test_the_record_has_the_sha_256_of_every_picture(mapped: Path, device: Device) -> None:
     made = load_scene("small.yaml", [MAP, SHORT])
     told = run(made, "out", threads=device.threads)
@@ -269,13 +255,14 @@ def test_the_record_has_the_sha_256_of_every_picture(mapped: Path, device: Devic
     assert set(run(gone, "gone", threads=device.threads)["sha256"]) == {"springs.map.image"}
 
 
-def test_an_interrupted_run_is_repeated_to_its_end(mapped: Path, device: Device, program: Program) -> None:
+def test_an_interrupted_run_is_repeated_to_its_end_where_it_was(small: Path, device: Device, program: Program) -> None:
     made = load_scene("small.yaml")
-    whole = run(made, "whole", threads=device.threads)
+    run(made, "whole", threads=device.threads)
     assert run(made, "parts", threads=device.threads, progress=Stop(4))["status"] == "interrupted"
-    assert program("run", "--again", "parts", "--quiet").returncode == 0
-    assert record(mapped / "parts")["frames"] == whole["frames"]
-    assert results(mapped / "parts") == results(mapped / "whole")
+    done = program("run", "--again", "parts")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("parts: 5 frames")
+    assert results(small / "parts") == results(small / "whole")
 
 
 CHANGES: dict[str, Callable[[], object]] = {

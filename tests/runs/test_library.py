@@ -32,7 +32,6 @@ from taichi_msm import (
 )
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.render.camera import view
-from taichi_msm.render.labels import FrameOutputs
 from taichi_msm.runs.finished import read_run
 from taichi_msm.runs.run import free_cores
 from taichi_msm.solver.planning import with_time
@@ -89,6 +88,16 @@ WRONG: dict[str, tuple[Callable[[Simulation, Any], object], list[Any]]] = {
             np.zeros((4, 5, 3)),
         ],
     ),
+    "labels": (
+        lambda one, value: one.flow(value(one.labels())),
+        [
+            lambda labels: "labels",
+            lambda labels: labels._replace(coordinates=np.zeros((3, 3, 2))),
+            lambda labels: labels._replace(coordinates="none"),
+            lambda labels: labels._replace(coordinates=labels.coordinates * 7),
+        ],
+    ),
+    "coordinates": (Simulation.locate, [[[0.5, 1.5]], [0.5, 0.5], [[np.nan, 0.5]]]),
     "camera": (Simulation.draw, [3, "side", {"eye": [0, 0]}, {"eye": [0, 0, 0]}]),
     "frames": (Simulation.advance, [-1, 1.5, "2", None]),
     "frames played": (lambda one, value: one.play(value), [-1]),
@@ -162,14 +171,11 @@ def test_a_tool_that_stands_can_be_put_elsewhere(device: Device) -> None:
         np.testing.assert_array_equal(steered.positions(), expected.positions())
 
 
-@pytest.mark.parametrize(
-    "probes", [[], [PRESS, PRESS], [{**PRESS, "at": [[0, 0.5, 0.5], [1, 0.6, 0.5]]}]], ids=["none", "two", "moving"]
-)
-def test_what_needs_another_kernel_is_refused(probes: Any, simulation: Simulation, message: Messages) -> None:
+def test_a_tool_that_stands_cannot_be_moved(simulation: Simulation, message: Messages) -> None:
     simulation.advance()
     before = simulation.scene
     with message.raises(ArgumentError):
-        simulation.steer(probes)
+        simulation.steer([{**PRESS, "at": [[0, 0.5, 0.5], [1, 0.6, 0.5]]}])
     assert simulation.scene == before
     simulation.advance()
 
@@ -329,23 +335,6 @@ def test_frames_positions_and_pictures(device: Device) -> None:
         simulation.advance(0)
         assert simulation.frame == 3
     assert simulation.progress.max_displacement == pytest.approx(np.linalg.norm(twin[:4] - twin[0], axis=-1).max())
-
-
-def test_kernels_are_compiled_once_in_a_process(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    observed, own = [], Simulation.observe
-
-    def observe(simulation: Simulation, *given: Any) -> FrameOutputs:
-        observed.append(given)
-        return own(simulation, *given)
-
-    monkeypatch.setattr(Simulation, "observe", observe)
-    for refine, drawn in ((3, 2), (2, 2), (0, 4)):  # Only whether the sheet is refined is compiled.
-        made = scene(render={"size": [40, 30], "refine": refine}, image="any.png", output=["png"])
-        with Simulation(made, threads=device.threads, texture=speckle(30, 40)) as simulation:
-            if refine == 3:
-                monkeypatch.setattr("taichi_msm.runs.simulation._compiled_kernels", set())
-            simulation.compile()
-        assert len(observed) == drawn
 
 
 def test_positions_of_a_frame_stay_as_they_were(device: Device) -> None:

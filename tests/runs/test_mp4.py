@@ -17,7 +17,8 @@ from PIL import Image
 
 from taichi_msm import SceneError, run
 from taichi_msm.load.scene_file import load_scene
-from taichi_msm.runs.media import EncodingJob, Mp4Writer, PictureWriter
+from taichi_msm.runs.encoder import EncodingJob, PictureWriter
+from taichi_msm.runs.media import Mp4Writer
 from taichi_msm.scene import outputs
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
@@ -148,7 +149,7 @@ def test_a_film_of_an_interrupted_run_has_its_frames(small: Path, device: Device
 
 
 def test_a_film_can_be_given_up(tmp_path: Path) -> None:
-    job = EncodingJob((tmp_path,), (64, 48), 25.0, png=False, gif=True, background=(0, 0, 0), mp4=True)
+    job = EncodingJob((tmp_path,), (64, 48), 25.0, ("gif", "mp4"), (0, 0, 0), 65)
     writer = PictureWriter(job)
     for frame in range(30):
         writer.add(smooth(64, 48, frame)[None])

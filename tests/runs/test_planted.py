@@ -15,17 +15,14 @@ import pytest
 from taichi_msm.cli.session import result_directory
 from taichi_msm.errors import FilesError
 from taichi_msm.render.labels import FrameOutputs
-from taichi_msm.runs.checkpoint import MANIFEST_FILE, is_unfinished
-from taichi_msm.runs.manifest import read_manifest
+from taichi_msm.runs.checkpoint import STATE_FILE, is_unfinished, read_manifest
 from taichi_msm.runs.writer import ResultWriter
 from taichi_msm.scene.scene import Scene
 from tests.golden import Messages
 from tests.scenes import plan_of, scene, speckle
 
-pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs links and pipes")
-
 # Everything that a run might reach beyond its folder.
-TREASURE = "notes.txt 0000.png manifest.json positions state.npz run.json lock new/a.txt draft"
+TREASURE = "notes.txt 0000.png frames state.npz run.json lock new/a.txt draft"
 
 Plant = Callable[[Path, Path], None]
 
@@ -73,16 +70,6 @@ def pipe(name: str) -> Plant:
     return plant(name, lambda path, treasure: os.mkfifo(path))
 
 
-def device(name: str) -> Plant:
-    def make(path: Path, treasure: Path) -> None:
-        try:
-            os.mknod(path, 0o600 | stat.S_IFCHR, Path("/dev/zero").stat().st_rdev)
-        except (OSError, AttributeError):
-            pytest.skip("needs the right to make devices")
-
-    return plant(name, make)
-
-
 def file(name: str, text: str = "mine") -> Plant:
     return plant(name, lambda path, treasure: path.write_text(text))
 
@@ -100,7 +87,6 @@ PLANTED = {
     "the lock leads elsewhere": link(".partial/lock", "lock"),
     "the lock never ends": link(".partial/lock", "/dev/zero"),
     "the lock is a pipe": pipe(".partial/lock"),
-    "the lock is a device": device(".partial/lock"),
     "the whole results lead elsewhere": link(".partial/whole"),
     "the record of whole results is a pipe": pipe(".partial/whole/run.json"),
     "the record of whole results names what is elsewhere": file(
@@ -111,12 +97,11 @@ PLANTED = {
     "the new frames lead elsewhere": link(".partial/new/frames"),
     "unknown link beside them": link(".partial/x"),
     "the checkpoint leads elsewhere": link(".partial/checkpoint"),
-    "the manifest leads elsewhere": link(".partial/checkpoint/manifest.json", "manifest.json"),
-    "the manifest is a pipe": pipe(".partial/checkpoint/manifest.json"),
-    "the manifest is a device": device(".partial/checkpoint/manifest.json"),
-    "the positions lead elsewhere": link(".partial/checkpoint/positions", "positions"),
-    "the draft leads elsewhere": link(f".partial/checkpoint/.partial-{16 * 'a'}/draft", "draft"),
-    "a draft is the user's": file(".partial/checkpoint/draft"),
+    "the state leads elsewhere": link(".partial/checkpoint/state.npz", "state.npz"),
+    "the state is a pipe": pipe(".partial/checkpoint/state.npz"),
+    "the stored frames lead elsewhere": link(".partial/checkpoint/frames", "frames"),
+    "the draft leads elsewhere": link(".partial/checkpoint/state.new", "draft"),
+    "unknown file beside them": file(".partial/checkpoint/draft"),
     "the state is a folder": folder(".partial/checkpoint/state.npz"),
     "the frames lead elsewhere": link("frames"),
     "the frames are a file": file("frames"),
@@ -154,13 +139,13 @@ def test_what_no_run_has_put_there_is_left_alone(case: str, treasure: Path, mess
         with message.raises(FilesError):
             write(out, resumes=resumes)
         assert (snapshot(treasure), snapshot(out)) == (precious, before)
-    if "manifest" in case or "checkpoint" in case:
+    if "the state" in case or "checkpoint" in case:
         assert not is_unfinished(out)
         with message.raises(FilesError):
             read_manifest(out)
 
 
-@pytest.mark.parametrize("name", ["positions", "manifest.json", "state.npz"])
+@pytest.mark.parametrize("name", ["frames", "state.npz"])
 def test_a_checkpoint_whose_file_has_another_name(name: str, treasure: Path) -> None:
     """A hard link to what is elsewhere is not written to."""
     checkpoint = treasure.parent / "out" / ".partial" / "checkpoint"
@@ -192,5 +177,5 @@ def test_the_default_folder_is_not_reached_by_a_link(
 
 
 def test_a_plan_alone_is_enough_to_be_unfinished(tmp_path: Path) -> None:
-    file(f".partial/checkpoint/{MANIFEST_FILE}")(tmp_path, tmp_path)
+    file(f".partial/checkpoint/{STATE_FILE}")(tmp_path, tmp_path)
     assert is_unfinished(tmp_path)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import itertools
 import math
 import time
 from collections.abc import Iterator
@@ -20,7 +19,7 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_POINTS
 from taichi_msm.solver import backoff, kernel_cpu, kernel_gpu
 from taichi_msm.solver.arrays import SheetLayout
-from taichi_msm.solver.dynamics import POINTS_PER_WORKER
+from taichi_msm.solver.sheet_solver import POINTS_PER_WORKER
 from taichi_msm.system import process
 from taichi_msm.system.launches import MAX_ROUNDS, VULKAN_THREADS
 from taichi_msm.system.process import available_threads
@@ -92,20 +91,11 @@ def test_small_sheets_and_fixed_sides(points: list[int], fixed: Any, device: Dev
 @pytest.fixture
 def short_launches(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Few steps a launch on a GPU, as each of them is compiled."""
-    kernel_gpu._kernels.cache_clear()
+    kernel_gpu._build_advance.cache_clear()
     for module in ("kernel_gpu", "dynamics"):
         monkeypatch.setattr(f"taichi_msm.solver.{module}.STEPS_PER_LAUNCH", 3)
     yield
-    kernel_gpu._kernels.cache_clear()
-
-
-@pytest.mark.usefixtures("short_launches")
-def test_the_plain_layout_of_a_gpu_gives_the_same(device: Device) -> None:
-    made = scene(probes=[PRESS], time={"duration": 0.08})
-    layout = as_on_a_gpu(structure_of(made, device))
-    count = plan_of(made).grid.steps_per_frame
-    assert count % kernel_gpu.STEPS_PER_LAUNCH != 0, "a launch that is not full is part of the test"
-    assert simulate(made, device, layout).tobytes() == simulate(made, device).tobytes()
+    kernel_gpu._build_advance.cache_clear()
 
 
 @pytest.mark.parametrize("fixed", [pytest.param("border", marks=pytest.mark.slow), ["top"]])
@@ -119,17 +109,6 @@ def test_bands_and_passes_do_not_change_the_bits(fixed: Any, device: Device) -> 
         assert plan_of(made).grid.steps_per_frame % depth != 0 or depth == 1
         layout = replace(whole, workers=workers, depth=depth)
         assert simulate(made, device, layout).tobytes() == plain.tobytes(), (workers, depth)
-
-
-@pytest.mark.parametrize("workers", [3, 10])
-def test_more_bands_than_threads_give_the_same_bits(workers: int, device: Device) -> None:
-    # Bands that end at one border are those of the second and third worker, and it takes as many threads to step them
-    # at one time; but one step a launch, nobody waits.
-    made = scene(sheet={**SHEET, "points": [21, 19], "fixed": ["top"]}, time={"precision": "f32", "duration": 0.08})
-    dynamics = dynamics_of(made, device, replace(structure_of(made, device), workers=workers))
-    for _ in range(plan_of(made).grid.steps):
-        dynamics.advance(1)
-    assert dynamics.displacement().tobytes() == simulate(made, device)[-1].tobytes()
 
 
 def test_the_depth_of_a_pass_is_chosen_from_the_size(device: Device) -> None:
@@ -182,10 +161,9 @@ def test_a_launch_ends_soon(device: Device, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_a_frame_of_a_small_sheet_is_one_launch(device: Device) -> None:
-    dynamics = dynamics_of(scene(), device)
-    dynamics.advance(plan_of(scene()).grid.steps_per_frame)
-    assert plan_of(scene()).grid.steps_per_frame > 1
-    assert dynamics.launches == 1
+    pauses: list[int] = []
+    dynamics_of(scene(), device).advance(plan_of(scene()).grid.steps_per_frame, lambda: pauses.append(1))
+    assert plan_of(scene()).grid.steps_per_frame > len(pauses) == 1
 
 
 def test_absent_terms_are_left_out(device: Device) -> None:
@@ -257,40 +235,6 @@ def test_energy_does_not_drift(device: Device) -> None:
 
 
 @pytest.mark.usefixtures("short_launches")
-@pytest.mark.parametrize(
-    "change",
-    [
-        pytest.param({}, id="one band"),
-        pytest.param({"workers": 2}, id="two bands"),
-        pytest.param({"workers": 2, "depth": 4}, id="passes of four steps"),
-        pytest.param(None, id="as on a GPU"),
-    ],
-)
-def test_a_state_is_gone_on_from_with_the_same_bits(change: dict[str, Any] | None, device: Device) -> None:
-    """On odd sheets whose columns do not fill the strips, and after an odd number of steps."""
-    made = scene(
-        sheet={**SHEET, "points": [13, 19], "fixed": ["top", "left"]},
-        probes=[PRESS, {**PRESS, "at": [[0, 0.1, 0.1], [0.4, 0.9, 0.9]]}],
-        time={"precision": "f32"},
-    )
-    whole = structure_of(made, device)
-    dynamics = dynamics_of(made, device, as_on_a_gpu(whole) if change is None else replace(whole, **change))
-    dynamics.advance(37)
-    state, energy = dynamics.state(), dynamics.read().energy
-    dynamics.advance(50)
-    end = dynamics.state()
-    dynamics.restart(plan_of(made), state)
-    again = dynamics.state()
-    assert dynamics.read().energy == energy
-    dynamics.advance(50)
-    for there, here in ((again, state), (dynamics.state(), end)):
-        assert there.steps == here.steps
-        assert there.displacement.tobytes() == here.displacement.tobytes()
-        assert there.difference.tobytes() == here.difference.tobytes()
-    assert end.difference.any()
-
-
-@pytest.mark.usefixtures("short_launches")
 @pytest.mark.parametrize(("seed", "width"), [(3, 8), (4, 1)])
 def test_the_energy_is_that_of_motion_and_springs(seed: int, width: int, device: Device) -> None:
     made = random_scene(seed)
@@ -358,58 +302,41 @@ def test_workers_that_give_up_waiting_go_on_to_the_same_bits(
             assert one.tobytes() == other.tobytes()
 
 
-def test_rests_grow_while_workers_give_up_and_are_forgotten_when_they_do_not(
-    device: Device, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made = scene(sheet={**SHEET, "points": [21, 19]}, time={"precision": "f32"})
-    scatter: Any = dynamics_of(made, device, replace(structure_of(made, device), workers=2)).sheet.kernel
-    now, taken, patient = 0.0, [0, 0], False
+def test_backoffs_grow_while_workers_time_out_on_crowded_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, waits = [0.0], [0.0]
+    monkeypatch.setattr("time.perf_counter", lambda: now[0])
+    monkeypatch.setattr("time.process_time", lambda: now[0])
+    monkeypatch.setattr(process, "core_wait_s", lambda: waits[0])
+    paused = backoff.Backoff()
 
-    def alone(done: int, end: int, *_: object) -> None:
-        nonlocal now
-        now, taken[0] = now + 0.001 * (end - done), taken[0] + end - done
+    def period(parallel_s: float, waited: float, timed_out: bool = True) -> float:
+        """The back-off after a launch in which threads waited for a share of its time."""
+        paused.start_launch()
+        now[0], waits[0] = now[0] + parallel_s, waits[0] + waited * parallel_s
+        paused.end_launch(timed_out=timed_out)
+        begin = now[0]
+        while paused.is_active:
+            now[0] += 1e-4
+            waits[0] += 0.5e-4  # of no account, as nobody waits for another worker
+        return now[0] - begin
 
-    def together(done: int, end: int, *_: object) -> tuple[int, bool]:
-        nonlocal now
-        steps = end - done if patient else 1
-        now, taken[1] = now + 0.001 * steps, taken[1] + steps
-        return steps, not patient
-
-    def steps_together(count: int) -> int:
-        taken[:] = [0, 0]
-        scatter.advance(count, np.empty(0))
-        assert sum(taken) == count
-        return taken[1]
-
-    had, waited = itertools.count(), itertools.count()
-    monkeypatch.setattr(scatter, "_advance_alone", alone)
-    monkeypatch.setattr(scatter, "_launch_together", together)
-    monkeypatch.setattr("time.perf_counter", lambda: now)
-    monkeypatch.setattr("time.process_time", lambda: next(had))
-    # As long as nobody wants our cores, a worker that gives up is an accident, and rests stay the shortest.
-    monkeypatch.setattr(process, "core_wait_s", lambda: 0.0)
-    assert steps_together(10_000) > 1000
-    # We wait as long as we run.
-    monkeypatch.setattr(process, "core_wait_s", lambda: float(next(waited)))
-    assert steps_together(10_000) < 100
-    # During a rest nobody waits, which makes the next one no shorter.
-    with monkeypatch.context() as patch:
-        patch.setattr("time.process_time", lambda: now)
-        patch.setattr(process, "core_wait_s", lambda: 0.001 * taken[1])
-        assert steps_together(10_000) < 200
-    # Undisturbed for minutes, and then disturbed once: the rest is the shortest again.
-    patient = True
-    steps_together(1_000_000)
-    patient = False
-    # One step in each launch of all; the rest of 2 ms takes pieces of one and two steps.
-    assert steps_together(5) == 2
+    shortest, longest = backoff.MIN_BACKOFF_S, backoff.MAX_BACKOFF_S
+    # As long as no other program wants the cores, a timeout is an accident.
+    for _ in range(3):
+        assert period(1e-3, 0.0) == pytest.approx(shortest, abs=2e-4)
+    periods = [round(period(1e-3, 1.0), 3) for _ in range(6)]
+    assert periods == sorted(periods)
+    assert periods[-1] == pytest.approx(longest, abs=2e-4)
+    # After a long undisturbed time the next one is the shortest again.
+    assert period(10.0, 0.0, timed_out=False) == 0
+    assert period(1e-3, 1.0) == pytest.approx(shortest, abs=2e-4)
 
 
 def test_giving_up_in_the_last_pass_of_a_launch_counts(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     made = scene(sheet={**SHEET, "points": [101, 101]}, time={"precision": "f32"})
     monkeypatch.setattr(kernel_cpu, "MAX_CHECKS", 0)
     dynamics = dynamics_of(made, device, replace(structure_of(made, device), workers=2, depth=8))
-    scatter = dynamics.sheet.kernel
+    scatter = dynamics.kernel
     assert isinstance(scatter, kernel_cpu.ScatterKernel)
     for _ in range(200):
         dynamics.advance(8)
@@ -423,13 +350,13 @@ def test_a_sheet_that_was_interrupted_while_stepping_is_not_used(
     made = scene()
     dynamics = dynamics_of(made, device)
     dynamics.advance(10)
-    saved, advance = dynamics.state(), dynamics.sheet.kernel.advance
+    saved, advance = dynamics.state(), dynamics.kernel.advance
 
     def interrupted(*arguments: Any) -> None:
         advance(*arguments)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(dynamics.sheet.kernel, "advance", interrupted)
+    monkeypatch.setattr(dynamics.kernel, "advance", interrupted)
     with pytest.raises(KeyboardInterrupt):
         dynamics.advance(5)
     monkeypatch.undo()

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm.accuracy.time_step import estimate_error
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.model import sheet
 from taichi_msm.model.tool_force import probe_force
@@ -20,7 +19,7 @@ from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests import reference
-from tests.motion import dynamics_of, frames
+from tests.motion import dynamics_of, estimate_error, frames
 from tests.scenes import plan_of
 
 Array = NDArray[np.float64]

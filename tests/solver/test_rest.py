@@ -18,13 +18,12 @@ from taichi_msm.model.tools import path_warnings
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.arrays import SheetLayout
-from taichi_msm.solver.dynamics import Dynamics, choose_layout
+from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.solver.rest import FORCE_TOLERANCE, QuasiStatics
 from taichi_msm.system.runtime import Device
 from tests import reference
 from tests.golden import Messages
 from tests.scenes import plan_of, scene, speckle
-from tests.solver.test_dynamics import with_lanes
 from tests.terms.test_contact import moved
 
 Array = NDArray[np.float64]
@@ -178,21 +177,6 @@ def test_a_stepped_sheet_comes_to_the_same_rest(device: Device) -> None:
     stepped = Dynamics(plan_of(dynamic).with_grid(precision="f64"), device)
     stepped.advance(stepped.plan.grid.steps)
     assert_close(shape_of(plan_of(made), device), stepped.displacement())
-
-
-@pytest.mark.default_cases("made1")
-@pytest.mark.parametrize(
-    "made",
-    [
-        tissue({**PUSH, "at": [[0, 0.2, 0.2], [2, 0.8, 0.6]]}, {"points": [9, 14]}, bending="plate"),
-        at_rest([PRESSED], sheet={**SHEET, "fixed": ["left", "top"]}),
-    ],
-)
-def test_lanes_do_not_change_the_bits(made: Scene, device: Device) -> None:
-    plan = plan_of(made)
-    layout = choose_layout(plan, device)
-    plain = shape_of(plan, device).tobytes()
-    assert shape_of(plan, device, layout=with_lanes(layout, 1)).tobytes() == plain
 
 
 SQUEEZE = {"total": [1.5, 0, 0], "radius": 0.03, "falloff": 30, "at": [0.3, 0.5]}

@@ -3,53 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from contextlib import closing
-from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
-from PIL import Image
 from pydantic import BaseModel
 
 from taichi_msm.accuracy.mesh import with_points
 from taichi_msm.accuracy.time_step import max_norm
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
-from taichi_msm.runs.run import run
 from taichi_msm.scene.scene import Scene
-from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.solver.planning import with_time
 from taichi_msm.study import measurements
-from taichi_msm.study import study as study_module
 from taichi_msm.study.measurements import (
-    MESH_ROUNDS,
     REFERENCE_MARGIN,
-    IntegrationError,
+    ROUNDS,
     MeshStudy,
     SteppingStudy,
-    TimeLimitError,
     _reference,
     measure_pictures,
-    measure_terms,
     mesh_plans,
-    scene_variants,
-    solve_with_dop853,
 )
-from taichi_msm.study.measurements import MESH_ROUNDS as POINTS_ROUNDS
-from taichi_msm.study.result import DrawingMeasurement, SteppingMeasurement, Study, Timing, observed_orders
+from taichi_msm.study.result import DrawingMeasurement, SteppingMeasurement, Study, observed_orders
 from taichi_msm.system.runtime import Device
-from taichi_msm.terms.damping import DampingTerm
-from taichi_msm.terms.foundation import FoundationTerm
-from taichi_msm.terms.loads import ProbeTerm
-from taichi_msm.terms.springs import SpringTerm
 from tests import reference
 from tests.golden import Messages
-from tests.motion import frames_on, structure_of
-from tests.scenes import PRESS, SPRINGS, plan_of, scene, speckle
-from tests.terms.test_contact import PRESSED, RUBBED, moved, touching
+from tests.motion import frames_on
+from tests.scenes import PRESS, plan_of, scene, speckle
+from tests.terms.test_contact import PRESSED, moved, touching
 
 SOFT_PRESS = {**PRESS, "force": [0, 300, -1000]}
 
@@ -62,58 +45,62 @@ def nothing(done: int, total: int) -> None:
     assert 0 <= done <= total
 
 
+def stepping_study(made: Scene, device: Device, longest_run: float) -> tuple[Study, Any]:
+    """The study of the steps of a scene, and the reference displacements."""
+    study = study_of(made)
+    return study, SteppingStudy(plan_of(made), device, longest_run, study, nothing).run()
+
+
+# A release on a step.
+RELEASE = scene(probes=[SOFT_PRESS], damping=0.02, time={"damping_difference": "backward"})
+
+
 @pytest.fixture(scope="module")
-def stepping(device: Device) -> Any:
-    """A study of a small scene with a release on a step."""
-    made = scene(probes=[SOFT_PRESS], damping=0.02, time={"damping_difference": "backward"})
-    with closing(SteppingStudy(plan_of(made), device, 0.05, study_of(made), nothing)) as measured:
-        measured.run()
-        yield measured
+def stepping(device: Device) -> tuple[Study, Any]:
+    return stepping_study(RELEASE, device, 0.05)
 
 
-def test_stepping_starts_at_the_largest_stable_step_and_halves_it(stepping: SteppingStudy) -> None:
-    points = stepping.study.stepping
+def test_stepping_starts_at_the_largest_stable_step_and_halves_it(stepping: tuple[Study, Any]) -> None:
+    points = stepping[0].stepping
     assert {point.method for point in points} == {"f32 central", "f32 backward", "f64 central", "f64 backward"}
     for method in ("f32 central", "f64 backward"):
         steps = [point.step for point in points if point.method == method]
-        limit = plan_of(with_time(stepping.plan.scene, damping_difference=method.split()[1])).stable_step
+        limit = plan_of(with_time(RELEASE, damping_difference=method.split()[1])).stable_step
         assert 0.5 * limit < steps[0] <= limit
         np.testing.assert_allclose(np.divide(steps[:-1], steps[1:]), 2)
         assert len(steps) >= 3
-    assert all(point.seconds.runs == MESH_ROUNDS for point in points)
+    assert all(point.seconds.runs == ROUNDS for point in points)
     assert all(point.seconds.fastest <= point.seconds.median <= point.seconds.slowest for point in points)
 
 
-def test_errors_of_stepping_are_those_of_the_twin(stepping: SteppingStudy) -> None:
-    point = next(point for point in stepping.study.stepping if point.method == "f64 backward")
-    made = with_time(stepping.plan.scene, step=point.step, precision="f64")
+def test_errors_of_stepping_are_those_of_the_twin(stepping: tuple[Study, Any]) -> None:
+    study, _ = stepping
+    point = next(point for point in study.stepping if point.method == "f64 backward")
+    made = with_time(RELEASE, step=point.step, precision="f64")
     exact = reference.simulate(with_time(made, step=point.step / 16, damping_difference="central"))
     wrong = reference.simulate(made) - exact
     largest = np.linalg.norm(exact - exact[0], axis=-1).max()
     # 16 times finer, of order 2 where the other is of order 1, the twin is off by 1 % of the error or less.
     assert point.error == pytest.approx(np.linalg.norm(wrong, axis=-1).max() / largest, rel=0.01)
-    assert stepping.study.reference is not None
-    assert stepping.study.reference.largest == pytest.approx(largest, rel=1e-5)
+    assert study.reference is not None
+    assert study.reference.largest == pytest.approx(largest, rel=1e-5)
 
 
-def test_the_reference_is_as_exact_as_it_says(stepping: SteppingStudy) -> None:
-    assert stepping.frames is not None
-    assert stepping.study.reference is not None
-    made = with_time(stepping.plan.scene, damping_difference="central")
-    solved, _ = solve_with_dop853(plan_of(made), 1e-12, 1e-14, float("inf"), lambda: None)
-    error = np.linalg.norm(solved - stepping.frames, axis=-1).max() / stepping.study.reference.largest
-    # The integrator keeps 1e-12 a step, of some thousand steps.
-    assert error < stepping.study.reference.error + 1e-9
-    for point in stepping.study.stepping:
+def test_the_reference_is_as_exact_as_it_says(stepping: tuple[Study, Any], device: Device) -> None:
+    study, frames = stepping
+    assert study.reference is not None
+    plan, steps = (
+        plan_of(with_time(RELEASE, damping_difference="central", precision="f64")),
+        study.reference.steps_per_frame,
+    )
+    coarse, fine = (frames_on(plan.with_grid(steps_per_frame=n * steps), device) for n in (2, 4))
+    # Extrapolated from steps a quarter as long, it has 1 / 4^4 of the error.
+    error = max_norm(frames - (fine + (fine - coarse) / 3)) / study.reference.largest
+    # Some ten thousand steps round by 1e-16 each.
+    assert error < study.reference.error + 1e-11
+    for point in study.stepping:
         assert point.error is not None
-        assert point.known == (point.error >= REFERENCE_MARGIN * stepping.study.reference.error)
-
-
-def test_observed_orders(stepping: SteppingStudy) -> None:
-    orders = observed_orders(stepping.study.stepping)
-    assert orders["f64 backward"] == pytest.approx(1, abs=0.15)
-    # From the limit of stability down the first halvings are not in the range of the asymptote yet.
-    assert orders["f64 central"] == pytest.approx(2, abs=0.3)
+        assert point.known == (point.error >= REFERENCE_MARGIN * study.reference.error)
 
 
 def test_orders_are_fitted_above_the_rounding_floor() -> None:
@@ -129,66 +116,8 @@ def test_orders_are_fitted_above_the_rounding_floor() -> None:
 def test_a_series_halves_its_steps_though_they_miss_a_jump(device: Device) -> None:
     # A release at 3.25 frames, which no ninth of a frame meets.
     made = scene(probes=[{**SOFT_PRESS, "load": [[0, 100], [0.13, 100], [0.13, 0]]}], time={"duration": 0.2})
-    with closing(SteppingStudy(plan_of(made), device, 0.001, study_of(made), nothing)) as measured:
-        measured.run()
-        counts = [point.steps_per_frame for point in measured.study.stepping if point.method == "f64 central"]
-    assert counts == [9, 18, 36]
-
-
-@pytest.mark.slow
-def test_dop853_solves_moving_and_jumping_probes() -> None:
-    at = [[0, 0.2, 0.3], [0.2, 0.6, 0.5], [0.2, 0.4, 0.4], [0.3, 0.5, 0.7]]
-    probe = {"at": at, "force": [200, 100, -500], "load": [[0.05, 50], [0.3, 100], [0.3, 0]], "falloff": 20}
-    made = scene(probes=[probe], springs={**SPRINGS, "virtual": 5}, time={"step": 0.04 / 320})
-    solved, evaluations = solve_with_dop853(plan_of(made), 1e-8, 1e-12, float("inf"), lambda: None)
-    coarse, fine = (
-        (reference.simulate(with_time(made, step=0.04 / cut)) - rest_positions(made.sheet))[1:] for cut in (160, 320)
-    )
-    largest = np.abs(solved).max()
-    error = np.abs(solved - fine).max()
-    # The twin's own error, of order 2 as every jump is on a step: a third of what a halving changes.
-    assert error == pytest.approx(np.abs(fine - coarse).max() / 3, rel=0.1)
-    assert error < 1e-3 * largest
-    assert solved.shape == (10, 9, 11, 3)
-    assert evaluations > 100
-
-
-def test_a_timing_is_a_median_with_its_spread() -> None:
-    assert Timing.of([3.0, 1.0, 9.0, 2.0, 4.0]) == Timing(3.0, 1.0, 9.0, 5)
-
-
-def test_dop853_gives_up_in_time() -> None:
-    with pytest.raises(TimeLimitError):
-        solve_with_dop853(plan_of(scene()), 1e-3, 1e-6, 0.0, lambda: None)
-
-
-def test_dop853_fails_where_no_step_is_small_enough(monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
-    failed = SimpleNamespace(success=False, t=np.array([0.04, 0.08]))
-    monkeypatch.setattr("scipy.integrate.solve_ivp", lambda *_, **__: failed)
-    with message.raises(IntegrationError, "0.08 s"):
-        solve_with_dop853(plan_of(scene()), 1e-4, 1e-6, float("inf"), lambda: None)
-
-
-@pytest.mark.slow
-def test_dop853_is_left_out_where_tools_touch(device: Device, message: Messages) -> None:
-    made = touching([PRESSED])
-    with closing(SteppingStudy(plan_of(made), device, 0.01, study_of(made), nothing)) as measured:
-        measured.run()
-        study_module._measure_peer(
-            plan_of(made), measured, study_module.QUICK, measured.study, lambda stage, done, total: None
-        )
-    assert not measured.study.peers
-    message(measured.study.notes, "contact")
-    # The reference is the finest run itself, and what a run with half its steps differs from it is its error.
-    known = measured.study.reference
-    assert known is not None
-    fine, half = (
-        frames_on(plan_of(made).with_grid(steps_per_frame=count), device)
-        for count in (known.steps_per_frame, known.steps_per_frame // 2)
-    )
-    assert measured.frames is not None
-    assert measured.frames.tobytes() == fine.tobytes()
-    assert known.error == max_norm(fine - half) / max_norm(fine)
+    study, _ = stepping_study(made, device, 0.001)
+    assert [point.steps_per_frame for point in study.stepping if point.method == "f64 central"] == [9, 18, 36]
 
 
 @pytest.mark.slow
@@ -196,9 +125,19 @@ def test_a_study_takes_no_steps_in_which_a_tool_moves_too_far(device: Device) ->
     fast = moved([0, 0.5, 0.5, 0.1], [0.1, 0.9, 0.5, 0.1], instrument={"radius": 0.005})
     made = touching([fast], time={"step": 0.001, "duration": 0.04})
     assert plan_of(made).stable_step > 0.01
-    with closing(SteppingStudy(plan_of(made), device, 0.001, study_of(made), nothing)) as measured:
-        measured.run()
-    assert max(point.step for point in measured.study.stepping) <= 0.005 / 2 / 1.6
+    study, _ = stepping_study(made, device, 0.001)
+    assert max(point.step for point in study.stepping) <= 0.005 / 2 / 1.6
+
+
+@pytest.mark.slow
+def test_the_reference_in_contact_is_the_finest_run(device: Device) -> None:
+    made = touching([PRESSED])
+    study, frames = stepping_study(made, device, 0.01)
+    assert study.reference is not None
+    steps = study.reference.steps_per_frame
+    fine, half = (frames_on(plan_of(made).with_grid(steps_per_frame=n), device) for n in (steps, steps // 2))
+    assert frames.tobytes() == fine.tobytes()
+    assert study.reference.error == max_norm(fine - half) / max_norm(fine)
 
 
 def test_points_in_contact_are_not_extrapolated() -> None:
@@ -206,58 +145,6 @@ def test_points_in_contact_are_not_extrapolated() -> None:
     exact, bound = _reference(fields, extrapolate=False)
     assert exact is fields[-1]
     assert bound == pytest.approx(3**0.5)
-
-
-def test_a_tool_that_is_moved_is_left_out_like_any_other() -> None:
-    made = touching([PRESSED, RUBBED])
-    without = dict(scene_variants(made))
-    assert [len(plan_of(without[f"probes.{n}"]).tools) for n in (0, 1)] == [1, 1]
-
-
-@pytest.mark.parametrize("raised", [TimeLimitError(), IntegrationError("after 0.3 s")], ids=["slow", "failed"])
-def test_why_dop853_is_left_out_is_told(
-    raised: Exception, stepping: SteppingStudy, monkeypatch: pytest.MonkeyPatch, message: Messages
-) -> None:
-    def solve_with_dop853(*_: Any) -> Any:
-        raise raised
-
-    monkeypatch.setattr(study_module, "solve_with_dop853", solve_with_dop853)
-    found = study_of(scene())
-    found.reference = stepping.study.reference
-    study_module._measure_peer(plan_of(scene()), stepping, study_module.QUICK, found, lambda stage, done, total: None)
-    message(found.notes, "DOP853", str(raised))
-
-
-def test_terms_are_left_out_of_the_kernel(device: Device) -> None:
-    made = scene(probes=[PRESS, PRESS])
-    shapes = {name: structure_of(variant, device).config for name, variant in scene_variants(made)}
-    springs = ["springs.structural", "springs.shear", "springs.virtual"]
-    assert list(shapes) == ["", *springs, "damping", "probes.0", "probes.1"]
-    terms = {name: code.require(SpringTerm) for name, code in shapes.items()}
-    assert (terms[""].structural, terms[""].shear) == (True, True)
-    assert not terms["springs.structural"].structural
-    assert not terms["springs.shear"].shear
-    assert not shapes["springs.virtual"].get(FoundationTerm)
-    assert not shapes["damping"].get(DampingTerm)
-    assert shapes["probes.1"].get(ProbeTerm) == ProbeTerm((False,), (False,))
-    assert list(dict(scene_variants(scene(springs={}, damping=0, probes=[])))) == [""]
-
-
-@pytest.mark.slow
-def test_all_terms_are_timed_on_the_grid_of_the_whole_scene(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a stiff spring `auto` would take longer steps, and maybe others in f64."""
-    grids = []
-
-    class Recorded(Dynamics):
-        def __init__(self, plan: Plan, device: Device) -> None:
-            grids.append(plan.grid)
-            super().__init__(plan, device)
-
-    monkeypatch.setattr(measurements, "Dynamics", Recorded)
-    made = scene(damping=0, springs={"structural": 20, "shear": 1}, time={"precision": "auto"})
-    measure_terms(plan_of(made), device, 0.0001, study_of(made), nothing)
-    assert len(grids) == len(list(scene_variants(made)))
-    assert set(grids) == {plan_of(made).grid} != {plan_of(variant).grid for _, variant in scene_variants(made)}
 
 
 TISSUE = {"young": 3e3, "thickness": 2e-3, "density": 1050}
@@ -285,22 +172,11 @@ def points(device: Device) -> Study:
     return points_study(tissue(), device, 2.0)
 
 
-@pytest.mark.slow
-def test_the_error_of_points_is_of_order_2(points: Study) -> None:
-    found = points.points
-    assert points.notes == []
-    assert [one.name for one in found] == ["9 x 9", "17 x 17", "33 x 33", "65 x 65"]
-    assert [one.known for one in found[:3]] == [True] * 3
-    errors = [one.error or 0.0 for one in found]
-    # Between 9 points a side the cubics are wrong besides, by terms of order 4.
-    assert np.log2(errors[1] / errors[2]) == pytest.approx(2, abs=0.2)
-    assert errors[0] / errors[1] > 4
-    assert all(one.seconds.runs == POINTS_ROUNDS for one in found)
-    # The largest stable step is as long as a cell.
-    assert found[3].steps_per_frame / found[2].steps_per_frame == pytest.approx(2, abs=0.05)
-
-
 def test_the_error_of_points_is_that_against_many_more(points: Study, device: Device) -> None:
+    assert points.notes == []
+    assert [one.name for one in points.points] == ["9 x 9", "17 x 17", "33 x 33", "65 x 65"]
+    assert [one.known for one in points.points[:3]] == [True] * 3
+    assert all(one.seconds.runs == ROUNDS for one in points.points)
     many = tissue((65, 65))
     steps = plan_of(many).grid.steps_per_frame
 
@@ -316,15 +192,6 @@ def test_the_error_of_points_is_that_against_many_more(points: Study, device: De
         assert apart <= (found.error or 0.0) < 1.6 * apart
 
 
-def test_the_estimate_beside_it_is_that_of_a_run(points: Study, device: Device, tmp_path: Path) -> None:
-    found = points.points[1]
-    record = run(tissue((17, 17)), tmp_path / "out", threads=device.threads, estimate_error=True)
-    estimate = record["error_estimate"]
-    assert estimate is not None
-    # The run compares sheets with half as many steps, whose own errors differ by less than this with the points.
-    assert estimate["mesh_error"] == pytest.approx(found.estimate, rel=0.01)
-
-
 def test_without_time_for_more_points_the_error_of_the_finest_is_a_bound(
     points: Study, device: Device, message: Messages
 ) -> None:
@@ -335,14 +202,6 @@ def test_without_time_for_more_points_the_error_of_the_finest_is_a_bound(
     assert found[0].known
     assert not found[2].known
     assert (found[2].error or 0.0) > (better[2].error or 1.0)
-
-
-def test_where_the_finest_is_the_reference_its_error_is_never_known(device: Device) -> None:
-    # At the border the displacement jumps, by far more than the extrapolation there may be wrong.
-    made = tissue((13, 13))
-    assert made.tissue is not None
-    slack = made.model_copy(update={"tissue": made.tissue.model_copy(update={"pretension": 0.0, "foundation": 2e6})})
-    assert [one.known for one in points_study(slack, device, 1e-6).points] == [True, False]
 
 
 def points_of(plans: Iterable[Plan]) -> list[tuple[int, int]]:
@@ -369,12 +228,12 @@ def test_an_interruption_leaves_the_points_that_were_timed(device: Device) -> No
     made = study_of(tissue((13, 13)))
 
     def stop(done: int, total: int) -> None:
-        # The estimates and the errors of three are done, and one was timed once.
+        # The first runs and the errors of three are done, and one was timed once.
         if done == 2 * 3 + 1 + 1:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        MeshStudy(plan_of(tissue((13, 13))), device, study_module.QUICK.longest_run, made, stop).run()
+        MeshStudy(plan_of(tissue((13, 13))), device, 0.25, made, stop).run()
     made.finish()
     assert [(one.name, one.seconds.runs) for one in made.points] == [("7 x 7", 1)]
     assert made.points[0].error is not None
@@ -462,20 +321,8 @@ def test_an_interruption_leaves_what_is_done(device: Device) -> None:
         if calls > 90:
             raise KeyboardInterrupt
 
-    with closing(SteppingStudy(plan_of(scene(probes=[SOFT_PRESS])), device, 0.01, study_of(scene()), stop)) as measured:
-        with pytest.raises(KeyboardInterrupt):
-            measured.run()
-        assert measured.study.reference is not None
-        assert measured.study.stepping
-
-
-@pytest.mark.slow
-def test_without_a_term_a_given_step_may_be_unstable(device: Device, tmp_path: Path) -> None:
-    """A map of soft places, left out, makes the sheet stiffer than the step allows; it is timed all the same."""
-    Image.new("L", (3, 3), 0).save(tmp_path / "map.png")
-    soft = {"structural": 20, "map": {"image": str(tmp_path / "map.png"), "range": [0.01, 1]}}
-    plan = plan_of(scene(damping=0, springs=soft, time={"step": 0.04 / 4}))
     study = study_of(scene())
-    measure_terms(plan, device, 0.0001, study, nothing)
-    assert [term.without for term in study.terms] == [name for name, _ in scene_variants(plan.scene)]
-    assert all(1e-8 < term.seconds.median < 1e-2 and term.seconds.runs == 9 for term in study.terms)
+    with pytest.raises(KeyboardInterrupt):
+        SteppingStudy(plan_of(scene(probes=[SOFT_PRESS])), device, 0.01, study, stop).run()
+    assert study.reference is not None
+    assert study.stepping

@@ -10,13 +10,12 @@ from PIL import Image
 
 from scenes.textures.make_mucosa import FOLDER, PICTURES, paint
 from taichi_msm.load.scene_file import plan_file
-from taichi_msm.sweeps.spec import load_sweep, run_values
+from taichi_msm.sweeps.spec import load_sweep
 
 
 def test_no_run_of_the_data_set_is_refused(root: Path) -> None:
     sweep = load_sweep(root / "scenes/sweeps/tracking.yaml")
-    runs = run_values(sweep.settings.vary, sweep.settings.samples, sweep.settings.seed)
-    plans = [plan_file(sweep.scene, sweep.overrides(values)) for values in runs]
+    plans = [plan_file(sweep.scene, sweep.overrides(values)) for values in sweep.values()]
     assert len(plans) == 64
     assert {plan.scene.time.frames for plan in plans} == {30}
     assert {Path(str(plan.scene.image)).name for plan in plans} | {"mucosa.png"} == {

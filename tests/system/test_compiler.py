@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import runpy
 from collections.abc import Iterator
 from dataclasses import replace
 from importlib.util import find_spec
@@ -107,13 +106,6 @@ def test_a_compiler_that_cannot_be_imported(tmp_path: Path, root: Path, message:
     message(done.stderr, "libfoo.so is missing", hide=f"{active_compiler().title}|(?<=; ).*")
 
 
-def test_a_folder_with_its_name_is_no_compiler(tmp_path: Path) -> None:
-    for name in COMPILERS:
-        (tmp_path / name).mkdir()
-    done = python(tmp_path, PROGRAM, "--version")
-    assert done.stdout.endswith(f"\n{active_compiler().title} {active_compiler().version}\n")
-
-
 def test_the_version_names_the_compiler(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--version"]) == 0
     version = ".".join(str(part) for part in runtime.ti.__version__)
@@ -154,51 +146,6 @@ def test_the_folder_of_compiled_kernels(named: bool, tmp_path: Path, monkeypatch
     done = python(tmp_path, FOLDERS, HOME=str(tmp_path), **({variable: str(tmp_path / "kernels")} if named else {}))
     ours, its = done.stdout.split("\n")[-2].split("|")
     assert ours == its == str(tmp_path / "kernels" if named else tmp_path / active_compiler().cache)
-
-
-def test_replacements_are_in_place_for_a_while(device: runtime.Device) -> None:
-    patches = active_compiler().patches
-
-    def parts() -> list[object]:
-        return [getattr(owner, name) for owner, name, _ in patches]
-
-    def interrupted() -> None:
-        with runtime.compilation_options():
-            assert not any(now is then for now, then in zip(parts(), before, strict=True))
-            raise KeyboardInterrupt
-
-    before = parts()
-    with pytest.raises(KeyboardInterrupt):
-        interrupted()
-    assert parts() == before
-
-
-# Annotations of kernels must be values.
-CLASSES = """
-from taichi_msm.system.compiler import active_compiler
-ti = active_compiler().load()
-
-@ti.data_oriented
-class Doubled:
-    @ti.func
-    def twice(self, x):
-        return 2 * x
-
-    @ti.kernel
-    def double(self, x: ti.i32) -> ti.i32:
-        return self.twice(x)
-
-@ti.kernel
-def triple(x: ti.i32) -> ti.i32:
-    return 3 * x
-"""
-
-
-def test_kernels_in_classes_work_as_without_this_package(device: runtime.Device, tmp_path: Path) -> None:
-    """The line around a decorator decides whether a function is in a class."""
-    (tmp_path / "classes.py").write_text(CLASSES)
-    found = runpy.run_path(str(tmp_path / "classes.py"))
-    assert (found["Doubled"]().double(4), found["triple"](4)) == (8, 12)
 
 
 def test_nothing_is_replaced_in_a_version_that_was_not_tested() -> None:

@@ -45,17 +45,6 @@ print(json.dumps([[t == os.getpid(), ticks[t], sorted(os.sched_getaffinity(t))] 
 """
 
 
-@pytest.mark.parametrize(("cores", "pinned"), [({4, 7}, {11: {4}, 12: {7}}), ({4, 5, 7}, {})])
-def test_threads_that_take_all_cores_have_one_each(
-    cores: set[int], pinned: dict[int, set[int]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    found: dict[int, set[int]] = {}
-    monkeypatch.setattr(os, "sched_getaffinity", lambda process: cores, raising=False)
-    monkeypatch.setattr(os, "sched_setaffinity", found.__setitem__, raising=False)
-    runtime._pin([11, 12])
-    assert found == pinned
-
-
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="the system does not tell the cores of threads")
 def test_the_threads_that_are_pinned_are_those_that_work(tmp_path: Path) -> None:
     cores = sorted(os.sched_getaffinity(0))
@@ -119,15 +108,6 @@ def test_waiting_for_a_core_is_noticed(root: Path) -> None:
         process.stdin.write("\n")
         process.stdin.flush()
     assert max(float(process.communicate(timeout=60)[0]) for process in both) > 0.1
-
-
-def test_where_the_system_does_not_tell_of_waiting(tmp_path: Path) -> None:
-    assert process_module.core_wait_s(tmp_path / "missing") is None
-    (tmp_path / "1").mkdir()
-    (tmp_path / "1" / "schedstat").write_text("5 2000000000 7\n")
-    assert process_module.core_wait_s(tmp_path) == 2.0
-    (tmp_path / "2").mkdir()
-    assert process_module.core_wait_s(tmp_path) is None
 
 
 # One simulation in another thread and another process.
@@ -237,20 +217,3 @@ print(len(sums))
 def test_taichi_starts_again_after_a_stop(tmp_path: Path) -> None:
     done = python(tmp_path, AGAIN)
     assert (done.returncode, done.stdout, done.stderr) == (0, "1\n", "")
-
-
-@pytest.mark.usefixtures("device")
-def test_pictures_are_compiled_quickly_and_steps_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    config = runtime.ti.lang.impl.current_cfg()
-    made = scene(render={"size": [8, 8]})
-    drawing = Rasterizer(made, speckle(8, 8))
-    seen: list[bool] = []
-
-    def draw(*arguments: Any) -> None:
-        seen.append(config.advanced_optimization)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(drawing._backend, "_draw", draw)
-    with pytest.raises(KeyboardInterrupt):
-        drawing.draw(rest_positions(made.sheet))
-    assert [*seen, config.advanced_optimization] == [False, True]

@@ -20,21 +20,17 @@ from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.surface import place_instruments
 from taichi_msm.model.tools import Clamp, overlap, path_warnings
 from taichi_msm.scene.scene import Scene
-from taichi_msm.solver.dynamics import choose_layout
 from taichi_msm.solver.planning import try_plan
 from taichi_msm.solver.rest import QuasiStatics
-from taichi_msm.solver.state import State
 from taichi_msm.system.runtime import Device
 from tests import reference
 from tests.golden import Messages
-from tests.motion import assert_steered_like, dynamics_of, structure_of
+from tests.motion import assert_steered_like
 from tests.runs.test_forces import expected_forces
 from tests.scenes import plan_of, speckle
-from tests.solver.test_dynamics import as_on_a_gpu, assert_like_twin, short_launches, with_lanes
+from tests.solver.test_dynamics import assert_like_twin
 from tests.solver.test_rest import at_rest, nearly_flat
-from tests.terms.test_contact import moved, states, touching
-
-__all__ = ["short_launches"]
+from tests.terms.test_contact import moved, touching
 
 RIGHT = {"clamp": "right", "path": [[0, 0, 0, 0], [0.2, 0.01, 0.004, 0.02], [0.4, 0.02, 0, -0.01]]}
 TOP = {"clamp": "top", "path": [[0, 0, 0, 0], [0.1, 0, 0.006, 0], [0.4, -0.004, 0.006, 0.01]]}
@@ -52,17 +48,13 @@ CASES: dict[str, Scene] = {
     "with a rod": touching([HOOK, RIGHT], sheet=HELD),
     "nothing fixed": touching([RIGHT], sheet={**LEFT, "fixed": "none"}),
     "tension and bending": touching([TOP, RIGHT], sheet=HELD, tissue=TENSE),
+    "backward damping": touching([TOP], sheet=LEFT, time={"precision": "f32", "damping_difference": "backward"}),
 }
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_like_twin(case: str, device: Device) -> None:
     assert_like_twin(CASES[case], device)
-
-
-def test_like_twin_in_f32_and_with_backward_damping(device: Device) -> None:
-    made = touching([TOP, RIGHT], sheet=LEFT, time={"precision": "f32", "damping_difference": "backward"})
-    assert_like_twin(made, device)
 
 
 @pytest.mark.parametrize("case", ["a corner of two", "tension and bending", "with a rod"])
@@ -95,40 +87,6 @@ def test_what_a_clamp_holds(device: Device) -> None:
             assert not u[:, 0].any()
             assert not u[-1].any()
             simulation.advance()
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("short_launches")
-@pytest.mark.parametrize("case", ["with a rod", "a corner of two"])
-def test_lanes_workers_and_passes_do_not_change_the_bits(case: str, device: Device) -> None:
-    made = CASES[case]
-    made = made.model_copy(update={"time": made.time.model_copy(update={"precision": "f32", "duration": 0.12})})
-    layout = structure_of(made, device)
-    plain = states(made, device, layout)
-    assert states(made, device, replace(with_lanes(layout, 4), workers=2, depth=3)) == plain
-    assert states(made, device, as_on_a_gpu(layout)) == plain
-
-
-@pytest.mark.slow
-def test_bending_at_a_clamp_has_the_same_bits_on_two_workers_and_a_gpu(device: Device) -> None:
-    made = CASES["tension and bending"]
-    made = made.model_copy(update={"time": made.time.model_copy(update={"duration": 0.08})})
-    layout = structure_of(made, device)
-    plain = states(made, device, layout)
-    assert states(made, device, replace(with_lanes(layout, 1), workers=2)) == plain
-    assert states(made, device, as_on_a_gpu(layout)) == plain
-
-
-def test_steps_go_on_from_a_state(device: Device) -> None:
-    made = CASES["with a rod"]
-    plan, dynamics = plan_of(made), dynamics_of(made, device)
-    dynamics.advance(plan.grid.steps // 2 + 1)
-    saved = dynamics.state()
-    dynamics.restart(plan, State(*saved))
-    dynamics.advance(plan.grid.steps - saved.steps)
-    whole = dynamics_of(made, device)
-    whole.advance(plan.grid.steps)
-    assert [part.tobytes() for part in dynamics.state()[1:]] == [part.tobytes() for part in whole.state()[1:]]
 
 
 # At rest.
@@ -208,29 +166,6 @@ def test_a_strip_resists_by_its_modulus_and_section(device: Device) -> None:
         assert 1 < force / (stiffness * 1e-4) < 1.05
         compliance.append(1e-4 * length / force)
     assert compliance[1] - compliance[0] == pytest.approx((0.10 - 0.06) / stiffness, rel=1e-3)
-
-
-def test_lanes_do_not_change_the_bits_at_rest(device: Device) -> None:
-    plan = plan_of(at_rest([PULL], sheet=LEFT))
-    layout, shapes = choose_layout(plan, device), []
-    for each in (layout, with_lanes(layout, 1)):
-        rest = QuasiStatics(plan, device, each)
-        rest.advance(1)
-        shapes.append(rest.displacement().tobytes() + rest.tool_forces().tobytes())
-    assert shapes[0] == shapes[1]
-
-
-@pytest.mark.parametrize("motion", ["dynamic", "quasistatic"])
-def test_a_run_goes_on_with_the_same_bits(motion: str, device: Device) -> None:
-    made = touching([RIGHT], sheet=LEFT, time={"motion": motion, "precision": "auto", "duration": 0.24})
-    with Simulation(made, threads=device.threads) as simulation:
-        simulation.advance(2)
-        saved = simulation.save()
-        simulation.advance(4)
-        expected = simulation.positions().tobytes(), simulation.forces()
-        simulation.restore(saved)
-        simulation.advance(4)
-        assert (simulation.positions().tobytes(), simulation.forces()) == expected
 
 
 # What a clamp is to the rest of the program.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,18 +12,15 @@ from taichi_msm.errors import SceneError
 from taichi_msm.load.check import check_scene
 from taichi_msm.model.tools import build_tools, min_steps_per_frame, path_warnings
 from taichi_msm.scene.scene import Scene
-from taichi_msm.solver.arrays import SheetLayout
 from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.solver.planning import try_plan
 from taichi_msm.solver.state import RunProgress, State
 from taichi_msm.system.runtime import Device
 from tests import reference
 from tests.golden import Messages
-from tests.motion import dynamics_of, notes_of, structure_of
+from tests.motion import notes_of
 from tests.scenes import plan_of, scene
-from tests.solver.test_dynamics import as_on_a_gpu, assert_like_twin, short_launches, with_lanes
-
-__all__ = ["short_launches"]
+from tests.solver.test_dynamics import assert_like_twin
 
 ROD = {"radius": 0.05, "shaft": [0.5, -0.6, 0.9], "length": 0.3}
 
@@ -61,41 +57,6 @@ def test_the_case_is_what_its_name_says(case: str) -> None:
         held |= set(contact.holder.ravel()) - {-1}
     assert pushed == set(probes)
     assert held == {index for index in probes if "grip" in CASES[case][index]}
-
-
-def states(made: Scene, device: Device, layout: SheetLayout) -> bytes:
-    """All that the next steps depend on, at the end, and the forces that the tools feel in each frame."""
-    dynamics, grid = dynamics_of(made, device, layout), plan_of(made).grid
-    forces = []
-    for _ in range(grid.frames):
-        dynamics.advance(grid.steps_per_frame)
-        forces.append(dynamics.tool_forces())
-    assert len({force.tobytes() for force in forces}) == grid.frames
-    state = dynamics.state()
-    dynamics.close()
-    return b"".join(array.tobytes() for array in (*state[1:], *forces))
-
-
-@pytest.mark.usefixtures("short_launches")
-def test_lanes_workers_and_passes_do_not_change_the_bits(device: Device) -> None:
-    made = touching([HELD, RUBBED], time={"precision": "f32", "duration": 0.24})
-    layout = structure_of(made, device)
-    plain = states(made, device, layout)
-    assert states(made, device, replace(with_lanes(layout, 4), workers=2, depth=3)) == plain
-    assert states(made, device, as_on_a_gpu(layout)) == plain
-
-
-def test_steps_go_on_from_a_state(device: Device) -> None:
-    made = touching(CASES["together"])
-    plan, dynamics = plan_of(made), dynamics_of(made, device)
-    dynamics.advance(plan.grid.steps * 3 // 4 + 1)
-    saved = dynamics.state()
-    assert len(saved.memory) == 3 * 3 + 4
-    dynamics.restart(plan, State(*saved))
-    dynamics.advance(plan.grid.steps - saved.steps)
-    whole = dynamics_of(made, device)
-    whole.advance(plan.grid.steps)
-    assert [part.tobytes() for part in dynamics.state()[1:]] == [part.tobytes() for part in whole.state()[1:]]
 
 
 DOWN_AND_UP = ([0, 0.5, 0.5, 0.0], [0.1, 0.5, 0.5, -0.02], [0.4, 0.6, 0.5, 0.02])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,27 +13,18 @@ from PIL import Image
 from taichi_msm.accuracy.mesh import coarser_plan
 from taichi_msm.errors import SceneError
 from taichi_msm.load.scene_file import load_scene
-from taichi_msm.model.loads import average_loads
-from taichi_msm.model.sheet import rest_positions
 from taichi_msm.runs.run import run
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Foundation
-from taichi_msm.solver.planning import plan_variant
 from taichi_msm.solver.state import RunProgress, largest_displacement
-from taichi_msm.study.measurements import acceleration_function, scene_variants
 from taichi_msm.system.runtime import Device
-from taichi_msm.terms.foundation import FoundationTerm
-from tests import reference
 from tests.conftest import Program
 from tests.golden import Messages
-from tests.motion import frames, notes_of, structure_of
+from tests.motion import frames, notes_of
 from tests.outputs import results
 from tests.scenes import plan_of, speckle
-from tests.solver.test_dynamics import as_on_a_gpu, short_launches, simulate, with_lanes
 from tests.solver.test_tissue_physics import EVERYWHERE, tissue, weight
-
-__all__ = ["short_launches"]
 
 TOOL = {"at": [0.4, 0.6], "total": [0.3, 0.2, -2], "radius": 0.01, "falloff": 100, "load": [[0, 0], [0.05, 100]]}
 
@@ -50,37 +40,6 @@ def mapped(image: str, fixed: Any = "border", **more: Any) -> Scene:
     """Tissue on a foundation that is up to ten times as stiff in one place as in another."""
     terms: dict[str, Any] = {"foundation": 2e6, "foundation_map": {"image": image, "range": [0.5, 5]}}
     return tissue((13, 15), fixed=fixed, **terms | {"damping": 40, "probes": [TOOL], "time": {"duration": 0.08}} | more)
-
-
-@pytest.mark.parametrize(
-    ("fixed", "active", "precision"),
-    [("none", "loaded", "f64"), (["left"], "always", "f32"), ("border", "always", "f64")],
-)
-def test_it_is_like_the_twin(fixed: Any, active: str, precision: str, image: str, device: Device) -> None:
-    time = {"duration": 0.08, "precision": precision}
-    made = mapped(image, fixed, foundation_active=active, time=time)
-    twin = reference.simulate(made) - rest_positions(made.sheet)
-    rounding = {"f64": 1e-12, "f32": 2e-4}[precision] * np.abs(twin).max()
-    np.testing.assert_allclose(simulate(made, device), twin, rtol=0, atol=rounding)
-
-
-@pytest.mark.usefixtures("short_launches")
-@pytest.mark.parametrize("precision", ["f32", pytest.param("f64", marks=pytest.mark.fuzz)])
-def test_both_forms_bands_and_lanes_give_the_same_bits(precision: str, image: str, device: Device) -> None:
-    made = mapped(image, "none", time={"duration": 0.04, "precision": precision})
-    whole = structure_of(made, device)
-    plain = simulate(made, device, whole).tobytes()
-    for layout in (as_on_a_gpu(whole), replace(with_lanes(whole, 2), workers=2, depth=3)):
-        assert simulate(made, device, layout).tobytes() == plain, layout
-
-
-def test_it_is_compiled_in_only_with_a_map(image: str, device: Device) -> None:
-    def term(made: Scene) -> FoundationTerm | None:
-        return structure_of(made, device).config.get(FoundationTerm)
-
-    assert term(mapped(image)) == FoundationTerm(by_area=False, mapped=True)
-    assert term(tissue((13, 15), foundation=2e6, fixed="none", probes=[TOOL])) == FoundationTerm(True, False)
-    assert term(mapped(image, probes=[])) is None, "loaded, but nothing ever loads"
 
 
 def test_where_nothing_else_holds_every_point_sinks_by_the_pressure_over_its_stiffness(
@@ -131,21 +90,6 @@ def test_the_energy_that_it_gives_is_explained(tmp_path: Path, device: Device) -
         assert held / 10 < simulation.progress.peak < 1.1 * held
 
 
-def test_the_peer_and_the_terms_of_a_study_know_it(image: str, device: Device) -> None:
-    made = mapped(image, "none", damping=0, map={"image": image, "range": [1, 2]})
-    plan = plan_of(made)
-    u = 1e-3 * np.random.default_rng(0).normal(size=(*made.sheet.points, 3))
-    loads = average_loads(plan, plan.grid.steps, 1)
-    expected = reference.force(made, u, loads, 0) / reference.sheet(made).mass[..., None]
-    found = acceleration_function(plan)(u, 0 * u, loads)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
-    without = dict(scene_variants(made))
-    assert list(without) == ["", "tissue.foundation", "tissue.map", "tissue.foundation_map", "probes.0"]
-    unmapped, unheld = (plan_variant(plan, without[f"tissue.{name}"]) for name in ("foundation_map", "foundation"))
-    assert FoundationTerm.from_plan(unmapped) == FoundationTerm(by_area=True, mapped=False)
-    assert FoundationTerm.from_plan(unheld) is None
-
-
 SCENE = """\
 sheet: {points: [9, 11], size: [0.1, 0.1]}
 tissue:
@@ -159,6 +103,12 @@ probes:
 time: {duration: 0.4, frames_per_second: 10}
 output: [trajectory]
 """
+
+
+REFUSED = [
+    "foundation={young: 1e4}", "foundation.depth=0", "foundation.depht=1", "foundation=-1", "foundation=soft",
+    "foundation=0", "foundation_map={image: no.png, range: [1, 2]}", "foundation_map.image=deep.png",
+]  # fmt: skip
 
 
 @pytest.fixture
@@ -217,19 +167,7 @@ def test_a_run_tells_how_deep_it_went(device: Device) -> None:
 
 
 @pytest.mark.usefixtures("here")
-@pytest.mark.parametrize(
-    "override",
-    [
-        "foundation={young: 1e4}",
-        "foundation.depth=0",
-        "foundation.depht=1",
-        "foundation=-1",
-        "foundation=soft",
-        "foundation=0",
-        "foundation_map={image: no.png, range: [1, 2]}",
-        "foundation_map.image=deep.png",
-    ],
-)
+@pytest.mark.parametrize("override", REFUSED)
 def test_what_cannot_be_is_refused_with_the_remedy(override: str, message: Messages) -> None:
     more = ["tissue.foundation_map={image: deep.png, range: [1, 2]}"] if override == "foundation=0" else []
     with message.raises(SceneError, "tissue.foundation"):

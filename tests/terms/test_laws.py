@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import replace
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -23,19 +22,15 @@ from taichi_msm.model.loads import evaluate_frame_loads
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.planning import make_plan
-from taichi_msm.solver.state import State
 from taichi_msm.system.runtime import Device
 from taichi_msm.terms.elasticity import energy_density
-from taichi_msm.terms.locking import LockingLaw, build_locking
+from taichi_msm.terms.law import LockingLaw, build_locking
 from tests import reference
 from tests.conftest import Program
 from tests.golden import Messages
-from tests.motion import dynamics_of, structure_of
 from tests.reference.dynamics import Relaxation, internal_force, lock
 from tests.scenes import plan_of
-from tests.solver.test_dynamics import as_on_a_gpu, assert_like_twin, short_launches, with_lanes
-
-__all__ = ["short_launches"]
+from tests.solver.test_dynamics import assert_like_twin
 
 STIFFENING = {"stiffening": {"lock": 0.02, "factor": 6}}
 LOCKING_FOUNDATION = {"foundation": {"young": 2e4, "depth": 0.015, "lock": 0.002, "factor": 5}}
@@ -123,36 +118,6 @@ def test_energy(device: Device) -> None:
     share = np.outer(*(np.r_[0.5, np.ones(n - 2), 0.5] / (n - 1) for n in scene.sheet.points))
     total = (energy_density(plan_of(plain), u) * share).sum() * height * width
     assert total == pytest.approx(reference.energy(plain, u), rel=1e-11)
-
-
-@pytest.mark.usefixtures("short_launches")
-def test_lanes_workers_and_passes_do_not_change_the_bits(device: Device) -> None:
-    scene = made("everything", sheet={"points": [11, 21]}, time={"precision": "f32"})
-
-    def state(layout: Any) -> bytes:
-        dynamics = dynamics_of(scene, device, layout)
-        dynamics.advance(plan_of(scene).grid.steps)
-        state = dynamics.state()
-        dynamics.close()
-        assert len(state.memory) == 6
-        return b"".join(array.tobytes() for array in state[1:])
-
-    layout = structure_of(scene, device)
-    plain = state(layout)
-    assert state(replace(with_lanes(layout, 4), workers=2)) == plain
-    assert state(as_on_a_gpu(layout)) == plain
-
-
-def test_steps_go_on_from_a_state(device: Device) -> None:
-    scene = made("everything")
-    plan, dynamics = plan_of(scene), dynamics_of(scene, device)
-    dynamics.advance(plan.grid.steps // 2 + 1)
-    saved = dynamics.state()
-    dynamics.restart(plan, State(*saved))
-    dynamics.advance(plan.grid.steps - saved.steps)
-    whole = dynamics_of(scene, device)
-    whole.advance(plan.grid.steps)
-    assert [part.tobytes() for part in dynamics.state()[1:]] == [part.tobytes() for part in whole.state()[1:]]
 
 
 def at_rest(case: str, **sections: Any) -> Scene:

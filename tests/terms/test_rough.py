@@ -17,15 +17,13 @@ from taichi_msm.runs.run import resume, run
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.tools import Probe
-from taichi_msm.solver.dynamics import choose_layout
 from taichi_msm.solver.rest import FORCE_TOLERANCE, QuasiStatics
 from taichi_msm.solver.state import RunProgress
 from taichi_msm.system.runtime import Device
-from taichi_msm.terms.locking import make_stiffening
+from taichi_msm.terms.law import make_stiffening
 from tests.golden import Messages
 from tests.reference.rough import rough_frames
 from tests.scenes import plan_of
-from tests.solver.test_dynamics import with_lanes
 from tests.solver.test_rest import TISSUE, at_rest, nearly_flat
 from tests.terms.test_contact import moved, touching
 
@@ -166,18 +164,6 @@ def test_an_interruption_does_not_change_the_bits(device: Device, tmp_path: Path
         assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "parts" / name).read_bytes()
     assert 0 < whole["residual"] <= FORCE_TOLERANCE
     assert not [note for note in whole["notes"] if "path-dependent" in note or "slides off" in note]
-
-
-@pytest.mark.slow
-def test_lanes_do_not_change_the_bits(device: Device) -> None:
-    plan = plan_of(lifted())
-    layout = choose_layout(plan, device)
-    states = []
-    for lanes in (layout.config.lanes, 1):
-        rest = QuasiStatics(plan, device, with_lanes(layout, lanes))
-        rest.advance(3)
-        states.append([array.tobytes() for array in rest.state()[1:]])
-    assert states[0] == states[1]
 
 
 def test_a_grip_takes_what_sticks_and_leaves_it(device: Device) -> None:

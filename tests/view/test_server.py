@@ -24,7 +24,7 @@ from taichi_msm.cli.main import main
 from taichi_msm.errors import Pause
 from taichi_msm.system.runtime import Device
 from taichi_msm.view import server as server_module
-from taichi_msm.view.messages import MAX_BYTES, parse_message
+from taichi_msm.view.events import MAX_BYTES, parse_message
 from taichi_msm.view.recording import Captures
 from taichi_msm.view.server import MAX_PAGES, MAX_UNREAD_PICTURES, PAGE, Server, listen
 from taichi_msm.view.session import Session

@@ -148,18 +148,13 @@ def test_it_is_no_deeper_than_the_sheet_bears() -> None:
     assert hand.depth == pytest.approx(0.3 / 4), "a quarter of the shorter side"
 
 
-def test_what_stays_as_it_is_needs_no_keys() -> None:
-    hand = tool(plan())
-    follow(hand, 0, 50)
-    assert len(hand.recorded_probe(50).path or ()) == 2
-
-
 def test_the_friction_is_that_of_the_scene_if_it_gives_any() -> None:
     made = plan()
     path = {"path": [[0, 0.5, 0.5, 0.01]], **ROD}
     assert tool(made).recorded_probe(0).friction == DEFAULT_FRICTION
     assert tool(made, path).recorded_probe(0).friction == DEFAULT_FRICTION
     assert tool(made, {**path, "friction": 0.1}).recorded_probe(0).friction == 0.1
+    assert tool(plan(motion="quasistatic")).recorded_probe(0).friction == 0, "at rest nothing rubs"
 
 
 def test_what_was_done_is_forgotten_at_rest() -> None:
@@ -171,7 +166,3 @@ def test_what_was_done_is_forgotten_at_rest() -> None:
     assert not hand.engaged
     assert not hand.gripping
     assert hand.recorded_probe(0) == beginning
-
-
-def test_at_rest_nothing_rubs() -> None:
-    assert tool(plan(motion="quasistatic")).recorded_probe(0).friction == 0

@@ -55,7 +55,7 @@ def test_every_frame_has_the_loads_of_the_record(seed: int) -> None:
                 hand.strength = float(rng.integers(0, 101))
             else:
                 hand.move(place)
-        seen.append(hand.advance(frame) or seen[-1])
+        seen.append(hand.advance(frame))
     record = hand.recorded_probe(frames)
     for frame, probe in enumerate(seen):
         now, then = loads(probe, frame), loads(record, frame)
@@ -112,45 +112,3 @@ def test_what_it_is_asked_for_last_is_its_goal() -> None:
     assert hand.target == (0.7, 0.2)
     hand.move((0.8, 0.2))
     assert hand.target == (0.8, 0.2)
-
-
-def test_the_control_point_stays_on_the_sheet() -> None:
-    hand = tool()
-    hand.press((-0.5, 1.5), 1)
-    hand.advance(0)
-    assert hand.position == (0.0, 1.0)
-
-
-def test_it_moves_along_a_line_within_a_frame() -> None:
-    hand = tool()
-    hand.press((0.2, 0.2), 1)
-    hand.advance(0)
-    hand.move((0.4, 0.2))
-    probe = hand.advance(1)
-    assert probe is not None
-    points = loads(probe, 1).point[:, 0, 0]
-    width = 0.4
-    assert points[0] == pytest.approx((0.2 - 0.5) * width)
-    assert (np.diff(points) > 0).all()
-    assert points[-1] < (0.4 - 0.5) * width
-
-
-def test_what_was_asked_for_is_forgotten_at_rest() -> None:
-    hand = tool()
-    hand.press((0.2, 0.2), 1)
-    hand.advance(0)
-    hand.reset()
-    assert not hand.engaged
-    assert percents(hand, 0, 2) == [0, 0]
-    assert hand.recorded_probe(2).load == ((0.0, 0.0), (2 / RATE, 0.0))
-
-
-def test_what_stays_as_it_is_is_not_told_again() -> None:
-    hand = tool()
-    assert hand.advance(0) is not None, "the one who is told may have an older probe"
-    assert hand.advance(1) is None
-    hand.press((0.2, 0.2), 1)
-    told = [hand.advance(frame) is not None for frame in range(2, 20)]
-    assert told == [True] * 10 + [False] * 8
-    hand.reset()
-    assert hand.advance(0) is not None

@@ -1,0 +1,282 @@
+"""Cells of a text table or of a workbook, by row and column, before they have a meaning, and their numbers.
+
+A text may be UTF-8, UTF-16 or Windows-1252; its separator is the one that splits its header.
+"""
+
+from __future__ import annotations
+
+import csv
+import datetime
+import io
+import re
+import warnings
+import zipfile
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from taichi_msm.errors import NotInstalledError, SceneError
+from taichi_msm.images import irregular_kind
+from taichi_msm.scene.section import MAX_MAGNITUDE
+
+Row = list[str]
+
+# Limits: size of the file, unpacked size of a workbook, and cells of a sheet.
+MAX_BYTES, MAX_UNPACKED_BYTES, MAX_CELLS = 2**26, 2**29, 10**7
+
+WORKBOOK_SUFFIX = ".xlsx"
+
+# Separators by name, in the order in which they are tried on a header: names may contain commas and spaces.
+SEPARATORS = {"tabs": "\t", "semicolons": ";", "commas": ",", "bars": "|", "wide spaces": "", "spaces": ""}
+
+# Where spaces separate the names of a header; a unit in brackets belongs to the name before it.
+SPACES = {"wide spaces": re.compile(r"\s{2,}"), "spaces": re.compile(r"\s+(?![\[(])")}
+
+# A letter that numbers do not have.
+LETTER = re.compile(r"[^\W\d_eE]")
+
+NUMBER_PATTERN = re.compile(r"[+-]?(?:\d+(?:\.(\d*))?|\.(\d+))(?:[eE]([+-]?\d{1,3}))?", re.ASCII)
+
+# Thousands in groups, with the mark of the groups and the decimal mark.
+GROUPS = {
+    mark: re.compile(rf"[+-]?[1-9]\d{{0,2}}(?:\{other}\d{{3}})+\{mark}\d+", re.ASCII) for mark, other in (",.", ".,")
+}
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Cells of a table."""
+
+    name: str  # of the file
+    sheet: str  # of a workbook; empty for a text
+    rows: list[Row]  # a row ends at its last filled cell
+    separator: str = ""  # name of that of a text
+    merged: frozenset[tuple[int, int]] = frozenset()  # rows and columns of cells merged with the one to their right
+
+    @property
+    def title(self) -> str:
+        """The file, and the sheet of a workbook."""
+        return f"{self.name}: {self.sheet}" if self.sheet else self.name
+
+    def place(self, row: int, column: int = 0) -> str:
+        """Return the place of a row or a cell, counted from 0, for a message."""
+        if not self.sheet:
+            return f"{self.name}:{row + 1}"
+        from openpyxl.utils import get_column_letter
+
+        return f"{self.name}: {self.sheet}!{get_column_letter(column + 1)}{row + 1}"
+
+    def has_content(self, row: int) -> bool:
+        """Return whether a row is not empty, a ruling or a comment of a text."""
+        cells = self.rows[row]
+        is_comment = not self.sheet and cells[:1] and cells[0].startswith(("#", "%"))
+        return not is_comment and any(character.isalnum() for cell in cells for character in cell)
+
+    def require_names(self, row: int, header: int) -> None:
+        """Check that a row of a text has not more cells than its header has names; SceneError: it has."""
+        cells, names = self.rows[row], self.rows[header]
+        if not self.sheet and len(cells) > len(names):
+            is_decimal = self.separator == "commas"
+            remedy = "with decimal commas, separate cells by semicolons" if is_decimal else "name each column"
+            fault = f"{len(cells)} cells separated by {self.separator} as in the header, and {len(names)} columns"
+            raise SceneError([f"{self.place(row)}: {fault}; {remedy}"])
+
+    def numbers(self, header: int, cells: Iterable[tuple[int, int]], remedy: str) -> list[tuple[float, int]]:
+        """Parse cells as `parse_number` does.
+
+        Args:
+            header: row of the names.
+            cells: row and column of each cell.
+            remedy: for a cell that is not a number.
+
+        Raises:
+            SceneError: when a cell is not a number, or has another decimal mark than an earlier one.
+        """
+        numbers, known_mark = [], ""
+        for row, column in cells:
+            cell = self.rows[row][column]
+            where = f"{self.place(row, column)}: {self.rows[header][column]}: {cell[:40]!r}"
+            if (number := parse_number(cell)) is None:
+                if cell.startswith("="):
+                    remedy = "calculate and save the workbook"
+                    where += ", a formula without a saved value"
+                raise SceneError([f"{where}; {remedy}"])
+            mark = _decimal_mark(cell)
+            if mark and known_mark not in ("", mark):
+                raise SceneError([f"{where}; both . and , are decimal marks in this table; take one"])
+            known_mark = mark or known_mark
+            numbers.append(number)
+        return numbers
+
+
+def read_text(name: str, is_header: Callable[[Row], bool], expected: str) -> Grid:
+    """Read a text table.
+
+    Args:
+        name: the file.
+        is_header: whether a row names the columns; it selects the separator.
+        expected: remedy for a file that cannot be read.
+
+    Raises:
+        SceneError: when the file cannot be read, or is not a text.
+    """
+    rows, separator = [], ""
+    lines = re.split(r"\r\n|\r|\n", _decode(name, _read_bytes(name, expected), expected))
+    for n, line in enumerate(lines):
+        headers = {}
+        if LETTER.search(line):
+            headers = {mark: row for mark in SEPARATORS if is_header(row := _split_header(line, mark))}
+        if headers:
+            separator = _separator(headers, lines[n + 1 :])
+        rows.append(headers[separator] if headers else _split(line, separator))
+    return Grid(name, "", rows, separator)
+
+
+def read_workbook(name: str, expected: str) -> dict[str, Grid]:
+    """Read the sheets of a workbook by name, without chart sheets.
+
+    Args:
+        name: the file.
+        expected: remedy for a file that cannot be read.
+
+    Raises:
+        SceneError: when the file cannot be read, or is not a workbook.
+        NotInstalledError: when openpyxl is not installed.
+    """
+    try:
+        import openpyxl
+    except ImportError:
+        raise NotInstalledError(f"{name}: needs openpyxl, which is not installed; pip install openpyxl") from None
+    data = _read_bytes(name, expected)
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            unpacked = sum(entry.file_size for entry in archive.infolist())
+        if unpacked > MAX_UNPACKED_BYTES:
+            raise SceneError([f"{name}: {unpacked / 1e6:.0f} MB unpacked; save the sheet as CSV"])
+        # openpyxl warns of parts that it leaves out, such as styles.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            # The values as saved, and the formulas for cells that were saved without one.
+            values, formulas = (openpyxl.load_workbook(io.BytesIO(data), data_only=saved) for saved in (True, False))
+        return {sheet.title: _sheet(name, sheet, formulas[sheet.title]) for sheet in values.worksheets}
+    except SceneError:
+        raise
+    # openpyxl has no error of its own for a damaged file.
+    except Exception as error:
+        reason = f"not a workbook, or a damaged one ({type(error).__name__})"
+        raise SceneError([f"{name}: {reason}; save it again as .xlsx, or as CSV"]) from None
+
+
+def parse_number(cell: str) -> tuple[float, int] | None:
+    """Parse a number with a decimal point or comma, perhaps with groups of thousands, and U+2212 as a minus.
+
+    Returns:
+        The number, and the power of ten of its last digit; None if the cell is not a number.
+    """
+    text = cell.replace("\N{MINUS SIGN}", "-")
+    if (mark := _decimal_mark(text)) and GROUPS[mark].fullmatch(text):
+        text = text.replace("," if mark == "." else ".", "")
+    match_ = NUMBER_PATTERN.fullmatch(text.replace(",", "."))
+    if match_ is None or abs(value := float(match_[0])) > MAX_MAGNITUDE:
+        return None
+    return value, int(match_[3] or 0) - len(match_[1] or match_[2] or "")
+
+
+def _decimal_mark(cell: str) -> str:
+    """Return the last mark of a cell, or an empty text."""
+    return "," if cell.rfind(",") > cell.rfind(".") else "." if "." in cell else ""
+
+
+def _sheet(name: str, sheet: Any, formulas: Any) -> Grid:
+    """Read the cells of a sheet as texts."""
+    if (cells := sheet.max_row * sheet.max_column) > MAX_CELLS:
+        raise SceneError([f"{name}: {sheet.title}: {cells} cells; delete the empty rows and columns around the table"])
+    rows = [
+        _stripped([_text(value if value is not None else formula) for value, formula in zip(*pair, strict=False)])
+        for pair in zip(sheet.iter_rows(values_only=True), formulas.iter_rows(values_only=True), strict=False)
+    ]
+    merged = frozenset(
+        (row - 1, block.min_col - 1)
+        for block in sheet.merged_cells.ranges
+        for row in range(block.min_row, min(block.max_row, len(rows)) + 1)
+        if block.max_col > block.min_col
+    )
+    return Grid(name, sheet.title, rows, merged=merged)
+
+
+def _text(value: object) -> str:
+    """Write a cell of a workbook as a text, a number with the digits that Excel shows."""
+    if isinstance(value, float):
+        return format(value, ".15g")
+    if isinstance(value, datetime.date | datetime.time | datetime.timedelta):
+        return f"a date or time of day, {value}"
+    return "" if value is None else str(value)
+
+
+def _stripped(cells: Row) -> Row:
+    """Strip spaces, and empty cells at the end."""
+    cells = [" ".join(cell.split()) for cell in cells]
+    while cells and not cells[-1]:
+        cells.pop()
+    return cells
+
+
+def _separator(headers: dict[str, Row], lines: list[str]) -> str:
+    """Return the first separator of a header that separates three numbers of the next line of numbers, or the first."""
+    line = next((line for line in lines if line.strip() and not LETTER.search(line)), "")
+
+    def count(separator: str) -> int:
+        return sum(parse_number(cell) is not None for cell in _split(line, separator)[: len(headers[separator])])
+
+    return next((separator for separator in headers if count(separator) >= 3), next(iter(headers)))
+
+
+def _split_header(line: str, separator: str) -> Row:
+    """Split a line that may be a header."""
+    if spaces := SPACES.get(separator):
+        return _stripped(spaces.split(line.replace('"', "").strip("#% \t")))
+    return _split(line, separator)
+
+
+def _split(line: str, separator: str) -> Row:
+    """Split a line of text; a line before the first header, without a separator, is a cell."""
+    if separator in SPACES:
+        return line.replace('"', "").split()
+    if separator:
+        with suppress(csv.Error):
+            return _stripped(next(csv.reader([line], delimiter=SEPARATORS[separator], skipinitialspace=True), []))
+    return _stripped([line])
+
+
+def _read_bytes(name: str, expected: str) -> bytes:
+    """Read a file of at most `MAX_BYTES`."""
+    try:
+        if not (reason := irregular_kind(Path(name))):
+            if (size := Path(name).stat().st_size) <= MAX_BYTES:
+                return Path(name).read_bytes()
+            reason = f"{size / 1e6:.0f} MB, more than the {MAX_BYTES / 1e6:.0f} MB of a table"
+    except OSError as error:
+        reason = "no such file" if isinstance(error, FileNotFoundError) else str(error.strerror).lower()
+    except ValueError as error:
+        reason = str(error)
+    raise SceneError([f"{name}: {reason}; {expected}"])
+
+
+def _decode(name: str, data: bytes, expected: str) -> str:
+    """Decode a text; without a byte order mark, zeros at even or odd places mean UTF-16."""
+    if data.startswith((b"PK", b"\xd0\xcf\x11\xe0")):
+        raise SceneError([f"{name}: a workbook; {expected}"])
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        encodings = ["utf-16"]
+    elif b"\0" in data:
+        encodings = ["utf-16-le" if data[1::2].count(0) > data[::2].count(0) else "utf-16-be"]
+    else:
+        # Windows programs of western Europe write cp1252; the numbers are ASCII in any encoding.
+        encodings = ["utf-8-sig", "cp1252"]
+    for encoding in encodings:
+        with suppress(UnicodeDecodeError):
+            if "\0" not in (text := data.decode(encoding, "replace" if encoding == "cp1252" else "strict")):
+                return text
+    raise SceneError([f"{name}: not a text; save it as CSV in UTF-8"])

@@ -1,0 +1,87 @@
+"""Camera, light and mesh display of a session, which the user changes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.model.surface import Solid
+from taichi_msm.render.camera import View, frozen_camera, orbit_camera, pinhole, view
+from taichi_msm.render.renderer import Renderer, Shot
+from taichi_msm.runs.media import Picture
+from taichi_msm.scene.camera import Camera
+from taichi_msm.scene.render import AnyCamera, Render
+
+
+class Viewport:
+    """Interactive camera, light and mesh display of a session.
+
+    Args:
+        renderer: has the initial settings in its scene.
+        play: whether to follow a moving camera of the scene; otherwise it stays at its initial pose.
+    """
+
+    def __init__(self, renderer: Renderer, *, play: bool = False) -> None:
+        self._renderer, self._plays, self._time = renderer, play, 0.0
+        self.render: Render = renderer.scene.render
+        self.view: View = renderer.view
+        self.set_camera(self.render.main_camera)
+
+    @property
+    def is_compiled(self) -> bool:
+        """Whether the next picture can be drawn without compiling a kernel."""
+        return self._renderer.is_compiled(self.render, self.view)
+
+    def set_camera(self, camera: AnyCamera) -> None:
+        """Set the main camera; the other cameras of the rig move with it."""
+        if isinstance(camera, Camera) and not self._plays:
+            camera = frozen_camera(camera, 0.0)
+        self.render = self.render.with_main(camera)
+        self.view = view(self._renderer.scene.model_copy(update={"render": self.render, "output": ()}), self._time)
+
+    def set_time(self, time: float) -> bool:
+        """Move the camera to its pose at a time [s]; return whether it moves."""
+        self._time = time
+        camera = self.render.main_camera
+        moving = isinstance(camera, Camera) and camera.moves
+        if moving:
+            self.view = self._renderer.resolve_camera(None, time)
+        return moving
+
+    def recorded_render(self, duration: float) -> Render:
+        """Return the drawing settings for a scene of a duration [s], with the last camera pose held until its end."""
+        camera = self.render.main_camera
+        if isinstance(camera, Camera) and isinstance(camera.poses, tuple) and camera.poses[-1][0] < duration:
+            last = (duration, *camera.poses[-1][1:])
+            return self.render.with_main(camera.model_copy(update={"poses": (*camera.poses, last)}))
+        return self.render
+
+    def turn(self, right: float, down: float) -> None:
+        """Orbit the camera as if the near side of the tissue were dragged [px]; the height is half a turn."""
+        angle = math.pi / self.render.size[1]
+        scene = self._renderer.scene.model_copy(update={"render": self.render})
+        self.set_camera(orbit_camera(pinhole(scene, self._time), -right * angle, down * angle))
+
+    def toggle_light(self) -> None:
+        """Toggle the shading of the scene, or a headlight if the scene has none."""
+        scene_shading = self._renderer.scene.render.shading
+        shading = scene_shading if scene_shading != "none" else "headlight"
+        update = {"shading": "none" if self.render.shading != "none" else shading}
+        self.render = self.render.model_copy(update=update)
+
+    def toggle_mesh(self) -> None:
+        """Show or hide the mesh."""
+        self.render = self.render.model_copy(update={"wireframe": not self.render.wireframe})
+
+    def draw(self, positions: NDArray[Any], instruments: Sequence[Solid] = ()) -> Picture:
+        """Return the picture of the sheet at positions [m], shape (rows, cols, 3), and of instruments."""
+        return self._renderer.draw(Shot(positions, self.view, instruments), self.render)
+
+    def project(self, point: NDArray[np.floating]) -> tuple[float, float] | None:
+        """Project a point [m], shape (3,), to a pixel (x, y); None behind the camera."""
+        x, y = self.view.pixels(point.astype(float)).tolist()
+        return (x, y) if math.isfinite(x) else None
