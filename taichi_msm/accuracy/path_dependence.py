@@ -25,6 +25,7 @@ from taichi_msm.scene.tools import Probe
 from taichi_msm.solver.planning import affords_companions, plan_variant
 from taichi_msm.solver.rest import build_dynamics
 from taichi_msm.system.runtime import Device
+from taichi_msm.terms import build_terms
 
 # Shapes that differ by more than this share of the largest displacement are different equilibria.
 DIFFERENCE_TOLERANCE = 0.01
@@ -95,8 +96,7 @@ class PathDependence:
 
     def finish(self, device: Device, cores: int | None, pause: Pause) -> None:
         """Solve the most displaced frame, one after it and the last frame a second time, see `second_solution`."""
-        # Tissue that relaxes, and mass points that stick to tools, depend on the history of the loads in any case.
-        has_history = self._plan.material.relaxation or any(tool.rough for tool in self._plan.tools)
+        has_history = any(term.has_history(self._plan) for term in build_terms(self._plan))
         if self._largest == 0 or has_history:
             return
         for frame, displacement in dict(filter(None, (self._most_displaced, self._unloaded, self._previous))).items():

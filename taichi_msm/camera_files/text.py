@@ -43,7 +43,11 @@ class CameraFileError(Exception):
 
 
 class CameraFile:
-    """A text file of a camera; CameraFileError: it cannot be read."""
+    """A text file of a camera.
+
+    Raises:
+        CameraFileError: when the file cannot be read.
+    """
 
     def __init__(self, path: str, max_bytes: int) -> None:
         self.path = path
@@ -55,7 +59,11 @@ class CameraFile:
 
     @cached_property
     def data(self) -> Mapping[str, Any]:
-        """Keys and values of YAML, JSON, XML or an ini file; CameraFileError: it has another format."""
+        """Keys and values of YAML, JSON, XML or an ini file.
+
+        Raises:
+            CameraFileError: when the file has another format.
+        """
         try:
             data = _parse(self.text)
         except RepeatedError as error:

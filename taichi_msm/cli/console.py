@@ -85,7 +85,7 @@ class _Pace:
         self._last = now
 
     def remaining_s(self, done: int, total: int, now: float) -> float | None:
-        """Estimate the remaining time of the stage; None: unknown, or finished."""
+        """Estimate the remaining time of the stage; None if it is unknown, or finished."""
         if done > self.done:
             self._last, self.done = now, done
         if done == self._initially_done or done >= total:

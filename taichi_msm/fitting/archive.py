@@ -147,7 +147,7 @@ def _read_archive(name: str) -> tuple[Arrays, list[str]]:
 
 
 def _require_understood(name: str, keys: list[str]) -> None:
-    """Check that no array is ignored whose name suggests data of observations; SceneError: lists such arrays."""
+    """Raise a SceneError that lists the ignored arrays whose names suggest data of observations."""
     ignored = [key for key in keys if key not in MEMBERS and SUGGESTIVE_PARTS.search(key.lower())]
     if ignored:
         fault = "not understood; take NaN where not observed, or visible or occluded (N, T), and sigma for errors"

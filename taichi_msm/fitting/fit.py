@@ -317,7 +317,7 @@ def _larger_part(observations: Sequence[Observation], parts: Sequence[Array], pr
 def _mesh(
     runs: Runs, misfit: Misfit, solution: Solution, uncertainties: Uncertainty
 ) -> tuple[float | None, Array | None]:
-    """Estimate the mesh error, and the shifts of the parameters by it, in units of x; NaN: not known.
+    """Estimate the mesh error, and the shifts of the parameters by it, in units of x; NaN if unknown.
 
     The shifts are extrapolated with the order of convergence of three meshes, at most the expected one. A difference
     that is small by chance is replaced by the expectation from the coarser meshes.

@@ -177,7 +177,7 @@ def _is_header(row: Row) -> bool:
 
 
 def _require_units(where: str, units: Sequence[str]) -> None:
-    """Check the units of the columns; SceneError: another one."""
+    """Raise a SceneError if a column has another unit."""
     for (key, expected), unit in zip(COLUMNS.items(), units, strict=True):
         if unit not in (expected, "", "-", "1"):
             raise SceneError([f"{where}: {key}: unit {unit!r}; give seconds and newtons"])

@@ -193,7 +193,7 @@ class CurveRuns(Runs):
         return self._tangent.reach
 
     def _reach(self, values: dict[str, float]) -> float:
-        """Return the greatest travel of a curve [m]; SceneError: no test has any."""
+        """Return the greatest travel of a curve [m]; raise a SceneError if no test has any."""
         if not (reach := self.job.reach(values)):
             raise SceneError(["contact: no test goes deeper; take a smaller depth"])
         return reach * (1 + CONTACT_MARGIN * self.of_contact.any())

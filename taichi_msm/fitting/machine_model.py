@@ -127,7 +127,7 @@ def is_table(path: object) -> bool:
 
 
 def table_paths(observed: Any) -> list[str]:
-    """Return the paths of tables; an empty list for other observations; SceneError: both are given."""
+    """Return the paths of tables; an empty list for other observations; raise a SceneError for both."""
     paths = [observed] if isinstance(observed, (str, Path)) or not isinstance(observed, Sequence) else list(observed)
     others = [path for path in paths if not is_table(path)]
     if len(others) == len(paths) == 1:

@@ -76,7 +76,7 @@ class Approach:
 
 
 def find_approach(scene: Scene) -> Approach:
-    """Return the line of the scene's tool; SceneError: not one position-controlled tool, or it misses the sheet."""
+    """Return the line of the scene's tool; raise a SceneError unless one tool moves, over the sheet."""
     tools = build_tools(scene.probes, scene.sheet)
     if len(tools) != 1:
         fault = f"{len(tools)} position-controlled tools, and a table of a testing machine is of one"

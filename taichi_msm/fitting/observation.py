@@ -26,7 +26,7 @@ MAX_COSINE, MIN_SIGMAS, MIN_COUNT = -0.9, 5.0, 3
 
 
 class ErrorCorrelation(NamedTuple):
-    """Correlation lengths of the errors of tracks; None: independent."""
+    """Correlation lengths of the errors of tracks; None for independent errors."""
 
     correlation: float | None  # of two tracks [px]
     drift: float | None  # of two times [s]
@@ -67,7 +67,7 @@ class Observation(ABC):
         return np.isfinite(self.values)
 
     def with_sigma(self, sigma: Any) -> Self:
-        """Replace sigma unless it is None; SceneError: not a positive number."""
+        """Replace sigma unless it is None; raise a SceneError if it is no positive number."""
         if sigma is None:
             return self
         array = np.asarray(sigma)

@@ -88,7 +88,7 @@ class Parameter:
 
 
 def make_parameters(scene: Scene, free: Sequence[str], bounds: Mapping[str, Bounds]) -> tuple[Parameter, ...]:
-    """Build the parameters of the keys `free`, with bounds by key; SceneError: lists all faults."""
+    """Build the parameters of the keys `free`, with bounds by key; raise a SceneError with all faults."""
     data, faults, parameters = as_data(scene), [], []
     if not free:
         faults.append("--free: names no key; take one or more, such as --free tissue.young")
@@ -134,7 +134,7 @@ def _parameter(scene: Scene, data: dict[str, Any], key: str, low: float, high: f
 
 
 def _look_up(option: str, data: Any, path: Key) -> Any:
-    """Return the value of a key; SceneError: it does not exist."""
+    """Return the value of a key; raise a SceneError if it does not exist."""
     for part in path or ("",):
         indices = range(len(data)) if isinstance(data, list) else ()
         known = list(data) if isinstance(data, dict) else [str(n) for n in indices]
@@ -204,7 +204,7 @@ class Method(TypedDict, total=False):
 
 
 def require_types(observed: Any, free: Any, method: Mapping[str, Any], **others: Any) -> None:
-    """Check the types of the arguments of `fit`; ArgumentError: the first fault."""
+    """Check the types of the arguments of `fit`; raise an ArgumentError for the first fault."""
     known = Method.__annotations__
     if unknown := sorted(set(method) - set(known)):
         raise ArgumentError(f"{unknown[0]}: unknown; take {', '.join(known)}{did_you_mean(unknown[0], known)}")

@@ -55,7 +55,7 @@ class FitProblem:
         return low, high
 
     def build_model(self, threads: int | None) -> ForwardModel:
-        """Build the forward model on a number of threads; None: all cores."""
+        """Build the forward model on a number of threads, by default on all cores."""
         return ForwardModel(self, threads)
 
     def fitted_data(self, data: dict[str, Any], values: Mapping[str, float]) -> dict[str, Any]:
@@ -144,7 +144,7 @@ class ForwardModel:
         return predicted if all(np.isfinite(values[observed.known]).all() for values, observed in pairs) else None
 
     def values(self, x: Array) -> dict[str, float]:
-        """Return the parameter values by key at x; SceneError: they are out of range."""
+        """Return the parameter values by key at x; raise a SceneError if they are out of range."""
         pairs = zip(self.job.parameters, x.tolist(), strict=True)
         values = {parameter.key: parameter.value(coordinate) for parameter, coordinate in pairs}
         if not np.isfinite(list(values.values())).all():
@@ -152,7 +152,7 @@ class ForwardModel:
         return values
 
     def plan(self, x: Array) -> Plan:
-        """Plan the scene with the parameters at x; SceneError: it is not valid."""
+        """Plan the scene with the parameters at x; raise a SceneError if it is not valid."""
         return check_scene(Scene(**self.job.fitted_data(self.data, self.values(x))), self.maps)
 
     def record(

@@ -57,7 +57,7 @@ class MapSettings:
 def map_settings(
     scene: Scene, free: Sequence[str], bounds: Mapping[str, Bounds], resolution: int | None
 ) -> MapSettings | None:
-    """Return the settings of a map, None for a fit of numbers; SceneError: invalid or conflicting arguments."""
+    """Return the settings of a map, None for a fit of numbers; raise a SceneError for invalid arguments."""
     if KEY not in free:
         if resolution is not None:
             raise SceneError([f"--resolution {resolution}: is that of a map; add --free {KEY}"])
@@ -210,7 +210,7 @@ def _faults(observations: PointObservation, scene: Scene, settings: MapSettings)
 
 
 def _initial_points(position: Array, model: PointModel, observations: PointObservation, scene: Scene) -> Array:
-    """Return the observed points in the initial run [m], shape (N, T, 3); SceneError: implausible observations."""
+    """Return the observed points in the initial run [m], shape (N, T, 3); raise a SceneError if implausible."""
     at_frames = model.on_sheet(position)
     points = model.interpolate(at_frames)
     prediction = Prediction((model.observe(points),), 0, model.motion(at_frames))
@@ -220,7 +220,7 @@ def _initial_points(position: Array, model: PointModel, observations: PointObser
 
 
 def _with_stable_steps(plan: Plan, high: float) -> Plan:
-    """Return the plan with steps that are stable for factors up to `high`; SceneError: the scene's own step is not."""
+    """Return the plan with steps stable up to the factor `high`; raise a SceneError if the scene's own are not."""
     if plan.scene.time.at_rest:
         return plan
     stiffest = replace(plan.material, factors=np.full(_cells(plan), high))

@@ -75,7 +75,7 @@ class Grid:
         return not is_comment and any(character.isalnum() for cell in cells for character in cell)
 
     def require_names(self, row: int, header: int) -> None:
-        """Check that a row of a text has not more cells than its header has names; SceneError: it has."""
+        """Raise a SceneError if a row of a text has more cells than its header has names."""
         cells, names = self.rows[row], self.rows[header]
         if not self.sheet and len(cells) > len(names):
             is_decimal = self.separator == "commas"

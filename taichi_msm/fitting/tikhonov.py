@@ -84,7 +84,7 @@ class Linearisation:
         return SmoothnessWeight(candidates[-1][0], step, *np.array(candidates).T)
 
     def errors(self, weight: float, roughness: Array) -> Array:
-        """Return the standard errors of x, shape (R^2,); NaN: unknown."""
+        """Return the standard errors of x, shape (R^2,); NaN if unknown."""
         deviations = np.sqrt(np.diag(np.linalg.inv(self.information + weight * roughness)))
         return np.where(np.diag(self.information) * MAX_KNOWN_ERROR**2 >= 1, deviations, np.nan)
 

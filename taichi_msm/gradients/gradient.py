@@ -23,19 +23,20 @@ from taichi_msm.solver.planning import stable_step
 from taichi_msm.system import runtime
 from taichi_msm.system.process import available_memory
 from taichi_msm.system.runtime import Device
+from taichi_msm.terms import build_terms
 
 Array = NDArray[np.float64]
 
 
 def require_differentiable(plan: Plan) -> None:
-    """Raise a SceneError if a scene has position-controlled tools or stress relaxation, and thus no gradient."""
-    if plan.material.relaxation:
-        raise SceneError(
-            ["tissue.relaxation: has no gradient, and no map is fitted with it; remove it, or fit numbers"]
-        )
+    """Raise a SceneError if a scene has position-controlled tools, or another term without a gradient."""
     for tool in plan.tools:
         reason = "a tool with a path has no gradient, as points meet and leave it; fit such scenes by differences"
         raise SceneError([f"probes.{tool.probe}.path: {reason}"])
+    for term in build_terms(plan):
+        if not term.has_gradient:
+            reason = "has no gradient, and no map is fitted with it; remove it, or fit numbers"
+            raise SceneError([f"{term.key}: {reason}"])
 
 
 def with_stiffness_map(plan: Plan) -> Plan:

@@ -39,6 +39,10 @@ class Dual:
         ratio = self.value / value
         return Dual(ratio, (self.slope - slope * ratio) / value)
 
+    def __rtruediv__(self, other: Any) -> Dual:
+        ratio = other / self.value
+        return Dual(ratio, -self.slope * ratio / self.value)
+
     def __rsub__(self, other: Any) -> Dual:
         return Dual(other - self.value, -self.slope)
 

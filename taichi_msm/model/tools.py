@@ -292,7 +292,7 @@ def overlap(tools: Sequence[Tool], duration: float) -> tuple[int, int, float] | 
     Returns the indices of their probes, and the first time [s]; None if no tools intersect.
     """
     times = np.linspace(0, duration, 1025)
-    for a, b in combinations([tool for tool in touching_tools(tools) if tool.shape.name == "capsule"], 2):
+    for a, b in combinations([tool for tool in touching_tools(tools) if tool.shape.is_round], 2):
         distance = _axis_distance(a, b, a.tip_centre(times) - b.tip_centre(times))
         intersecting = np.flatnonzero(distance < (1 - 1e-9) * (a.radius + b.radius))
         if intersecting.size:

@@ -16,6 +16,7 @@ class Capsule(Shape):
 
     name = "capsule"
     max_stride = 0.5
+    is_round = True
 
     def build_depth(self, operations: Operations) -> Callable[..., Any]:
         """Build the depth, radius - |r'|, and the normal r' / |r'|, or +z on the axis; see `Shape.build_depth`."""

@@ -27,6 +27,7 @@ class Shape(ABC):
 
     name: ClassVar[str]  # for messages
     max_stride: ClassVar[float]  # largest displacement of a tool in a step, in radii
+    is_round: ClassVar[bool] = False  # whether it has all points within `radius` of the axis
 
     @abstractmethod
     def build_depth(self, operations: Operations) -> Callable[..., Any]:

@@ -42,6 +42,8 @@ class Term(ABC):
     reach: ClassVar[int] = 0  # number of rows on either side on which the force on a row depends
     constant_count: ClassVar[int] = 0  # number of the sheet's constants that belong to the term
     reductions: ClassVar[tuple[str, ...]] = ()  # reduction of each measure over a row: "min", "max" or "sum"
+    has_gradient: ClassVar[bool] = False  # whether `build_tangents` has all of its force that depends on displacements
+    key: ClassVar[str] = ""  # of the scene, for the message of a term without a gradient
 
     @classmethod
     @abstractmethod
@@ -76,6 +78,10 @@ class Term(ABC):
     def memory(self) -> tuple[str, ...]:
         """Names of the numbers that the term remembers at every mass point: its last fields, which steps change."""
         return ()
+
+    def has_history(self, plan: Plan) -> bool:
+        """Return whether the shapes of a sheet at rest depend on earlier loads by the definition of the term."""
+        return bool(self.memory)
 
     @property
     def field_count(self) -> int:

@@ -24,6 +24,7 @@ from taichi_msm.terms.base import DX, DY, HAS_LEFT, HAS_RIGHT, KernelConfig, Ter
 class BendingTerm(Term):
     """Bending. Moments are stored in additional rows of u, one row ahead of the row that is stepped."""
 
+    has_gradient: ClassVar[bool] = True
     # The force on a row depends on the moments of the next rows, which depend on the displacements one row further.
     reach: ClassVar[int] = 2
     constant_count: ClassVar[int] = 1

@@ -86,6 +86,10 @@ class ContactTerm(Term):
         names = tuple(f"correction {tool} {axis}" for tool in range(len(self.shapes)) for axis in "xyz")
         return (*names, "holder", *(f"held {axis}" for axis in "xyz")) if self.grips else names
 
+    def has_history(self, plan: Plan) -> bool:
+        """Return whether mass points stick to a tool."""
+        return any(tool.rough for tool in plan.tools)
+
     def fields(self, plan: Plan) -> NDArray[Any]:
         fields = super().fields(plan)
         for n, tool in enumerate(plan.tools):

@@ -21,6 +21,7 @@ from taichi_msm.terms.base import KernelConfig, Term
 class DampingTerm(Term):
     """Damping. It stores no energy; `verlet.stability_limit` includes its effect on the stable step."""
 
+    has_gradient: ClassVar[bool] = True
     constant_count: ClassVar[int] = 1
 
     @staticmethod

@@ -10,7 +10,7 @@ Scene: `springs.virtual` and `virtual_active`, or `tissue.foundation`, `foundati
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,8 @@ from taichi_msm.terms.law import LockingLaw, build_locking, law_numbers, make_st
 @dataclass(frozen=True)
 class FoundationTerm(Term):
     """Virtual springs. Their energy is not measured; `accuracy.divergence` bounds it."""
+
+    has_gradient: ClassVar[bool] = True
 
     by_area: bool  # whether K is smaller at an open edge, because mass points have less area there
     mapped: bool  # whether the factor of K at each mass point is read from a field

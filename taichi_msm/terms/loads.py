@@ -10,7 +10,7 @@ exponentials, are stored in a field.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,8 @@ FORCE, POINT, FALLOFF, SHIFT, OFFSET, SLOT_COLUMNS = 0, 3, 5, 6, 7, 8
 @dataclass(frozen=True)
 class ProbeTerm(Term):
     """Loads of force-controlled probes."""
+
+    has_gradient: ClassVar[bool] = True
 
     moves: tuple[bool, ...]  # whether the control point moves, for each slot
     by_area: tuple[bool, ...]  # whether forces are smaller at an open edge, for each slot

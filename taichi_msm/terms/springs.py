@@ -52,6 +52,8 @@ MIN_SQUARED_LENGTH = 1e-36
 class SpringTerm(Term):
     """Springs between neighbouring mass points."""
 
+    has_gradient: ClassVar[bool] = True
+
     structural: bool  # whether the sheet has springs along rows and columns
     shear: bool  # whether the sheet has springs along diagonals
     open_edges: bool  # whether mass points at an edge can move; springs beyond the edge are then excluded

@@ -16,7 +16,7 @@ is, and then s_i = share_i (exp(-x_i) - phi_i) f.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,8 @@ FACTOR, UPDATE, BRANCHES, BRANCH_COLUMNS = 0, 1, 2, 2
 @dataclass(frozen=True)
 class ViscoelasticTerm(Term):
     """Stress relaxation. It changes the sum of the elastic forces, so it follows them in `terms.TERMS`."""
+
+    key: ClassVar[str] = "tissue.relaxation"
 
     branches: int  # count
     at_rest: bool  # whether the memory changes only where the load table says so

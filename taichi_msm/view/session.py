@@ -414,7 +414,7 @@ class Session:
                 self._show_keys = not self._show_keys
 
     def _with_tool(self, tool: ForceControlledTool | PositionControlledTool) -> Plan:
-        """Plan the scene with a tool at rest; SceneError: its instrument cannot be position-controlled."""
+        """Plan the scene with a tool at rest; raise a SceneError if it cannot be position-controlled."""
         plan = self._plan.with_probes((*self._scene_probes, tool.recorded_probe(0)))
         session_tools = [tool for tool in plan.tools if tool.probe == len(self._scene_probes)]
         if any(path_problems(plan.scene, session_tools, plan.grid)):

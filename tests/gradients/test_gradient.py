@@ -28,7 +28,8 @@ from taichi_msm.model.sheet import rest_positions
 from taichi_msm.solver import backoff
 from taichi_msm.solver.sheet_solver import choose_layout
 from taichi_msm.system.runtime import Device
-from taichi_msm.terms.base import KernelConfig
+from taichi_msm.terms.base import KernelConfig, Term
+from taichi_msm.terms.foundation import FoundationTerm
 from tests import reference
 from tests.golden import Messages
 from tests.reference.sheet import Sheet, sheet
@@ -378,6 +379,15 @@ def test_contact_is_refused(device: Device, message: Messages) -> None:
     made = {**REST, "probes": [{"path": [[0, 0.5, 0.5, 0.01]], "instrument": rod}]}
     with message.raises(SceneError, "probes.0.path: "):
         gradient(made, loss, threads=device.threads)
+
+
+def test_a_term_without_a_gradient_is_refused(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As every new term is, until it has tangents."""
+    assert not Term.has_gradient
+    monkeypatch.setattr(FoundationTerm, "has_gradient", False)
+    monkeypatch.setattr(FoundationTerm, "key", "tissue.foundation")
+    with pytest.raises(SceneError, match=r"^tissue\.foundation: has no gradient"):
+        gradient(REST, loss, threads=device.threads)
 
 
 LOSSES: dict[str, Any] = {

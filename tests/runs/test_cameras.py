@@ -288,6 +288,7 @@ WRONG = {
     "a folder of labels": "flow: top",
     "a folder of exports": "export-obj: top",
     "a calibration that is not there": "left: top, right: {eye: [0, 0, 1], calibration: a.yml}",
+    "a calibration that is a folder": "left: top, right: {eye: [0, 0, 1], calibration: .}",
 }
 
 
