@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -248,7 +247,7 @@ class Diagnosis:
     last_sound_state: Snapshot | None
 
 
-def diagnose(dynamics: SheetSolver[Any], start: Snapshot | None, pause: Pause) -> Diagnosis:
+def diagnose(dynamics: SheetSolver, start: Snapshot | None, pause: Pause) -> Diagnosis:
     """Repeat a run to find the step and the mass point of its divergence.
 
     Args:

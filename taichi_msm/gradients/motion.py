@@ -28,8 +28,8 @@ from taichi_msm.solver.backoff import Backoff
 from taichi_msm.solver.bands import MOMENT_ROWS
 from taichi_msm.solver.dynamics import STEPS_PER_TABLE, Dynamics
 from taichi_msm.solver.kernel_cpu import MAX_CHECKS, PAGE
-from taichi_msm.solver.state import State, largest_displacement
-from taichi_msm.system.runtime import Memory, compilation_options, write_vectors
+from taichi_msm.solver.state import largest_displacement
+from taichi_msm.system.runtime import Device, Memory, compilation_options, write_vectors
 from taichi_msm.terms.base import GAIN
 from taichi_msm.terms.foundation import point_shares
 from taichi_msm.terms.loads import ProbeTerm
@@ -62,18 +62,28 @@ def motion_bytes(plan: Plan) -> int:
     return shape_bytes * (segment + 2 * -(-steps // segment) + kernels.ADJOINT_PARTS + kernels.SUM_PARTS)
 
 
-class MotionAdjoint(Dynamics):
-    """Dynamic sheet, of a plan in f64 with a stiffness map, and its adjoint."""
+class MotionAdjoint:
+    """Adjoint of a dynamic sheet, of a plan in f64 with a stiffness map; its arguments are those of `Dynamics`."""
 
-    _allocated_for: tuple[SheetLayout, int] | None = None  # layout and number of steps
+    def __init__(self, plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> None:
+        self._forward = Dynamics(plan, device, layout, cores)
+        self._allocate()
 
-    def restart(self, plan: Plan, state: State | None = None) -> None:
-        """Restart with the same scene or another, see `SheetSolver.restart`."""
-        super().restart(plan, state)
+    def restart(self, plan: Plan) -> None:
+        """Restart with the same scene or another."""
+        self._forward.restart(plan)
         if self._allocated_for != (self.layout, plan.grid.steps):
             self._allocate()
-            self._allocated_for = self.layout, plan.grid.steps
-            self._backoff = Backoff()
+
+    @property
+    def plan(self) -> Plan:
+        """The current plan."""
+        return self._forward.plan
+
+    @property
+    def layout(self) -> SheetLayout:
+        """The memory layout, and the configuration of the kernels."""
+        return self._forward.layout
 
     @property
     def _decay_parts(self) -> int:
@@ -108,6 +118,7 @@ class MotionAdjoint(Dynamics):
         self._derivatives = scalar((kernels.SUM_PARTS + self._decay_parts) * layout.rows + row_sums)
         # Derivative of the loss with respect to the displacements of a frame.
         self._loss = vector(layout.rows)
+        self._allocated_for, self._backoff = (layout, plan.grid.steps), Backoff()
 
     def run(self, pause: Pause = lambda: None) -> Array:
         """Run all steps and store the checkpoints.
@@ -121,11 +132,11 @@ class MotionAdjoint(Dynamics):
         monitor, frames = DivergenceMonitor(plan), np.zeros((grid.frames + 1, *plan.scene.sheet.points, 3))
         stops = {*range(0, grid.steps + 1, grid.steps_per_frame), *range(0, grid.steps, self._segment)}
         for n in sorted(stops):
-            self.advance(n - self.steps_done, pause)
+            self._forward.advance(n - self._forward.steps_done, pause)
             if n % self._segment == 0 and n < grid.steps:
                 self._store_checkpoint(n // self._segment)
             if n and n % grid.steps_per_frame == 0:
-                reading = self.read()
+                reading = self._forward.read()
                 fault = monitor.check_frame(reading)
                 if fault:
                     message = divergence.format_message(grid.time(n), n, fault, exact=False)
@@ -154,7 +165,7 @@ class MotionAdjoint(Dynamics):
 
     def _sweep_block(self, first: int, end: int, by_frame: Array, loads: LoadGradient, pause: Pause) -> Array:
         """Sweep backward over a block of segments; return the work of the loads on p after step 0 and in step 0."""
-        table, h = self.step_table(first, end - first), self.plan.grid.step
+        table, h = self._forward.step_table(first, end - first), self.plan.grid.step
         by_slot = np.zeros((end - first, len(self.plan.slots), kernels.LOAD_DERIVATIVES))
         at = end
         for begin in reversed(range(first, end, self._segment)):
@@ -175,7 +186,7 @@ class MotionAdjoint(Dynamics):
         return np.array([work[int(first == 0) :].sum(), work[: int(first == 0)].sum()])
 
     def _store_checkpoint(self, segment: int) -> None:
-        sheet, first = self.kernel.arrays, segment * self._shape_entries
+        sheet, first = self._forward.sheet.kernel.arrays, segment * self._shape_entries
         self._copy_shape(0, first, sheet.u, self._checkpoints)
         self._copy_shape(0, first, sheet.d, self._checkpoint_differences)
 
@@ -261,7 +272,7 @@ class MotionAdjoint(Dynamics):
 
     @property
     def _sheet_arrays(self) -> tuple[Any, ...]:
-        arrays = self.kernel.arrays
+        arrays = self._forward.sheet.kernel.arrays
         return arrays.constants, arrays.by_column, arrays.stiffness, arrays.fields
 
     def _max_launch_steps(self) -> int:

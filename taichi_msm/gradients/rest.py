@@ -21,6 +21,7 @@ from taichi_msm.model.loads import Schedule, decay, decay_gradient, evaluate_fra
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import spacing
 from taichi_msm.solver.rest import QuasiStatics
+from taichi_msm.system.runtime import Device
 from taichi_msm.terms.elasticity import SpringFamily, spring_families
 from taichi_msm.terms.foundation import foundation_derivatives, foundation_force, foundation_tangent, point_shares
 
@@ -33,8 +34,20 @@ Array = NDArray[np.float64]
 RESIDUAL_TOLERANCE = 1e-6
 
 
-class RestAdjoint(QuasiStatics):
-    """Quasi-static sheet, of a plan with a stiffness map, and its adjoint."""
+class RestAdjoint:
+    """Adjoint of a quasi-static sheet, of a plan with a stiffness map."""
+
+    def __init__(self, plan: Plan, device: Device) -> None:
+        self._forward = QuasiStatics(plan, device)
+
+    def restart(self, plan: Plan) -> None:
+        """Restart with the same scene or another."""
+        self._forward.restart(plan)
+
+    @property
+    def plan(self) -> Plan:
+        """The current plan."""
+        return self._forward.plan
 
     def run(self, pause: Pause) -> Array:
         """Solve all frames; return the displacements at every frame [m], shape (F + 1, rows, cols, 3).
@@ -42,11 +55,10 @@ class RestAdjoint(QuasiStatics):
         Raises:
             DivergedError: when a frame has no equilibrium.
         """
-        self.restart(self.plan)
         frames = []
         for n in range(self.plan.grid.frames + 1):
-            self.advance(int(n > 0), pause)
-            frames.append(self.displacement())
+            self._forward.advance(int(n > 0), pause)
+            frames.append(self._forward.displacement())
         self._displacements = np.array(frames)
         return self._displacements.copy()
 

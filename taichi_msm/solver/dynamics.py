@@ -18,12 +18,13 @@ from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.surface import surface_point
 from taichi_msm.model.tool_force import probe_force
 from taichi_msm.model.verlet import coefficients, mean_force
-from taichi_msm.solver.arrays import InitialData, StepKernel
+from taichi_msm.solver.arrays import InitialData, SheetLayout, StepKernel
 from taichi_msm.solver.contact_corrections import sum_corrections
 from taichi_msm.solver.kernel_cpu import ScatterKernel
 from taichi_msm.solver.kernel_gpu import STEPS_PER_LAUNCH, GatherKernel
-from taichi_msm.solver.sheet_solver import SheetSolver
+from taichi_msm.solver.planned_sheet import PlannedSheet
 from taichi_msm.solver.state import PeakForce, ProbeForces, Reading, State, TipForce
+from taichi_msm.system.runtime import Device
 from taichi_msm.terms.base import GAIN
 
 # Largest numbers of steps times mass points, about 0.1 s of one core, and of steps in a launch. Ctrl-C is handled only
@@ -35,22 +36,43 @@ MAX_STEPS_PER_LAUNCH = 8192
 STEPS_PER_TABLE = 4096
 
 
-class Dynamics(SheetSolver[StepKernel]):
-    """The sheet in motion.
+def _build_kernel(_: Plan, layout: SheetLayout, start: InitialData) -> StepKernel:
+    return (ScatterKernel if layout.workers else GatherKernel)(layout, start)
+
+
+class Dynamics:
+    """The sheet in motion, a `SheetSolver`; see `PlannedSheet` for the arguments.
 
     An exception such as KeyboardInterrupt during a launch leaves the sheet inconsistent, because the number of steps
     taken is then unknown.
     """
 
-    def restart(self, plan: Plan, state: State | None = None) -> None:
-        self._first_tabled, self._loads = 0, np.empty((0, 0))
-        super().restart(plan, state)
+    def __init__(self, plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> None:
+        self.sheet = PlannedSheet(plan, _build_kernel, device, layout, cores)
+        self._begin(None)
 
-    def _build_kernel(self, start: InitialData) -> StepKernel:
-        return (ScatterKernel if self.layout.workers else GatherKernel)(self.layout, start)
+    @property
+    def plan(self) -> Plan:
+        return self.sheet.plan
+
+    @property
+    def layout(self) -> SheetLayout:
+        return self.sheet.layout
+
+    @property
+    def inconsistent(self) -> bool:
+        return self.sheet.inconsistent
+
+    def restart(self, plan: Plan, state: State | None = None) -> None:
+        self._begin(state)
+        self.sheet.restart(plan, state)
+
+    def _begin(self, state: State | None) -> None:
+        self.steps_done = 0 if state is None else state.steps
+        self._first_tabled, self._loads = 0, np.empty((0, 0))
 
     def steer(self, plan: Plan) -> None:
-        super().steer(plan)
+        self.sheet.steer(plan)
         # A caller that steers usually steers again at the next frame, so the table has only the steps of one frame.
         self._tabulate(plan.grid.steps_per_frame)
 
@@ -64,45 +86,51 @@ class Dynamics(SheetSolver[StepKernel]):
             max_steps = STEPS_PER_LAUNCH
         self._require_consistent()
         if steps and self.steps_done % self.plan.grid.steps_per_frame == 0:
-            sum_corrections(self.layout, self.kernel.arrays, clear=True)
+            sum_corrections(self.layout, self.sheet.kernel.arrays, clear=True)
         end = self.steps_done + steps
         while self.steps_done < end:
             count = min(max_steps, end - self.steps_done)
-            self.inconsistent = True
-            self.kernel.advance(count, self._next_loads(count))
+            self.sheet.inconsistent = True
+            self.sheet.kernel.advance(count, self._next_loads(count))
             self.steps_done += count
-            self.inconsistent = False
+            self.sheet.inconsistent = False
             pause()
 
     def compile(self) -> None:
-        self.kernel.compile(self._next_loads(1))
+        self.sheet.kernel.compile(self._next_loads(1))
         self.displacement()
         self.tool_forces()
 
     def state(self) -> State:
         self._require_consistent()
-        u, d = (self._read_arrays(differences=differences)[0] for differences in (False, True))
-        return State(self.steps_done, u, d, self._read_memory())
+        u, d = (self.sheet.read_arrays(differences=differences)[0] for differences in (False, True))
+        return State(self.steps_done, u, d, self.sheet.read_memory())
 
     def read(self) -> Reading:
         self._require_consistent()
-        return self._measure(moving=True)
+        return self.sheet.read(self.steps_done, moving=True)
+
+    def displacement(self) -> NDArray[Any]:
+        return self.read().displacement
 
     def tool_forces(self) -> NDArray[np.float64]:
         """Compute the mean force of each position-controlled tool since the previous frame [N], shape (tools, 3).
 
         It has the effect of the contact corrections (`verlet.mean_force`), summed over mass points.
         """
-        sums = sum_corrections(self.layout, self.kernel.arrays, clear=False)
+        sums = sum_corrections(self.layout, self.sheet.kernel.arrays, clear=False)
         return mean_force(self.plan, sums, self.plan.grid.steps_per_frame)
 
     def step_table(self, first: int, count: int) -> NDArray[Any]:
         """Compute the load table of steps first, ..., first + count - 1, shape (count, columns)."""
-        table = self.load_table(average_loads(self.plan, first, count), first)
+        table = self.sheet.load_table(average_loads(self.plan, first, count), first)
         _, table[:, GAIN], first_gain = coefficients(self.plan)
         if first == 0:
             table[0, GAIN] = first_gain
         return table
+
+    def close(self) -> None:
+        self.sheet.close()
 
     def _require_consistent(self) -> None:
         if self.inconsistent:

@@ -80,11 +80,11 @@ class RestSheet(NamedTuple):
 class Relaxation(SheetKernel):
     """A sheet in the memory of a CPU, and the kernels that find its equilibrium.
 
-    `masses` contains M of every mass point [N/m], shape (rows, cols).
+    The argument and attribute `masses` contains M of every mass point [N/m], shape (rows, cols).
     """
 
     def __init__(self, layout: SheetLayout, start: InitialData, masses: NDArray[Any]) -> None:
-        self._layout = layout
+        self._layout, self.masses = layout, masses
         self._relax, self._scale_kernel = _build_relax(layout.config), _build_scale(layout.config)
         self._read = build_read(layout.config, parallel=False, iterations=1)
         moments = 0 if layout.config.get(BendingTerm) is None else MOMENT_ROWS

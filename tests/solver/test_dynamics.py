@@ -19,7 +19,7 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.section import MAX_POINTS
 from taichi_msm.solver import backoff, kernel_cpu, kernel_gpu
 from taichi_msm.solver.arrays import SheetLayout
-from taichi_msm.solver.sheet_solver import POINTS_PER_WORKER
+from taichi_msm.solver.planned_sheet import POINTS_PER_WORKER
 from taichi_msm.system import process
 from taichi_msm.system.launches import MAX_ROUNDS, VULKAN_THREADS
 from taichi_msm.system.process import available_threads
@@ -336,7 +336,7 @@ def test_giving_up_in_the_last_pass_of_a_launch_counts(device: Device, monkeypat
     made = scene(sheet={**SHEET, "points": [101, 101]}, time={"precision": "f32"})
     monkeypatch.setattr(kernel_cpu, "MAX_CHECKS", 0)
     dynamics = dynamics_of(made, device, replace(structure_of(made, device), workers=2, depth=8))
-    scatter = dynamics.kernel
+    scatter = dynamics.sheet.kernel
     assert isinstance(scatter, kernel_cpu.ScatterKernel)
     for _ in range(200):
         dynamics.advance(8)
@@ -350,13 +350,13 @@ def test_a_sheet_that_was_interrupted_while_stepping_is_not_used(
     made = scene()
     dynamics = dynamics_of(made, device)
     dynamics.advance(10)
-    saved, advance = dynamics.state(), dynamics.kernel.advance
+    saved, advance = dynamics.state(), dynamics.sheet.kernel.advance
 
     def interrupted(*arguments: Any) -> None:
         advance(*arguments)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(dynamics.kernel, "advance", interrupted)
+    monkeypatch.setattr(dynamics.sheet.kernel, "advance", interrupted)
     with pytest.raises(KeyboardInterrupt):
         dynamics.advance(5)
     monkeypatch.undo()

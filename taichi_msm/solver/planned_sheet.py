@@ -1,0 +1,189 @@
+"""The sheet of a plan in the memory of a device: its arrays, the load table of its steps, and readings of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.errors import ArgumentError, DeviceError, MsmError
+from taichi_msm.model.loads import Schedule
+from taichi_msm.model.plan import Plan
+from taichi_msm.model.sheet import area_shares, axes, spacing
+from taichi_msm.solver.arrays import NUMBER_BYTES, InitialData, SheetKernel, SheetLayout
+from taichi_msm.solver.state import Reading, State
+from taichi_msm.system.process import available_threads
+from taichi_msm.system.runtime import Device, lanes
+from taichi_msm.terms import base, build_terms
+from taichi_msm.terms.loads import ProbeTerm, decay_parameters
+from taichi_msm.terms.springs import MAX_STRAIN, MIN_STRAIN, SpringTerm
+
+Kernel = TypeVar("Kernel", bound=SheetKernel)
+
+# With fewer mass points per worker, an additional worker costs more waiting time than it saves.
+POINTS_PER_WORKER = 450
+
+# A pass over a larger band takes several steps, so that the rows stay in the cache.
+CACHE_BYTES = 3 << 17
+
+
+def choose_layout(plan: Plan, device: Device, cores: int | None = None) -> SheetLayout:
+    """Choose the memory layout of a sheet, its division among workers, and the configuration of its kernels.
+
+    Raises:
+        DeviceError: when the device does not support the scene.
+    """
+    (rows, cols), fixed, precision = plan.scene.sheet.points, plan.fixed, plan.grid.precision
+    fixed_rows = bool(fixed[0].all()), bool(fixed[-1].all())
+    if plan.scene.time.at_rest:
+        if device.arch != "cpu":
+            raise DeviceError(f"--arch {device.arch}: time.motion: quasistatic runs on a CPU only; take --arch cpu")
+        workers = 1
+    elif device.arch == "cpu":
+        # Workers wait by spinning, so more workers than cores would delay each other.
+        cores = min(device.threads, available_threads() if cores is None else cores)
+        workers = max(1, min(cores, rows * cols // POINTS_PER_WORKER, (rows - sum(fixed_rows)) // 2))
+    else:
+        workers = 0
+    config = base.KernelConfig(
+        precision, lanes(precision), plan.open_edges and plan.material.by_area, build_terms(plan)
+    )
+    if device.arch == "vulkan" and precision == "f64" and any(slot.moves for slot in plan.slots):
+        raise DeviceError(
+            "--arch vulkan: has no exp in f64, which control points that move need; take time.precision: f32 without a "
+            "tolerance or an estimate of the error, or --arch cpu"
+        )
+    # Per mass point a pass reads displacement, last difference and carried force, with three components each.
+    fits = workers == 0 or rows // workers * cols * 9 * NUMBER_BYTES[precision] <= CACHE_BYTES
+    depth = 1 if fits or config.reach > 1 else 8
+    return SheetLayout(rows, cols, workers, depth, fixed_rows, config)
+
+
+class PlannedSheet(Generic[Kernel]):
+    """The sheet of a plan in the memory of a device.
+
+    Args:
+        plan: the plan.
+        build: builds the kernel of a plan and a layout from initial values.
+        device: the device.
+        layout: replaces the layout chosen by `choose_layout`, for tests.
+        cores: largest number of CPU cores; by default all available cores.
+
+    Attributes:
+        plan: the current plan.
+        layout: the memory layout, and the configuration of the kernels.
+        inconsistent: whether an interruption left the arrays inconsistent.
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        build: Callable[[Plan, SheetLayout, InitialData], Kernel],
+        device: Device,
+        layout: SheetLayout | None = None,
+        cores: int | None = None,
+    ) -> None:
+        self._build, self._device, self._given_layout, self._cores = build, device, layout, cores
+        self.restart(plan)
+
+    def restart(self, plan: Plan, state: State | None = None) -> None:
+        """Restart with the same or another plan, see `SheetSolver.restart`."""
+        self.inconsistent = True
+        self.plan, self.layout = plan, self._given_layout or choose_layout(plan, self._device, self._cores)
+        self._real = np.dtype(np.float32 if self.layout.config.precision == "f32" else np.float64)
+        self._kernel: Kernel | None = None  # Frees its memory before the new arrays are allocated.
+        self._kernel = self._build(plan, self.layout, _initial_data(plan, self.layout, state))
+        self.inconsistent = False
+
+    def close(self) -> None:
+        """Release the memory of the device."""
+        self._kernel = None
+
+    @property
+    def kernel(self) -> Kernel:
+        """The arrays of the sheet, with the kernels that move and read it."""
+        if self._kernel is None:
+            raise MsmError("interrupted while the sheet was restarted; restart the scene")
+        return self._kernel
+
+    def steer(self, plan: Plan) -> None:
+        """Continue with other probes, see `SheetSolver.steer`."""
+        config, terms = self.layout.config, build_terms(plan)
+        if [tool.probe for tool in plan.tools] != [tool.probe for tool in self.plan.tools]:
+            raise ArgumentError("probes: which of them have a path cannot change; restart with the new scene")
+        for term in terms:
+            compiled = config.get(type(term))
+            if compiled and (reason := term.supports(compiled)):
+                raise ArgumentError(f"probes: {reason}")
+        if decay_parameters(plan) != decay_parameters(self.plan):
+            probes = config.require(ProbeTerm)
+            self.kernel.arrays.set_fields(config.first_field(ProbeTerm), probes.fields(plan))
+        self.plan = plan
+
+    def load_table(self, loads: Schedule, first: int) -> NDArray[Any]:
+        """Compute the load table from step `first` on, with a gain of 0, shape (steps, columns)."""
+        config = self.layout.config
+        table = np.zeros((len(loads.active), config.first_column(None)))
+        for term in config.terms:
+            column = config.first_column(type(term))
+            table[:, column : column + term.column_count] = term.columns(self.plan, loads, first)
+        # Loads too large for f32 become infinite; the next reading of the sheet detects it.
+        with np.errstate(over="ignore"):
+            return table.astype(self._real)
+
+    def read(self, steps: int, *, moving: bool) -> Reading:
+        """Read and measure the sheet after a number of steps; its energy includes the kinetic energy if `moving`."""
+        displacement, measures = self.read_arrays(differences=False)
+        config, plan = self.layout.config, self.plan
+        springs = measures[:, config.first_measure(SpringTerm) :]
+        # The measures are (L^2 - L0^2) / L0^2.
+        extremes = springs[:, MIN_STRAIN].min(), springs[:, MAX_STRAIN].max()
+        shortest, longest = (math.sqrt(max(0.0, 1.0 + float(extreme))) for extreme in extremes)
+        sums = measures.sum(axis=0, dtype=np.float64)
+        energy = plan.material.mass * float(sums[base.SQUARED_MOTION]) / plan.grid.step**2 if moving else 0.0
+        for term in config.terms:
+            first = config.first_measure(type(term))
+            energy += term.energy(sums[first : first + len(term.reductions)], plan)
+        return Reading(steps, displacement, shortest, longest, energy / 2)
+
+    def read_arrays(self, *, differences: bool) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Read displacements or last differences, see `SheetKernel.read`, and the measures of every row."""
+        rows, cols, count = self.layout.rows, self.layout.cols, self.layout.config.first_measure(None)
+        values, measures = np.empty((rows, cols, 3), self._real), np.empty((rows, count), self._real)
+        self.kernel.read(differences, values, measures)
+        return values, measures
+
+    def read_memory(self) -> NDArray[Any]:
+        """Read the numbers that terms remember, shape (numbers, rows, cols)."""
+        fields = [self.kernel.arrays.get_fields(n, 1) for n in self.layout.config.memory_fields]
+        # Only some kernels step fixed mass points, whose memory has no effect.
+        fields = [np.where(self.plan.fixed, 0, field).astype(self._real) for field in fields]
+        return np.concatenate([np.empty((0, self.layout.rows, self.layout.cols), self._real), *fields])
+
+
+def _initial_data(plan: Plan, layout: SheetLayout, state: State | None) -> InitialData:
+    sheet = plan.scene.sheet
+    moves, column, areas = ~plan.fixed, np.arange(layout.cols), area_shares(sheet)
+    # One row of each kind: first, middle, last.
+    kinds = [0, layout.rows // 2, -1]
+    shares = areas[kinds] if layout.config.by_area else np.ones((3, layout.cols))
+    by_column = np.empty((base.COLUMN_ROWS, layout.cols))
+    by_column[base.MOBILITY : base.MOBILITY + 3] = moves[kinds] / shares
+    # Springs along columns read the shares of a middle row even in a sheet of two rows.
+    by_column[base.AREA_SHARE : base.AREA_SHARE + 3] = areas[0], 2 * areas[0], areas[-1]
+    by_column[base.REST_X] = axes(sheet)[0]
+    by_column[base.HAS_LEFT] = column > 0
+    by_column[base.HAS_RIGHT] = column < layout.cols - 1
+    constants = (
+        *spacing(sheet),
+        sheet.size[0] / 2,
+        *(n for term in layout.config.terms for n in term.constants(plan)),
+    )
+    fields = np.concatenate([term.fields(plan) for term in layout.config.terms])
+    if state is not None and len(state.memory):
+        fields[layout.config.memory_fields] = state.memory
+    stiffness = layout.config.require(SpringTerm).stiffness_array(plan)
+    return InitialData(np.array(constants), by_column, fields, stiffness, state)
