@@ -100,6 +100,11 @@ class LockNumbers(NamedTuple):
     lock: float  # m: strain of a spring; of the foundation a depth [m]
     factor: float  # largest tangent stiffness, relative to the initial one
 
+    @property
+    def steepest(self) -> float:
+        """Largest tangent stiffness, relative to the initial one, for the stability limit."""
+        return self.factor
+
 
 @dataclass(frozen=True, eq=False)
 class Material:

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from taichi_msm.arithmetic import NUMPY
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import area_shares, spacing
-from taichi_msm.terms.law import LawFunctions, law_numbers
-from taichi_msm.terms.springs import MIN_SQUARED_LENGTH, spring_law, spring_stiffness
+from taichi_msm.terms.law import LawFunctions, law_numbers, spring_law
+from taichi_msm.terms.springs import MIN_SQUARED_LENGTH, spring_stiffness
 
 Array = NDArray[np.float64]
 Window = tuple[slice, slice]
@@ -91,7 +91,7 @@ def spring_families(plan: Plan) -> Iterator[SpringFamily]:
     (rows, cols), (dx, dy), material = plan.scene.sheet.points, spacing(plan.scene.sheet), plan.material
     factors = np.ones((rows - 1, cols - 1)) if material.factors is None else material.factors
     along_rows, along_columns, diagonals = spring_stiffness(material, factors)
-    law = spring_law(material).build(NUMPY)
+    law = spring_law(material.stiffening).build(NUMPY)
     # The tension of a spring at rest does not depend on the map; at an edge of tissue it is half, like the stiffness.
     shares = (np.where(np.isin(np.arange(count), (0, count - 1)), 0.5, 1.0) for count in (rows, cols))
     row_shares, column_shares = np.ix_(*shares) if material.by_area else (1.0, 1.0)

@@ -36,6 +36,7 @@ from typing import Any, ClassVar, NamedTuple
 
 from taichi_msm.arithmetic import Operations
 from taichi_msm.model.sheet import LockNumbers
+from taichi_msm.scene.sheet import Tissue
 
 # Up to this y, atanh(y) - y is computed by its series.
 MAX_SERIES_Y = 0.1
@@ -201,3 +202,14 @@ class LockingLaw(Law):
             return (k + tau) * (lock * lock) * integral(stretch / lock, end) - tau * stretch * stretch
 
         return LawFunctions(pull if tense else pull_untensed, slopes, by_numbers, energy)
+
+
+def spring_numbers(tissue: Tissue) -> LockNumbers | None:
+    """Return the numbers of the law of the springs of a tissue; None for a linear law."""
+    keys = tissue.stiffening
+    return None if keys is None else make_stiffening(keys.lock, keys.factor)
+
+
+def spring_law(numbers: LockNumbers | None) -> Law:
+    """Return the law of springs with these numbers."""
+    return LINEAR if numbers is None else LockingLaw()

@@ -32,7 +32,7 @@ from taichi_msm.model.sheet import Material, largest_mean, spacing
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.terms.base import AREA_SHARE, DX, DY, HAS_LEFT, HAS_RIGHT, KernelConfig, Term
-from taichi_msm.terms.law import LINEAR, Law, LockingLaw, law_numbers, make_stiffening
+from taichi_msm.terms.law import LINEAR, Law, law_numbers, spring_law, spring_numbers
 
 # Families of springs.
 ALONG_ROW, ALONG_COLUMN, DIAGONAL = range(3)
@@ -88,7 +88,7 @@ class SpringTerm(Term):
             "down": membrane * (9 / 8 * dx / dy - 3 / 8 * dy / dx),
             "shear": 3 / 16 * membrane * (dx * dx + dy * dy) / (dx * dy),
             "tension": tissue.pretension / (1.5 * membrane),
-            "stiffening": tissue.stiffening and make_stiffening(tissue.stiffening.lock, tissue.stiffening.factor),
+            "stiffening": spring_numbers(tissue),
         }
 
     @classmethod
@@ -101,7 +101,7 @@ class SpringTerm(Term):
             by_area=open_edges and material.by_area,
             mapped=material.factors is not None,
             tense=material.tension > 0,
-            law=spring_law(material),
+            law=spring_law(material.stiffening),
         )
 
     @staticmethod
@@ -444,14 +444,9 @@ class SpringTerm(Term):
         return np.concatenate([np.pad(np.maximum(k - k1 * material.tension, 0), pad) for k, k1, pad in families])
 
 
-def spring_law(material: Material) -> Law:
-    """Return the law of the springs."""
-    return LINEAR if material.stiffening is None else LockingLaw()
-
-
 def _unmapped_bound(material: Material) -> float:
     across, down, shear = material.across, material.down, material.shear
-    steepest = 1.0 if material.stiffening is None else material.stiffening.factor
+    steepest = 1.0 if material.stiffening is None else material.stiffening.steepest
     return steepest * 4 * max(across + down, across + 2 * shear, down + 2 * shear)
 
 
