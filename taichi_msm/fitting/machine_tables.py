@@ -308,10 +308,10 @@ def _select_columns(grid: Grid, block: _Block, chosen: dict[str, str]) -> tuple[
             scale = scale if given is None else given
             if scale is not None:
                 columns.append(_Column(index, titles[index], scale))
-        usual, known = next(iter(UNITS[quantity])), ", ".join(UNITS[quantity])
+        known = ", ".join(UNITS[quantity])
         if not columns:
             title = titles[candidates[0]]
-            fault = f'no unit of {quantity} ({known}); give it by --columns "{quantity}={title}, {usual}"'
+            fault = f'no unit of {quantity} ({known}); give it by --columns "{quantity}={title}, UNIT"'
             raise SceneError([f"{grid.place(header, candidates[0])}: {title}: {fault}"])
         best = min(columns, key=first_size)
         if (repeated := sum(column.title == best.title for column in columns)) > 1:

@@ -299,7 +299,7 @@ FAULTS: dict[str, tuple[str | bytes, list[str], list[str]]] = {
     "no names": (rows(), [], ["--columns"]),
     "no depth": (TABLE.replace("Depth", "Traverse"), [], ["csv:1", "depth", "Traverse"]),
     "names in one cell": ("time/depth/force\n" + rows(), [], ["csv:1"]),
-    "no unit": (TABLE.replace(" [mm]", ""), [], ["csv:1", "Depth", '--columns "depth=Depth, mm"']),
+    "no unit": (TABLE.replace(" [mm]", ""), [], ["csv:1", "Depth", '--columns "depth=Depth, UNIT"']),
     "other unit": (TABLE.replace("[N]", "[lbf]"), [], ["Force [lbf]", "kgf"]),
     "megaunit": (TABLE.replace("[N]", "[MN]"), [], ["Force [MN]"]),
     "repeated name": (HEADER + ";Force [N]\n" + rows(";", "{t}{s}{d}{s}{f}{s}{f}"), [], ["csv:1", "Force [N]", "2"]),
