@@ -17,6 +17,8 @@ CAMERA = re.compile(r"^(\d+)[ \t]+([A-Z_]+)[ \t]+(\d+)[ \t]+(\d+)((?:[ \t]+[-+.\
 # A line of images.txt: id, quaternion w, x, y, z and translation, camera, name.
 IMAGE = re.compile(r"^(\d+)((?:[ \t]+[-+.\deE]+){7})[ \t]+(\d+)[ \t]+(\S.*)$", re.MULTILINE)
 
+POINT_ID = re.compile(r"-1|\d+")
+
 # Models: the number of focal lengths, the lens model, and the number of its coefficients.
 MODELS = {
     "SIMPLE_PINHOLE": (1, "pinhole", 0),
@@ -57,12 +59,13 @@ def _read_images(file: CameraFile) -> Trajectory | None:
         return None
     from scipy.spatial.transform import Rotation
 
-    images = []
+    images, follows_image = [], False
     for n, line in lines:
         if (match := _image(line)) is not None:
             images.append((match[4], n, [float(word) for word in match[2].split()], match[3]))
-        elif parse_numbers(line.split()[-1:]) is None:
-            raise file.fault("neither IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME nor points", n)
+        elif not (follows_image and _has_points(line.split())):
+            raise file.fault("neither IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME nor its line of points", n)
+        follows_image = match is not None
     if len(cameras := {camera for *_, camera in images}) > 1:
         raise file.fault(f"has images of cameras {listed(sorted(cameras))}; keep those of one")
     stems = [name.rpartition(".")[0] or name for name, *_ in images]
@@ -86,6 +89,11 @@ def _read_images(file: CameraFile) -> Trajectory | None:
 def _image(line: str) -> re.Match[str] | None:
     """Match the line of an image; the last word of a line of points is a number."""
     return None if parse_numbers(line.split()[-1:]) else IMAGE.match(line)
+
+
+def _has_points(words: Sequence[str]) -> bool:
+    """Return whether a line consists of points: X, Y and a whole number each."""
+    return parse_numbers(words) is not None and len(words) % 3 == 0 and all(map(POINT_ID.fullmatch, words[2::3]))
 
 
 COLMAP_CAMERAS = CalibrationReader(

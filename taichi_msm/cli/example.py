@@ -34,7 +34,11 @@ def example(name: str | None, directory: str) -> None:
     for path, target in targets.items():
         with writing(target, "DIR"):
             target.parent.mkdir(parents=True, exist_ok=True)
-            target.write_bytes(path.read_bytes())
+            try:
+                target.write_bytes(path.read_bytes())
+            except OSError:
+                target.unlink(missing_ok=True)
+                raise
         click.echo(printable(str(target)))
     command = "sweep" if "vary" in _content(scenes[name]) else "run"
     click.echo(printable(f"next: taichi-msm {command} {shlex.quote(str(targets[scenes[name]]))}"))

@@ -189,6 +189,8 @@ def test_a_trajectory_that_cannot_be_used_is_refused(text: str, place: str, smal
         pytest.param(COLMAP.replace("-0.8", "-0.9"), {"poses_rate": 5}, id="no rotation of COLMAP"),
         pytest.param(COLMAP.replace("0.4 1 f", "0.4 2 f"), {"poses_rate": 5}, id="two cameras"),
         pytest.param(COLMAP.replace("20 15 -1\n", "20 15 x\n"), {"poses_rate": 5}, id="no points"),
+        pytest.param(COLMAP.replace("20 15 -1\n", "20 15 0.5\n"), {"poses_rate": 5}, id="no point"),
+        pytest.param(COLMAP.replace(" 0.4 1 frames/00102.jp2", ""), {"poses_rate": 5}, id="an image cut short"),
         pytest.param(COLMAP.split("\n7 ")[0], {"poses_rate": 5}, id="no images"),
         pytest.param(TUM, {"poses_rate": 5}, id="rate and times"),
         pytest.param(EUROC, {"poses_time": "ms"}, id="two units of time"),
