@@ -1,23 +1,17 @@
-"""Divergence: NaN, a mass point too far away, or more energy than the load can have supplied; and its likely cause."""
+"""Detection of divergence: NaN, a mass point too far away, or more energy than the load can have supplied."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
 from taichi_msm.accuracy.contact_warnings import first_piercing_probe
-from taichi_msm.errors import Pause
 from taichi_msm.model.loads import LoadBounds
 from taichi_msm.model.plan import Plan
-from taichi_msm.model.sheet import axes
-from taichi_msm.model.surface import to_positions
-from taichi_msm.model.tool_force import control_points, probe_force
-from taichi_msm.solver.dynamics import ForceRecorder
-from taichi_msm.solver.sheet_solver import SheetSolver
-from taichi_msm.solver.state import LargestDisplacement, Reading, RunProgress, Snapshot, largest_displacement
+from taichi_msm.model.sheet import spacing
+from taichi_msm.solver.state import LargestDisplacement, Reading, RunProgress, largest_displacement
 from taichi_msm.terms import TERMS
 from taichi_msm.terms.foundation import FoundationTerm, foundation_energy, point_shares
 from taichi_msm.terms.loads import force_norm, max_free_acceleration
@@ -88,6 +82,7 @@ class DivergenceMonitor:
         self._oscillation = ENERGY_OSCILLATION / max(1e-9, 1 - (plan.grid.step / plan.stable_step) ** 2)
         self._relaxing = sum(share for share, _ in material.relaxation)
         self._oscillation /= 1 - self._relaxing
+        self._underflow = _underflow_energy(plan)
         # Stiffness of virtual springs that are active after the last load, too [N/m].
         lasting = material.always_active and material.virtual > 0
         self._lasting_stiffness = material.virtual * point_shares(plan) if lasting else np.zeros((1, 1))
@@ -182,7 +177,7 @@ class DivergenceMonitor:
             root = math.sqrt(root * root + virtual * reach * reach)
             reach += (end - begin) * root * math.sqrt(2 / mass)
         # Rounding may add 1e-9 of the largest energy so far.
-        return self._oscillation * root * root + 1e-9 * progress.peak
+        return self._oscillation * root * root + 1e-9 * progress.peak + self._underflow
 
 
 def format_message(time: float, step: int, fault: str, *, exact: bool) -> str:
@@ -205,6 +200,16 @@ def _tool_energy_bound(plan: Plan) -> float:
         distance, speed = tool.path_length + tool.radius, tool.max_stride(step)[0] / step
         energy += (stiffness * distance * distance + material.mass * speed * speed) / 2
     return plan.fixed.size * energy
+
+
+def _underflow_energy(plan: Plan) -> float:
+    """Return the energy below which its squared terms may underflow [J]."""
+    tiny = float(np.finfo(np.float32 if plan.grid.precision == "f32" else np.float64).tiny)
+    (dx, dy), material = spacing(plan.scene.sheet), plan.material
+    inertia = material.mass / plan.grid.step**2
+    # The sums contain squares with and without a factor of stiffness.
+    springs = max(1.0, sum(term.stiffness_bound(material, plan.scene.sheet) for term in TERMS)) * (dx**2 + dy**2)
+    return math.prod(plan.scene.sheet.points) * tiny * (inertia + springs)
 
 
 def _release_time(plan: Plan) -> float:
@@ -232,85 +237,3 @@ def energy_growth_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
             "active any more: the steps are too long for springs that were pressed together, and the motion from "
             f"there on is invalid; try time.step: {plan.grid.step / 2:.6g}, press less, or take more damping"
         )
-
-
-@dataclass(frozen=True)
-class Diagnosis:
-    """Diagnosis of a divergence.
-
-    Attributes:
-        message: Time, step, mass point, likely cause and remedy.
-        last_sound_state: Last state of the run without a fault; None if it is the start.
-    """
-
-    message: str
-    last_sound_state: Snapshot | None
-
-
-def diagnose(dynamics: SheetSolver, start: Snapshot | None, pause: Pause) -> Diagnosis:
-    """Repeat a run to find the step and the mass point of its divergence.
-
-    Args:
-        dynamics: Sheet that diverged; its state afterwards is arbitrary.
-        start: Sound state to repeat the run from; None for the state of rest.
-        pause: Called several times a second; an exception from it ends the diagnosis.
-    """
-    plan, grid, bad_step = dynamics.plan, dynamics.plan.grid, dynamics.steps_done
-    recorder = ForceRecorder(plan)
-    state, progress, forces = (None, RunProgress(), recorder.at_rest()) if start is None else start[:3]
-    monitor = DivergenceMonitor(plan, progress)
-    dynamics.restart(plan, state)
-    sound, fault = dynamics.state(), ""
-    while sound.steps < bad_step:
-        dynamics.advance(min(bad_step, (monitor.progress.frame + 1) * grid.steps_per_frame) - sound.steps, pause)
-        reading = dynamics.read()
-        fault = monitor.check_frame(reading)
-        if fault:
-            break
-        if monitor.progress.frame * grid.steps_per_frame == reading.steps:
-            position = to_positions(reading.displacement, plan.scene.sheet)
-            forces = recorder.follow(forces, monitor.progress.frame, position, dynamics.tool_forces())
-        sound = dynamics.state()
-    if not fault:
-        reason = "but not when it was repeated, so the machine has made an error; continue with --resume"
-        return Diagnosis(format_message(grid.time(bad_step), bad_step, reason, exact=False), start)
-    bad_step = dynamics.steps_done
-    while bad_step - sound.steps > 1:
-        dynamics.restart(plan, sound)
-        dynamics.advance((bad_step - sound.steps) // 2, pause)
-        if monitor.check(dynamics.read()):
-            bad_step = dynamics.steps_done
-        else:
-            sound = dynamics.state()
-    dynamics.restart(plan, sound)
-    dynamics.advance(1)
-    reading = dynamics.read()
-    cause = _likely_cause(plan, largest_displacement(reading.displacement))
-    message = format_message(grid.time(bad_step), bad_step, f"{monitor.check(reading)}; {cause}", exact=True)
-    return Diagnosis(message, Snapshot(sound, monitor.progress, forces, plan.scene.probes))
-
-
-def _likely_cause(plan: Plan, point: LargestDisplacement) -> str:
-    """Describe the force that is largest at a mass point at any time, or the fastest tool, and the remedy."""
-    scene, step = plan.scene, plan.grid.step
-    if not plan.slots:
-        tool = max(plan.tools, key=lambda tool: tool.max_stride(step)[0])
-        return (
-            f"likely cause: probes.{tool.probe}.path, at up to {tool.max_stride(step)[0] / step:.3g} m/s; move the "
-            f"tool more slowly, or less far, or take a time.step below {step:.6g} s"
-        )
-    x, y = axes(scene.sheet)
-    rest = np.array([x[point.column], y[point.row, 0]])
-
-    def force(index: int) -> float:
-        probe = scene.probes[index]
-        distance = np.linalg.norm(control_points(probe, scene.sheet)[1] - rest, axis=1).min()
-        profile, load = probe_force(probe, scene.sheet), max(abs(percent) for _, percent in probe.load) / 100
-        return load * math.hypot(*profile.force) * float(profile.decay(distance))
-
-    strongest = max((index for index, probe in enumerate(scene.probes) if not probe.moved), key=force)
-    name = "force" if scene.probes[strongest].total is None else "total"
-    return (
-        f"likely cause: probes.{strongest}.{name}, which reaches {force(strongest):.3g} N at this point; take less, or "
-        f"a time.step below {step:.6g} s"
-    )

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm.accuracy import divergence
-from taichi_msm.accuracy.divergence import Diagnosis, DivergenceMonitor, diagnose
+from taichi_msm.accuracy.diagnosis import Diagnosis, diagnose
+from taichi_msm.accuracy.divergence import DivergenceMonitor
 from taichi_msm.errors import (
     ArgumentError,
     DivergedError,

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from taichi_msm import DivergedError, Simulation
-from taichi_msm.accuracy.divergence import Diagnosis, displacement_bound
+from taichi_msm.accuracy.diagnosis import Diagnosis
+from taichi_msm.accuracy.divergence import displacement_bound
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.dynamics import ForceRecorder
 from taichi_msm.solver.state import RunProgress, Snapshot, State
@@ -146,6 +147,13 @@ SOUND = {
     "a force presses it into a tool that stands": scene(
         damping=0, probes=[moved([0, 0.5, 0.5, 0.0]), {"force": [0, 0, 0.3], "falloff": 3, "offset": 0}]
     ),
+    "moves by less than f32 can square": scene(
+        sheet={"points": [9, 9], "size": [1e10, 1e10], "mass": 1},
+        springs={"structural": 1},
+        damping=0,
+        probes=[{**PLAIN, "force": [1e-13, 0, 0], "load": [[0, 100], [3, 100], [3, 0]]}],
+        time={"duration": 100, "frames_per_second": 1, "precision": "f32"},
+    ),
 }
 
 
@@ -154,6 +162,7 @@ SOUND = {
     "virtual springs begin twice in a frame, each time farther away",
     "is let go at a frame, but for rounding",
     "a tool takes it along, and lets it fly sixty times as far as it is long",
+    "moves by less than f32 can square",
 )
 @pytest.mark.parametrize("name", SOUND)
 def test_what_is_sound_is_let_pass(name: str, device: Device) -> None:
@@ -223,6 +232,19 @@ def test_a_force_that_is_too_strong_is_named(device: Device, message: Messages) 
         simulation.restore(found.last_sound_state)
         with pytest.raises(DivergedError):
             simulation.advance()
+
+
+def test_a_step_that_is_too_long_is_named(device: Device, message: Messages) -> None:
+    """Near the limit of stability, an undamped sheet that is hit hard flies apart."""
+    blow = {"force": [0, 0, -4e6], "load": [[0.1, 0], [0.1, 100]], "falloff": 60}
+    made = with_steps(pressed("f64", probes=[blow], damping=0), 9)
+    found = diagnosed(made, device).message
+    message(
+        found, "time.step, 0.00444444 s", hide=r"(?<=step )\d+|(?<=with )[.\d]+|(?<= at )[.\d]+|(?<= is )[.\d]+|\(.*?\)"
+    )
+    finer = float(re.findall(r"with ([.\d]+) s it does not diverge here", found)[0])
+    with Simulation(with_steps(made, round(1 / 25 / finer)), threads=device.threads) as simulation:
+        simulation.advance(3)
 
 
 def test_a_machine_that_makes_errors_is_told_of(device: Device, message: Messages) -> None:
