@@ -182,7 +182,9 @@ class Tile(NamedTuple):
     caption: list[str]  # unbreakable parts
 
 
-def write_contact_sheet(state: SweepState, executor: Executor, progress: StageProgressCallback) -> list[str]:
+def write_contact_sheet(
+    state: SweepState, written: list[str], executor: Executor, progress: StageProgressCallback
+) -> list[str]:
     """Write contact.jpg, if any run has a frame; arguments as of `tables.write_reports`; return warnings."""
     runs = spread(len(state.outcomes), 36)
     complete = [run for run in runs if state.outcomes[run].status == "complete"]
@@ -206,6 +208,7 @@ def write_contact_sheet(state: SweepState, executor: Executor, progress: StagePr
     sheet = _draw_tiles(tiles, _column_count(state, len(runs)), heading)
     with replacing(state.directory / "contact.jpg") as file:
         sheet.save(file, "JPEG", quality=90)
+    written.append("contact.jpg")
     return [f"contact.jpg lacks the frames of {len(errors)} runs, for example: {errors[0]}"] if errors else []
 
 

@@ -57,27 +57,28 @@ def write_reports(
     Raises:
         FilesError: when the table cannot be written.
     """
-    writers: dict[str, Callable[[SweepState], list[str]]] = {
+    writers: dict[str, Callable[[SweepState, list[str]], list[str]]] = {
         "table.parquet": write_parquet,
         "dataset.json": write_dataset,
         "contact.jpg": partial(plots.write_contact_sheet, executor=executor, progress=progress),
         "sweep.png": _write_plots,
     }
-    notes = []
+    written, notes = ["table.csv"], list[str]()
     with writing(state.directory):
         write_table(state)
-        for name in REPORT_FILES[1:]:
-            (state.directory / name).unlink(missing_ok=True)
         for name, write in writers.items():
             try:
-                notes += write(state)
+                notes += write(state, written)
             except Exception as error:
                 # A failing report must not discard hours of runs.
                 notes.append(f"{name} could not be made: {type(error).__name__}: {error}")
-    return [name for name in REPORT_FILES if (state.directory / name).exists()], notes
+        for path in (state.directory / name for name in REPORT_FILES if name not in written):
+            if not path.is_dir():
+                path.unlink(missing_ok=True)
+    return written, notes
 
 
-def _write_plots(state: SweepState) -> list[str]:
+def _write_plots(state: SweepState, written: list[str]) -> list[str]:
     """Write sensitivity.csv if there are enough runs, and sweep.png if complete runs differ; return warnings."""
     # More runs would slow down the plots without changing them visibly.
     runs = spread(len(state.outcomes), 4096)
@@ -92,6 +93,7 @@ def _write_plots(state: SweepState) -> list[str]:
         notes.append(WITHOUT_SALIB)
     if indices:
         _write_csv(state.directory / "sensitivity.csv", [indices[0]._fields, *indices])
+        written.append("sensitivity.csv")
     try:
         import matplotlib  # noqa: F401
     except ImportError:
@@ -101,6 +103,7 @@ def _write_plots(state: SweepState) -> list[str]:
     title = f"{state.sweep.scene.name}: {complete} of {len(state.outcomes)} runs complete{subset}"
     with replacing(state.directory / "sweep.png") as file:
         plots.plot(plots.PlotData(title, varied, columns, failed, indices), file)
+    written.append("sweep.png")
     return notes
 
 
@@ -112,7 +115,7 @@ def write_table(state: SweepState) -> None:
     _write_csv(state.directory / "table.csv", [list(columns), *zip(*columns.values(), strict=True)])
 
 
-def write_parquet(state: SweepState) -> list[str]:
+def write_parquet(state: SweepState, written: list[str]) -> list[str]:
     """Write table.parquet if pyarrow is installed; return no warnings."""
     try:
         import pyarrow
@@ -131,6 +134,7 @@ def write_parquet(state: SweepState) -> list[str]:
         columns[name] = pyarrow.array(columns[name], kind)
     with replacing(state.directory / "table.parquet") as file:
         parquet.write_table(pyarrow.table(columns), file)
+    written.append("table.parquet")
     return []
 
 
@@ -154,7 +158,7 @@ def csv_line(row: Iterable[Any]) -> str:
     return text.getvalue()
 
 
-def write_dataset(state: SweepState) -> list[str]:
+def write_dataset(state: SweepState, written: list[str]) -> list[str]:
     """Write dataset.json, with a line for every complete run; return no warnings."""
     sweep, complete = state.sweep, [outcome.run for outcome in state.outcomes if outcome.status == "complete"]
     common = _output_format(state.run_directory(complete[0])) if complete else {}
@@ -177,6 +181,7 @@ def write_dataset(state: SweepState) -> list[str]:
             row = {"run": run, "folder": folder, "part": splits[run], "values": values, **outputs}
             file.write((b"" if run == complete[0] else b",") + b"\n" + _json(row))
         file.write(b"\n]\n}\n")
+    written.append("dataset.json")
     return []
 
 

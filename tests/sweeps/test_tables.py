@@ -213,6 +213,29 @@ def test_without_pictures_there_is_a_note_and_no_earlier_picture(make: Make) -> 
     assert not (result.directory / "contact.jpg").exists()
 
 
+def test_an_earlier_report_stays_until_its_successor_replaces_it(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where the drawing is killed, and where other reports fail."""
+    result = make(128)
+    for name in REPORT_FILES:
+        (result.directory / name).write_text("earlier")
+
+    def kill(*arguments: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("taichi_msm.sweeps.plots.plot", kill)
+        with pytest.raises(KeyboardInterrupt):
+            write(result)
+    assert {path.name for path in result.directory.iterdir()} == {"runs", *REPORT_FILES}
+    assert (result.directory / "contact.jpg").read_text() == (result.directory / "sweep.png").read_text() == "earlier"
+    (result.directory / "sweep.png").unlink()
+    (result.directory / "sweep.png").mkdir()
+    names, notes = write(result)
+    assert names == ["table.csv", "table.parquet", "dataset.json", "sensitivity.csv"]
+    assert {path.name for path in result.directory.iterdir()} == {"runs", "sweep.png", *names}
+    assert notes[1].startswith("sweep.png could not be made: ")
+
+
 def test_without_libraries_there_are_notes(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("matplotlib", "SALib", "SALib.analyze", "pyarrow"):
         monkeypatch.setitem(sys.modules, name, None)
