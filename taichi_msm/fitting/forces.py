@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from taichi_msm.errors import SceneError
 from taichi_msm.fitting import observation
 from taichi_msm.fitting.observation import Array, Observation, ObservationModel
-from taichi_msm.fitting.tables import Row, read_text
+from taichi_msm.fitting.tables import Row, decimal_mark, read_text
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 
@@ -132,8 +132,11 @@ def read_forces(path: str | Path, sigma: float, probes: int) -> ToolForces:
     header = next((n for n, row in enumerate(grid.rows) if _is_header(row)), None)
     if header is None:
         found = [{*re.findall(r"\w+", " ".join(row).lower())} & {*COLUMNS} for row in grid.rows]
-        missing = [key for key in COLUMNS if key not in max(found, key=len)]
-        raise SceneError([f"{name}: no row names {', '.join(missing)}; {EXPECTED}"])
+        best = max(range(len(found)), key=lambda n: len(found[n]))
+        if missing := [key for key in COLUMNS if key not in found[best]]:
+            raise SceneError([f"{name}: no row names {', '.join(missing)}; {EXPECTED}"])
+        remedy = "give each name a cell, alone or with its unit in brackets, as time [s]"
+        raise SceneError([f"{grid.place(best)}: names all columns, but not in a cell each; {remedy}"])
     names, units = map(list, zip(*_titles(grid.rows[header]), strict=True))
     if repeated := [key for key in COLUMNS if names.count(key) > 1]:
         fault = f"{repeated[0]}: {names.count(repeated[0])} columns of this name; leave one"
@@ -147,19 +150,32 @@ def read_forces(path: str | Path, sigma: float, probes: int) -> ToolForces:
         _require_units(grid.place(rows.pop(0)), units)
     for n in rows:
         grid.require_names(n, header)
+        if (count := grid.counts[n]) < len(names):
+            fault = f"{count} of {len(names)} cells separated by {grid.separator} as in the header"
+            remedy = "fill the row in, with nan where nothing was measured, or delete it"
+            raise SceneError([f"{grid.place(n)}: {fault}; {remedy}"])
     cells = [(n, column) for n in rows for column in columns if column < len(grid.rows[n])]
     cells = [(n, column) for n, column in cells if grid.rows[n][column].lower() not in ("", "nan")]
+    for n, column in cells:
+        if grid.separator == "commas" and decimal_mark(text := grid.rows[n][column]) == ",":
+            fault = "a comma within a cell of a table separated by commas"
+            remedy = "leave it out of thousands, or, with decimal commas, separate cells by semicolons"
+            raise SceneError([f"{grid.place(n)}: {grid.rows[header][column]}: {text[:40]!r}, {fault}; {remedy}"])
     table = np.full((len(grid.rows), len(names)), np.nan)
     remedy = "take a number, or leave the cell empty where nothing was measured"
     for cell, (value, _) in zip(cells, grid.numbers(header, cells, remedy), strict=True):
         table[cell] = value
     table = table[np.ix_(rows, columns)]
     time, probe, force = table[:, 0], table[:, 1], table[:, 2:]
-    if not (np.isfinite(force).any() and np.isfinite(time).all()):
-        fault = "no row" if not len(time) else "no force" if np.isfinite(time).all() else "a row without a time"
+    for key, values in (("time", time), ("probe", probe)):
+        if len(absent := np.flatnonzero(np.isnan(values))):
+            raise SceneError([f"{grid.place(rows[absent[0]])}: a row without a {key}; fill it in, or delete the row"])
+    if not np.isfinite(force).any():
+        fault = "no force" if len(time) else "no row"
         raise SceneError([f"{name}: {fault}; {EXPECTED}, and numbers in them"])
-    if unknown := [index for index in probe.tolist() if index not in range(probes)]:
-        raise SceneError([f"{name}: probe: {unknown[0]:g}; the scene has {probes}, numbered from 0"])
+    for n, index in zip(rows, probe.tolist(), strict=True):
+        if index not in range(probes):
+            raise SceneError([f"{grid.place(n)}: probe: {index:g}; the scene has {probes}, numbered from 0"])
     _, kept = np.unique(table[:, :2], axis=0, return_index=True)
     for n in set(range(len(rows))) - set(kept.tolist()):
         raise SceneError([f"{grid.place(rows[n])}: a second row of {time[n]:g} s and probe {probe[n]:g}; leave one"])

@@ -224,7 +224,7 @@ def _find_candidates(row: Row, chosen: dict[str, str]) -> dict[str, list[int]]:
     """Return the columns of a header that may be each quantity."""
     found = {}
     for quantity, title in chosen.items():
-        name = _plain(_split_title(title, quantity)[0])
+        name = _plain(_split_choice(title, quantity)[0])
         same = [n for n, cell in enumerate(row) if _plain(cell) == _plain(title)]
         found[quantity] = same or [
             n for n, cell in enumerate(row) if name in (_plain(cell), _plain(_split_title(cell, quantity)[0]))
@@ -263,6 +263,13 @@ def _split_title(title: str, quantity: str) -> tuple[str, float | None]:
     return (match_[1], scale) if match_ and scale is not None else (title, None)
 
 
+def _split_choice(title: str, quantity: str) -> tuple[str, float | None]:
+    """Split a chosen title at its last comma, as `_split_title`; without a comma it has no unit."""
+    name, _, unit = (part.strip() for part in title.rpartition(","))
+    scale = _scale(quantity, unit)
+    return (name, scale) if name and scale is not None else (title, None)
+
+
 def _read_block(grid: Grid, block: _Block, chosen: dict[str, str]) -> MachineTest:
     """Read the numbers of a block."""
     columns, notes = _select_columns(grid, block, chosen)
@@ -297,7 +304,7 @@ def _select_columns(grid: Grid, block: _Block, chosen: dict[str, str]) -> tuple[
 
     selected, notes = [], []
     for quantity, candidates in _find_candidates(titles, chosen).items():
-        given, columns = _split_title(chosen.get(quantity, ""), quantity)[1], []
+        given, columns = _split_choice(chosen.get(quantity, ""), quantity)[1], []
         for index in candidates:
             scale = _split_title(titles[index], quantity)[1]
             if scale is None and index < len(units):

@@ -5,13 +5,14 @@ A text may be UTF-8, UTF-16 or Windows-1252; its separator is the one that split
 
 from __future__ import annotations
 
+import codecs
 import csv
 import datetime
 import io
 import re
 import warnings
 import zipfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -53,6 +54,7 @@ class Grid:
     sheet: str  # of a workbook; empty for a text
     rows: list[Row]  # a row ends at its last filled cell
     separator: str = ""  # name of that of a text
+    counts: Sequence[int] = ()  # of cells in each row of a text, with the empty ones at its end
     merged: frozenset[tuple[int, int]] = frozenset()  # rows and columns of cells merged with the one to their right
 
     @property
@@ -103,7 +105,7 @@ class Grid:
                     remedy = "calculate and save the workbook"
                     where += ", a formula without a saved value"
                 raise SceneError([f"{where}; {remedy}"])
-            mark = _decimal_mark(cell)
+            mark = decimal_mark(cell)
             if mark and known_mark not in ("", mark):
                 raise SceneError([f"{where}; both . and , are decimal marks in this table; take one"])
             known_mark = mark or known_mark
@@ -122,7 +124,7 @@ def read_text(name: str, is_header: Callable[[Row], bool], expected: str) -> Gri
     Raises:
         SceneError: when the file cannot be read, or is not a text.
     """
-    rows, separator = [], ""
+    rows, counts, separator = [], [], ""
     lines = re.split(r"\r\n|\r|\n", _decode(name, _read_bytes(name, expected), expected))
     for n, line in enumerate(lines):
         headers = {}
@@ -130,8 +132,10 @@ def read_text(name: str, is_header: Callable[[Row], bool], expected: str) -> Gri
             headers = {mark: row for mark in SEPARATORS if is_header(row := _split_header(line, mark))}
         if headers:
             separator = _separator(headers, lines[n + 1 :])
-        rows.append(headers[separator] if headers else _split(line, separator))
-    return Grid(name, "", rows, separator)
+        cells = headers[separator] if headers else _cells(line, separator)
+        rows.append(_stripped(cells))
+        counts.append(len(cells))
+    return Grid(name, "", rows, separator, counts)
 
 
 def read_workbook(name: str, expected: str) -> dict[str, Grid]:
@@ -176,7 +180,7 @@ def parse_number(cell: str) -> tuple[float, int] | None:
         The number, and the power of ten of its last digit; None if the cell is not a number.
     """
     text = cell.replace("\N{MINUS SIGN}", "-")
-    if (mark := _decimal_mark(text)) and GROUPS[mark].fullmatch(text):
+    if (mark := decimal_mark(text)) and GROUPS[mark].fullmatch(text):
         text = text.replace("," if mark == "." else ".", "")
     match_ = NUMBER_PATTERN.fullmatch(text.replace(",", "."))
     if match_ is None or abs(value := float(match_[0])) > MAX_MAGNITUDE:
@@ -184,7 +188,7 @@ def parse_number(cell: str) -> tuple[float, int] | None:
     return value, int(match_[3] or 0) - len(match_[1] or match_[2] or "")
 
 
-def _decimal_mark(cell: str) -> str:
+def decimal_mark(cell: str) -> str:
     """Return the last mark of a cell, or an empty text."""
     return "," if cell.rfind(",") > cell.rfind(".") else "." if "." in cell else ""
 
@@ -241,13 +245,18 @@ def _split_header(line: str, separator: str) -> Row:
 
 
 def _split(line: str, separator: str) -> Row:
-    """Split a line of text; a line before the first header, without a separator, is a cell."""
+    """Split a line of text, without empty cells at the end."""
+    return _stripped(_cells(line, separator))
+
+
+def _cells(line: str, separator: str) -> Row:
+    """Return the cells of a line of text; a line before the first header, without a separator, is a cell."""
     if separator in SPACES:
         return line.replace('"', "").split()
     if separator:
         with suppress(csv.Error):
-            return _stripped(next(csv.reader([line], delimiter=SEPARATORS[separator], skipinitialspace=True), []))
-    return _stripped([line])
+            return next(csv.reader([line], delimiter=SEPARATORS[separator], skipinitialspace=True), [])
+    return [line]
 
 
 def _read_bytes(name: str, expected: str) -> bytes:
@@ -274,7 +283,7 @@ def _decode(name: str, data: bytes, expected: str) -> str:
         encodings = ["utf-16-le" if data[1::2].count(0) > data[::2].count(0) else "utf-16-be"]
     else:
         # Windows programs of western Europe write cp1252; the numbers are ASCII in any encoding.
-        encodings = ["utf-8-sig", "cp1252"]
+        data, encodings = data.removeprefix(codecs.BOM_UTF8), ["utf-8", "cp1252"]
     for encoding in encodings:
         with suppress(UnicodeDecodeError):
             if "\0" not in (text := data.decode(encoding, "replace" if encoding == "cp1252" else "strict")):

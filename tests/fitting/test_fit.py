@@ -531,6 +531,13 @@ UNREADABLE: dict[str, str | bytes] = {
     # A German -1.234 is a thousand times as much.
     "both decimal marks": FORCES.replace(",", ";") + "0,2;0;0;0;-1.234\n",
     "millinewtons": f"{FORCES}s,-,mN,mN,mN\n0,0,0,0,1\n",
+    # One thousand two hundred and thirty-four, or a decimal comma.
+    "comma between commas": f'{FORCES}0,0,0,1,"1,234"\n',
+    "row that ends early": f"{ZEROS}0.1,0,0,0\n",
+    "row that ends early, after spaces": "time probe force_x force_y force_z\n0 0 0 0\n",
+    "no probe": f"{FORCES}0,,0,0,1\n",
+    "no such probe": f"{ZEROS}0.1,1,0,0,1\n",
+    "names not in a cell each": FORCES.replace("time", "time s") + "0,0,0,0,1\n",
     "column twice": f"{FORCES.strip()},force_z [N]\n0,0,0,0,1,2\n",
 }
 
@@ -549,9 +556,11 @@ def test_a_table_of_forces_that_cannot_be_read_is_refused(tmp_path: Path, case: 
         b'# a rig\n"time","probe","force_x","force_y","force_z"\ns,-,N,N,N\n# it begins\n"0.1","0","","","-0.5"\n',
         b"time [s];probe;force_x [N];force_y [N];force_z [N]\n0,1;0;;;-0,5\n",
         b"# time,probe,force_x,force_y,force_z\n0.1,0,,,-0.5\n",
+        b"\xef\xbb\xbftime,probe,force_x,force_y,force_z,rig\n0.1,0,,,-0.5,W\xe4ge 1, \n",
+        b"time,probe,force_z,force_x,force_y\n0.1,0,-0.5,,\n",
         b"sep=;\nA rig; of a lab\nTime;Probe;Force_X;Force_Y;Force_Z\n[s];[-];[N];[N];[N]\n0,1;0;;;-0,5\n% end\n;;;;\n",
     ],
-    ids=["quotes, units, comments", "decimal commas", "commented header", "titles"],
+    ids=["quotes, units, comments", "decimal commas", "commented header", "damaged byte", "empty cells", "titles"],
 )
 def test_tables_of_other_programs_are_understood(tmp_path: Path, data: bytes) -> None:
     (tmp_path / "forces.csv").write_bytes(data)

@@ -324,6 +324,10 @@ FAULTS: dict[str, tuple[str | bytes, list[str], list[str]]] = {
     "column without a name": (TABLE, ["depth="], ["--columns", "depth="]),
     "column chosen twice": (TABLE, ["depth=Depth", "depth=Time"], ["--columns", "depth"]),
     "missing column": (TABLE, ["depth=Traverse, mm"], ["csv:1", "Traverse"]),
+    "time of another unit": (TABLE.replace("[s]", "[ms]"), ["time=Time [s]"], ["csv:1", "Time [s]"]),
+    "depth of another unit": (TABLE.replace("[mm]", "[cm]"), ["depth=Depth [mm]"], ["csv:1", "Depth [mm]"]),
+    "force of another unit": (TABLE.replace("[N]", "(kN)"), ["force=Force (N)"], ["csv:1", "Force (N)"]),
+    "other unit after a space": (TABLE.replace("[N]", "(kN)"), ["force=Force N"], ["csv:1", "Force N"]),
     "unknown unit": (TABLE, ["depth=Depth, in"], ["csv:1", "Depth, in", "mm"]),
     "column for two quantities": (TABLE, ["depth=Force [N], mm"], ["csv:1", "force"]),
 }
