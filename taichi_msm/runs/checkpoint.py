@@ -113,7 +113,7 @@ def read_manifest(directory: Path) -> tuple[Manifest, Plan]:
 
     Raises:
         DamagedError: when the manifest is damaged or its scene cannot be run.
-        FilesError: when there is no unfinished run.
+        FilesError: when there is no unfinished run, or one of an earlier version of the program.
         SceneError: when a map of the scene cannot be read.
     """
     path = directory / STAGING_FOLDER / CHECKPOINT_FOLDER / STATE_FILE
@@ -163,8 +163,11 @@ def input_digests(plan: Plan) -> dict[str, str]:
 
 
 def _open_state(directory: Path) -> BinaryIO:
-    """Open the state of the unfinished run in a directory; raise an OSError or a ForeignError without one."""
+    """Open the state of the unfinished run in a directory; raise an OSError or a FilesError without one."""
     checkpoint = require_kind(require_kind(directory / STAGING_FOLDER, FOLDER) / CHECKPOINT_FOLDER, FOLDER)
+    if (checkpoint / "manifest.json").exists():
+        problem = "is of an earlier version of the program"
+        raise FilesError(f"{checkpoint} {problem}; run the scene again, or continue with that version")
     return require_kind(checkpoint / STATE_FILE, FILE).open("rb")
 
 

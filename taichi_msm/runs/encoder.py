@@ -96,6 +96,7 @@ class PictureWriter:
             frame.result()
         self._video_executor.submit(self._close_videos).result()
         # An interruption of `add` may leave stills without a frame of the videos.
+        self._still_executor.shutdown()
         for number in range(self._frames, self._added_frames):
             for path in self._job.still_paths(number):
                 path.unlink(missing_ok=True)
@@ -218,8 +219,9 @@ class Encoder:
 def main() -> None:
     """Run the child process: read a job and its pictures from stdin, write the report to stdout."""
     result: EncodingReport | Exception
-    # A SIGTERM to all processes of a service is ignored here: the parent closes the stream when it ends.
+    # Signals to all processes of a service are ignored here: the parent closes the stream when it ends.
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         result = _encode_stream()
     except (OSError, FilesError) as error:

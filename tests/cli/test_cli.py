@@ -196,9 +196,10 @@ def test_a_signal_keeps_the_frames_so_far(
         process.until("frames", 9)
         assert len(children(process.pid)) == (threads != "1")
         if number == signal.SIGTERM:
-            # A service's processes all get it, the encoder too.
+            # A service's processes all get it, the encoder too, and all of a terminal Ctrl-C.
             for child in children(process.pid):
                 os.kill(child, number)
+                os.kill(child, signal.SIGINT)
         process.send_signal(number)
         _, error = process.communicate(timeout=60)
     assert process.returncode == code

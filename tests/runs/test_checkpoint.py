@@ -9,16 +9,17 @@ import zipfile
 from collections.abc import Callable
 from operator import methodcaller
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import pytest
 
-from taichi_msm.errors import DamagedError
-from taichi_msm.runs.checkpoint import FRAMES_FILE, STATE_FILE, Checkpoint, Manifest, read_manifest
+from taichi_msm.errors import DamagedError, FilesError
+from taichi_msm.runs.checkpoint import FRAMES_FILE, STATE_FILE, Checkpoint, Manifest, is_unfinished, read_manifest
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.state import PeakForce, ProbeForces, RunProgress, Snapshot, State, TipForce
 from tests.golden import Messages
+from tests.outputs import files
 from tests.scenes import plan_of, scene
 
 FRAMES = 3
@@ -242,3 +243,30 @@ def test_a_forged_plan_is_refused(out: Path, message: Messages) -> None:
             read_manifest(out)
         errors.add(str(caught.value))
     message(sorted(errors))
+
+
+def test_a_state_that_is_cut_short_leaves_the_one_before(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(file: BinaryIO, arrays: object) -> None:
+        file.write(b"PK")
+        raise OSError
+
+    before = read(out)
+    checkpoint = checkpoint_in(out)
+    checkpoint.reopen()
+    monkeypatch.setattr("taichi_msm.runs.checkpoint.write_arrays", full)
+    with pytest.raises(OSError):  # noqa: PT011
+        checkpoint.save(state())
+    checkpoint.close()
+    assert read(out) == before
+
+
+def test_a_checkpoint_of_an_earlier_version_is_named(out: Path, message: Messages) -> None:
+    folder = out / ".partial" / "checkpoint"
+    repacked(folder / STATE_FILE, lambda arrays: arrays.pop("manifest"))
+    for name in ("manifest.json", "positions", "forces"):
+        (folder / name).touch()
+    before = files(out)
+    with message.raises(FilesError):
+        read_manifest(out)
+    assert not is_unfinished(out)
+    assert files(out) == before

@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm.errors import FilesError
-from taichi_msm.render.labels import FrameOutputs
+from taichi_msm.render.labels import Flow, FrameOutputs
 from taichi_msm.runs import media
-from taichi_msm.runs.encoder import Encoder
+from taichi_msm.runs.checkpoint import is_unfinished
+from taichi_msm.runs.encoder import Encoder, PictureWriter
 from taichi_msm.runs.writer import ResultWriter
 from taichi_msm.scene.scene import Scene
 from tests.golden import Messages
@@ -69,10 +70,16 @@ def picture(frame: int) -> NDArray[np.uint8]:
     return speckle(HEIGHT, WIDTH, frame)
 
 
+def observed(frame: int) -> dict[str, FrameOutputs]:
+    """A picture and a label."""
+    flow = Flow(np.full((HEIGHT, WIDTH, 2), frame, np.float32), np.zeros((HEIGHT, WIDTH), np.uint8))
+    return {"": FrameOutputs(picture(frame), flow=flow)}
+
+
 def write(directory: Path, frames: int, scene: Scene, *, beside: bool = True) -> list[str]:
     with ResultWriter(directory, plan_of(scene), encode_in_subprocess=beside) as writer:
         for frame in range(frames):
-            writer.add(position(frame), {"": FrameOutputs(picture(frame) if scene.draws else None)})
+            writer.add(position(frame), observed(frame) if scene.draws else {"": FrameOutputs()})
         names: list[str] = writer.publish({})["outputs"]
         assert writer.frames == frames
         assert 0 < writer.encode_seconds < 60 or not scene.draws
@@ -180,17 +187,17 @@ def test_an_interrupted_hand_over_leaves_whole_frames(
         add(encoder, pictures[:, :rows])
         raise KeyboardInterrupt
 
-    add = Encoder.add
-    with ResultWriter(tmp_path / "interrupted", plan_of(small_scene())) as writer:
-        writer.add(position(0), {"": FrameOutputs(picture(0))})
+    add, made = Encoder.add, small_scene("png", "gif", "trajectory", "flow")
+    with ResultWriter(tmp_path / "interrupted", plan_of(made)) as writer:
+        writer.add(position(0), observed(0))
         with monkeypatch.context() as patch:
             patch.setattr(Encoder, "add", interrupted)
             with pytest.raises(KeyboardInterrupt):
-                writer.add(position(1), {"": FrameOutputs(picture(1))})
+                writer.add(position(1), observed(1))
         writer.finish()
         assert writer.frames == frames
         writer.publish({})
-    write(tmp_path / "whole", frames, small_scene())
+    write(tmp_path / "whole", frames, made)
     assert files(tmp_path / "interrupted") == files(tmp_path / "whole")
 
 
@@ -224,6 +231,33 @@ def test_an_interruption_while_a_picture_is_encoded_here_leaves_whole_frames(
         frames = writer.frames
     write(tmp_path / "whole", frames, small_scene())
     assert files(tmp_path / "interrupted") == files(tmp_path / "whole")
+
+
+def test_an_interruption_between_still_and_film_leaves_whole_frames(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with ResultWriter(tmp_path / "interrupted", plan_of(small_scene()), encode_in_subprocess=False) as writer:
+        writer.add(position(0), observed(0))
+        assert isinstance(writer._encoder, PictureWriter)
+        with monkeypatch.context() as patch:
+            patch.setattr(writer._encoder._video_executor, "submit", interrupted)
+            with pytest.raises(KeyboardInterrupt):
+                writer.add(position(1), observed(1))
+        writer.publish({})
+    write(tmp_path / "whole", 1, small_scene())
+    assert files(tmp_path / "interrupted") == files(tmp_path / "whole")
+
+
+def test_a_run_whose_results_are_published_is_not_gone_on_with(tmp_path: Path) -> None:
+    """Not even when it is killed before its checkpoint is deleted."""
+    with ResultWriter(tmp_path, plan_of(small_scene()), {}) as writer:
+        writer.add(position(0), observed(0))
+        assert is_unfinished(tmp_path)
+        writer.publish({"status": "complete"})
+        assert not is_unfinished(tmp_path)
 
 
 def test_ctrl_c_does_not_reach_the_encoder(tmp_path: Path) -> None:
