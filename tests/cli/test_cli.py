@@ -196,7 +196,7 @@ def test_a_signal_keeps_the_frames_so_far(
         process.until("frames", 9)
         assert len(children(process.pid)) == (threads != "1")
         if number == signal.SIGTERM:
-            # A service's processes all get it, the encoder too, and all of a terminal Ctrl-C.
+            # A service's processes all get it, the encoder too, which ignores SIGINT likewise.
             for child in children(process.pid):
                 os.kill(child, number)
                 os.kill(child, signal.SIGINT)

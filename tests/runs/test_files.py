@@ -22,7 +22,7 @@ from PIL import Image
 
 from taichi_msm.errors import FilesError
 from taichi_msm.render.labels import Flow, FrameOutputs
-from taichi_msm.runs import media
+from taichi_msm.runs import encoder, media
 from taichi_msm.runs.checkpoint import is_unfinished
 from taichi_msm.runs.encoder import Encoder, PictureWriter
 from taichi_msm.runs.writer import ResultWriter
@@ -236,16 +236,26 @@ def test_an_interruption_while_a_picture_is_encoded_here_leaves_whole_frames(
 def test_an_interruption_between_still_and_film_leaves_whole_frames(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Even if the still is written late."""
+
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
+    def write_late(*arguments: Any) -> float:
+        time.sleep(0.1)
+        return write_still(*arguments)
+
+    write_still = encoder._write_still
     with ResultWriter(tmp_path / "interrupted", plan_of(small_scene()), encode_in_subprocess=False) as writer:
         writer.add(position(0), observed(0))
         assert isinstance(writer._encoder, PictureWriter)
         with monkeypatch.context() as patch:
             patch.setattr(writer._encoder._video_executor, "submit", interrupted)
+            patch.setattr(encoder, "_write_still", write_late)
             with pytest.raises(KeyboardInterrupt):
                 writer.add(position(1), observed(1))
+        writer.finish()
+        time.sleep(0.2)
         writer.publish({})
     write(tmp_path / "whole", 1, small_scene())
     assert files(tmp_path / "interrupted") == files(tmp_path / "whole")
