@@ -129,6 +129,9 @@ def read_manifest(directory: Path) -> tuple[Manifest, Plan]:
         # The current directory may be another one.
         manifest = replace(manifest, scene=manifest.scene.with_pictures(partial(os.path.join, manifest.folder)))
     except Exception:  # zipfile raises almost any type for a forged archive
+        if path.with_name("manifest.json").exists():
+            problem = "is of an earlier version of the program"
+            raise FilesError(f"{path} {problem}; run the scene again, or continue with that version") from None
         raise _damaged(path) from None
     plan, problems = try_plan(manifest.scene)
     if unreadable := [str(problem) for problem in problems if problem.path[-1:] == ("image",)]:
@@ -163,11 +166,8 @@ def input_digests(plan: Plan) -> dict[str, str]:
 
 
 def _open_state(directory: Path) -> BinaryIO:
-    """Open the state of the unfinished run in a directory; raise an OSError or a FilesError without one."""
+    """Open the state of the unfinished run in a directory; raise an OSError or a ForeignError without one."""
     checkpoint = require_kind(require_kind(directory / STAGING_FOLDER, FOLDER) / CHECKPOINT_FOLDER, FOLDER)
-    if (checkpoint / "manifest.json").exists():
-        problem = "is of an earlier version of the program"
-        raise FilesError(f"{checkpoint} {problem}; run the scene again, or continue with that version")
     return require_kind(checkpoint / STATE_FILE, FILE).open("rb")
 
 
