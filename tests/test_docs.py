@@ -297,7 +297,8 @@ def test_the_fit_shown_is_what_it_finds(
         return re.sub(r"31, ?31", points, text)
 
     shown, unseen = (block.splitlines() for block in blocks(DOCS / "fit.md", "text"))
-    seen, found, pressed, _, with_forces = ([smaller(word) for word in words] for words in commands(DOCS / "fit.md"))
+    typed = ([smaller(word) for word in words] for words in commands(DOCS / "fit.md") if "beef.yaml" not in words)
+    seen, found, pressed, _, with_forces = typed
     assert program(*seen, "--no-estimate").returncode == 0
     done = program(*found)
     assert done.returncode == 0
