@@ -115,8 +115,8 @@ class PathDependence:
             yield (
                 f"path-dependent at {frame / self._plan.grid.frames_per_second:.6g} s, frame {frame}: {description} "
                 f"{100 * distance / self._largest:.2g} % of the largest displacement: there are several equilibria "
-                "under one load, as the sheet buckles, wrinkles or slips off a tool, and what was found holds for this "
-                f"way of loading alone; {remedy} may leave one equilibrium"
+                "under one load, as the sheet buckles, wrinkles or slips off a tool, and the result holds for this "
+                f"loading path only; {remedy} may leave one equilibrium"
             )
 
 

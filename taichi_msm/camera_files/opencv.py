@@ -83,7 +83,7 @@ def read_camera(keys: Keys) -> Calibration:
         raise file.fault(f"{fault}; found {keys}; {remedy}")
     size = _size(keys)
     if names := keys.unread(UNSUPPORTED):
-        fault = f"{listed(names)}: not understood, and may change what the camera sees"
+        fault = f"{listed(names)}: not understood, and may change the picture"
         raise file.fault(f"{fault}; found {keys}; {_REMEDY}, or remove what does not matter")
     model, values = ("pinhole", []) if model == NO_DISTORTION else (model, values or [])
     lens = _coefficients(file, model, [*xi, *values] if model == "omnidir" else values)

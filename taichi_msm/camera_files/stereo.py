@@ -34,7 +34,7 @@ def _cameras(file: CameraFile) -> Sequence[Keys]:
 
 
 def _pose(keys: Keys) -> StereoPose | None:
-    """Read R and T, beside which nothing may state another unit or pose."""
+    """Read R and T; other keys must not contradict their unit or pose."""
     if names := keys.unread(r"units?|[rt]c?m+|rt|extrinsics?"):
         fault = f"{listed(names)}: not understood; write R, 3 x 3, and T, 3 numbers"
         raise keys.file.fault(f"{fault}, in metres, or set calibration_unit: mm, and remove these")

@@ -216,7 +216,7 @@ class Draft:
             self.problems.append((origin, problem))
 
     def resolve_path(self, key: Key, folder: Path) -> None:
-        """Make the path of a file, relative to a folder, relative to the current directory.
+        """Convert the path of a file from relative to a folder to relative to the current directory.
 
         A path that is neither in the folder nor in an override is a problem, and so is a camera's file that is missing.
         """

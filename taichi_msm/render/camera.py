@@ -54,7 +54,7 @@ class View(NamedTuple):
     pinhole: bool  # whether the projection is perspective
     lens: Lens | None = None
     baseline: float = 0.0  # distance to the companion of a parallel stereo pair, along the x axis [m]
-    companion: View | None = None  # the first camera that is `beside` this one
+    companion: View | None = None  # the other camera of a stereo pair, the first whose `beside` names this one
     light_view: View | None = None  # the camera at the light; None if it is this one
 
     @property

@@ -32,7 +32,7 @@ class Film:
     The constructor and the methods raise a FilesError when the film cannot be written.
 
     Args:
-        path: the film, .gif or .mp4, beside which the folder is.
+        path: the film, .gif or .mp4; the hidden folder is in its folder.
         option: name of the option in messages.
         render: has the size and background of the pictures.
         rate: frames of the session per second.
