@@ -137,12 +137,6 @@ def evaluate_frame_loads(plan: Plan, frame: int) -> Schedule:
     return loads._replace(active=np.array([float(plan.material.always_active or pressed)]))
 
 
-def keyframe_times(scene: Scene) -> Array:
-    """Return the keyframe times between 0 and the end of the scene [s], between which the loads are smooth."""
-    times = _all_key_times(scene)
-    return times[(times > 0) & (times < scene.time.duration)]
-
-
 def _all_key_times(scene: Scene) -> Array:
     keys: list[Any] = [[]]
     for probe in scene.probes:

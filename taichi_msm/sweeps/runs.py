@@ -303,7 +303,7 @@ _OUTCOME = TypeAdapter(Outcome)
 
 
 def _outcome_from_record(run: int, record: Mapping[str, Any]) -> Outcome:
-    """Extract the outcome of a run from its run.json; ValueError, KeyError, ...: it was not written by a run."""
+    """Extract the outcome of a run from its run.json; raise any exception if no run wrote it."""
     estimate = record["error_estimate"] or {}
     return _OUTCOME.validate_python(
         {

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import quad
 
-from taichi_msm.model.loads import LoadBounds, average_loads, evaluate_loads, keyframe_times
+from taichi_msm.model.loads import LoadBounds, average_loads, evaluate_loads
 from taichi_msm.model.plan import probe_slots
 from taichi_msm.scene.scene import Scene
 from tests.scenes import PRESS, SPRINGS, plan_of, scene
@@ -214,14 +214,6 @@ def test_a_control_point_that_jumps_a_thousand_times_has_few_places() -> None:
     across = [n / 5 + 0.04 * ((n + 1) / 7 - n / 5) for n in (1, 2)]
     np.testing.assert_allclose(loads.point[:, 0, 0], (np.array(across) - 0.5) * 0.4)
     np.testing.assert_allclose(sum(between.strength[0, :2, 2]), 8, rtol=1e-12)
-
-
-def test_keys() -> None:
-    load = [[-1, 0], [0, 0], [0.1, 50], [0.1, 100], [0.3, 100], [0.5, 0], [0.7, 0], [2, 1]]
-    at = [[0, 0, 0], [0.25, 0, 1], [0.25, 1, 1], [0.6, 1, 0]]
-    made = scene(springs=SOFT, probes=[{"force": [0, 0, 8], "load": load, "at": at}], time=STEPS)
-    np.testing.assert_allclose(keyframe_times(made), [0.1, 0.25, 0.3, 0.5, 0.6, 0.7])
-    assert keyframe_times(scene(probes=[])).size == 0
 
 
 def within(made: Scene, begin: float, end: float) -> tuple[float, bool, int]:
