@@ -28,12 +28,15 @@ CAMERAS = pytest.mark.parametrize("camera", ["top", "oblique", NEAR], ids=["top"
 
 
 def look(
-    made: Scene, position: Array, names: Collection[str] = requested_labels(()), rods: Sequence[Solid] | None = None
+    made: Scene,
+    position: Array,
+    names: Collection[str] = requested_labels(()),
+    instruments: Sequence[Solid] | None = None,
 ) -> Labels:
     """Labels of these names, with the instruments of the scene by default."""
     config = drawing_config(made, picture=False, labels=names)
-    placed = place_instruments(made, position, 0) if rods is None else rods
-    found = Rasterizer(made, np.zeros((1, 1, 3), np.uint8), config).look(position, rods=placed).labels
+    placed = place_instruments(made, position, 0) if instruments is None else instruments
+    found = Rasterizer(made, np.zeros((1, 1, 3), np.uint8), config).look(position, instruments=placed).labels
     assert found is not None
     return found
 

@@ -43,7 +43,7 @@ def dented(made: Scene, seed: int = 1) -> NDArray[np.float64]:
 
 
 def with_instruments(made: Scene) -> Scene:
-    """Two rods, one of which lies almost along the view from the top."""
+    """Two instruments, one of which lies almost along the view from the top."""
     probes = [
         {"force": [0, 0, -1], "at": [0.4, 0.4], "instrument": {"radius": 0.02, "shaft": [1, -0.4, 0.7], "length": 0.2}},
         {"force": [0, 0, -1], "at": [0.7, 0.8], "instrument": {"radius": 0.03, "shaft": [0, 0.01, 1], "length": 0.05}},
@@ -57,15 +57,15 @@ def difference(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> NDArray[np.int_]:
 
 
 def drawn_as_by_the_twin(
-    made: Scene, position: NDArray[Any], texture: NDArray[np.uint8], rods: Sequence[Solid] = ()
+    made: Scene, position: NDArray[Any], texture: NDArray[np.uint8], instruments: Sequence[Solid] = ()
 ) -> NDArray[np.uint8]:
     """The picture, which is the twin's.
 
     A vertex is off by 1/512 px where it is snapped, which moves a silhouette past few pixel centres; elsewhere f32 puts
     a vertex of a 97-pixel picture at 97 x 2^-24 px, and the speckle changes by at most 255 in 2 px.
     """
-    drawn = Rasterizer(made, texture).draw(position, rods=rods)
-    apart = difference(drawn, reference.draw(made, position, texture, rods))
+    drawn = Rasterizer(made, texture).draw(position, instruments=instruments)
+    apart = difference(drawn, reference.draw(made, position, texture, instruments))
     assert (apart > 1).mean() < 0.005
     assert (apart == 1).mean() < 0.01
     return drawn
@@ -142,8 +142,8 @@ def assert_alike_in_other_tiles(made: Scene, texture: NDArray[np.uint8], positio
     """Pictures and labels have the same bits if so many pixels are drawn at a time; labels have one sample a pixel."""
     config = drawing_config(made, labels=LABELS if made.render.supersample == 1 else ())
     placed = place_instruments(made, position, 0)
-    expected = Rasterizer(made, texture, config).look(position, rods=placed)
-    other = Rasterizer(made, texture, config._replace(lanes=lanes)).look(position, rods=placed)
+    expected = Rasterizer(made, texture, config).look(position, instruments=placed)
+    other = Rasterizer(made, texture, config._replace(lanes=lanes)).look(position, instruments=placed)
     np.testing.assert_array_equal(other.picture, expected.picture)
     for label, same in zip(other.labels or (), expected.labels or (), strict=True):
         np.testing.assert_array_equal(label, same)
@@ -191,15 +191,15 @@ def test_launches_do_not_change_the_bits(parts: int, device: Device, monkeypatch
 
     monkeypatch.setattr(launches.Launches, "launch", counted)
     monkeypatch.setattr(gpu, "build_bins", shuffled)
-    pictures = [Rasterizer(made, texture, config).draw(position, rods=placed)]
+    pictures = [Rasterizer(made, texture, config).draw(position, instruments=placed)]
     few = len(begun)
     monkeypatch.setattr(launches, "MAX_ROUNDS", launches.RESERVED_ROUNDS + 250)
     monkeypatch.setattr(launches, "VULKAN_THREADS", 700)
     monkeypatch.setattr(gpu, "VULKAN_THREADS", 700)
     monkeypatch.setattr(gpu, "MAX_PARTS", parts)
-    pictures += [Rasterizer(made, texture, config).draw(position, rods=placed) for _ in range(3)]
+    pictures += [Rasterizer(made, texture, config).draw(position, instruments=placed) for _ in range(3)]
     assert len(begun) > 30 * few
-    expected = Rasterizer(made, texture).draw(position, rods=placed)
+    expected = Rasterizer(made, texture).draw(position, instruments=placed)
     for picture in pictures:
         np.testing.assert_array_equal(picture, expected)
 
@@ -212,10 +212,10 @@ def test_the_bound_of_a_thread_is_asserted(device: Device, monkeypatch: pytest.M
     position = np.random.default_rng(4).normal(0, 0.2, (4, 4, 3))
     drawing = Rasterizer(made, speckle(8, 8), drawing_config(made)._replace(lanes=1))
     monkeypatch.setattr(gpu, "MAX_PARTS", 1)
-    drawing.draw(position, rods=place_instruments(made, position, 0))
+    drawing.draw(position, instruments=place_instruments(made, position, 0))
     monkeypatch.setattr(launches, "MAX_ROUNDS", launches.RESERVED_ROUNDS + 3 * 2 * 65**2)
     with pytest.raises(AssertionError):
-        drawing.draw(position, rods=place_instruments(made, position, 0))
+        drawing.draw(position, instruments=place_instruments(made, position, 0))
 
 
 @pytest.mark.default_cases("headlight-oblique")

@@ -190,12 +190,12 @@ def looks(made: Scene, texture: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
     placed = place_instruments(made, position, 0)
     found = Rasterizer(
         made, texture, drawing_config(made, labels=requested_labels(()) if made.render.supersample == 1 else ())
-    ).look(position, rods=placed)
+    ).look(position, instruments=placed)
     seen: dict[str, NDArray[Any]] = {"picture": np.asarray(found.picture)}
     labels = found.labels
     if labels is None:  # Several samples a pixel.
         config = drawing_config(made, picture=False, labels=requested_labels(()))
-        labels = Rasterizer(made, texture, config).look(position, rods=placed).labels
+        labels = Rasterizer(made, texture, config).look(position, instruments=placed).labels
     assert labels is not None
     seen |= {name: value for name, value in labels._asdict().items() if value.size}
     moved = position + np.array([0.002, 0.001, 0])
