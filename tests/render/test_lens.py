@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import product
 from typing import Any
 
 import cv2
@@ -19,8 +18,6 @@ from taichi_msm.render import tracking, uniforms
 from taichi_msm.render.camera import calibration, view
 from taichi_msm.render.lens import Lens
 from taichi_msm.render.picking import pick
-from taichi_msm.render.rasterizer import Rasterizer
-from taichi_msm.render.tracking import compute_flow, locate_points
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.golden import Messages
@@ -68,12 +65,6 @@ LENSES: dict[str, dict[str, Any]] = {
         "outside": "background",
     },
 }
-
-
-def cases(*default: tuple[Any, ...], **values: Any) -> pytest.MarkDecorator:
-    """All combinations of parameters, of which only some are not slow: kernels take seconds to compile."""
-    marks = {case: () if case in default else pytest.mark.slow for case in product(*values.values())}
-    return pytest.mark.parametrize(",".join(values), [pytest.param(*case, marks=mark) for case, mark in marks.items()])
 
 
 def scene_with_lens(lens: str, **render: Any) -> Scene:
@@ -244,8 +235,9 @@ def test_lanes_do_not_change_the_bits(lens: str, lanes: int, device: Device) -> 
         assert_same_bits_with_lanes(made, texture, folded(made), lanes)
 
 
-@pytest.mark.default_cases("endoscope-folded", "fisheye-folded")
-@cases(("fold", crumpled), *((lens, folded) for lens in LENSES), lens=LENSES, shape=(dented, folded, crumpled))
+# Kernels take seconds to compile.
+@pytest.mark.default_cases("endoscope-folded", "fold-crumpled", "fisheye-folded")
+@pytest.mark.parametrize(("lens", "shape"), [*((lens, folded) for lens in LENSES), ("fold", crumpled)])
 def test_labels_match_the_twin_and_picking(lens: str, shape: Any, device: Device) -> None:
     made = scene_with_lens(lens)
     position = shape(made)
@@ -258,43 +250,15 @@ def test_labels_match_the_twin_and_picking(lens: str, shape: Any, device: Device
             np.testing.assert_allclose(picked, coordinates, atol=1e-5)
 
 
-@cases(
-    *((lens, folded, None) for lens in ("endoscope", "fold", "rational", "fisheye", "pincushion")),
-    *((lens, crumpled, 1) for lens in ("fold", "fisheye")),
-    lens=LENSES,
-    shape=(folded, crumpled),
-    lanes=(None, 1),
-)
-def test_tracks_match_the_twin(
-    lens: str, shape: Any, lanes: int | None, device: Device, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.default_cases(*(f"{lens}-False" for lens in ("endoscope", "fold", "rational", "fisheye")), "fisheye-True")
+@pytest.mark.parametrize("gpu_kernels", [False, True])
+@pytest.mark.parametrize("lens", LENSES)
+def test_tracks_match_the_twin(lens: str, gpu_kernels: bool, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    if gpu_kernels:
+        monkeypatch.setattr(tracking, "lanes", lambda precision: 1)
     made = scene_with_lens(lens)
-    if lanes:
-        monkeypatch.setattr(tracking, "lanes", lambda precision: lanes)
-    assert_tracks_match_twin(made, shape(made))
-
-
-def test_labels_beyond_the_limit(device: Device) -> None:
-    camera = {"eye": [0, 0, 0.1], "intrinsics": INTRINSICS, **LENSES["fold"]}
-    made = drawable(camera=camera, background=[10, 20, 30])
-    position = rest_positions(made.sheet)
-    # 0.0816 m of the sheet are visible up to 0.816 from the axis, and with distortion sqrt(8 / 27).
-    labels = draw_labels(made, position)
-    y, x = np.mgrid[:60, :80]
-    radius, rim = np.hypot((x - 37) / 60, (y - 31) / 62), np.sqrt(8 / 27)
-    assert not np.isnan(labels.coordinates[radius < rim - 0.01]).any()
-    assert np.isnan(labels.coordinates[radius > rim]).all()
-    assert (labels.depth[radius > rim] == 0).all()
-    picture = Rasterizer(made, speckle(9, 9)).draw(position)
-    assert (picture[radius > rim] == [10, 20, 30]).all()
-    # Points beyond the limit have no second projection.
-    flow, occlusion = compute_flow(made, labels.coordinates, position + np.array([0.05, 0, 0]), view(made))
-    lost: NDArray[np.bool_] = np.all(flow > 1e9, axis=-1)
-    assert (occlusion[lost & ~np.isnan(labels.coordinates[..., 0])] == 255).all()
-    assert lost[31, 68]
-    tracks = locate_points(made, np.array([[0.5, 0.5], [0.99, 0.5]]), position, view(made))
-    np.testing.assert_array_equal(np.isnan(tracks.pixels[:, 0]), [False, True])
-    np.testing.assert_array_equal(tracks.hidden, [False, True])
+    for shape in (folded, crumpled):
+        assert_tracks_match_twin(made, shape(made))
 
 
 def test_lens_with_zero_coefficients_is_ignored() -> None:

@@ -128,22 +128,15 @@ def test_lossless_formats(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert problems(name) == []
 
 
+# By EXIF orientation, from 1.
+UPRIGHT = [COLOURS, COLOURS[:, ::-1], COLOURS[::-1, ::-1], COLOURS[::-1], COLOURS.swapaxes(0, 1)]
+UPRIGHT += [np.rot90(COLOURS, -1), COLOURS[::-1, ::-1].swapaxes(0, 1), np.rot90(COLOURS)]
+
+
 @pytest.mark.parametrize("name", ["a.png", "a.tif", "a.webp"])
-@pytest.mark.parametrize(
-    ("orientation", "upright"),
-    [
-        (1, COLOURS),
-        (2, COLOURS[:, ::-1]),
-        (3, COLOURS[::-1, ::-1]),
-        (4, COLOURS[::-1]),
-        (5, COLOURS.swapaxes(0, 1)),
-        (6, np.rot90(COLOURS, -1)),
-        (7, COLOURS[::-1, ::-1].swapaxes(0, 1)),
-        (8, np.rot90(COLOURS)),
-    ],
-)
-def test_exif_orientation(name: str, orientation: int, upright: NDArray[np.uint8]) -> None:
-    exif = Image.Exif()
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_exif_orientation(name: str, orientation: int) -> None:
+    exif, upright = Image.Exif(), UPRIGHT[orientation - 1]
     exif[ORIENTATION] = orientation
     Image.fromarray(COLOURS).save(name, exif=exif, lossless=True)
     assert_texture(name, upright)
