@@ -90,11 +90,11 @@ class Rasterizer:
         Raises:
             DeviceError: when the device ended a thread early.
         """
-        picture = self.look(position, camera, instruments).picture
+        picture = self.render(position, camera, instruments).picture
         assert picture is not None
         return picture
 
-    def look(
+    def render(
         self, position: NDArray[Any], camera: View | None = None, instruments: Sequence[Solid] = ()
     ) -> FrameOutputs:
         """Draw the picture, the labels or both, as configured.

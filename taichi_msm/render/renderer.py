@@ -183,7 +183,7 @@ class Renderer:
         observed = FrameOutputs()
         if scene.draws:
             labels = requested if scene.labels_pixels and is_single_sample else frozenset[str]()
-            observed = self._rasterizer(picture=True, labels=labels, camera=shot.view).look(*shot)
+            observed = self._rasterizer(picture=True, labels=labels, camera=shot.view).render(*shot)
         if scene.labels_pixels and observed.labels is None:
             observed = observed._replace(labels=self._labels(shot, requested))
         if observed.labels is not None and scene.asks_for("stereo") and shot.view.companion is not None:
@@ -208,7 +208,7 @@ class Renderer:
         return Stereo(disparity, *compute_stereo(self.scene, labels, *shot))
 
     def _labels(self, shot: Shot, names: Collection[str]) -> Labels:
-        labels = self._rasterizer(picture=False, labels=names, camera=shot.view).look(*shot).labels
+        labels = self._rasterizer(picture=False, labels=names, camera=shot.view).render(*shot).labels
         assert labels is not None
         return labels
 

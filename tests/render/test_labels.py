@@ -36,7 +36,7 @@ def draw_labels(
     """Labels of these names, with the instruments of the scene by default."""
     config = drawing_config(made, picture=False, labels=names)
     placed = place_instruments(made, position, 0) if instruments is None else instruments
-    labels = Rasterizer(made, np.zeros((1, 1, 3), np.uint8), config).look(position, instruments=placed).labels
+    labels = Rasterizer(made, np.zeros((1, 1, 3), np.uint8), config).render(position, instruments=placed).labels
     assert labels is not None
     return labels
 

@@ -144,7 +144,7 @@ def assert_same_bits_with_lanes(made: Scene, texture: NDArray[np.uint8], positio
     config = drawing_config(made, labels=LABELS if made.render.supersample == 1 else ())
     placed = place_instruments(made, position, 0)
     expected, found = (
-        Rasterizer(made, texture, config._replace(lanes=count)).look(position, instruments=placed)
+        Rasterizer(made, texture, config._replace(lanes=count)).render(position, instruments=placed)
         for count in (config.lanes, lanes)
     )
     np.testing.assert_array_equal(found.picture, expected.picture)

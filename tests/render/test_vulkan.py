@@ -189,7 +189,7 @@ def draw_all(made: Scene, texture: NDArray[np.uint8]) -> dict[str, NDArray[Any]]
     camera, placed = view(made), place_instruments(made, position, 0)
     result = {"picture": Rasterizer(made, texture).draw(position, instruments=placed)}
     config = drawing_config(made, picture=False, labels=requested_labels(()))
-    labels = Rasterizer(made, texture, config).look(position, instruments=placed).labels
+    labels = Rasterizer(made, texture, config).render(position, instruments=placed).labels
     assert labels is not None
     result |= {name: value for name, value in labels._asdict().items() if value.size}
     shifted = position + np.array([0.002, 0.001, 0])
