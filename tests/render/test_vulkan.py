@@ -187,7 +187,7 @@ def draw_all(made: Scene, texture: NDArray[np.uint8]) -> dict[str, NDArray[Any]]
     position[..., 2] = -0.05 * np.exp(-((x + 0.1) ** 2 + y**2) / 0.005) + 0.06 / (1 + np.exp((0.08 - x) / 0.005))
     position[..., 0] = np.where(x > 0.08, 0.16 - x, x)
     camera, placed = view(made), place_instruments(made, position, 0)
-    result = {"picture": Rasterizer(made, texture).draw(position, instruments=placed)}
+    result: dict[str, NDArray[Any]] = {"picture": Rasterizer(made, texture).draw(position, instruments=placed)}
     config = drawing_config(made, picture=False, labels=requested_labels(()))
     labels = Rasterizer(made, texture, config).render(position, instruments=placed).labels
     assert labels is not None
