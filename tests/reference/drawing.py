@@ -73,7 +73,7 @@ class Seen(NamedTuple):
     u: Array
     v: Array
     wire: Array  # share of the mesh lines in the colour
-    footprint: Array  # larger of a sample's width and height on the texture, in units of uniforms.SHARP texels
+    footprint: Array  # larger side of a sample on the texture, in units of uniforms.FULL_RESOLUTION_TEXELS
     front: Array  # 1 where the front of the triangle is seen, else -1
     facet: Array  # normal of the triangle's front in the world [m^2], shape (height, width, 3); NaN where none is
 
@@ -137,7 +137,7 @@ def triangles(surface: Array) -> Iterator[Array]:
 
 
 def footprint(triangle: Array, at: Sampled, texels: tuple[int, int]) -> Array:
-    """Give the larger of a sample's width and height on the texture, in units of uniforms.SHARP texels.
+    """Give the larger of a sample's width and height on the texture, in units of uniforms.FULL_RESOLUTION_TEXELS.
 
     It is found by finite differences over a thousandth of a sample; corners as for `wire_share`.
     """
@@ -149,7 +149,7 @@ def footprint(triangle: Array, at: Sampled, texels: tuple[int, int]) -> Array:
 
     right = place(*at(step, 0)) - place(*at(-step, 0))
     down = place(*at(0, step)) - place(*at(0, -step))
-    return np.asarray(np.maximum(np.hypot(*right), np.hypot(*down)) / (2 * step * uniforms.SHARP))
+    return np.asarray(np.maximum(np.hypot(*right), np.hypot(*down)) / (2 * step * uniforms.FULL_RESOLUTION_TEXELS))
 
 
 def draw(
