@@ -28,8 +28,8 @@ from taichi_msm.scene.tools import Probe
 from taichi_msm.shapes import SHAPES
 from taichi_msm.shapes.shape import Shape
 
-# Largest displacement of a rough tool between two equilibria, in its radii. Its force depends on where mass points first
-# touch it.
+# Largest displacement of a rough tool between two equilibria, in its radii. Its force depends on where it first touches
+# each mass point.
 ROUGH_STRIDE_RADII = 1 / 16
 
 # A larger spacing of the mass points, in radii of the tool, makes the contact force rough and issues a warning.
