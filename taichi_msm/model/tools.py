@@ -36,8 +36,8 @@ ROUGH_STRIDE_RADII = 1 / 16
 MAX_SPACING_RADII = 0.5
 COARSE_TIP_PHRASE = "which touches few of them"
 
-# Remedies suggest at most this multiple of the number of mass points.
-MAX_REFINEMENT = 4
+# Largest number of mass points that a remedy suggests, as a multiple of the sheet's.
+MAX_POINTS_RATIO = 4
 
 # A grip holds the mass points within this distance of the tip's centre, in radii of the tip.
 GRIP_RADII = 1.5
@@ -332,7 +332,7 @@ def path_warnings(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:
                 yield f"probes.{tool.probe}.grip from {begin:g} to {until:g} s holds nothing: no frame is between them"
         if not isinstance(tool, Clamp) and spacing_max > MAX_SPACING_RADII * tool.radius:
             points = [int(np.ceil(length / (MAX_SPACING_RADII * tool.radius))) + 1 for length in scene.sheet.size]
-            affordable = math.prod(points) <= MAX_REFINEMENT * math.prod(scene.sheet.points)
+            affordable = math.prod(points) <= MAX_POINTS_RATIO * math.prod(scene.sheet.points)
             remedy = f"try sheet.points: {points}" if affordable else "take a wider tip"
             yield (
                 f"probes.{tool.probe}: the points are {spacing_max:.3g} m apart, more than half the radius of the "

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.accuracy.companions import QUASISTATIC_REASON, CompanionRuns, choose_companion_runs
 from taichi_msm.accuracy.path_dependence import PathDependence
-from taichi_msm.accuracy.report import RunErrorEstimates, RunErrorEstimator, run_warnings
+from taichi_msm.accuracy.run_errors import RunErrorEstimates, RunErrorEstimator, run_warnings
 from taichi_msm.errors import (
     DamagedError,
     DeviceError,

@@ -14,7 +14,7 @@ from PIL import Image
 from taichi_msm.accuracy import time_step
 from taichi_msm.accuracy.companions import choose_companion_runs
 from taichi_msm.accuracy.mesh import MeshEstimate, estimate_mesh_error, mesh_companion_plan, with_points
-from taichi_msm.accuracy.report import RunErrorEstimates, RunErrorEstimator
+from taichi_msm.accuracy.run_errors import RunErrorEstimates, RunErrorEstimator
 from taichi_msm.accuracy.time_step import (
     TimeStepEstimate,
     choose_step,
