@@ -42,7 +42,7 @@ def tool_contact_warnings(plan: Plan, progress: RunProgress) -> Iterator[str]:
             time, cell = progress.pierced_frame / plan.grid.frames_per_second, max(spacing(plan.scene.sheet))
             yield (
                 f"probes.{tool.probe}: the instrument went through the sheet, first at {time:.6g} s, frame "
-                f"{progress.pierced_frame}: its middle line passes between points, which are {cell:.3g} m apart at "
+                f"{progress.pierced_frame}: its axis passes between points, which are {cell:.3g} m apart at "
                 f"rest; its radius is {tool.radius:.3g} m. Its force is invalid from there on; take a wider "
                 "instrument or more points, press less, or move it from above and within the border"
             )

@@ -237,7 +237,7 @@ def run_warnings(
             of = "the time step" if not estimate.parted or estimate.in_f64 > REMEDY_THRESHOLD / 2 else "rounding"
             yield f"for a smaller error of {of}, {_step_remedy(plan, estimate, affords)}"
     elif reason == QUASISTATIC_REASON:
-        yield "error: none due to a time step, as the sheet is at rest"
+        yield "error: no time step in a quasi-static scene"
     elif reason:
         yield f"error {'of the time step ' if mesh is not None else ''}not estimated: {reason}"
     if force is not None:
@@ -251,13 +251,13 @@ def run_warnings(
     yield from tool_contact_warnings(plan, progress)
     yield from energy_growth_warnings(plan, progress)
     if mesh is not None and mesh.doubt and mesh.error < math.inf:
-        yield f"the error due to the number of points may be larger: {mesh.doubt}"
+        yield f"the mesh error may be larger: {mesh.doubt}"
     # The warning about a mesh that is too coarse for a tool already contains the remedy.
     too_coarse_for_tool = any(COARSE_TIP_PHRASE in warning for warning in tool_warnings)
     if mesh is not None and REMEDY_THRESHOLD < mesh.error < math.inf and not too_coarse_for_tool:
         yield f"for a smaller error of the mesh, {_mesh_remedy(plan, mesh, affords)}"
     if progress.max_displacement == 0 and progress.frame > 0:
-        yield "nothing moved: does a probe press where and when it should?"
+        yield "nothing moved: check at, load or path of the probes"
     foundation = scene.tissue.foundation if scene.tissue is not None else None
     if isinstance(foundation, Foundation) and not foundation.lock and progress.deepest > foundation.depth / 3:
         yield (

@@ -127,7 +127,7 @@ class Adjoint:
             MsmError: when `run` has not been called.
         """
         if not self._ran:
-            raise MsmError("nothing has run yet that could be differentiated; call run first")
+            raise MsmError("no run to differentiate; call run first")
         plan, by_position = self._sheet.plan, as_array(by_position, "slope")
         shape = plan.grid.frames + 1, *plan.scene.sheet.points, 3
         if not is_real_array(by_position, shape) or not np.isfinite(by_position).all():
