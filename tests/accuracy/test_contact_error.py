@@ -6,6 +6,7 @@ import math
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -218,16 +219,15 @@ def test_mesh_companion_is_compared_with_the_run(device: Device, monkeypatch: py
         plan, choose_companion_runs(plan, requested=True), RunErrorEstimates(), device, device.threads
     )
     mesh: Any = estimator._mesh
-    compared: list[Any] = []
-    monkeypatch.setattr(mesh, "compare_frame", lambda displacement, pause: compared.append(displacement))
+    compared = Mock()
+    monkeypatch.setattr(mesh, "compare_frame", compared)
     displacement = np.zeros((*plan.scene.sheet.points, 3))
     estimator.compare_frame(displacement, lambda: None)
-    assert compared[0] is displacement
-    steps = [sheet.plan.grid.steps_per_frame for sheet in mesh._sheets]
-    assert steps == [math.ceil(plan.grid.steps_per_frame / 2)]
+    assert compared.call_args.args[0] is displacement
+    assert mesh._sheets[0].plan.grid.steps_per_frame == math.ceil(plan.grid.steps_per_frame / 2)
     coarse = mesh_companion_plan(plan_of(with_points(small_sheet(), (25, 25))))
     assert coarse is not None
-    assert coarse.scene.sheet.points == (18, 18), "24 / sqrt(2) is 16.97, and even as 24"
+    assert coarse.scene.sheet.points == (18, 18), "24 / sqrt(2) is 16.97 cells"
 
 
 @pytest.mark.slow

@@ -239,13 +239,12 @@ def test_stiffness_map_against_differences(kind: str, image: str, device: Device
     assert (maps[0] == maps[1]).all()
 
 
-@pytest.mark.parametrize("steps", [1, 2, 10_000])
-def test_number_of_steps(steps: int, image: str, device: Device) -> None:
+def test_numbers_after_10000_steps(image: str, device: Device) -> None:
     description = moving("tissue", image)
-    description["time"] |= {"duration": steps * 0.0016, "frames_per_second": 1 / (steps * 0.0016), "step": 0.0016}
+    description["time"] |= {"duration": 16, "frames_per_second": 1 / 16, "step": 0.0016}
     adjoint = adjoint_of(description, device)
     known, slope = loss(adjoint.run())
-    derivatives = adjoint.backward(slope)
+    numbers = adjoint.backward(slope).numbers
     for name, index, step in (
         ("probes.0.total", (2,), 0.2),
         ("tissue.thickness", (), 4e-4),
@@ -255,13 +254,7 @@ def test_number_of_steps(steps: int, image: str, device: Device) -> None:
         def changed(by: float, name: str = name, index: tuple[int, ...] = index) -> float:
             return loss(adjoint_of(with_change(description, name.split("."), index, by), device).run())[0]
 
-        derivative = float(np.asarray(derivatives.numbers[name])[index])
-        if steps > 10 or (derivative and name.startswith("tissue")):
-            assert_second_order(known, derivative, step, changed, name)
-        else:
-            # In the first step a point moves in proportion to the load, and the loss is quadratic in that.
-            difference = (changed(step) - changed(-step)) / (2 * step)
-            assert difference == pytest.approx(derivative, rel=1e-9, abs=1e-12)
+        assert_second_order(known, float(np.asarray(numbers[name])[index]), step, changed, name)
 
 
 def test_bits_depend_neither_on_workers_nor_on_segments(

@@ -44,16 +44,6 @@ def test_average_of_a_load(load: list[list[float]], expected: list[float]) -> No
     assert average_loads(plan_with({"load": load}), 0, 6).strength[:, 0, 0] == pytest.approx(expected, abs=1.1e-5)
 
 
-def test_average_away_from_keyframes_is_the_value() -> None:
-    load = [[0, 0], [0.1, 33.3], [0.3, 33.3], [0.7, 80], [2, 81]]
-    averages = average_loads(plan_with({"load": load}), 0, 100).strength[:, 0, 0]
-    values = np.interp(np.arange(100) / 100, *np.array(load).T)
-    at_keyframe = np.isin(np.arange(100), [0, 10, 30, 70])
-    np.testing.assert_allclose(averages[~at_keyframe], values[~at_keyframe], rtol=1e-15)
-    assert (np.abs(averages - values)[at_keyframe] > 1e-3).all()
-    assert (averages[11:30] == 33.3).all()
-
-
 def random_load(seed: int) -> list[list[float]]:
     rng = np.random.default_rng(seed)
     times = np.sort(rng.uniform(-0.02, 0.08, 9))
