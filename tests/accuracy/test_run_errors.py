@@ -16,7 +16,6 @@ from taichi_msm.accuracy.mesh import MeshEstimate
 from taichi_msm.accuracy.time_step import TimeStepEstimate
 from taichi_msm.errors import Pause
 from taichi_msm.scene.scene import Scene
-from taichi_msm.solver import planning
 from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.solver.planning import affords_companions, choose_precision, with_time
 from taichi_msm.solver.state import RunProgress
@@ -121,9 +120,6 @@ def test_default_precision() -> None:
     # Pictures make stepping a smaller part of the work.
     edge = next(n for n in range(61, 1024) if precision(made(n)) == "f32")
     assert precision(made(edge, image="a.png", output=["png"])) == "f64"
-    # The work is counted, not timed.
-    work = planning.F64_WORK * 30 * plan_of(made(edge)).grid.steps_per_frame * edge**2
-    assert work > planning.MAX_F64_SHARE * planning.START_WORK >= work * (1 - 3 / edge)
 
 
 def test_companion_runs_take_up_to_two_fifths_of_the_run() -> None:
@@ -196,22 +192,19 @@ def test_interrupted_fine_companion_leaves_a_complete_run(small: Path, device: D
     assert record["error_estimate"]["at_least"]
 
 
-def test_bound_by_a_coarse_companion_of_order_1_in_f32(small: Path, device: Device) -> None:
+def test_bounds_by_a_coarse_companion_in_f32(
+    small: Path, device: Device, monkeypatch: pytest.MonkeyPatch, node_steps: list[int]
+) -> None:
     step = ["time.frames_per_second=50", "time.step=0.004", "time.damping_difference=backward", "time.precision=f32"]
     soft = ["springs.structural=8", "springs.shear=4", "output=[trajectory]", "probes.0.load=[[0, 0], [0.4, 100]]"]
     made, _, estimate = run_with_error([*step, *soft], device)
     assert choose_companion_runs(plan_of(made)).concurrent_steps == 3
-    error = true_error(plan_of(made), device, fine=16)
-    assert error < estimate < 4 * error
-
-
-def test_bound_by_a_coarse_companion_in_f32(
-    small: Path, device: Device, monkeypatch: pytest.MonkeyPatch, node_steps: list[int]
-) -> None:
+    assert 1 < estimate / true_error(plan_of(made), device, fine=16) < 4
+    # At order 2, it is three times the error of the step, plus all of the rounding, which is small here.
     monkeypatch.setattr(companions, "affords_companions", lambda plan, steps: steps < 1)
+    node_steps.clear()
     made, record, estimate = run_with_error([*LARGE_ERROR, "time.precision=f32"], device)
     assert sum(node_steps) <= 1.6 * math.prod(made.sheet.points) * record["steps"]
-    # Three times the error of the step, plus all of the rounding, which is small here.
     assert estimate == pytest.approx(3 * true_error(plan_of(made), device, fine=16), rel=0.5)
     parts = record["error_estimate"]
     assert (parts["rounding"], parts["in_f64"], parts["at_least"]) == (None, None, False)
