@@ -64,7 +64,7 @@ class ForceEstimate(NamedTuple):
 class RunErrorEstimates(NamedTuple):
     """Estimated errors of a run."""
 
-    estimate: TimeStepEstimate | None = None  # error of the time step and of rounding; None if not estimated
+    time_step: TimeStepEstimate | None = None  # error of the time step and of rounding; None if not estimated
     reason: str = ""  # reason for the missing estimate
     mesh: MeshEstimate | None = None  # discretisation error of the mesh; None if not estimated
     force: ForceEstimate | None = None  # error of the forces of position-controlled tools; None without such tools
@@ -90,8 +90,8 @@ class RunErrorEstimator:
         self._plan, self._companions, self._known = plan, companions, known
         self._device, self._cores = device, cores
         steps = companions.concurrent_steps
-        self._coarse = known.estimate is None and 0 < steps < plan.grid.steps_per_frame
-        estimates_step = known.estimate is None and not companions.reason
+        self._coarse = known.time_step is None and 0 < steps < plan.grid.steps_per_frame
+        estimates_step = known.time_step is None and not companions.reason
         self._time_step = TimeStepCompanion(plan, steps, device, cores) if estimates_step else None
         coarse = mesh_companion_plan(plan) if companions.mesh and known.mesh is None else None
         # The meshes are compared with the coarse time-step companion if there is one, except in contact.
@@ -156,7 +156,7 @@ class RunErrorEstimator:
             for companion in companions:
                 companion.compare_frame(displacement, partial(progress, frame, frames))
         if first is not None and fine is not None:
-            self._known = self._known._replace(estimate=combine_estimates(first.estimate, fine.estimate))
+            self._known = self._known._replace(time_step=combine_estimates(first.estimate, fine.estimate))
 
     def _repeated(self) -> Iterator[NDArray[Any]]:
         """Repeat the run and yield the displacements of its frames."""
@@ -169,18 +169,18 @@ class RunErrorEstimator:
     def estimates(self) -> RunErrorEstimates:
         """Estimates from the frames so far."""
         known = self._known
-        if known.estimate is None and self._time_step is not None:
+        if known.time_step is None and self._time_step is not None:
             estimate = self._time_step.estimate
             # For a run in f32 the estimate of a coarse companion run is an upper bound already.
             if self._coarse and estimate.parted and NEGLIGIBLE_ERROR <= estimate.error < math.inf:
                 estimate = replace(estimate, at_least=True)
-            known = known._replace(estimate=estimate)
+            known = known._replace(time_step=estimate)
         if self._mesh is not None:
             known = known._replace(mesh=self._mesh.estimate)
             meets = self._max_force[[not isinstance(tool, Clamp) for tool in self._plan.tools]].all()
             if self._all_forces and not meets:
                 known = known._replace(mesh=MeshEstimate(math.inf, NO_CONTACT))
-            elif self._plan.has_contact and known.estimate is not None and known.estimate.error > MAX_DIFFERENCE:
+            elif self._plan.has_contact and known.time_step is not None and known.time_step.error > MAX_DIFFERENCE:
                 known = known._replace(mesh=MeshEstimate(math.inf, LARGE_STEP_ERROR))
         return known._replace(force=self._force_estimate(known)) if self._plan.tools else known
 
@@ -201,7 +201,7 @@ class RunErrorEstimator:
         relative = max(relative, MIN_MESH_ERROR_SHARE * mesh.error)
         if not self._plan.has_contact:
             return ForceEstimate(relative)
-        displacement_error = max(mesh.error, known.estimate.error if known.estimate is not None else 0.0)
+        displacement_error = max(mesh.error, known.time_step.error if known.time_step is not None else 0.0)
         return ForceEstimate(min(relative, displacement_error))
 
 

@@ -41,9 +41,6 @@ SEGMENT_BYTES = 64 * 2**20
 # single worker then finishes the launch, and its kernel may have to be compiled first.
 MAX_WAIT_CHECKS = 8 * MAX_CHECKS
 
-# Largest number of steps times mass points in a launch of the adjoint, about 0.1 s of one core.
-NODE_STEPS_PER_LAUNCH = 10_000_000
-
 Array = NDArray[np.float64]
 
 
@@ -296,7 +293,8 @@ class MotionAdjoint:
         return arrays.constants, arrays.by_column, arrays.stiffness, arrays.fields
 
     def _max_launch_steps(self) -> int:
-        return max(1, NODE_STEPS_PER_LAUNCH // (self.layout.rows * self.layout.cols))
+        # Steps times mass points take about 0.1 s of one core.
+        return max(1, 10_000_000 // (self.layout.rows * self.layout.cols))
 
     def _sizes(self, count: int, shape: int, moment_row: int, with_loss: bool = False) -> NDArray[np.int64]:
         layout = self.layout

@@ -70,7 +70,7 @@ def test_time_step_estimate_bounds_the_error(seed: int, image: str, device: Devi
     plan = plan_of(random_contact(seed, image))
     # Half of an odd number of steps is rounded up.
     assert choose_companion_runs(plan).cost <= 0.75 + 1 / plan.grid.steps_per_frame
-    estimate = estimates_of(plan, device).estimate
+    estimate = estimates_of(plan, device).time_step
     assert estimate.at_most
     error = true_error(plan, device, fine=16)
     assert error <= 1.5 * estimate.error or estimate.at_least
@@ -209,7 +209,7 @@ def test_estimate_with_overlapping_tools_is_a_lower_bound(device: Device, messag
     plan = plan_of(touching([PRESSED, meets], time={"duration": 0.2}))
     notes = [note for note in path_warnings(plan.scene, plan.tools) if "through each other" in note]
     message(notes, "probes.0 and probes.1: ")
-    assert estimates_of(plan, device).estimate.at_least
+    assert estimates_of(plan, device).time_step.at_least
 
 
 def test_mesh_companion_is_compared_with_the_run(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:

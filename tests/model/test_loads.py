@@ -191,8 +191,7 @@ def test_slots_of_a_control_point_with_1000_jumps() -> None:
     np.testing.assert_allclose(sum(averages.strength[0, :2, 2]), 8, rtol=1e-12)
     assert len(probe_slots(made.probes, made.sheet, 0.01)) == 1 + 3, "two jumps within a hat of 0.01 s"
     # Without averaging, a probe has one slot.
-    slots = [(slot.probe, slot.turns) for slot in evaluate_loads(plan_of(made), np.array([0.0104])).slots]
-    assert slots == [(0, 1), (1, 1)]
+    assert [slot.turns for slot in evaluate_loads(plan_of(made), np.array([0.0104])).slots] == [1, 1]
 
 
 def test_bounds_of_loads() -> None:
