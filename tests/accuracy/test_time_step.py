@@ -148,8 +148,8 @@ def test_rounding_is_part_of_the_estimate(device: Device, message: Messages) -> 
     assert estimate.error > 1.5 * estimate.in_f64
     assert in_double.rounding == 0
     assert in_double.in_f64 == in_double.error == pytest.approx(estimate.in_f64, rel=1e-9)
-    for made in (estimate, in_double):
-        message(notes_of(single, MOVED, made), "error: time step 0.000001 %")
+    for each in (estimate, in_double):
+        message(notes_of(single, MOVED, each), "error: time step 0.000001 %")
 
 
 def test_tolerance_out_of_reach_of_f32(device: Device, message: Messages) -> None:
