@@ -9,11 +9,10 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, StrictBool, ValidationError, ValidationInfo, create_model, field_validator, model_validator
 from typing_extensions import Self
 
-from taichi_msm.camera_files.calibration import Calibration
-from taichi_msm.camera_files.calibrations import read_calibration
-from taichi_msm.camera_files.keys import ROUNDING_TOLERANCE
-from taichi_msm.camera_files.text import CameraFileError
-from taichi_msm.camera_files.trajectories import PoseKeys, read_poses
+from taichi_msm.camera_files.calibration import Calibration, focal_fault
+from taichi_msm.camera_files.camera_file import CameraFileError
+from taichi_msm.camera_files.key_lookup import ROUNDING_TOLERANCE
+from taichi_msm.camera_files.readers import PoseKeys, read_calibration, read_poses
 from taichi_msm.camera_files.trajectory import pose_fault
 from taichi_msm.lenses import MODELS
 from taichi_msm.lenses.model import MAX_COEFFICIENT
@@ -351,6 +350,9 @@ class Camera(Section):
     def calibrated(self, size: tuple[int, int]) -> Self:
         """Return a copy with the intrinsics and distortion of the calibration file for pictures of a size [px]."""
         if self.calibration is None:
+            given = self.intrinsics
+            if given and given.fx and given.fy and (fault := focal_fault((given.fx, given.fy), size)):
+                raise scene_fault(fault, "intrinsics")
             return self
         # Only a stereo pair uses the distance of the cameras.
         unit = self.calibration_unit if self.beside else "m"
@@ -358,6 +360,8 @@ class Camera(Section):
             calibration = read_calibration(self.calibration, self.calibration_eye, unit)
         except CameraFileError as error:
             raise scene_fault(str(error), "calibration") from None
+        if calibration.focal and (fault := focal_fault(calibration.focal, calibration.size or size)):
+            raise scene_fault(f"{self.calibration}: {fault}", "calibration")
         if self.scale and calibration.size is None:
             fault = "has no size of its pictures, so it cannot be scaled; add image_width and image_height"
             raise scene_fault(f"{self.calibration}: {fault}, or remove scale", "calibration")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from taichi_msm import load_scene
-from taichi_msm.camera_files.trajectories import PoseKeys, read_poses
+from taichi_msm.camera_files.readers import PoseKeys, read_poses
 from taichi_msm.errors import SceneError
 from taichi_msm.render.camera import view
 from taichi_msm.scene.camera import Camera
@@ -23,7 +23,7 @@ TUM = """\
 """
 
 
-def test_a_trajectory_is_read(small: Path) -> None:
+def test_poses_of_a_trajectory(small: Path) -> None:
     Path("poses.txt").write_text(TUM)
     made = load_scene("small.yaml", ["render.camera={poses: poses.txt}"])
     # A camera that looks down: half a turn about x.
@@ -68,7 +68,7 @@ t_ms,x_mm,y_mm,z_mm,qx,qy,qz,qw
     [EUROC, MILLISECONDS, SUFFIXES, TABLE, TABLE.replace(",", ";").replace(".", ",").replace("time", '"t"')],
     ids=["EuRoC", "milliseconds", "suffixes", "table", "table of a spreadsheet"],
 )
-def test_a_header_decides_on_the_columns(text: str, small: Path) -> None:
+def test_columns_of_the_header(text: str, small: Path) -> None:
     Path("tum.txt").write_text(TUM)
     Path("poses.txt").write_text(text)
     expected = load_scene("small.yaml", ["render.camera={poses: tum.txt}"])
@@ -94,7 +94,7 @@ COLMAP = """\
 
 
 @pytest.mark.parametrize("text", [KITTI, COLMAP, COLMAP.replace("/0010", "/x")], ids=["KITTI", "COLMAP", "names"])
-def test_poses_without_times_have_a_rate(text: str, small: Path) -> None:
+def test_poses_rate(text: str, small: Path) -> None:
     Path("poses.txt").write_text(text)
     rows = read_poses("poses.txt", PoseKeys(poses_rate=5))
     expected = np.loadtxt(TUM.splitlines())
@@ -103,7 +103,7 @@ def test_poses_without_times_have_a_rate(text: str, small: Path) -> None:
         assert abs(abs(np.dot(row[4:], other[4:])) - 1) < 1e-12
 
 
-def test_a_gap_in_the_names_of_pictures_is_a_gap_in_time(small: Path) -> None:
+def test_gap_in_the_picture_numbers(small: Path) -> None:
     more = COLMAP + "".join(f"9 0 -1 0 0 0 0 0.4 1 frames/{name}.jp2\n20 15 -1\n" for name in ("00110", "00108"))
     Path("poses.txt").write_text(more)
     assert [row[0] for row in read_poses("poses.txt", PoseKeys(poses_rate=5))] == [0, 0.2, 0.4, 0.8, 1]
@@ -134,7 +134,7 @@ def test_a_gap_in_the_names_of_pictures_is_a_gap_in_time(small: Path) -> None:
         "the first pose",
     ],
 )
-def test_keys_of_the_camera_describe_the_file(text: str, keys: dict[str, object], small: Path) -> None:
+def test_units_and_start(text: str, keys: dict[str, object], small: Path) -> None:
     Path("poses.txt").write_text(text)
     made = load_scene("small.yaml", {"render.camera": {"poses": "poses.txt", **keys}}).render.camera
     assert isinstance(made, Camera)
@@ -173,7 +173,7 @@ HEADER = "# timestamp tx ty tz qx qy qz qw"
         ),
     ],
 )
-def test_a_trajectory_that_cannot_be_used_is_refused(text: str, place: str, small: Path, message: Messages) -> None:
+def test_invalid_trajectory(text: str, place: str, small: Path, message: Messages) -> None:
     Path("poses.txt").write_text(text)
     with message.raises(SceneError, f"render.camera.poses: {place}"):
         load_scene("small.yaml", ["render.camera={poses: poses.txt}"])
@@ -199,15 +199,13 @@ def test_a_trajectory_that_cannot_be_used_is_refused(text: str, place: str, smal
         pytest.param(TUM, {"poses_start": 1}, id="start after the end"),
     ],
 )
-def test_keys_that_do_not_fit_the_file_are_refused(
-    text: str, keys: dict[str, object], small: Path, message: Messages
-) -> None:
+def test_keys_contradicting_the_file(text: str, keys: dict[str, object], small: Path, message: Messages) -> None:
     Path("poses.txt").write_text(text)
     with message.raises(SceneError, "render.camera.poses: poses.txt"):
         load_scene("small.yaml", {"render.camera": {"poses": "poses.txt", **keys}})
 
 
-def test_keys_of_a_file_go_with_a_file(small: Path, message: Messages) -> None:
+def test_file_keys_without_a_file(small: Path, message: Messages) -> None:
     for keys in ({"poses_rate": 5}, {"calibration_unit": "mm"}):
         with message.raises(SceneError, f"render.camera.{next(iter(keys))}"):
             load_scene("small.yaml", {"render.camera": {"eye": [0, 0, 1], **keys}})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from taichi_msm.camera_files.text import CameraFile
+from taichi_msm.camera_files.camera_file import CameraFile
 from taichi_msm.camera_files.trajectory import NORM_TOLERANCE, Trajectory, TrajectoryReader, parse_numbers
 
 COUNT = 12
