@@ -92,14 +92,14 @@ class Distortion(_Coefficients):  # type: ignore[misc]
 
     @model_validator(mode="after")
     def _check_coefficients_of_model(self) -> Self:
-        own = MODELS[self.model].coefficients
-        for name, row in own.items():
+        coefficients = MODELS[self.model].coefficients
+        for name, row in coefficients.items():
             if getattr(self, name) is None:
                 raise scene_fault(f"missing; expected {_COEFFICIENT.format(row.least, row.most)}", name)
-        for name in sorted(self.model_fields_set - {"model", *own}):
+        for name in sorted(self.model_fields_set - {"model", *coefficients}):
             if getattr(self, name):
                 models = _alternatives(model for model, row in MODELS.items() if name in row.coefficients)
-                *names, last = own
+                *names, last = coefficients
                 raise scene_fault(f"goes with model: {models}; a {self.model} has {', '.join(names)} and {last}", name)
         return self
 
@@ -230,7 +230,7 @@ class Camera(Section):
 
     @property
     def has_own_lens(self) -> bool:
-        """Whether a camera with a reference camera has intrinsics of its own."""
+        """Whether a camera with a reference camera has intrinsics, rather than those of the reference camera."""
         return self.intrinsics is not None or "fov" in self.model_fields_set
 
     @property
@@ -287,7 +287,7 @@ class Camera(Section):
             if len(both := [name for name in names if name in given]) > 1:
                 raise scene_fault(f"is given together with {both[0]}; remove one of them", both[1])
         for name in {"target", "up"} & given if {"pose", "poses"} & given else ():
-            raise scene_fault("goes with eye; a pose has a direction of its own", name)
+            raise scene_fault("goes with eye; a pose has its direction", name)
         return self
 
     def _check_pair(self, given: set[str]) -> None:
