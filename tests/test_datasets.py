@@ -70,7 +70,7 @@ def torch(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(sys.modules["torch.utils.data"], "DataLoader", batches, raising=False)
 
 
-def test_pairs_are_those_of_the_files(data_set: Path) -> None:
+def test_pairs(data_set: Path) -> None:
     pairs = Pairs(data_set, "train")
     assert len(pairs) == 2 * (FRAMES - 1)
     folder, pair = data_set / "runs/000002", pairs[(FRAMES - 1) + 3]
@@ -89,7 +89,7 @@ def test_pairs_are_those_of_the_files(data_set: Path) -> None:
         pairs[len(pairs)]
 
 
-def test_clips_follow_one_another(data_set: Path) -> None:
+def test_clips(data_set: Path) -> None:
     clips = Clips(data_set, "train", frames=3)
     assert len(clips) == 2 * (FRAMES // 3)
     clip, folder = clips[3], data_set / "runs/000002"
@@ -100,7 +100,7 @@ def test_clips_follow_one_another(data_set: Path) -> None:
         assert np.array_equal(clip["visible"], ~tracks["occluded"][:, 3:6])
 
 
-def test_flow_leads_where_tracks_go(data_set: Path) -> None:
+def test_flow_agrees_with_tracks(data_set: Path) -> None:
     # Both measure pixels in one way. Flow is interpolated between the centres of pixels; if these were elsewhere, it
     # would be wrong by its gradient.
     pairs, clip = Pairs(data_set, "test"), Clips(data_set, "test", frames=FRAMES)[0]
@@ -118,7 +118,7 @@ def test_flow_leads_where_tracks_go(data_set: Path) -> None:
     assert 10 * error(0.5) < min(error(0), error(1))
 
 
-def test_a_loader_makes_batches_of_the_items(data_set: Path, torch: None) -> None:
+def test_batches_of_a_loader(data_set: Path, torch: None) -> None:
     pairs = Pairs(data_set, "train")
     made = list(pairs.loader(batch_size=4))
     assert [len(batch["flow"]) for batch in made] == [4, 4, 2]
@@ -129,7 +129,7 @@ def test_a_loader_makes_batches_of_the_items(data_set: Path, torch: None) -> Non
     assert tuple(clips["points"].shape) == (2, TRACKS**2, FRAMES, 2)
 
 
-def test_what_is_no_data_set_is_refused(data_set: Path, tmp_path: Path, message: Messages) -> None:
+def test_invalid_data_set(data_set: Path, tmp_path: Path, message: Messages) -> None:
     with message.raises(ArgumentError, "'valid'"):
         Pairs(data_set, "valid")
     with message.raises(FilesError, "dataset.json"):
@@ -140,7 +140,7 @@ def test_what_is_no_data_set_is_refused(data_set: Path, tmp_path: Path, message:
         Pairs(tmp_path, "train")
 
 
-def test_pytorch_is_imported_when_used(data_set: Path, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
+def test_pytorch_is_not_installed(data_set: Path, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
     monkeypatch.setitem(sys.modules, "torch", None)
     pairs = Pairs(data_set, "train")
     with message.raises(NotInstalledError, "PyTorch"):

@@ -63,7 +63,7 @@ def single(stereo: Path) -> Path:
 
 
 @pytest.mark.parametrize("name", ["tapvid", "tapvid3d", "csv"])
-def test_a_camera_is_chosen_by_its_name(name: str, stereo: Path, program: Program) -> None:
+def test_camera_by_name(name: str, stereo: Path, program: Program) -> None:
     for side in ("left", "right"):
         done = program("export", str(stereo), "--format", name, "--camera", side, "--out", str(stereo.parent / "out"))
         assert (done.returncode, done.stderr) == (0, "")
@@ -75,7 +75,7 @@ def test_a_camera_is_chosen_by_its_name(name: str, stereo: Path, program: Progra
             assert len(got["tapvid.pkl"]) == len(expected["tapvid.pkl"]) + len("stereo") - len(side)
 
 
-def test_a_choice_that_is_none_is_told_of(stereo: Path, program: Program, message: Messages) -> None:
+def test_invalid_camera(stereo: Path, program: Program, message: Messages) -> None:
     for camera in ([], ["--camera", "lift"]):
         done = program("export", str(stereo), "--format", "tapvid", *camera)
         assert (done.returncode, done.stdout) == (2, "")
@@ -85,7 +85,7 @@ def test_a_choice_that_is_none_is_told_of(stereo: Path, program: Program, messag
             export(folder, name, camera="left")
 
 
-def test_what_a_camera_lacks_is_named(stereo: Path, message: Messages) -> None:
+def test_missing_output_of_a_camera(stereo: Path, message: Messages) -> None:
     (stereo / "right" / "tracks.npz").unlink()
     with message.raises(FilesError, "tracks"):
         export(stereo, "tapvid", camera="right")
@@ -97,7 +97,7 @@ def test_what_a_camera_lacks_is_named(stereo: Path, message: Messages) -> None:
 @pytest.mark.parametrize(
     ("name", "formats"), [("left", ["tapvid", "tapvid3d", "csv"]), ("", ["obj"])], ids=["camera", "record"]
 )
-def test_a_link_on_the_way_is_not_followed(name: str, formats: list[str], stereo: Path, message: Messages) -> None:
+def test_linked_camera_folder_or_record(name: str, formats: list[str], stereo: Path, message: Messages) -> None:
     """Be it the folder of a camera or the record: both may lead to the results of another run."""
     other = stereo.with_name("other")
     shutil.copytree(stereo, other)
@@ -123,7 +123,7 @@ WRONG: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_cameras_that_cannot_be_described_are_refused(name: str, single: Path, message: Messages) -> None:
+def test_tapvid3d_rejects_a_camera(name: str, single: Path, message: Messages) -> None:
     describe(single, **WRONG[name])
     with message.raises(ArgumentError if list(WRONG).index(name) < 3 else FilesError, "camera.json"):
         export(single, "tapvid3d")
@@ -141,7 +141,7 @@ def column(path: Path, *names: str) -> np.ndarray[Any, Any]:
     return np.array([[float(row[name] or "nan") for name in names] for row in rows(path)])
 
 
-def test_every_number_comes_back(single: Path) -> None:
+def test_csv_round_trip(single: Path) -> None:
     with np.load(single / "tracks.npz") as archive:
         made = dict(archive)
     made["points"][7, 2], made["occluded"][7, 2] = np.nan, True
@@ -169,7 +169,7 @@ def test_every_number_comes_back(single: Path) -> None:
     assert forces == rows(single / "forces.csv")
 
 
-def test_runs_are_told_apart_by_their_numbers(single: Path, message: Messages) -> None:
+def test_csv_of_several_runs(single: Path, message: Messages) -> None:
     """And one without forces is missing from their table."""
     other = single.parent / "other"
     export(single, "csv", single / "alone")
@@ -184,7 +184,7 @@ def test_runs_are_told_apart_by_their_numbers(single: Path, message: Messages) -
             assert [{**row, "run": "000000"} for row in part] == expected
 
 
-def test_forces_have_no_camera_to_choose(stereo: Path) -> None:
+def test_csv_of_forces_only(stereo: Path) -> None:
     record = json.loads((stereo / "run.json").read_text())
     record["scene"]["output"].remove("tracks")
     (stereo / "run.json").write_text(json.dumps(record))
@@ -193,7 +193,7 @@ def test_forces_have_no_camera_to_choose(stereo: Path) -> None:
     assert export(stereo, "csv").files == ["forces.csv", "index.csv"]
 
 
-def test_one_of_both_is_needed(single: Path, message: Messages) -> None:
+def test_csv_without_forces_or_tracks(single: Path, message: Messages) -> None:
     (single / "forces.csv").unlink()
     assert export(single, "csv").files == ["index.csv", "tracks.csv"]
     (single / "tracks.npz").unlink()
@@ -201,7 +201,7 @@ def test_one_of_both_is_needed(single: Path, message: Messages) -> None:
         export(single, "csv")
 
 
-def test_damaged_tables_are_one_line(single: Path, message: Messages) -> None:
+def test_damaged_tables(single: Path, message: Messages) -> None:
     whole = (single / "forces.csv").read_text()
     header = whole.partition("\n")[0]
     for text in ("", "time\n0\n", f"{header}\n0,0,0\n", f"{header}\n0,0,0,0,0,0,0,=1+1\n", "\xff"):
@@ -228,7 +228,7 @@ def tracks(folder: Path) -> dict[str, Any]:
         return dict(archive)
 
 
-def test_tracks_and_frames_come_back(single: Path) -> None:
+def test_tapvid3d_round_trip(single: Path) -> None:
     done = export([single, single], "tapvid3d", single / "all")
     assert (done.files, done.notes) == (["000000.npz", "000001.npz", "index.csv"], [])
     found, expected = read(done.directory / "000000.npz"), tracks(single)
@@ -251,7 +251,7 @@ def test_tracks_and_frames_come_back(single: Path) -> None:
             assert np.abs(np.asarray(image).astype(int) - drawn).mean() < 2, "grey levels"
 
 
-def test_a_query_is_the_first_sight_of_its_point(single: Path, message: Messages) -> None:
+def test_tapvid3d_queries(single: Path, message: Messages) -> None:
     made = tracks(single)
     made["occluded"][3, :2] = True
     made["occluded"][4] = True
@@ -271,7 +271,7 @@ def test_a_query_is_the_first_sight_of_its_point(single: Path, message: Messages
     assert (y < HEIGHT).all()
 
 
-def test_the_axes_are_those_of_the_camera_in_each_frame(single: Path) -> None:
+def test_tapvid3d_of_a_moving_camera(single: Path) -> None:
     angle = 0.1 * np.arange(FRAMES)
     poses = np.tile(np.eye(3, 4), (FRAMES, 1, 1))
     poses[:, 0, 0] = poses[:, 1, 1] = np.cos(angle)

@@ -46,7 +46,7 @@ def load(folder: Path) -> tuple[Array, Array, list[Array], list[Array], list[Arr
     return poses, bounds, images, masks, [each.astype(float) for each in pictures["depth"]]
 
 
-def test_what_the_loaders_read(labelled_in_motion: Path, tmp_path: Path) -> None:
+def test_loaders_of_endonerf_and_endogaussian(labelled_in_motion: Path, tmp_path: Path) -> None:
     run = labelled_in_motion
     done = export(run, "endonerf", tmp_path / "out")
     poses, bounds, images, masks, depths = load(done.directory)
@@ -87,7 +87,7 @@ def test_what_the_loaders_read(labelled_in_motion: Path, tmp_path: Path) -> None
     assert any("640 x 512" in note for note in done.notes)
 
 
-def test_depths_that_do_not_fit_16_bits_have_a_larger_unit(labelled_in_motion: Path, tmp_path: Path) -> None:
+def test_unit_of_large_depths(labelled_in_motion: Path, tmp_path: Path) -> None:
     run = Path(shutil.copytree(labelled_in_motion, tmp_path / "run"))
     deep = np.array(Image.open(run / "depth/0001.tiff"))
     deep[0, :2] = 1.0, 2e-5
@@ -99,7 +99,7 @@ def test_depths_that_do_not_fit_16_bits_have_a_larger_unit(labelled_in_motion: P
     assert any("0.1 mm" in note for note in done.notes)
 
 
-def test_cameras_that_the_loaders_cannot_describe(labelled_in_motion: Path, tmp_path: Path, message: Messages) -> None:
+def test_unsupported_cameras(labelled_in_motion: Path, tmp_path: Path, message: Messages) -> None:
     run = Path(shutil.copytree(labelled_in_motion, tmp_path / "run"))
     describe(run, intrinsics=[[45, 0, 22], [0, 46, 16.5], [0, 0, 1]])
     with message.raises(ArgumentError):

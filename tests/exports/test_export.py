@@ -33,7 +33,7 @@ def exported(results: Path, out: Path) -> list[str]:
     return export(results, "obj", out).files
 
 
-def test_files_go_beside_the_results(results: Path, program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_default_folder(results: Path, program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(results.parent)
     before = files(results)
     done = program("export", "results", "--format", "obj")
@@ -41,7 +41,7 @@ def test_files_go_beside_the_results(results: Path, program: Program, monkeypatc
     assert {name: data for name, data in files(results).items() if not name.startswith("export-obj")} == before
 
 
-def test_json_is_all_there_is_on_stdout(results: Path, program: Program) -> None:
+def test_json_and_text_on_stdout(results: Path, program: Program) -> None:
     done = program("export", str(results), "--format", "gltf", "--out", str(results / "here"), "--json")
     assert (done.returncode, done.stderr) == (0, "")
     here = str(results / "here")
@@ -65,7 +65,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("arguments", WRONG.values(), ids=WRONG)
-def test_what_is_wrong_is_one_line(
+def test_invalid_arguments_and_results(
     arguments: list[str], results: Path, program: Program, monkeypatch: pytest.MonkeyPatch, message: Messages
 ) -> None:
     monkeypatch.chdir(results.parent)
@@ -83,7 +83,7 @@ def test_what_is_wrong_is_one_line(
     assert not list(Path().glob("*/export-*")), "a folder that was made for nothing goes"
 
 
-def test_a_new_export_takes_the_place_of_the_earlier_one(results: Path) -> None:
+def test_new_export_replaces_the_earlier_one(results: Path) -> None:
     """All of it: files that the new one lacks go with their folders, and so does what a killed process left."""
     out = results / "here"
     names = exported(results, out)
@@ -98,7 +98,7 @@ def test_a_new_export_takes_the_place_of_the_earlier_one(results: Path) -> None:
     assert {path.name for path in out.iterdir()} == {*names, "export.json"}
 
 
-def test_a_file_that_is_named_like_ours_is_not_touched(results: Path, message: Messages) -> None:
+def test_foreign_file_with_the_name_of_an_export(results: Path, message: Messages) -> None:
     out = results / "here"
     out.mkdir()
     for name in ("picture.png", "0000.obj"):
@@ -109,7 +109,7 @@ def test_a_file_that_is_named_like_ours_is_not_touched(results: Path, message: M
         (out / name).unlink()
 
 
-def test_two_exports_do_not_write_into_one_folder(results: Path, message: Messages) -> None:
+def test_concurrent_exports(results: Path, message: Messages) -> None:
     out = results / "here"
 
     def second(done: int, total: int) -> None:
@@ -138,7 +138,7 @@ export(Path(sys.argv[1]), "obj", Path(sys.argv[2]), progress)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="kills with SIGKILL")
-def test_an_export_that_is_killed_is_known_to_the_next_one(results: Path) -> None:
+def test_killed_export(results: Path) -> None:
     """Also to one of another format; and one that ends has the same bytes in another process."""
     out, there = results / "here", results / "there"
     exported(results, out)
@@ -156,7 +156,7 @@ def test_an_export_that_is_killed_is_known_to_the_next_one(results: Path) -> Non
         assert name != "obj" or files(results / name) == before
 
 
-def test_a_record_that_was_made_up_takes_no_file_of_the_user(results: Path, message: Messages) -> None:
+def test_forged_export_record(results: Path, message: Messages) -> None:
     out = results / "here"
     names = exported(results, out)
     before = files(out)
@@ -176,9 +176,7 @@ def test_a_record_that_was_made_up_takes_no_file_of_the_user(results: Path, mess
 
 
 @pytest.mark.parametrize("moment", [0, 2])
-def test_a_run_that_publishes_meanwhile_is_noticed(
-    moment: int, results: Path, device: Device, message: Messages
-) -> None:
+def test_run_published_during_an_export(moment: int, results: Path, device: Device, message: Messages) -> None:
     """No file of an export is of another run than the others."""
     out = results / "here"
     exported(results, out)
@@ -194,7 +192,7 @@ def test_a_run_that_publishes_meanwhile_is_noticed(
     assert files(out) == before
 
 
-def test_results_that_go_meanwhile_are_no_fault_of_the_files(results: Path, message: Messages) -> None:
+def test_results_removed_during_an_export(results: Path, message: Messages) -> None:
     def take_away(done: int, total: int) -> None:
         (results / "run.json").unlink(missing_ok=True)
         (results / "trajectory.npz").unlink(missing_ok=True)
@@ -212,9 +210,7 @@ def secret(results: Path) -> str:
 
 
 @pytest.mark.parametrize("name", ["gltf", "obj", "vtk"])
-def test_a_record_that_names_a_picture_elsewhere_gets_nothing_of_it(
-    name: str, results: Path, message: Messages
-) -> None:
+def test_forged_picture_path(name: str, results: Path, message: Messages) -> None:
     change_scene(results, image=secret(results))
     for digests in ({"image": "0" * 64}, {}):
         change(results, sha256=digests)
@@ -223,14 +219,14 @@ def test_a_record_that_names_a_picture_elsewhere_gets_nothing_of_it(
         assert not (results / f"export-{name}").exists()
 
 
-def test_a_record_that_names_a_map_elsewhere_gets_nothing_of_it_for_vtk(results: Path, message: Messages) -> None:
+def test_forged_map_path(results: Path, message: Messages) -> None:
     change_scene(results, springs={"map": {"image": secret(results), "range": [1.0, 2.0]}})
     with message.raises(FilesError, "springs.map.image", "secret.png"):
         export(results, "vtk")
 
 
 @pytest.mark.parametrize("name", ["trajectory.npz", "frames/0001.png", "frames"])
-def test_results_that_are_links_get_nothing_of_what_they_lead_to(name: str, results: Path, message: Messages) -> None:
+def test_linked_results(name: str, results: Path, message: Messages) -> None:
     (results.parent / "elsewhere").mkdir()
     moved = (results / name).rename(results.parent / "elsewhere" / Path(name).name)
     (results / name).symlink_to(moved)
@@ -240,15 +236,13 @@ def test_results_that_are_links_get_nothing_of_what_they_lead_to(name: str, resu
 
 
 @pytest.mark.parametrize("name", ["gltf", "obj", "vtk"])
-def test_positions_that_no_run_reaches_are_damage(name: str, results: Path, message: Messages) -> None:
+def test_implausible_positions(name: str, results: Path, message: Messages) -> None:
     rewrite(results, edit=lambda position: position * np.array([1, 1, 1e300, 1e300, 1])[:, None, None, None])
     with message.raises(FilesError, "trajectory.npz"):
         export(results, name)
 
 
-def test_numbers_that_a_format_cannot_hold_are_one_line(
-    results: Path, monkeypatch: pytest.MonkeyPatch, message: Messages
-) -> None:
+def test_overflow_in_a_format(results: Path, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
     def overflow(*_: object) -> Iterator[list[str]]:
         yield [str(np.float32(1) * np.array([1e300]).astype(np.float32))]
 
@@ -259,7 +253,7 @@ def test_numbers_that_a_format_cannot_hold_are_one_line(
 
 
 @pytest.mark.parametrize("name", ["notes.txt", "sub/0000.obj", "0000.obj.bak", "0000.obj/x"])
-def test_what_no_export_has_written_is_not_touched(name: str, results: Path, message: Messages) -> None:
+def test_foreign_files_in_the_folder(name: str, results: Path, message: Messages) -> None:
     out = results / "here"
     (out / name).parent.mkdir(parents=True)
     (out / name).write_text("mine")
@@ -272,7 +266,7 @@ def test_what_no_export_has_written_is_not_touched(name: str, results: Path, mes
         exported(results, results)
 
 
-def test_a_link_leads_nowhere(results: Path, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
+def test_linked_default_folder(results: Path, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
     """A folder that nobody named may have come with the results."""
     monkeypatch.chdir(results.parent)
     Path("elsewhere").mkdir()
@@ -283,9 +277,7 @@ def test_a_link_leads_nowhere(results: Path, monkeypatch: pytest.MonkeyPatch, me
     assert files(Path("elsewhere")) == {}
 
 
-def test_an_export_that_fails_leaves_the_earlier_one(
-    results: Path, monkeypatch: pytest.MonkeyPatch, message: Messages
-) -> None:
+def test_failed_export(results: Path, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
     out = results / "here"
     exported(results, out)
     before = files(out)
@@ -306,7 +298,7 @@ def test_an_export_that_fails_leaves_the_earlier_one(
 
 
 @pytest.mark.parametrize("name", ["gltf", "obj", "vtk"])
-def test_an_interrupted_export_changes_nothing(name: str, results: Path) -> None:
+def test_interrupted_export(name: str, results: Path) -> None:
     out = results / "here"
     export(results, name, out)
     before, calls = files(out), []
@@ -324,7 +316,7 @@ def test_an_interrupted_export_changes_nothing(name: str, results: Path) -> None
     assert [path.name for path in out.iterdir() if path.name.startswith(".")] == []
 
 
-def test_the_command_says_that_it_was_interrupted(
+def test_interrupted_command(
     results: Path, program: Program, monkeypatch: pytest.MonkeyPatch, message: Messages
 ) -> None:
     def interrupt(_: object) -> None:

@@ -68,7 +68,7 @@ def decode(colours: NDArray[np.uint16]) -> tuple[NDArray[np.float64], NDArray[np
     return (colours[..., :2].astype(float) - 2**15) / 64, colours[..., 2] > 0
 
 
-def test_flow_comes_back(labelled: Path) -> None:
+def test_flow_round_trip(labelled: Path) -> None:
     done = export(labelled, "kitti", labelled / "out")
     training = labelled / "out" / "training"
     assert done.notes == []
@@ -85,7 +85,7 @@ def test_flow_comes_back(labelled: Path) -> None:
         np.testing.assert_array_equal(seen[also_seen], found[also_seen])
 
 
-def test_every_pair_has_its_two_pictures(labelled: Path) -> None:
+def test_pictures_of_the_pairs(labelled: Path) -> None:
     export(labelled, "kitti", labelled / "out")
     written = files(labelled / "out" / "training")
     kinds = ["flow_noc/{}_10.png", "flow_occ/{}_10.png", "image_2/{}_10.png", "image_2/{}_11.png"]
@@ -112,13 +112,13 @@ def test_every_pair_has_its_two_pictures(labelled: Path) -> None:
         ((0, -np.inf), (0, 0, 0)),
     ],
 )
-def test_what_a_flow_is_in_colours(flow: tuple[float, float], colours: tuple[int, ...]) -> None:
+def test_encoded_flow(flow: tuple[float, float], colours: tuple[int, ...]) -> None:
     assert encode_flow(np.array([[flow]], np.float32)).ravel().tolist() == list(colours)
     assert encode_flow(np.array([[flow]], np.float32), np.array([[False]])).ravel().tolist() == [0, 0, 0]
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (37, 53)])
-def test_a_picture_of_16_bits_comes_back(shape: tuple[int, int], tmp_path: Path) -> None:
+def test_16_bit_png_round_trip(shape: tuple[int, int], tmp_path: Path) -> None:
     colours = np.random.default_rng(0).integers(0, 1 << 16, (*shape, 3)).astype(np.uint16)
     data = png16(colours)
     (tmp_path / "picture.png").write_bytes(data)
@@ -127,7 +127,7 @@ def test_a_picture_of_16_bits_comes_back(shape: tuple[int, int], tmp_path: Path)
     np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(data))), colours >> 8)
 
 
-def test_what_is_not_there_is_left_out_and_said(labelled: Path, message: Messages) -> None:
+def test_missing_outputs_are_reported(labelled: Path, message: Messages) -> None:
     shutil.rmtree(labelled / "occlusion")
     shutil.rmtree(labelled / "frames")
     done = export(labelled, "kitti", labelled / "out")
@@ -135,7 +135,7 @@ def test_what_is_not_there_is_left_out_and_said(labelled: Path, message: Message
     message(done.notes, "flow_noc", "image_2")
 
 
-def test_one_frame_has_no_flow(labelled: Path, message: Messages) -> None:
+def test_single_frame(labelled: Path, message: Messages) -> None:
     change(labelled, frames=1)
     with message.raises(FilesError, "frame"):
         export(labelled, "kitti", labelled / "out")
@@ -155,7 +155,7 @@ WHOLE = b"PIEH" + struct.pack("<ii", WIDTH, HEIGHT) + bytes(8 * WIDTH * HEIGHT)
     ],
     ids=["cut in its header", "longer", "another kind", "turned", "huge"],
 )
-def test_damaged_flow_is_one_line(data: bytes, tmp_path: Path, message: Messages) -> None:
+def test_damaged_flow(data: bytes, tmp_path: Path, message: Messages) -> None:
     path = tmp_path / "0000.flo"
     path.write_bytes(WHOLE)
     assert read_flo(path, (WIDTH, HEIGHT)).shape == (HEIGHT, WIDTH, 2)
@@ -173,9 +173,7 @@ DAMAGE: dict[str, tuple[str, Callable[[Path], object]]] = {
 
 
 @pytest.mark.parametrize(("name", "change"), DAMAGE.values(), ids=DAMAGE)
-def test_a_damaged_file_is_named_and_nothing_is_written(
-    name: str, change: Callable[[Path], object], labelled: Path, message: Messages
-) -> None:
+def test_damaged_results(name: str, change: Callable[[Path], object], labelled: Path, message: Messages) -> None:
     change(labelled / name)
     # Why it cannot be decoded are words of Pillow.
     with message.raises(FilesError, name, hide=r"(?<=decoded )\(.*\)"):

@@ -22,7 +22,7 @@ from tests.golden import Messages
 FRAMES, WIDTH, HEIGHT = 3, 40, 32
 
 
-def test_without_rerun_the_package_is_named(
+def test_rerun_is_not_installed(
     labelled_in_motion: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, message: Messages
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
@@ -45,7 +45,7 @@ def logged(path: Path) -> dict[str, dict[int, Any]]:
     return found
 
 
-def test_a_recording_has_what_the_run_has(labelled_in_motion: Path, tmp_path: Path) -> None:
+def test_recording_round_trip(labelled_in_motion: Path, tmp_path: Path) -> None:
     pytest.importorskip("rerun.chunk")
     run, finished = labelled_in_motion, read_run(labelled_in_motion)
     done = export(run, "rerun", tmp_path / "out")
@@ -86,7 +86,7 @@ def test_a_recording_has_what_the_run_has(labelled_in_motion: Path, tmp_path: Pa
     np.testing.assert_array_equal(values, read_flo(run / "flow/0001.flo", (WIDTH, HEIGHT)))
 
 
-def test_each_camera_has_an_entity_and_what_is_missing_is_named(stereo: Path, message: Messages) -> None:
+def test_entities_of_several_cameras(stereo: Path, message: Messages) -> None:
     pytest.importorskip("rerun.chunk")
     shutil.rmtree(stereo / "right/frames")
     done = export(stereo, "rerun")

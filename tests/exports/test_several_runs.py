@@ -61,7 +61,7 @@ def contents(out: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("name", ["vtk", "gltf", "obj"])
-def test_each_run_has_a_folder_of_its_own(name: str, pair: list[str], tmp_path: Path) -> None:
+def test_folder_per_run(name: str, pair: list[str], tmp_path: Path) -> None:
     export(pair, name, "all")
     expected: dict[str, bytes] = {}
     for number, run in enumerate(pair):
@@ -74,7 +74,7 @@ def test_each_run_has_a_folder_of_its_own(name: str, pair: list[str], tmp_path: 
     assert json.loads(Path("all", "export.json").read_text())["files"] == sorted([*expected, "index.csv"])
 
 
-def test_pairs_of_frames_are_numbered_through(pair: list[str]) -> None:
+def test_numbers_of_frame_pairs(pair: list[str]) -> None:
     export(pair, "kitti", "all")
     pairs = [*(("a", frame) for frame in range(FRAMES - 1)), *(("b", frame) for frame in range(FRAMES - 3))]
     rows = [[f"{number:06}", run, str(frame)] for number, (run, frame) in enumerate(pairs)]
@@ -87,7 +87,7 @@ def test_pairs_of_frames_are_numbered_through(pair: list[str]) -> None:
     assert contents(Path("all")) == expected
 
 
-def test_videos_are_named_by_their_numbers(pair: list[str]) -> None:
+def test_names_of_videos(pair: list[str]) -> None:
     export(pair, "tapvid", "all")
     videos = pickle.loads(Path("all", "tapvid.pkl").read_bytes())
     assert list(videos) == ["000000", "000001"]
@@ -99,9 +99,7 @@ def test_videos_are_named_by_their_numbers(pair: list[str]) -> None:
             np.testing.assert_array_equal(video[key], values)
 
 
-def test_all_videos_together_must_fit_into_memory(
-    pair: list[str], monkeypatch: pytest.MonkeyPatch, message: Messages
-) -> None:
+def test_memory_limit_of_all_videos(pair: list[str], monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
     need = 2 * 3 * (FRAMES + FRAMES - 2) * WIDTH * HEIGHT
     monkeypatch.setattr(tapvid, "available_memory", lambda: need - 1)
     with message.raises(FilesError, "memory"):
@@ -110,13 +108,13 @@ def test_all_videos_together_must_fit_into_memory(
     export(pair, "tapvid", "all")
 
 
-def test_progress_counts_the_frames_of_all_runs(pair: list[str]) -> None:
+def test_progress(pair: list[str]) -> None:
     calls: list[tuple[int, int]] = []
     export(pair, "obj", "all", lambda done, total: calls.append((done, total)))
     assert calls == [(done, 8) for done in (0, *range(8))]
 
 
-def test_a_run_that_is_replaced_while_it_is_read_is_noticed(pair: list[str], message: Messages) -> None:
+def test_run_replaced_during_an_export(pair: list[str], message: Messages) -> None:
     def replace(done: int, total: int) -> None:
         if done == FRAMES:
             change(Path("b"), frames=FRAMES - 1)
@@ -126,7 +124,7 @@ def test_a_run_that_is_replaced_while_it_is_read_is_noticed(pair: list[str], mes
     assert not Path("all").exists()
 
 
-def test_notes_name_their_runs(pair: list[str], message: Messages) -> None:
+def test_warnings_name_their_runs(pair: list[str], message: Messages) -> None:
     message(export("a", "kitti").notes, "flow_noc")
     message(export(pair, "kitti", "all").notes, "a and 1 more")
     shutil.rmtree("b/frames")
@@ -143,7 +141,7 @@ def sweep(pair: list[str]) -> Path:
     return Path("sweep")
 
 
-def test_complete_runs_of_a_sweep_are_exported(sweep: Path, program: Program, message: Messages) -> None:
+def test_complete_runs_of_a_sweep(sweep: Path, program: Program, message: Messages) -> None:
     done = program("export", "sweep", "--format", "kitti", "--json")
     assert (done.returncode, done.stderr) == (0, "")
     told = json.loads(done.stdout)
@@ -154,7 +152,7 @@ def test_complete_runs_of_a_sweep_are_exported(sweep: Path, program: Program, me
     assert index(sweep / "export-kitti")[1:] == expected
 
 
-def test_sweeps_and_runs_go_together(sweep: Path, program: Program, message: Messages) -> None:
+def test_sweeps_and_runs(sweep: Path, program: Program, message: Messages) -> None:
     """A run that is named is taken, whatever its status, and links are not followed."""
     (sweep / "runs" / "000003").symlink_to(Path("a").resolve())
     done = program("export", "./sweep/runs/000002", "sweep", "b/", "--format", "gltf")
@@ -165,7 +163,7 @@ def test_sweeps_and_runs_go_together(sweep: Path, program: Program, message: Mes
     assert export(sweep / "runs" / "000000", "obj").notes == []
 
 
-def test_what_a_sweep_lacks_is_named_with_the_remedy(sweep: Path, message: Messages) -> None:
+def test_incomplete_sweep(sweep: Path, message: Messages) -> None:
     shutil.rmtree(sweep / "runs" / "1000000" / "flow")
     with message.raises(FilesError, "sweep/runs/1000000", "flow"):
         export("sweep", "kitti")
@@ -179,7 +177,7 @@ def test_what_a_sweep_lacks_is_named_with_the_remedy(sweep: Path, message: Messa
         export("sweep", "obj")
 
 
-def test_wrong_arguments_are_told_of(results: Path, message: Messages) -> None:
+def test_invalid_arguments(results: Path, message: Messages) -> None:
     wrong: list[tuple[Any, ...]] = [(results, "glft"), (results, ["obj"]), ([], "obj"), (3, "obj")]
     for arguments in (*wrong, ([results, None], "obj"), (results, "obj", 3)):
         with message.raises(ArgumentError):

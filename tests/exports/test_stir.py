@@ -68,7 +68,7 @@ def left(stereo: Path) -> Path:
     return left
 
 
-def test_the_loader_finds_films_and_calibration(stereo: Path, left: Path) -> None:
+def test_videos_and_calibration(stereo: Path, left: Path) -> None:
     assert left == stereo / "export-stir/000000/left/seq00"
     for side in (left, to_the_right(left)):
         shown = film(side)
@@ -91,7 +91,7 @@ def test_the_loader_finds_films_and_calibration(stereo: Path, left: Path) -> Non
         )
 
 
-def test_marked_points_are_the_tracked_ones(stereo: Path, left: Path) -> None:
+def test_marked_tracks(stereo: Path, left: Path) -> None:
     count = set()
     for side in (left, to_the_right(left)):
         made = tracks(stereo / side.parent.name)
@@ -106,7 +106,7 @@ def test_marked_points_are_the_tracked_ones(stereo: Path, left: Path) -> None:
     assert marked > 20
 
 
-def test_places_come_back_from_both_cameras(stereo: Path, left: Path) -> None:
+def test_triangulated_positions(stereo: Path, left: Path) -> None:
     """As the loader computes them [mm], where the depth is off by as much as a pixel of disparity tells."""
     calibration = json.loads((left.parents[1] / "calib.json").read_text())
     matrix, baseline = np.array(calibration["leftcameramat"]), calibration["translation"][0] * 1000
@@ -126,7 +126,7 @@ def test_places_come_back_from_both_cameras(stereo: Path, left: Path) -> None:
             assert np.abs(place[:2] / place[2] - expected[:2] / expected[2]).max() < 0.51 / matrix[0, 0]
 
 
-def test_points_that_a_camera_does_not_see_are_not_marked(stereo: Path, left: Path, message: Messages) -> None:
+def test_occluded_tracks_are_not_marked(stereo: Path, left: Path, message: Messages) -> None:
     before = len(centres(left, "start"))
     made = tracks(stereo / "right")
     x, y = centres(left, "start")[0]
@@ -140,7 +140,7 @@ def test_points_that_a_camera_does_not_see_are_not_marked(stereo: Path, left: Pa
     message(done.notes, f"{before - 1} of 36", "1280 x 1024", "8 to 105 px")
 
 
-def test_discs_do_not_touch_each_other(stereo: Path) -> None:
+def test_discs_do_not_touch(stereo: Path) -> None:
     """Two that did would be one point, in between."""
     for side in ("left", "right"):
         made = tracks(stereo / side)
@@ -152,7 +152,7 @@ def test_discs_do_not_touch_each_other(stereo: Path) -> None:
     assert [centre.tolist() in found for centre in first] == [True, False, True]
 
 
-def test_cameras_that_are_not_beside_each_other_are_refused(stereo: Path, message: Messages) -> None:
+def test_cameras_that_are_not_rectified(stereo: Path, message: Messages) -> None:
     pose = np.array(json.loads((stereo / "right/camera.json").read_text())["pose"])
     turned, lower, swapped = pose.copy(), pose.copy(), pose.copy()
     turned[0], turned[1] = pose[1], -pose[0]
@@ -165,7 +165,7 @@ def test_cameras_that_are_not_beside_each_other_are_refused(stereo: Path, messag
             export(stereo, "stir")
 
 
-def test_two_cameras_are_needed_with_their_tracks_and_without_distortion(stereo: Path, message: Messages) -> None:
+def test_unsupported_runs(stereo: Path, message: Messages) -> None:
     with message.raises(FilesError, "cameras"):
         export(alone(stereo, "left"), "stir")
     describe(stereo / "right", distortion=[0.1] * 8)
@@ -176,7 +176,7 @@ def test_two_cameras_are_needed_with_their_tracks_and_without_distortion(stereo:
         export(stereo, "stir")
 
 
-def test_without_pyav_there_is_one_line(stereo: Path, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
+def test_pyav_is_not_installed(stereo: Path, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
     monkeypatch.setattr(outputs, "is_pyav_installed", lambda: False)
     with message.raises(NotInstalledError, "PyAV"):
         export(stereo, "stir")

@@ -35,7 +35,7 @@ def tracked(results: Path) -> Path:
     return results
 
 
-def test_tracks_come_back(tracked: Path) -> None:
+def test_tracks_round_trip(tracked: Path) -> None:
     done = export(tracked, "tapvid", tracked / "out")
     assert (done.files, done.notes) == (["index.csv", "tapvid.pkl"], [])
     written = (tracked / "out" / "tapvid.pkl").read_bytes()
@@ -72,7 +72,7 @@ DAMAGE: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("name", DAMAGE)
-def test_damaged_tracks_are_one_line(name: str, tracked: Path, message: Messages) -> None:
+def test_damaged_tracks(name: str, tracked: Path, message: Messages) -> None:
     arrays = {key: value for key, value in {**made_up(), **DAMAGE[name]}.items() if value is not None}
     (np.savez_compressed if name == "compressed" else np.savez)(tracked / "tracks.npz", **arrays)
     with message.raises(FilesError, "tracks.npz"):
@@ -80,9 +80,7 @@ def test_damaged_tracks_are_one_line(name: str, tracked: Path, message: Messages
     assert not (tracked / "out").exists()
 
 
-def test_a_video_that_does_not_fit_is_told_of(
-    tracked: Path, monkeypatch: pytest.MonkeyPatch, message: Messages
-) -> None:
+def test_memory_limit(tracked: Path, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
     monkeypatch.setattr(tapvid, "available_memory", lambda: 6 * FRAMES * WIDTH * HEIGHT - 1)
     with message.raises(FilesError, "render.size"):
         export(tracked, "tapvid", tracked / "out")
@@ -90,7 +88,7 @@ def test_a_video_that_does_not_fit_is_told_of(
     export(tracked, "tapvid", tracked / "out")
 
 
-def test_frames_are_needed(tracked: Path, message: Messages) -> None:
+def test_missing_frames(tracked: Path, message: Messages) -> None:
     (tracked / "frames").rename(tracked / "elsewhere")
     with message.raises(FilesError, "png"):
         export(tracked, "tapvid", tracked / "out")

@@ -39,7 +39,7 @@ def read(path: Path) -> tuple[Any, dict[str, NDArray[Any]]]:
     return grid, arrays | {"points": vtk_to_numpy(grid.GetPoints().GetData())}
 
 
-def test_every_frame_is_where_the_run_had_it(ran: Path, out: Path) -> None:
+def test_point_data_of_every_frame(ran: Path, out: Path) -> None:
     run = read_run(ran)
     for frame, position in enumerate(run.positions()):
         grid, found = read(out / f"000{frame}.vtu")
@@ -57,7 +57,7 @@ def test_every_frame_is_where_the_run_had_it(ran: Path, out: Path) -> None:
     assert total > 0
 
 
-def test_the_surface_faces_the_viewer_and_has_the_picture_upright(out: Path) -> None:
+def test_orientation_and_texture_coordinates(out: Path) -> None:
     from vtkmodules.vtkFiltersCore import vtkPolyDataNormals
     from vtkmodules.vtkFiltersGeometry import vtkGeometryFilter
 
@@ -78,7 +78,7 @@ def test_the_surface_faces_the_viewer_and_has_the_picture_upright(out: Path) -> 
     assert [data.GetTuple(n) for n in range(data.GetNumberOfTuples())] == [(0, 0, 1)] * 99
 
 
-def test_the_collection_has_the_time_of_every_file(out: Path) -> None:
+def test_collection(out: Path) -> None:
     collection = ElementTree.parse(out / "surface.pvd").getroot()
     assert (collection.tag, collection.get("type")) == ("VTKFile", "Collection")
     found = {float(one.attrib["timestep"]): one.attrib["file"] for one in collection.iter("DataSet")}
@@ -87,7 +87,7 @@ def test_the_collection_has_the_time_of_every_file(out: Path) -> None:
     assert (out / "picture.png").exists()
 
 
-def test_the_speed_is_of_order_2() -> None:
+def test_speed_is_of_order_2() -> None:
     """Against that of a motion from rest whose speed is known."""
     errors = []
     for frames in (20, 40, 80):

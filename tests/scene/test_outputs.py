@@ -14,7 +14,7 @@ from taichi_msm.scene.outputs import OUTPUTS, RESULT_PATTERNS, file_names, resul
 FIELDS = {"labels": Labels._fields, "flow": Flow._fields, "stereo": Stereo._fields}
 
 
-def test_every_label_has_its_field_and_a_format() -> None:
+def test_fields_and_formats_of_the_labels() -> None:
     for output in OUTPUTS.values():
         assert output.source in (*FrameOutputs._fields, "positions", "forces")
         if output.source in FIELDS:
@@ -24,7 +24,7 @@ def test_every_label_has_its_field_and_a_format() -> None:
             assert output.pixel_bytes > 0
 
 
-def test_the_files_of_a_run_in_the_order_of_its_record() -> None:
+def test_file_names_of_a_run() -> None:
     assert result_names({"": ["tracks", "flow", "gif", "png"]}) == [
         *("frames", "flow", "animation.gif", "tracks.npz", "camera.json", "run.json")
     ]
@@ -53,7 +53,7 @@ def test_the_files_of_a_run_in_the_order_of_its_record() -> None:
         "a/trajectory.npz",
     ],
 )
-def test_no_other_file_is_taken_for_one_of_a_run(name: str) -> None:
+def test_patterns_match_only_results(name: str) -> None:
     seen = [output.name for output in OUTPUTS.values() if output.is_camera_output]
     every = file_names(result_names({"": OUTPUTS, "left": seen}), 3)
     assert all(re.fullmatch("|".join(RESULT_PATTERNS), file) for file in every)
