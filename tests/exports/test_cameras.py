@@ -1,18 +1,16 @@
-"""Exports of a camera: which one, which a format can describe, tables of its tracks, and TAPVid-3D.
+"""Exports of a camera by its name, CSV tables of its tracks, and TAPVid-3D.
 
-What TAPVid-3D's own evaluation reads of our files.
-
-Its requirements, restated (google-deepmind/tapnet, tapnet/tapvid3d, at c2cbab8 where nothing else is said):
+Requirements of TAPVid-3D's evaluation (google-deepmind/tapnet, tapnet/tapvid3d, at c2cbab8 unless stated otherwise):
 
 - evaluation/evaluate_model.py, lines 191 to 197: an .npz with images_jpeg_bytes, queries_xyt, tracks_XYZ, visibility
   and fx_fy_cx_cy; lines 108 to 112: each image is a JPEG that Pillow opens; lines 237 to 244: visibility is true where
-  a point is seen, tracks and visibility have the order t, n, and the columns of queries, reversed, are t, y, x;
+  a point is visible, tracks and visibility have the order t, n, and the columns of queries, reversed, are t, y, x;
 - evaluation/metrics.py, lines 23 to 29: the thresholds are the depth, the last column of tracks, over the focal length
   in pixels; lines 205 to 211: tracks are read in the frame of their query;
 - annotation_generation/adt_utils.py at 00f244e, lines 109 to 118: a point is in the pixel of row floor(y) and column
-  floor(x), with x = fx X / Z + cx, so that pixels are counted from the picture's corner;
-- colab/load_and_visualize_tapvid3d_samples.ipynb, lines 166 to 174: np.load without pickle; extrinsics_w2c if it is
-  there, README.md, line 108: from the world to the camera.
+  floor(x), with x = fx X / Z + cx, so that pixels count from the picture's corner;
+- colab/load_and_visualize_tapvid3d_samples.ipynb, lines 166 to 174: np.load without pickle; optional extrinsics_w2c,
+  README.md, line 108: from the world to the camera.
 """
 
 from __future__ import annotations
@@ -36,7 +34,7 @@ from tests.outputs import files
 
 
 def describe(folder: Path, **changes: Any) -> None:
-    """Change what a run has written of its camera; None removes a key."""
+    """Change keys of camera.json; None removes a key."""
     path = folder / "camera.json"
     described = {**json.loads(path.read_text()), **changes}
     path.write_text(json.dumps({name: value for name, value in described.items() if value is not None}))
@@ -46,7 +44,7 @@ FRAMES, TRACKS, WIDTH, HEIGHT = 5, 36, 320, 256
 
 
 def alone(stereo: Path, side: str) -> Path:
-    """The same run with one camera, as one without a name."""
+    """Return the run with one camera, which has no name."""
     out = stereo.parent / side
     shutil.copytree(stereo, out, ignore=shutil.ignore_patterns("left", "right"))
     shutil.copytree(stereo / side, out, dirs_exist_ok=True)
@@ -90,7 +88,7 @@ def test_missing_output_of_a_camera(stereo: Path, message: Messages) -> None:
     with message.raises(FilesError, "tracks"):
         export(stereo, "tapvid", camera="right")
     export(stereo, "tapvid", camera="left")
-    # Surfaces have no camera to choose.
+    # Surfaces are independent of the cameras.
     assert export(stereo, "gltf").files == ["index.csv", "surface.glb"]
 
 
@@ -98,7 +96,7 @@ def test_missing_output_of_a_camera(stereo: Path, message: Messages) -> None:
     ("name", "formats"), [("left", ["tapvid", "tapvid3d", "csv"]), ("", ["obj"])], ids=["camera", "record"]
 )
 def test_linked_camera_folder_or_record(name: str, formats: list[str], stereo: Path, message: Messages) -> None:
-    """Be it the folder of a camera or the record: both may lead to the results of another run."""
+    """Links to the results of another run."""
     other = stereo.with_name("other")
     shutil.copytree(stereo, other)
     link = stereo / (name or "run.json")
@@ -115,10 +113,8 @@ WRONG: dict[str, dict[str, Any]] = {
     "distorted": {"distortion": [-0.3, 0.1, 0, 0, 0, 0, 0, 0], "model": "pinhole"},
     "fisheye": {"distortion": [0, 0, 0, 0], "model": "fisheye"},
     "no perspective": {"intrinsics": None, "pose": None},
-    "2 x 2": {"intrinsics": [[1, 0], [0, 1]]},
     "no focal length": {"intrinsics": [[0, 0, 1], [0, 1, 0], [0, 0, 1]]},
     "too few poses": {"poses": [[[1, 0, 0, 0]] * 3]},
-    "no pose": {"pose": "here"},
 }
 
 
@@ -128,7 +124,7 @@ def test_tapvid3d_rejects_a_camera(name: str, single: Path, message: Messages) -
     with message.raises(ArgumentError if list(WRONG).index(name) < 3 else FilesError, "camera.json"):
         export(single, "tapvid3d")
     assert not (single / "export-tapvid3d").exists()
-    # What has no calibration takes any camera.
+    # Formats without a calibration export any camera.
     export(single, "tapvid")
 
 
@@ -142,49 +138,54 @@ def column(path: Path, *names: str) -> np.ndarray[Any, Any]:
 
 
 def test_csv_round_trip(single: Path) -> None:
-    with np.load(single / "tracks.npz") as archive:
-        made = dict(archive)
+    made = tracks(single)
     made["points"][7, 2], made["occluded"][7, 2] = np.nan, True
     np.savez(single / "tracks.npz", **made)
     done = export(single, "csv")
     assert (done.files, done.notes) == (["forces.csv", "index.csv", "tracks.csv"], [])
-    tracks = done.directory / "tracks.csv"
-    assert list(rows(tracks)[0]) == [
+    table = done.directory / "tracks.csv"
+    assert list(rows(table)[0]) == [
         *("run", "time", "point", "across", "down", "x", "y", "occluded", "position_x", "position_y", "position_z")
     ]
     shape = FRAMES, TRACKS, -1
-    np.testing.assert_array_equal(column(tracks, "point").reshape(shape)[..., 0], [np.arange(TRACKS)] * FRAMES)
-    np.testing.assert_array_equal(column(tracks, "time").reshape(shape)[:, 0, 0], np.arange(FRAMES) / 10)
+    np.testing.assert_array_equal(column(table, "point").reshape(shape)[..., 0], [np.arange(TRACKS)] * FRAMES)
+    np.testing.assert_array_equal(column(table, "time").reshape(shape)[:, 0, 0], np.arange(FRAMES) / 10)
     for names, expected in (
         (("across", "down"), np.tile(made["coordinates"][:, None], (1, FRAMES, 1))),
         (("x", "y"), made["points"]),
         (("occluded",), made["occluded"][..., None]),
         (("position_x", "position_y", "position_z"), made["position"]),
     ):
-        found = column(tracks, *names).reshape(shape).transpose(1, 0, 2)
-        np.testing.assert_array_equal(found.astype(np.float32), expected)
-    assert rows(tracks)[2 * TRACKS + 7]["x"] == "", "behind the eye"
+        values = column(table, *names).reshape(shape).transpose(1, 0, 2)
+        np.testing.assert_array_equal(values.astype(np.float32), expected)
+    assert rows(table)[2 * TRACKS + 7]["x"] == "", "behind the eye"
     forces = rows(done.directory / "forces.csv")
     assert {row.pop("run") for row in forces} == {"000000"}
     assert forces == rows(single / "forces.csv")
 
 
 def test_csv_of_several_runs(single: Path, message: Messages) -> None:
-    """And one without forces is missing from their table."""
-    other = single.parent / "other"
+    """A run without forces is missing from their table."""
+    second = single.parent / "second"
     export(single, "csv", single / "alone")
-    shutil.copytree(single, other)
-    (other / "forces.csv").unlink()
-    done = export([other, single], "csv", single.parent / "all")
+    shutil.copytree(single, second)
+    (second / "forces.csv").unlink()
+    done = export([second, single], "csv", single.parent / "all")
     message(done.notes, "forces")
     for name in ("tracks.csv", "forces.csv"):
-        found, expected = rows(done.directory / name), rows(single / "alone" / name)
+        exported, expected = rows(done.directory / name), rows(single / "alone" / name)
         for run in ("000000", "000001") if name == "tracks.csv" else ("000001",):
-            part = [row for row in found if row["run"] == run]
+            part = [row for row in exported if row["run"] == run]
             assert [{**row, "run": "000000"} for row in part] == expected
 
 
-def test_csv_of_forces_only(stereo: Path) -> None:
+def test_csv_without_forces_or_tracks(stereo: Path, single: Path, message: Messages) -> None:
+    (single / "forces.csv").unlink()
+    assert export(single, "csv").files == ["index.csv", "tracks.csv"]
+    (single / "tracks.npz").unlink()
+    with message.raises(FilesError, "forces"):
+        export(single, "csv")
+    # Forces are independent of the cameras.
     record = json.loads((stereo / "run.json").read_text())
     record["scene"]["output"].remove("tracks")
     (stereo / "run.json").write_text(json.dumps(record))
@@ -193,26 +194,17 @@ def test_csv_of_forces_only(stereo: Path) -> None:
     assert export(stereo, "csv").files == ["forces.csv", "index.csv"]
 
 
-def test_csv_without_forces_or_tracks(single: Path, message: Messages) -> None:
-    (single / "forces.csv").unlink()
-    assert export(single, "csv").files == ["index.csv", "tracks.csv"]
-    (single / "tracks.npz").unlink()
-    with message.raises(FilesError, "forces"):
-        export(single, "csv")
-
-
 def test_damaged_tables(single: Path, message: Messages) -> None:
-    whole = (single / "forces.csv").read_text()
-    header = whole.partition("\n")[0]
-    for text in ("", "time\n0\n", f"{header}\n0,0,0\n", f"{header}\n0,0,0,0,0,0,0,=1+1\n", "\xff"):
-        (single / "forces.csv").write_bytes(text.encode("latin1"))
+    text = (single / "forces.csv").read_text()
+    header = text.partition("\n")[0]
+    for damaged in ("", f"{header}\n0,0,0\n", f"{header}\n0,0,0,0,0,0,0,=1+1\n"):
+        (single / "forces.csv").write_text(damaged)
         with message.raises(FilesError, "forces.csv"):
             export(single, "csv")
-    (single / "forces.csv").write_text(whole)
-    with np.load(single / "tracks.npz") as archive:
-        made = dict(archive)
-    del made["position"]
-    np.savez(single / "tracks.npz", **made)
+    (single / "forces.csv").write_text(text)
+    arrays = tracks(single)
+    del arrays["position"]
+    np.savez(single / "tracks.npz", **arrays)
     with message.raises(FilesError, "tracks.npz"):
         export(single, "csv")
     assert not (single / "export-csv").exists()
@@ -240,9 +232,9 @@ def test_tapvid3d_round_trip(single: Path) -> None:
     x, y, depth = np.moveaxis(found["tracks_XYZ"], -1, 0)
     assert (depth > 0.3).all(), "forward is positive"
     fx, fy, cx, cy = found["fx_fy_cx_cy"]
-    seen = np.stack([fx * x / depth + cx, fy * y / depth + cy], axis=-1).transpose(1, 0, 2)
-    # Places and pixels were rounded to single precision.
-    np.testing.assert_allclose(seen, expected["points"], rtol=0, atol=1e-4)
+    pixels = np.stack([fx * x / depth + cx, fy * y / depth + cy], axis=-1).transpose(1, 0, 2)
+    # Positions and pixels are rounded to single precision.
+    np.testing.assert_allclose(pixels, expected["points"], rtol=0, atol=1e-4)
     assert found["images_jpeg_bytes"].shape == (FRAMES,)
     for frame, data in enumerate(found["images_jpeg_bytes"]):
         with Image.open(io.BytesIO(data)) as image:
@@ -277,7 +269,7 @@ def test_tapvid3d_of_a_moving_camera(single: Path) -> None:
     poses[:, 0, 0] = poses[:, 1, 1] = np.cos(angle)
     poses[:, 1, 0], poses[:, 0, 1] = np.sin(angle), -np.sin(angle)
     poses[:, 2, 3] = 1 + angle
-    # Of a calibrated camera all coefficients may be written, and be 0.
+    # The coefficients of a calibrated camera may all be 0.
     describe(single, poses=poses.tolist(), distortion=[0.0] * 8, model="pinhole")
     found, world = read(export(single, "tapvid3d").directory / "000000.npz"), tracks(single)["position"]
     np.testing.assert_array_equal(found["extrinsics_w2c"][:, :3], poses)

@@ -1,6 +1,6 @@
-"""What the loaders of EndoNeRF and EndoGaussian read of our files.
+"""EndoNeRF export, decoded as by the loaders of EndoNeRF and EndoGaussian.
 
-Their requirements, restated (med-air/EndoNeRF at 5201b1e, yifliu3/EndoGaussian at d7aad82):
+Their requirements (med-air/EndoNeRF at 5201b1e, yifliu3/EndoGaussian at d7aad82):
 
 - load_llff.py, lines 97 to 200, and endo_loader.py, lines 170 to 204: poses_bounds.npy has 17 numbers a frame, a
   matrix 3 x 5 whose last column is height, width and focal length, and two bounds; images, depth and masks have a .png
@@ -78,11 +78,11 @@ def test_loaders_of_endonerf_and_endogaussian(labelled_in_motion: Path, tmp_path
         # EndoNeRF's rays end on the same points.
         rays = np.stack([(i - WIDTH / 2) / 45, -(j - HEIGHT / 2) / 45, -np.ones_like(i)], axis=-1)
         ends = pose[:, 3] + depths[frame][..., None] * (rays @ pose[:, :3].T)
-        seen = ~tracks["occluded"][:, frame]
-        column, row = np.rint(pixels[seen]).astype(int).T
+        visible = ~tracks["occluded"][:, frame]
+        column, row = np.rint(pixels[visible]).astype(int).T
         # A pixel's middle is up to 0.71 px from the point, 0.011 of its depth of 0.5 m; the sheet is tilted.
-        assert seen.sum() > 5
-        assert np.linalg.norm(ends[row, column] - points[seen], axis=-1).max() * UNIT < 0.02
+        assert visible.sum() > 5
+        assert np.linalg.norm(ends[row, column] - points[visible], axis=-1).max() * UNIT < 0.02
     assert any("0.01 mm" in note for note in done.notes)
     assert any("640 x 512" in note for note in done.notes)
 

@@ -1,4 +1,4 @@
-"""The OBJ files hold the surface of every frame, with its picture."""
+"""Surface, texture and material in OBJ files."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def out(ran: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def rows(path: Path, key: str) -> list[list[str]]:
-    """The lines of a file that begin with a key, without it."""
+    """Return the words of the lines that begin with a key."""
     lines = (line.split() for line in path.read_text(encoding="ascii").splitlines())
     return [words[1:] for words in lines if words and words[0] == key]
 

@@ -33,7 +33,7 @@ def test_rerun_is_not_installed(
 
 
 def logged(path: Path) -> dict[str, dict[int, Any]]:
-    """The values of all components in every frame of a recording, by entity and component; frame -1 is static."""
+    """Return the values of all components by entity and component, then by frame; frame -1 is static."""
     chunk: Any = pytest.importorskip("rerun.chunk")
     found: dict[str, dict[int, Any]] = {}
     for each in chunk.RrdReader(path).stream():
@@ -65,7 +65,7 @@ def test_recording_round_trip(labelled_in_motion: Path, tmp_path: Path) -> None:
         (capsule,) = place_instruments(finished.scene, positions[frame], frame / 10)
         np.testing.assert_allclose(found["/world/tools/0 Transform3D:translation"][frame][0], capsule.tip, atol=1e-6)
         np.testing.assert_allclose(found["/world/tracks Points3D:positions"][frame], tracks["position"][:, frame])
-        # Columns first, and from the camera to the world.
+        # Column by column, from the camera to the world.
         matrix = np.array(found["/world/camera Transform3D:mat3x3"][frame]).reshape(3, 3).T
         eye = np.array(found["/world/camera Transform3D:translation"][frame][0])
         np.testing.assert_allclose(matrix.T, poses[frame, :, :3], atol=1e-6)

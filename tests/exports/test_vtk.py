@@ -1,4 +1,4 @@
-"""VTK reads the surface of every frame, and what is known at its points."""
+"""Surface and point data, read with VTK."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def out(ran: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def read(path: Path) -> tuple[Any, dict[str, NDArray[Any]]]:
-    """The grid of a file, and the arrays at its points by name."""
+    """Return the grid of a file, and its point data by name."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridReader
 
@@ -44,12 +44,12 @@ def test_point_data_of_every_frame(ran: Path, out: Path) -> None:
     for frame, position in enumerate(run.positions()):
         grid, found = read(out / f"000{frame}.vtu")
         assert set(found) == {"points", "displacement", "speed", "energy_density", "texture"}
-        assert {array.dtype for array in found.values()} == {np.dtype(np.float64)}, "that of the run"
+        assert {array.dtype for array in found.values()} == {np.dtype(np.float64)}, "precision of the run"
         np.testing.assert_array_equal(found["points"], position.reshape(-1, 3))
         displacement = position - rest_positions(run.scene.sheet)
         np.testing.assert_array_equal(found["displacement"], displacement.reshape(-1, 3))
         np.testing.assert_array_equal(found["speed"], speed(run.positions(), run.time, frame).ravel())
-        # The energy of all springs, by the twin.
+        # The energy of all springs, by the reference implementation.
         area = area_shares(run.scene.sheet).ravel() * (0.3 / 8) * (0.4 / 10)
         total = reference.energy(run.scene, displacement)
         assert (found["energy_density"] * area).sum() == pytest.approx(total, rel=1e-12)
@@ -81,14 +81,14 @@ def test_orientation_and_texture_coordinates(out: Path) -> None:
 def test_collection(out: Path) -> None:
     collection = ElementTree.parse(out / "surface.pvd").getroot()
     assert (collection.tag, collection.get("type")) == ("VTKFile", "Collection")
-    found = {float(one.attrib["timestep"]): one.attrib["file"] for one in collection.iter("DataSet")}
-    assert found == {frame / 10: f"000{frame}.vtu" for frame in range(5)}
-    assert all((out / name).exists() for name in found.values())
+    times = {float(entry.attrib["timestep"]): entry.attrib["file"] for entry in collection.iter("DataSet")}
+    assert times == {frame / 10: f"000{frame}.vtu" for frame in range(5)}
+    assert all((out / name).exists() for name in times.values())
     assert (out / "picture.png").exists()
 
 
 def test_speed_is_of_order_2() -> None:
-    """Against that of a motion from rest whose speed is known."""
+    """Of the motion sin^2 t, whose speed is 5 sin 2t."""
     errors = []
     for frames in (20, 40, 80):
         time = np.linspace(0, 1, frames + 1)
@@ -96,9 +96,9 @@ def test_speed_is_of_order_2() -> None:
         exact = 5 * np.sin(2 * time)
         assert (speed(position, time, 0) == 0).all()
         errors.append(max(np.abs(speed(position, time, n) - exact[n]).max() for n in range(1, frames)))
-        # One-sided: half a frame's time the acceleration, and less.
+        # One-sided: at most half the frame interval times the acceleration.
         assert np.abs(speed(position, time, frames) - exact[-1]).max() < 10 / frames / 2
-    assert (speed(np.ones((1, 2, 3, 3)), np.zeros(1), 0) == 0).all(), "of a frame alone"
+    assert (speed(np.ones((1, 2, 3, 3)), np.zeros(1), 0) == 0).all(), "single frame"
     # h^2 / 6 times the third derivative, 20 at most.
     assert errors[0] < 20 / 20**2 / 6
     assert np.log2(np.divide(errors[:-1], errors[1:])) == pytest.approx([2, 2], abs=0.05)
