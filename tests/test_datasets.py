@@ -119,10 +119,10 @@ def test_flow_agrees_with_tracks(data_set: Path) -> None:
 
 def test_batches_of_a_loader(data_set: Path, torch: None) -> None:
     pairs = Pairs(data_set, "train")
-    batches = list(pairs.loader(batch_size=4))
-    assert [len(batch["flow"]) for batch in batches] == [4, 4, 2]
+    loaded = list(pairs.loader(batch_size=4))
+    assert [len(batch["flow"]) for batch in loaded] == [4, 4, 2]
     last: dict[str, Any] = {**pairs[-1]}
-    assert all(np.array_equal(batches[2][name][1], value) for name, value in last.items())
+    assert all(np.array_equal(loaded[2][name][1], value) for name, value in last.items())
     (clips,) = Clips(data_set, "train", FRAMES).loader(batch_size=2)
     assert tuple(clips["video"].shape) == (2, FRAMES, 3, HEIGHT, WIDTH)
     assert tuple(clips["points"].shape) == (2, TRACKS**2, FRAMES, 2)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from taichi_msm import load_scene
+from taichi_msm.camera_files.calibration import Calibration
 from taichi_msm.camera_files.camera_file import CameraFileError
 from taichi_msm.camera_files.readers import read_calibration
 from taichi_msm.cli.main import main
@@ -32,6 +33,11 @@ def camera_of(path: str, *overrides: str) -> Camera:
     camera = load_scene("small.yaml", [READ.replace("FILE", path), *overrides]).render.camera
     assert isinstance(camera, Camera)
     return camera
+
+
+def read(text: str, eye: Literal["left", "right"] = "left", unit: Literal["mm"] | None = None) -> Calibration:
+    Path("camera.yml").write_text(text)
+    return read_calibration("camera.yml", eye, unit)
 
 
 def write_opencv(path: str) -> None:
@@ -64,20 +70,40 @@ def test_opencv_file(suffix: str, small: Path) -> None:
 ROS = """\
 image_width: 40
 image_height: 30
-camera_name: narrow_stereo
 camera_matrix: {rows: 3, cols: 3, data: [61.5, 0, 19.25, 0, 60.5, 14.75, 0, 0, 1]}
 distortion_model: MODEL
 distortion_coefficients: {rows: 1, cols: 4, data: [0.01, 0.002, 0.0003, -0.0004]}
 rectification_matrix: {rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}
 """
+# Printed by `rostopic echo`.
+MESSAGE = """\
+header: {seq: 7, frame_id: "camera"}
+height: 30
+width: 40
+distortion_model: "plumb_bob"
+D: [0.01, 0.002, 0.0003, -0.0004, 0.0]
+K: [61.5, 0.0, 19.25, 0.0, 60.5, 14.75, 0.0, 0.0, 1.0]
+binning_x: 0
+binning_y: 1
+roi: {x_offset: 0, y_offset: 0, height: 0, width: 0, do_rectify: False}
+---
+"""
 
 
-def test_ros_camera_info(small: Path) -> None:
-    for model, expected in (("plumb_bob", "pinhole"), ("equidistant", "fisheye")):
-        Path("ros.yaml").write_text(ROS.replace("MODEL", model))
-        calibration = read_calibration("ros.yaml")
-        assert calibration.model == expected
-        assert [*calibration.coefficients.values()] == [0.01, 0.002, 0.0003, -0.0004]
+@pytest.mark.parametrize(
+    ("text", "model"),
+    [
+        (ROS.replace("MODEL", "plumb_bob"), "pinhole"),
+        (ROS.replace("MODEL", "equidistant"), "fisheye"),
+        (2 * MESSAGE, "pinhole"),
+        (MESSAGE.replace("D:", "d:").replace("K:", "k:").replace("width: 0", "width: 40"), "pinhole"),
+    ],
+    ids=["plumb_bob", "equidistant", "ROS 1", "ROS 2"],
+)
+def test_ros_camera_info(text: str, model: str, small: Path) -> None:
+    calibration = read(text)
+    assert (calibration.model, calibration.centre, calibration.size) == (model, (19.25, 14.75), (40, 30))
+    assert [*calibration.coefficients.values()][:4] == [0.01, 0.002, 0.0003, -0.0004]
 
 
 RIGHT = np.array([[62.5, 0, 20.25], [0, 61.5, 13.75], [0, 0, 1]])
@@ -132,26 +158,19 @@ cam1:
   rostopic: /cam1/image_raw
 """
 OMNI_KALIBR = KALIBR.replace("pinhole", "omni").replace("intrinsics: [", "intrinsics: [1.25, ")
-_SECTION = """\
-[Stereo{}]
-res_x = 40
-res_y = 30
-{}
-fc_x = {}
-fc_y = {}
-cc_x = {}
-cc_y = {}
-"""
 
 
 def stereomis() -> str:
     """Return StereoCalibration.ini of the data set."""
     text = "[Version]\nmajor = 1\n"
-    for eye, matrix, coefficients in (("Left", MATRIX, COEFFICIENTS), ("Right", RIGHT, [0.25, *4 * [0]])):
-        lines = [f"kc_{n} = {value}" for n, value in enumerate([*coefficients, 0, 0, 0])]
-        lines += [f"R_{n} = {value}" for n, value in enumerate((ROTATION if eye == "Right" else np.eye(3)).ravel())]
-        lines += [f"T_{n} = {value}" for n, value in enumerate(TRANSLATION if eye == "Right" else np.zeros(3))]
-        text += _SECTION.format(eye, "\n".join(lines), *matrix[[0, 1], [0, 1]], *matrix[:2, 2])
+    left = "Left", MATRIX, COEFFICIENTS, np.eye(3), np.zeros(3)
+    for eye, matrix, coefficients, rotation, translation in (left, ("Right", RIGHT, [0.25], ROTATION, TRANSLATION)):
+        values = {"res_x": 40, "res_y": 30}
+        values |= {f"kc_{n}": value for n, value in enumerate([*coefficients, *8 * [0]][:8])}
+        values |= {f"R_{n}": value for n, value in enumerate(rotation.ravel())}
+        values |= {f"T_{n}": value for n, value in enumerate(translation)}
+        values |= {"fc_x": matrix[0, 0], "fc_y": matrix[1, 1], "cc_x": matrix[0, 2], "cc_y": matrix[1, 2]}
+        text += f"[Stereo{eye}]\n" + "".join(f"{name} = {value}\n" for name, value in values.items())
     return text
 
 
@@ -179,8 +198,7 @@ def sections() -> str:
     ],
 )
 def test_stereo_pair(write: Callable[[], str], unit: Literal["mm"] | None, small: Path) -> None:
-    Path("pair.yml").write_text(write())
-    left, right = (read_calibration("pair.yml", eye, unit) for eye in ("left", "right"))
+    left, right = read(write()), read(write(), "right", unit)
     assert (left.focal, left.centre) == ((61.5, 60.5), (19.25, 14.75))
     assert (right.focal, right.centre) == ((62.5, 61.5), (20.25, 13.75))
     assert [*left.coefficients.values()][:4] == COEFFICIENTS[:4]
@@ -192,12 +210,11 @@ def test_stereo_pair(write: Callable[[], str], unit: Literal["mm"] | None, small
 
 
 def test_stereo_pair_without_unit_or_right_camera(small: Path, message: Messages) -> None:
-    Path("pair.yml").write_text(stereo("M", "D", "1", "2"))
-    with message.raises(CameraFileError, "pair.yml", "calibration_unit"):
-        read_calibration("pair.yml", "right")
-    Path("pair.yml").write_text(K + D)
-    with message.raises(SceneError, "render.camera.calibration: pair.yml", "calibration_eye"):
-        camera_of("pair.yml", "render.camera.calibration_eye=right")
+    with message.raises(CameraFileError, "camera.yml", "calibration_unit"):
+        read(stereo("M", "D", "1", "2"), "right")
+    read(K + D)
+    with message.raises(SceneError, "render.camera.calibration: camera.yml", "calibration_eye"):
+        camera_of("camera.yml", "render.camera.calibration_eye=right")
 
 
 # Polynomial of a mirror; x is down, and the axis backward.
@@ -225,13 +242,12 @@ OCAMCALIB = """\
 
 
 def test_ocamcalib(small: Path) -> None:
-    Path("calib_results.txt").write_text(OCAMCALIB)
+    calibration = read(OCAMCALIB)
     rows, columns = (axis.ravel().astype(float) for axis in np.mgrid[0:30:5, 0:40:5])
     # cam2world: x, y and z of OCamCalib are OpenCV's y, x and -z.
     down, across = np.linalg.solve([[1.02, 0.01], [-0.02, 1]], np.stack([rows - 14.75, columns - 19.25]))
     radius = np.hypot(down, across)
     forward = -np.polynomial.Polynomial([-120, 0, 2.5e-3, -1.5e-5, 4e-8])(radius)
-    calibration = read_calibration("calib_results.txt")
     for scale_x, scale_y in ((1, 1), (2, 3)):
         scaled = calibration.scaled(scale_x, scale_y)
         lens = MODELS[scaled.model].build(NUMPY)
@@ -240,7 +256,7 @@ def test_ocamcalib(small: Path) -> None:
         assert scaled.focal is None
         np.testing.assert_allclose(focal * x + scaled.centre[0], (columns + 0.5) * scale_x - 0.5, atol=1e-9)
         np.testing.assert_allclose(focal * y + scaled.centre[1], (rows + 0.5) * scale_y - 0.5, atol=1e-9)
-    camera = camera_of("calib_results.txt")
+    camera = camera_of("camera.yml")
     assert camera.distortion is not None
     assert camera.distortion.coefficients == tuple(calibration.coefficients.values())
     assert camera.focal_lengths == (1.02 * 120, 1.02 * 120)
@@ -269,8 +285,7 @@ OMNIDIR = f"camera_matrix: {MATRIX.tolist()}\ndistortion_coefficients: {COEFFICI
     ids=["EuRoC", "OpenCV's omnidir", "Kalibr's omni"],
 )
 def test_euroc_and_omnidirectional(text: str, model: str, first: list[float], small: Path) -> None:
-    Path("sensor.yaml").write_text(text)
-    calibration = read_calibration("sensor.yaml")
+    calibration = read(text)
     assert (calibration.focal, calibration.centre, calibration.size) == ((61.5, 60.5), (19.25, 14.75), (40, 30))
     assert calibration.model == model
     assert calibration.coefficients == dict(zip(MODELS[model].coefficients, [*first, *COEFFICIENTS[:4]], strict=False))
@@ -291,35 +306,11 @@ def test_colmap_cameras(
     line: str, model: str, focal: tuple[float, float], coefficients: dict[str, float], small: Path
 ) -> None:
     head = "# Camera list with one line of data per camera:\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
-    Path("cameras.txt").write_text(f"{head}# Number of cameras: 1\n1 {line}\n")
-    calibration = read_calibration("cameras.txt")
+    calibration = read(f"{head}# Number of cameras: 1\n1 {line}\n")
     assert (calibration.model, calibration.focal, calibration.size) == (model, focal, (40, 30))
     # COLMAP's first pixel has its centre at (0.5, 0.5).
     assert calibration.centre == (19.25, 14.75)
     assert {name: value for name, value in calibration.coefficients.items() if value} == coefficients
-
-
-PRINTED = """\
-header: {seq: 7, frame_id: "camera"}
-height: 30
-width: 40
-distortion_model: "plumb_bob"
-D: [0.01, 0.002, 0.0003, -0.0004, 0.0]
-K: [61.5, 0.0, 19.25, 0.0, 60.5, 14.75, 0.0, 0.0, 1.0]
-binning_x: 0
-binning_y: 1
-roi: {x_offset: 0, y_offset: 0, height: 0, width: 0, do_rectify: False}
----
-"""
-
-
-def test_ros_topic_echo(small: Path) -> None:
-    second = PRINTED.replace("D:", "d:").replace("K:", "k:")
-    for text in (2 * PRINTED, second, PRINTED.replace("width: 0", "width: 40")):
-        Path("ros.yaml").write_text(text)
-        calibration = read_calibration("ros.yaml")
-        assert calibration.centre == (19.25, 14.75)
-        assert calibration.coefficients["k2"] == 0.002
 
 
 def test_picture_size_and_scale(small: Path, message: Messages) -> None:
@@ -383,7 +374,7 @@ NORMALISED = "D: [0, 0, 0, 0]\nK: [0.837, 0, 0.5, 0, 1.1, 0.5, 0, 0, 1]\n"
         pytest.param(OMNI_KALIBR.replace("radtan", "equidistant"), id="omnidirectional of Kalibr"),
         pytest.param(OCAMCALIB.replace("-1.2e+02 0.0", "-1.2e+02 1.0"), id="OCamCalib"),
         pytest.param(K + D + "radial_distortion: [0.1]\nrms: 0.2", id="other distortion"),
-        pytest.param(PRINTED.replace("g_x: 0", "g_x: 2"), id="binning of ROS"),
+        pytest.param(MESSAGE.replace("g_x: 0", "g_x: 2"), id="binning of ROS"),
         pytest.param(K.replace("K", "M1") + K.replace("K", "M2") + "D1: 3\nD2: [0, 0, 0, 0]", id="stereo pair"),
         pytest.param(KALIBR.replace("distortion_coeffs: [-0.3, 0.1, 0.001, -0.002]", "x: 1"), id="Kalibr"),
         pytest.param(KALIBR.replace("[61.5", "[1.25, 61.5", 1), id="intrinsics of Kalibr"),
@@ -403,66 +394,35 @@ def test_invalid_calibration(text: str, small: Path, message: Messages) -> None:
         camera_of("camera.yml")
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        *(
-            f"{K}{name}: [[-0.3, 0.1, 0.001, -0.002, 0.03]]"
-            for name in ("DistCoeff", "distortion_coefs", "dist", "d", "DISTORTION_PARAMETERS", "distortion_vector")
-        ),
-        *(K.replace("K", name) + D for name in ("mtx", "camera_mtx", "intrinsic_matrix", "cameraMatrix", "M")),
-        # Twice, equal up to rounding.
-        K + D + "mtx: [61.5, 0, 19.25, 0, 60.50000001, 14.75, 0, 0, 1]\ndist: [[-0.3, 0.1, 0.001, -0.002, 0.03]]",
-    ],
-)
-def test_spellings_of_matrix_and_distortion(text: str, small: Path) -> None:
-    Path("camera.yml").write_text(text)
-    calibration = read_calibration("camera.yml")
-    assert calibration.focal == (61.5, 60.5)
-    assert [*calibration.coefficients.values()] == COEFFICIENTS
+def test_spellings(small: Path) -> None:
+    keys = ("DistCoeff", "distortion_coefs", "dist", "d", "DISTORTION_PARAMETERS", "distortion_vector")
+    texts = [f"{K}{key}: [[-0.3, 0.1, 0.001, -0.002, 0.03]]" for key in keys]
+    texts += [K.replace("K", key) + D for key in ("mtx", "camera_mtx", "intrinsic_matrix", "cameraMatrix", "M")]
+    # Twice, equal up to rounding.
+    texts += [f"{K}{D}mtx: [61.5, 0, 19.25, 0, 60.50000001, 14.75, 0, 0, 1]\ndist: {[COEFFICIENTS]}"]
+    for text in texts:
+        calibration = read(text)
+        assert (calibration.focal, [*calibration.coefficients.values()]) == ((61.5, 60.5), COEFFICIENTS), text
+    sizes = ["resolution: [80, 90]", "imageSize: !!python/tuple [80, 90]", "img_width: 80\nimg_height: 90"]
+    for text in (*sizes, "image_size: [80, 90]\nw: 80\nh: 90", "DIM: 80 90"):
+        assert read(K + D + text).size == (80, 90), text
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "resolution: [80, 90]",
-        "imageSize: !!python/tuple [80, 90]",
-        "img_width: 80\nimg_height: 90",
-        "image_size: [80, 90]\nw: 80\nh: 90",
-        "DIM: 80 90",
-    ],
-)
-def test_spellings_of_the_size(text: str, small: Path) -> None:
-    Path("camera.yml").write_text(K + D + text)
-    assert read_calibration("camera.yml").size == (80, 90)
-
-
-@pytest.mark.parametrize(
-    ("text", "fisheye"),
-    [
-        *((f"{key}: fisheye", True) for key in ("lens", "type", "projection", "calibration_model", "model_name")),
-        ("fisheye: true", True),
-        ("camera_model: fisheye", True),
-        ("camera_model: pinhole\ndistortion_model: equidistant", True),
-        ("distortion_model: radtan", False),
-        ("camera_model: pinhole", False),
-        ("xi: 0.0", False),
-        ("skew: 0", False),
-        ("lens: 25 mm\ntype: endoscope", False),
-    ],
-)
-def test_names_of_lens_models(text: str, fisheye: bool, small: Path) -> None:
-    Path("camera.yml").write_text(f"{K}D: [0.01, 0.002, 0.0003, -0.0004]\n{text}\n")
-    assert read_calibration("camera.yml").model == ("fisheye" if fisheye else "pinhole")
-    Path("camera.yml").write_text(K + "distortion_model: none")
+def test_names_of_lens_models(small: Path) -> None:
+    fisheye = [f"{key}: fisheye" for key in ("lens", "type", "projection", "calibration_model", "camera_model")]
+    fisheye += ["fisheye: true", "camera_model: pinhole\ndistortion_model: equidistant"]
+    pinhole = ["distortion_model: radtan", "xi: 0.0", "skew: 0", "lens: 25 mm\ntype: endoscope"]
+    for text in fisheye + pinhole:
+        calibration = read(f"{K}D: [0.01, 0.002, 0.0003, -0.0004]\n{text}\n")
+        assert calibration.model == ("fisheye" if text in fisheye else "pinhole"), text
+    read(K + "distortion_model: none")
     assert camera_of("camera.yml").distortion is None
 
 
 def test_check_prints_the_calibration(small: Path, capsys: pytest.CaptureFixture[str], message: Messages) -> None:
     Path("pair.yml").write_text(stereo("K", "D", "1", "2"))
-    cameras = "{left: {eye: [0, 0, 0.4], calibration: pair.yml}, right: {eye: [0, 0, 0.4], intrinsics: INTRINSICS}}"
-    intrinsics = "{fx: 20, fy: 15, cx: 19.5, cy: 14.5}"
-    value = cameras.replace("INTRINSICS", intrinsics)
+    right = "{eye: [0, 0, 0.4], intrinsics: {fx: 20, fy: 15, cx: 19.5, cy: 14.5}}"
+    value = f"{{left: {{eye: [0, 0, 0.4], calibration: pair.yml}}, right: {right}}}"
     assert not main(["check", "small.yaml", "--set", f"render.cameras={value}", "--set", "output=[]"])
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("render.")]
     # 20 px on both sides of the centre are 45 degrees at a focal length of 20 px.
@@ -480,13 +440,10 @@ def test_field_of_view_beyond_the_projection(small: Path, capsys: pytest.Capture
 
 def test_focal_length_in_other_units(small: Path, message: Messages) -> None:
     """The limit is a twentieth of the picture's width or height."""
-    for fx, fy in ((2, 1.5), (1.99, 1.5)):
-        camera = f"render.camera={{eye: [0, 0, 0.4], intrinsics: {{fx: {fx}, fy: {fy}, cx: 20, cy: 15}}}}"
-        if fx == 2:
-            load_scene("small.yaml", [camera])
-            continue
-        with message.raises(SceneError, "render.camera.intrinsics: fx = 1.99"):
-            load_scene("small.yaml", [camera])
+    camera = {"eye": [0, 0, 0.4], "intrinsics": {"fx": 2, "fy": 1.5, "cx": 20, "cy": 15}}
+    load_scene("small.yaml", {"render.camera": camera})
+    with message.raises(SceneError, "render.camera.intrinsics: fx = 1.99"):
+        load_scene("small.yaml", {"render.camera": camera, "render.camera.intrinsics.fx": 1.99})
 
 
 def test_calibration_path_is_relative_to_the_scene(small: Path, message: Messages) -> None:
@@ -505,8 +462,7 @@ def test_calibration_path_is_relative_to_the_scene(small: Path, message: Message
 def test_camera_json(small: Path) -> None:
     camera = {"size": [40, 30], "projection": [[1.0] * 4] * 3, "intrinsics": [[60, 0, 20], [0, 61, 15], [0, 0, 1]]}
     camera |= {"calibration": [[60, 0, 19.5], [0, 61, 14.5], [0, 0, 1]], "model": "omnidir"}
-    Path("camera.json").write_text(json.dumps({**camera, "distortion": [1.1, 0.1, 0.0, 0.01, 0.02]}))
-    calibration = read_calibration("camera.json")
+    calibration = read(json.dumps({**camera, "distortion": [1.1, 0.1, 0.0, 0.01, 0.02]}))
     assert (calibration.model, calibration.focal, calibration.size) == ("omnidir", (60, 61), (40, 30))
     assert calibration.centre == (19.5, 14.5)
     assert calibration.coefficients == {"xi": 1.1, "k1": 0.1, "k2": 0.0, "p1": 0.01, "p2": 0.02}
@@ -526,6 +482,5 @@ PAIR = ONE.replace("N", "1") + ONE.replace("N", "2")
     ids=["not a rotation", "units", "key of StereoMIS"],
 )
 def test_invalid_stereo_pair(eye: Literal["left", "right"], text: str, small: Path, message: Messages) -> None:
-    Path("pair.yml").write_text(text)
-    with message.raises(CameraFileError, "pair.yml"):
-        read_calibration("pair.yml", eye)
+    with message.raises(CameraFileError, "camera.yml"):
+        read(text, eye)
