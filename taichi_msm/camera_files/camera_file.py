@@ -37,7 +37,8 @@ _PARSER_ERRORS = (
 class Entries(dict[str, Any]):
     """Keys and values of a file or of a section of it.
 
-    Attributes:
+    Args:
+        values: values by keys.
         lines: number of the line of each key, counted from 1; empty for JSON and XML, whose parsers drop it.
     """
 

@@ -165,7 +165,7 @@ def stereomis() -> str:
     text = "[Version]\nmajor = 1\n"
     left = "Left", MATRIX, COEFFICIENTS, np.eye(3), np.zeros(3)
     for eye, matrix, coefficients, rotation, translation in (left, ("Right", RIGHT, [0.25], ROTATION, TRANSLATION)):
-        values = {"res_x": 40, "res_y": 30}
+        values: dict[str, float] = {"res_x": 40, "res_y": 30}
         values |= {f"kc_{n}": value for n, value in enumerate([*coefficients, *8 * [0]][:8])}
         values |= {f"R_{n}": value for n, value in enumerate(rotation.ravel())}
         values |= {f"T_{n}": value for n, value in enumerate(translation)}

@@ -36,8 +36,8 @@ from tests.outputs import files
 def describe(folder: Path, **changes: Any) -> None:
     """Change keys of camera.json; None removes a key."""
     path = folder / "camera.json"
-    described = {**json.loads(path.read_text()), **changes}
-    path.write_text(json.dumps({name: value for name, value in described.items() if value is not None}))
+    camera = {**json.loads(path.read_text()), **changes}
+    path.write_text(json.dumps({name: value for name, value in camera.items() if value is not None}))
 
 
 FRAMES, TRACKS, WIDTH, HEIGHT = 5, 36, 320, 256
@@ -97,11 +97,11 @@ def test_missing_output_of_a_camera(stereo: Path, message: Messages) -> None:
 )
 def test_linked_camera_folder_or_record(name: str, formats: list[str], stereo: Path, message: Messages) -> None:
     """Links to the results of another run."""
-    other = stereo.with_name("other")
-    shutil.copytree(stereo, other)
+    second = stereo.with_name("second")
+    shutil.copytree(stereo, second)
     link = stereo / (name or "run.json")
     shutil.rmtree(link) if name else link.unlink()
-    link.symlink_to(other / link.name)
+    link.symlink_to(second / link.name)
     for each in formats:
         with message.raises(FilesError, link.name):
             export(stereo, each, camera=name or None)
@@ -138,9 +138,9 @@ def column(path: Path, *names: str) -> np.ndarray[Any, Any]:
 
 
 def test_csv_round_trip(single: Path) -> None:
-    made = tracks(single)
-    made["points"][7, 2], made["occluded"][7, 2] = np.nan, True
-    np.savez(single / "tracks.npz", **made)
+    arrays = tracks(single)
+    arrays["points"][7, 2], arrays["occluded"][7, 2] = np.nan, True
+    np.savez(single / "tracks.npz", **arrays)
     done = export(single, "csv")
     assert (done.files, done.notes) == (["forces.csv", "index.csv", "tracks.csv"], [])
     table = done.directory / "tracks.csv"
@@ -151,10 +151,10 @@ def test_csv_round_trip(single: Path) -> None:
     np.testing.assert_array_equal(column(table, "point").reshape(shape)[..., 0], [np.arange(TRACKS)] * FRAMES)
     np.testing.assert_array_equal(column(table, "time").reshape(shape)[:, 0, 0], np.arange(FRAMES) / 10)
     for names, expected in (
-        (("across", "down"), np.tile(made["coordinates"][:, None], (1, FRAMES, 1))),
-        (("x", "y"), made["points"]),
-        (("occluded",), made["occluded"][..., None]),
-        (("position_x", "position_y", "position_z"), made["position"]),
+        (("across", "down"), np.tile(arrays["coordinates"][:, None], (1, FRAMES, 1))),
+        (("x", "y"), arrays["points"]),
+        (("occluded",), arrays["occluded"][..., None]),
+        (("position_x", "position_y", "position_z"), arrays["position"]),
     ):
         values = column(table, *names).reshape(shape).transpose(1, 0, 2)
         np.testing.assert_array_equal(values.astype(np.float32), expected)
@@ -223,20 +223,20 @@ def tracks(folder: Path) -> dict[str, Any]:
 def test_tapvid3d_round_trip(single: Path) -> None:
     done = export([single, single], "tapvid3d", single / "all")
     assert (done.files, done.notes) == (["000000.npz", "000001.npz", "index.csv"], [])
-    found, expected = read(done.directory / "000000.npz"), tracks(single)
-    assert found["tracks_XYZ"].shape == (FRAMES, TRACKS, 3)
-    np.testing.assert_array_equal(read(done.directory / "000001.npz")["tracks_XYZ"], found["tracks_XYZ"])
-    assert found["visibility"].shape == (FRAMES, TRACKS)
-    assert found["visibility"].dtype == np.bool_
-    np.testing.assert_array_equal(~found["visibility"].T, expected["occluded"])
-    x, y, depth = np.moveaxis(found["tracks_XYZ"], -1, 0)
+    exported, expected = read(done.directory / "000000.npz"), tracks(single)
+    assert exported["tracks_XYZ"].shape == (FRAMES, TRACKS, 3)
+    np.testing.assert_array_equal(read(done.directory / "000001.npz")["tracks_XYZ"], exported["tracks_XYZ"])
+    assert exported["visibility"].shape == (FRAMES, TRACKS)
+    assert exported["visibility"].dtype == np.bool_
+    np.testing.assert_array_equal(~exported["visibility"].T, expected["occluded"])
+    x, y, depth = np.moveaxis(exported["tracks_XYZ"], -1, 0)
     assert (depth > 0.3).all(), "forward is positive"
-    fx, fy, cx, cy = found["fx_fy_cx_cy"]
+    fx, fy, cx, cy = exported["fx_fy_cx_cy"]
     pixels = np.stack([fx * x / depth + cx, fy * y / depth + cy], axis=-1).transpose(1, 0, 2)
     # Positions and pixels are rounded to single precision.
     np.testing.assert_allclose(pixels, expected["points"], rtol=0, atol=1e-4)
-    assert found["images_jpeg_bytes"].shape == (FRAMES,)
-    for frame, data in enumerate(found["images_jpeg_bytes"]):
+    assert exported["images_jpeg_bytes"].shape == (FRAMES,)
+    for frame, data in enumerate(exported["images_jpeg_bytes"]):
         with Image.open(io.BytesIO(data)) as image:
             assert (image.format, image.size, image.mode) == ("JPEG", (WIDTH, HEIGHT), "RGB")
             drawn = np.asarray(Image.open(single / f"frames/{frame:04}.png"))
@@ -244,21 +244,21 @@ def test_tapvid3d_round_trip(single: Path) -> None:
 
 
 def test_tapvid3d_queries(single: Path, message: Messages) -> None:
-    made = tracks(single)
-    made["occluded"][3, :2] = True
-    made["occluded"][4] = True
-    made["points"][4, 1] = np.nan
-    np.savez(single / "tracks.npz", **made)
+    arrays = tracks(single)
+    arrays["occluded"][3, :2] = True
+    arrays["occluded"][4] = True
+    arrays["points"][4, 1] = np.nan
+    np.savez(single / "tracks.npz", **arrays)
     done = export(single, "tapvid3d")
     message(done.notes, "1 of 36")
-    found = read(done.directory / "000000.npz")
-    assert found["tracks_XYZ"].shape == (FRAMES, TRACKS - 1, 3)
-    assert found["queries_xyt"].shape == (TRACKS - 1, 3)
-    t, y, x = np.round(found["queries_xyt"][:, ::-1]).astype(int).T
+    exported = read(done.directory / "000000.npz")
+    assert exported["tracks_XYZ"].shape == (FRAMES, TRACKS - 1, 3)
+    assert exported["queries_xyt"].shape == (TRACKS - 1, 3)
+    t, y, x = np.round(exported["queries_xyt"][:, ::-1]).astype(int).T
     np.testing.assert_array_equal(t, [0, 0, 0, 2, *[0] * 31])
-    assert found["visibility"][t, np.arange(TRACKS - 1)].all()
-    kept = np.delete(made["points"], 4, axis=0)
-    np.testing.assert_array_equal(found["queries_xyt"][:, :2], kept[np.arange(TRACKS - 1), t])
+    assert exported["visibility"][t, np.arange(TRACKS - 1)].all()
+    kept = np.delete(arrays["points"], 4, axis=0)
+    np.testing.assert_array_equal(exported["queries_xyt"][:, :2], kept[np.arange(TRACKS - 1), t])
     assert (x < WIDTH).all()
     assert (y < HEIGHT).all()
 
@@ -271,10 +271,10 @@ def test_tapvid3d_of_a_moving_camera(single: Path) -> None:
     poses[:, 2, 3] = 1 + angle
     # The coefficients of a calibrated camera may all be 0.
     describe(single, poses=poses.tolist(), distortion=[0.0] * 8, model="pinhole")
-    found, world = read(export(single, "tapvid3d").directory / "000000.npz"), tracks(single)["position"]
-    np.testing.assert_array_equal(found["extrinsics_w2c"][:, :3], poses)
-    np.testing.assert_array_equal(found["extrinsics_w2c"][:, 3], [[0, 0, 0, 1]] * FRAMES)
+    exported, world = read(export(single, "tapvid3d").directory / "000000.npz"), tracks(single)["position"]
+    np.testing.assert_array_equal(exported["extrinsics_w2c"][:, :3], poses)
+    np.testing.assert_array_equal(exported["extrinsics_w2c"][:, 3], [[0, 0, 0, 1]] * FRAMES)
     for frame in range(FRAMES):
         points = np.column_stack([world[:, frame], np.ones(TRACKS)]).astype(float)
-        expected = (found["extrinsics_w2c"][frame] @ points.T).T[:, :3]
-        np.testing.assert_allclose(found["tracks_XYZ"][frame], expected, rtol=0, atol=1e-15)
+        expected = (exported["extrinsics_w2c"][frame] @ points.T).T[:, :3]
+        np.testing.assert_allclose(exported["tracks_XYZ"][frame], expected, rtol=0, atol=1e-15)

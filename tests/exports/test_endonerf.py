@@ -63,8 +63,8 @@ def test_loaders_of_endonerf_and_endogaussian(labelled_in_motion: Path, tmp_path
         np.testing.assert_array_equal(masks[frame], instrument == 0)
         depth = np.array(Image.open(run / f"depth/{frame:04}.tiff"))
         np.testing.assert_allclose(depths[frame] * UNIT, depth, atol=UNIT * 0.501)
-        shown = depth[depth > 0]
-        np.testing.assert_allclose(bounds[frame] * UNIT, [shown.min(), shown.max()], rtol=1e-6)
+        on_sheet = depth[depth > 0]
+        np.testing.assert_allclose(bounds[frame] * UNIT, [on_sheet.min(), on_sheet.max()], rtol=1e-6)
         assert 0.02 < (masks[frame] == 0).mean() < 0.5
         # Tracked points, in the world of the loaders: the first camera's, right, up and backward.
         points = tracks["position"][:, frame].astype(float) @ first[:, :3].T + first[:, 3]

@@ -136,12 +136,12 @@ export(Path(sys.argv[1]), "obj", Path(sys.argv[2]), progress)
 @pytest.mark.skipif(sys.platform == "win32", reason="kills with SIGKILL")
 def test_killed_export(results: Path) -> None:
     """The next export, also of another format, replaces it; another process exports the same bytes."""
-    out, other = results / "out", results / "other"
+    out, second = results / "out", results / "second"
     exported(results, out)
     before = files(out)
-    killed = subprocess.run([sys.executable, "-c", KILLED, str(results), str(out), str(other)], check=False)
+    killed = subprocess.run([sys.executable, "-c", KILLED, str(results), str(out), str(second)], check=False)
     assert killed.returncode == -signal.SIGKILL
-    assert files(other) == before
+    assert files(second) == before
     assert {path: data for path, data in files(out).items() if not path.startswith(".")} == before
     assert set(files(out)) > set(before), "killed after its beginning"
     for name in ("gltf", "obj"):
@@ -222,9 +222,9 @@ def test_linked_results(name: str, results: Path, message: Messages) -> None:
     (results.parent / "elsewhere").mkdir()
     moved = (results / name).rename(results.parent / "elsewhere" / Path(name).name)
     (results / name).symlink_to(moved)
-    found = read_run(results)
+    finished = read_run(results)
     with message.raises(FilesError, name):
-        found.positions() if name == "trajectory.npz" else found.result_path("png", 1)
+        finished.positions() if name == "trajectory.npz" else finished.result_path("png", 1)
 
 
 def test_implausible_positions(results: Path, message: Messages) -> None:

@@ -106,49 +106,49 @@ def positions(ran: Path) -> Array:
 
 
 def test_positions_and_normals_of_every_frame(ran: Path, glb: Path) -> None:
-    found, expected = read_glb(glb), positions(ran)
+    content, expected = read_glb(glb), positions(ran)
     largest = np.abs(expected).max()
     for frame, position in enumerate(expected):
         # Positions and differences are rounded to float32.
-        np.testing.assert_allclose(found.at(frame / 10), position.reshape(-1, 3), rtol=0, atol=3 * ROUNDING * largest)
-        np.testing.assert_allclose(found.at(frame / 10, "NORMAL"), unit_normals(position), rtol=0, atol=4 * ROUNDING)
+        np.testing.assert_allclose(content.at(frame / 10), position.reshape(-1, 3), rtol=0, atol=3 * ROUNDING * largest)
+        np.testing.assert_allclose(content.at(frame / 10, "NORMAL"), unit_normals(position), rtol=0, atol=4 * ROUNDING)
     between = (expected[2] + expected[3]) / 2
     # So are times, by some 1e-8 s, 1e-7 of the frame interval.
     atol = (3 * ROUNDING + 1e-6) * largest
-    np.testing.assert_allclose(found.at(0.25), between.reshape(-1, 3), rtol=0, atol=atol)
+    np.testing.assert_allclose(content.at(0.25), between.reshape(-1, 3), rtol=0, atol=atol)
 
 
 def test_orientation_and_texture_coordinates(glb: Path) -> None:
-    found = read_glb(glb)
-    corners = found.attribute("POSITION")[found.accessor(found.primitive["indices"]).reshape(-1, 3)]
+    content = read_glb(glb)
+    corners = content.attribute("POSITION")[content.accessor(content.primitive["indices"]).reshape(-1, 3)]
     assert len(corners) == 2 * 8 * 10
     area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert (area[:, 2] > 0).all(), "counter-clockwise from above"
-    np.testing.assert_array_equal(found.attribute("NORMAL"), np.tile([0, 0, 1], (99, 1)))
+    np.testing.assert_array_equal(content.attribute("NORMAL"), np.tile([0, 0, 1], (99, 1)))
     # Coincident points have no normal; z replaces it.
     np.testing.assert_array_equal(unit_normals(np.zeros((3, 4, 3), np.float32)), np.tile([0, 0, 1], (12, 1)))
     # From the upper left.
-    corner = dict(zip(map(tuple, found.attribute("TEXCOORD_0").tolist()), found.attribute("POSITION"), strict=True))
+    corner = dict(zip(map(tuple, content.attribute("TEXCOORD_0").tolist()), content.attribute("POSITION"), strict=True))
     for texture, position in (((0, 0), (-0.2, 0.15, 0)), ((1, 0), (0.2, 0.15, 0)), ((0, 1), (-0.2, -0.15, 0))):
         np.testing.assert_allclose(corner[texture], position, atol=ROUNDING)
 
 
 def test_material(glb: Path) -> None:
-    found = read_glb(glb)
-    (material,), (texture,) = found.document["materials"], found.document["textures"]
-    (image,), (sampler,) = found.document["images"], found.document["samplers"]
+    content = read_glb(glb)
+    (material,), (texture,) = content.document["materials"], content.document["textures"]
+    (image,), (sampler,) = content.document["images"], content.document["samplers"]
     assert material["doubleSided"]
     assert material["pbrMetallicRoughness"]["baseColorTexture"] == {"index": 0}
-    assert (texture["source"], texture["sampler"], found.primitive["material"]) == (0, 0, 0)
+    assert (texture["source"], texture["sampler"], content.primitive["material"]) == (0, 0, 0)
     assert (image["mimeType"], sampler["wrapS"], sampler["wrapT"]) == ("image/png", 33071, 33071)
-    np.testing.assert_array_equal(found.picture(), speckle(30, 40))
+    np.testing.assert_array_equal(content.picture(), speckle(30, 40))
 
 
 def test_region_of_the_picture(results: Path) -> None:
     change_scene(results, region=[5, 7, 20, 10])
     export(results, "gltf", results / "out")
-    found = read_glb(results / "out" / "surface.glb")
-    np.testing.assert_array_equal(found.picture(), speckle(30, 40)[7:17, 5:25])
+    content = read_glb(results / "out" / "surface.glb")
+    np.testing.assert_array_equal(content.picture(), speckle(30, 40)[7:17, 5:25])
 
 
 def without_picture(results: Path) -> Path:
@@ -235,14 +235,14 @@ def error_of(position: Array, frames: list[int]) -> float:
 
 def test_keyframes_of_a_sudden_motion() -> None:
     position = motion(300)
-    found = key_frames(position, 25)
-    assert len(found.frames) == 25
-    assert found.frames == sorted(set(found.frames))
-    assert (found.frames[0], found.frames[-1]) == (0, 299)
-    assert {119, 120} <= set(found.frames), "before and after the fall"
-    assert found.error == pytest.approx(error_of(position, found.frames), rel=1e-12)
+    keys = key_frames(position, 25)
+    assert len(keys.frames) == 25
+    assert keys.frames == sorted(set(keys.frames))
+    assert (keys.frames[0], keys.frames[-1]) == (0, 299)
+    assert {119, 120} <= set(keys.frames), "before and after the fall"
+    assert keys.error == pytest.approx(error_of(position, keys.frames), rel=1e-12)
     evenly = np.linspace(0, 299, 25).round().astype(int).tolist()
-    assert found.error < error_of(position, evenly) / 5
+    assert keys.error < error_of(position, evenly) / 5
 
 
 def test_keyframes_of_simple_motions() -> None:
@@ -262,25 +262,25 @@ def test_limits_of_the_morph_targets(
 ) -> None:
     monkeypatch.setattr(gltf, limit, value)
     done = export(ran, "gltf", tmp_path)
-    found, expected = read_glb(tmp_path / "surface.glb"), positions(ran)
+    content, expected = read_glb(tmp_path / "surface.glb"), positions(ran)
     keys = key_frames(expected, targets + 1)
-    assert len(found.primitive["targets"]) == targets
+    assert len(content.primitive["targets"]) == targets
     assert f" {keys.error:.2g} m" in done.notes[0]
     message(done.notes, hide=r"(?<=most )\S+")
-    errors = [found.at(frame / 10) - expected[frame].reshape(-1, 3) for frame in range(5)]
+    errors = [content.at(frame / 10) - expected[frame].reshape(-1, 3) for frame in range(5)]
     assert np.linalg.norm(errors, axis=-1).max() == pytest.approx(keys.error, rel=1e-5)
 
 
-def pose_at(found: Glb, name: str, frame: int) -> tuple[Array, Array]:
+def pose_at(content: Glb, name: str, frame: int) -> tuple[Array, Array]:
     """Return translation and rotation matrix of a node in a frame."""
-    (number,) = [number for number, node in enumerate(found.document["nodes"]) if node["name"] == name]
-    values = {"rotation": np.array([0, 0, 0, 1.0])} | found.document["nodes"][number]
-    (animation,) = found.document["animations"]
+    (number,) = [number for number, node in enumerate(content.document["nodes"]) if node["name"] == name]
+    values = {"rotation": np.array([0, 0, 0, 1.0])} | content.document["nodes"][number]
+    (animation,) = content.document["animations"]
     for channel in animation["channels"]:
         if channel["target"]["node"] == number:
             sampler = animation["samplers"][channel["sampler"]]
-            np.testing.assert_allclose(found.accessor(sampler["input"])[:, 0], np.arange(5) / 10, rtol=1e-6)
-            values[channel["target"]["path"]] = found.accessor(sampler["output"])[frame]
+            np.testing.assert_allclose(content.accessor(sampler["input"])[:, 0], np.arange(5) / 10, rtol=1e-6)
+            values[channel["target"]["path"]] = content.accessor(sampler["output"])[frame]
     return np.array(values["translation"]), Rotation.from_quat(values["rotation"]).as_matrix()
 
 

@@ -71,55 +71,55 @@ def left(stereo: Path) -> Path:
 def test_videos_and_calibration(stereo: Path, left: Path) -> None:
     assert left == stereo / "export-stir/000000/left/seq00"
     for side in (left, to_the_right(left)):
-        shown = video(side)
-        assert (len(shown), shown[0].shape) == (FRAMES, (HEIGHT, WIDTH, 3))
+        frames = video(side)
+        assert (len(frames), frames[0].shape) == (FRAMES, (HEIGHT, WIDTH, 3))
         for frame, part in ((0, "start"), (FRAMES - 1, "end")):
             (picture,) = side.glob(f"*_icg{part}.png")
             drawn = np.asarray(Image.open(stereo / side.parent.name / f"frames/{frame:04}.png"))
             np.testing.assert_array_equal(np.asarray(Image.open(picture)), drawn)
             # Luminance, as colours have half the resolution.
-            assert np.abs((shown[frame].astype(int) - drawn) @ (0.2126, 0.7152, 0.0722)).mean() < 3, "grey levels"
+            assert np.abs((frames[frame].astype(int) - drawn) @ (0.2126, 0.7152, 0.0722)).mean() < 3, "grey levels"
     calibration = json.loads((left.parents[1] / "calib.json").read_text())
     assert not np.any(calibration["rightdistortioncoeffs"])
     np.testing.assert_array_equal(calibration["rotation"], np.eye(3))
     np.testing.assert_allclose(calibration["translation"], [-BASELINE, 0, 0], rtol=1e-9)
-    described = json.loads((stereo / "left/camera.json").read_text())["intrinsics"]
+    intrinsics = json.loads((stereo / "left/camera.json").read_text())["intrinsics"]
     for name in ("left", "right"):
         # From pixels that count from the corner to OpenCV's.
         np.testing.assert_allclose(
-            np.subtract(described, calibration[f"{name}cameramat"]), [[0, 0, 0.5]] * 2 + [[0] * 3]
+            np.subtract(intrinsics, calibration[f"{name}cameramat"]), [[0, 0, 0.5]] * 2 + [[0] * 3]
         )
 
 
 def test_marked_tracks(stereo: Path, left: Path) -> None:
     count = set()
     for side in (left, to_the_right(left)):
-        made = tracks(stereo / side.parent.name)
+        arrays = tracks(stereo / side.parent.name)
         for frame, part in ((0, "start"), (-1, "end")):
-            found = centres(side, part)
-            count.add(len(found))
-            pixels = np.floor(made["points"][:, frame]).astype(int)
-            number = [np.flatnonzero((pixels == centre).all(axis=-1)) for centre in found]
+            marked = centres(side, part)
+            count.add(len(marked))
+            pixels = np.floor(arrays["points"][:, frame]).astype(int)
+            number = [np.flatnonzero((pixels == centre).all(axis=-1)) for centre in marked]
             assert all(len(each) == 1 for each in number)
-            assert not made["occluded"][np.concatenate(number), frame].any()
-    (marked,) = count
-    assert marked > 20
+            assert not arrays["occluded"][np.concatenate(number), frame].any()
+    (total,) = count
+    assert total > 20
 
 
 def test_triangulated_positions(stereo: Path, left: Path) -> None:
     """The error of depth [mm] is at most that of a pixel of disparity, z^2 / (f b) / (1 - 1 / d)."""
     calibration = json.loads((left.parents[1] / "calib.json").read_text())
     matrix, baseline = np.array(calibration["leftcameramat"]), calibration["translation"][0] * 1000
-    made = tracks(stereo / "left")
+    arrays = tracks(stereo / "left")
     pose = np.array(json.loads((stereo / "left/camera.json").read_text())["pose"])
     for frame, part in ((0, "start"), (-1, "end")):
         matches = centres(to_the_right(left), part)
         for x, y in centres(left, part):
-            (n,) = np.flatnonzero((np.floor(made["points"][:, frame]) == (x, y)).all(axis=-1))
+            (n,) = np.flatnonzero((np.floor(arrays["points"][:, frame]) == (x, y)).all(axis=-1))
             disparity = x - matches[np.abs(matches - (x, y)).sum(axis=-1).argmin(), 0]
             w = -disparity / baseline
             position = np.array([x - matrix[0, 2], y - matrix[1, 2], matrix[0, 0]]) / w
-            expected = 1000 * (pose @ np.append(made["position"][n, frame], 1))
+            expected = 1000 * (pose @ np.append(arrays["position"][n, frame], 1))
             assert abs(position[2] - expected[2]) < 1.01 * expected[2] ** 2 / (matrix[0, 0] * -baseline) / (
                 1 - 1 / disparity
             )
@@ -128,11 +128,11 @@ def test_triangulated_positions(stereo: Path, left: Path) -> None:
 
 def test_occluded_tracks_are_not_marked(stereo: Path, left: Path, message: Messages) -> None:
     before = len(centres(left, "start"))
-    made = tracks(stereo / "right")
+    arrays = tracks(stereo / "right")
     x, y = centres(left, "start")[0]
     (n,) = np.flatnonzero((np.floor(tracks(stereo / "left")["points"][:, 0]) == (x, y)).all(axis=-1))
-    made["occluded"][n, -1], made["points"][n, -1] = True, np.nan
-    np.savez(stereo / "right" / "tracks.npz", **made)
+    arrays["occluded"][n, -1], arrays["points"][n, -1] = True, np.nan
+    np.savez(stereo / "right" / "tracks.npz", **arrays)
     done = export(stereo, "stir")
     assert all(
         len(centres(side, part)) == before - 1 for side in (left, to_the_right(left)) for part in ("start", "end")
@@ -143,13 +143,13 @@ def test_occluded_tracks_are_not_marked(stereo: Path, left: Path, message: Messa
 def test_discs_do_not_touch(stereo: Path) -> None:
     """Touching discs would be one region."""
     for side in ("left", "right"):
-        made = tracks(stereo / side)
-        made["points"][1] = made["points"][0] + (5, 0)
-        made["points"][2] = made["points"][0] + (6, 0)
-        np.savez(stereo / side / "tracks.npz", **made)
-    found = centres(export(stereo, "stir").directory / "000000/left/seq00", "start").tolist()
+        arrays = tracks(stereo / side)
+        arrays["points"][1] = arrays["points"][0] + (5, 0)
+        arrays["points"][2] = arrays["points"][0] + (6, 0)
+        np.savez(stereo / side / "tracks.npz", **arrays)
+    marked = centres(export(stereo, "stir").directory / "000000/left/seq00", "start").tolist()
     first = np.floor(tracks(stereo / "left")["points"][:3, 0]).astype(int)
-    assert [centre.tolist() in found for centre in first] == [True, False, True]
+    assert [centre.tolist() in marked for centre in first] == [True, False, True]
 
 
 def test_cameras_that_are_not_rectified(stereo: Path, message: Messages) -> None:

@@ -46,16 +46,16 @@ def test_tracks_round_trip(tracked: Path) -> None:
     assert named == {"results", "video", "points", "occluded"} | of_numpy
     assert data["results"]["points"].flags.writeable
     assert list(data) == ["results"]
-    found, expected = data["results"], made_up()
-    assert set(found) == {"video", "points", "occluded"}
-    assert (found["video"].dtype, found["points"].dtype, found["occluded"].dtype) == (np.uint8, np.float32, np.bool_)
-    assert found["video"].shape == (FRAMES, HEIGHT, WIDTH, 3)
+    exported, expected = data["results"], made_up()
+    dtypes = {"video": np.uint8, "points": np.float32, "occluded": np.bool_}
+    assert {name: array.dtype for name, array in exported.items()} == dtypes
+    assert exported["video"].shape == (FRAMES, HEIGHT, WIDTH, 3)
     for frame in range(FRAMES):
         picture = np.asarray(Image.open(tracked / "frames" / f"000{frame}.png"))
-        np.testing.assert_array_equal(found["video"][frame], picture)
-    np.testing.assert_array_equal(found["occluded"], expected["occluded"])
+        np.testing.assert_array_equal(exported["video"][frame], picture)
+    np.testing.assert_array_equal(exported["occluded"], expected["occluded"])
     # Pixels of create_davis_dataset and visualize.py; two roundings to single precision.
-    pixels = found["points"] * np.array([WIDTH, HEIGHT])
+    pixels = exported["points"] * np.array([WIDTH, HEIGHT])
     is_finite = np.isfinite(expected["points"])
     np.testing.assert_allclose(pixels[is_finite], expected["points"][is_finite], rtol=2**-23)
     assert (pixels[~is_finite] == 0).all()

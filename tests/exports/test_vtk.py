@@ -42,17 +42,17 @@ def read(path: Path) -> tuple[Any, dict[str, NDArray[Any]]]:
 def test_point_data_of_every_frame(ran: Path, out: Path) -> None:
     run = read_run(ran)
     for frame, position in enumerate(run.positions()):
-        grid, found = read(out / f"000{frame}.vtu")
-        assert set(found) == {"points", "displacement", "speed", "energy_density", "texture"}
-        assert {array.dtype for array in found.values()} == {np.dtype(np.float64)}, "precision of the run"
-        np.testing.assert_array_equal(found["points"], position.reshape(-1, 3))
+        grid, arrays = read(out / f"000{frame}.vtu")
+        assert set(arrays) == {"points", "displacement", "speed", "energy_density", "texture"}
+        assert {array.dtype for array in arrays.values()} == {np.dtype(np.float64)}, "precision of the run"
+        np.testing.assert_array_equal(arrays["points"], position.reshape(-1, 3))
         displacement = position - rest_positions(run.scene.sheet)
-        np.testing.assert_array_equal(found["displacement"], displacement.reshape(-1, 3))
-        np.testing.assert_array_equal(found["speed"], speed(run.positions(), run.time, frame).ravel())
+        np.testing.assert_array_equal(arrays["displacement"], displacement.reshape(-1, 3))
+        np.testing.assert_array_equal(arrays["speed"], speed(run.positions(), run.time, frame).ravel())
         # The energy of all springs, by the reference implementation.
         area = area_shares(run.scene.sheet).ravel() * (0.3 / 8) * (0.4 / 10)
         total = reference.energy(run.scene, displacement)
-        assert (found["energy_density"] * area).sum() == pytest.approx(total, rel=1e-12)
+        assert (arrays["energy_density"] * area).sum() == pytest.approx(total, rel=1e-12)
         assert grid.GetNumberOfCells() == 2 * 8 * 10
     assert total > 0
 
@@ -61,13 +61,13 @@ def test_orientation_and_texture_coordinates(out: Path) -> None:
     from vtkmodules.vtkFiltersCore import vtkPolyDataNormals
     from vtkmodules.vtkFiltersGeometry import vtkGeometryFilter
 
-    grid, found = read(out / "0000.vtu")
+    grid, arrays = read(out / "0000.vtu")
     for name, unit in (("displacement", "m"), ("speed", "m/s"), ("energy_density", "J/m2")):
         array = grid.GetPointData().GetArray(name)
         assert array.GetInformation().Get(array.UNITS_LABEL()) == unit
     assert grid.GetPointData().GetTCoords().GetName() == "texture"
     assert grid.GetPointData().GetVectors().GetName() == "displacement"
-    np.testing.assert_allclose(found["texture"], found["points"][:, :2] / (0.4, 0.3) + 0.5, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(arrays["texture"], arrays["points"][:, :2] / (0.4, 0.3) + 0.5, rtol=0, atol=1e-15)
     shell, normals = vtkGeometryFilter(), vtkPolyDataNormals()
     shell.SetInputData(grid)
     normals.SetInputConnection(shell.GetOutputPort())
