@@ -72,4 +72,4 @@ class CalibrationReader(NamedTuple):
     read: Callable[[Keys], Calibration]
     # Pose of the right camera, in the unit of the file, from the keys of this camera.
     pose: Callable[[Keys], StereoPose | None] = lambda keys: None
-    unit: float | None = 1.0  # unit of lengths in the file [m]; None where it depends on who wrote the file
+    unit: float | None = 1.0  # unit of lengths in the file [m]; None where the format does not define it

@@ -62,7 +62,7 @@ def read_camera(keys: Keys) -> Calibration:
     """Read a calibration from the keys of a camera."""
     file, matrix, values = keys.file, keys.numbers(MATRIX), keys.numbers(COEFFICIENTS)
     if matrix is None:
-        raise file.fault(f"has no camera matrix that is known; found {keys}; {_REMEDY}")
+        raise file.fault(f"has no known camera matrix; found {keys}; {_REMEDY}")
     name = keys.find(MATRIX)
     if len(matrix) != 9 or [matrix[n] for n in (1, 3, 6, 7, 8)] != [0, 0, 0, 0, 1] or min(matrix[::4]) <= 0:
         raise keys.fault(f"{name}: is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]; write the camera matrix like that", name)
@@ -71,7 +71,7 @@ def read_camera(keys: Keys) -> Calibration:
     xi = keys.numbers("xi") or []
     model = _model(keys, values or (), has_xi=any(xi))
     if values is None and model != NO_DISTORTION:
-        fault = "has a camera matrix, and no distortion that is known"
+        fault = "has a camera matrix, but no known distortion"
         remedy = "write distortion_coefficients, [0, 0, 0, 0] where there is none"
         raise file.fault(f"{fault}; found {keys}; {remedy}")
     size = _size(keys)

@@ -144,7 +144,7 @@ def _add_cameras(glb: Glb, run: FinishedRun) -> list[str]:
             field = {"xmag": width / 2, "ymag": height / 2, "znear": 0.0, "zfar": 2 * view.distance}
             optics = {"type": "orthographic", "orthographic": field}
         if view.lens is not None or not np.allclose(view.centre, view.size / 2):
-            notes.append(f"{title}: without its distortion and its principal point, which a camera of glTF cannot have")
+            notes.append(f"{title}: without lens distortion and principal point, which glTF cameras do not have")
         camera = glb.add("cameras", {"name": title, **optics})
         pose = {
             "translation": np.array([view.eye for view in views]),

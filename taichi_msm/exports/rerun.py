@@ -63,7 +63,9 @@ def _write_run(run: FinishedRun, path: Path, progress: ProgressCallback) -> list
     missing = [key for key in FORMATS["rerun"].optional_outputs if not any(each.has_output(key) for each in views)]
     notes = [f"without {key}, which is not among the results; {run.remedy(key)}" for key in missing]
     if any(view_at(run.scene, 0.0, each.camera).lens is not None for each in views):
-        notes.append("Rerun has no lens distortion, so that points in space are off in the pictures of a lens")
+        notes.append(
+            "Rerun has no lens distortion, so projected points deviate from the pictures of a distorted camera"
+        )
     return notes
 
 

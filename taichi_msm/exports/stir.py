@@ -148,16 +148,16 @@ def _notes(size: tuple[int, int], pixels: Pixels, tracks: int, baseline: float) 
     notes, marked = [], pixels.shape[2]
     if marked < tracks:
         notes.append(
-            f"{marked} of {tracks} points are marked; the others are hidden from a camera in the first or last frame, "
-            "or too near to the edge or to a marked one"
+            f"{marked} of {tracks} tracks are marked; the others are occluded in the first or last frame of a camera, "
+            "or too close to the edge or to a marked one"
         )
     if size != LOADER_SIZE:
         width, height = LOADER_SIZE
-        notes.append(f"STIR's loader reads films of {width} x {height} pixels only; these have {size[0]} x {size[1]}")
+        notes.append(f"STIR's loader reads videos of {width} x {height} pixels only; these have {size[0]} x {size[1]}")
     disparity = pixels[0, :, :, 0] - pixels[1, :, :, 0]
     if ((disparity < MIN_DISPARITY_PX) | (disparity > MAX_DISPARITY_PX)).any():
         notes.append(
-            f"STIR's loader finds places in space for disparities of {MIN_DISPARITY_PX} to {MAX_DISPARITY_PX} px; "
-            f"here they are {disparity.min()} to {disparity.max()} px with a baseline of {baseline:g} m"
+            f"STIR's loader triangulates disparities of {MIN_DISPARITY_PX} to {MAX_DISPARITY_PX} px only; "
+            f"these are {disparity.min()} to {disparity.max()} px, with a baseline of {baseline:g} m"
         )
     return notes
