@@ -144,7 +144,7 @@ def test_check_and_run_print_the_notes(tmp_path: Path, program: Program) -> None
         },
         {
             "eye": [0, 0, 0.4],
-            "intrinsics": {"fx": 15, "fy": 15, "cx": 2000, "cy": 256},
+            "intrinsics": {"fx": 26, "fy": 26, "cx": 2000, "cy": 256},
             "distortion": {"model": "fisheye"},
             "outside": "background",
         },
