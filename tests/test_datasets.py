@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
-from scipy.ndimage import map_coordinates
 
 from taichi_msm import sweep
 from taichi_msm.datasets import Clips, Pairs
@@ -98,23 +97,6 @@ def test_clips(data_set: Path) -> None:
     with np.load(folder / "tracks.npz") as tracks:
         assert np.array_equal(clip["points"], tracks["points"][:, 3:6])
         assert np.array_equal(clip["visible"], ~tracks["occluded"][:, 3:6])
-
-
-def test_flow_agrees_with_tracks(data_set: Path) -> None:
-    """Flow is interpolated between pixel centres; with another convention, its error is that of its gradient."""
-    pairs, clip = Pairs(data_set, "test"), Clips(data_set, "test", frames=FRAMES)[0]
-    pair, (start, end) = pairs[FRAMES - 2], clip["points"][:, -2:].transpose(1, 2, 0)
-    inside = ((start > 1) & (start.T < [WIDTH - 1, HEIGHT - 1]).T).all(axis=0)
-
-    def error(centre: float) -> float:
-        down_right = start[::-1] - centre
-        valid = map_coordinates(pair["valid"].astype(float), down_right, order=1) > 1 - 1e-6
-        chosen = valid & inside & clip["visible"][:, -2]
-        assert chosen.sum() > 50
-        flow = np.stack([map_coordinates(part, down_right[:, chosen], order=1) for part in pair["flow"]])
-        return float(np.abs(flow - (end - start)[:, chosen]).mean())
-
-    assert 10 * error(0.5) < min(error(0), error(1))
 
 
 def test_batches_of_a_loader(data_set: Path, torch: None) -> None:

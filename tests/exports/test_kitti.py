@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import shutil
 import struct
 from collections.abc import Callable
@@ -16,7 +15,7 @@ from PIL import Image
 
 from taichi_msm.errors import FilesError
 from taichi_msm.exports.export import export
-from taichi_msm.exports.kitti import encode_flow, png16
+from taichi_msm.exports.kitti import encode_flow
 from tests.golden import Messages
 from tests.outputs import files
 from tests.runs.test_finished import change
@@ -105,15 +104,6 @@ def test_flow_round_trip(labelled: Path) -> None:
 def test_encoded_flow(flow: tuple[float, float], colours: tuple[int, ...]) -> None:
     assert encode_flow(np.array([[flow]], np.float32)).ravel().tolist() == list(colours)
     assert encode_flow(np.array([[flow]], np.float32), np.array([[False]])).ravel().tolist() == [0, 0, 0]
-
-
-def test_16_bit_png_round_trip(tmp_path: Path) -> None:
-    colours = np.random.default_rng(0).integers(0, 1 << 16, (37, 53, 3)).astype(np.uint16)
-    data = png16(colours)
-    (tmp_path / "picture.png").write_bytes(data)
-    np.testing.assert_array_equal(read_png(tmp_path / "picture.png"), colours)
-    # Pillow checks the checksums, and keeps the higher byte.
-    np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(data))), colours >> 8)
 
 
 def test_missing_outputs_are_reported(labelled: Path, message: Messages) -> None:

@@ -89,9 +89,3 @@ def test_memory_limit(tracked: Path, monkeypatch: pytest.MonkeyPatch, message: M
             export(runs, "tapvid", tracked / "out")
         monkeypatch.setattr(tapvid, "available_memory", lambda need=need: need)
         export(runs, "tapvid", tracked / "out")
-
-
-def test_missing_frames(tracked: Path, message: Messages) -> None:
-    (tracked / "frames").rename(tracked / "elsewhere")
-    with message.raises(FilesError, "png"):
-        export(tracked, "tapvid", tracked / "out")
