@@ -34,12 +34,8 @@ class Pair(TypedDict):
     first: NDArray[np.uint8]  # RGB, shape (3, height, width)
     second: NDArray[np.uint8]  # of the same shape
     flow: NDArray[np.float32]  # displacement to the right and down [px], shape (2, height, width)
-    valid: NDArray[
-        np.bool_
-    ]  # whether flow is known, which is on tissue; shape (height, width)
-    occluded: NDArray[
-        np.bool_
-    ]  # tissue hidden or outside the picture in the second frame; shape (height, width)
+    valid: NDArray[np.bool_]  # whether flow is known, which is on tissue; shape (height, width)
+    occluded: NDArray[np.bool_]  # tissue hidden or outside the picture in the second frame; shape (height, width)
     depth: NDArray[np.float32]  # along the viewing direction [m], 0 on the background; shape (height, width)
 
 
