@@ -94,7 +94,6 @@ NOT_PROVOKED = {
     "a run of the fit ended early:",
     "another command for the same folder has ended meanwhile",
     "interrupted while the sheet was restarted; restart the scene",
-    "is neither true nor false",
     "is no number; expected",
     "is not a writable directory",
     "lost the scheduler at",
