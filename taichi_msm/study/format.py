@@ -93,6 +93,9 @@ def format_table(measurements: Sequence[Any], columns: Columns, remark: Callable
         measurements: measurements of one kind.
         columns: format functions of the cells, by the name of the column.
         remark: format function of a last column without a name, which is omitted if all its cells are empty.
+
+    Returns:
+        The table, without a final line break.
     """
     if remark and any(map(remark, measurements)):
         columns = {**columns, "": remark}

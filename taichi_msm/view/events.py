@@ -118,9 +118,9 @@ KEYS = {
     "q": "quit",
 }
 
-_CONFIG = ConfigDict(strict=True, allow_inf_nan=False)
 _EVENTS: dict[str, TypeAdapter[Event]] = {
-    kind.__name__.lower(): TypeAdapter(kind, config=_CONFIG) for kind in get_args(Event)
+    kind.__name__.lower(): TypeAdapter(kind, config=ConfigDict(strict=True, allow_inf_nan=False))
+    for kind in get_args(Event)
 }
 
 

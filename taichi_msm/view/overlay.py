@@ -67,7 +67,13 @@ def write_text(
 
 
 def mark_tool(picture: Picture, pixel: tuple[float, float], *, pulls: bool) -> None:
-    """Draw a ring around the pixel (x, y) of a tool into a picture, shape (height, width, 3)."""
+    """Draw a ring around a tool into a picture, in place.
+
+    Args:
+        picture: shape (height, width, 3).
+        pixel: centre (x, y) of the ring [px]; may be outside of the picture.
+        pulls: whether the ring has the colour of pulling.
+    """
     radius = picture.shape[0] * (1 / 50)
     reach = int(radius) + 4
     left, top = max(0, int(pixel[0]) - reach), max(0, int(pixel[1]) - reach)

@@ -142,8 +142,10 @@ class Server:
         """Return whether an origin is this server's, or that of a port that `ssh -L` forwards to it."""
         try:
             parts, forwarded = urlsplit(origin), urlsplit(f"//{host}").port
-            own = f"{parts.scheme}://{parts.netloc}" == origin and parts.scheme == "http"
-            return own and parts.hostname in {ADDRESS, "localhost", "::1"} and parts.port in (self._port, forwarded)
+            is_plain = f"{parts.scheme}://{parts.netloc}" == origin and parts.scheme == "http"
+            return (
+                is_plain and parts.hostname in {ADDRESS, "localhost", "::1"} and parts.port in (self._port, forwarded)
+            )
         except ValueError:
             return False
 
@@ -172,7 +174,12 @@ class Server:
         self.pages.remove(page)
 
     def receive(self, page: _Connection, message: str | bytes) -> None:
-        """Process a message of a page; describe the fault of a message that is not valid to it."""
+        """Queue the event of a message, or reply with its fault.
+
+        Args:
+            page: the sender; events are ignored unless it steers.
+            message: see `events.parse_message`.
+        """
         try:
             event = events.parse_message(message)
         except (ValueError, RecursionError) as error:
@@ -232,8 +239,8 @@ class Server:
             self._picture, self._jpeg = picture, encode_jpeg(picture)
         state = self._state(pacing)
         for page in ready:
-            own = {"steers": page is self.pages[0], "readings": list(page.readings)}
-            header = json.dumps({**state, **own}, allow_nan=False).encode()
+            of_page = {"steers": page is self.pages[0], "readings": list(page.readings)}
+            header = json.dumps({**state, **of_page}, allow_nan=False).encode()
             jpeg = b"" if page.jpeg is self._jpeg else self._jpeg
             page.send(len(header).to_bytes(4, "big") + header + jpeg)
             page.jpeg = self._jpeg
