@@ -429,7 +429,7 @@ class Session:
         tool = self._position_tool if isinstance(self.tool, ForceControlledTool) else self._force_tool
         if tool is None:
             needs = "an instrument" if isinstance(self.tool, ForceControlledTool) else "a force"
-            self.show_notice(f"this control of the tool needs {needs}; give a probe of the scene one")
+            self.show_notice(f"this control of the tool needs {needs}; add it to a probe of the scene")
             return
         try:
             plan = self._with_tool(tool)
