@@ -40,7 +40,7 @@ def parse_shard(text: str) -> tuple[int, int]:
     """Parse I/N, part I of N counted from 1."""
     numbers = re.fullmatch("([0-9]{1,9})/([0-9]{1,9})", text)
     if numbers is None or not 1 <= int(numbers[1]) <= int(numbers[2]):
-        raise click.BadParameter(f"{text} is no part; take I/N with 1 <= I <= N, such as 3/8")
+        raise click.BadParameter(f"{text} is not a part; take I/N with 1 <= I <= N, such as 3/8")
     return int(numbers[1]), int(numbers[2])
 
 
