@@ -409,12 +409,6 @@ def test_check_prints_the_baseline_of_a_stereo_pair(small: Path, call: Call, mes
     message((line for line in out.splitlines() if line.startswith("render.")), "0.004 m", "0.005 m")
 
 
-def test_schema_is_a_json_schema(call: Call) -> None:
-    code, out, _ = call("schema")
-    assert code == 0
-    assert json.loads(out)["$schema"] == "https://json-schema.org/draft/2020-12/schema"
-
-
 def test_bug_is_one_line(small: Path, call: Call, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
     def broken(*arguments: object) -> None:
         raise ZeroDivisionError("by zero\nin two lines")
@@ -424,14 +418,6 @@ def test_bug_is_one_line(small: Path, call: Call, monkeypatch: pytest.MonkeyPatc
     code, _, err = call("check", "small.yaml")
     assert code == 1
     message(err, "TAICHI_MSM_TRACEBACK=1")
-
-
-@pytest.mark.slow
-def test_warnings_of_libraries(small: Path, root: Path) -> None:
-    environment = {**os.environ, "PYTHONPATH": str(root), "PYTHONWARNINGS": "error"}
-    command = [sys.executable, "-m", "taichi_msm", "run", "small.yaml", "--quiet", "--set", "output=[gif]"]
-    done = subprocess.run(command, capture_output=True, text=True, env=environment)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
 needs_full = pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")

@@ -310,19 +310,3 @@ def test_recommended_step_divides_a_frame() -> None:
     text = study.recommendation()[1].split(": ")[1]
     assert plan_of(with_time(scene(), step=float(text))).grid.steps_per_frame == 77
     assert plan_of(scene(time={"step": float(text)})).grid.step == 1 / (25 * 77)
-
-
-def test_interruption_keeps_the_measured_steps(device: Device) -> None:
-    calls = 0
-
-    def stop(done: int, total: int) -> None:
-        nonlocal calls
-        calls += 1
-        if calls > 90:
-            raise KeyboardInterrupt
-
-    study = study_of(scene())
-    with pytest.raises(KeyboardInterrupt):
-        SteppingStudy(plan_of(scene(probes=[SOFT_PRESS])), device, 0.01, study, stop).run()
-    assert study.reference is not None
-    assert study.stepping

@@ -344,16 +344,6 @@ def test_python_interface_and_its_executors(many: Path, pool: Pool, message: Mes
     assert not Path("wrong").exists()
 
 
-def test_variables_of_the_python_interface(many: Path, pool: Pool) -> None:
-    variables, overrides = {"n": {"grid": [1, 2]}}, {"time.duration": "=n / 10", "output": []}
-    rows = list(sweep("small.yaml", {}, "out", variables=variables, overrides=overrides, executor=pool))
-    assert {row.status for row in rows} == {"complete"}
-    assert [row["n"] for row in table("out")] == ["1", "2"]
-    # The file of the same sweep has the same outcomes.
-    (many / "many.yaml").write_text(json.dumps({"scene": "small.yaml", "variables": variables, "set": overrides}))
-    assert begin_sweep(load_sweep("many.yaml"), Path("out")).missing == []
-
-
 def number(row: Outcome) -> int:
     return row.run
 

@@ -84,7 +84,6 @@ def test_mp4_needs_pyav(
 FAULTS = {
     "empty": ("", "1:1"),
     "no time": ("events:\n  - {do: press, at: [1, 2]}", "2:5: events.0.t"),
-    "unknown action": ("events:\n  - {t: 1, do: pres}", "2:12: events.0.do"),
     "no pixel": ("events:\n  - {t: 1, do: press}", "2:5: events.0.at"),
     "pixel of a release": ("events:\n  - {t: 1, do: release, at: [1, 2]}", "2:25: events.0.at"),
     "drag unpressed": ("events:\n  - {t: 1, do: drag, at: [1, 2]}", "2:5: events.0"),
@@ -99,7 +98,6 @@ FAULTS = {
         "events:\n  - {t: 1, do: turn, by: [1, 2], seconds: 2}\n  - {t: 2, do: key, name: m}",
         "3:5: events.1",
     ),
-    "two faults": ("events:\n  - {t: 1, do: percent, to: 101}\nfoo: 1", "2:25: events.0.to", "3:1: foo"),
 }
 
 
