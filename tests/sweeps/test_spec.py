@@ -307,19 +307,3 @@ def test_files_of_the_wrong_kind(folder: Path, message: Messages) -> None:
     (folder / "small.yaml").write_text((folder / "small.yaml").read_text() + "dampign: 1\n")
     with message.raises(SceneError, "many.yaml:1:", "dampign"):
         load_sweep("many.yaml")
-
-
-def test_folders_may_be_links(folder: Path) -> None:
-    (folder / "real" / "scenes").mkdir(parents=True)
-    (folder / "pictures").mkdir()
-    (folder / "textures" / "a.png").rename(folder / "pictures" / "a.png")
-    for name in ("small.yaml", "speckle.png"):
-        (folder / name).rename(folder / "real" / "scenes" / name)
-    (folder / "link").symlink_to(folder / "real" / "scenes")
-    (folder / "many.yaml").write_text(
-        json.dumps({**GOOD, "scene": "link/small.yaml", "set": {"image": "pictures/a.png"}})
-    )
-    sweep = load_sweep("many.yaml")
-    (override, _) = sweep.overrides([0.01])
-    # Relative to the target of the link.
-    assert (sweep.scene.folder / override.removeprefix("image=")).samefile("pictures/a.png")

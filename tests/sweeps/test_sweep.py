@@ -25,7 +25,6 @@ from PIL import Image
 from taichi_msm import sweep
 from taichi_msm.errors import ArgumentError, MsmError, SceneError
 from taichi_msm.images import file_sha256
-from taichi_msm.load import cost as cost_module
 from taichi_msm.sweeps import tables
 from taichi_msm.sweeps.pool import PARENT_POLL_S, DiedError, Pool
 from taichi_msm.sweeps.runs import Outcome, RunTask, SweepState, begin_sweep, run_missing
@@ -148,15 +147,6 @@ def test_shards_change_nothing(many: Path, pool: Pool, whole: Path) -> None:
     assert not Path("parts/table.csv").exists()
     execute_sweep(pool, "parts")
     assert (table("parts"), runs("parts")) == (table(whole), runs(whole))
-
-
-@pytest.mark.slow
-def test_shard_writes_no_table(many: Path, program: Program, message: Messages) -> None:
-    done = program("sweep", "many.yaml", "--shard", "2/4", "--out", "out")
-    assert done.returncode == 0
-    message(done.stdout, "part 2 of 4", "--shard", hide=SECONDS)
-    assert sorted(str(path.relative_to("out")) for path in Path("out").glob("*/*")) == ["runs/000001"]
-    assert [path.name for path in Path("out").glob("*.*")] == ["sweep.json"]
 
 
 @pytest.mark.slow
@@ -333,13 +323,9 @@ def test_python_interface_and_its_executors(many: Path, pool: Pool, message: Mes
     assert sorted(sweep("small.yaml", vary, "workers", overrides={"output": []}, workers=1), key=number) == rows
     with message.raises(SceneError, "vary.dampign"):
         sweep("small.yaml", {"dampign": {"grid": [1]}}, "wrong")
-    wrong: list[tuple[str, dict[str, Any]]] = [
-        ("scene", {"scene": 3}),
-        *(("workers", {"workers": number}) for number in (0, 10**30)),
-        ("vary", {"vary": {"damping": 1j}}),
-    ]
-    for key, argument in wrong:
-        with message.raises(ArgumentError, key):
+    wrong: list[dict[str, Any]] = [{"scene": 3}, {"workers": 0}, {"vary": {"damping": 1j}}]
+    for argument in wrong:
+        with message.raises(ArgumentError, *argument):
             sweep(**{"scene": "small.yaml", "vary": vary, "directory": "wrong", **argument})
     assert not Path("wrong").exists()
 
@@ -449,17 +435,3 @@ def test_number_of_workers(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(tables, "available_memory", lambda free=free: free)
         assert tables.choose_worker_count(cost, runs_).number == number
     assert tables.choose_worker_count(cost, 1, requested=7).number == 7
-
-
-def test_cost_of_all_runs(many: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tables, "available_threads", lambda: 2)
-    monkeypatch.setattr(cost_module, "estimate_duration", lambda plan: cost_module.DurationEstimate(5.0, 3.0))
-    for samples in (64, 6400):
-        (many / "many.yaml").write_text(
-            SWEEP.replace("[0.01, auto]", "[auto]").replace("samples: 4", f"samples: {samples}")
-        )
-        estimate = tables.estimate_cost(load_sweep("many.yaml"))
-        # One start, and for each run its work and the overhead of 3 frames, which is shared by two processes.
-        seconds = 5 - 3 + (tables.RUN_OVERHEAD_S + 3 * tables.FRAME_OVERHEAD_S) / 2
-        assert estimate.seconds == pytest.approx(3 + samples * seconds)
-        assert (estimate.looked_at, estimate.refused) == (64, 0)

@@ -198,15 +198,6 @@ def test_picture_of_an_animation_at_a_time(tmp_path: Path) -> None:
         assert read_gif_frame(tmp_path / "a.gif", time).getcolors() == [(40 * 30, colour)]
 
 
-def test_missing_pictures(make: Make) -> None:
-    result = make()
-    (result.directory / "contact.jpg").touch()
-    names, notes = write(result)
-    assert notes == [WITHOUT_PICTURES]
-    assert "contact.jpg" not in names
-    assert not (result.directory / "contact.jpg").exists()
-
-
 def test_earlier_reports_are_replaced_atomically(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also when the drawing is interrupted, or another report fails."""
     result = make(128)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -333,16 +332,13 @@ def test_film_has_the_duration_of_the_session(begin: Begin) -> None:
     assert duration("captures/film-1.gif") == 1300, "1.2 s from the first to the last picture, which lasts 0.1 s"
 
 
-def test_session_outlives_the_encoder_of_its_film(begin: Begin, message: Messages) -> None:
+def test_session_outlives_a_failing_film(begin: Begin, monkeypatch: pytest.MonkeyPatch) -> None:
     session = begin(TILTED)
     session.handle(Key("g"))
-    session.picture()
-    subprocess.run(["pkill", "-KILL", "-P", str(os.getpid())], check=True)
-    while not session.notice:
-        session.advance()
+    with monkeypatch.context() as patch:
+        patch.setattr(recording.Film, "add_frame", Mock(side_effect=FilesError("full")))
         session.picture()
-    message(session.notice, "captures")
-    assert not Path("captures").exists()
+    assert (session.notice, session.filming) == ("full", False)
     session.handle(Key("g"))
     session.picture()
     session.handle(Key("g"))
