@@ -274,7 +274,7 @@ def summary_lines(
         example = next((outcome for outcome in outcomes if outcome.status == status), None)
         if example and example.error:
             lines.append(f"{status}, for example run {example.run:06}: {example.error}")
-    for name, cause in (("error_estimate", "the time step"), ("mesh_error", "the number of points")):
+    for name, cause in (("error_estimate", "the time step"), ("mesh_error", "the mesh")):
         errors = [(getattr(outcome, name), outcome.run) for outcome in outcomes if getattr(outcome, name) is not None]
         if errors:
             largest, run = max(errors)

@@ -33,7 +33,7 @@ SheetPosition = tuple[float, float]
 
 # Positions at which a tool may start, in order of preference.
 CENTRE = 0.5, 0.5
-STARTS: tuple[SheetPosition, ...] = (CENTRE, *product((0.1, 0.9), repeat=2), *product((0.0, 1.0), repeat=2))
+STARTS: tuple[SheetPosition, ...] = (CENTRE, *product((0.1, 0.9), (0.1, 0.9)), *product((0.0, 1.0), (0.0, 1.0)))
 
 
 def clear_start(probe: Probe, played: Sequence[Probe], scene: Scene) -> SheetPosition:

@@ -72,7 +72,7 @@ class Viewport:
         self.set_camera(orbit_camera(pinhole(scene, self._time), -right * angle, down * angle))
 
     def toggle_light(self) -> None:
-        """Toggle the shading of the scene, or a headlight if the scene has none."""
+        """Toggle the shading of the scene, or a headlight if the scene has no shading."""
         scene_shading = self._renderer.scene.render.shading
         shading = scene_shading if scene_shading != "none" else "headlight"
         update = {"shading": "none" if self.render.shading != "none" else shading}

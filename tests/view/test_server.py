@@ -222,7 +222,8 @@ async def test_page_changes_the_material(session: Session) -> None:
             (("key", "w"), "session-1"),
         ):
             await client.send(*message)
-            await client.until(lambda state, notice=notice: notice in state["notice"])
+            while notice not in (await client.until(lambda state: True))["notice"]:
+                pass
         springs = load_scene("captures/session-1.yaml").springs
         assert springs is not None
         assert springs.structural == 160

@@ -132,7 +132,8 @@ def test_drag_moves_the_control_point(begin: Begin) -> None:
     drag = Drag(*pixel_of(session, 10, 16))
     advance(session, 10)
     # A turn of the camera moves no tool, and neither does a drag after the release.
-    for events in ([drag], [Turn(12, 4), drag, Turn(-6, 4), drag], [Release(), Drag(10, 10)]):
+    sequences: list[list[Event]] = [[drag], [Turn(12, 4), drag, Turn(-6, 4), drag], [Release(), Drag(10, 10)]]
+    for events in sequences:
         for event in events:
             session.handle(event)
         session.advance()
@@ -482,7 +483,7 @@ def test_instrument_follows_the_pointer(begin: Begin) -> None:
 
 
 # An instrument that is wide enough to touch several mass points.
-WIDE = {"radius": 0.03, "shaft": [0.3, -0.2, 1], "length": 0.2}
+WIDE: dict[str, Any] = {"radius": 0.03, "shaft": [0.3, -0.2, 1], "length": 0.2}
 BY_HAND = {**TILTED, "probes.0.instrument": WIDE}
 # Events of position control: press, drag, deeper press, grip, lift, and another press.
 EVENTS: dict[int, list[Event]] = {
