@@ -484,6 +484,7 @@ def test_instrument_follows_the_pointer(begin: Begin) -> None:
 
 # An instrument that is wide enough to touch several mass points.
 WIDE: dict[str, Any] = {"radius": 0.03, "shaft": [0.3, -0.2, 1], "length": 0.2}
+PLATE: dict[str, Any] = {**WIDE, "radius": None, "plate": 0.03}
 BY_HAND = {**TILTED, "probes.0.instrument": WIDE}
 # Events of position control: press, drag, deeper press, grip, lift, and another press.
 EVENTS: dict[int, list[Event]] = {
@@ -540,7 +541,7 @@ def test_run_is_bit_identical_to_a_position_controlled_session(
     "probe",
     [
         {"path": [[0, 0.5, 0.5, 0.05]], "instrument": WIDE},
-        {"path": [[0, 0.5, 0.5, 0.05]], "instrument": {**WIDE, "radius": None, "plate": 0.03}},
+        {"path": [[0, 0.5, 0.5, 0.05]], "instrument": PLATE},
         {"force": [0, 0, -2000], "falloff": 60, "instrument": WIDE},
     ],
     ids=["capsule", "plate", "force"],
