@@ -24,7 +24,6 @@ from PIL import Image
 
 from taichi_msm import sweep
 from taichi_msm.errors import ArgumentError, MsmError, SceneError
-from taichi_msm.images import file_sha256
 from taichi_msm.sweeps import tables
 from taichi_msm.sweeps.pool import PARENT_POLL_S, DiedError, Pool
 from taichi_msm.sweeps.runs import Outcome, RunTask, SweepState, begin_sweep, run_missing
@@ -238,23 +237,13 @@ def test_links_are_refused(many: Path, program: Program, name: str, message: Mes
     assert not list((many / "target").iterdir())
 
 
-def test_record_of_another_run_is_ignored(many: Path) -> None:
+def test_record_of_another_run_is_ignored(many: Path, whole: Path) -> None:
     def begin() -> SweepState:
         return begin_sweep(load_sweep("many.yaml"), Path("out"))
 
-    record = {
-        "status": "diverged",
-        "error": "at 0.1 s",
-        "max_displacement": 1.0,
-        "shortest_spring": 0.5,
-        "error_estimate": None,
-        "probes": [{"greatest_force": 3.0}],
-        "notes": ["not known"],
-        "timings": {"total": 2.0},
-        "overrides": begin().missing[2].overrides,
-        "sha256": {"image": file_sha256("speckle.png")},
-    }
-    file = Path("out/runs/000002/run.json")
+    number = next(task.run for task in begin().missing if (whole / "runs" / f"{task.run:06}").exists())
+    record = json.loads((whole / "runs" / f"{number:06}" / "run.json").read_text())
+    file = Path("out/runs") / f"{number:06}" / "run.json"
     file.parent.mkdir(parents=True)
     changes: list[dict[str, Any]] = [
         {"overrides": ["time.duration=0.2"]},
@@ -265,10 +254,10 @@ def test_record_of_another_run_is_ignored(many: Path) -> None:
     for content in (*(json.dumps({**record, **change}) for change in changes), "[" * 4000):
         file.write_text(content)
         assert len(begin().missing) == 4, content
-    file.write_text(json.dumps(record))
-    state = begin()
-    assert state.outcomes == [Outcome(2, "diverged", "at 0.1 s", 1.0, 0.5, forces=(3.0,))]
-    assert [task.run for task in state.missing] == [0, 1, 3]
+    file.write_text(json.dumps({**record, "status": "diverged", "error": "at 0.1 s"}))
+    (outcome,) = begin().outcomes
+    assert (outcome.run, outcome.status, outcome.error) == (number, "diverged", "at 0.1 s")
+    assert outcome.forces == (record["probes"][0]["greatest_force"],)
     file.rename("record.json")
     file.symlink_to(Path("record.json").absolute())
     assert len(begin().missing) == 4
@@ -321,6 +310,9 @@ def test_python_interface_and_its_executors(many: Path, pool: Pool, message: Mes
     assert [(row.run, row.status) for row in rows] == [(0, "complete"), (1, "complete")]
     assert [row["damping"] for row in table("out")] == ["0.01", "0.02"]
     assert sorted(sweep("small.yaml", vary, "workers", overrides={"output": []}, workers=1), key=number) == rows
+    variables, overrides = {"n": {"grid": [1, 2]}}, {"time.duration": "=n / 10", "output": []}
+    list(sweep("small.yaml", {}, "variables", variables=variables, overrides=overrides, executor=pool))
+    assert [(row["n"], row["status"]) for row in table("variables")] == [("1", "complete"), ("2", "complete")]
     with message.raises(SceneError, "vary.dampign"):
         sweep("small.yaml", {"dampign": {"grid": [1]}}, "wrong")
     wrong: list[dict[str, Any]] = [{"scene": 3}, {"workers": 0}, {"vary": {"damping": 1j}}]

@@ -17,7 +17,6 @@ from taichi_msm.errors import FilesError, SceneError
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.surface import place_instruments
 from taichi_msm.model.tools import build_tools, overlap
-from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from taichi_msm.view import overlay, recording
 from taichi_msm.view import session as live_session
@@ -83,18 +82,6 @@ def advance(session: Session, frames: int) -> list[np.ndarray]:
     return positions
 
 
-def positions_with_events(session: Session, events: dict[int, list[Event]], calls: int) -> Iterator[np.ndarray]:
-    """Yield the positions at every frame [m], with events before the calls of `advance` with their numbers."""
-    yield session.positions().copy()
-    for call in range(calls):
-        for event in events.get(call, []):
-            session.handle(event)
-        before = session.frame
-        session.advance()
-        if session.frame > before:
-            yield session.positions().copy()
-
-
 def displacement(session: Session) -> np.ndarray:
     return np.linalg.norm(session.positions() - rest_positions(session.scene.sheet), axis=-1)
 
@@ -140,51 +127,78 @@ def test_drag_moves_the_control_point(begin: Begin) -> None:
         assert cell_of(session) == pytest.approx([16, 10], abs=0.4)
 
 
-@pytest.mark.default_cases("f64 with the scene's probes")
+# An instrument that is wide enough to touch several mass points.
+WIDE: dict[str, Any] = {"radius": 0.03, "shaft": [0.3, -0.2, 1], "length": 0.2}
+PLATE: dict[str, Any] = {**WIDE, "radius": None, "plate": 0.03}
+BY_HAND = {**TILTED, "probes.0.instrument": WIDE}
+# Events before the calls of `advance` with their numbers. Position control: press, drag, deeper press, grip and lift.
+FORCE_EVENTS: dict[int, list[Event]] = {
+    2: [Press(20, 12)],
+    9: [Drag(23, 14)],
+    11: [Drag(25, 15), Strength(40)],
+    16: [Release(), Press(14, 16, pull=True)],
+    17: [Turn(5, -3)],
+    30: [Release()],
+    33: [Press(22, 11), Release()],
+    50: [Press(22, 18), Key("space"), Key("m")],
+    52: [Key("space"), StrengthChange(15)],
+}
+POSITION_EVENTS: dict[int, list[Event]] = {
+    1: [Hover(15, 14)],
+    4: [Press(18, 14)],
+    14: [Drag(22, 16), StrengthChange(10)],
+    16: [Drag(25, 15)],
+    20: [Release(), Hover(20, 17)],
+    24: [Press(20, 17, pull=True)],
+    36: [Strength(-30)],
+    46: [Turn(5, -3), Release()],
+    50: [Press(22, 11), Key("space")],
+    52: [Key("space"), Key("m")],
+}
+F64 = {"time.precision": "f64", "springs.virtual_active": "always"}
+FREE = {"time.step": 0.0025, "time.frames_per_second": 20, "sheet.fixed": "none"}
+
+
+@pytest.mark.default_cases("force, f64")
 @pytest.mark.parametrize(
-    ("overrides", "play"),
-    [
-        ({}, False),
-        ({"time.precision": "f64", "springs.virtual_active": "always"}, True),
-        ({"time.step": 0.0025, "sheet.fixed": "none"}, False),
-    ],
-    ids=["f32", "f64 with the scene's probes", "free, given step"],
+    ("by_position", "overrides", "play"),
+    [(False, {}, False), (False, F64, True), (False, FREE, False), (True, F64, True), (True, FREE, False)],
+    ids=["force, f32", "force, f64", "force, free", "position, f64", "position, free"],
 )
-def test_run_is_bit_identical_to_its_session(overrides: dict[str, Any], play: bool, begin: Begin) -> None:
-    session = begin({**TILTED, "render.size": [40, 30], **overrides}, play=play)
-    events: dict[int, list[Event]] = {
-        2: [Press(20, 12)],
-        9: [Drag(23, 14)],
-        11: [Drag(25, 15), Strength(40)],
-        16: [Release(), Press(14, 16, pull=True)],
-        17: [Turn(5, -3)],
-        30: [Release()],
-        33: [Press(22, 11), Release()],
-        36: [Press(22, 18), Key("space"), Key("m")],
-        38: [Key("space"), StrengthChange(15)],
-    }
-    positions: list[np.ndarray] = []
-    for position in positions_with_events(session, events, 50):
-        positions.append(position)
-        if len(positions) % 10 == 0:
+def test_run_is_bit_identical_to_its_session(
+    by_position: bool, overrides: dict[str, Any], play: bool, begin: Begin
+) -> None:
+    settings = {**TILTED, "probes.0.instrument": WIDE, "time.precision": "f32", "render.size": [40, 30], **overrides}
+    session = begin(settings, play=play)
+    if by_position:
+        session.handle(Press(20, 15))
+        advance(session, 3)
+        session.handle(Key("f"))
+        assert (session.frame, session.tool.engaged) == (0, False), "the force-controlled part is not recorded"
+    events = POSITION_EVENTS if by_position else FORCE_EVENTS
+    positions = [session.positions().copy()]
+    for call in range(62):
+        for event in events.get(call, []):
+            session.handle(event)
+        before = session.frame
+        session.advance()
+        if session.frame > before:
+            positions.append(session.positions().copy())
+        if call % 10 == 0:
             session.picture()
     assert np.abs(np.array(positions) - positions[0]).max() > 0.003
-    require_same_run(session, positions, frames=48)  # It was paused for two.
-    render = load_scene("captures/session-1.yaml").render
-    assert render.wireframe
-    assert render.camera.eye == session.recorded_scene().render.camera.eye  # type: ignore[union-attr]
-
-
-def require_same_run(session: Session, positions: list[np.ndarray], frames: int) -> Scene:
-    """Save the session, and require that the run of its scene has bit-identical positions; return the scene."""
     session.handle(Key("w"))
     assert session.notice == "saved captures/session-1.yaml"
     scene = load_scene("captures/session-1.yaml", {"output": ["trajectory"]})
     assert run(scene, "again", threads=2)["status"] == "complete"
     again = np.load("again/trajectory.npz")["position"]
-    assert len(again) == len(positions) == session.frame + 1 == frames + 1
+    assert len(again) == len(positions) == session.frame + 1 == 61, "it was paused for two calls"
     np.testing.assert_array_equal(again, np.array(positions))
-    return scene
+    assert scene.render.wireframe
+    assert scene.render.camera.eye == session.recorded_scene().render.camera.eye  # type: ignore[union-attr]
+    probe = scene.probes[-1]
+    assert len(scene.probes) == 1 + play
+    assert (probe.moved, probe.friction, len(probe.grip)) == ((True, 0.5, 1) if by_position else (False, 0.0, 0))
 
 
 def test_pause_and_single_steps(begin: Begin) -> None:
@@ -264,8 +278,7 @@ def test_keys_of_the_display(begin: Begin) -> None:
     plain = session.picture()
     for key in ("t", "m", "l", "i", "h"):
         session.handle(Key(key))
-        changed = session.picture()
-        assert (changed != plain).any(), key
+        assert (session.picture() != plain).any(), key
         session.handle(Key("c" if key == "t" else key))
         np.testing.assert_array_equal(session.picture(), plain, err_msg=f"{key} and back")
     # The near side follows the pointer; dragged down, the camera rises.
@@ -482,58 +495,10 @@ def test_instrument_follows_the_pointer(begin: Begin) -> None:
         assert 20 < len(pixels) < 3000
 
 
-# An instrument that is wide enough to touch several mass points.
-WIDE: dict[str, Any] = {"radius": 0.03, "shaft": [0.3, -0.2, 1], "length": 0.2}
-PLATE: dict[str, Any] = {**WIDE, "radius": None, "plate": 0.03}
-BY_HAND = {**TILTED, "probes.0.instrument": WIDE}
-# Events of position control: press, drag, deeper press, grip, lift, and another press.
-EVENTS: dict[int, list[Event]] = {
-    1: [Hover(15, 14)],
-    4: [Press(18, 14)],
-    14: [Drag(22, 16), StrengthChange(10)],
-    16: [Drag(25, 15)],
-    20: [Release(), Hover(20, 17)],
-    24: [Press(20, 17, pull=True)],
-    36: [Strength(-30)],
-    46: [Turn(5, -3), Release()],
-    50: [Press(22, 11), Key("space")],
-    52: [Key("space"), Key("m")],
-}
-
-
 def moved(session: Session) -> PositionControlledTool:
     """Return the position-controlled tool."""
     assert isinstance(session.tool, PositionControlledTool)
     return session.tool
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("overrides", "play"),
-    [
-        ({"time.precision": "f64", "springs.virtual_active": "always"}, True),
-        ({"time.step": 0.0025, "time.frames_per_second": 20, "sheet.fixed": "none"}, False),
-    ],
-    ids=["f64 with the scene's probes", "free, given step"],
-)
-def test_run_is_bit_identical_to_a_position_controlled_session(
-    overrides: dict[str, Any], play: bool, begin: Begin
-) -> None:
-    session = begin({**BY_HAND, "time.precision": "f32", "render.size": [40, 30], **overrides}, play=play)
-    session.handle(Press(20, 15))
-    advance(session, 3)
-    session.handle(Key("f"))
-    assert (session.frame, session.tool.engaged) == (0, False), "the force-controlled part is not recorded"
-    positions: list[np.ndarray] = []
-    largest_force = 0.0
-    for position in positions_with_events(session, EVENTS, 62):
-        positions.append(position)
-        largest_force = max(largest_force, session.felt_force())
-    assert largest_force > 0
-    scene = require_same_run(session, positions, frames=60)
-    probe = scene.probes[-1]
-    assert probe.path is not None
-    assert (probe.friction, len(probe.grip), len(scene.probes)) == (0.5, 1, 1 + play)
 
 
 @pytest.mark.default_cases("capsule", "force")

@@ -134,19 +134,6 @@ def test_clicks_in_a_pause_become_one() -> None:
     assert tool.position == (0.49, 0.123456)
 
 
-def test_target_is_the_last_position() -> None:
-    tool = force_tool()
-    tool.press((0.2, 0.2), 1)
-    assert tool.target == (0.2, 0.2)
-    tool.advance(0)
-    tool.move((0.3, 0.2))
-    assert (tool.target, tool.position) == ((0.3, 0.2), (0.2, 0.2))
-    tool.press((0.7, 0.2), 1)
-    assert tool.target == (0.7, 0.2)
-    tool.move((0.8, 0.2))
-    assert tool.target == (0.8, 0.2)
-
-
 def position_plan(probe: dict[str, Any] | None = None, **time: Any) -> Plan:
     force = {"force": [0, 0, -1], **INSTRUMENT}
     # Virtual springs act only where a tool presses.

@@ -72,14 +72,6 @@ def test_invalid_arguments_of_view(
     assert sorted(path.name for path in small.iterdir()) == ["small.yaml", "speckle.png"]
 
 
-def test_mp4_needs_pyav(
-    small: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, message: Messages
-) -> None:
-    monkeypatch.setattr("taichi_msm.scene.outputs.is_pyav_installed", lambda: False)
-    assert main(["view", "small.yaml", "--record", "a.mp4"]) == 2
-    message(capsys.readouterr().err, "--record", "pip")
-
-
 # Invalid scripts, and the locations of their faults.
 FAULTS = {
     "empty": ("", "1:1"),
