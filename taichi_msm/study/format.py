@@ -23,7 +23,11 @@ def format_number(value: float) -> str:
 
 
 def time_unit(seconds: float) -> tuple[float, str]:
-    """Choose a readable unit of time; return its number in a second, and its name."""
+    """Choose a readable unit of time for a duration [s].
+
+    Returns:
+        Its number in a second, and its name.
+    """
     return next(((scale, name) for scale, name in TIME_UNITS if seconds * scale >= 0.9995), TIME_UNITS[-1])
 
 

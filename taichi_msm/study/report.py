@@ -38,7 +38,11 @@ WITHOUT_MATPLOTLIB = "study.png needs matplotlib: pip install matplotlib"
 
 
 def require_writable(directory: Path) -> None:
-    """Check that a directory can be written; FilesError otherwise."""
+    """Check that a directory can be written.
+
+    Raises:
+        FilesError: when it cannot be written.
+    """
     with writing(directory), hidden_folder(directory):
         pass
 

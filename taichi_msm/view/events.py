@@ -125,10 +125,16 @@ _EVENTS: dict[str, TypeAdapter[Event]] = {
 
 
 def parse_message(message: str | bytes) -> Event | None:
-    """Parse a message; return its event, or None for `SHOWN`.
+    """Parse a message of a page.
+
+    Args:
+        message: JSON list of the name of an event and its values.
+
+    Returns:
+        The event; None for `SHOWN`.
 
     Raises:
-        ValueError: when it is neither.
+        ValueError: when the message is invalid; names the event and the reason.
     """
     values: Any = json.loads(message)
     if values == SHOWN:

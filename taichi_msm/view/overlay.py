@@ -47,8 +47,8 @@ def write_text(
         picture: shape (height, width, 3).
         above: lines in the upper left corner, above the bar and the two columns of the table.
         below: text at the bottom, which is wrapped.
-        table: names and their meanings.
-        bar: a value.
+        table: names and their meanings, such as keys and their effects.
+        bar: value that is shown as a bar.
     """
     height, width = picture.shape[:2]
     # Height of letters [px].

@@ -71,7 +71,13 @@ MAX_STEPPING_S = 0.03
 
 
 def listen(port: int) -> socket.socket:
-    """Listen on a port of the loopback interface; 0: a free one.
+    """Listen on a port of the loopback interface.
+
+    Args:
+        port: number of the port, or 0 for a free one.
+
+    Returns:
+        The listening socket, which does not block.
 
     Raises:
         DeviceError: when the port cannot be used.
@@ -92,7 +98,11 @@ class Server:
         session: a new session.
         listener: see `listen`.
         title: of the page.
-        origins: of pages behind a proxy, in addition to the loopback interface's own.
+        origins: of pages behind a proxy, in addition to those of the loopback interface.
+
+    Attributes:
+        url: address of the page, with the token.
+        pages: connected pages; the first one steers.
     """
 
     def __init__(self, session: Session, listener: socket.socket, title: str, origins: Collection[str] = ()) -> None:
@@ -168,7 +178,7 @@ class Server:
         page.send(json.dumps(description))
 
     def disconnect(self, page: _Connection) -> None:
-        """Remove a page; if it steered, the tool lets go, and the next page steers."""
+        """Remove a page; if it steered, the tool is released, and the next page steers."""
         if page is self.pages[0]:
             self._events.append(events.Release())
         self.pages.remove(page)

@@ -94,6 +94,7 @@ class ForceControlledTool:
     Attributes:
         strength: force of a press [% of the full force].
         percent: current force [% of the full force]; negative when pulling.
+        position: current control point, fractions (across, down) of the sheet.
     """
 
     def __init__(self, probe: Probe, frame_rate: float, start: SheetPosition = CENTRE) -> None:
@@ -230,6 +231,8 @@ class PositionControlledTool:
 
     Attributes:
         strength: depth of a press [% of the largest depth]; negative to lift a grip.
+        position: current position of the tip, fractions (across, down) of the sheet.
+        target: position that the tip moves to.
         height: current height of the lowest point of the tip above the sheet at rest [m].
         grid: of the session; a change of the material changes its step.
     """

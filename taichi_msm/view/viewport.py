@@ -23,6 +23,10 @@ class Viewport:
     Args:
         renderer: has the initial settings in its scene.
         play: whether to follow a moving camera of the scene; otherwise it stays at its initial pose.
+
+    Attributes:
+        render: current drawing settings.
+        view: current pose and projection of the main camera.
     """
 
     def __init__(self, renderer: Renderer, *, play: bool = False) -> None:

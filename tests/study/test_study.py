@@ -303,8 +303,7 @@ def test_recommendation_is_the_cheapest_within_the_tolerance() -> None:
     assert study.best_stepping is study.stepping[0], "the largest step of a method"
 
 
-def test_recommended_step_divides_a_frame() -> None:
-    """Its digits suffice to divide a frame."""
+def test_digits_of_the_recommended_step_suffice() -> None:
     study = study_of(scene())
     study.stepping = [stepping_point(1e-4, 1.0, step=1 / 25 / 77, steps_per_frame=77)]
     text = study.recommendation()[1].split(": ")[1]
