@@ -17,8 +17,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
-from PIL import Image
 
 from taichi_msm.cli import console
 from taichi_msm.cli.main import main
@@ -29,7 +27,7 @@ from tests import reference
 from tests.conftest import Program
 from tests.golden import Messages
 from tests.outputs import files
-from tests.scenes import SMALL, speckle
+from tests.scenes import SMALL
 from tests.telling import Telling
 
 
@@ -49,12 +47,9 @@ def test_run_writes_all_outputs(small: Path, program: Program) -> None:
     out = small / "output" / "small"
     assert sorted(path.name for path in out.iterdir()) == ["animation.gif", "frames", "run.json", "trajectory.npz"]
     assert sorted(path.name for path in (out / "frames").iterdir()) == [f"000{n}.png" for n in range(5)]
-    scene = load_scene("small.yaml")
     trajectory = np.load(out / "trajectory.npz")
-    np.testing.assert_allclose(trajectory["position"], reference.simulate(scene), atol=1e-6)
+    np.testing.assert_allclose(trajectory["position"], reference.simulate(load_scene("small.yaml")), atol=1e-6)
     np.testing.assert_allclose(trajectory["time"], [0, 0.1, 0.2, 0.3, 0.4])
-    expected = reference.draw(scene, trajectory["position"][2], speckle(30, 40))
-    assert (np.abs(np.array(Image.open(out / "frames" / "0002.png")).astype(int) - expected) > 1).mean() < 0.01
     record = json.loads((out / "run.json").read_text())
     assert record["status"] == "complete"
     assert record["steps"] == record["steps_per_frame"] * 4 == 164
@@ -82,26 +77,6 @@ def test_tolerance_chooses_the_step(small: Path, program: Program) -> None:
     assert set(estimate) == {"error", "rounding", "in_f64", "order", "at_least"}
     assert 0 == estimate["rounding"] < estimate["error"] <= 1e-4
     assert "error: time step 0.0" in done.stdout
-
-
-@pytest.mark.slow
-def test_recommendation_of_a_study(small: Path, program: Program) -> None:
-    """The run with these lines has the measured error."""
-    common = ["--set", "damping=0.02", "--set", "image=null", "--set", "output=[]"]
-    done = program("study", "small.yaml", "--quick", "--json", "--tolerance", "2e-3", *common)
-    record = json.loads(done.stdout)
-    assert (done.returncode, record["status"], record["tolerance"]) == (0, "complete", 2e-3)
-    step, *method = yaml.safe_load("\n".join(record["recommendation"]))["time"].items()
-    settings = [word for key, value in (step, *method) for word in ("--set", f"time.{key}={value}")]
-    again = program("run", "small.yaml", *common, *settings, "--estimate-error", "--json", "--out", "again")
-    (measured,) = (
-        point["error"]
-        for point in record["stepping"]
-        if (f"{point['step']:.12g}", point["damping_difference"], point["precision"])
-        == (f"{step[1]:.12g}", *(value for _, value in method))
-    )
-    assert measured <= 2e-3
-    assert json.loads(again.stdout)["error_estimate"]["error"] == pytest.approx(measured, rel=0.3)
 
 
 def test_study_without_a_writable_directory(

@@ -32,7 +32,7 @@ from tests import reference
 from tests.golden import Messages
 from tests.motion import frames_on
 from tests.scenes import PRESS, plan_of, scene, speckle
-from tests.terms.test_contact import PRESSED, moved, touching
+from tests.terms.test_contact import PRESSED, touching
 
 SOFT_PRESS = {**PRESS, "force": [0, 300, -1000]}
 
@@ -118,15 +118,6 @@ def test_steps_that_miss_a_jump_are_halved(device: Device) -> None:
     release = scene(probes=[{**SOFT_PRESS, "load": [[0, 100], [0.13, 100], [0.13, 0]]}], time={"duration": 0.2})
     study, _ = stepping_study(release, device, 0.001)
     assert [point.steps_per_frame for point in study.stepping if point.method == "f64 central"] == [9, 18, 36]
-
-
-@pytest.mark.slow
-def test_steps_are_limited_by_the_stride_of_tools(device: Device) -> None:
-    fast = moved([0, 0.5, 0.5, 0.1], [0.1, 0.9, 0.5, 0.1], instrument={"radius": 0.005})
-    contact = touching([fast], time={"step": 0.001, "duration": 0.04})
-    assert plan_of(contact).stable_step > 0.01
-    study, _ = stepping_study(contact, device, 0.001)
-    assert max(point.step for point in study.stepping) <= 0.005 / 2 / 1.6
 
 
 @pytest.mark.slow

@@ -25,6 +25,7 @@ from taichi_msm.sweeps.spec import load_sweep
 from tests.conftest import Program
 from tests.golden import Messages
 from tests.outputs import results
+from tests.sweeps.conftest import CALIBRATION, POSES
 
 distributed = pytest.importorskip("distributed", reason="needs dask.distributed: pip install distributed")
 
@@ -36,8 +37,6 @@ samples: 6
 vary: {damping: {uniform: [0.005, 0.02]}}
 set: {sheet.points: [5, 5], time.duration: 0.1, output: [trajectory], render.camera: {calibration: k.yml, poses: t.txt}}
 """
-CALIBRATION = "K: [50, 0, 20, 0, 50, 15, 0, 0, 1]\nD: [0, 0, 0, 0]\nwidth: 40\nheight: 30\n"
-POSES = "0 0 0 0.4 1 0 0 0\n999 0 0 0.5 1 0 0 0\n"
 
 MAX_WAIT_S = 150.0
 
@@ -50,11 +49,11 @@ class Machines:
         self.started: list[subprocess.Popen[bytes]] = []
         self.sweeps: list[subprocess.Popen[str]] = []
 
-    def schedule(self, **settings: str) -> str:
+    def schedule(self) -> str:
         """Start a scheduler; return its address."""
         file = self.folder / f"scheduler-{len(self.started)}.json"
         words = ["--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(file)]
-        self.scheduler = self._start("dask_scheduler", *words, **settings)
+        self.scheduler = self._start("dask_scheduler", *words)
         # The file is created before it is written.
         wait_for(lambda: file.exists() and file.read_text().endswith("}"))
         return str(json.loads(file.read_text())["address"])
@@ -74,9 +73,9 @@ class Machines:
     def log(self, process: subprocess.Popen[bytes]) -> str:
         return (self.folder / f"{self.started.index(process)}.log").read_text()
 
-    def _start(self, program: str, *words: str, **settings: str) -> subprocess.Popen[bytes]:
+    def _start(self, program: str, *words: str) -> subprocess.Popen[bytes]:
         command = [sys.executable, "-m", f"distributed.cli.{program}", "--no-dashboard", *words]
-        environment = {**os.environ, "DASK_TEMPORARY_DIRECTORY": str(self.folder), **settings}
+        environment = {**os.environ, "DASK_TEMPORARY_DIRECTORY": str(self.folder)}
         with (self.folder / f"{len(self.started)}.log").open("wb") as log:
             process = subprocess.Popen(
                 command, cwd=self.folder, env=environment, stdout=log, stderr=log, start_new_session=True
@@ -167,23 +166,6 @@ def test_sweep_resumes_after_the_loss_of_its_scheduler(lab: Path, machines: Mach
     output, _ = machines.sweep("far", address, "--json").communicate(timeout=MAX_WAIT_S)
     assert json.loads(output)["complete"] == 30
     assert earlier == {path: path.stat().st_mtime_ns for path in earlier}
-
-
-@pytest.mark.slow
-def test_run_whose_workers_die_is_a_row(lab: Path, machines: Machines, message: Messages) -> None:
-    address = machines.schedule(DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES="0")
-    doomed = machines.work(address)
-    command = machines.sweep("far", address, "--json")
-    wait_for(lambda: list(lab.glob("far/runs/*/.partial")))
-    doomed.kill()
-    wait_for(lambda: "Remove worker" in machines.log(machines.scheduler))
-    machines.work(address)
-    record = json.loads(command.communicate(timeout=MAX_WAIT_S)[0])
-    # For dask, a run that waits in the worker has failed too.
-    assert record["died"] in (1, 2)
-    assert record["died"] + record["complete"] == 6
-    (died, *_) = [line for line in rows("far") if ",died," in line]
-    message(died.split(",died,")[1].rstrip(","), "died")
 
 
 @pytest.mark.slow

@@ -23,6 +23,7 @@ from taichi_msm.sweeps.expressions import evaluate
 from taichi_msm.sweeps.spec import Distribution, Sweep, SweepSettings, format_override, load_sweep, make_sweep
 from tests.golden import Messages
 from tests.scenes import speckle
+from tests.sweeps.conftest import CALIBRATION, POSES
 
 
 def sobol_points(dimensions: int, samples: int, seed: int) -> Any:
@@ -99,10 +100,6 @@ def folder(small: Path) -> Path:
         Image.fromarray(speckle(30, 40, ord(name))).save(small / "textures" / f"{name}.png")
     (small / "textures" / "notes.txt").write_text("not a picture")
     return small
-
-
-CALIBRATION = "K: [50, 0, 20, 0, 50, 15, 0, 0, 1]\nD: [0, 0, 0, 0]\nwidth: 40\nheight: 30\n"
-POSES = "0 0 0 0.4 1 0 0 0\n9 0 0 0.5 1 0 0 0\n"
 
 
 def test_paths_of_files(folder: Path) -> None:

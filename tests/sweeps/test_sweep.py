@@ -33,6 +33,7 @@ from tests.conftest import Program
 from tests.golden import Messages
 from tests.outputs import files, results
 from tests.scenes import SMALL, speckle
+from tests.sweeps.conftest import CALIBRATION
 from tests.telling import Telling
 
 # The step of 0.01 s is above the stability limit, so some runs are refused.
@@ -171,9 +172,6 @@ def test_interruption_of_a_sweep(many: Path, message: Messages) -> None:
     assert process.returncode == 130
     message(errors.splitlines()[-1], "of 4 runs", hide=r"\d(?= of)")
     assert not Path("out/table.csv").exists()
-
-
-CALIBRATION = "K: [50, 0, 20, 0, 50, 15, 0, 0, 1]\nD: [0, 0, 0, 0]\nwidth: 40\nheight: 30\n"
 
 
 def test_another_sweep_in_the_directory_is_refused(many: Path, program: Program, message: Messages) -> None:

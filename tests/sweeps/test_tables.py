@@ -164,18 +164,6 @@ def test_contact_sheet(make: Make, ran: Path, message: Messages) -> None:
     message(notes, "contact.jpg", "0002.png", hide=r"(?<=decoded).*")
 
 
-@pytest.mark.slow
-def test_reports_are_reproducible(make: Make, ran: Path) -> None:
-    result = make(128)
-    copy_runs(ran, result)
-    written = []
-    for _ in range(2):
-        names, _ = write(result)
-        written.append({name: (result.directory / name).read_bytes() for name in names})
-    assert written[0] == written[1]
-    assert len(written[0]) == 6
-
-
 @pytest.mark.default_cases("frames-0")
 @pytest.mark.parametrize(("kept", "difference"), [("frames", 0), ("animation.gif", 10), ("trajectory.npz", 0)])
 def test_frames_come_from_any_output(make: Make, ran: Path, kept: str, difference: float, pool: Pool) -> None:

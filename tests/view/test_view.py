@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import signal
-import subprocess
 from itertools import islice
 from pathlib import Path
 
@@ -20,7 +18,6 @@ from taichi_msm.view.server import MAX_DELAY_S, Pacing
 from tests.conftest import Program
 from tests.golden import Messages
 from tests.outputs import duration
-from tests.telling import Telling
 
 SCRIPT = """\
 events:
@@ -125,21 +122,6 @@ events:
         (7, Strength(40)),
         (7, Key("m")),
     ]
-
-
-@pytest.mark.slow
-def test_interrupted_film_leaves_the_earlier_one(small: Path, message: Messages) -> None:
-    Path("live.gif").write_bytes(b"before")
-    filming = ["view", "small.yaml", "--record", "live.gif", "--seconds", "3600"]
-    with Telling(*filming, stderr=subprocess.PIPE) as process:
-        process.until("film", 1)
-        process.send_signal(signal.SIGINT)
-        _, error = process.communicate(timeout=60)
-        # On a slow machine lines of progress precede it.
-        message(error.splitlines()[-1], "interrupted")
-    assert process.returncode == 130
-    assert Path("live.gif").read_bytes() == b"before"
-    assert sorted(path.name for path in small.iterdir()) == ["live.gif", "small.yaml", "speckle.png"]
 
 
 def test_events_are_generated_lazily(tmp_path: Path) -> None:
