@@ -23,7 +23,7 @@ OUTLINE_GREY = 140
 class ValueBar(NamedTuple):
     """A value as a bar, scaled to the largest value so far, rounded up."""
 
-    value: float
+    value: float  # in `unit`, as the others
     largest: float  # positive
     unit: str
 
