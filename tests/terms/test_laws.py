@@ -87,7 +87,7 @@ def test_slopes_of_a_spring() -> None:
         return np.asarray(law.pull(k, tau, square - length**2, square, length, *numbers) * edge)
 
     p, square = np.array([0.3, -0.2, 0.5]), float(edge @ edge)
-    s, w, by_k, by_tau = law.slopes(3.0, 0.4, square - length**2, square, length, edge @ p, *numbers)
+    s, w, by_k, by_tau = law.derivatives(3.0, 0.4, square - length**2, square, length, edge @ p, *numbers)
     np.testing.assert_allclose(s * p + w * edge, (force(edge + h * p) - force(edge - h * p)) / (2 * h), rtol=1e-8)
     np.testing.assert_allclose(by_k * edge, force(edge, k=4.0) - force(edge), rtol=1e-12)
     np.testing.assert_allclose(by_tau * edge, force(edge, tau=1.4) - force(edge), rtol=1e-12)
