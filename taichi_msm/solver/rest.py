@@ -308,9 +308,9 @@ class QuasiStatics(SheetSolver):
         elif (self._touched().sum(axis=0) > 1).any():
             remedy = "two tools press on one point; keep them apart"
         message = (
-            f"diverged at {time:.6g} s, frame {frame}: no shape was found in which the forces balance: after "
-            f"{evaluations} evaluations, {residual:.2g} of the largest force is left at point ({row}, {column}), and "
-            f"{FORCE_TOLERANCE:g} was wanted; {remedy}"
+            f"diverged at {time:.6g} s, frame {frame}: no equilibrium was found: after {evaluations} evaluations, "
+            f"{residual:.2g} of the largest force remains as residual at point ({row}, {column}), above the tolerance "
+            f"of {FORCE_TOLERANCE:g}; {remedy}"
         )
         return DivergedError(message, frame, time, (row, column))
 
