@@ -201,15 +201,9 @@ def test_indentation_by_a_flat_disc(device: Device) -> None:
 
 
 def test_foundation_without_springs(device: Device) -> None:
-    """The force is K w times the area of the held mass points; a pressure p under a flat end has the depth p / K."""
-    alone = {"young": 1e-6, "pretension": 0}
+    """The force on held mass points is K w times their area."""
     a = 0.01015  # between the distances of mass points from the centre
     tool = lowered(a / math.sqrt(1.5**2 - 1), 4e-4, grip=[[0, 10]])
-    _, force = pressed(membrane(101, tool, **alone), device)
+    _, force = pressed(membrane(101, tool, young=1e-6, pretension=0), device)
     area = 1e-6 * sum(math.hypot(i, j) < 1e3 * a for i in range(-11, 12) for j in range(-11, 12))
-    assert area == pytest.approx(math.pi * a**2, rel=0.01)
     np.testing.assert_allclose(force, [0, 0, K * area * 4e-4], rtol=1e-9, atol=1e-12)
-    load = {"total": [0, 0, -0.1], "radius": a, "falloff": 1e7, "load": [[0, 0], [0.02, 100]]}
-    tip, force = pressed(membrane(101, load, **alone), device)
-    assert force[2] == pytest.approx(-0.1, rel=0.01)
-    assert tip[2] == pytest.approx(-0.1 / (math.pi * a**2) / K, rel=1e-3)
