@@ -91,7 +91,7 @@ def short_launches(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("fixed", [pytest.param("border", marks=pytest.mark.slow), ["top"]])
-def test_bands_and_passes_preserve_bits(fixed: Any, device: Device) -> None:
+def test_bands_passes_and_lanes_preserve_bits(fixed: Any, device: Device) -> None:
     made = scene(sheet={**SHEET, "points": [21, 19], "fixed": fixed}, time={"precision": "f32", "duration": 0.12})
     serial = structure_of(made, device)
     assert (serial.workers, serial.depth) == (1, 1)
@@ -101,13 +101,8 @@ def test_bands_and_passes_preserve_bits(fixed: Any, device: Device) -> None:
         assert plan_of(made).grid.steps_per_frame % depth != 0 or depth == 1
         layout = replace(serial, workers=workers, depth=depth)
         assert simulate(made, device, layout).tobytes() == expected.tobytes(), (workers, depth)
-
-
-@pytest.mark.parametrize("widths", [(16, 2), pytest.param((16, 8, 4, 2), marks=pytest.mark.fuzz)])
-def test_lanes_preserve_bits(widths: tuple[int, ...], device: Device) -> None:
-    made = scene(sheet={**SHEET, "points": [7, 13]}, time={"precision": "f32"})
-    layout = structure_of(made, device)
-    assert len({simulate(made, device, with_lanes(layout, width)).tobytes() for width in widths}) == 1
+    for lanes in (16, 2):
+        assert simulate(made, device, with_lanes(serial, lanes)).tobytes() == expected.tobytes(), lanes
 
 
 def test_layout_by_size(device: Device) -> None:
@@ -267,16 +262,6 @@ def test_worker_timeouts_preserve_bits(checks: int, device: Device, monkeypatch:
             time.sleep(0.003)
         for array, expected in zip(together.state()[1:3], alone.state()[1:3], strict=True):
             assert array.tobytes() == expected.tobytes()
-
-
-def test_timeout_in_the_last_pass(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    made = scene(sheet={**SHEET, "points": [101, 101]}, time={"precision": "f32"})
-    monkeypatch.setattr(kernel_cpu, "MAX_CHECKS", 0)
-    dynamics = dynamics_of(made, device, replace(structure_of(made, device), workers=2, depth=8))
-    for _ in range(200):
-        dynamics.advance(8)
-    assert isinstance(dynamics.sheet.kernel, kernel_cpu.ScatterKernel)
-    assert dynamics.sheet.kernel._backoff._until > 0
 
 
 def test_backoff_period(monkeypatch: pytest.MonkeyPatch) -> None:

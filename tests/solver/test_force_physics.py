@@ -198,12 +198,3 @@ def test_indentation_by_a_flat_disc(device: Device) -> None:
     coarse, fine = (float(pressed(membrane(points, tool), device)[1][2]) for points in (61, 121))
     assert fine == pytest.approx(expected, rel=0.06)
     assert 2 * fine - coarse == pytest.approx(expected, rel=0.03)
-
-
-def test_foundation_without_springs(device: Device) -> None:
-    """The force on held mass points is K w times their area."""
-    a = 0.01015  # between the distances of mass points from the centre
-    tool = lowered(a / math.sqrt(1.5**2 - 1), 4e-4, grip=[[0, 10]])
-    _, force = pressed(membrane(101, tool, young=1e-6, pretension=0), device)
-    area = 1e-6 * sum(math.hypot(i, j) < 1e3 * a for i in range(-11, 12) for j in range(-11, 12))
-    np.testing.assert_allclose(force, [0, 0, K * area * 4e-4], rtol=1e-9, atol=1e-12)

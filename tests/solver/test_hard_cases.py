@@ -57,18 +57,6 @@ def reference_run(scene: Scene, device: Device) -> tuple[Array, float]:
     return exact, longest(fine - coarse) / longest(exact)
 
 
-def test_difficulty_of_the_cases(root: Path) -> None:
-    paper, stiff = plan_of(load_scene(root / "scenes/figure-3.yaml")).material, plan_of(hard("stiff")).material
-    assert (stiff.across, stiff.shear) == pytest.approx((1e4 * paper.across, 1e4 * paper.shear))
-    assert max(percent for _, percent in hard("overload").probes[0].load) == 1000
-    damped = hard("overdamped")
-    assert plan_of(damped).material.drag * plan_of(damped).grid.step > 2
-    assert damped.time.damping_difference == "central"
-    for path in FOLDER.glob("*.yaml"):
-        scene = load_scene(path)
-        assert (scene.output, scene.image, scene.time.precision) == ((), None, "auto")
-
-
 @pytest.mark.parametrize("name", SHORT)
 def test_error_and_progress(name: str, device: Device) -> None:
     """The estimated error bounds the true one; of all cases only the pinch compresses springs to less than half."""

@@ -16,7 +16,6 @@ from taichi_msm.accuracy.mesh import (
     MeshEstimate,
     choose_points,
     coarser_plan,
-    interpolate,
 )
 from taichi_msm.accuracy.time_step import max_norm
 from taichi_msm.cli.console import run_summary
@@ -220,14 +219,6 @@ def test_mesh_estimate(count: int, load: Any, device: Device) -> None:
     assert not estimate.doubt
 
 
-def test_interpolation_of_cubics() -> None:
-    def surface(rows: int, cols: int) -> Any:
-        x, y = np.arange(cols) / (cols - 1), np.arange(rows)[:, None] / (rows - 1)
-        return np.stack([(x**3 - 2 * x) * y, y**3 + 0 * x, x * x * y * y], axis=-1)
-
-    np.testing.assert_allclose(interpolate(surface(5, 8), surface(9, 13)), surface(9, 13), atol=1e-14)
-
-
 def test_scenes_without_coarser_mesh(load: Any) -> None:
     for points, exists in (((MIN_POINTS_PER_SIDE, 9), True), ((MIN_POINTS_PER_SIDE - 1, 7), False)):
         plan = plan_of(load(f"sheet.points={list(points)}", "sheet.size=[0.1, 0.13]"))
@@ -279,20 +270,6 @@ def test_wrinkles_make_the_estimate_a_lower_bound(load: Any, device: Device) -> 
     assert mesh_estimate(load("sheet.points=[25, 25]", *pushed), device).doubt
     stiff = ("tissue.bending=plate", "tissue.thickness=5.0e-3")
     assert not mesh_estimate(load("sheet.points=[25, 25]", *pushed, *stiff), device).doubt
-
-
-def test_coarser_mesh_with_a_darker_cell(load: Any, tmp_path: Path) -> None:
-    """A pretension that the coarser sheet would not allow does not prevent the mesh estimate."""
-    grey = np.full((6, 7), 255, np.uint8)
-    grey[3, 3] = 0
-    Image.fromarray(grey).save(tmp_path / "map.png")
-    # A cell of the coarser sheet, of 6 x 7 cells, is at the texel's centre; the nearest cells of the sheet, of 12 x 14,
-    # are a quarter of a texel away in both directions and have 3/4 of it in each. They allow slightly more tension.
-    most = 1.5 * 3e4 * 2e-3 * (1 - (1 - 0.01) * (3 / 4) ** 2)
-    made = load("tissue.map={image: map.png, range: [0.01, 1]}", f"tissue.pretension={0.99 * most}")
-    coarse: Any = coarser_plan(plan_of(made))
-    assert coarse.scene.sheet.points == (7, 8)
-    assert coarse.material.factors.min() == pytest.approx(0.01)
 
 
 # Records and warnings.
