@@ -113,9 +113,10 @@ class FoundationTerm(Term):
         return add
 
     def build_derivatives(self, config: KernelConfig) -> Callable[..., Any]:
-        """Build the Taichi function derive(sheet, p, u), derivatives of minus the product of p with the force.
+        """Build the Taichi function derive(sheet, p, u) for derivatives of minus the product of p with the force.
 
-        It returns those with respect to K, and for K = 1 with respect to log(lock) and the factor.
+        Returns:
+            A function that returns the derivatives with respect to K, and for K = 1 to log(lock) and the factor.
         """
         ti, locks, first, law = config.ti, self.locks, config.first_constant(FoundationTerm), self._build_law(config)
         secant, tangent = law

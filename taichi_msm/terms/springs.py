@@ -164,10 +164,11 @@ class SpringTerm(Term):
         return parameters_of
 
     def build_shares(self, config: KernelConfig) -> tuple[Callable[..., Any], Callable[..., Any]]:
-        """Build the Taichi functions share_of_row(exists, kind) and share_of_column(sheet, exists, b).
+        """Build the Taichi functions for the argument `exists` of the force of a spring.
 
-        In a sheet with `tense_edges` the argument `exists` of a spring's force is the share of its cells that exist,
-        because its tension is their sum. Elsewhere they return `exists` as it is.
+        Returns:
+            share_of_row(exists, kind) and share_of_column(sheet, exists, b). In a sheet with `tense_edges` they return
+            the share of the spring's cells that exist, because its tension is their sum; otherwise `exists`.
         """
         ti, real, tense_edges = config.ti, config.real, self.tense_edges
 
@@ -188,10 +189,13 @@ class SpringTerm(Term):
         return share_of_row, share_of_column
 
     def build_spring_forces(self, config: KernelConfig) -> tuple[Callable[..., Any], ...]:
-        """Build the Taichi functions of springs.
+        """Build the Taichi functions for the forces and stiffness of springs.
 
-        They are along and to_other_row, the forces within a row and between two rows; and of_row, of_column and
-        of_diagonal, the stiffness of a spring of each family.
+        Returns:
+            along(sheet, right, u, k, exists), the force [N] of a mass point with displacement u on its right neighbour,
+            entry `right` of u; to_other_row(sheet, entry, right, u, up, length, k, exists), that on `entry` of a row
+            `up` [m] above and `right` columns to the right; and of_row(sheet, i, kind, b), of_column(sheet, lower, b)
+            and of_diagonal(sheet, lower, b), the stiffness k - tau [N/m] of a spring of each family.
         """
         ti = config.ti
         tense, mapped, by_area = self.tense, self.mapped, self.by_area and not self.mapped
@@ -310,7 +314,7 @@ class SpringTerm(Term):
         ):
             """Return the change of the force (3), and derivatives of its product with p.
 
-            They are those with respect to k - tau and tau, and with a law that locks to log(lock) and the factor.
+            The derivatives are with respect to k - tau and tau, and for a law that locks to log(lock) and the factor.
             """
             to = [q[0] + x0, q[1] + y0, q[2]]
             square = to[0] * to[0] + to[1] * to[1] + (to[2] * to[2] + MIN_SQUARED_LENGTH)
