@@ -36,6 +36,8 @@ MAX_STEPS_PER_LAUNCH = 8192
 # Number of rows of a load table; fewer rows hardly take less time to compute.
 STEPS_PER_TABLE = 4096
 
+Array = NDArray[np.float64]
+
 
 def _build_kernel(_: Plan, layout: SheetLayout, start: InitialData) -> StepKernel:
     return (ScatterKernel if layout.workers else GatherKernel)(layout, start)
@@ -164,9 +166,6 @@ class Dynamics(SheetSolver):
 
     def _tabulate(self, count: int) -> None:
         self._first_tabled, self._loads = self.steps_done, self.step_table(self.steps_done, count)
-
-
-Array = NDArray[np.float64]
 
 
 class ForceRecorder:

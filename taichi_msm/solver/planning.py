@@ -69,7 +69,7 @@ ROUNDING_MARGIN = 1 - 1e-12
 
 
 class Work(NamedTuple):
-    """The work of a run, by stages."""
+    """The work of a run by stages [f32 steps of a mass point]."""
 
     start: float  # starting Python and Taichi, and compiling the kernels
     stepping: float  # all steps

@@ -61,7 +61,13 @@ def _build_kernel(plan: Plan, layout: SheetLayout, start: InitialData) -> Relaxa
 
 
 class QuasiStatics(SheetSolver):
-    """The sheet in quasi-static motion, with the arguments of `Dynamics`.
+    """The sheet in quasi-static motion.
+
+    Args:
+        plan: plan of the run.
+        device: device of the arrays, a CPU.
+        layout: replaces the layout chosen by `choose_layout`, for tests.
+        cores: accepted for the same interface as `Dynamics`; a single worker is used.
 
     Attributes:
         sheet: the sheet in the memory of the device.
