@@ -301,8 +301,8 @@ def precision_problems(plan: Plan) -> Iterator[Problem]:
     if not MIN_F32_LENGTH_M**2 < gain < MAX_F32_LENGTH_M**2:
         yield Problem(
             ("time", "precision"),
-            f"f32 cannot hold the {gain:g} m by which a step of {step:g} s moves a mass of "
-            f"{mass:g} kg for every newton; take f64",
+            f"a step of {step:g} s moves a mass of {mass:g} kg by {gain:g} m per newton, outside the range of f32; "
+            "take f64",
         )
 
 
@@ -328,7 +328,7 @@ def steer_plan(plan: Plan, probes: Sequence[Probe | Mapping[str, Any] | None], n
     """
     before = plan.scene.probes
     if len(probes) != len(before):
-        raise ArgumentError(f"probes: {len(probes)} are given, and the scene has {len(before)}; give all of them")
+        raise ArgumentError(f"probes: {len(probes)} given, but the scene has {len(before)}; give all of them")
     given = [_fill_omitted_keys(*pair) for pair in zip(before, probes, strict=True)]
     after = plan.with_probes(given)
     joined, lines = list(after.scene.probes), []
@@ -387,7 +387,7 @@ def _path_problems(plan: Plan, index: int, before: Probe, given: Probe, now: flo
     tolerance = FRAME_TOLERANCE / plan.grid.frames_per_second
     assert given.path is not None
     if given.path[0][0] <= now + tolerance:
-        text = f"is at {given.path[0][0]:g} s, and it is {now:g} s; give only times after that"
+        text = f"is at {given.path[0][0]:g} s, not after the current time, {now:g} s; give only later times"
         yield Problem((*key, "path", 0), text)
         return
     if given.clamp != before.clamp:
@@ -401,13 +401,13 @@ def _path_problems(plan: Plan, index: int, before: Probe, given: Probe, now: flo
         yield Problem((*key, "path", fault[0] - first - 1), fault[1])
     deviation = _shape_change(old_tool, tool)
     if deviation > tool.stride:
-        text = f"changes by {deviation:.3g} m in a step, over {tool.stride:.3g} m; change it little by little"
+        text = f"changes by {deviation:.3g} m in a step, over {tool.stride:.3g} m; change it gradually"
         yield Problem((*key, "instrument"), text)
     for n, (begin, end) in enumerate(given.grip):
         has_ended = end <= now + tolerance
         continues = any(begin == old_begin and old_end > now + tolerance for old_begin, old_end in before.grip)
         if begin < now - tolerance and not (has_ended or continues):
-            text = f"begins at {begin:g} s, and it is {now:g} s; begin at that time or later"
+            text = f"begins at {begin:g} s, before the current time, {now:g} s; begin at that time or later"
             yield Problem((*key, "grip", n), text)
 
 

@@ -98,7 +98,7 @@ class ProbeTerm(Term):
                 f"{_format_flags(self.moves)}); restart with the new scene"
             )
         if self.by_area != compiled.by_area:
-            return "one has total instead of force, or the reverse; restart with the new scene"
+            return "a probe has total instead of force, or the reverse; restart with the new scene"
         return ""
 
     def decay_gradients(self, plan: Plan) -> NDArray[Any]:
