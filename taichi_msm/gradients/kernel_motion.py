@@ -248,7 +248,7 @@ def _build_sweep_row(code: KernelConfig) -> Callable[..., None]:
     foundation = code.first_column(FoundationTerm) if foundation_term else 0
     foundation_derivatives = [foundation_term.build_derivatives(code)] if foundation_term else []
     shares = [foundation_term.build_share(code)] if foundation_term and foundation_term.locks else []
-    locks = springs.law.number_count > 0
+    locks = springs.law.parameter_count > 0
     results = 7 if locks else 5
 
     @ti.func

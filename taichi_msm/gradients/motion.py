@@ -27,7 +27,7 @@ from taichi_msm.solver.arrays import SheetLayout, from_lanes, to_lanes
 from taichi_msm.solver.backoff import Backoff
 from taichi_msm.solver.bands import MOMENT_ROWS
 from taichi_msm.solver.dynamics import STEPS_PER_TABLE, Dynamics
-from taichi_msm.solver.kernel_cpu import MAX_CHECKS, PAGE
+from taichi_msm.solver.kernel_cpu import MAX_CHECKS, PAGE_BYTES
 from taichi_msm.solver.state import largest_displacement
 from taichi_msm.system.runtime import Device, Memory, compilation_options, write_vectors
 from taichi_msm.terms.base import GAIN
@@ -100,7 +100,7 @@ class MotionAdjoint:
         row_bytes = layout.width * layout.config.lanes * 8
         self._segment = _segment_steps(plan.grid.steps, 3 * layout.rows * row_bytes)
         # The carried forces of two workers never share a page.
-        self._carried_rows = 1 - (-PAGE // row_bytes)
+        self._carried_rows = 1 - (-PAGE_BYTES // row_bytes)
         self._worker_rows = (MOMENT_ROWS + self._carried_rows) * layout.workers
         row_sums = -(-kernels.ROW_SUMS * layout.rows // layout.width)
 

@@ -138,10 +138,12 @@ def _add_springs(gradient: SheetGradient, families: Sequence[SpringFamily], u: A
         q, edges, square_difference, square = family.elongation(u)
         p_difference = p[family.start] - p[family.end]
         along = (p_difference * edges).sum(axis=-1)
-        _, _, by_stiffness, by_tension = family.slopes(square_difference, square, along)
+        _, _, by_stiffness, by_tension = family.derivatives(square_difference, square, along)
         index = min(n, 2)  # both diagonals count as one family
         gradient.springs[index][...] += by_stiffness * along
-        gradient.stiffening += [float((by * along).sum()) for by in family.by_numbers(square_difference, square)]
+        gradient.stiffening += [
+            float((by * along).sum()) for by in family.parameter_derivatives(square_difference, square)
+        ]
         gradient.tensions[index] += (p_difference * q).sum() + (by_tension * along).sum()
 
 

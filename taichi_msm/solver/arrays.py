@@ -40,9 +40,8 @@ NUMBER_BYTES = {"f32": 4, "f64": 8}
 class SheetLayout:
     """The memory layout of a sheet, its division among workers, and the configuration of its kernels."""
 
-    # rows, cols: numbers of mass points
-    rows: int
-    cols: int
+    rows: int  # number of rows of mass points
+    cols: int  # number of columns of mass points
     workers: int  # number of bands of rows, which are stepped in parallel; 0 on a GPU
     depth: int  # number of steps that a band takes in one pass
     fixed_rows: tuple[bool, bool]  # whether all mass points of the first and of the last row are fixed
@@ -70,9 +69,14 @@ class InitialData(NamedTuple):
 
 
 def to_lanes(layout: SheetLayout, values: NDArray[Any]) -> NDArray[Any]:
-    """Arrange rows of values, shape (..., cols), in lanes with halo, in the precision of the kernels.
+    """Arrange values in lanes with halo, in the precision of the kernels.
 
-    Values too large for the precision become infinite. Entries without a column are 0; shape (entries, lanes).
+    Args:
+        layout: layout of the sheet.
+        values: values by column, shape (..., cols); those too large for the precision become infinite.
+
+    Returns:
+        Entries, shape (entries, lanes), with `layout.width` entries per row; 0 in entries without a column.
     """
     column = np.arange(layout.config.lanes) * layout.strip + np.arange(-1, layout.strip + 1)[:, None]
     inside = (column >= 0) & (column < layout.cols)
@@ -83,7 +87,16 @@ def to_lanes(layout: SheetLayout, values: NDArray[Any]) -> NDArray[Any]:
 
 
 def from_lanes(layout: SheetLayout, entries: NDArray[Any], rows: int) -> NDArray[Any]:
-    """Arrange entries, shape (entries, lanes), in a number of rows, shape (rows, cols): the inverse of `to_lanes`."""
+    """Arrange entries by column, the inverse of `to_lanes`.
+
+    Args:
+        layout: layout of the sheet.
+        entries: entries with halo, shape (entries, lanes), at least `rows` rows of them.
+        rows: number of rows.
+
+    Returns:
+        Values, shape (rows, cols).
+    """
     laid = entries[: rows * layout.width].reshape(rows, layout.width, layout.config.lanes)
     return laid[:, 1:-1].transpose(0, 2, 1).reshape(rows, -1)[:, : layout.cols]
 
@@ -125,14 +138,27 @@ class SheetArrays:
         return *self.u, *self.d, self.constants, self.by_column, self.stiffness, self.fields
 
     def get_fields(self, first: int, count: int) -> NDArray[Any]:
-        """Read the fields first, ..., first + count - 1, shape (count, rows, cols)."""
+        """Read consecutive fields of the terms.
+
+        Args:
+            first: index of the first field.
+            count: number of fields.
+
+        Returns:
+            Fields, shape (count, rows, cols).
+        """
         layout = self._layout
         entries = self.fields.to_numpy()[first * layout.rows * layout.width :]
         values = from_lanes(layout, entries, count * layout.rows)
         return np.ascontiguousarray(values.reshape(count, layout.rows, layout.cols))
 
     def set_fields(self, first: int, values: NDArray[Any]) -> None:
-        """Replace the fields from `first` on by values of shape (fields, rows, cols)."""
+        """Replace consecutive fields of the terms.
+
+        Args:
+            first: index of the first field.
+            values: new values, shape (fields, rows, cols).
+        """
         entries, laid = self.fields.to_numpy(), to_lanes(self._layout, values)
         at = first * self._layout.rows * self._layout.width
         entries[at : at + len(laid)] = laid
@@ -173,7 +199,12 @@ class StepKernel(SheetKernel, ABC):
 
     @abstractmethod
     def advance(self, count: int, table: NDArray[Any]) -> None:
-        """Advance the sheet by `count` steps, with rows of the load table, shape (count, columns)."""
+        """Advance the sheet.
+
+        Args:
+            count: number of steps.
+            table: rows of the load table for these steps, shape (count, columns).
+        """
 
     @abstractmethod
     def compile(self, table: NDArray[Any]) -> None:
@@ -197,7 +228,7 @@ def build_point_step(config: KernelConfig) -> Callable[..., None]:
 
     @ti.func
     def move(sheet: ti.template(), entry: ti.template(), target, force: ti.template(), now: ti.template()):
-        """Step an entry with the force of its springs and a row of the load table; store it in row `target` of u."""
+        """Step an entry and store it in row `target` of u; `force` is that of its springs, `now` a row of loads."""
         for add in ti.static(forces):
             add(force, sheet, entry, now)
         gain = now[GAIN] * sheet.by_column[(MOBILITY + entry.row.kind) * sheet.width + entry.b]
@@ -216,9 +247,15 @@ def build_point_step(config: KernelConfig) -> Callable[..., None]:
 
 @cache
 def build_read(config: KernelConfig, *, parallel: bool, iterations: int) -> Callable[..., None]:
-    """Build the kernel that reads and measures a sheet, parallel over rows or not.
+    """Build the kernel that reads and measures a sheet.
 
-    Of the `iterations` loop iterations per row only the first does work.
+    Args:
+        config: compile-time configuration.
+        parallel: whether to distribute the rows over threads.
+        iterations: number of loop iterations per row; only the first of them does work.
+
+    Returns:
+        The kernel `read`, see `SheetKernel.read`.
     """
     real, vector, vectors, lanes = config.real, config.vector, config.vectors, config.lanes
     count = config.first_constant(None)
@@ -233,6 +270,17 @@ def build_read(config: KernelConfig, *, parallel: bool, iterations: int) -> Call
         d_x: vectors, d_y: vectors, d_z: vectors,
         constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
+        """Read and measure a sheet.
+
+        Args:
+            first: row of u that contains the first row of the sheet.
+            rows: number of rows of the sheet.
+            cols: number of columns of the sheet.
+            differences: whether to read d instead of u.
+            values: output [m], shape (rows, cols, 3).
+            measures: output, shape (rows, measures).
+            u_x, u_y, u_z, d_x, d_y, d_z, constants_of, by_column, stiffness, fields: `SheetArrays.all`.
+        """
         ti.loop_config(serialize=not parallel)
         for index in range(rows * iterations):
             if index % iterations == 0:

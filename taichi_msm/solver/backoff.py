@@ -13,9 +13,6 @@ from taichi_msm.system import process
 # Shortest and longest back-off period, and half-life of its growth [s].
 MIN_BACKOFF_S, MAX_BACKOFF_S, HALF_LIFE_S = 0.002, 0.2, 0.02
 
-# Other programs compete for the cores if threads have waited for a core for more than this share of their CPU time.
-MAX_WAIT_SHARE = 0.2
-
 
 class Backoff:
     """Back-off of the workers of a sheet."""
@@ -51,6 +48,6 @@ class Backoff:
             self._parallel_s += now - self._start
 
     def _is_crowded(self) -> bool:
-        """Return whether other programs have competed for the cores since the last back-off; True if unknown."""
+        """Return whether threads have waited for a core for 20 % of their CPU time or longer; True if unknown."""
         cpu_time, wait_time = time.process_time(), process.core_wait_s()
-        return wait_time is None or wait_time - self._wait_time > MAX_WAIT_SHARE * (cpu_time - self._cpu_time)
+        return wait_time is None or wait_time - self._wait_time > 0.2 * (cpu_time - self._cpu_time)

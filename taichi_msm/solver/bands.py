@@ -53,7 +53,7 @@ class RowBand(NamedTuple):
     workers: Any  # number of workers
     low: Any  # first row of the band
     high: Any  # row after the last of the band
-    direction: Any  # 1 if the worker ready down, -1 if up
+    direction: Any  # 1 if the worker moves down, -1 if up
     rows: Any  # number of rows of the sheet
     max_checks: Any  # number of checks after which a waiting worker ends
     progress: Any  # array of all workers
@@ -80,8 +80,14 @@ def build_step_row(
 ) -> Callable[..., Any]:
     """Build the Taichi function that steps a row of a band, as soon as the neighbours' rows are available.
 
-    For `move` see `build_pass_row`; `corrects`: whether the corrections of terms are applied after the step;
-    `parallel`: whether the band has neighbours.
+    Args:
+        config: compile-time configuration.
+        move: Taichi function that steps an entry, see `build_pass_row`.
+        corrects: whether the corrections of terms follow the step.
+        parallel: whether the band has neighbours.
+
+    Returns:
+        The Taichi function step_row(sheet, carried, loads, band, row, n, at, carry, moments).
     """
     vector, bending, copied = config.vector, config.get(BendingTerm), config.reach
     join_strips = build_join_strips(config)
@@ -131,11 +137,11 @@ def build_step_row(
         """Store the moments of the next row; at the start of a band also those of the rows -1 and 0."""
         begin = ti.select(band.direction > 0, band.low, band.high - 1)
         for ahead in range(ti.select(row < 0, -1, row + 1), row + 2):
-            before, here = row_at(band, ahead - 1, n), row_at(band, ahead, n)
+            before, middle = row_at(band, ahead - 1, n), row_at(band, ahead, n)
             after, target = row_at(band, ahead + 1, n), moments + (ahead + MOMENT_ROWS) % MOMENT_ROWS
             for b in range(1, sheet.width - 1):
                 for store_moment in ti.static(storing):
-                    store_moment(sheet, begin + ahead * band.direction, before, here, after, b, target)
+                    store_moment(sheet, begin + ahead * band.direction, before, middle, after, b, target)
             join_strips(sheet.u, target, sheet.width)
 
     @ti.func
@@ -143,22 +149,31 @@ def build_step_row(
         sheet: ti.template(), carried: ti.template(), loads: ti.template(), band: ti.template(),
         row, n, at, carry, moments,
     ):  # fmt: skip
-        """Perform step n of the launch, after `at` steps of the run, on a row of a band; return False after a timeout.
+        """Step a row of a band; return False after a timeout.
 
-        Row -1 is the row before the band. Its forces are computed, but it is not stepped.
+        Args:
+            sheet: a `KernelSheet`.
+            carried: forces carried to the next row [N], as three arrays.
+            loads: load table of the launch, shape (steps, columns).
+            band: a `RowBand`.
+            row: row of the band, from 0 at its beginning; -1 for the row before, whose forces are only computed.
+            n: step of the launch, the row of `loads`.
+            at: number of steps taken before this one in the run.
+            carry: row of `carried`.
+            moments: first row of the worker's moments in u.
         """
         begin = ti.select(band.direction > 0, band.low, band.high - 1)
         begin_worker, end_worker = band.worker - band.direction, band.worker + band.direction
         last = band.high - band.low - 1
         i = begin + row * band.direction
-        here = i
+        source = i
         next_row = i + band.direction
         exists = ti.cast(0 <= next_row < band.rows, config.real)
         ready = True
         if ti.static(parallel):
             if row == -1 and 0 <= begin_worker < band.workers:
                 ready = wait_for(band, begin_worker, BEGIN, at)
-                here = copy_row(band.rows, begin_worker, BEGIN, at, 0)
+                source = copy_row(band.rows, begin_worker, BEGIN, at, 0)
             # With bending, the step depends on one more row.
             if ready and row > last - copied and 0 <= end_worker < band.workers:
                 ready = wait_for(band, end_worker, END, at)
@@ -174,7 +189,7 @@ def build_step_row(
                 before, middle = moments + (row + 2) % MOMENT_ROWS, moments + row % MOMENT_ROWS
                 after = moments + (row + 1) % MOMENT_ROWS
                 line = ti.static(KernelRow(i, kind, before, middle, after))
-                pass_row(sheet, carried, carry, line, here, next_row, exists, up, loads, n, row >= 0)
+                pass_row(sheet, carried, carry, line, source, next_row, exists, up, loads, n, row >= 0)
                 if row >= 0:
                     for correct_row in ti.static(correcting):
                         correct_row(sheet, i, kind, loads, n)
@@ -197,7 +212,15 @@ def build_step_row(
 
 @cache
 def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None]:
-    """Build the kernel that takes steps, with several workers at the same time if `parallel`."""
+    """Build the kernel that takes steps.
+
+    Args:
+        config: compile-time configuration.
+        parallel: whether several workers step at the same time.
+
+    Returns:
+        The kernel `advance`, called by `kernel_cpu.ScatterKernel`.
+    """
     real, vector, vectors, lanes = config.real, config.vector, config.vectors, config.lanes
     constant_count = config.first_constant(None)
     step_row = build_step_row(config, build_point_step(config), corrects=True, parallel=parallel)
@@ -248,6 +271,15 @@ def build_advance(config: KernelConfig, *, parallel: bool) -> Callable[..., None
         d_x: vectors, d_y: vectors, d_z: vectors,
         constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
+        """Take the steps of a launch, from the workers' recorded progress on.
+
+        Args:
+            sizes: integer arguments of the launch, in the order of FIRST, ..., MAX_CHECKS.
+            progress: integers of the workers, in and out, shape (workers x WORKER_STRIDE,).
+            loads: load table of the launch, shape (steps, columns).
+            carried_x, carried_y, carried_z: forces carried to the next row [N], rows per worker and step of a pass.
+            u_x, u_y, u_z, d_x, d_y, d_z, constants_of, by_column, stiffness, fields: `SheetArrays.all`.
+        """
         ti.loop_config(serialize=not parallel)
         for index in range(ti.cast(sizes[WORKERS], ti.i32) * ITERATIONS_PER_THREAD):
             # One worker per thread.

@@ -17,8 +17,15 @@ from taichi_msm.terms.contact import CORRECTIONS, ContactTerm
 def sum_corrections(layout: SheetLayout, arrays: SheetArrays, *, clear: bool) -> NDArray[np.float64]:
     """Sum the contact corrections over the mass points, weighted with their shares of a cell's mass.
 
-    Returns the sums [m], shape (tools, 3); `clear` sets the corrections to 0 afterwards. The order of summation depends
-    neither on lanes nor on workers.
+    The order of summation depends neither on lanes nor on workers.
+
+    Args:
+        layout: layout of the sheet.
+        arrays: arrays of the sheet.
+        clear: whether to set the corrections to 0 afterwards.
+
+    Returns:
+        Sums [m], shape (tools, 3).
     """
     contact = layout.config.get(ContactTerm)
     if contact is None:
@@ -31,7 +38,7 @@ def sum_corrections(layout: SheetLayout, arrays: SheetArrays, *, clear: bool) ->
 
 @cache
 def _build_sum(config: KernelConfig) -> Callable[..., None]:
-    """Build the kernel that sums the corrections in every row from left to right, per tool and component."""
+    """Build the kernel that sums the corrections in every row, per tool and component."""
     vector, vectors, lanes, serial = config.vector, config.vectors, config.lanes, config.lanes > 1
     first, count = config.first_field(ContactTerm), CORRECTIONS * len(config.require(ContactTerm).shapes)
     by_area = config.by_area
@@ -41,6 +48,16 @@ def _build_sum(config: KernelConfig) -> Callable[..., None]:
         rows: ti.i32, cols: ti.i32, clear: ti.i32,
         by_column: vectors, fields: vectors, sums: ti.types.ndarray(dtype=ti.f64, ndim=2),
     ):  # fmt: skip
+        """Sum the corrections in every row from left to right.
+
+        Args:
+            rows: number of rows of the sheet.
+            cols: number of columns of the sheet.
+            clear: whether to set the corrections to 0 afterwards.
+            by_column: as in `SheetArrays`.
+            fields: as in `SheetArrays`.
+            sums: output [m], shape (tools x 3, rows).
+        """
         share_of, corrections = ti.static(by_column, fields)
         ti.loop_config(serialize=serial)
         for i in range(rows):

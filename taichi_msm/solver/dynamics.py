@@ -23,6 +23,7 @@ from taichi_msm.solver.contact_corrections import sum_corrections
 from taichi_msm.solver.kernel_cpu import ScatterKernel
 from taichi_msm.solver.kernel_gpu import STEPS_PER_LAUNCH, GatherKernel
 from taichi_msm.solver.planned_sheet import PlannedSheet
+from taichi_msm.solver.sheet_solver import SheetSolver
 from taichi_msm.solver.state import PeakForce, ProbeForces, Reading, State, TipForce
 from taichi_msm.system.runtime import Device
 from taichi_msm.terms.base import GAIN
@@ -35,16 +36,27 @@ MAX_STEPS_PER_LAUNCH = 8192
 # Number of rows of a load table; fewer rows hardly take less time to compute.
 STEPS_PER_TABLE = 4096
 
+Array = NDArray[np.float64]
+
 
 def _build_kernel(_: Plan, layout: SheetLayout, start: InitialData) -> StepKernel:
     return (ScatterKernel if layout.workers else GatherKernel)(layout, start)
 
 
-class Dynamics:
-    """The sheet in motion, a `SheetSolver`; see `PlannedSheet` for the arguments.
+class Dynamics(SheetSolver):
+    """The sheet in motion.
 
     An exception such as KeyboardInterrupt during a launch leaves the sheet inconsistent, because the number of steps
     taken is then unknown.
+
+    Args:
+        plan: plan of the run.
+        device: device of the arrays.
+        layout: replaces the layout chosen by `choose_layout`, for tests.
+        cores: largest number of CPU cores; by default all available cores.
+
+    Attributes:
+        sheet: the sheet in the memory of the device.
     """
 
     def __init__(self, plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> None:
@@ -77,7 +89,6 @@ class Dynamics:
         self._tabulate(plan.grid.steps_per_frame)
 
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
-        """Advance, see `SheetSolver.advance`. A call at a frame resets the sums of contact corrections."""
         points = self.layout.rows * self.layout.cols
         max_steps, depth = max(1, min(MAX_STEPS_PER_LAUNCH, POINT_STEPS_PER_LAUNCH // points)), self.layout.depth
         # A launch takes whole passes; a single pass may exceed the limit up to four times.
@@ -85,6 +96,7 @@ class Dynamics:
         if self.layout.workers == 0:
             max_steps = STEPS_PER_LAUNCH
         self._require_consistent()
+        # The forces of tools at a frame are means over the steps since the previous frame.
         if steps and self.steps_done % self.plan.grid.steps_per_frame == 0:
             sum_corrections(self.layout, self.sheet.kernel.arrays, clear=True)
         end = self.steps_done + steps
@@ -122,7 +134,15 @@ class Dynamics:
         return mean_force(self.plan, sums, self.plan.grid.steps_per_frame)
 
     def step_table(self, first: int, count: int) -> NDArray[Any]:
-        """Compute the load table of steps first, ..., first + count - 1, shape (count, columns)."""
+        """Compute the load table of consecutive steps.
+
+        Args:
+            first: number of the first step.
+            count: number of steps.
+
+        Returns:
+            Load table, shape (count, columns).
+        """
         table = self.sheet.load_table(average_loads(self.plan, first, count), first)
         _, table[:, GAIN], first_gain = coefficients(self.plan)
         if first == 0:
@@ -148,14 +168,11 @@ class Dynamics:
         self._first_tabled, self._loads = self.steps_done, self.step_table(self.steps_done, count)
 
 
-Array = NDArray[np.float64]
-
-
 class ForceRecorder:
     """Computes the forces of all probes on the sheet at the frames of a run, and their maxima.
 
     The force of a force-controlled probe at a frame is (percent(t) / 100) force times the sum of its decay factors over
-    the mass points that are not fixed. `Dynamics.tool_forces` computes the force of a position-controlled tool.
+    the mass points that are not fixed. The solver computes the forces of position-controlled tools.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -174,8 +191,14 @@ class ForceRecorder:
     def follow(self, before: ProbeForces, frame: int, position: NDArray[Any], tools: Array) -> ProbeForces:
         """Compute the forces at a frame and their maxima up to it.
 
-        They follow from the forces at the frame before, the positions [m], and the forces of position-controlled tools
-        [N].
+        Args:
+            before: forces and maxima at the previous frame.
+            frame: number of the frame.
+            position: positions of the mass points [m], shape (rows, cols, 3).
+            tools: forces of the position-controlled tools [N], shape (tools, 3), see `SheetSolver.tool_forces`.
+
+        Returns:
+            Forces at the frame, and maxima up to it.
         """
         forces, time = self._forces(frame, position, tools), frame / self._plan.grid.frames_per_second
         peaks = zip(before.greatest, (PeakForce(time, tip.force) for tip in forces), strict=True)

@@ -21,15 +21,20 @@ from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, compilation_options
 from taichi_msm.terms.base import KernelConfig
 from taichi_msm.terms.bending import BendingTerm
 
-# Size of a memory page [bytes].
-PAGE = 4096
+# Size of a memory page.
+PAGE_BYTES = 4096
 
 # Number of checks, in about 1.3 ms, after which a worker stops waiting for its neighbour.
 MAX_CHECKS = round(1.32e-3 / active_compiler().poll_s)
 
 
 class ScatterKernel(StepKernel):
-    """A sheet in the memory of a CPU."""
+    """A sheet in the memory of a CPU.
+
+    Args:
+        layout: layout of the sheet, with at least one worker.
+        start: initial values.
+    """
 
     def __init__(self, layout: SheetLayout, start: InitialData) -> None:
         self._layout = layout
@@ -47,7 +52,7 @@ class ScatterKernel(StepKernel):
         self.arrays = SheetArrays(layout, np.concatenate(sheet_rows), start)
         # Rows of `carried` per worker: one per step of a pass, and one page, which no prefetcher crosses.
         row_bytes = layout.width * layout.config.lanes * NUMBER_BYTES[layout.config.precision]
-        self._carried_rows = layout.depth - (-PAGE // row_bytes)
+        self._carried_rows = layout.depth - (-PAGE_BYTES // row_bytes)
         # Forces carried to the next row, per worker and step of a pass.
         self._carried = [self.arrays.rows(layout.workers * self._carried_rows) for _ in range(3)]
         self._progress = np.zeros(layout.workers * bands.WORKER_STRIDE, np.int64)
@@ -149,6 +154,14 @@ def _build_copy(config: KernelConfig) -> Callable[..., None]:
         u_x: vectors, u_y: vectors, u_z: vectors,
         borders: ti.types.ndarray(dtype=ti.i32, ndim=1), rows: ti.i32, width: ti.i32,
     ):  # fmt: skip
+        """Copy rows of the sheet into the rows of u after it.
+
+        Args:
+            u_x, u_y, u_z: displacements [m].
+            borders: row of the sheet that each copy contains, shape (copies,).
+            rows: number of rows of the sheet.
+            width: number of entries of a row.
+        """
         for n, b in ti.ndrange(borders.shape[0], width):
             for u in ti.static((u_x, u_y, u_z)):
                 u[(rows + n) * width + b] = u[borders[n] * width + b]

@@ -24,7 +24,12 @@ STEPS_PER_LAUNCH = 8
 
 
 class GatherKernel(StepKernel):
-    """A sheet in the memory of a GPU."""
+    """A sheet in the memory of a GPU; a launch takes at most STEPS_PER_LAUNCH steps.
+
+    Args:
+        layout: layout of the sheet, with one lane and without workers.
+        start: initial values.
+    """
 
     def __init__(self, layout: SheetLayout, start: InitialData) -> None:
         self._layout = layout
@@ -37,7 +42,6 @@ class GatherKernel(StepKernel):
         self.arrays = SheetArrays(layout, np.concatenate([buffer, buffer, moments]), start)
 
     def advance(self, count: int, table: NDArray[Any]) -> None:
-        """Advance the sheet by at most STEPS_PER_LAUNCH steps."""
         with compilation_options():
             self._advance(self._now, count, self._layout.rows, self._layout.cols, table, *self.arrays.all)
         self._now = (self._now + count) % 2
@@ -78,11 +82,11 @@ def _build_step(config: KernelConfig) -> Callable[..., None]:
 
     @ti.func
     def by_right(sheet: ti.template(), p, i, kind, b):
-        exists, here = vector(1), p * sheet.width + b
+        exists, entry = vector(1), p * sheet.width + b
         if ti.static(open_edges):
             exists = sheet.by_column[HAS_RIGHT * sheet.width + b]
-        k, u = of_row(sheet, i, kind, b) * vector(1), [sheet.u[c][here] for c in ti.static(range(3))]
-        return along(sheet, here + 1, u, k, share_of_row(exists, kind))
+        k, u = of_row(sheet, i, kind, b) * vector(1), [sheet.u[c][entry] for c in ti.static(range(3))]
+        return along(sheet, entry + 1, u, k, share_of_row(exists, kind))
 
     @ti.func
     def step(sheet: ti.template(), loads: ti.template(), now, i, b, n):
@@ -127,6 +131,16 @@ def _build_advance(config: KernelConfig) -> Callable[..., None]:
         d_x: vectors, d_y: vectors, d_z: vectors,
         constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
+        """Take the steps of a launch.
+
+        Args:
+            now: index of the buffer of u_n, 0 or 1.
+            count: number of steps, at most STEPS_PER_LAUNCH.
+            rows: number of rows of the sheet.
+            cols: number of columns of the sheet.
+            loads: load table of the launch, shape (steps, columns).
+            u_x, u_y, u_z, d_x, d_y, d_z, constants_of, by_column, stiffness, fields: `SheetArrays.all`.
+        """
         for n in ti.static(range(STEPS_PER_LAUNCH)):
             for store_moment in ti.static(storing):
                 for i, b in ti.ndrange((-1, rows + 1), cols + 2):

@@ -80,7 +80,13 @@ class RestSheet(NamedTuple):
 class Relaxation(SheetKernel):
     """A sheet in the memory of a CPU, and the kernels that find its equilibrium.
 
-    The argument and attribute `masses` contains M of every mass point [N/m], shape (rows, cols).
+    Args:
+        layout: layout of the sheet.
+        start: initial values.
+        masses: fictitious masses M [N/m], shape (rows, cols).
+
+    Attributes:
+        masses: as given.
     """
 
     def __init__(self, layout: SheetLayout, start: InitialData, masses: NDArray[Any]) -> None:
@@ -112,9 +118,15 @@ class Relaxation(SheetKernel):
             write_vectors(self.arrays.u[c], to_lanes(self._layout, np.where(held, displacement[self._stored, :, c], 0)))
 
     def relax(self, count: int, tolerance: float, row: NDArray[Any]) -> tuple[int, float]:
-        """Evaluate the forces and move the mass points, at most `count` times, until no force exceeds a tolerance [N].
+        """Evaluate the forces and move the mass points until no force exceeds a tolerance.
 
-        Returns the number of evaluations, and the largest force of the last one [N], infinite if any force is NaN.
+        Args:
+            count: largest number of evaluations.
+            tolerance: largest force on a mass point [N].
+            row: row of the load table, shape (1, columns).
+
+        Returns:
+            Number of evaluations, and the largest force of the last one [N], infinite if any force is NaN.
         """
         fire = self._fire
         fire[[COUNT, SQUARED_TOLERANCE]] = count, tolerance * tolerance
@@ -232,6 +244,15 @@ def _build_relax(config: KernelConfig) -> Callable[..., None]:
         d_x: vectors, d_y: vectors, d_z: vectors,
         constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
+        """Evaluate the forces and move the mass points, see `Relaxation.relax`.
+
+        Args:
+            fire: arguments, state of FIRE and results, in the order of ROWS, ..., FORCE_SUM, shape (NUMBERS,).
+            row: row of the load table, shape (1, columns).
+            q_x, q_y, q_z: momenta [N].
+            work: 1 / M of every mass point [m/N], followed by SUMS rows of reductions.
+            u_x, u_y, u_z, d_x, d_y, d_z, constants_of, by_column, stiffness, fields: `SheetArrays.all`.
+        """
         ti.loop_config(serialize=True)
         for _ in range(1):
             rows, width = ti.cast(fire[ROWS], ti.i32), ti.cast(fire[STRIP], ti.i32) + 2
@@ -302,6 +323,15 @@ def _build_scale(config: KernelConfig) -> Callable[..., None]:
         d_x: vectors, d_y: vectors, d_z: vectors,
         constants_of: ti.types.ndarray(dtype=vector, ndim=1), by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
+        """Square the largest force of a spring, a load or the foundation on a mass point.
+
+        Args:
+            rows: number of rows of the sheet.
+            width: number of entries of a row.
+            result: output [N2], shape (1,).
+            row: row of the load table, shape (1, columns).
+            u_x, u_y, u_z, d_x, d_y, d_z, constants_of, by_column, stiffness, fields: `SheetArrays.all`.
+        """
         ti.loop_config(serialize=True)
         for _ in range(1):
             constants = [constants_of[n][0] for n in ti.static(range(constant_count))]
@@ -313,8 +343,8 @@ def _build_scale(config: KernelConfig) -> Callable[..., None]:
                 kind = ti.select(i == rows - 1, 2, ti.select(i == 0, 0, 1))
                 line = ti.static(KernelRow(i, kind, 0, 0, 0))
                 for b in range(1, width - 1):
-                    here = [u[c][i * width + b] for c in ti.static(range(3))]
-                    entry = ti.static(Entry(line, b, here))
+                    displacement = [u[c][i * width + b] for c in ti.static(range(3))]
+                    entry = ti.static(Entry(line, b, displacement))
                     largest = ti.max(largest, max_spring_force(sheet, entry))
                     moves = sheet.by_column[(MOBILITY + kind) * width + b] > 0
                     for add in ti.static(forces):

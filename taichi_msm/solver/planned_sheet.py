@@ -26,12 +26,17 @@ Kernel = TypeVar("Kernel", bound=SheetKernel)
 # With fewer mass points per worker, an additional worker costs more waiting time than it saves.
 POINTS_PER_WORKER = 450
 
-# A pass over a larger band takes several steps, so that the rows stay in the cache.
-CACHE_BYTES = 3 << 17
-
 
 def choose_layout(plan: Plan, device: Device, cores: int | None = None) -> SheetLayout:
     """Choose the memory layout of a sheet, its division among workers, and the configuration of its kernels.
+
+    Args:
+        plan: plan of the run.
+        device: device of the arrays.
+        cores: largest number of CPU cores; by default all available cores.
+
+    Returns:
+        Layout of the sheet.
 
     Raises:
         DeviceError: when the device does not support the scene.
@@ -56,8 +61,9 @@ def choose_layout(plan: Plan, device: Device, cores: int | None = None) -> Sheet
             "--arch vulkan: has no exp in f64, which control points that move need; take time.precision: f32 without a "
             "tolerance or an estimate of the error, or --arch cpu"
         )
-    # Per mass point a pass reads displacement, last difference and carried force, with three components each.
-    fits = workers == 0 or rows // workers * cols * 9 * NUMBER_BYTES[precision] <= CACHE_BYTES
+    # A pass over a band that exceeds the cache takes several steps while its rows are there. Per mass point it reads
+    # displacement, last difference and carried force, with three components each.
+    fits = workers == 0 or rows // workers * cols * 9 * NUMBER_BYTES[precision] <= 3 << 17
     depth = 1 if fits or config.reach > 1 else 8
     return SheetLayout(rows, cols, workers, depth, fixed_rows, config)
 
@@ -66,15 +72,15 @@ class PlannedSheet(Generic[Kernel]):
     """The sheet of a plan in the memory of a device.
 
     Args:
-        plan: the plan.
+        plan: plan of the run.
         build: builds the kernel of a plan and a layout from initial values.
-        device: the device.
+        device: device of the arrays.
         layout: replaces the layout chosen by `choose_layout`, for tests.
         cores: largest number of CPU cores; by default all available cores.
 
     Attributes:
-        plan: the current plan.
-        layout: the memory layout, and the configuration of the kernels.
+        plan: current plan.
+        layout: memory layout, and configuration of the kernels.
         inconsistent: whether an interruption left the arrays inconsistent.
     """
 
@@ -90,7 +96,12 @@ class PlannedSheet(Generic[Kernel]):
         self.restart(plan)
 
     def restart(self, plan: Plan, state: State | None = None) -> None:
-        """Restart with the same or another plan, see `SheetSolver.restart`."""
+        """Restart with the same or another plan, without compilation if only coefficients differ.
+
+        Args:
+            plan: new plan.
+            state: state to continue from, of a sheet with the same mass points and steps; by default the sheet at rest.
+        """
         self.inconsistent = True
         self.plan, self.layout = plan, self._given_layout or choose_layout(plan, self._device, self._cores)
         self._real = np.dtype(np.float32 if self.layout.config.precision == "f32" else np.float64)
@@ -104,13 +115,17 @@ class PlannedSheet(Generic[Kernel]):
 
     @property
     def kernel(self) -> Kernel:
-        """The arrays of the sheet, with the kernels that move and read it."""
+        """The arrays of the sheet, with the kernels that move and read it; MsmError while a restart is incomplete."""
         if self._kernel is None:
             raise MsmError("interrupted while the sheet was restarted; restart the scene")
         return self._kernel
 
     def steer(self, plan: Plan) -> None:
-        """Continue with other probes, see `SheetSolver.steer`."""
+        """Continue with other probes, see `SheetSolver.steer`.
+
+        Raises:
+            ArgumentError: when the new probes require other kernels.
+        """
         config, terms = self.layout.config, build_terms(plan)
         if [tool.probe for tool in plan.tools] != [tool.probe for tool in self.plan.tools]:
             raise ArgumentError("probes: which of them have a path cannot change; restart with the new scene")
@@ -124,7 +139,15 @@ class PlannedSheet(Generic[Kernel]):
         self.plan = plan
 
     def load_table(self, loads: Schedule, first: int) -> NDArray[Any]:
-        """Compute the load table from step `first` on, with a gain of 0, shape (steps, columns)."""
+        """Compute the load table of consecutive steps, with a gain of 0.
+
+        Args:
+            loads: loads at the steps.
+            first: number of the first step.
+
+        Returns:
+            Load table in the precision of the kernels, shape (steps, columns).
+        """
         config = self.layout.config
         table = np.zeros((len(loads.active), config.first_column(None)))
         for term in config.terms:
@@ -135,7 +158,15 @@ class PlannedSheet(Generic[Kernel]):
             return table.astype(self._real)
 
     def read(self, steps: int, *, moving: bool) -> Reading:
-        """Read and measure the sheet after a number of steps; its energy includes the kinetic energy if `moving`."""
+        """Read and measure the sheet.
+
+        Args:
+            steps: number of steps taken, for the reading.
+            moving: whether the energy includes the kinetic energy.
+
+        Returns:
+            Displacements and measures.
+        """
         displacement, measures = self.read_arrays(differences=False)
         config, plan = self.layout.config, self.plan
         springs = measures[:, config.first_measure(SpringTerm) :]

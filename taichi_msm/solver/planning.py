@@ -69,7 +69,7 @@ ROUNDING_MARGIN = 1 - 1e-12
 
 
 class Work(NamedTuple):
-    """The work of a run, by stages."""
+    """The work of a run by stages [f32 steps of a mass point]."""
 
     start: float  # starting Python and Taichi, and compiling the kernels
     stepping: float  # all steps
@@ -78,7 +78,15 @@ class Work(NamedTuple):
 
 
 def count_work(plan: Plan, companions: float) -> Work:
-    """Estimate the work of a run; `companions` is that of companion runs [f64 steps of the sheet per step]."""
+    """Estimate the work of a run.
+
+    Args:
+        plan: plan of the run.
+        companions: work of its companion runs [f64 steps of the sheet per step of the run].
+
+    Returns:
+        Work by stages [f32 steps of a mass point].
+    """
     steps = _stepping_work(plan)
     stepping = F64_WORK * steps if plan.grid.precision == "f64" else steps
     return Work(START_WORK, stepping, F64_WORK * companions * steps, _other_work(plan.scene) - START_WORK)
@@ -90,7 +98,12 @@ def is_f64_cheap(plan: Plan) -> bool:
 
 
 def affords_companions(plan: Plan, companions: float) -> bool:
-    """Return whether `companions`, as for `count_work`, take at most MAX_COMPANION_SHARE of the work of a run."""
+    """Return whether companion runs take at most MAX_COMPANION_SHARE of the work of a run.
+
+    Args:
+        plan: plan of the run.
+        companions: work of the companion runs [f64 steps of the sheet per step of the run].
+    """
     work = count_work(plan, companions)
     return work.companions <= MAX_COMPANION_SHARE * sum(work)
 
@@ -112,6 +125,13 @@ def _other_work(scene: Scene) -> float:
 
 def make_plan(scene: Scene, maps: Maps | None = None) -> Plan:
     """Build the plan of a scene for a CPU, as `try_plan`.
+
+    Args:
+        scene: a scene whose keys are valid individually.
+        maps: images of its stiffness maps; by default they are read.
+
+    Returns:
+        Plan of the run.
 
     Raises:
         SceneError: when sheet, steps or paths are invalid; it lists all problems.
@@ -147,7 +167,15 @@ def try_plan(scene: Scene, maps: Maps | None = None) -> tuple[Plan | None, list[
 
 
 def plan_variant(plan: Plan, scene: Scene) -> Plan:
-    """Build the plan of a modified scene, which must be valid and have the maps of `plan`, without checks."""
+    """Build the plan of a modified scene without checks.
+
+    Args:
+        plan: plan of the original scene, whose maps are reused.
+        scene: the modified scene, which must be valid.
+
+    Returns:
+        Plan of the modified scene.
+    """
     return _plan(scene, plan.maps, fixed_points(scene.sheet), derive_material(scene, plan.maps))
 
 
@@ -170,10 +198,14 @@ def _plan(scene: Scene, maps: Maps, fixed: NDArray[np.bool_], material: Material
 
 
 def choose_precision(plan: Plan, arch: str) -> Plan:
-    """Return a plan with the precision chosen for an arch: cpu, cuda or vulkan.
+    """Return a plan with the precision chosen for an arch.
 
     Quasi-static scenes always use f64. With `auto`, a CPU uses f64 if the scene has a tolerance or if stepping is a
     small part of the work; GPUs use f32, because f64 is slow or missing there.
+
+    Args:
+        plan: plan in any precision.
+        arch: cpu, cuda or vulkan.
     """
     time = plan.scene.time
     if time.at_rest:
@@ -185,7 +217,13 @@ def choose_precision(plan: Plan, arch: str) -> Plan:
 
 
 def stable_step(material: Material, sheet: Sheet, difference: str) -> float:
-    """Compute the largest stable step of a sheet [s], see `verlet.stability_limit`."""
+    """Return the largest stable step of a sheet [s], see `verlet.stability_limit`.
+
+    Args:
+        material: coefficients of the sheet.
+        sheet: section `sheet` of the scene.
+        difference: difference quotient of the damping, central or backward.
+    """
     return stability_limit(highest_frequency(material, sheet), material.drag, difference)
 
 
@@ -195,10 +233,14 @@ def stable_steps(plan: Plan) -> int:
 
 
 def steps_per_frame(time: Time, limit: float) -> int:
-    """Compute the number of steps per frame, for the largest stable step `limit` [s]; 1 in quasi-static scenes.
+    """Return the number of steps per frame; 1 in quasi-static scenes.
 
     With `auto`, it is the smallest number whose step is at most half the limit. A given step is rounded to a fraction
     of a frame. `accuracy.time_step` increases the number for a tolerance.
+
+    Args:
+        time: section `time` of the scene.
+        limit: largest stable step [s].
     """
     if time.at_rest:
         return 1
@@ -209,7 +251,12 @@ def steps_per_frame(time: Time, limit: float) -> int:
 
 
 def with_time(scene: Scene, **changes: Any) -> Scene:
-    """Return a copy of a scene with other values of keys of `time`."""
+    """Return a copy of a scene with other values in its section `time`.
+
+    Args:
+        scene: the scene, not modified.
+        **changes: new values by key, not validated.
+    """
     return scene.model_copy(update={"time": scene.time.model_copy(update=changes)})
 
 
@@ -254,8 +301,8 @@ def precision_problems(plan: Plan) -> Iterator[Problem]:
     if not MIN_F32_LENGTH_M**2 < gain < MAX_F32_LENGTH_M**2:
         yield Problem(
             ("time", "precision"),
-            f"f32 cannot hold the {gain:g} m by which a step of {step:g} s moves a mass of "
-            f"{mass:g} kg for every newton; take f64",
+            f"a step of {step:g} s moves a mass of {mass:g} kg by {gain:g} m per newton, outside the range of f32; "
+            "take f64",
         )
 
 
@@ -266,11 +313,14 @@ def steer_plan(plan: Plan, probes: Sequence[Probe | Mapping[str, Any] | None], n
     """Replace the probes of a plan from a time on.
 
     Args:
-        plan: the plan.
+        plan: plan of the run.
         probes: one item per probe of the plan. None, or the current probe, leaves the probe unchanged. The `path` of a
             position-controlled tool contains only keyframes after `now`; a mapping may omit its instrument, friction
             and grips, which then stay the same.
         now: the current time [s].
+
+    Returns:
+        Plan with the new probes, whose paths include the past keyframes on which later steps depend.
 
     Raises:
         ArgumentError: when the number of probes differs.
@@ -278,7 +328,7 @@ def steer_plan(plan: Plan, probes: Sequence[Probe | Mapping[str, Any] | None], n
     """
     before = plan.scene.probes
     if len(probes) != len(before):
-        raise ArgumentError(f"probes: {len(probes)} are given, and the scene has {len(before)}; give all of them")
+        raise ArgumentError(f"probes: {len(probes)} given, but the scene has {len(before)}; give all of them")
     given = [_fill_omitted_keys(*pair) for pair in zip(before, probes, strict=True)]
     after = plan.with_probes(given)
     joined, lines = list(after.scene.probes), []
@@ -293,7 +343,12 @@ def steer_plan(plan: Plan, probes: Sequence[Probe | Mapping[str, Any] | None], n
 
 
 def with_current_paths(plan: Plan, probes: Sequence[Probe]) -> Plan:
-    """Replace the position-controlled tools of a plan by those of other probes, one per probe of the plan."""
+    """Return a plan with other position-controlled tools.
+
+    Args:
+        plan: plan of the run.
+        probes: one probe per probe of the plan, of which those that are position-controlled replace the plan's.
+    """
     if not plan.tools:
         return plan
     pairs = zip(plan.scene.probes, probes, strict=True)
@@ -332,7 +387,7 @@ def _path_problems(plan: Plan, index: int, before: Probe, given: Probe, now: flo
     tolerance = FRAME_TOLERANCE / plan.grid.frames_per_second
     assert given.path is not None
     if given.path[0][0] <= now + tolerance:
-        text = f"is at {given.path[0][0]:g} s, and it is {now:g} s; give only times after that"
+        text = f"is at {given.path[0][0]:g} s, not after the current time, {now:g} s; give only later times"
         yield Problem((*key, "path", 0), text)
         return
     if given.clamp != before.clamp:
@@ -346,13 +401,13 @@ def _path_problems(plan: Plan, index: int, before: Probe, given: Probe, now: flo
         yield Problem((*key, "path", fault[0] - first - 1), fault[1])
     deviation = _shape_change(old_tool, tool)
     if deviation > tool.stride:
-        text = f"changes by {deviation:.3g} m in a step, over {tool.stride:.3g} m; change it little by little"
+        text = f"changes by {deviation:.3g} m in a step, over {tool.stride:.3g} m; change it gradually"
         yield Problem((*key, "instrument"), text)
     for n, (begin, end) in enumerate(given.grip):
         has_ended = end <= now + tolerance
         continues = any(begin == old_begin and old_end > now + tolerance for old_begin, old_end in before.grip)
         if begin < now - tolerance and not (has_ended or continues):
-            text = f"begins at {begin:g} s, and it is {now:g} s; begin at that time or later"
+            text = f"begins at {begin:g} s, before the current time, {now:g} s; begin at that time or later"
             yield Problem((*key, "grip", n), text)
 
 

@@ -52,9 +52,6 @@ MIN_FORCE_N = 1e-30
 # Largest number of evaluations per mass point along the longer side; a sheet that buckles takes up to 200.
 MAX_EVALUATIONS = 2000
 
-# Largest numbers of evaluations, and of evaluations times mass points, about 0.1 s of one core, in a launch.
-EVALUATIONS_PER_LAUNCH, POINT_EVALUATIONS_PER_LAUNCH = 64, 40_000_000
-
 Array = NDArray[np.float64]
 
 
@@ -63,12 +60,19 @@ def _build_kernel(plan: Plan, layout: SheetLayout, start: InitialData) -> Relaxa
     return Relaxation(layout, start, np.maximum(fictitious_masses(plan), MIN_MAGNITUDE))
 
 
-class QuasiStatics:
-    """The sheet in quasi-static motion, a `SheetSolver`; see `PlannedSheet` for the arguments.
+class QuasiStatics(SheetSolver):
+    """The sheet in quasi-static motion.
+
+    Args:
+        plan: plan of the run.
+        device: device of the arrays, a CPU.
+        layout: replaces the layout chosen by `choose_layout`, for tests.
+        cores: accepted for the same interface as `Dynamics`; a single worker is used.
 
     Attributes:
+        sheet: the sheet in the memory of the device.
         evaluations: number of evaluations of the forces for the last frame.
-        residual: of the last frame, relative to the largest force.
+        residual: largest residual force of the last frame, relative to the largest force.
     """
 
     def __init__(self, plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> None:
@@ -103,7 +107,9 @@ class QuasiStatics:
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
         """Find the equilibria of the next frames, and of the first frame if it is still missing.
 
-        After an exception from `pause` another call continues from the last frame found.
+        Args:
+            steps: number of frames.
+            pause: called between launches; after an exception from it, another call continues from the last frame.
 
         Raises:
             DivergedError: when the iteration does not converge.
@@ -250,8 +256,8 @@ class QuasiStatics:
         """Iterate until the residual, relative to the largest force, is below a tolerance; return it."""
         relaxation, longer = self.sheet.kernel, max(self.layout.rows, self.layout.cols)
         relaxation.stop()
-        points = self.layout.rows * self.layout.cols
-        per_launch = max(1, min(EVALUATIONS_PER_LAUNCH, POINT_EVALUATIONS_PER_LAUNCH // points))
+        # About 0.1 s of one core at most.
+        per_launch = max(1, min(64, 40_000_000 // (self.layout.rows * self.layout.cols)))
         limit, evaluations, perturbed = MAX_EVALUATIONS * longer, 0, tolerance >= PERTURBATION_TOLERANCE
         scale, stability_limit = max(MIN_FORCE_N, relaxation.scale(row)), math.inf
         while True:
@@ -308,9 +314,9 @@ class QuasiStatics:
         elif (self._touched().sum(axis=0) > 1).any():
             remedy = "two tools press on one point; keep them apart"
         message = (
-            f"diverged at {time:.6g} s, frame {frame}: no shape was found in which the forces balance: after "
-            f"{evaluations} evaluations, {residual:.2g} of the largest force is left at point ({row}, {column}), and "
-            f"{FORCE_TOLERANCE:g} was wanted; {remedy}"
+            f"diverged at {time:.6g} s, frame {frame}: no equilibrium was found: after {evaluations} evaluations, "
+            f"{residual:.2g} of the largest force remains as residual at point ({row}, {column}), above the tolerance "
+            f"of {FORCE_TOLERANCE:g}; {remedy}"
         )
         return DivergedError(message, frame, time, (row, column))
 
@@ -318,5 +324,15 @@ class QuasiStatics:
 def build_dynamics(
     plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None
 ) -> SheetSolver:
-    """Build the dynamic or quasi-static solver of a plan, with the arguments of `Dynamics`."""
+    """Build the dynamic or quasi-static solver of a plan.
+
+    Args:
+        plan: plan of the run.
+        device: device of the arrays.
+        layout: replaces the layout chosen by `choose_layout`, for tests.
+        cores: largest number of CPU cores; by default all available cores.
+
+    Returns:
+        Solver at rest; a quasi-static one finds the first frame in its first call of `advance`.
+    """
     return (QuasiStatics if plan.scene.time.at_rest else Dynamics)(plan, device, layout, cores)

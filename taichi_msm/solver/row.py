@@ -25,6 +25,9 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
         config: compile-time configuration.
         move: Taichi function move(sheet, entry, target, force, now) that steps an entry with the force of its springs,
             see `build_point_step`.
+
+    Returns:
+        The Taichi function pass_row(sheet, carried, carried_row, line, source, next_row, exists, up, loads, n, moving).
     """
     vector, columns, springs = config.vector, config.first_column(None), config.require(SpringTerm)
     structural, shear, open_edges = springs.structural, springs.shear, springs.open_edges
@@ -33,20 +36,30 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
 
     @ti.func
     def pass_row(
-        sheet: ti.template(), carried: ti.template(), carried_row, line: ti.template(), here, next_row, exists, up,
+        sheet: ti.template(), carried: ti.template(), carried_row, line: ti.template(), source, next_row, exists, up,
         loads: ti.template(), n, moving,
     ):  # fmt: skip
-        """Compute the forces on row `line`, which is row `here` of u, and step it if `moving`.
+        """Compute the forces on a row, and step it if `moving`.
 
-        The next row of the pass, `next_row` of u, is `up` [m] above this one; `exists` is 0 if the sheet ends here,
-        otherwise 1. `carried_row` is the row of `carried` with the forces between rows, n the row of the load table.
+        Args:
+            sheet: a `KernelSheet`.
+            carried: forces carried to the next row [N], as three arrays.
+            carried_row: row of `carried`.
+            line: the row, a `KernelRow`.
+            source: row of u with its displacements.
+            next_row: row of u with the displacements of the next row of the pass.
+            exists: 1, or 0 if the sheet has no next row.
+            up: distance of the next row along y [m].
+            loads: load table, shape (steps, columns).
+            n: row of the load table.
+            moving: whether to step the row.
         """
         width, strip, i, kind = sheet.width, sheet.width - 2, line.i, line.kind
         diagonal = ti.sqrt(sheet.constants[DX] * sheet.constants[DX] + sheet.constants[DY] * sheet.constants[DY])
         # The lower of the two rows.
         lower = i + ti.select(up < 0, 1, 0)
         # Entry 0 of both rows of u and of the row of carried forces.
-        row, next_at, carry = here * width, next_row * width, carried_row * width
+        row, next_at, carry = source * width, next_row * width, carried_row * width
         # Force of the left neighbour, and forces carried to the other row for the previous, this and the next entry.
         left, last = [vector(0) for _ in ti.static(range(3))], [vector(0) for _ in ti.static(range(3))]
         this, following = [vector(0) for _ in ti.static(range(3))], [vector(0) for _ in ti.static(range(3))]
@@ -110,7 +123,7 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
                 carried[c][carry + b - 1] = last[c]
             if moving:
                 entry = ti.static(Entry(line, b, u))
-                move(sheet, entry, here, force, now)
+                move(sheet, entry, source, force, now)
         if ti.static(shear):
             if ti.static(open_edges):
                 has_left = sheet.by_column[HAS_LEFT * width + strip + 1]
@@ -128,7 +141,15 @@ def build_pass_row(config: KernelConfig, move: Callable[..., None]) -> Callable[
 
 
 def build_correct_row(config: KernelConfig, correction: Correction) -> Callable[..., None]:
-    """Build the Taichi function that applies the correction of a term to a row, if the row may need it."""
+    """Build the Taichi function that applies the correction of a term to a row, if the row may need it.
+
+    Args:
+        config: compile-time configuration.
+        correction: Taichi functions of the term.
+
+    Returns:
+        The Taichi function correct_row(sheet, i, kind, loads, n), for row i and row n of the load table.
+    """
     columns, (reaches, resolve), max_lane = config.first_column(None), correction, build_max_lane(config)
 
     @ti.func

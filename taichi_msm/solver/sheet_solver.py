@@ -53,7 +53,12 @@ class SheetSolver(Protocol):
         """
 
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
-        """Advance by a number of steps; an exception from `pause` interrupts, and another call continues."""
+        """Advance by a number of steps.
+
+        Args:
+            steps: number of steps.
+            pause: called between launches; an exception from it interrupts, and another call of `advance` continues.
+        """
 
     def compile(self) -> None:
         """Compile all kernels without moving a mass point."""

@@ -15,9 +15,8 @@ from taichi_msm.scene.tools import Probe
 class LargestDisplacement(NamedTuple):
     """The largest displacement of a mass point; NaN and infinity count as the largest."""
 
-    # row, column: indices of the mass point
-    row: int
-    column: int
+    row: int  # row of the mass point
+    column: int  # column of the mass point
     distance: float  # of the mass point from its rest position [m]
     reach: float  # Euclidean norm of all displacements [m]
 
@@ -59,18 +58,16 @@ class RunProgress:
 
     frame: int = 0  # number of the frame
     max_displacement: float = 0.0  # largest displacement at any frame so far [m]
-    # shortest_spring, longest_spring: as in a `Reading`, at any frame so far
-    shortest_spring: float = 1.0
-    longest_spring: float = 1.0
+    shortest_spring: float = 1.0  # as in a `Reading`, at any frame so far
+    longest_spring: float = 1.0  # as in a `Reading`, at any frame so far
     energy: float = 0.0  # as in a `Reading`, at this frame [J]
     reach: float = 0.0  # Euclidean norm of all displacements at this frame [m]
     deepest: float = 0.0  # largest depth of a mass point below its rest position at any frame so far [m]
     peak: float = 0.0  # largest energy at any frame so far [J]
     residual: float = 0.0  # as in a `Reading`, the largest of all frames so far
     evaluations: int = 0  # as in a `Reading`, the sum over all frames so far
-    # least_energy, energy_growth: as `DivergenceMonitor` measures them
-    least_energy: float = 0.0
-    energy_growth: float = 0.0
+    least_energy: float = 0.0  # as measured by `DivergenceMonitor` [J]
+    energy_growth: float = 0.0  # as measured by `DivergenceMonitor` [J]
     pierced_by: int = 0  # number, from 1, of the first probe reported by `piercing`; 0 without a report
     pierced_frame: int = 0  # frame of the report
     max_displacement_frame: int = 0  # the first frame with the largest displacement

@@ -37,7 +37,15 @@ TERMS: tuple[type[Term], ...] = (
 
 
 def derive_material(scene: Scene, maps: Maps) -> Material:
-    """Derive the coefficients of a scene without `material_key_problems`; missing images of `maps` are ignored."""
+    """Derive the coefficients of a sheet.
+
+    Args:
+        scene: a scene without `material_key_problems`.
+        maps: images of its stiffness maps by key; missing ones are ignored.
+
+    Returns:
+        Coefficients of the sheet.
+    """
     (dx, dy), mass = spacing(scene.sheet), scene.sheet.mass
     readable = {key: (keys, maps[key], scene.sheet) for key, keys in scene.maps.items() if key in maps}
     if scene.tissue is not None:
@@ -71,5 +79,10 @@ def fictitious_masses(plan: Plan) -> NDArray[np.float64]:
 
 
 def highest_frequency(material: Material, sheet: Sheet) -> float:
-    """Bound the highest angular frequency [rad/s], as long as no spring is shorter than half its rest length."""
+    """Return a bound of the highest angular frequency [rad/s] of a sheet without springs below half their rest length.
+
+    Args:
+        material: coefficients of the sheet.
+        sheet: section `sheet` of the scene.
+    """
     return math.sqrt(sum(term.stiffness_bound(material, sheet) for term in TERMS) / material.mass)

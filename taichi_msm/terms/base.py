@@ -57,7 +57,12 @@ class Term(ABC):
 
     @staticmethod
     def stiffness_bound(material: Material, sheet: Sheet) -> float:
-        """Bound the term's contribution to m w^2 [N/m], for the angular frequency w of any mode."""
+        """Return a bound of the term's contribution to m w^2 [N/m], for the angular frequency w of any mode.
+
+        Args:
+            material: coefficients of the sheet.
+            sheet: section `sheet` of the scene.
+        """
         return 0.0
 
     @classmethod
@@ -89,7 +94,13 @@ class Term(ABC):
         return len(self.memory)
 
     def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
-        """Compute the term's columns of the load table from step `first` on, shape (steps, column_count)."""
+        """Return the term's columns of the load table, shape (steps, column_count).
+
+        Args:
+            plan: plan of the run.
+            loads: loads at consecutive steps; at rest, at a frame.
+            first: number of the first of these steps or frames.
+        """
         return np.empty((len(loads.active), 0))
 
     def fields(self, plan: Plan) -> NDArray[Any]:
@@ -97,7 +108,12 @@ class Term(ABC):
         return np.zeros((self.field_count, *plan.scene.sheet.points))
 
     def energy(self, sums: NDArray[Any], plan: Plan) -> float:
-        """Compute twice the term's energy [J] from its measures, reduced over the sheet."""
+        """Return twice the term's energy [J].
+
+        Args:
+            sums: the term's measures, reduced over the sheet, shape (reductions,).
+            plan: plan of the run.
+        """
         return 0.0
 
     def build_forces(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
@@ -134,8 +150,11 @@ class Term(ABC):
     def mark_update(self, columns: NDArray[Any]) -> bool:
         """Mark the columns of a frame at rest, if the term changes its memory once the frame is in equilibrium.
 
-        `columns` is a row of the load table, from the first column of the term on. Returns whether the term changes its
-        memory in the next evaluation of the forces.
+        Args:
+            columns: row of the load table, from the first column of the term on, in and out.
+
+        Returns:
+            Whether the term changes its memory in the next evaluation of the forces.
         """
         return False
 
@@ -176,7 +195,7 @@ AnyTerm = TypeVar("AnyTerm", bound=Term)
 class KernelConfig:
     """Compile-time configuration of the kernels of a sheet; everything else is an argument of a kernel."""
 
-    precision: str  # f32 or f64
+    precision: str  # of the numbers, f32 or f64
     lanes: int  # number of lanes of a vector, and of strips of columns
     by_area: bool  # whether mass points at an open edge are lighter, because they belong to fewer cells
     terms: tuple[Term, ...]  # terms of the scene in the order of `terms.TERMS`, always with springs and probes
@@ -223,7 +242,12 @@ class KernelConfig:
         return Operations(ti.sqrt, log, ti.max, ti.min, ti.select, ti.func)
 
     def compile_law(self, law: Law, *, tense: bool) -> LawFunctions:
-        """Wrap the functions of a law for kernels; see `Law.build`."""
+        """Return the functions of a law as Taichi functions.
+
+        Args:
+            law: law of the springs.
+            tense: whether the springs have a tension at rest, see `Law.build`.
+        """
         return LawFunctions(*(self.ti.func(function) for function in law.build(self.operations, tense=tense)))
 
     def get(self, kind: type[AnyTerm]) -> AnyTerm | None:
@@ -287,9 +311,8 @@ def build_max_lane(config: KernelConfig) -> Callable[..., Any]:
 class KernelSheet(NamedTuple):
     """A sheet within a kernel; `solver.arrays` describes the arrays."""
 
-    # u, d: displacements, with bending also moments, and last differences, each as three arrays for x, y and z
-    u: Any
-    d: Any
+    u: Any  # displacements [m], with bending also moments, as three arrays for x, y and z
+    d: Any  # last differences [m], as three arrays
     by_column: Any
     stiffness: Any
     fields: Any
@@ -303,10 +326,9 @@ class KernelRow(NamedTuple):
 
     i: Any  # index of the row
     kind: Any  # 0 for the first row of the sheet, 2 for the last, 1 for all others
-    # before, at, after: with bending, rows of u with the moments of the previous row, of row i and of the next row
-    before: Any
-    at: Any
-    after: Any
+    before: Any  # with bending, row of u with the moments of the previous row
+    at: Any  # with bending, row of u with the moments of row i
+    after: Any  # with bending, row of u with the moments of the next row
 
 
 class Entry(NamedTuple):

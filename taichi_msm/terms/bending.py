@@ -46,7 +46,7 @@ class BendingTerm(Term):
 
     @staticmethod
     def stiffness_bound(material: Material, sheet: Sheet) -> float:
-        """Return (4 / dx^2 + 4 / dy^2)^2 D dx dy [N/m], from the largest eigenvalue of the discrete Laplacian."""
+        # The largest eigenvalue of the discrete Laplacian is 4 / dx^2 + 4 / dy^2.
         dx, dy = spacing(sheet)
         return material.bending * (4 / dx**2 + 4 / dy**2) ** 2
 
@@ -63,7 +63,7 @@ class BendingTerm(Term):
 
         @ti.func
         def store_moment(sheet: ti.template(), i, before, row, after, b, target):
-            """Store the curved of entry b of row i, which is row `row` of u, in row `target` of u."""
+            """Store the moment of entry b of row i, which is row `row` of u, in row `target` of u."""
             dx, dy, stiffness = sheet.constants[DX], sheet.constants[DY], sheet.constants[constant]
             across, down = stiffness / (dx * dx), stiffness / (dy * dy)
             for c in ti.static(range(3)):

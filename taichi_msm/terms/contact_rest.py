@@ -5,8 +5,7 @@ displacement u' that a rough tool reaches when its tip is at c' sticks to it: wi
 held as by a grip until the tool would pull it, that is, until the sum F of all other forces on it points out of the
 tool, F . n > 0.
 
-In all functions `memory` is that of the term, shape (numbers, rows, cols), and displacements x - X [m] and forces [N]
-have the shape (rows, cols, 3).
+The memory of the term (`ContactTerm.memory`) contains the normals of contact and the holders of mass points.
 """
 
 from __future__ import annotations
@@ -33,15 +32,14 @@ from taichi_msm.terms.contact import (
 
 Array = NDArray[np.float64]
 
-# A mass point within this share of the radius above the surface of a tool touches it.
-TOUCH_TOLERANCE = 1e-9
-
-# Mass points are released together if the pulls on them exceed this share of the largest pull.
-RELEASE_SHARE = 0.5
-
 
 def touched_points(tools: int, memory: Array) -> NDArray[np.bool_]:
-    """Return whether each of a number of tools touches or holds each mass point, shape (tools, rows, cols)."""
+    """Return whether each tool touches or holds each mass point, shape (tools, rows, cols).
+
+    Args:
+        tools: number of tools.
+        memory: memory of the term, shape (numbers, rows, cols).
+    """
     normals = memory[: CORRECTIONS * tools].reshape(tools, CORRECTIONS, *memory.shape[1:])
     touched = (normals != 0).any(axis=1)
     if len(memory) > CORRECTIONS * tools:
@@ -51,14 +49,26 @@ def touched_points(tools: int, memory: Array) -> NDArray[np.bool_]:
 
 
 def is_gripping(tools: Sequence[Tool], memory: Array) -> bool:
-    """Return whether the tip of any tool holds a mass point."""
+    """Return whether the tip of any tool holds a mass point.
+
+    Args:
+        tools: the position-controlled tools.
+        memory: memory of the term, shape (numbers, rows, cols).
+    """
     touching = [n + 1 for n, tool in enumerate(tools) if not isinstance(tool, Clamp)]
     begin = CORRECTIONS * len(tools) + HOLDER
     return bool(np.isin(memory[begin : begin + 1], touching).any())
 
 
 def set_tools(plan: Plan, frame: int, time: float, columns: Array) -> None:
-    """Write the positions of the tools at a time [s], up to that of a frame, into the columns of the term."""
+    """Write the positions of the tools into the columns of the term.
+
+    Args:
+        plan: plan of the run.
+        frame: number of the next frame, which determines the active grips.
+        time: time of the positions [s], at most that of the frame.
+        columns: row of the load table from the first column of the term on, in and out.
+    """
     for n, tool in enumerate(plan.tools):
         of_tool, centre = columns[COLUMNS + TOOL_COLUMNS * n :], tool.tip_centre(np.array([time]))[0]
         of_tool[TIP_AFTER : TIP_AFTER + 3] = centre
@@ -70,7 +80,14 @@ def set_tools(plan: Plan, frame: int, time: float, columns: Array) -> None:
 
 
 def memory_after_grips(plan: Plan, frame: int, displacement: Array, before: Array) -> Array:
-    """Return the memory at a frame, after grips ended and began, from memory and displacements at the frame before."""
+    """Return the memory at a frame, after grips ended and began, shape (numbers, rows, cols).
+
+    Args:
+        plan: plan of the run.
+        frame: number of the frame.
+        displacement: x - X at the previous frame [m], shape (rows, cols, 3).
+        before: memory at the previous frame, shape (numbers, rows, cols).
+    """
     tools, memory = plan.tools, before.copy()
     if len(memory) == CORRECTIONS * len(tools):
         return memory
@@ -106,9 +123,14 @@ def _centre_at_grip(plan: Plan, tool: Tool, frame: int) -> Array:
 
 
 def stick(plan: Plan, memory: Array, start: Array, end: Array, times: tuple[float, float]) -> Array:
-    """Return the memory after rough tools have taken the mass points that they reach between two times [s].
+    """Return the memory after mass points began to stick to rough tools, shape (numbers, rows, cols).
 
-    `start` and `end` are the displacements at these times, `end` without further contact.
+    Args:
+        plan: plan of the run.
+        memory: memory before, shape (numbers, rows, cols).
+        start: x - X at the first time [m], shape (rows, cols, 3).
+        end: x - X at the second time without further contact [m], shape (rows, cols, 3).
+        times: times between which the tools move along straight lines [s].
     """
     tools, memory, rest = plan.tools, memory.copy(), rest_positions(plan.scene.sheet)
     fields = memory[CORRECTIONS * len(tools) :]
@@ -127,13 +149,24 @@ def stick(plan: Plan, memory: Array, start: Array, end: Array, times: tuple[floa
 
 
 def stuck_points(plan: Plan, memory: Array) -> NDArray[np.bool_]:
-    """Return whether each mass point sticks to a rough tool, shape (rows, cols)."""
+    """Return whether each mass point sticks to a rough tool, shape (rows, cols).
+
+    Args:
+        plan: plan of the run.
+        memory: memory of the term, shape (numbers, rows, cols).
+    """
     tools = len(plan.tools)
     return np.asarray((memory[CORRECTIONS * tools + HOLDER :][:1] > tools).any(axis=0))
 
 
 def without_rough_tools(plan: Plan, row: Array, first_column: int) -> Array:
-    """Return a row of the load table in which rough tools touch nothing, because their radius is 0."""
+    """Return a row of the load table in which rough tools touch nothing, because their radius is 0.
+
+    Args:
+        plan: plan of the run.
+        row: row of the load table, shape (1, columns).
+        first_column: first column of the term.
+    """
     row = row.copy()
     for n, tool in enumerate(plan.tools):
         if tool.rough:
@@ -142,9 +175,17 @@ def without_rough_tools(plan: Plan, row: Array, first_column: int) -> Array:
 
 
 def compute_pulls(plan: Plan, memory: Array, displacement: Array, force: Array, time: float) -> Array:
-    """Compute the pull of rough tools on the mass points that stick to them, 0 where they push [N], shape (rows, cols).
+    """Compute the pull of rough tools on the mass points that stick to them.
 
-    `force` is the sum of all forces but those of tools, and `time` that of the tools [s].
+    Args:
+        plan: plan of the run.
+        memory: memory of the term, shape (numbers, rows, cols).
+        displacement: x - X [m], shape (rows, cols, 3).
+        force: sum of all forces except those of tools [N], shape (rows, cols, 3).
+        time: time of the tools' positions [s].
+
+    Returns:
+        Pull along the outward normal [N], 0 where the tool pushes, shape (rows, cols).
     """
     tools, position = plan.tools, rest_positions(plan.scene.sheet) + displacement
     holder, pulls = memory[CORRECTIONS * len(tools) + HOLDER], np.zeros(plan.fixed.shape)
@@ -157,9 +198,17 @@ def compute_pulls(plan: Plan, memory: Array, displacement: Array, force: Array, 
 
 
 def release(plan: Plan, memory: Array, pulls: Array) -> Array:
-    """Return the memory without the mass points of the largest pulls, as each release relieves others."""
+    """Return the memory after the release of mass points, shape (numbers, rows, cols).
+
+    Only pulls above half the largest one lead to a release, because each release relieves other mass points.
+
+    Args:
+        plan: plan of the run.
+        memory: memory before, shape (numbers, rows, cols).
+        pulls: pull on each mass point [N], shape (rows, cols), not all 0.
+    """
     memory = memory.copy()
-    memory[CORRECTIONS * len(plan.tools) + HOLDER, pulls > RELEASE_SHARE * pulls.max()] = 0
+    memory[CORRECTIONS * len(plan.tools) + HOLDER, pulls > 0.5 * pulls.max()] = 0
     return memory
 
 
@@ -172,4 +221,5 @@ def _first_touch(tool: Tool, r: Array, motion: Array) -> Array:
     depth, *_ = tool.shape.build_depth(NUMPY)(*np.moveaxis(r, -1, 0), *tool.axis, tool.length, tool.radius)
     with np.errstate(divide="ignore", invalid="ignore"):
         first = np.where(enters & (t >= 0) & (distance > 0), t / distance, np.inf)
-    return np.asarray(np.where(depth >= -TOUCH_TOLERANCE * tool.radius, 0.0, first))
+    # Rounding can place a touching mass point just above the surface.
+    return np.asarray(np.where(depth >= -1e-9 * tool.radius, 0.0, first))

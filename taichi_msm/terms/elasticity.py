@@ -1,9 +1,9 @@
-"""The springs of a sheet as float64 arrays with their forces, energies and tangents, for SciPy and exports."""
+"""The springs of a sheet as float64 arrays with their energies and tangents, for SciPy and exports."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -12,34 +12,33 @@ from numpy.typing import NDArray
 from taichi_msm.arithmetic import NUMPY
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import area_shares, spacing
-from taichi_msm.terms.law import LawFunctions, law_numbers, spring_law
-from taichi_msm.terms.springs import MIN_SQUARED_LENGTH, spring_stiffness
+from taichi_msm.terms.law import LawFunctions, law_parameters, spring_law
+from taichi_msm.terms.springs import spring_stiffness
 
 Array = NDArray[np.float64]
 Window = tuple[slice, slice]
 
 
 class Elongation(NamedTuple):
-    """The elongation of each spring of a family."""
+    """The elongation of each spring of a family; arrays have the shape (...) of the springs."""
 
     difference: Array  # displacement of the end minus that of the start, q [m], shape (..., 3)
     edge: Array  # vector from start to end [m], shape (..., 3)
-    square_difference: Array  # L^2 - L0^2 [m2]
-    square: Array  # L^2 [m2]
+    square_difference: Array  # L^2 - L0^2 [m2], shape (...)
+    square: Array  # L^2 [m2], shape (...)
 
 
 class SpringFamily(NamedTuple):
     """All springs with the same offset between their ends."""
 
-    # start, end: slices of the mass points at both ends; `end` is below or to the right of `start`
-    start: Window
-    end: Window
+    start: Window  # slices of the mass points at the start of each spring
+    end: Window  # slices of the mass points at the end, below or to the right of the start
     offset: Array  # vector from start to end at rest [m], shape (3,)
     length: float  # at rest [m]
-    stiffness: Array  # k - tau of each spring [N/m], shape as selected by `start`
-    tension: Array  # tau of each spring, its tension at rest divided by its length [N/m]
+    stiffness: Array  # k - tau of each spring [N/m], shape (...) as selected by `start`
+    tension: Array  # tau of each spring, its tension at rest divided by its length [N/m], shape (...)
     law: LawFunctions
-    numbers: tuple[float, ...]  # of the law
+    parameters: tuple[float, ...]  # of the law
 
     def elongation(self, displacement: Array) -> Elongation:
         """Compute the elongation of each spring; displacement: x - X [m], shape (rows, cols, 3)."""
@@ -47,42 +46,45 @@ class SpringFamily(NamedTuple):
         edges = q + self.offset
         return Elongation(q, edges, (q * (edges + self.offset)).sum(axis=-1), (edges**2).sum(axis=-1))
 
-    def force(self, displacement: Array) -> Array:
-        """Compute the force of each spring on its start without the tension at rest [N], shape (..., 3)."""
-        q, edges, square_difference, square = self.elongation(displacement)
-        pull = self.law.pull(
-            self.stiffness, self.tension, square_difference, square + MIN_SQUARED_LENGTH, self.length, *self.numbers
-        )
-        return pull[..., None] * edges + self.tension[..., None] * q
-
     def tangent(self, displacement: Array) -> Array:
-        """Compute the symmetric derivative of each spring's force by the position of an end [N/m], (..., 3, 3)."""
+        """Compute the derivative of each spring's force by the position of an end [N/m], shape (..., 3, 3)."""
         _, edges, square_difference, square = self.elongation(displacement)
-        isotropic, axial, *_ = self.slopes(square_difference, square, 1.0)
+        isotropic, axial, *_ = self.derivatives(square_difference, square, 1.0)
         along = axial[..., None, None] * edges[..., :, None] * edges[..., None, :]
         return (isotropic + self.tension)[..., None, None] * np.eye(3) + along
 
-    def slopes(self, square_difference: Array, square: Array, along: Array | float) -> tuple[Array, ...]:
-        """Apply the slopes of the law."""
-        return self.law.slopes(
-            self.stiffness, self.tension, square_difference, square, self.length, along, *self.numbers
+    def derivatives(self, square_difference: Array, square: Array, along: Array | float) -> tuple[Array, ...]:
+        """Return `LawFunctions.derivatives` for each spring, shape (...) each.
+
+        Args:
+            square_difference: L^2 - L0^2 [m2], shape (...).
+            square: L^2 [m2], shape (...).
+            along: (o + q) . p for a displacement p of an end [m2], shape (...).
+        """
+        return self.law.derivatives(
+            self.stiffness, self.tension, square_difference, square, self.length, along, *self.parameters
         )
 
-    def by_numbers(self, square_difference: Array, square: Array) -> tuple[Array, Array]:
-        """Apply the derivatives of the law with respect to its numbers."""
+    def parameter_derivatives(self, square_difference: Array, square: Array) -> tuple[Array, Array]:
+        """Return `LawFunctions.parameter_derivatives` for each spring, shape (...) each.
+
+        Args:
+            square_difference: L^2 - L0^2 [m2], shape (...).
+            square: L^2 [m2], shape (...).
+        """
         arguments = self.stiffness, self.tension, square_difference, square, self.length
-        by_lock, by_factor = self.law.by_numbers(*arguments, *self.numbers)
+        by_lock, by_factor = self.law.parameter_derivatives(*arguments, *self.parameters)
         return by_lock, by_factor
 
     def energy(self, displacement: Array) -> Array:
-        """Compute the energy of each spring above that at rest [J].
+        """Compute the energy of each spring above that at rest [J], shape (...).
 
         The part that is linear in the displacement is left out. Its sum over all springs is 0, because the sheet is in
         equilibrium at rest.
         """
         q, _, square_difference, _ = self.elongation(displacement)
         share = square_difference / self.length**2
-        stretched = self.law.energy(self.stiffness, self.tension, share, *self.numbers)
+        stretched = self.law.energy(self.stiffness, self.tension, share, *self.parameters)
         return (stretched * self.length**2 + self.tension * (q**2).sum(axis=-1)) / 2
 
 
@@ -106,25 +108,22 @@ def spring_families(plan: Plan) -> Iterator[SpringFamily]:
         length = math.hypot(right * dx, down * dy)
         tension = np.broadcast_to(material.tension * unmapped, stiffness.shape)
         offset = np.array([right * dx, -down * dy, 0.0])
-        numbers = law_numbers(material.stiffening, length)
-        yield SpringFamily(start, end, offset, length, stiffness - tension, tension, law, numbers)
-
-
-def elastic_force(families: Sequence[SpringFamily], displacement: Array) -> Array:
-    """Sum the forces of the springs (eq. 2), without the tension at rest [N], shape (rows, cols, 3)."""
-    force = np.zeros_like(displacement)
-    for family in families:
-        forward = family.force(displacement)
-        force[family.start] += forward
-        force[family.end] -= forward
-    return force
+        parameters = law_parameters(material.stiffening, length)
+        yield SpringFamily(start, end, offset, length, stiffness - tension, tension, law, parameters)
 
 
 def energy_density(plan: Plan, displacement: Array) -> Array:
-    """Compute the energy density of the springs, without bending and foundation [J/m2], shape (rows, cols).
+    """Compute the energy density of the springs, without bending and foundation.
 
     Each end of a spring has half of its energy. The sum of density times `area_shares` times the area of a cell is
     therefore the energy of all springs, relative to the state at rest.
+
+    Args:
+        plan: plan of the run.
+        displacement: x - X [m], shape (rows, cols, 3).
+
+    Returns:
+        Energy density [J/m2], shape (rows, cols).
     """
     by_point, (dx, dy) = np.zeros(displacement.shape[:2]), spacing(plan.scene.sheet)
     for family in spring_families(plan):

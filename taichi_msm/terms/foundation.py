@@ -23,7 +23,7 @@ from taichi_msm.model.sheet import Material, area_shares, spacing
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Foundation, Sheet
 from taichi_msm.terms.base import AREA_SHARE, KernelConfig, Term
-from taichi_msm.terms.law import LockingLaw, build_locking, law_numbers, make_stiffening
+from taichi_msm.terms.law import LockingLaw, build_locking, law_parameters, make_stiffening
 
 
 @dataclass(frozen=True)
@@ -86,10 +86,10 @@ class FoundationTerm(Term):
 
     @property
     def constant_count(self) -> int:  # type: ignore[override]
-        return LockingLaw.number_count if self.locks else 0
+        return LockingLaw.parameter_count if self.locks else 0
 
     def constants(self, plan: Plan) -> tuple[float, ...]:
-        return law_numbers(plan.material.virtual_stiffening, 1.0)
+        return law_parameters(plan.material.virtual_stiffening, 1.0)
 
     def build_forces(self, config: KernelConfig) -> Sequence[Callable[..., Any]]:
         return (self._build_add(config, tangent=False),)
@@ -113,9 +113,10 @@ class FoundationTerm(Term):
         return add
 
     def build_derivatives(self, config: KernelConfig) -> Callable[..., Any]:
-        """Build the Taichi function derive(sheet, p, u), derivatives of minus the product of p with the force.
+        """Build the Taichi function derive(sheet, p, u) for derivatives of minus the product of p with the force.
 
-        It returns those with respect to K, and for K = 1 with respect to log(lock) and the factor.
+        Returns:
+            A function that returns the derivatives with respect to K, and for K = 1 to log(lock) and the factor.
         """
         ti, locks, first, law = config.ti, self.locks, config.first_constant(FoundationTerm), self._build_law(config)
         secant, tangent = law
@@ -172,37 +173,64 @@ def _steepest(material: Material) -> float:
 
 
 def foundation_force(material: Material, k: NDArray[Any] | float, displacement: NDArray[Any]) -> NDArray[Any]:
-    """Compute the force of the foundation [N], for its stiffness k [N/m] at all or at each of the mass points."""
+    """Return the force of the foundation on each mass point [N], shape (rows, cols, 3).
+
+    Args:
+        material: coefficients of the sheet.
+        k: stiffness [N/m], a number or shape (rows, cols).
+        displacement: x - X [m], shape (rows, cols, 3).
+    """
     force = -np.asarray(k)[..., None] * displacement
     if material.virtual_stiffening is not None:
-        scale, end, _ = law_numbers(material.virtual_stiffening, 1.0)
+        scale, end, _ = law_parameters(material.virtual_stiffening, 1.0)
         force[..., 2] *= build_locking(NUMPY).secant(-displacement[..., 2] * scale, end)
     return force
 
 
 def foundation_energy(material: Material, k: NDArray[Any] | float, displacement: NDArray[Any]) -> float:
-    """Compute the energy of the foundation [J], with arguments as for `foundation_force`."""
+    """Return the energy of the foundation [J].
+
+    Args:
+        material: coefficients of the sheet.
+        k: stiffness [N/m], a number or shape (rows, cols).
+        displacement: x - X [m], shape (rows, cols, 3).
+    """
     square = displacement**2
     if material.virtual_stiffening is not None:
-        scale, end, lock = law_numbers(material.virtual_stiffening, 1.0)
+        scale, end, lock = law_parameters(material.virtual_stiffening, 1.0)
         square[..., 2] = lock**2 * build_locking(NUMPY).energy(-displacement[..., 2] * scale, end)
     return float((k * square.sum(axis=-1)).sum()) / 2
 
 
 def foundation_derivatives(material: Material, k: NDArray[Any], u_z: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Differentiate the z component of `foundation_force` with respect to log(lock) and to the factor [N]."""
+    """Differentiate the z component of `foundation_force` with respect to log(lock) and to the factor.
+
+    Args:
+        material: coefficients of the sheet.
+        k: stiffness [N/m], shape (rows, cols).
+        u_z: z component of x - X [m], shape (rows, cols).
+
+    Returns:
+        Both derivatives [N], shape (rows, cols) each; 0 for a linear foundation.
+    """
     if material.virtual_stiffening is None:
         return np.zeros_like(u_z), np.zeros_like(u_z)
-    (scale, end, lock), law = law_numbers(material.virtual_stiffening, 1.0), build_locking(NUMPY)
+    (scale, end, lock), law = law_parameters(material.virtual_stiffening, 1.0), build_locking(NUMPY)
     x = -u_z * scale
     return -k * u_z * (law.secant(x, end) - law.tangent(x, end)), k * lock * np.maximum(x - end, 0)
 
 
 def foundation_tangent(material: Material, k: NDArray[Any], displacement: NDArray[Any]) -> NDArray[Any]:
-    """Compute the derivative of minus `foundation_force` along x, y and z [N/m], shape (rows, cols, 3)."""
+    """Return the diagonal of the derivative of minus `foundation_force` [N/m], shape (rows, cols, 3).
+
+    Args:
+        material: coefficients of the sheet.
+        k: stiffness [N/m], shape (rows, cols).
+        displacement: x - X [m], shape (rows, cols, 3).
+    """
     tangent = np.repeat(k[..., None], 3, axis=-1)
     if material.virtual_stiffening is not None:
-        scale, end, _ = law_numbers(material.virtual_stiffening, 1.0)
+        scale, end, _ = law_parameters(material.virtual_stiffening, 1.0)
         tangent[..., 2] *= build_locking(NUMPY).tangent(-displacement[..., 2] * scale, end)
     return tangent
 

@@ -36,43 +36,44 @@ from typing import Any, ClassVar, NamedTuple
 
 from taichi_msm.arithmetic import Operations
 from taichi_msm.model.sheet import LockNumbers
-from taichi_msm.scene.sheet import Tissue
-
-# Up to this y, atanh(y) - y is computed by its series.
-MAX_SERIES_Y = 0.1
 
 
 class LawFunctions(NamedTuple):
     """The functions of a law.
 
-    In them `k` is k - tau and `tau` is tau [N/m], `square_difference` is L^2 - L0^2, `square` is L^2, `length` is L0,
-    and `numbers` are those of the law.
+    Their arguments are k - tau and tau [N/m] as `k` and `tau`, L^2 - L0^2 and L^2 [m2] as `square_difference` and
+    `square`, L0 [m] as `length`, and the parameters of the law (`law_parameters`).
 
     Attributes:
-        pull: pull(k, tau, square_difference, square, length, *numbers), the force divided by L, without tau q [N/m].
-        slopes: slopes(k, tau, square_difference, square, length, along, *numbers) for a displacement p of an end, with
-            along = (o + q) . p. It returns s, w and the derivatives of `pull` by k and by tau. The force changes by
-            s p + w (o + q), without tau p.
-        by_numbers: by_numbers(k, tau, square_difference, square, length, *numbers), the derivatives of `pull` with
-            respect to the logarithm of the lock and to the factor.
-        energy: energy(k, tau, share, *numbers) for share = (L^2 - L0^2) / L0^2, twice the energy divided by
+        pull: pull(k, tau, square_difference, square, length, *parameters), the force divided by L, without tau q [N/m].
+        derivatives: derivatives(k, tau, square_difference, square, length, along, *parameters) returns s, w, and the
+            derivatives of `pull` with respect to k and tau. A displacement p of an end, with along = (o + q) . p,
+            changes the force by s p + w (o + q), without tau p.
+        parameter_derivatives: parameter_derivatives(k, tau, square_difference, square, length, *parameters), the
+            derivatives of `pull` with respect to the logarithm of the lock and to the factor.
+        energy: energy(k, tau, share, *parameters) for share = (L^2 - L0^2) / L0^2, twice the energy divided by
             L0^2, without tau q^2 [N/m].
     """
 
     pull: Callable[..., Any]
-    slopes: Callable[..., Any]
-    by_numbers: Callable[..., Any]
+    derivatives: Callable[..., Any]
+    parameter_derivatives: Callable[..., Any]
     energy: Callable[..., Any]
 
 
 class Law(ABC):
-    """A law, as a frozen dataclass without numbers."""
+    """A law, as a frozen dataclass without coefficients."""
 
-    number_count: ClassVar[int] = 0  # count of numbers of a spring
+    parameter_count: ClassVar[int] = 0  # number of parameters of a spring
 
     @abstractmethod
     def build(self, operations: Operations, *, tense: bool = True) -> LawFunctions:
-        """Build the functions of the law for NumPy or Taichi; if not `tense`, `pull` ignores tau, because it is 0."""
+        """Return the functions of the law.
+
+        Args:
+            operations: operations of NumPy or Taichi.
+            tense: whether the springs have a tension at rest; otherwise `pull` ignores tau, which is 0.
+        """
 
 
 @dataclass(frozen=True)
@@ -85,14 +86,14 @@ class LinearLaw(Law):
         def pull(k, tau, square_difference, square, length):
             return k * square_difference / (square + length * sqrt(square))
 
-        def slopes(k, tau, square_difference, square, length, along):
+        def derivatives(k, tau, square_difference, square, length, along):
             both = square + length * sqrt(square)
             # One division instead of two.
             inverse = 1 / (square * both)
             share = square_difference * square * inverse
             return k * share, k * ((1 - share) * both * inverse * along), share, 0 * share
 
-        def by_numbers(k, tau, square_difference, square, length):
+        def parameter_derivatives(k, tau, square_difference, square, length):
             return 0 * k, 0 * k
 
         def energy(k, tau, share):
@@ -100,7 +101,7 @@ class LinearLaw(Law):
             stretch = share / (1 + sqrt(maximum(share + 1, 0)))
             return stretch * stretch * k
 
-        return LawFunctions(pull, slopes, by_numbers, energy)
+        return LawFunctions(pull, derivatives, parameter_derivatives, energy)
 
 
 LINEAR = LinearLaw()
@@ -115,7 +116,7 @@ class LockingFunctions(NamedTuple):
 
 
 def build_locking(operations: Operations) -> LockingFunctions:
-    """Build the functions of the law that locks."""
+    """Build the functions of the law that locks, for NumPy or Taichi."""
     log, maximum, minimum, where = operations.log, operations.maximum, operations.minimum, operations.where
 
     def secant(x, end):
@@ -130,9 +131,9 @@ def build_locking(operations: Operations) -> LockingFunctions:
         inner = minimum(maximum(x, 0), end)
         # -inner - log(1 - inner) = y^2 (2 - inner) + 2 (atanh(y) - y), which avoids cancellation.
         y = inner / (2 - inner)
-        square, one = y * y, 1 + 0 * y
-        series = square * (one / 3 + square * (one / 5 + square * (one / 7 + square * (one / 9 + square / 11))))
-        excess = where(y < MAX_SERIES_Y, series * y, log((1 + y) / (1 - y)) / 2 - y)
+        square, unit = y * y, 1 + 0 * y
+        series = square * (unit / 3 + square * (unit / 5 + square * (unit / 7 + square * (unit / 9 + square / 11))))
+        excess = where(y < 0.1, series * y, log((1 + y) / (1 - y)) / 2 - y)
         slope = 1 / (1 - inner)
         beyond = x - inner
         return 2 * (square * (2 - inner) + 2 * excess) + beyond * (2 * inner * slope + beyond * (slope * slope))
@@ -141,12 +142,22 @@ def build_locking(operations: Operations) -> LockingFunctions:
 
 
 def make_stiffening(lock: float | None, factor: float) -> LockNumbers | None:
-    """Return the numbers of a law that locks; None for a linear law."""
+    """Return the parameters of a law that locks; None for a linear law.
+
+    Args:
+        lock: strain m of springs, or depth m of a foundation [m]; None for a linear law.
+        factor: ratio of the largest stiffness to that at rest.
+    """
     return None if lock is None or factor == 1 else LockNumbers(lock, factor)
 
 
-def law_numbers(stiffening: LockNumbers | None, length: float) -> tuple[float, ...]:
-    """Return 1 / (m L0), x0 and m for a spring of length L0 [m]; none for a linear law. For the foundation L0 is 1."""
+def law_parameters(stiffening: LockNumbers | None, length: float) -> tuple[float, ...]:
+    """Return the parameters of a law for kernels: 1 / (m L0), x0 and m; () for a linear law.
+
+    Args:
+        stiffening: lock m and factor; None for a linear law.
+        length: length L0 of the springs [m]; 1 for the foundation.
+    """
     if stiffening is None:
         return ()
     return 1 / (stiffening.lock * length), 1 - stiffening.factor**-0.5, stiffening.lock
@@ -154,9 +165,9 @@ def law_numbers(stiffening: LockNumbers | None, length: float) -> tuple[float, .
 
 @dataclass(frozen=True)
 class LockingLaw(Law):
-    """The law of springs that lock, see above; its numbers are `law_numbers`."""
+    """The law of springs that lock, with the parameters 1 / (m L0), x0 and m."""
 
-    number_count: ClassVar[int] = 3
+    parameter_count: ClassVar[int] = 3
 
     def build(self, operations: Operations, *, tense: bool = True) -> LawFunctions:
         sqrt, maximum, minimum = operations.sqrt, operations.maximum, operations.minimum
@@ -181,7 +192,7 @@ class LockingLaw(Law):
             divisor = (square + length * root) * ((1 - inner) * (1 - inner) * beyond)
             return k * square_difference * (beyond - inner * end) / divisor
 
-        def slopes(k, tau, square_difference, square, length, along, scale, end, lock):
+        def derivatives(k, tau, square_difference, square, length, along, scale, end, lock):
             root = sqrt(square)
             share = square_difference / (square + length * root)
             x = share * root * scale
@@ -190,7 +201,7 @@ class LockingLaw(Law):
             axial = ((k + tau) * tangent(x, end) - tau - isotropic) / square * along
             return isotropic, axial, share * ratio, share * (ratio - 1)
 
-        def by_numbers(k, tau, square_difference, square, length, scale, end, lock):
+        def parameter_derivatives(k, tau, square_difference, square, length, scale, end, lock):
             root = sqrt(square)
             share = square_difference / (square + length * root)
             x = share * root * scale
@@ -201,15 +212,9 @@ class LockingLaw(Law):
             stretch = share / (1 + sqrt(maximum(share + 1, 0)))
             return (k + tau) * (lock * lock) * integral(stretch / lock, end) - tau * stretch * stretch
 
-        return LawFunctions(pull if tense else pull_untensed, slopes, by_numbers, energy)
+        return LawFunctions(pull if tense else pull_untensed, derivatives, parameter_derivatives, energy)
 
 
-def spring_numbers(tissue: Tissue) -> LockNumbers | None:
-    """Return the numbers of the law of the springs of a tissue; None for a linear law."""
-    keys = tissue.stiffening
-    return None if keys is None else make_stiffening(keys.lock, keys.factor)
-
-
-def spring_law(numbers: LockNumbers | None) -> Law:
-    """Return the law of springs with these numbers."""
-    return LINEAR if numbers is None else LockingLaw()
+def spring_law(stiffening: LockNumbers | None) -> Law:
+    """Return the law of springs with a lock and a factor; None for linear springs."""
+    return LINEAR if stiffening is None else LockingLaw()

@@ -98,7 +98,7 @@ class ProbeTerm(Term):
                 f"{_format_flags(self.moves)}); restart with the new scene"
             )
         if self.by_area != compiled.by_area:
-            return "one has total instead of force, or the reverse; restart with the new scene"
+            return "a probe has total instead of force, or the reverse; restart with the new scene"
         return ""
 
     def decay_gradients(self, plan: Plan) -> NDArray[Any]:
@@ -107,12 +107,17 @@ class ProbeTerm(Term):
         gradients = [decay_gradient(scene.probes[slot.probe], scene.sheet) for slot in plan.slots if not slot.moves]
         return np.array(gradients).reshape(-1, 2, *scene.sheet.points)
 
-    def build_load_adjoint(self, config: KernelConfig, first_slope: int) -> Callable[..., None]:
-        """Build the function add_adjoint(sums, sheet, entry, now), the adjoint of the loads.
+    def build_load_adjoint(self, config: KernelConfig, first_gradient: int) -> Callable[..., None]:
+        """Build the adjoint of the loads.
 
-        It differentiates the product of the force of each slot and `entry.u`, by the force (3) and by the control point
-        (2), and adds these derivatives to the list `sums`. `first_slope` is the index of the first array of
-        `decay_gradients` in `sheet.derivatives`, counted in arrays of the sheet.
+        Args:
+            config: compile-time configuration.
+            first_gradient: index of the first field of `decay_gradients` among the fields in `sheet.derivatives`.
+
+        Returns:
+            The Taichi function add_adjoint(sums, sheet, entry, now). It differentiates the product of the force of each
+            slot and `entry.u` with respect to the force (3) and the control point (2), and adds the derivatives to the
+            list `sums`.
         """
         ti = config.ti
         moves, by_area, first = self.moves, self.by_area, config.first_column(ProbeTerm)
@@ -124,7 +129,7 @@ class ProbeTerm(Term):
             i, b = entry.row.i, entry.b
             for n in ti.static(range(len(moves))):
                 column = ti.static(first + SLOT_COLUMNS * n)
-                share, slope = vector(0), [vector(0), vector(0)]
+                share, gradient = vector(0), [vector(0), vector(0)]
                 if ti.static(moves[n]):
                     off_x = sheet.by_column[REST_X * sheet.width + b] - now[column + POINT]
                     off_y = sheet.constants[TOP_Y] - i * sheet.constants[DY] - now[column + POINT + 1]
@@ -137,18 +142,18 @@ class ProbeTerm(Term):
                     share = vector([ti.exp(-exponent[lane]) for lane in ti.static(range(lanes))])
                     if ti.static(by_area[n]):
                         share *= sheet.by_column[(AREA_SHARE + entry.row.kind) * sheet.width + b]
-                    slope[0], slope[1] = share * falloff_by_distance * off_x, share * falloff_by_distance * off_y
+                    gradient[0], gradient[1] = share * falloff_by_distance * off_x, share * falloff_by_distance * off_y
                 else:
                     share = sheet.fields[((first_field + stationary[n]) * sheet.rows + i) * sheet.width + b]
                     for axis in ti.static(range(2)):
-                        row = (first_slope + 2 * stationary[n] + axis) * sheet.rows + i
-                        slope[axis] = sheet.derivatives[row * sheet.width + b]
+                        row = (first_gradient + 2 * stationary[n] + axis) * sheet.rows + i
+                        gradient[axis] = sheet.derivatives[row * sheet.width + b]
                 work = vector(0)
                 for c in ti.static(range(3)):
                     sums[5 * n + c] += share * entry.u[c]
                     work += now[column + c] * entry.u[c]
                 for axis in ti.static(range(2)):
-                    sums[5 * n + 3 + axis] += work * slope[axis]
+                    sums[5 * n + 3 + axis] += work * gradient[axis]
 
         return add_adjoint
 
@@ -170,7 +175,12 @@ def max_free_acceleration(plan: Plan) -> float:
 
 
 def force_norm(slot: ProbeSlot, scene: Scene) -> float:
-    """Bound the Euclidean norm of the forces on all mass points for a force of 1 N at the control point."""
+    """Return a bound of the Euclidean norm of the decay factors of all mass points.
+
+    Args:
+        slot: slot of a probe, whose control point may move.
+        scene: scene of the slot.
+    """
     if not slot.moves:
         return float(np.linalg.norm(decay(scene.probes[slot.probe], scene.sheet)))
     # The control point is within half a cell's diagonal of some mass point. Four copies of the sheet that meet at this

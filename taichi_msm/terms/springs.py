@@ -32,7 +32,7 @@ from taichi_msm.model.sheet import Material, largest_mean, spacing
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.sheet import Sheet
 from taichi_msm.terms.base import AREA_SHARE, DX, DY, HAS_LEFT, HAS_RIGHT, KernelConfig, Term
-from taichi_msm.terms.law import LINEAR, Law, law_numbers, spring_law, spring_numbers
+from taichi_msm.terms.law import LINEAR, Law, law_parameters, make_stiffening, spring_law
 
 # Families of springs.
 ALONG_ROW, ALONG_COLUMN, DIAGONAL = range(3)
@@ -41,8 +41,8 @@ ALONG_ROW, ALONG_COLUMN, DIAGONAL = range(3)
 # tension, for each family the sum of |q|^2 / L0^2.
 MIN_STRAIN, MAX_STRAIN, STRETCH_SUMS, TENSION_SUMS = 0, 1, 2, 5
 
-# Constants: k - tau of each family, followed by tau of each family, and by the numbers of the law for each family.
-FIRST_TENSION, FIRST_NUMBER = 3, 6
+# Constants: k - tau of each family, followed by tau of each family, and by the parameters of the law for each family.
+FIRST_TENSION, FIRST_PARAMETER = 3, 6
 
 # Prevents a division by 0 at L = 0, where the force then is 0. Literals in kernels are f32, which can represent it.
 MIN_SQUARED_LENGTH = 1e-36
@@ -72,7 +72,7 @@ class SpringTerm(Term):
 
     @property
     def constant_count(self) -> int:  # type: ignore[override]
-        return FIRST_NUMBER + 3 * self.law.number_count
+        return FIRST_PARAMETER + 3 * self.law.parameter_count
 
     @staticmethod
     def derive(scene: Scene) -> dict[str, Any]:
@@ -82,13 +82,13 @@ class SpringTerm(Term):
             stiffness = {"across": springs.structural, "down": springs.structural, "shear": springs.shear}
             return {**stiffness, "tension": 0.0, "stiffening": None}
         dx, dy = spacing(scene.sheet)
-        membrane = tissue.young * tissue.thickness
+        membrane, stiffening = tissue.young * tissue.thickness, tissue.stiffening
         return {
             "across": membrane * (9 / 8 * dy / dx - 3 / 8 * dx / dy),
             "down": membrane * (9 / 8 * dx / dy - 3 / 8 * dy / dx),
             "shear": 3 / 16 * membrane * (dx * dx + dy * dy) / (dx * dy),
             "tension": tissue.pretension / (1.5 * membrane),
-            "stiffening": spring_numbers(tissue),
+            "stiffening": None if stiffening is None else make_stiffening(stiffening.lock, stiffening.factor),
         }
 
     @classmethod
@@ -106,7 +106,11 @@ class SpringTerm(Term):
 
     @staticmethod
     def stiffness_bound(material: Material, sheet: Sheet) -> float:
-        """Bound m w^2 of the springs [N/m], as long as no spring is shorter than half its rest length.
+        """Return a bound of m w^2 [N/m], as long as no spring is shorter than half its rest length.
+
+        Args:
+            material: coefficients of the sheet.
+            sheet: section `sheet` of the scene.
 
         The energy is a sum over cells. A spring of a cell has at most the energy k / 2 |q|^2. With a quarter of the
         mass of a mass point at each corner, every mode of a cell, and hence every mode of the sheet, satisfies
@@ -141,29 +145,30 @@ class SpringTerm(Term):
         remainder = 1 - material.tension
         stiffness = material.across * remainder, material.down * remainder, material.shear * remainder
         lengths = dx, dy, math.hypot(dx, dy)
-        numbers = (number for length in lengths for number in law_numbers(material.stiffening, length))
-        return *stiffness, *material.tensions, *numbers
+        parameters = (value for length in lengths for value in law_parameters(material.stiffening, length))
+        return *stiffness, *material.tensions, *parameters
 
     def energy(self, sums: NDArray[Any], plan: Plan) -> float:
         dx, dy = spacing(plan.scene.sheet)
         squares = np.array([dx**2, dy**2, dx**2 + dy**2])
         return float((sums[STRETCH_SUMS:TENSION_SUMS] + plan.material.tensions * sums[TENSION_SUMS:]) @ squares)
 
-    def build_numbers(self, config: KernelConfig) -> Callable[..., Any]:
-        """Build the Taichi function that returns the numbers of the law for a family of springs, as a list."""
-        ti, count, first = config.ti, self.law.number_count, config.first_constant(SpringTerm) + FIRST_NUMBER
+    def build_parameters(self, config: KernelConfig) -> Callable[..., Any]:
+        """Build the Taichi function that returns the parameters of the law for a family of springs, as a list."""
+        ti, count, first = config.ti, self.law.parameter_count, config.first_constant(SpringTerm) + FIRST_PARAMETER
 
         @ti.func
-        def numbers_of(sheet: ti.template(), family: ti.template()):
+        def parameters_of(sheet: ti.template(), family: ti.template()):
             return [sheet.constants[first + count * family + n] for n in ti.static(range(count))]
 
-        return numbers_of
+        return parameters_of
 
     def build_shares(self, config: KernelConfig) -> tuple[Callable[..., Any], Callable[..., Any]]:
-        """Build the Taichi functions share_of_row(exists, kind) and share_of_column(sheet, exists, b).
+        """Build the Taichi functions for the argument `exists` of the force of a spring.
 
-        In a sheet with `tense_edges` the argument `exists` of a spring's force is the share of its cells that exist,
-        because its tension is their sum. Elsewhere they return `exists` as it is.
+        Returns:
+            share_of_row(exists, kind) and share_of_column(sheet, exists, b). In a sheet with `tense_edges` they return
+            the share of the spring's cells that exist, because its tension is their sum; otherwise `exists`.
         """
         ti, real, tense_edges = config.ti, config.real, self.tense_edges
 
@@ -184,16 +189,19 @@ class SpringTerm(Term):
         return share_of_row, share_of_column
 
     def build_spring_forces(self, config: KernelConfig) -> tuple[Callable[..., Any], ...]:
-        """Build the Taichi functions of springs.
+        """Build the Taichi functions for the forces and stiffness of springs.
 
-        They are along and to_other_row, the forces within a row and between two rows; and of_row, of_column and
-        of_diagonal, the stiffness of a spring of each family.
+        Returns:
+            along(sheet, right, u, k, exists), the force [N] of a mass point with displacement u on its right neighbour,
+            entry `right` of u; to_other_row(sheet, entry, right, u, up, length, k, exists), that on `entry` of a row
+            `up` [m] above and `right` columns to the right; and of_row(sheet, i, kind, b), of_column(sheet, lower, b)
+            and of_diagonal(sheet, lower, b), the stiffness k - tau [N/m] of a spring of each family.
         """
         ti = config.ti
         tense, mapped, by_area = self.tense, self.mapped, self.by_area and not self.mapped
         open_edges, real, first = self.open_edges, config.real, config.first_constant(SpringTerm)
         tense_edges, vector = self.tense_edges, config.vector
-        first_tension, numbers_of = first + FIRST_TENSION, self.build_numbers(config)
+        first_tension, parameters_of = first + FIRST_TENSION, self.build_parameters(config)
         pull = config.compile_law(self.law, tense=self.tense).pull
 
         @ti.func
@@ -218,8 +226,8 @@ class SpringTerm(Term):
             to: ti.template(), q: ti.template(),
         ):  # fmt: skip
             """Return the force of a spring of a family, for k - tau, 0 beyond an edge, L^2 - L0^2, L^2 and L0."""
-            tension, numbers = tension_of(sheet, family, exists), numbers_of(sheet, family)
-            share = pull(masked(k, exists), tension, square_difference, square, length, *numbers)
+            tension, parameters = tension_of(sheet, family, exists), parameters_of(sheet, family)
+            share = pull(masked(k, exists), tension, square_difference, square, length, *parameters)
             total = [share * to[c] for c in ti.static(range(3))]
             if ti.static(tense):
                 for c in ti.static(range(3)):
@@ -227,10 +235,10 @@ class SpringTerm(Term):
             return total
 
         @ti.func
-        def along(sheet: ti.template(), right, here: ti.template(), k, exists):
-            """Return the force of a mass point displaced by `here` on its right neighbour, entry `right` of u."""
+        def along(sheet: ti.template(), right, u: ti.template(), k, exists):
+            """Return the force of a mass point displaced by `u` on its right neighbour, entry `right`."""
             dx = sheet.constants[DX]
-            x, y, z = here[0] - sheet.u[0][right], here[1] - sheet.u[1][right], here[2] - sheet.u[2][right]
+            x, y, z = u[0] - sheet.u[0][right], u[1] - sheet.u[1][right], u[2] - sheet.u[2][right]
             to_x = x - dx
             rest = y * y + z * z
             square_difference = x * (to_x - dx) + rest
@@ -238,9 +246,9 @@ class SpringTerm(Term):
             return force(sheet, ALONG_ROW, k, exists, square_difference, square, dx, [to_x, y, z], [x, y, z])
 
         @ti.func
-        def to_other_row(sheet: ti.template(), entry, right: ti.template(), here: ti.template(), up, length, k, exists):
-            """Return the force of a mass point displaced by `here` on `entry`, `up` [m] above, `right` columns on."""
-            x, y, z = here[0] - sheet.u[0][entry], here[1] - sheet.u[1][entry], here[2] - sheet.u[2][entry]
+        def to_other_row(sheet: ti.template(), entry, right: ti.template(), u: ti.template(), up, length, k, exists):
+            """Return the force of a mass point displaced by `u` on `entry`, `up` [m] above, `right` columns on."""
+            x, y, z = u[0] - sheet.u[0][entry], u[1] - sheet.u[1][entry], u[2] - sheet.u[2][entry]
             to_x = x
             to_y = y - up
             rest = z * z
@@ -294,11 +302,11 @@ class SpringTerm(Term):
         ti, tense, count, law = (
             config.ti,
             self.tense,
-            self.law.number_count,
+            self.law.parameter_count,
             config.compile_law(self.law, tense=self.tense),
         )
-        slopes, by_numbers = law.slopes, law.by_numbers
-        first_tension, numbers_of = config.first_constant(SpringTerm) + FIRST_TENSION, self.build_numbers(config)
+        derivatives, parameter_derivatives = law.derivatives, law.parameter_derivatives
+        first_tension, parameters_of = config.first_constant(SpringTerm) + FIRST_TENSION, self.build_parameters(config)
 
         @ti.func
         def differentiate(
@@ -306,20 +314,22 @@ class SpringTerm(Term):
         ):
             """Return the change of the force (3), and derivatives of its product with p.
 
-            They are those with respect to k - tau and tau, and with a law that locks to log(lock) and the factor.
+            The derivatives are with respect to k - tau and tau, and for a law that locks to log(lock) and the factor.
             """
             to = [q[0] + x0, q[1] + y0, q[2]]
             square = to[0] * to[0] + to[1] * to[1] + (to[2] * to[2] + MIN_SQUARED_LENGTH)
             square_difference = q[0] * (to[0] + x0) + (q[1] * (to[1] + y0) + q[2] * q[2])
             along = to[0] * p[0] + to[1] * p[1] + to[2] * p[2]
-            tension, numbers = sheet.constants[first_tension + family], numbers_of(sheet, family)
-            isotropic, axial, by_k, by_tau = slopes(k, tension, square_difference, square, length, along, *numbers)
+            tension, parameters = sheet.constants[first_tension + family], parameters_of(sheet, family)
+            isotropic, axial, by_k, by_tau = derivatives(
+                k, tension, square_difference, square, length, along, *parameters
+            )
             if ti.static(tense):
                 isotropic += tension
             change = [isotropic * p[c] + axial * to[c] for c in ti.static(range(3))]
             product = q[0] * p[0] + q[1] * p[1] + q[2] * p[2] + by_tau * along
             if ti.static(count > 0):
-                by_lock, by_factor = by_numbers(k, tension, square_difference, square, length, *numbers)
+                by_lock, by_factor = parameter_derivatives(k, tension, square_difference, square, length, *parameters)
                 return [change[0], change[1], change[2], by_k * along, product, by_lock * along, by_factor * along]
             else:  # noqa: RET505
                 return [change[0], change[1], change[2], by_k * along, product]
@@ -346,10 +356,10 @@ class SpringTerm(Term):
             has_left = sheet.by_column[HAS_LEFT * sheet.width + b]
             has_right = sheet.by_column[HAS_RIGHT * sheet.width + b]
             dx, dy = sheet.constants[DX], sheet.constants[DY]
-            here, below, lower = row.i * sheet.width + b, (row.i + 1) * sheet.width + b, row.i + 1
+            at, below, lower = row.i * sheet.width + b, (row.i + 1) * sheet.width + b, row.i + 1
             if ti.static(structural):
                 k, in_row = vector(0) + of_row(sheet, row.i, row.kind, b), share_of_row(has_right, row.kind)
-                largest = larger(largest, along(sheet, here + 1, u, k * has_right, in_row))
+                largest = larger(largest, along(sheet, at + 1, u, k * has_right, in_row))
             if lower < sheet.rows:
                 if ti.static(structural):
                     k, in_column = vector(0) + of_column(sheet, lower, b), share_of_column(sheet, vector(1), b)
@@ -370,7 +380,7 @@ class SpringTerm(Term):
         _, _, of_row, of_column, of_diagonal = self.build_spring_forces(config)
         share_of_row, share_of_column = self.build_shares(config)
         tense_edges = self.tense_edges
-        first_tension, numbers_of = config.first_constant(SpringTerm) + FIRST_TENSION, self.build_numbers(config)
+        first_tension, parameters_of = config.first_constant(SpringTerm) + FIRST_TENSION, self.build_parameters(config)
         energy = config.compile_law(self.law, tense=self.tense).energy
         # For each family: its index, and the offsets in rows and columns from one end to the other.
         structural = ((ALONG_ROW, 0, (1,)), (ALONG_COLUMN, 1, (0,))) if self.structural else ()
@@ -398,7 +408,7 @@ class SpringTerm(Term):
             for family, down, rights in ti.static(families):
                 if i + down < sheet.rows:
                     stretch_sum, tension_sum = vector(0), vector(0)
-                    tension, numbers = sheet.constants[first_tension + family], numbers_of(sheet, family)
+                    tension, parameters = sheet.constants[first_tension + family], parameters_of(sheet, family)
                     for right in ti.static(rights):
                         k = vector(0)
                         if ti.static(family == ALONG_ROW):
@@ -410,7 +420,7 @@ class SpringTerm(Term):
                         share, squared = strains(sheet, p, p + down, b, right, right * dx, -down * dy)
                         measures[first + MIN_STRAIN] = ti.min(measures[first + MIN_STRAIN], share)
                         measures[first + MAX_STRAIN] = ti.max(measures[first + MAX_STRAIN], share)
-                        stretch_sum += energy(k, tension, share, *numbers)
+                        stretch_sum += energy(k, tension, share, *parameters)
                         if ti.static(tense_edges):
                             cells = vector(1)
                             if ti.static(right != 0):

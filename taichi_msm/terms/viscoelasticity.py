@@ -39,7 +39,7 @@ class ViscoelasticTerm(Term):
     key: ClassVar[str] = "tissue.relaxation"
 
     branches: int  # count
-    at_rest: bool  # whether the memory changes only where the load table says so
+    at_rest: bool  # whether the memory changes only at frames, as marked in the load table
 
     @staticmethod
     def derive(scene: Scene) -> dict[str, Any]:

@@ -70,7 +70,7 @@ def test_the_force_of_a_tool_is_that_of_the_twin(precision: str, difference: str
 
 @pytest.mark.slow
 def test_points_at_an_open_edge_count_with_their_mass(device: Device) -> None:
-    made = touching(EDGES["comes from beside"])
+    made = touching(EDGES["from outside the border"])
     made = made.model_copy(update={"sheet": made.sheet.model_copy(update={"fixed": "none"})})
     expected = expected_forces(made)
     with Simulation(made, threads=device.threads) as simulation:

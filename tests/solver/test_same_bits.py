@@ -1,4 +1,4 @@
-"""Lanes, workers, passes, the kernels of a GPU, and interruptions change no bit of what a sheet does."""
+"""Results have the same bits for any lanes, workers, passes, launches and restarts, and in the kernels of a GPU."""
 
 from __future__ import annotations
 
@@ -48,11 +48,12 @@ MOVING: dict[str, Callable[[str], Scene]] = {
 }
 
 AT_REST: dict[str, Scene] = {
-    "a load that moves, bending": tissue(
+    "moving load, bending": tissue(
         {**PUSH, "at": [[0, 0.2, 0.2], [2, 0.8, 0.6]]}, {"points": [9, 14]}, bending="plate"
     ),
     "tool": at_rest([PRESSED_AT_REST], sheet={**SHEET, "fixed": ["left", "top"]}),
     "rough tool": lifted(),
+    "relaxation": pressed("relaxation", time={"motion": "quasistatic"}),
     "clamp": at_rest([PULL], sheet=LEFT),
 }
 
@@ -64,15 +65,15 @@ def image(tmp_path: Path) -> str:
 
 
 def states(made: Scene, device: Device, layout: SheetLayout, *, piece: int = 10**9, restarts: bool = False) -> bytes:
-    """The last state, and the forces of tools at every frame; steps in pieces, or a restart within every frame."""
+    """The last state and the tool forces at all frames, for steps in pieces or with a restart within each frame."""
     plan, forces = plan_of(made), []
     sheet, steps = build_dynamics(plan, device, layout), plan.grid.steps_per_frame
     for _ in range(plan.grid.frames):
-        parts = [steps // 2 + 1, steps - steps // 2 - 1] if restarts else [min(piece, steps)] * -(-steps // piece)
-        for count in parts:
-            sheet.advance(count)
-            if restarts:
+        halves = [count for count in (steps // 2 + 1, steps - steps // 2 - 1) if count]
+        for count in halves if restarts else [min(piece, steps)] * -(-steps // piece):
+            if restarts and sheet.steps_done:
                 sheet.restart(plan, sheet.state())
+            sheet.advance(count)
         forces.append(sheet.tool_forces())
     assert not plan.tools or np.any(forces)
     state = sheet.state()
@@ -83,22 +84,22 @@ def states(made: Scene, device: Device, layout: SheetLayout, *, piece: int = 10*
 @pytest.mark.default_cases("springs", "tools", "laws", "foundation map", "tissue with a map", "tissue that bends")
 @pytest.mark.usefixtures("short_launches")
 @pytest.mark.parametrize("name", MOVING)
-def test_in_motion(name: str, image: str, device: Device) -> None:
+def test_dynamic_scenes(name: str, image: str, device: Device) -> None:
     made = MOVING[name](image)
     layout = choose_layout(plan_of(made), device)
     # With bending a pass takes one step.
     depth = 3 if layout.config.reach == 1 else 1
-    plain = states(made, device, layout)
-    assert states(made, device, replace(with_lanes(layout, 4), workers=2, depth=depth), restarts=True) == plain
+    expected = states(made, device, layout)
+    assert states(made, device, replace(with_lanes(layout, 4), workers=2, depth=depth), restarts=True) == expected
     for restarts in (False, True):
-        assert states(made, device, as_on_a_gpu(layout), restarts=restarts) == plain
-    # Of three bands two end at one border; but one step a launch, nobody waits.
-    assert states(made, device, replace(layout, workers=min(3, layout.rows // 3)), piece=1) == plain
+        assert states(made, device, as_on_a_gpu(layout), restarts=restarts) == expected
+    # Of three bands two end at one border; with one step per launch no worker waits.
+    assert states(made, device, replace(layout, workers=min(3, layout.rows // 3)), piece=1) == expected
 
 
-@pytest.mark.default_cases("tool", "clamp")
+@pytest.mark.default_cases("tool", "relaxation", "clamp")
 @pytest.mark.parametrize("name", AT_REST)
-def test_at_rest(name: str, device: Device) -> None:
+def test_quasistatic_scenes(name: str, device: Device) -> None:
     made = AT_REST[name]
     layout = choose_layout(plan_of(made), device)
-    assert states(made, device, with_lanes(layout, 1)) == states(made, device, layout)
+    assert states(made, device, with_lanes(layout, 1), restarts=True) == states(made, device, layout)

@@ -1,4 +1,4 @@
-"""Rough tools at rest: closed forms, the twin, and what must hold of points that stick."""
+"""Rough tools in quasi-static scenes: closed forms, the twin, release, grips, and invalid keys."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from taichi_msm.accuracy.contact_warnings import tool_contact_warnings
 from taichi_msm.errors import SceneError
 from taichi_msm.load.check import check_scene
-from taichi_msm.runs.run import resume, run
+from taichi_msm.runs.run import run
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 from taichi_msm.scene.tools import Probe
@@ -29,8 +29,8 @@ from tests.terms.test_contact import moved, touching
 
 Array = NDArray[np.float64]
 
-# A ball on eight points a radius, on a foundation of a modulus [N/m3] below a sheet of hardly any stiffness, or a soft
-# one. All sheets are under tension, so that they share their kernels.
+# A ball of eight mass points per radius on a foundation [N/m3], with a sheet of negligible stiffness or a soft one. All
+# sheets are under tension, so they share kernels.
 RADIUS, MODULUS = 5e-3, 1e6
 ALONE = {"young": 1e-3, "thickness": 1e-3, "foundation": MODULUS, "foundation_active": "always", "pretension": 1e-7}
 SOFT = {**ALONE, "young": 3e4, "thickness": 3e-3, "pretension": 20}
@@ -44,13 +44,13 @@ def ball(*keys: list[float], **changes: Any) -> dict[str, Any]:
 
 
 def indented(depth: float, frames: int, tissue: dict[str, Any], **sections: Any) -> Scene:
-    """A ball that goes to a depth in a second."""
+    """A ball that reaches a depth in a second."""
     time = {"frames_per_second": frames}
     return at_rest([ball([0, 0.5, 0.5, 0], [1, 0.5, 0.5, -depth])], sheet=SHEET, tissue=tissue, time=time, **sections)
 
 
 def forces_of(made: Scene, device: Device) -> Array:
-    """The force of the first tool at every frame but the first [N], shape (frames, 3)."""
+    """The forces of the first tool at all frames except the first [N], shape (frames, 3)."""
     plan = plan_of(made)
     rest, forces = QuasiStatics(plan, device), []
     for _ in range(plan.grid.frames):
@@ -62,7 +62,8 @@ def forces_of(made: Scene, device: Device) -> Array:
 
 
 @pytest.mark.parametrize(("share", "frames"), [(0.5, 1), (1.0, 4)])
-def test_a_ball_on_a_foundation_displaces_its_volume(share: float, frames: int, device: Device) -> None:
+def test_indentation_of_a_foundation(share: float, frames: int, device: Device) -> None:
+    """The force is the modulus times the displaced volume."""
     depth = share * RADIUS
     volume = math.pi * depth**2 * (RADIUS - depth / 3)
     force = forces_of(indented(depth, frames, ALONE), device)[-1]
@@ -70,8 +71,8 @@ def test_a_ball_on_a_foundation_displaces_its_volume(share: float, frames: int, 
 
 
 @pytest.mark.slow
-def test_a_foundation_that_locks_and_relaxes(device: Device) -> None:
-    """Every stuck point has its own elastic force, so their sum relaxes as each of them does."""
+def test_stiffening_and_relaxation(device: Device) -> None:
+    """The force on each stuck mass point depends on its own history, so the sum relaxes like each of them."""
     lock, branches = 9e-3, [{"share": 0.6, "time": 0.3}, {"share": 0.2, "time": 4.0}]
     foundation = {"young": MODULUS * 0.015, "depth": 0.015, "lock": lock, "factor": 10}
     law = make_stiffening(lock, 10.0)
@@ -79,8 +80,8 @@ def test_a_foundation_that_locks_and_relaxes(device: Device) -> None:
     tissue = {**ALONE, "foundation": foundation, "relaxation": branches, "stiffening": {"lock": 0.5}}
     forces = forces_of(indented(RADIUS, 4, tissue), device)[:, 2]
     r = (np.arange(2000) + 0.5) / 2000 * RADIUS
-    going_in = np.clip(np.arange(1, 5)[:, None] / 4 * RADIUS - RADIUS + np.sqrt(RADIUS**2 - r**2), 0, None)
-    pressure = MODULUS * going_in / (1 - going_in / lock)
+    depth = np.clip(np.arange(1, 5)[:, None] / 4 * RADIUS - RADIUS + np.sqrt(RADIUS**2 - r**2), 0, None)
+    pressure = MODULUS * depth / (1 - depth / lock)
     elastic = (pressure * 2 * math.pi * r * RADIUS / 2000).sum(axis=1)
     s, expected = np.zeros(2), []
     share, time = (np.array([branch[key] for branch in branches]) for key in ("share", "time"))
@@ -93,22 +94,22 @@ def test_a_foundation_that_locks_and_relaxes(device: Device) -> None:
     assert abs(forces[-1]) < 0.7 * elastic[-1]
 
 
-def test_one_frame_goes_the_way_of_many(device: Device) -> None:
-    """Down and then aside: on a foundation alone to rounding, in soft tissue within 1 % with twice the frames."""
+def test_dependence_on_the_frame_rate(device: Device) -> None:
+    """Down and then sideways: none on a foundation alone, below 1 % in soft tissue with twice the frames."""
     path = [0, 0.45, 0.5, 0], [0.375, 0.45, 0.5, -0.4 * RADIUS], [1, 0.55, 0.5, -0.5 * RADIUS]
 
     def forces(frames: int, tissue: dict[str, Any]) -> Array:
         return forces_of(at_rest([ball(*path)], sheet=SMALL, tissue=tissue, time={"frames_per_second": frames}), device)
 
-    one, many = forces(1, ALONE), forces(8, ALONE)
-    np.testing.assert_allclose(one[-1], many[-1], rtol=0, atol=2e-5 * np.abs(many).max())
-    assert one[0, 0] > 0.3 * abs(one[0, 2])
-    soft, twice = forces(4, SOFT), forces(8, SOFT)[1::2]
-    assert np.abs(soft - twice).max() < 0.01 * np.abs(twice).max()
+    coarse, fine = forces(1, ALONE), forces(8, ALONE)
+    np.testing.assert_allclose(coarse[-1], fine[-1], rtol=0, atol=2e-5 * np.abs(fine).max())
+    assert coarse[0, 0] > 0.3 * abs(coarse[0, 2])
+    coarse, fine = forces(4, SOFT), forces(8, SOFT)[1::2]
+    assert np.abs(coarse - fine).max() < 0.01 * np.abs(fine).max()
 
 
-def test_strides_hardly_matter(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The error is of second order in the stride; if points stood still until they stick, it would be 14 %."""
+def test_dependence_on_intermediate_shapes(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The error is of order 2 in the stride; for mass points that do not move until they stick it would be 14 %."""
     made = indented(0.8 * RADIUS, 1, {**SOFT, "pretension": 1})
     fine = forces_of(made, device)[-1]
     monkeypatch.setattr("taichi_msm.model.tools.ROUGH_STRIDE_RADII", 1 / 8)
@@ -119,15 +120,15 @@ TILTED = {"radius": 0.1, "shaft": [0.3, -0.2, 1]}
 ASIDE = [0, 0.48, 0.53, 0], [1, 0.48, 0.53, -0.006], [2, 0.485, 0.53, -0.003]
 
 
-def test_like_twin(device: Device) -> None:
-    """It sticks, and releases points as it rises and goes aside."""
+def test_rough_contact_matches_twin(device: Device) -> None:
+    """Mass points stick, and are released while the tool rises and moves sideways."""
     rod = moved(*ASIDE, friction="rough", instrument=TILTED)
     sheet, tissue = {"points": [8, 8], "size": [0.12, 0.12]}, {**TISSUE, "pretension": 2}
     plan = plan_of(at_rest([rod], sheet=sheet, tissue=tissue, time={"duration": 2}))
     rest, counts = QuasiStatics(plan, device), []
     for u, force, stuck in rough_frames(plan, nearly_flat(plan)):
         rest.advance(1)
-        # Shapes without further contact are found to 1e-3.
+        # Shapes without further contact have residuals of up to 1e-3.
         np.testing.assert_allclose(rest.displacement(), u, rtol=0, atol=2e-3 * np.abs(u).max())
         np.testing.assert_allclose(rest.tool_forces()[0], force, rtol=0, atol=2e-3 * np.abs(force).max())
         counts.append(stuck.sum())
@@ -135,39 +136,31 @@ def test_like_twin(device: Device) -> None:
 
 
 def lifted(**sections: Any) -> Scene:
-    """A ball that is pressed in twice, and out of reach in between and at the end."""
+    """A ball that is pressed in twice, and above the sheet in between and at the end."""
     heights = [0.001, -RADIUS / 2, 0.001, -RADIUS / 2, 0.001]
     probe = ball(*([t, 0.5, 0.5, height] for t, height in enumerate(heights)))
     time = {"duration": 4, "frames_per_second": 2}
     return at_rest([probe], **{"sheet": SMALL, "tissue": SOFT, "time": time, **sections})
 
 
-def test_it_releases_what_it_would_pull_and_touches_again(device: Device) -> None:
+def test_release_and_second_contact(device: Device) -> None:
     force = forces_of(lifted(), device)
-    assert not force[[3, 7]].any(), "above the sheet, which is flat"
+    assert not force[[3, 7]].any(), "above the flat sheet"
     np.testing.assert_allclose(force[4:], force[:4], rtol=0, atol=1e-5 * np.abs(force).max())
     assert (force[[0, 1, 2], 2] < 0).all()
 
 
-def test_an_interruption_does_not_change_the_bits(device: Device, tmp_path: Path) -> None:
-    made = lifted(output=["trajectory", "forces"])
-
-    def stops(stage: str, done: int, _total: int) -> None:
-        if stage == "frames" and done == 3:
-            raise KeyboardInterrupt
-
-    whole = run(made, tmp_path / "whole", threads=device.threads, estimate_error=False)
-    run(made, tmp_path / "parts", threads=device.threads, estimate_error=False, progress=stops)
-    record = resume(tmp_path / "parts", threads=device.threads)
-    assert (record["status"], record["resumed"], record["evaluations"]) == ("complete", 3, whole["evaluations"])
-    for name in ("trajectory.npz", "forces.csv"):
-        assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "parts" / name).read_bytes()
-    assert 0 < whole["residual"] <= FORCE_TOLERANCE
-    assert not [note for note in whole["notes"] if "path-dependent" in note or "slides off" in note]
+def test_warnings_of_a_rough_tool(device: Device, tmp_path: Path, message: Messages) -> None:
+    """History by definition is not path dependence, and a rough tip does not slide."""
+    record = run(lifted(output=[]), tmp_path / "out", threads=device.threads, estimate_error=False)
+    assert not [note for note in record["notes"] if "path-dependent" in note or "slides off" in note]
+    made = indented(RADIUS, 1, ALONE)
+    smooth = made.model_copy(update={"probes": [made.probes[0].model_copy(update={"friction": 0.0})]})
+    message(tool_contact_warnings(plan_of(smooth), RunProgress()), "friction: rough")
 
 
-def test_a_grip_takes_what_sticks_and_leaves_it(device: Device) -> None:
-    """The grip lifts the tissue; at its end the points that pull are released."""
+def test_grip_of_stuck_mass_points(device: Device) -> None:
+    """A grip lifts the tissue; at its end the mass points that would be pulled are released."""
     path = [0, 0.5, 0.5, 0], [1, 0.5, 0.5, -RADIUS / 2], [2, 0.5, 0.5, 0.001]
     made = at_rest([ball(*path, grip=[[2, 3]])], sheet=SMALL, tissue=SOFT, time={"duration": 3})
     pressed, gripped, released = forces_of(made, device)
@@ -175,31 +168,22 @@ def test_a_grip_takes_what_sticks_and_leaves_it(device: Device) -> None:
     assert not released.any()
 
 
-REFUSED: dict[str, tuple[str, Any]] = {
+INVALID: dict[str, tuple[str, Any]] = {
     "in motion": ("probes.0.friction", lambda: touching([moved([0, 0.5, 0.5, 0], friction="rough")])),
-    "another word": ("friction", lambda: Probe(**ball([0, 0.5, 0.5, 0], friction="ruogh"))),
-    "a force": ("friction", lambda: Probe(**{"total": (0, 0, -1), "friction": "rough"})),
-    "a clamp": ("friction", lambda: Probe(clamp="right", path=((0, 0, 0, 0),), friction="rough")),
+    "typo": ("friction", lambda: Probe(**ball([0, 0.5, 0.5, 0], friction="ruogh"))),
+    "force": ("friction", lambda: Probe(**{"total": (0, 0, -1), "friction": "rough"})),
 }
 
 
-@pytest.mark.parametrize("name", REFUSED)
-def test_what_cannot_be_rough_is_refused(name: str, message: Messages) -> None:
-    key, make = REFUSED[name]
-    with message.raises(SceneError, key):
-        check_scene(make())
+def test_invalid_rough_tools(message: Messages) -> None:
+    for key, make in INVALID.values():
+        with message.raises(SceneError, key):
+            check_scene(make())
 
 
-def test_steering_to_a_number_is_refused(device: Device, message: Messages) -> None:
+def test_steering_to_coulomb_friction(device: Device, message: Messages) -> None:
     made, path = at_rest([ball([0, 0.5, 0.5, 0.001])], sheet=SMALL, tissue=SOFT), [[0.5, 0.5, 0.5, 0.002]]
     with Simulation(made, threads=device.threads) as simulation:
         simulation.steer([{"path": path, "friction": 0.0}])
         with message.raises(SceneError, "probes.0.friction"):
             simulation.steer([{"path": path, "friction": 0.3}])
-
-
-def test_a_tip_that_slides_is_told_to_be_rough(message: Messages) -> None:
-    made = indented(RADIUS, 1, ALONE)
-    assert not list(tool_contact_warnings(plan_of(made), RunProgress()))
-    smooth = made.model_copy(update={"probes": [made.probes[0].model_copy(update={"friction": 0.0})]})
-    message(tool_contact_warnings(plan_of(smooth), RunProgress()), "friction: rough")
