@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from taichi_msm.errors import SceneError
 from taichi_msm.fitting import observation
 from taichi_msm.fitting.observation import Array, Observation, ObservationModel
-from taichi_msm.fitting.tables import Row, decimal_mark, read_text
+from taichi_msm.machines.cells import Row, decimal_mark, read_text
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from taichi_msm.fitting.machine_model import MachineProblem
-from taichi_msm.fitting.machine_test import Loading
 from taichi_msm.fitting.observation import Array
 from taichi_msm.fitting.parameters import rounded
+from taichi_msm.machines.loading import Loading
 
 # The tool is held while the depth differs by at most this share of the travel.
 HELD_SHARE = 0.02

@@ -12,12 +12,12 @@ import numpy as np
 
 from taichi_msm.errors import Pause, SceneError
 from taichi_msm.fitting.forces import Forces
-from taichi_msm.fitting.machine_tables import cut_window, read_machine_test
-from taichi_msm.fitting.machine_test import Approach, Loading, build_loading, find_approach, late_contact_note
 from taichi_msm.fitting.observation import Array, ObservationModel
 from taichi_msm.fitting.parameters import Bounds, Method, Parameter, as_data, make_parameters, with_values
 from taichi_msm.fitting.predict import FitProblem, ForwardModel, Prediction, without_outputs
 from taichi_msm.load.check import check_scene
+from taichi_msm.machines.loading import Approach, Loading, build_loading, find_approach, late_contact_note
+from taichi_msm.machines.reader import cut_window, read_machine_test
 from taichi_msm.model.plan import Plan
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene

@@ -16,8 +16,8 @@ from taichi_msm.cli.fit import parse_window
 from taichi_msm.fitting.machine_curve import CurveRuns, relax
 from taichi_msm.fitting.machine_fit import FittedTest, explanations, unknown_notes
 from taichi_msm.fitting.machine_model import read_machine_problem
-from taichi_msm.fitting.machine_tables import MachineTest
-from taichi_msm.fitting.machine_test import (
+from taichi_msm.load.check import check_scene
+from taichi_msm.machines.loading import (
     CONTACT_NOISES,
     DEPTH_FRAMES,
     MAX_FRAMES,
@@ -25,7 +25,7 @@ from taichi_msm.fitting.machine_test import (
     find_approach,
     late_contact_note,
 )
-from taichi_msm.load.check import check_scene
+from taichi_msm.machines.reader import MachineTest
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program

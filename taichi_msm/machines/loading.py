@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 
 from taichi_msm.errors import SceneError
-from taichi_msm.fitting.machine_tables import MachineTest
-from taichi_msm.fitting.observation import Array
+from taichi_msm.machines.reader import Array, MachineTest
 from taichi_msm.model.tools import Clamp, Tool, build_tools, gap_to_sheet
 from taichi_msm.scene.scene import Scene
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import SceneError, did_you_mean
-from taichi_msm.fitting.tables import LETTER, WORKBOOK_SUFFIX, Grid, Row, parse_number, read_text, read_workbook
+from taichi_msm.machines.cells import LETTER, WORKBOOK_SUFFIX, Grid, Row, parse_number, read_text, read_workbook
 
 Array = NDArray[np.float64]
 

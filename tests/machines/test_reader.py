@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from taichi_msm.errors import NotInstalledError, SceneError
-from taichi_msm.fitting.machine_tables import MachineTest, cut_window, read_machine_test
+from taichi_msm.machines.reader import MachineTest, cut_window, read_machine_test
 from tests.golden import Messages
 
 COUNT = 12
