@@ -1,8 +1,8 @@
 """Reader of observed points, from an .npz or a mapping of the same arrays.
 
-It has `time` (T,) [s], `coordinates` (N, 2), across and down, and `position` (N, T, 3) [m] or `pixel` (N, T, 2) [px],
-NaN where not observed; optionally `sigma`, the standard deviation of their errors. A run's trajectory.npz and
-tracks.npz are accepted too.
+The arrays are `time` [s], shape (T,); `coordinates`, across and down as fractions of the sheet, shape (N, 2); and
+`position` [m], shape (N, T, 3), or `pixel` [px], shape (N, T, 2), NaN where not observed; optionally `sigma`, the
+standard deviation of their errors. A run's trajectory.npz and tracks.npz are accepted too.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ KINDS: dict[str, type[PointObservation]] = {"position": Positions, "pixel": Pixe
 
 
 def read_observations(observed: str | Path | Mapping[str, Any], rate: float) -> PointObservation:
-    """Read observations from a file, or from a mapping of the same arrays.
+    """Return the observed points of a file, or of a mapping of the same arrays.
 
     Args:
-        observed: path of an .npz, or a mapping.
-        rate: frames per second of the scene, for a tracks.npz.
+        observed: path of an .npz, or a mapping of array names to arrays.
+        rate: frames per second of the scene, which gives the times of a tracks.npz.
 
     Raises:
         SceneError: when arrays are missing, unknown, or have other shapes.
