@@ -20,19 +20,8 @@ from taichi_msm.fitting import rejection
 from taichi_msm.fitting.archive import read_observations
 from taichi_msm.fitting.checks import faults, faults_at_start, opposed, unit_faults
 from taichi_msm.fitting.forces import read_forces
-from taichi_msm.fitting.least_squares import (
-    MAX_RELATIVE_ERROR,
-    Misfit,
-    Profile,
-    ProfilePoint,
-    Profiler,
-    Search,
-    Solution,
-    Uncertainty,
-    UnidentifiedGroup,
-    uncertainty,
-    unseen,
-)
+from taichi_msm.fitting.identifiability import MAX_RELATIVE_ERROR, UnidentifiedGroup, unidentified_groups
+from taichi_msm.fitting.least_squares import Misfit, Search, Solution
 from taichi_msm.fitting.machine_curve import CurveRuns, has_curve, search_by_curve
 from taichi_msm.fitting.machine_fit import explanations, fitted_tests, unknown_notes
 from taichi_msm.fitting.machine_model import TABLE_OPTIONS, MachineProblem, read_machine_problem, table_paths
@@ -40,9 +29,11 @@ from taichi_msm.fitting.observation import Array, ErrorCorrelation, Observation
 from taichi_msm.fitting.parameters import Bounds, Method, Parameter, as_data, make_parameters, require_types, rounded
 from taichi_msm.fitting.points import PointObservation
 from taichi_msm.fitting.predict import FitProblem, Prediction, Runs, without_outputs
+from taichi_msm.fitting.profiles import Profile, ProfilePoint, Profiler
 from taichi_msm.fitting.report import publication, write_report
 from taichi_msm.fitting.result import Estimate, FitResult, FittedMap
 from taichi_msm.fitting.stiffness_map import KEY, MapSettings, fit_map, map_settings
+from taichi_msm.fitting.uncertainty import Uncertainty, uncertainty
 from taichi_msm.load.check import check_scene
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.scene.scene import Scene
@@ -206,7 +197,7 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
     }
     values = {key: estimate.value for key, estimate in estimates.items()}
     measures_forces = any(observed.noun == "forces" for observed in observations)
-    unidentified = unseen(parameters, solution.x, uncertainties, forces=measures_forces)
+    unidentified = unidentified_groups(parameters, solution.x, uncertainties, forces=measures_forces)
     rejection_reason = _rejection(misfit, solution, uncertainties, error_correlation)
     tests = fitted_tests(machine, values, solution.predicted.values[0]) if machine else ()
     residuals = misfit.split(misfit.of(solution.predicted))
