@@ -57,14 +57,23 @@ VALUE_START = re.compile(r"[+\-\N{MINUS SIGN}]?[.,]?\d|[+-]?(nan|inf)|[#=]", re.
 
 @dataclass(frozen=True)
 class MachineTest:
-    """A test of a testing machine."""
+    """A test of a testing machine.
 
-    name: str  # of the file, and the sheet and block where there is a choice
-    time: Array  # increasing [s], shape (n,)
-    depth: Array  # depths or elongations; their largest magnitude is positive [m], shape (n,)
-    force: Array  # their largest magnitude is positive [N], shape (n,)
-    digit: float  # last digit of the forces in the file [N]
-    notes: tuple[str, ...] = ()  # sentences about choices of the reader, and about the test
+    Attributes:
+        name: name of the file, and sheet and block where there is a choice.
+        time: increasing times [s], shape (n,).
+        depth: depths or elongations, the one of largest magnitude positive [m], shape (n,).
+        force: forces, the one of largest magnitude positive [N], shape (n,).
+        digit: last digit of the forces in the file [N].
+        notes: sentences about choices of the reader, and about the test.
+    """
+
+    name: str
+    time: Array
+    depth: Array
+    force: Array
+    digit: float
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -89,13 +98,13 @@ class _Column:
 def read_machine_test(
     path: str | Path, columns: Sequence[str] = (), sheet: str | None = None, block: int | None = None
 ) -> MachineTest:
-    """Read a test from a table.
+    """Return the test of a table.
 
     Args:
-        path: a workbook (.xlsx), or a text of any other suffix.
-        columns: chosen columns, such as "depth=Traverse, mm"; without a unit it is that of the file.
-        sheet: chosen sheet of a workbook.
-        block: chosen block, counted from 1.
+        path: path of a workbook (.xlsx), or of a text with any other suffix.
+        columns: chosen columns, such as "depth=Traverse, mm"; without a unit, that of the file.
+        sheet: chosen sheet of a workbook, or None for the only one with a table.
+        block: number of the chosen block, from 1, or None for the only one.
 
     Raises:
         SceneError: when the file is not such a table, or needs a choice.
@@ -127,8 +136,8 @@ def cut_window(test: MachineTest, start: float, end: float) -> MachineTest:
 
     Args:
         test: the test.
-        start: first time [s].
-        end: last time [s].
+        start: first time [s of the table].
+        end: last time [s of the table].
 
     Raises:
         SceneError: when too few rows remain.
