@@ -133,9 +133,9 @@ def read_forces(path: str | Path, sigma: float, probes: int) -> ToolForces:
     grid = read_text(name, _is_header, EXPECTED)
     header = next((n for n, row in enumerate(grid.rows) if _is_header(row)), None)
     if header is None:
-        found = [{*re.findall(r"\w+", " ".join(row).lower())} & {*COLUMNS} for row in grid.rows]
-        best = max(range(len(found)), key=lambda n: len(found[n]))
-        if missing := [key for key in COLUMNS if key not in found[best]]:
+        named = [{*re.findall(r"\w+", " ".join(row).lower())} & {*COLUMNS} for row in grid.rows]
+        best = max(range(len(named)), key=lambda n: len(named[n]))
+        if missing := [key for key in COLUMNS if key not in named[best]]:
             raise SceneError([f"{name}: no row names {', '.join(missing)}; {EXPECTED}"])
         remedy = "give each name a cell, alone or with its unit in brackets, as time [s]"
         raise SceneError([f"{grid.place(best)}: names all columns, but not in a cell each; {remedy}"])

@@ -119,8 +119,8 @@ def _describe_group(
     if known and not all(parameter.is_log for parameter in group):
         return UnidentifiedGroup(keys, [], f"{names} are not identifiable one by one: fix one{remedy}")
     if not known:
-        found = f"known {share}" if share else "not identifiable"
-        return UnidentifiedGroup(keys, [], f"{names}: {found}: {fix}")
+        status = f"known {share}" if share else "not identifiable"
+        return UnidentifiedGroup(keys, [], f"{names}: {status}: {fix}")
     combinations = ", ".join(f"{each} is known to {rounded(100 * each.standard_error)} %" for each in known)
     return UnidentifiedGroup(keys, known, f"{combinations}, each alone {share or 'is not'}: fix one{remedy}")
 

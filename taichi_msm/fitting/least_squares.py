@@ -108,13 +108,13 @@ class Misfit:
             predicted: prediction of all observations.
             parameters: number of parameters, subtracted from the numbers of values.
         """
-        found = []
+        deviations = []
         for residuals, signal in zip(self.split(self.of(predicted)), self.signals, strict=True):
             mean_square = np.sum(residuals**2) / max(1, len(residuals) - parameters)
             # 1.4826 is the ratio of sigma to the median of the magnitudes, of normal errors.
             sigma = 1.4826 * np.median(np.abs(residuals)) if self.robust else np.sqrt(mean_square)
-            found.append(max(float(sigma), 1e-9 * signal))
-        return found
+            deviations.append(max(float(sigma), 1e-9 * signal))
+        return deviations
 
     def scales(self, unknown: Sequence[float]) -> Scales:
         """Return the standard deviations of all observations, from `unknown` where they are not given."""
@@ -136,8 +136,8 @@ class Search:
 
     def __init__(self, runs: Runs, misfit: Misfit, limits: tuple[Array, Array] | None = None) -> None:
         self._runs, self._misfit = runs, misfit
-        self._delta = difference_step(runs.job.scene)
-        self._limits = limits or runs.job.limits
+        self._delta = difference_step(runs.problem.scene)
+        self._limits = limits or runs.problem.limits
         self._known: dict[bytes, Prediction | None] = {}
         self._neighbours: dict[bytes, Prediction | None] = {}
 
@@ -169,7 +169,7 @@ class Search:
 
     def jacobian(self, solution: Solution) -> Array:
         """Return the Jacobian of the predictions by x, shape (known, n)."""
-        return self._differences(solution.x, solution.predicted, signs=self._runs.job.signs)
+        return self._differences(solution.x, solution.predicted, signs=self._runs.problem.signs)
 
     def remember(self, x: Array, predicted: Prediction) -> None:
         """Store a prediction, which is then not computed again.
@@ -252,7 +252,7 @@ class Search:
         known = self._neighbours | {neighbour.tobytes(): prediction for neighbour, prediction in computed}
         self._neighbours = {neighbour.tobytes(): known[neighbour.tobytes()] for neighbour in each}
         columns = []
-        for n, parameter in enumerate(self._runs.job.parameters):
+        for n, parameter in enumerate(self._runs.problem.parameters):
             pairs = [(neighbour[n], known[neighbour.tobytes()]) for neighbour in neighbours[n]]
             points = [(side, prediction) for side, prediction in pairs if prediction is not None]
             if not points and len(signs) == 1:
@@ -273,6 +273,6 @@ class Search:
         from scipy.stats import qmc
 
         low, high = (np.clip(limit, -MAX_START_LOG, MAX_START_LOG) for limit in self._limits)
-        count = 8 * len(low) if len(self._runs.job.signs) > 1 else 8
+        count = 8 * len(low) if len(self._runs.problem.signs) > 1 else 8
         shares = qmc.Sobol(len(low), seed=1).random_base2((count - 1).bit_length())
         return list(qmc.scale(shares, low, high))

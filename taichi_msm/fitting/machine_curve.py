@@ -42,11 +42,11 @@ NO_SHARE = 1e-12
 MAX_SHARES = 0.999
 
 
-def has_curve(job: object) -> bool:
+def has_curve(problem: object) -> bool:
     """Return whether the tests of a fit are quasi-static, and of a scene with one tool, which grips nothing."""
-    if not isinstance(job, MachineProblem):
+    if not isinstance(problem, MachineProblem):
         return False
-    return job.scene.time.at_rest and len(job.scene.probes) == 1 and not job.scene.probes[0].grip
+    return problem.scene.time.at_rest and len(problem.scene.probes) == 1 and not problem.scene.probes[0].grip
 
 
 def relax(elastic: Array, branches: Sequence[tuple[float, float]], h: float) -> Array:
@@ -82,7 +82,7 @@ class CurveRuns(Runs):
     """Predictions of machine tests by a tangent, or by curves, with a correction of every frame.
 
     Args:
-        job: the fit.
+        problem: the fit.
         workers: ignored, as a curve is a single run.
         progress: called often, as of `Runs`.
 
@@ -92,16 +92,16 @@ class CurveRuns(Runs):
         of_contact: mask of the depths of contact, shape (n,).
     """
 
-    job: MachineProblem
+    problem: MachineProblem
     _predictor: MachineModel
     _tangent: _Tangent
 
-    def __init__(self, job: FitProblem, workers: int | None, progress: StageProgressCallback) -> None:
-        super().__init__(job, 1, progress)
+    def __init__(self, problem: FitProblem, workers: int | None, progress: StageProgressCallback) -> None:
+        super().__init__(problem, 1, progress)
         self._curves: dict[tuple[object, ...], Array] = {}
         self._correction: Array | float = 0.0
         self.by_tangent = True
-        keys = [parameter.key for parameter in self.job.parameters]
+        keys = [parameter.key for parameter in self.problem.parameters]
         self.of_curve = np.array([not key.startswith(("contact", "tissue.relaxation.")) for key in keys])
         self.of_contact = np.array([key.startswith("contact") for key in keys])
         self._of_lock = np.array([key.endswith(".lock") for key in keys])
@@ -146,7 +146,7 @@ class CurveRuns(Runs):
 
     def run_tests(self, x: Array) -> Prediction:
         """Return the prediction by runs of the tests at x; raises as `ForwardModel.predict` does."""
-        self.count += len(self.job.tests)
+        self.count += len(self.problem.tests)
         return self._predictor.predict(x, pause=self._report_progress)
 
     def correct(self, x: Array, predicted: Prediction) -> None:
@@ -170,7 +170,7 @@ class CurveRuns(Runs):
         of_free = sum(values[key] for key in free)
         # They are reduced to a sum of 0.98, with a margin for differences.
         reduction = np.log(max(0.98 - (total - of_free), NO_SHARE) / of_free)
-        return x + reduction * np.array([parameter.key in free for parameter in self.job.parameters])
+        return x + reduction * np.array([parameter.key in free for parameter in self.problem.parameters])
 
     def set_tangent(self, x: Array) -> None:
         """Set the tangent to the curve at x; raises as `ForwardModel.predict` does."""
@@ -178,8 +178,8 @@ class CurveRuns(Runs):
         reach = self._reach(values)
         forces, slopes = self._forces(values, reach), np.zeros((len(x), TRAVELS + 1))
         for n in np.flatnonzero(self.of_curve):
-            shifted, delta = x.copy(), difference_step(self.job.scene)
-            delta = delta if x[n] + delta <= self.job.parameters[n].limits[1] else -delta
+            shifted, delta = x.copy(), difference_step(self.problem.scene)
+            delta = delta if x[n] + delta <= self.problem.parameters[n].limits[1] else -delta
             shifted[n] += delta
             moved = self._forces(self._predictor.values(shifted), reach)
             is_pressed = (forces > 0) & (moved > 0)
@@ -193,7 +193,7 @@ class CurveRuns(Runs):
 
     def _reach(self, values: dict[str, float]) -> float:
         """Return the greatest travel of a curve [m]; raise a SceneError if no test has any."""
-        if not (reach := self.job.reach(values)):
+        if not (reach := self.problem.reach(values)):
             raise SceneError(["contact: no test goes deeper; take a smaller depth"])
         return reach * (1 + CONTACT_MARGIN * self.of_contact.any())
 
@@ -216,7 +216,7 @@ class CurveRuns(Runs):
         branches = [(scale * share, time) for share, time in branches]
         of_tests = [
             relax(curve(loading.travel(values.get(key))), branches, 1 / loading.rate)
-            for loading, key in zip(self.job.tests, self.job.contact_keys, strict=True)
+            for loading, key in zip(self.problem.tests, self.problem.contact_keys, strict=True)
         ]
         return Prediction((np.concatenate(of_tests)[:, None] + self._correction,), 1, np.zeros(1))
 
@@ -233,11 +233,11 @@ class CurveRuns(Runs):
 
     def _plan_curve(self, values: dict[str, float], reach: float) -> Plan:
         """Plan a run with equidistant travels up to `reach` [m], without relaxation."""
-        data = self.job.with_scene_values(self._predictor.data, values)
+        data = self.problem.with_scene_values(self._predictor.data, values)
         if branches := data.get("tissue", {}).get("relaxation"):
             no_branches = [{**branch, "share": NO_SHARE} for branch in branches]
             data = {**data, "tissue": {**data["tissue"], "relaxation": no_branches}}
-        placed = self.job.approach.place(data, np.linspace(0, reach, TRAVELS + 1), 1.0)
+        placed = self.problem.approach.place(data, np.linspace(0, reach, TRAVELS + 1), 1.0)
         return check_scene(Scene(**placed), self._predictor.maps)
 
 
@@ -271,7 +271,7 @@ def search_by_curve(runs: CurveRuns, misfit: Misfit, start: Array, first: Predic
     information = np.linalg.norm(misfit.scaled(search.jacobian(solution), solution.scales), axis=0)
     for n in np.flatnonzero(runs.of_curve & (information < 3.0)):
         starts.append(solution.x.copy())
-        starts[-1][n] = max(start[n] - 1, runs.job.parameters[n].limits[0])
+        starts[-1][n] = max(start[n] - 1, runs.problem.parameters[n].limits[0])
     for x in starts:
         with suppress(SceneError, DivergedError):
             solution = min(solution, _descend(runs, misfit, x, by_tests=False), key=lambda each: each.cost)
@@ -287,8 +287,8 @@ def _scaled(runs: CurveRuns, misfit: Misfit, x: Array, initial: Prediction) -> A
     measured = predicted - misfit.of(initial)
     ratio = np.linalg.norm(measured) / max(float(np.linalg.norm(predicted)), 1e-300)
     names = ("young", "foundation", "structural")
-    is_stiffness = [parameter.is_log and parameter.path[-1] in names for parameter in runs.job.parameters]
-    return np.clip(np.where(is_stiffness, x + np.log(ratio), x), *runs.job.limits)
+    is_stiffness = [parameter.is_log and parameter.path[-1] in names for parameter in runs.problem.parameters]
+    return np.clip(np.where(is_stiffness, x + np.log(ratio), x), *runs.problem.limits)
 
 
 def _descend(runs: CurveRuns, misfit: Misfit, start: Array, *, by_tests: bool) -> Solution:
@@ -331,8 +331,8 @@ def _descend(runs: CurveRuns, misfit: Misfit, start: Array, *, by_tests: bool) -
 
 def _limits(runs: CurveRuns, x: Array, region: Array) -> tuple[Array, Array]:
     """Return the bounds of x within the trust region, and of depths of contact within the reach of the curve."""
-    low, high = runs.job.limits
-    margin = np.array([CONTACT_MARGIN * runs.reach / (parameter.scale or 1) for parameter in runs.job.parameters])
+    low, high = runs.problem.limits
+    margin = np.array([CONTACT_MARGIN * runs.reach / (parameter.scale or 1) for parameter in runs.problem.parameters])
     below = np.where(runs.of_contact, np.minimum(region, margin), region)
     return np.maximum(low, x - below), np.minimum(high, x + region)
 

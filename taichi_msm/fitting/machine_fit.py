@@ -56,18 +56,18 @@ class FittedTest:
         }
 
 
-def fitted_tests(job: MachineProblem, values: Mapping[str, float], forces: Array) -> tuple[FittedTest, ...]:
+def fitted_tests(problem: MachineProblem, values: Mapping[str, float], forces: Array) -> tuple[FittedTest, ...]:
     """Return the fitted tests.
 
     Args:
-        job: the fit.
+        problem: the fit.
         values: fitted values of the parameters by key.
         forces: fitted forces of all tests [N], shape (frames of all tests, 1).
     """
-    ends = np.cumsum([len(loading.force) for loading in job.tests])[:-1]
+    ends = np.cumsum([len(loading.force) for loading in problem.tests])[:-1]
     return tuple(
         FittedTest(loading, values.get(key, loading.contact), force)
-        for loading, key, force in zip(job.tests, job.contact_keys, np.split(forces[:, 0], ends), strict=True)
+        for loading, key, force in zip(problem.tests, problem.contact_keys, np.split(forces[:, 0], ends), strict=True)
     )
 
 
@@ -161,10 +161,10 @@ def _explain_by_contact(fitted: FittedTest, rising: slice) -> str:
     shift = 0.0
     for shifts in (np.linspace(-0.5, 0.9, 141), np.linspace(-0.01, 0.01, 41)):
         shift = min((shift + reach * shifts).tolist(), key=lambda shift: fit_shifted(shift)[0])
-    left, coefficients = fit_shifted(shift)
-    left_by_curvature, _ = _fit_linear(measured, model, model * travel, is_pressed)
-    explained = 1 - left / max(float((model - measured) @ (model - measured)), 1e-300)
-    if abs(shift) <= 0.02 * reach or explained <= 0.7 or left >= left_by_curvature:
+    square, coefficients = fit_shifted(shift)
+    square_by_curvature, _ = _fit_linear(measured, model, model * travel, is_pressed)
+    explained = 1 - square / max(float((model - measured) @ (model - measured)), 1e-300)
+    if abs(shift) <= 0.02 * reach or explained <= 0.7 or square >= square_by_curvature:
         return ""
     slack = ""
     if shift > 0 and coefficients[1] > CONTACT_NOISES * loading.noise:

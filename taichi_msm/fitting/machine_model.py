@@ -104,7 +104,7 @@ class MachineProblem(FitProblem):
 class MachineModel(ForwardModel):
     """Forward model of machine tests; predicts `MachineForces`, of shape (frames of all tests, 1)."""
 
-    job: MachineProblem
+    problem: MachineProblem
 
     def predict(
         self,
@@ -116,8 +116,8 @@ class MachineModel(ForwardModel):
         pause: Pause = lambda: None,
     ) -> Prediction:
         forces, most_steps = [], 0
-        for n in range(len(self.job.tests)):
-            data = self.job.fitted_data(self.data, self.values(x), n)
+        for n in range(len(self.problem.tests)):
+            data = self.problem.fitted_data(self.data, self.values(x), n)
             simulation, plan = self.start(check_scene(Scene(**data), self.maps), steps, coarse)
             forces.append(self.forces(simulation, plan, pause))
             most_steps = max(most_steps, plan.grid.steps_per_frame)
@@ -131,7 +131,7 @@ class MachineModel(ForwardModel):
             plan: its plan.
             pause: called several times a second.
         """
-        (observed,) = self.job.observations
+        (observed,) = self.problem.observations
         frames = plan.grid.frames + 1
         model = observed.build_model(plan.scene, frames)
         (recorded,) = self.record([model], simulation, frames, pause)

@@ -381,10 +381,10 @@ class Pixels(PointObservation):
 
     def faults(self, scene: Scene) -> Iterator[str]:
         """Yield sentinel values of lost points, or fractions of the frame instead of pixels."""
-        found = list(super().faults(scene))
-        yield from found
+        sentinels = list(super().faults(scene))
+        yield from sentinels
         largest, rest = np.nanmax(np.abs(self.values)), self.at_rest(scene)
-        if not found and largest <= 1.5 < MAX_OFFSET_PX < np.nan_to_num(np.abs(rest)).max():
+        if not sentinels and largest <= 1.5 < MAX_OFFSET_PX < np.nan_to_num(np.abs(rest)).max():
             width, height = scene.render.size
             fault = "are they fractions of the frame? multiply them by its width and height"
             yield f"{self.subject}: up to {largest:.3g}; {fault}, {width} and {height} in the scene"

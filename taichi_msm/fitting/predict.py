@@ -93,17 +93,17 @@ class ForwardModel:
     """Forward model of a fit: a simulation that is restarted for every prediction.
 
     Args:
-        job: the fit.
+        problem: the fit.
         threads: number of threads; all cores if it is None.
     """
 
-    def __init__(self, job: FitProblem, threads: int | None) -> None:
-        self.job, self.data = job, as_data(job.scene)
-        plan = check_scene(job.scene)
+    def __init__(self, problem: FitProblem, threads: int | None) -> None:
+        self.problem, self.data = problem, as_data(problem.scene)
+        plan = check_scene(problem.scene)
         self.maps, self._threads = plan.maps, threads
         self._simulation: Simulation | None = None
-        times = np.concatenate([observed.time for observed in job.observations])
-        self._frames = max(2, math.ceil(time_in_frames(job.scene, times).max()) + 1)
+        times = np.concatenate([observed.time for observed in problem.observations])
+        self._frames = max(2, math.ceil(time_in_frames(problem.scene, times).max()) + 1)
 
     def predict(
         self,
@@ -129,7 +129,7 @@ class ForwardModel:
         """
         simulation, plan = self.start(self.plan(x), steps, coarse)
         # The mesh of a coarse run differs.
-        models = [observed.build_model(plan.scene, self._frames) for observed in self.job.observations]
+        models = [observed.build_model(plan.scene, self._frames) for observed in self.problem.observations]
         frames = max(self._frames, plan.grid.frames + 1) if to_end else self._frames
         pairs = list(zip(models, self.record(models, simulation, frames, pause), strict=True))
         values = tuple(model.predict(recorded[: self._frames]) for model, recorded in pairs)
@@ -188,12 +188,12 @@ class ForwardModel:
             predicted = self.predict(x, steps, **options)
         except (SceneError, DivergedError):
             return None
-        pairs = zip(predicted.values, self.job.observations, strict=True)
+        pairs = zip(predicted.values, self.problem.observations, strict=True)
         return predicted if all(np.isfinite(values[observed.known]).all() for values, observed in pairs) else None
 
     def values(self, x: Array) -> dict[str, float]:
         """Return the parameter values by key at x; raise a SceneError if they are out of range."""
-        pairs = zip(self.job.parameters, x.tolist(), strict=True)
+        pairs = zip(self.problem.parameters, x.tolist(), strict=True)
         values = {parameter.key: parameter.value(coordinate) for parameter, coordinate in pairs}
         if not np.isfinite(list(values.values())).all():
             raise SceneError(["the values are out of range"])
@@ -201,7 +201,7 @@ class ForwardModel:
 
     def plan(self, x: Array) -> Plan:
         """Plan the scene with the parameters at x; raise a SceneError if it is not valid."""
-        return check_scene(Scene(**self.job.fitted_data(self.data, self.values(x))), self.maps)
+        return check_scene(Scene(**self.problem.fitted_data(self.data, self.values(x))), self.maps)
 
     def record(
         self, models: Sequence[ObservationModel], simulation: Simulation, frames: int, pause: Pause
@@ -239,19 +239,19 @@ def difference_step(scene: Scene) -> float:
 _cached_models: dict[str, ForwardModel] = {}
 
 
-def predict(job: FitProblem, x: Array, steps: int | None) -> Prediction | None:
+def predict(problem: FitProblem, x: Array, steps: int | None) -> Prediction | None:
     """Return the prediction of a worker process on one thread, as `ForwardModel.try_predict` does.
 
     Args:
-        job: the fit; its forward model is kept for the next call.
+        problem: the fit; its forward model is kept for the next call.
         x: coordinates of the parameters, shape (n,).
         steps: smallest number of steps per frame, or None, as of `ForwardModel.predict`.
     """
-    if job.token not in _cached_models:
+    if problem.token not in _cached_models:
         for token in list(_cached_models):
             _cached_models.pop(token).close()
-        _cached_models[job.token] = job.build_model(threads=1)
-    return _cached_models[job.token].try_predict(x, steps)
+        _cached_models[problem.token] = problem.build_model(threads=1)
+    return _cached_models[problem.token].try_predict(x, steps)
 
 
 def mesh_error(plan: Plan, pause: Pause) -> float | None:
@@ -277,17 +277,17 @@ class Runs:
     """Execution of the runs of a fit, in this process or in a pool; a context manager, which ends the pool.
 
     Args:
-        job: the fit.
+        problem: the fit.
         workers: number of worker processes, without a pool if it is 1; by default by the duration of the first run.
         progress: called often with the stage, the finished and the expected number of runs; an exception from it ends
             the fit.
     """
 
-    def __init__(self, job: FitProblem, workers: int | None, progress: StageProgressCallback) -> None:
-        self.job = job
+    def __init__(self, problem: FitProblem, workers: int | None, progress: StageProgressCallback) -> None:
+        self.problem = problem
         self.count = self.expected = 0  # number of finished runs, and the expected number
         self._workers, self._progress = workers, progress
-        self._predictor = job.build_model(threads=None)
+        self._predictor = problem.build_model(threads=None)
         self._pool: Pool | None = None
         self._seconds = 0.0
 
@@ -339,7 +339,7 @@ class Runs:
             self._pool = Pool(workers)
         if self._pool is None or len(coordinates) < 2:
             return [self.predict_one(x, steps) for x in coordinates]
-        futures: list[Future[Any]] = [self._pool.submit(predict, self.job, x, steps) for x in coordinates]
+        futures: list[Future[Any]] = [self._pool.submit(predict, self.problem, x, steps) for x in coordinates]
         waiting = set(futures)
         while waiting:
             self._report_progress()
@@ -353,11 +353,11 @@ class Runs:
     def _choose_workers(self) -> int:
         if self._workers is not None:
             return self._workers
-        parameters = len(self.job.parameters)
+        parameters = len(self.problem.parameters)
         # A pool, whose start takes seconds, pays off if eight runs per parameter take longer than eight seconds.
         if 8 * parameters * self._seconds < 8.0:
             return 1
-        process_bytes = PROCESS_BYTES + cost.estimate_budget(check_scene(self.job.scene)).memory_bytes
+        process_bytes = PROCESS_BYTES + cost.estimate_budget(check_scene(self.problem.scene)).memory_bytes
         return max(1, min(available_threads(), available_memory() // process_bytes, 2 * parameters))
 
     def _report_progress(self) -> None:

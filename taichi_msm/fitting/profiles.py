@@ -63,7 +63,7 @@ class Profiler:
     def __init__(self, runs: Runs, misfit: Misfit, solution: Solution, uncertainties: Uncertainty) -> None:
         self._runs, self._misfit, self._solution, self._uncertainties = runs, misfit, solution, uncertainties
         self._min_cost = misfit.cost(uncertainties.residuals)
-        self._low, self._high = runs.job.limits
+        self._low, self._high = runs.problem.limits
 
     def profiles(self) -> list[Profile]:
         """Return the profiles of all parameters, with both sides of each computed in parallel."""

@@ -42,7 +42,7 @@ NUMBER_PATTERN = re.compile(r"[+-]?(?:\d+(?:\.(\d*))?|\.(\d+))(?:[eE]([+-]?\d{1,
 
 # Thousands in groups, with the mark of the groups and the decimal mark.
 GROUPS = {
-    mark: re.compile(rf"[+-]?[1-9]\d{{0,2}}(?:\{other}\d{{3}})+\{mark}\d+", re.ASCII) for mark, other in (",.", ".,")
+    mark: re.compile(rf"[+-]?[1-9]\d{{0,2}}(?:\{group}\d{{3}})+\{mark}\d+", re.ASCII) for mark, group in (",.", ".,")
 }
 
 

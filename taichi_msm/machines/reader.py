@@ -231,17 +231,17 @@ def _is_header(row: Row, chosen: dict[str, str]) -> bool:
 
 def _find_candidates(row: Row, chosen: dict[str, str]) -> dict[str, list[int]]:
     """Return the columns of a header that may be each quantity."""
-    found = {}
+    candidates = {}
     for quantity, title in chosen.items():
         name = _plain(_split_choice(title, quantity)[0])
         same = [n for n, cell in enumerate(row) if _plain(cell) == _plain(title)]
-        found[quantity] = same or [
+        candidates[quantity] = same or [
             n for n, cell in enumerate(row) if name in (_plain(cell), _plain(_split_title(cell, quantity)[0]))
         ]
-    taken = {column for columns in found.values() for column in columns}
+    taken = {column for columns in candidates.values() for column in columns}
     for quantity in WORDS.keys() - chosen.keys():
-        found[quantity] = [n for n, cell in enumerate(row) if n not in taken and _is_named(cell, quantity)]
-    return {quantity: found[quantity] for quantity in WORDS}
+        candidates[quantity] = [n for n, cell in enumerate(row) if n not in taken and _is_named(cell, quantity)]
+    return {quantity: candidates[quantity] for quantity in WORDS}
 
 
 def _is_named(cell: str, quantity: str) -> bool:
@@ -348,18 +348,18 @@ def _missing_header(grid: Grid, chosen: dict[str, str]) -> str:
         return f"{grid.title}: is empty; a table has columns of time, depth and force"
     # The row that names most; the cells of a text are separated only below a header.
     cells = [row if grid.sheet else re.split(r"[\t;,|]", ";".join(row)) for row in grid.rows]
-    found = [{quantity for quantity, columns in _find_candidates(row, chosen).items() if columns} for row in cells]
-    best = max(range(len(found)), key=lambda row: len(found[row]))
-    if merged := [column for row, column in grid.merged if row == best and found[best]]:
+    named = [{quantity for quantity, columns in _find_candidates(row, chosen).items() if columns} for row in cells]
+    best = max(range(len(named)), key=lambda row: len(named[row]))
+    if merged := [column for row, column in grid.merged if row == best and named[best]]:
         return _merged(grid, best, min(merged))
     shown = f"{grid.place(best)}: {', '.join(grid.rows[best])[:100]!r}"
-    missing = [quantity for quantity in WORDS if quantity not in found[best]]
+    missing = [quantity for quantity in WORDS if quantity not in named[best]]
     if not missing:
         return f"{shown} names time, depth and force, but not in a cell each; separate them"
-    quantity = missing[0] if found[best] else "depth"
+    quantity = missing[0] if named[best] else "depth"
     known = ", ".join(UNITS[quantity])
     remedy = f'choose columns by --columns "{quantity}=NAME, {next(iter(UNITS[quantity]))}" (units: {known})'
-    if not found[best]:
+    if not named[best]:
         return f"{grid.title}: no row names time, depth and force; {remedy}"
     return f"{shown} names no {repr(chosen[quantity]) if quantity in chosen else quantity}; {remedy}"
 
