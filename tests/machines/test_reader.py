@@ -87,11 +87,6 @@ EXPORTS: dict[str, tuple[str, list[str], float]] = {
     "spaces": (TABLE.replace(";", " "), [], 1),
     "aligned": ("# Temps d'essai (s)   Weg (mm)  Kraft (N)\n" + rows("    "), [], 1),
     "aligned decimal commas": ("Time, s   Position (z), mm   Fz, N\n" + comma(rows("   ")), [], 1),
-    "quoted decimal commas": (
-        '"Time, s","Depth, mm","Force, N"\n' + comma(rows(";", '"{t:.1f}"{s}"{d:.2f}"{s}"{f:.3f}"')).replace(";", ","),
-        [],
-        1,
-    ),
     "minus": (TABLE.replace(";0", ";\N{MINUS SIGN}0").replace(";1", ";\N{MINUS SIGN}1"), [], 1),
     "exponents": ("Time_s;Depth_mm;Force_N\n" + rows(";", "{t:.3E}{s}{d:+.3e}{s}{f:.4E}"), [], 1),
     "comments": ("% of a rig\n" + TABLE.replace("\n0.5", "\n# paused\n\n0.5"), [], 1),
@@ -122,7 +117,7 @@ Read = Callable[..., MachineTest]
 
 
 def assert_is_test(test: MachineTest, newtons: float = 1) -> None:
-    # Scales round once.
+    # A conversion of units rounds once.
     np.testing.assert_allclose(test.time, TIME, rtol=1e-15, atol=1e-16)
     np.testing.assert_allclose(test.depth, DEPTH, rtol=1e-14)
     np.testing.assert_allclose(test.force, FORCE * newtons, rtol=1e-14)
@@ -256,8 +251,7 @@ def test_a_tear_is_noted(read: Read, message: Messages) -> None:
     # Before the tear the test has no note.
     part = cut_window(test, 0.5, 1.45)
     assert part.notes == ()
-    assert part.time[0] >= 0.5
-    assert part.time[-1] <= 1.45
+    assert 0.5 <= part.time.min() <= part.time.max() <= 1.45
     assert len(part.time) == len(part.depth) == len(part.force) == 95
     assert cut_window(test, 0, 1.9).notes == test.notes
 
@@ -271,11 +265,10 @@ def relax(t: float) -> float:
     [
         # Held from 0.2 s on, with a creep of the depth.
         strip(relax, lambda t: min(t, 0.2) + 1e-3 * t),
-        strip(relax, lambda t: 9 - min(t, 0.2)),
         strip(lambda t: min(t, 2 - t), lambda t: min(t, 2 - t)),
         strip(lambda t: t if t < 1.5 else 0.8),
     ],
-    ids=["relaxes", "relaxes after the depth fell", "unloaded", "falls less"],
+    ids=["relaxes", "unloaded", "falls less"],
 )
 def test_no_tear(text: str, read: Read) -> None:
     assert read(text).notes == ()
@@ -300,14 +293,11 @@ FAULTS: dict[str, tuple[str | bytes, list[str], list[str]]] = {
     "megaunit": (TABLE.replace("[N]", "[MN]"), [], ["Force [MN]"]),
     "repeated name": (HEADER + ";Force [N]\n" + rows(";", "{t}{s}{d}{s}{f}{s}{f}"), [], ["csv:1", "Force [N]", "2"]),
     "gap": (TABLE.replace("0.5;0.50;0.250", "0.5;;0.250"), [], ["csv:7", "Depth [mm]", "empty"]),
-    "NaN": (TABLE.replace("0.250", "NaN"), [], ["csv:7", "Force [N]", "NaN"]),
     "too large": (TABLE.replace("0.250", "1e31"), [], ["csv:7", "Force [N]", "1e31"]),
     "word": (TABLE.replace("0.250", "over"), [], ["csv:7", "Force [N]", "over"]),
     "row of words": (TABLE.replace("0.5;0.50;0.250", "a;b;c"), [], ["csv:7", "a, b, c"]),
-    "time of day": (TABLE.replace("\n0.5", "\n12:00:05"), [], ["csv:7", "Time [s]", "12:00:05"]),
     "same time": (TABLE.replace("\n0.5", "\n0.4"), [], ["csv:7", "Time [s]", "0.4"]),
     "few rows": (HEADER + "\n" + rows(count=9), [], ["csv:1", "9", "10"]),
-    "no rows": (HEADER, [], ["csv:1", "0", "10"]),
     "decimal commas between commas": (HEADER.replace(";", ",") + "\n" + comma(rows(",")), [], ["csv:2", "6", "3"]),
     "other separator": (HEADER.replace(";", ",") + "\n" + rows(), [], ["csv:2", "commas"]),
     "two decimal marks": (TABLE.replace("0.250", "0,250"), [], ["csv:7", "Force [N]", "0,250"]),
@@ -316,11 +306,8 @@ FAULTS: dict[str, tuple[str | bytes, list[str], list[str]]] = {
     "workbook by another name": (b"PK\x03\x04\0\0", [], [".xlsx"]),
     "binary": (b"\xff\xfe\x00", [], ["text"]),
     "column of no quantity": (TABLE, ["strain=Strain, mm"], ["--columns", "strain"]),
-    "column without a name": (TABLE, ["depth="], ["--columns", "depth="]),
     "column chosen twice": (TABLE, ["depth=Depth", "depth=Time"], ["--columns", "depth"]),
     "time of another unit": (TABLE.replace("[s]", "[ms]"), ["time=Time [s]"], ["csv:1", "Time [s]"]),
-    "other unit after a space": (TABLE.replace("[N]", "(kN)"), ["force=Force N"], ["csv:1", "Force N"]),
-    "unknown unit": (TABLE, ["depth=Depth, in"], ["csv:1", "Depth, in", "mm"]),
     "column for two quantities": (TABLE, ["depth=Force [N], mm"], ["csv:1", "force"]),
 }
 
@@ -423,8 +410,6 @@ SHEET_FAULTS: dict[str, tuple[list[list[Any]], Callable[[Any], object], list[str
     "empty sheet": ([], lambda book: None, ["FF2", "empty"]),
     "several sheets without a table": ([], lambda book: book.create_sheet("FF3"), ["FF2, FF3"]),
     "merged names": (SHEET, lambda book: book["FF2"].merge_cells("B2:C2"), ["FF2!B2", "merged"]),
-    "names merged with an unnamed column": (SHEET, lambda book: book["FF2"].merge_cells("C2:D2"), ["FF2!C2", "merged"]),
-    "formula without a value": (SHEET, put("C14", "=B14*2"), ["FF2!C14", "Allongement", "=B14*2"]),
     "column of formulas": (
         [[*row[:2], f"=A{n}" if n > 3 else row[2], row[3]] for n, row in enumerate(SHEET, 1)],
         lambda book: None,
