@@ -116,14 +116,6 @@ def test_recovery_of_relaxing_tissue(pressed: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_several_tables_share_the_tissue_but_not_the_contact(pressed: str) -> None:
-    start = scene(relaxation=[BRANCH], foundation={**FOUNDATION, "young": 1.5e4})
-    result = estimate(start, [pressed, pressed], [YOUNG, "contact.1"], rate=RATE, contact=[CONTACT, 1.2e-3])
-    assert result.parameters[YOUNG].value == pytest.approx(FOUNDATION["young"], rel=0.01)
-    assert result.tests[1].contact == pytest.approx(CONTACT, abs=2e-5)
-
-
-@pytest.mark.slow
 def test_a_share_without_information_is_not_identifiable(pressed: str) -> None:
     start, free = (
         scene(relaxation=[BRANCH, {"share": 1e-3, "time": 1e4}]),
@@ -248,15 +240,18 @@ def test_options_and_files_of_points_and_tables_exclude_each_other(message: Mess
         fit(scene(), observed, ["tissue.young"], rate=5.0)
 
 
-def test_command(pressed: str, tmp_path: Path, program: Program, message: Messages) -> None:
-    (tmp_path / "scene.yaml").write_text(RELAXING.model_dump_json(exclude_none=True))
-    options = ["--rate", str(RATE), "--contact", str(CONTACT), "--window", "0,4", "--columns", "depth=Depth"]
-    arguments = [str(tmp_path / "scene.yaml"), pressed, pressed, "--free", YOUNG, *options]
-    done = program("fit", *arguments, "--out", str(tmp_path / "out"), "--json", "--workers", "1")
+def test_command_with_two_tables(pressed: str, tmp_path: Path, program: Program, message: Messages) -> None:
+    """They have the same tissue, but depths of contact of their own."""
+    start = scene(relaxation=[BRANCH], foundation={**FOUNDATION, "young": 1.5e4})
+    (tmp_path / "scene.yaml").write_text(start.model_dump_json(exclude_none=True))
+    options = ["--rate", str(RATE), "--contact", str(CONTACT), "--contact", "1.2e-3", "--window", "0,4", "--columns"]
+    free = ["--free", YOUNG, "--free", "contact.1", "--out", str(tmp_path / "out"), "--json", "--workers", "1"]
+    done = program("fit", str(tmp_path / "scene.yaml"), pressed, pressed, *free, *options, "depth=Depth")
     assert done.returncode == 0, done.stderr
     record = json.loads(done.stdout)
     assert [test["frames"] for test in record["tests"]] == [4 * RATE + 1] * 2
     assert record["parameters"][YOUNG]["value"] == pytest.approx(FOUNDATION["young"], rel=0.01)
+    assert record["tests"][1]["contact"] == pytest.approx(CONTACT, abs=2e-5)
     for name in ("scene", "scene-1"):
         assert load_scene(tmp_path / f"out/{name}.yaml").time.duration == 4
     with message.raises(click.BadParameter, "0.5"):
