@@ -252,12 +252,13 @@ def test_occluded_invisible_and_masked_tracks(tracks: Arrays, message: Messages)
 
 
 def test_robust_fit_of_outliers(tracks: Arrays, message: Messages) -> None:
-    """They have full weight for the rejection of the model; without them the fit is nearly the plain one."""
+    """They have full weight for the rejection of the model; without them the robust fit is less efficient."""
     observed, free = noisy(tracks, 0.1, sigma=0.1), [FOUNDATION]
     plain, robust = (estimate(changed(), observed, free, robust=is_robust) for is_robust in (False, True))
     assert not robust.model_rejected
-    intervals = [result.parameters[FOUNDATION].interval for result in (plain, robust)]
-    np.testing.assert_allclose(intervals[1], intervals[0], rtol=1e-3)
+    errors = [result.parameters[FOUNDATION].standard_error for result in (plain, robust)]
+    # E[(1 + z^2 / 4)^(-3/2)]^(-1/2) for standard normal z, as f = 1; the mean over some 100 numbers is within 1.6 %.
+    assert errors[1] / errors[0] == pytest.approx(1.129, rel=0.04)
     observed["pixel"][[7, 20]] += np.linspace(0, 40, 11)[:, None]
     plain, robust = (estimate(changed(), observed, free, robust=is_robust) for is_robust in (False, True))
     errors = [abs(values(result)[0] / 3e5 - 1) for result in (plain, robust)]
