@@ -138,11 +138,11 @@ def _read_problem(
     points = read_observations(observed, initial.time.frames_per_second).with_sigma(method.get("sigma"))
     observations: tuple[Observation, ...] = (points,)
     if unused := [name for name in TABLE_OPTIONS if method.get(name)]:
-        raise SceneError([f"--{unused[0]}: is of tables of a testing machine; leave it out"])
+        raise SceneError([f"--{unused[0]}: only for tables of a testing machine; leave it out"])
     settings = map_settings(initial, free, bounds, method.get("resolution"))
     options = {"forces": forces, **{name: method.get(name) for name in ("robust", "profile", "correlation", "drift")}}
     if settings is not None and (conflicting := [name for name, value in options.items() if value]):
-        raise SceneError([f"--free {KEY}: --{conflicting[0]} is of fits of numbers; leave it out"])
+        raise SceneError([f"--free {KEY}: --{conflicting[0]} is only for fits of numbers; leave it out"])
     parameters = () if settings is not None else make_parameters(initial, free, bounds)
     if forces is not None:
         observations = (points, read_forces(forces[0], forces[1], len(initial.probes)))

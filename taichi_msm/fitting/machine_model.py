@@ -184,7 +184,7 @@ def read_machine_problem(
     if forces is not None:
         raise SceneError([f"--forces: {paths[0]} has the forces; leave the option out"])
     if unused := [name for name in POINT_OPTIONS if method.get(name) is not None]:
-        raise SceneError([f"--{unused[0]}: is of observed points, and {paths[0]} has none; leave the option out"])
+        raise SceneError([f"--{unused[0]}: only for observed points, and {paths[0]} has none; leave the option out"])
     rate, contacts = method.get("rate"), list(method.get("contact") or ())
     if rate is not None and not 0 < rate < np.inf:
         raise SceneError([f"--rate {rate:g}: take a number of frames per second, above 0"])

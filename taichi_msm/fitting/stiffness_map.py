@@ -36,9 +36,6 @@ KEY = "tissue.map"
 # Key of a component of a force.
 FORCE_KEY = re.compile(r"probes\.\d+\.total\.[012]")
 
-# Standard deviation of an unknown log of a force.
-UNKNOWN_DEVIATION = 3.0
-
 # Default bounds of the factors.
 DEFAULT_LOW, DEFAULT_HIGH = 0.1, 10.0
 
@@ -77,7 +74,7 @@ def map_settings(
     """
     if KEY not in free:
         if resolution is not None:
-            raise SceneError([f"--resolution {resolution}: is that of a map; add --free {KEY}"])
+            raise SceneError([f"--resolution {resolution}: only for a map; add --free {KEY}"])
         return None
     option = f"--free {KEY}"
     force_keys = [key for key in free if key != KEY]
@@ -199,7 +196,8 @@ def fit_map(
 
 def _force_estimate(parameter: Parameter, solution: MapSolution) -> tuple[Estimate, list[ProfilePoint]]:
     """Return the estimate of a force, and the quadratic approximation of its profile."""
-    x, deviation = float(solution.x[-1]), float(np.nan_to_num(solution.errors[-1], nan=UNKNOWN_DEVIATION))
+    # The log of an unknown force has a standard deviation of 3.
+    x, deviation = float(solution.x[-1]), float(np.nan_to_num(solution.errors[-1], nan=3.0))
     value, error, is_identifiable = parameter.value(x), parameter.error(x, deviation), deviation <= MAX_RELATIVE_ERROR
     low, high = sorted(parameter.value(x + side * 1.96 * deviation) for side in (-1, 1))
     curve = [ProfilePoint(value * math.exp(n * deviation), float(n)) for n in np.linspace(-3, 3, 25)]

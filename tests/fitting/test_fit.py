@@ -155,15 +155,15 @@ def test_coverage_of_intervals(tracks: Arrays) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("bounded", [False, True])
 def test_profile_interval(tracks: Arrays, bounded: bool) -> None:
-    """At its ends, chi-square with the other parameter refitted has risen by Student's t squared."""
+    """At its ends, chi-square with the foundation refitted has risen by Student's t squared."""
     # Errors so large that the motion is not linear in the damping; or bounds that exclude the true foundation.
-    key, other, error = ("young", 2.95e5, 0.1) if bounded else ("damping", 3e5, 0.5)
+    key, foundation, error = ("young", 2.95e5, 0.1) if bounded else ("damping", 3e5, 0.5)
     options = {"bounds": {FOUNDATION: (2.9e5, 2.99e5)} if bounded else {}}
     free, observed = [f"tissue.{key}", FOUNDATION], noisy(tracks, error, sigma=error)
-    best = estimate(changed(tissue__foundation=other), observed, free, profile=True, **options)
+    best = estimate(changed(tissue__foundation=foundation), observed, free, profile=True, **options)
     quantile = student.ppf(0.975, best.degrees_of_freedom)
     for end in best.parameters[free[0]].interval:
-        start = changed(**{f"tissue__{key}": end, "tissue__foundation": other})
+        start = changed(**{f"tissue__{key}": end, "tissue__foundation": foundation})
         refitted = estimate(start, observed, free[1:], **options)
         # An end is determined to 1 % of its distance.
         assert refitted.chi_square - best.chi_square == pytest.approx(quantile**2, rel=0.04 if bounded else 0.03)
