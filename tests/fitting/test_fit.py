@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import zipfile
 from pathlib import Path
@@ -197,18 +196,6 @@ def test_identifiability_without_and_with_a_force(tracks: Arrays, tmp_path: Path
     np.testing.assert_allclose(values(result), [2e4, 3e5, 10, -2], rtol=1e-4)
 
 
-@pytest.mark.slow
-def test_identifiable_product(motion: Array) -> None:
-    # In equilibrium and without bending, young and thickness act only as their product.
-    scene = changed(time__motion="quasistatic")
-    with Simulation(scene) as simulation:
-        simulation.advance(4)
-        position = simulation.positions()[None]
-    result = fit(scene, {"time": [0.16], "position": position, "sigma": 1e-5}, [YOUNG, "tissue.thickness"])
-    assert [group.text.startswith("tissue.young x tissue.thickness is known to ") for group in result.unseen] == [True]
-    assert not result.identifiable
-
-
 def test_an_unidentifiable_pair_does_not_change_other_estimates(tracks: Arrays) -> None:
     """Young and depth of the foundation act only as their quotient."""
     start, observed = changed(tissue__foundation={"young": 1.5e4, "depth": 0.05}), noisy(tracks, 0.02, sigma=0.02)
@@ -217,8 +204,9 @@ def test_an_unidentifiable_pair_does_not_change_other_estimates(tracks: Arrays) 
     errors = [fitted.parameters[YOUNG].standard_error for fitted in (result, alone)]
     assert errors[0] == pytest.approx(errors[1], rel=0.05)
     assert [parameter.identifiable for parameter in result.parameters.values()] == [True, False, False]
-    ((known,),) = (group.known for group in result.unseen)
-    assert sorted(known.exponents.values()) == [-1, 1]
+    (group,) = result.unseen
+    assert group.text.startswith("tissue.foundation.young / tissue.foundation.depth is known to ")
+    (known,) = group.known
     assert known.standard_error == pytest.approx(alone.parameters[free[1]].standard_error / 1.5e4, rel=0.05)
 
 
@@ -484,20 +472,13 @@ def test_options_are_documented() -> None:
     assert all(name in fit.__doc__ for name in Method.__annotations__)
 
 
-def saved(array: Array) -> bytes:
-    file = io.BytesIO()
-    np.save(file, array)
-    return file.getvalue()
-
-
-FILES = {"empty": b"", "text": b"nothing", "no arrays": b"PK\x05\x06" + bytes(18), "single array": saved(np.ones(3))}
-
-
-@pytest.mark.parametrize("case", FILES)
-def test_files_of_other_kinds_are_refused(tmp_path: Path, case: str, message: Messages) -> None:
-    (tmp_path / "tracks.npz").write_bytes(FILES[case])
-    with message.raises(SceneError, "tracks.npz: "):
-        fit(changed(), tmp_path / "tracks.npz", [YOUNG])
+def test_files_of_other_kinds_are_refused(tmp_path: Path, message: Messages) -> None:
+    np.save(tmp_path / "array.npy", np.ones(3))
+    single = (tmp_path / "array.npy").read_bytes()
+    for name, data in {"empty": b"", "text": b"nothing", "none": b"PK\x05\x06" + bytes(18), "single": single}.items():
+        (tmp_path / f"{name}.npz").write_bytes(data)
+        with message.raises(SceneError, f"{name}.npz: "):
+            fit(changed(), tmp_path / f"{name}.npz", [YOUNG])
 
 
 def test_unused_arrays_are_not_read(tracks: Arrays, tmp_path: Path, message: Messages) -> None:

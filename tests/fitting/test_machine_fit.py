@@ -158,13 +158,6 @@ def test_a_contact_at_the_greatest_depth_has_no_curve(pressed: str, message: Mes
             runs.run_curve(problem.limits[1])
 
 
-@pytest.mark.slow
-def test_rejection_of_a_model_without_relaxation(pressed: str, message: Messages) -> None:
-    result = estimate(scene(), pressed, [YOUNG], contact=[CONTACT])
-    assert result.model_rejected
-    message((note for note in result.notes if "relaxation" in note), "falls", hide=r"/\S*/|[\d.]+ %")
-
-
 def test_rejection_of_a_contact_found_in_a_slack(device: Device, tmp_path: Path, message: Messages) -> None:
     """A drag of 5 mN over a slack of 1 mm hides the contact; with the contact of the note the stiffness is right."""
     time = np.arange(121) / 10
