@@ -27,7 +27,7 @@ LAYERS = [
     {"load"},
     {"gradients"},
     {"runs"},
-    {"datasets", "exports", "study", "sweeps", "view"},
+    {"datasets", "exports", "machines", "study", "sweeps", "view"},
     {"fitting"},
     {"cli"},
     {"__main__", "__init__"},

@@ -1,8 +1,8 @@
 """Reader of observed points, from an .npz or a mapping of the same arrays.
 
-It has `time` (T,) [s], `coordinates` (N, 2), across and down, and `position` (N, T, 3) [m] or `pixel` (N, T, 2) [px],
-NaN where not observed; optionally `sigma`, the standard deviation of their errors. A run's trajectory.npz and
-tracks.npz are accepted too.
+The arrays are `time` [s], shape (T,); `coordinates`, across and down as fractions of the sheet, shape (N, 2); and
+`position` [m], shape (N, T, 3), or `pixel` [px], shape (N, T, 2), NaN where not observed; optionally `sigma`, the
+standard deviation of their errors. A run's trajectory.npz and tracks.npz are accepted too.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ KINDS: dict[str, type[PointObservation]] = {"position": Positions, "pixel": Pixe
 
 
 def read_observations(observed: str | Path | Mapping[str, Any], rate: float) -> PointObservation:
-    """Read observations from a file, or from a mapping of the same arrays.
+    """Return the observed points of a file, or of a mapping of the same arrays.
 
     Args:
-        observed: path of an .npz, or a mapping.
-        rate: frames per second of the scene, for a tracks.npz.
+        observed: path of an .npz, or a mapping of array names to arrays.
+        rate: frames per second of the scene, which gives the times of a tracks.npz.
 
     Raises:
         SceneError: when arrays are missing, unknown, or have other shapes.
@@ -55,9 +55,9 @@ def read_observations(observed: str | Path | Mapping[str, Any], rate: float) -> 
     kinds = [kind for kind in KINDS if kind in arrays]
     missing = [key for key in ("time", "coordinates") if key not in arrays]
     if missing := missing + ([] if kinds else ["position or pixel"]):
-        found = ", ".join(map(ascii, names[:20])) or "nothing"
+        listed = ", ".join(map(ascii, names[:20])) or "nothing"
         suggestion = did_you_mean(missing[0].partition(" ")[0], names).replace("; did you mean", "; is it")
-        raise SceneError([f"{name}: {missing[0]}: missing; expected {NEEDS}, and it has {found}{suggestion}"])
+        raise SceneError([f"{name}: {missing[0]}: missing; expected {NEEDS}, and it has {listed}{suggestion}"])
     if len(kinds) == 2:
         raise SceneError([f"{name}: has both position and pixel; leave one of them out"])
     return _checked(name, arrays, kinds[0]).with_sigma(arrays.get("sigma"))
@@ -73,11 +73,11 @@ def _checked(name: str, arrays: Arrays, kind: str) -> PointObservation:
     points, times = len(coordinates) if coordinates.ndim else 0, len(time) if time.ndim else 0
     expected = {"time": (times,), "coordinates": (points, 2), kind: (points, times, size)}
     for key, shape in expected.items():
-        if (found := arrays[key].shape) != shape or 0 in shape:
+        if (actual := arrays[key].shape) != shape or 0 in shape:
             remedy = f"expected {NEEDS}"
-            if key == kind and found == (times, points, size):
+            if key == kind and actual == (times, points, size):
                 remedy = f"the points come first: take {key}.swapaxes(0, 1)"
-            raise SceneError([f"{name}: {key}: shape {found}; {remedy}"])
+            raise SceneError([f"{name}: {key}: shape {actual}; {remedy}"])
     if not np.isfinite(time).all():
         raise SceneError([f"{name}: time: holds NaN or infinity; give the time of every column in seconds"])
     if not ((coordinates >= 0) & (coordinates <= 1)).all():

@@ -15,7 +15,13 @@ from taichi_msm.scene.section import FRAME_TOLERANCE
 
 
 def faults(observations: Sequence[Observation], scene: Scene, parameters: int) -> Iterator[str]:
-    """Yield the faults that need no run: too few observations, units, times, no motion."""
+    """Yield the faults that need no run: too few observations, units, times, no motion.
+
+    Args:
+        observations: the observations.
+        scene: the scene with its initial values.
+        parameters: number of parameters.
+    """
     count, first = sum(int(observed.known.sum()) for observed in observations), observations[0]
     if count <= parameters:
         fault = f"{count} numbers were observed, too few for {parameters} parameters and their errors"
@@ -39,7 +45,8 @@ def faults_at_start(
         observations: the observations.
         scene: the scene with its initial values.
         first: prediction of the scene up to its end.
-        parameters: of the fit, which may move the camera, or change the signs of forces and motion.
+        parameters: parameters of the fit. Those of the camera disable the checks of the camera, and linear ones that of
+            opposite signs.
     """
     rate, motion, name = scene.time.frames_per_second, float(first.motion.max()), observations[0].name
     if motion <= ROUNDING_SHARE * max(scene.sheet.size):
@@ -56,24 +63,35 @@ def faults_at_start(
         )
         return
     same_camera = not any(parameter.key.startswith("render.") for parameter in parameters)
-    found = [
+    problems = [
         fault
         for observed, predicted in zip(observations, first.values, strict=True)
         for fault in observed.faults_at_start(scene, predicted, same_camera=same_camera)
     ]
-    yield from found
-    if not found and all(parameter.is_log for parameter in parameters):
+    yield from problems
+    if not problems and all(parameter.is_log for parameter in parameters):
         yield from opposed(observations, scene, first)
 
 
 def opposed(observations: Sequence[Observation], scene: Scene, *predictions: Prediction) -> Iterator[str]:
-    """Yield the components of the sign opposite to all predictions."""
+    """Yield a message per observed component that has the opposite sign in all predictions.
+
+    Args:
+        observations: the observations.
+        scene: the scene with its initial values.
+        predictions: predictions of all observations.
+    """
     for n, observed in enumerate(observations):
         yield from observed.opposed(scene, *(prediction.values[n] for prediction in predictions))
 
 
 def unit_faults(observations: Sequence[Observation], *predictions: Prediction) -> Iterator[str]:
-    """Yield the units that explain the ratios of observed to predicted values, for all predictions."""
+    """Yield a message per unit that explains the ratio of observed to predicted values, for all predictions.
+
+    Args:
+        observations: the observations.
+        predictions: predictions of all observations.
+    """
     for n, observed in enumerate(observations):
         yield from observed.unit_faults(*(prediction.values[n] for prediction in predictions))
 

@@ -20,19 +20,8 @@ from taichi_msm.fitting import rejection
 from taichi_msm.fitting.archive import read_observations
 from taichi_msm.fitting.checks import faults, faults_at_start, opposed, unit_faults
 from taichi_msm.fitting.forces import read_forces
-from taichi_msm.fitting.least_squares import (
-    MAX_RELATIVE_ERROR,
-    Misfit,
-    Profile,
-    ProfilePoint,
-    Profiler,
-    Search,
-    Solution,
-    Uncertainty,
-    UnidentifiedGroup,
-    uncertainty,
-    unseen,
-)
+from taichi_msm.fitting.identifiability import MAX_RELATIVE_ERROR, UnidentifiedGroup, unidentified_groups
+from taichi_msm.fitting.least_squares import Misfit, Search, Solution
 from taichi_msm.fitting.machine_curve import CurveRuns, has_curve, search_by_curve
 from taichi_msm.fitting.machine_fit import explanations, fitted_tests, unknown_notes
 from taichi_msm.fitting.machine_model import TABLE_OPTIONS, MachineProblem, read_machine_problem, table_paths
@@ -40,9 +29,11 @@ from taichi_msm.fitting.observation import Array, ErrorCorrelation, Observation
 from taichi_msm.fitting.parameters import Bounds, Method, Parameter, as_data, make_parameters, require_types, rounded
 from taichi_msm.fitting.points import PointObservation
 from taichi_msm.fitting.predict import FitProblem, Prediction, Runs, without_outputs
+from taichi_msm.fitting.profiles import Profile, ProfilePoint, Profiler
 from taichi_msm.fitting.report import publication, write_report
 from taichi_msm.fitting.result import Estimate, FitResult, FittedMap
 from taichi_msm.fitting.stiffness_map import KEY, MapSettings, fit_map, map_settings
+from taichi_msm.fitting.uncertainty import Uncertainty, uncertainty
 from taichi_msm.load.check import check_scene
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.scene.scene import Scene
@@ -65,24 +56,25 @@ def fit(
     Args:
         scene: a scene file, a `Scene`, or its data as a mapping, with the initial values.
         observed: an .npz file, or a mapping of arrays: `time` [s], shape (T,); `coordinates` of points, across and
-            down, shape (N, 2); `position` [m], shape (N, T, 3), or `pixel` [px] of the scene's camera, shape (N, T, 2);
+            down, shape (N, 2); `position` [m], shape (N, T, 3), or `pixel` [px] of the scene's camera, shape (N, T, 2),
             NaN where not observed; optionally `sigma`, the standard deviation of their errors. Or a run's
             trajectory.npz or tracks.npz. Or one or more tables of a testing machine, .csv, .tsv, .txt or .xlsx, with
-            time, depth and force: the scene's only position-controlled tool follows them.
+            time, depth and force, which the scene's only position-controlled tool follows.
         free: keys of the parameters, as dotted paths such as tissue.young or probes.0.total.2; or tissue.map, a map
             of R x R cells, alone or with a component of a force, which scales all forces by a common factor. With
             tables also contact, or contact.0, ... of several: the depth of contact [m of the table].
         bounds: smallest and largest values by key; for tissue.map, of the factors.
         forces: a forces.csv of the same motion, and the standard deviation of its forces [N].
-        directory: receives fit.json, scene.yaml, fit.png and a map's pictures; None: nothing is written.
-        workers: number of worker processes; None: by the duration of the first run.
+        directory: directory for fit.json, scene.yaml, fit.png and a map's pictures; without it nothing is written.
+        workers: number of worker processes; by default by the duration of the first run.
         progress: called often with the stage, the finished and the expected number of runs; an exception from it ends
             the fit, and nothing is written.
-        **method: sigma: standard deviation instead of the file's; robust: whether to downweight outliers; profile:
-            whether to compute profile intervals; correlation: correlation length of the errors of tracks [px]; drift:
-            correlation time of the errors of a track [s]; resolution: R of a map. Of tables: columns: chosen columns,
-            such as ["depth=Traverse, mm"]; sheet, block: of those in a file; window: first and last time [s]; rate:
-            frames per second; contact: depths of contact [m of the table], one or one per table.
+        **method: options. Of observed points, sigma: standard deviation instead of the file's; robust: whether to
+            downweight outliers; profile: whether to compute profile intervals; correlation: correlation length of the
+            errors of tracks [px]; drift: correlation time of the errors of a track [s]; resolution: R of a map. Of
+            tables, columns: chosen columns, such as ["depth=Traverse, mm"]; sheet, block: chosen ones of a file;
+            window: first and last time [s]; rate: frames per second; contact: depths of contact [m of the table], one
+            for all or one per table.
 
     Returns:
         The estimates; `identifiable` is False if the data do not determine a parameter.
@@ -96,8 +88,8 @@ def fit(
     Example:
         >>> from taichi_msm import fit, load_scene
         >>> scene = load_scene("scenes/press.yaml", {"sheet.points": [41, 41], "tissue.young": 6e4})
-        >>> found = fit(scene, "output/press/trajectory.npz", ["tissue.young"])
-        >>> f"{found.parameters['tissue.young'].value:.4g} Pa", found.identifiable
+        >>> result = fit(scene, "output/press/trajectory.npz", ["tissue.young"])
+        >>> f"{result.parameters['tissue.young'].value:.4g} Pa", result.identifiable
         ('3e+04 Pa', True)
     """
     start = time.perf_counter()
@@ -105,7 +97,7 @@ def fit(
     initial = load_scene(scene) if isinstance(scene, (str, Path)) else check_scene(scene).scene
     for section in ("sheet", "time"):
         if (tolerance := getattr(initial, section).tolerance) is not None:
-            fault = "is for one run, and a fit compares many; remove it, and take what `run` chose for it"
+            fault = "is for one run, and a fit compares many; remove it, and take the value that `run` chose"
             raise SceneError([f"{section}.tolerance: {tolerance:g} {fault}"])
     if repeated := [key for n, key in enumerate(free) if key in free[:n]]:
         raise SceneError([f"--free {repeated[0]}: given twice; leave one of them out"])
@@ -142,15 +134,15 @@ def _read_problem(
     forces: tuple[str | Path, float] | None,
     method: Method,
 ) -> tuple[FitProblem, MapSettings | None]:
-    """Read observations of points and forces, and check them; returns also the settings of a map."""
+    """Read and check observations of points and forces; return the fit, and the settings of a map or None."""
     points = read_observations(observed, initial.time.frames_per_second).with_sigma(method.get("sigma"))
     observations: tuple[Observation, ...] = (points,)
     if unused := [name for name in TABLE_OPTIONS if method.get(name)]:
-        raise SceneError([f"--{unused[0]}: is of tables of a testing machine; leave it out"])
+        raise SceneError([f"--{unused[0]}: only for tables of a testing machine; leave it out"])
     settings = map_settings(initial, free, bounds, method.get("resolution"))
     options = {"forces": forces, **{name: method.get(name) for name in ("robust", "profile", "correlation", "drift")}}
     if settings is not None and (conflicting := [name for name, value in options.items() if value]):
-        raise SceneError([f"--free {KEY}: --{conflicting[0]} is of fits of numbers; leave it out"])
+        raise SceneError([f"--free {KEY}: --{conflicting[0]} is only for fits of numbers; leave it out"])
     parameters = () if settings is not None else make_parameters(initial, free, bounds)
     if forces is not None:
         observations = (points, read_forces(forces[0], forces[1], len(initial.probes)))
@@ -161,27 +153,27 @@ def _read_problem(
             raise SceneError([f"{points.name}: --correlation is in pixels, and these are positions; leave it out"])
     if (drift := method.get("drift")) is not None and not 0 < drift < math.inf:
         raise SceneError([f"--drift {drift:g}: take a number of seconds above 0"])
-    if settings is None and (found := list(faults(observations, initial, len(parameters)))):
-        raise SceneError(found)
+    if settings is None and (problems := list(faults(observations, initial, len(parameters)))):
+        raise SceneError(problems)
     return FitProblem(secrets.token_hex(8), without_outputs(initial), parameters, observations), settings
 
 
 def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
     """Estimate parameters by least squares, with their uncertainty."""
-    parameters, observations = runs.job.parameters, runs.job.observations
+    parameters, observations = runs.problem.parameters, runs.problem.observations
     error_correlation = ErrorCorrelation(method.get("correlation"), method.get("drift"))
     start = np.zeros(len(parameters))
     runs.expected = 8 * len(start) + 4
     first = runs.first(start)
-    machine = runs.job if isinstance(runs.job, MachineProblem) else None
-    found: list[str] = []
+    machine = runs.problem if isinstance(runs.problem, MachineProblem) else None
+    problems: list[str] = []
     if machine is None:
-        found += faults_at_start(observations, scene, first, parameters)
+        problems += faults_at_start(observations, scene, first, parameters)
     if not any(probe.moved for probe in scene.probes):
         # The forces of force-controlled tools do not depend on the tissue.
-        found += unit_faults(observations, first)
-    if found:
-        raise SceneError(found)
+        problems += unit_faults(observations, first)
+    if problems:
+        raise SceneError(problems)
     signals = [observed.signal(scene) or 1.0 for observed in observations]
     misfit = Misfit(observations, signals, robust=method.get("robust", False))
     if isinstance(runs, CurveRuns):
@@ -193,8 +185,8 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
         solution = search.best(start)
     # Signs and units that contradict both the initial and the fitted scene.
     both = first, solution.predicted
-    if found := [*opposed(observations, scene, *both), *unit_faults(observations, *both)]:
-        raise SceneError(found)
+    if problems := [*opposed(observations, scene, *both), *unit_faults(observations, *both)]:
+        raise SceneError(problems)
     uncertainties = uncertainty(misfit, solution, search.jacobian(solution), error_correlation)
     if isinstance(runs, CurveRuns):
         runs.by_tangent = False
@@ -206,7 +198,7 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
     }
     values = {key: estimate.value for key, estimate in estimates.items()}
     measures_forces = any(observed.noun == "forces" for observed in observations)
-    unidentified = unseen(parameters, solution.x, uncertainties, forces=measures_forces)
+    unidentified = unidentified_groups(parameters, solution.x, uncertainties, forces=measures_forces)
     rejection_reason = _rejection(misfit, solution, uncertainties, error_correlation)
     tests = fitted_tests(machine, values, solution.predicted.values[0]) if machine else ()
     residuals = misfit.split(misfit.of(solution.predicted))
@@ -237,7 +229,7 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
         mesh_error=mesh,
         runs=runs.count,
         notes=notes,
-        scene=Scene(**runs.job.fitted_data(as_data(scene), values)),
+        scene=Scene(**runs.problem.fitted_data(as_data(scene), values)),
         other_scenes=[
             Scene(**machine.fitted_data(as_data(scene), values, n)) for n in range(1, len(tests)) if machine is not None
         ],
@@ -254,7 +246,7 @@ def _fit(runs: Runs, scene: Scene, method: Method) -> FitResult:
 def _search_notes(solution: Solution, parameters: Sequence[Parameter], *, fits_well: bool) -> Iterator[str]:
     """Yield warnings about the search; `fits_well`: whether the residual is small."""
     if not solution.converged:
-        yield "the search ended before it came to rest; start nearer by --set, or give --bounds"
+        yield "the search did not converge; start nearer by --set, or give --bounds"
     if not fits_well:
         yield "the residual is large: no values of these parameters reproduce the observations"
     for parameter, x in zip(parameters, solution.x.tolist(), strict=True):
@@ -262,7 +254,7 @@ def _search_notes(solution: Solution, parameters: Sequence[Parameter], *, fits_w
         if min(x - low, high - x) < 1e-3:
             bounded = math.isfinite(parameter.low) or math.isfinite(parameter.high)
             end = "a bound" if bounded else "1000 times from where it starts"
-            yield f"{parameter.key}: ended at {parameter.value(x):.4g}, {end}: its interval says little"
+            yield f"{parameter.key}: ended at {parameter.value(x):.4g}, {end}: its interval is not reliable"
 
 
 def _uncertainty_notes(
@@ -272,12 +264,12 @@ def _uncertainty_notes(
     shifts: Array | None,
     unidentified: Sequence[UnidentifiedGroup],
 ) -> Iterator[str]:
-    """Yield warnings about mesh errors above the intervals, and correlated parameters except unidentified ones."""
+    """Yield warnings about mesh errors beyond the intervals, and about correlated, but identified parameters."""
     half_widths = uncertainties.quantile * uncertainties.deviations
     if shifts is not None and (moved := np.flatnonzero(shifts > half_widths).tolist()):
         shares = [(parameters[n].key, parameters[n].share(x[n], float(shifts[n]))) for n in moved]
         shifted = ", ".join(f"{key} by about {rounded(100 * share)} %" for key, share in shares)
-        yield f"the number of points moves {shifted}: farther than the interval; take more sheet.points"
+        yield f"the mesh changes {shifted}, more than the interval; take more sheet.points"
     for n, m in zip(*np.nonzero(np.triu(np.abs(uncertainties.correlation) > 0.95, 1)), strict=True):
         keys = parameters[n].key, parameters[m].key
         if not any({*keys} <= {*group.parameters} for group in unidentified):
@@ -325,7 +317,7 @@ def _mesh(
     error = runs.mesh_error(solution.x)
     if error is None or (half_mesh := runs.predict_coarse(solution.x, 1)) is None:
         return None, None
-    expected_order = CONTACT_ORDER if any(probe.moved for probe in runs.job.scene.probes) else 2.0
+    expected_order = CONTACT_ORDER if any(probe.moved for probe in runs.problem.scene.probes) else 2.0
 
     def shift_between(coarse: Prediction, fine: Prediction) -> Array:
         rows = misfit.row(coarse) - misfit.row(fine)

@@ -1,4 +1,4 @@
-"""Measured forces of tools on the sheet, and their reader: a forces.csv with any separator and decimal mark.
+"""Measured forces of tools on the sheet, and the reader of a forces.csv, with any separator and decimal mark.
 
 Empty cells and NaN mean "not measured"; any other cell must be a number.
 """
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from taichi_msm.errors import SceneError
 from taichi_msm.fitting import observation
 from taichi_msm.fitting.observation import Array, Observation, ObservationModel
-from taichi_msm.fitting.tables import Row, decimal_mark, read_text
+from taichi_msm.machines.cells import Row, decimal_mark, read_text
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 
@@ -45,13 +45,11 @@ class Forces(Observation):
         return float(np.sqrt(np.nanmean(self.values**2)))
 
     def fits_well(self, residuals: Array, deviation: float, signal: float) -> bool:
-        """Return whether the residuals are small, in sigma or as a share of the forces."""
         limit = (observation.MAX_RESIDUAL_SHARE * signal) ** 2
         limit = max(limit, observation.MAX_RESIDUAL_SIGMAS**2 * np.mean(np.square(self.sigma)))
         return float(np.mean(residuals**2)) <= limit
 
     def summary(self, residuals: Array, sigma: float | Array) -> dict[str, Any]:
-        """Return residual and sigma of the forces."""
         return {"residual_force": float(np.sqrt(np.mean(residuals**2))), "sigma_force": float(np.mean(sigma))}
 
     def factor_note(self, predicted: Array) -> str:
@@ -62,7 +60,13 @@ class Forces(Observation):
 
 
 class ForceModel(ObservationModel):
-    """Map from a run to the forces of its tools at the measured times."""
+    """Map from a run to the forces of its tools at the measured times.
+
+    Args:
+        scene: scene of the run.
+        observed: measured forces, with their times and tools.
+        frames: number of frames, from the first one.
+    """
 
     def __init__(self, scene: Scene, observed: ToolForces, frames: int) -> None:
         self._probe, self._shares = observed.probe, observation.time_weights(scene, observed.time, frames)
@@ -79,16 +83,14 @@ class ForceModel(ObservationModel):
 
 @dataclass(frozen=True, eq=False)
 class ToolForces(Forces):
-    """Forces of tools on the sheet, of shape (rows, 3)."""
+    """Forces of tools on the sheet; values of shape (rows, 3), one row per time and tool."""
 
     probe: NDArray[np.intp]  # index of the tool, shape (rows,)
 
     def build_model(self, scene: Scene, frames: int) -> ForceModel:
-        """Build the map from a run of a scene; `frames`: their number, from the first one."""
         return ForceModel(scene, self, frames)
 
     def opposed(self, scene: Scene, *predictions: Array) -> Iterator[str]:
-        """Yield components that all predictions have with the other sign."""
         for axis in observation.opposed_axes(self.values, predictions, self.sigma):
             fault = "is it the force on the tool? give the force on the sheet, of the other sign"
             yield f"{self.name}: force_{'xyz'[axis]}: acts against the scene's; {fault}"
@@ -104,7 +106,7 @@ class ToolForces(Forces):
                 return
 
     def _ratio(self, predictions: Array) -> float:
-        """Return the ratio of measured to predicted forces; 0: insignificant, or not parallel."""
+        """Return the ratio of measured to predicted forces, or 0 if they are insignificant or not parallel."""
         measured, predicted = self.values[self.known], predictions[self.known]
         lengths = float(np.linalg.norm(measured)), float(np.linalg.norm(predicted))
         is_small = max(lengths) < observation.MIN_SIGMAS * self.sigma * np.sqrt(len(measured))
@@ -115,15 +117,15 @@ class ToolForces(Forces):
 
 
 def read_forces(path: str | Path, sigma: float, probes: int) -> ToolForces:
-    """Read a forces.csv.
+    """Return the forces of a forces.csv.
 
     Args:
-        path: the file.
+        path: path of the file.
         sigma: standard deviation of the error of each component [N].
         probes: number of tools of the scene.
 
     Raises:
-        SceneError: when the file is not such a table, or refers to a missing tool.
+        SceneError: when the file is not such a table, or names a tool that the scene does not have.
     """
     name = str(path)
     if not 0 < sigma < math.inf:
@@ -131,9 +133,9 @@ def read_forces(path: str | Path, sigma: float, probes: int) -> ToolForces:
     grid = read_text(name, _is_header, EXPECTED)
     header = next((n for n, row in enumerate(grid.rows) if _is_header(row)), None)
     if header is None:
-        found = [{*re.findall(r"\w+", " ".join(row).lower())} & {*COLUMNS} for row in grid.rows]
-        best = max(range(len(found)), key=lambda n: len(found[n]))
-        if missing := [key for key in COLUMNS if key not in found[best]]:
+        named = [{*re.findall(r"\w+", " ".join(row).lower())} & {*COLUMNS} for row in grid.rows]
+        best = max(range(len(named)), key=lambda n: len(named[n]))
+        if missing := [key for key in COLUMNS if key not in named[best]]:
             raise SceneError([f"{name}: no row names {', '.join(missing)}; {EXPECTED}"])
         remedy = "give each name a cell, alone or with its unit in brackets, as time [s]"
         raise SceneError([f"{grid.place(best)}: names all columns, but not in a cell each; {remedy}"])

@@ -1,45 +1,20 @@
-"""Parameter estimation by nonlinear least squares, with confidence intervals and identifiability.
+"""Parameter estimation by nonlinear least squares.
 
 The sum of rho(r^2) over all residuals r = (predicted - observed) / sigma is minimised within bounds by SciPy's trust
 region method, with rho(z) = z, or soft_l1 in robust fits. The Jacobian consists of finite differences: forward ones
 during the search, central ones at the solution. With forces, and in robust fits, an unknown sigma is estimated
 alternately with the parameters.
-
-Covariance. With J the Jacobian of r by x, the covariance of x is
-
-    C = f (J^T W J)^-1 M (J^T W J)^-1,    M = J^T W^(1/2) K W^(1/2) J
-
-with W = 1 and K = 1, and f the mean of r^2 per degree of freedom, at least 1. In a robust fit W is the second
-derivative of rho / 2, and f the mean square of its first derivative over the mean of W. K is the correlation of the
-errors: exp(-distance / correlation) for two tracks at a time, exp(-interval / drift) for a track at two times, or the
-product of both. With the singular value decomposition W^(1/2) J = U S V^T,
-
-    C = f V S^-1 (U^T K U) S^-1 V^T
-
-which avoids the squared condition number of J^T W J.
-
-Profile intervals. A parameter is fixed, and the others are optimised within their bounds by Gauss-Newton steps with J
-from the solution, a run per step. The interval ends where the cost has risen by t^2 f / 2, with Student's t, times the
-widening by correlated errors.
-
-Identifiability. Parameters can be identifiable in combinations only: images determine the ratio of a stiffness and a
-force, but neither of them. The singular vectors with large standard deviations span the unidentifiable directions;
-the combinations orthogonal to them are reported.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from taichi_msm.errors import SceneError
-from taichi_msm.fitting.observation import Array, ErrorCorrelation, Observation
-from taichi_msm.fitting.parameters import Parameter, rounded
+from taichi_msm.fitting.observation import Array, Observation
 from taichi_msm.fitting.predict import Prediction, Runs, difference_step
 
 # Larger residuals are downweighted in robust fits.
@@ -48,27 +23,35 @@ OUTLIER_SIGMAS = 2.0
 # Largest log of the factor between alternative starts and the first one.
 MAX_START_LOG = np.log(10.0)
 
-# Standard deviations of the residuals of every observation, in its unit: of all, or of each.
+# Standard deviations of the values of every observation, in its unit: one number, or an array of shape (known,).
 Scales = tuple["float | Array", ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Solution of the least-squares problem."""
+    """Solution of the least-squares problem.
 
-    x: Array  # parameters, shape (n,)
+    Attributes:
+        x: coordinates of the parameters, shape (n,).
+        predicted: prediction at x.
+        scales: standard deviations of the observations, with which the cost was minimised.
+        cost: half the sum of rho.
+        converged: whether the search has converged.
+    """
+
+    x: Array
     predicted: Prediction
     scales: Scales
-    cost: float  # half the sum of rho
+    cost: float
     converged: bool
 
 
 class Misfit:
-    """Residuals of predictions, flattened to one axis, one observation after the other.
+    """Residuals of predictions, flattened to one axis of all known values, one observation after the other.
 
     Args:
         observations: the observations.
-        signals: root mean square of what a fit explains of each, in its unit.
+        signals: root mean square of the explained part of each observation, in its unit.
         robust: whether outliers are downweighted.
     """
 
@@ -79,24 +62,34 @@ class Misfit:
         self._observed = self._flatten([observed.values for observed in observations])
 
     def row(self, predicted: Prediction) -> Array:
-        """Return the predictions of all observed values, shape (numbers,)."""
+        """Return the predictions of all known values, shape (known,)."""
         return self._flatten(predicted.values)
 
     def of(self, predicted: Prediction) -> Array:
-        """Return predicted minus observed, in the units of the observations, shape (numbers,)."""
+        """Return predicted minus observed values, in the units of the observations, shape (known,)."""
         return self.row(predicted) - self._observed
 
     def split(self, rows: Array) -> list[Array]:
-        """Split rows, shape (numbers, ...), by observation."""
+        """Split rows, shape (known, ...), by observation."""
         return np.split(rows, np.cumsum(self.count)[:-1])
 
     def scaled(self, rows: Array, scales: Scales) -> Array:
-        """Divide rows, shape (numbers, ...), by their standard deviations."""
+        """Return rows divided by standard deviations, shape (known, ...).
+
+        Args:
+            rows: rows in the units of the observations, shape (known, ...).
+            scales: standard deviations of the observations.
+        """
         deviations = np.concatenate([np.broadcast_to(scale, n) for scale, n in zip(scales, self.count, strict=True)])
         return rows / deviations.reshape(-1, *(1,) * (rows.ndim - 1))
 
     def residuals(self, predicted: Prediction, scales: Scales) -> Array:
-        """Return the residuals r, shape (numbers,)."""
+        """Return the residuals r, shape (known,).
+
+        Args:
+            predicted: prediction of all observations.
+            scales: standard deviations of the observations.
+        """
         return self.scaled(self.of(predicted), scales)
 
     def robust_factor(self, residuals: Array) -> Array:
@@ -109,17 +102,22 @@ class Misfit:
         return float(np.sum(rho)) / 2
 
     def deviations(self, predicted: Prediction, parameters: int) -> list[float]:
-        """Estimate the standard deviation of every observation from its residuals, in its unit."""
-        found = []
+        """Return the standard deviation of every observation, in its unit, estimated from its residuals.
+
+        Args:
+            predicted: prediction of all observations.
+            parameters: number of parameters, subtracted from the numbers of values.
+        """
+        deviations = []
         for residuals, signal in zip(self.split(self.of(predicted)), self.signals, strict=True):
             mean_square = np.sum(residuals**2) / max(1, len(residuals) - parameters)
             # 1.4826 is the ratio of sigma to the median of the magnitudes, of normal errors.
             sigma = 1.4826 * np.median(np.abs(residuals)) if self.robust else np.sqrt(mean_square)
-            found.append(max(float(sigma), 1e-9 * signal))
-        return found
+            deviations.append(max(float(sigma), 1e-9 * signal))
+        return deviations
 
     def scales(self, unknown: Sequence[float]) -> Scales:
-        """Return the standard deviations of all observations; `unknown`: those where they are not given."""
+        """Return the standard deviations of all observations, from `unknown` where they are not given."""
         given = zip(self.observations, unknown, strict=True)
         return tuple(sigma if observed.sigma is None else observed.sigma for observed, sigma in given)
 
@@ -131,20 +129,20 @@ class Search:
     """Nonlinear least squares with restarts.
 
     Args:
-        runs: computes predictions.
-        misfit: the residuals; the initial value of an unknown sigma is the observed motion.
+        runs: predictions.
+        misfit: residuals; the initial value of an unknown sigma is the signal.
         limits: smallest and largest coordinates, each of shape (n,); by default those of the parameters.
     """
 
     def __init__(self, runs: Runs, misfit: Misfit, limits: tuple[Array, Array] | None = None) -> None:
         self._runs, self._misfit = runs, misfit
-        self._delta = difference_step(runs.job.scene)
-        self._limits = limits or runs.job.limits
+        self._delta = difference_step(runs.problem.scene)
+        self._limits = limits or runs.problem.limits
         self._known: dict[bytes, Prediction | None] = {}
         self._neighbours: dict[bytes, Prediction | None] = {}
 
     def best(self, start: Array) -> Solution:
-        """Minimise from a start, and from two alternative starts if the fit is poor."""
+        """Minimise from a start, shape (n,), and from two alternative starts if the fit is poor."""
         solution = self.refine(start)
         if self.fits_well(solution):
             return solution
@@ -170,11 +168,16 @@ class Search:
         return all(observed.fits_well(part, deviation, signal) for observed, part, deviation, signal in each)
 
     def jacobian(self, solution: Solution) -> Array:
-        """Return the Jacobian of the predictions by x, shape (numbers, parameters)."""
-        return self._differences(solution.x, solution.predicted, signs=self._runs.job.signs)
+        """Return the Jacobian of the predictions by x, shape (known, n)."""
+        return self._differences(solution.x, solution.predicted, signs=self._runs.problem.signs)
 
     def remember(self, x: Array, predicted: Prediction) -> None:
-        """Store a prediction that is known."""
+        """Store a prediction, which is then not computed again.
+
+        Args:
+            x: coordinates of the parameters, shape (n,).
+            predicted: prediction at x.
+        """
         self._known[x.tobytes()] = predicted
 
     def _predict(self, x: Array) -> Prediction | None:
@@ -184,7 +187,7 @@ class Search:
         return self._known[x.tobytes()]
 
     def refine(self, start: Array) -> Solution:
-        """Minimise from a start, alternating with an unknown sigma."""
+        """Minimise from a start, shape (n,), alternating with an unknown sigma."""
         misfit = self._misfit
         is_unknown = any(observed.sigma is None for observed in misfit.observations)
         scales = misfit.scales(misfit.signals)
@@ -249,7 +252,7 @@ class Search:
         known = self._neighbours | {neighbour.tobytes(): prediction for neighbour, prediction in computed}
         self._neighbours = {neighbour.tobytes(): known[neighbour.tobytes()] for neighbour in each}
         columns = []
-        for n, parameter in enumerate(self._runs.job.parameters):
+        for n, parameter in enumerate(self._runs.problem.parameters):
             pairs = [(neighbour[n], known[neighbour.tobytes()]) for neighbour in neighbours[n]]
             points = [(side, prediction) for side, prediction in pairs if prediction is not None]
             if not points and len(signs) == 1:
@@ -270,318 +273,6 @@ class Search:
         from scipy.stats import qmc
 
         low, high = (np.clip(limit, -MAX_START_LOG, MAX_START_LOG) for limit in self._limits)
-        count = 8 * len(low) if len(self._runs.job.signs) > 1 else 8
+        count = 8 * len(low) if len(self._runs.problem.signs) > 1 else 8
         shares = qmc.Sobol(len(low), seed=1).random_base2((count - 1).bit_length())
         return list(qmc.scale(shares, low, high))
-
-
-# Smaller components of unidentified directions are 0.
-MIN_COMPONENT = 1e-3
-
-# Largest standard deviation of an identified direction.
-MAX_DIRECTION_DEVIATION = 0.5
-
-
-@dataclass(frozen=True, eq=False)
-class Uncertainty:
-    """Uncertainty of n parameters, in units of x."""
-
-    scales: Scales  # standard deviations of the observations, given or estimated
-    factor: float  # f
-    freedom: int  # degrees of freedom
-    independent: float  # effective number of independent observations
-    residuals: Array  # r
-    weighted: Array  # W^(1/2) J, shape (numbers, n)
-    directions: Array  # V, with uncorrelated combinations of x as columns, the most certain one first, shape (n, n)
-    root: Array  # F with C = F F^T, shape (n, n)
-    widening: Array  # factor of the deviations by K, shape (n,)
-
-    @property
-    def deviations(self) -> Array:
-        """Standard deviations of x, shape (n,)."""
-        return np.linalg.norm(self.root, axis=1)
-
-    @property
-    def direction_deviations(self) -> Array:
-        """Standard deviations of the directions, shape (n,)."""
-        return np.linalg.norm(self.directions.T @ self.root, axis=1)
-
-    @property
-    def correlation(self) -> Array:
-        """Correlations of x, shape (n, n)."""
-        each = self.root / np.maximum(self.deviations, np.finfo(float).tiny)[:, None]
-        return np.clip(each @ each.T, -1.0, 1.0)
-
-    @property
-    def quantile(self) -> float:
-        """Half width of the 95 % interval in standard deviations, by Student's t."""
-        from scipy.stats import t
-
-        return float(t.ppf((1 + 0.95) / 2, self.freedom))
-
-    @property
-    def unidentified(self) -> NDArray[np.bool_]:
-        """Mask of the parameters with a component in an unidentified direction, without a valid `shift`, shape (n,)."""
-        directions = self.directions[:, self.direction_deviations > MAX_DIRECTION_DEVIATION]
-        return np.linalg.norm(directions, axis=1) > MIN_COMPONENT * 50
-
-    def shift(self, rows: Array) -> Array:
-        """Return the shift of x due to an error of the predictions, in units of r, shape (numbers,)."""
-        identified = self.directions[:, self.direction_deviations <= MAX_DIRECTION_DEVIATION]
-        return identified @ np.linalg.lstsq(self.weighted @ identified, rows, rcond=None)[0]
-
-
-def uncertainty(
-    misfit: Misfit, solution: Solution, derivatives: Array, error_correlation: ErrorCorrelation
-) -> Uncertainty:
-    """Compute the uncertainty of a solution.
-
-    Args:
-        misfit: the residuals.
-        solution: their minimum.
-        derivatives: Jacobian of the predictions by x, shape (numbers, parameters).
-        error_correlation: correlation lengths of the errors.
-    """
-    parameters = len(solution.x)
-    freedom = max(1, sum(misfit.count) - parameters)
-    scales = misfit.scales(misfit.deviations(solution.predicted, parameters))
-    residuals, jacobian = misfit.residuals(solution.predicted, scales), misfit.scaled(derivatives, scales)
-    robust_factor = misfit.robust_factor(residuals)
-    weighted = jacobian * robust_factor[:, None] ** (-0.75)
-    factor = max(1.0, float(np.sum(residuals**2 / robust_factor)) / freedom / float(np.mean(robust_factor**-1.5)))
-    singular = np.linalg.svd(weighted, full_matrices=False)
-    # Small singular values are rounding errors: their directions are unidentified, with a standard deviation of 1e4.
-    is_unidentified = 1e-8 * max(1.0, singular.S[0]) >= singular.S
-    singular_values = np.where(is_unidentified, 1 / 1e4, singular.S)
-    directions = np.where(is_unidentified & (np.abs(singular.Vh.T) < MIN_COMPONENT), 0.0, singular.Vh.T)
-    independent_root = root = np.sqrt(factor) * directions / singular_values
-    independent = float(freedom)
-    if error_correlation != (None, None):
-        # U^T K U, and the effective number of observations tr(K)^2 / tr(K^2).
-        pairs = zip(misfit.observations, misfit.split(singular.U), strict=True)
-        matrices, squares = zip(
-            *(observed.correlated(part, error_correlation) for observed, part in pairs), strict=True
-        )
-        independent = min(len(singular.U) ** 2 / sum(squares), freedom)
-        values, vectors = np.linalg.eigh(np.sum(matrices, axis=0))
-        root = independent_root @ (vectors * np.sqrt(np.maximum(values, 0.0)))
-    widening = np.linalg.norm(root, axis=1) / np.linalg.norm(independent_root, axis=1)
-    return Uncertainty(scales, factor, freedom, independent, residuals, weighted, singular.Vh.T, root, widening)
-
-
-# Relative tolerance of the end of an interval.
-PROFILE_TOLERANCE = 0.01
-
-Side = Generator[Array, "Prediction | None", "list[ProfilePoint]"]
-
-
-class ProfilePoint(NamedTuple):
-    """Point of a profile."""
-
-    x: float  # of the parameter
-    deviations: float  # signed root of twice the rise of the cost over f; infinite where runs fail
-
-
-class Profile(NamedTuple):
-    """Profile of a parameter."""
-
-    points: list[ProfilePoint]  # sorted by x
-    low: float | None  # end of the interval; None: beyond the bounds
-    high: float | None
-
-
-class Profiler:
-    """Profile likelihood of a solution's parameters."""
-
-    def __init__(self, runs: Runs, misfit: Misfit, solution: Solution, uncertainties: Uncertainty) -> None:
-        self._runs, self._misfit, self._solution, self._uncertainties = runs, misfit, solution, uncertainties
-        self._min_cost = misfit.cost(uncertainties.residuals)
-        self._low, self._high = runs.job.limits
-
-    def profiles(self) -> list[Profile]:
-        """Compute the profiles of all parameters, with both sides of each in parallel."""
-        count, runs = len(self._low), self._runs
-        sides = {(n, sign): self._side(n, sign) for n in range(count) for sign in (-1, 1)}
-        points: dict[tuple[int, int], list[ProfilePoint]] = {side_key: [] for side_key in sides}
-        requests = {side_key: x for side_key, side in sides.items() if (x := next(side, None)) is not None}
-        while requests:
-            runs.expected = max(runs.expected, runs.count + 2 * len(requests))
-            predictions = runs.predict_many(list(requests.values()))
-            for side_key, prediction in zip(list(requests), predictions, strict=True):
-                try:
-                    requests[side_key] = sides[side_key].send(prediction)
-                except StopIteration as stop:
-                    del requests[side_key]
-                    points[side_key] = stop.value
-        return [self._profile(n, points[n, -1], points[n, 1]) for n in range(count)]
-
-    def _profile(self, n: int, below: list[ProfilePoint], above: list[ProfilePoint]) -> Profile:
-        quantile = self._uncertainties.quantile
-        ends = [
-            side[-1].x if side and abs(abs(side[-1].deviations) / quantile - 1) < 5 * PROFILE_TOLERANCE else None
-            for side in (below, above)
-        ]
-        points = [*below, ProfilePoint(float(self._solution.x[n]), 0.0), *above]
-        return Profile(sorted(point for point in points if math.isfinite(point.deviations)), ends[0], ends[1])
-
-    def _side(self, n: int, sign: int) -> Side:
-        """Search for the end of the interval on one side; yields x to be predicted, and returns the points."""
-        x, root, quantile = self._solution.x, self._uncertainties.root, self._uncertainties.quantile
-        variance = float(root[n] @ root[n])
-        direction = root @ root[n] / variance
-        limit = float((self._high if sign > 0 else self._low)[n] - x[n]) * sign
-        points: list[ProfilePoint] = []
-        # Bracket of the end: distances, and the rises there, which are nearly proportional.
-        inner, outer = (0.0, 0.0), (math.inf, math.inf)
-        distance = min(quantile * math.sqrt(variance), limit)
-        while distance > 0 and len(points) < 8:
-            trial = np.clip(x + sign * distance * direction, self._low, self._high)
-            trial[n] = x[n] + sign * distance
-            cost = yield from self._conditional_minimum(n, trial)
-            rise = math.sqrt(max(0.0, 2 * (cost - self._min_cost) / self._uncertainties.factor))
-            rise /= self._uncertainties.widening[n]
-            points.append(ProfilePoint(float(trial[n]), sign * rise))
-            if abs(rise / quantile - 1) < PROFILE_TOLERANCE or (distance == limit and rise < quantile):
-                break
-            inner, outer = ((distance, rise), outer) if rise < quantile else (inner, (distance, rise))
-            if outer[1] < math.inf:
-                distance = inner[0] + (outer[0] - inner[0]) * (quantile - inner[1]) / (outer[1] - inner[1])
-            elif outer[0] < math.inf:  # The run there has failed.
-                distance = (inner[0] + outer[0]) / 2
-            else:
-                distance = min(distance * min(3.0, quantile / max(rise, 1e-3)), limit)
-        return points
-
-    def _conditional_minimum(self, n: int, x: Array) -> Generator[Array, Prediction | None, float]:
-        """Minimise over the other parameters; returns the cost, infinite if a run fails."""
-        from scipy.optimize import lsq_linear
-
-        others = np.delete(np.arange(len(x)), n)
-        jacobian, deviations = self._uncertainties.weighted[:, others], self._uncertainties.deviations[others]
-        min_cost = math.inf
-        for _ in range(6):
-            predicted = yield x
-            if predicted is None:
-                break
-            residuals = self._misfit.residuals(predicted, self._uncertainties.scales)
-            cost = self._misfit.cost(residuals)
-            if cost > min_cost:
-                break
-            min_cost = cost
-            # Gauss-Newton step: first derivatives of rho / 2 over the roots of the second ones.
-            bounds = (self._low - x)[others], (self._high - x)[others]
-            step = lsq_linear(jacobian, -residuals * self._misfit.robust_factor(residuals) ** 0.25, bounds).x
-            if np.all(np.abs(step) < 0.02 * deviations):
-                break
-            x = x.copy()
-            x[others] += step
-        return min_cost
-
-
-# Largest standard error of an identifiable parameter, as a share of its value or of a coordinate's range.
-MAX_RELATIVE_ERROR = 1.0
-
-# Smallest component of the parameters of a direction.
-MIN_GROUP_COMPONENT = 0.05
-
-
-class Combination(NamedTuple):
-    """Identifiable product of powers of parameters."""
-
-    exponents: dict[str, float]
-    standard_error: float  # relative
-
-    def __str__(self) -> str:
-        text = ""
-        for key, exponent in sorted(self.exponents.items(), key=lambda item: item[1] < 0):
-            power = "" if abs(exponent) == 1 else f"^{abs(exponent):.3g}"
-            sign = (" / " if exponent < 0 else " x ") if text else ("1 / " if exponent < 0 else "")
-            text += f"{sign}{key}{power}"
-        return text
-
-
-class UnidentifiedGroup(NamedTuple):
-    """Parameters that are not identifiable one by one."""
-
-    parameters: list[str]
-    known: list[Combination]  # identifiable combinations
-    text: str
-
-    def as_json(self) -> dict[str, Any]:
-        """Return JSON data."""
-        known = [{"combination": str(combination), **combination._asdict()} for combination in self.known]
-        return {"parameters": self.parameters, "known": known, "text": self.text}
-
-
-def unseen(
-    parameters: Sequence[Parameter], x: Array, uncertainties: Uncertainty, *, forces: bool
-) -> list[UnidentifiedGroup]:
-    """Return the groups of unidentifiable parameters; `forces`: whether forces were measured."""
-    from scipy.sparse.csgraph import connected_components
-
-    directions = uncertainties.directions[:, uncertainties.direction_deviations > MAX_DIRECTION_DEVIATION]
-    members = np.flatnonzero(np.linalg.norm(directions, axis=1) > MIN_GROUP_COMPONENT)
-    # Parameters that share directions; the projection does not depend on the choice of their basis.
-    is_coupled = np.abs(directions @ directions.T) > MIN_GROUP_COMPONENT**2
-    count, labels = connected_components(is_coupled[np.ix_(members, members)], directed=False)
-    groups = [members[labels == label] for label in range(count)]
-    pairs = zip(parameters, x.tolist(), uncertainties.deviations.tolist(), strict=True)
-    errors = np.array([parameter.share(coordinate, deviation) for parameter, coordinate, deviation in pairs])
-    return [
-        _describe_group(
-            [parameters[n] for n in group],
-            float(errors[group].max()),
-            list(_known_combinations(parameters, uncertainties, group, directions[group])),
-            "" if forces else ", or give a force (--forces)",
-        )
-        for group in groups
-    ]
-
-
-def _known_combinations(
-    parameters: Sequence[Parameter], uncertainties: Uncertainty, group: Array, directions: Array
-) -> Iterator[Combination]:
-    """Yield the identifiable combinations of a group of parameters, with their components in `directions`."""
-    for exponents in _complement(directions):
-        # Exponents close to a multiple of 1/2 are rounded.
-        half = np.round(2 * exponents) / 2
-        all_exponents = np.zeros(len(parameters))
-        all_exponents[group] = np.where(np.abs(exponents - half) < 0.06, half, exponents)
-        powers = {parameters[n].key: float(all_exponents[n]) for n in group if all_exponents[n]}
-        error = float(np.linalg.norm(all_exponents @ uncertainties.root))
-        if error <= MAX_RELATIVE_ERROR:
-            yield Combination(powers, error)
-
-
-def _describe_group(
-    group: Sequence[Parameter], largest: float, known: list[Combination], remedy: str
-) -> UnidentifiedGroup:
-    """Describe a group of parameters by their largest relative error, and by the combinations that are known."""
-    keys = [parameter.key for parameter in group]
-    names = " and ".join([", ".join(keys[:-1]), keys[-1]] if len(keys) > 1 else keys)
-    fix = f"fix {'it' if len(keys) == 1 else 'them'}"
-    share = f"only to {rounded(100 * largest)} %" if largest <= MAX_RELATIVE_ERROR else ""
-    if known and not all(parameter.is_log for parameter in group):
-        return UnidentifiedGroup(keys, [], f"{names} are not identifiable one by one: fix one{remedy}")
-    if not known:
-        found = f"known {share}" if share else "not identifiable"
-        return UnidentifiedGroup(keys, [], f"{names}: {found}: {fix}")
-    combinations = ", ".join(f"{each} is known to {rounded(100 * each.standard_error)} %" for each in known)
-    return UnidentifiedGroup(keys, known, f"{combinations}, each alone {share or 'is not'}: fix one{remedy}")
-
-
-def _complement(directions: Array) -> Iterator[Array]:
-    """Yield a basis of the orthogonal complement of directions, shape (m, directions), in reduced echelon form."""
-    vectors, singular, _ = np.linalg.svd(directions)
-    rank = int(np.sum(singular > MIN_GROUP_COMPONENT * singular[0]))
-    rows = vectors[:, rank:].T.copy()
-    # Pivots are the best identified parameters.
-    order = list(np.argsort(np.linalg.norm(directions, axis=1), kind="stable"))
-    for n in range(len(rows)):
-        pivot = max(order, key=lambda column: (abs(rows[n, column]) > 0.1, -order.index(column)))
-        order.remove(pivot)
-        rows[n] /= rows[n, pivot]
-        for row in range(len(rows)):
-            if row != n:
-                rows[row] -= rows[row, pivot] * rows[n]
-    yield from rows

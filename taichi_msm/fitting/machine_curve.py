@@ -1,6 +1,6 @@
 """Fast approximation of quasi-static machine tests: one curve of elastic force over travel, relaxed in time.
 
-All elastic forces relax alike, so that the shape of the tissue at rest depends on the travel of the tool only. With f,
+All elastic forces relax alike, so that the equilibrium of the tissue depends on the travel of the tool only. With f,
 the elastic force over the travel, computed at few travels and interpolated, the force of every test at frame n is
 
     F_n = (1 - G) f_n + sum of (s_i + share_i phi_i f_n)
@@ -32,49 +32,30 @@ from taichi_msm.load.check import check_scene
 from taichi_msm.model.plan import Plan
 from taichi_msm.scene.scene import Scene
 
-# Travels of a curve above 0, and its reach beyond the greatest travel if depths of contact are free.
+# Number of travels of a curve above 0, and its reach beyond the greatest travel if depths of contact are free.
 TRAVELS, CONTACT_MARGIN = 24, 0.05
 
 # Share of branches in the runs of a curve, with which the tissue does not relax, but has the kernels of the tests.
 NO_SHARE = 1e-12
 
-# Largest sum of the shares in the model, and the sum to which larger ones are reduced, with a margin for differences.
-MAX_SHARES, RESTART_SHARES = 0.999, 0.98
-
-# Initial and largest trust region of the parameters of a curve, in units of x.
-FIRST_REGION, MAX_REGION = 0.5, 2.0
-
-# Largest number of steps, and changes of the cost below which they end: relative, and absolute, which is a third of a
-# standard deviation of a parameter.
-MAX_STEPS, MIN_RELATIVE_CHANGE, MIN_CHANGE = 20, 1e-3, 0.05
-
-# Change of the forces by a change of x of 1 [sigma], below which a parameter is also searched from a smaller value.
-MIN_INFORMATION = 3.0
-
-# Number of starts of the parameters that need no curve, and the largest logarithm of their factor.
-RELAXATION_STARTS, START_LOG = 64, np.log(10.0)
-
-# Keys of stiffnesses, which are scaled by the measured forces before the search.
-STIFFNESSES = ("young", "foundation", "structural")
+# Largest sum of the shares in the model.
+MAX_SHARES = 0.999
 
 
-def has_curve(job: object) -> bool:
+def has_curve(problem: object) -> bool:
     """Return whether the tests of a fit are quasi-static, and of a scene with one tool, which grips nothing."""
-    if not isinstance(job, MachineProblem):
+    if not isinstance(problem, MachineProblem):
         return False
-    return job.scene.time.at_rest and len(job.scene.probes) == 1 and not job.scene.probes[0].grip
+    return problem.scene.time.at_rest and len(problem.scene.probes) == 1 and not problem.scene.probes[0].grip
 
 
 def relax(elastic: Array, branches: Sequence[tuple[float, float]], h: float) -> Array:
-    """Return the force of tissue that relaxes.
+    """Return the force of relaxing tissue [N], shape (frames,).
 
     Args:
-        elastic: elastic force at every frame, shape (frames,).
+        elastic: elastic force at every frame [N], shape (frames,).
         branches: share and time [s] of every branch.
         h: time between frames [s].
-
-    Returns:
-        The force, shape (frames,).
     """
     if not branches:
         return elastic
@@ -93,35 +74,43 @@ class _Tangent(NamedTuple):
 
     x: Array  # coordinates of the parameters, shape (n,)
     reach: float  # greatest travel [m]
-    forces: Array  # at x, shape (TRAVELS + 1,)
-    slopes: Array  # derivatives of their logarithms, shape (n, TRAVELS + 1)
+    forces: Array  # forces at x [N], shape (TRAVELS + 1,)
+    slopes: Array  # derivatives of their logarithms by x, shape (n, TRAVELS + 1)
 
 
 class CurveRuns(Runs):
-    """Predictions of machine tests by a tangent, or curves, with a correction of every frame; see `Runs`."""
+    """Predictions of machine tests by a tangent, or by curves, with a correction of every frame.
 
-    job: MachineProblem
+    Args:
+        problem: the fit.
+        workers: ignored, as a curve is a single run.
+        progress: called often, as of `Runs`.
+
+    Attributes:
+        by_tangent: whether predictions are by the tangent; otherwise by curves.
+        of_curve: mask of the parameters on which a curve depends, shape (n,).
+        of_contact: mask of the depths of contact, shape (n,).
+    """
+
+    problem: MachineProblem
     _predictor: MachineModel
     _tangent: _Tangent
 
-    def __init__(self, job: FitProblem, workers: int | None, progress: StageProgressCallback) -> None:
-        super().__init__(job, 1, progress)
+    def __init__(self, problem: FitProblem, workers: int | None, progress: StageProgressCallback) -> None:
+        super().__init__(problem, 1, progress)
         self._curves: dict[tuple[object, ...], Array] = {}
         self._correction: Array | float = 0.0
-        self.by_tangent = True  # whether predictions are by the tangent
-        keys = [parameter.key for parameter in self.job.parameters]
-        # Masks of the parameters on which a curve depends, of depths of contact, and of locks, shape (n,).
+        self.by_tangent = True
+        keys = [parameter.key for parameter in self.problem.parameters]
         self.of_curve = np.array([not key.startswith(("contact", "tissue.relaxation.")) for key in keys])
         self.of_contact = np.array([key.startswith("contact") for key in keys])
         self._of_lock = np.array([key.endswith(".lock") for key in keys])
 
     def first(self, x: Array) -> Prediction:
-        """Predict with the initial values; raises as `ForwardModel.predict` does."""
         self._predictor.compile(x, self._report_progress)
         return self.run_curve(x)
 
     def predict_one(self, x: Array, steps: int | None = None) -> Prediction | None:
-        """Predict at x by the tangent, or a curve; None if that fails."""
         if not self.by_tangent:
             return self.predict_coarse(x, 0)
         tangent = self._tangent
@@ -134,30 +123,39 @@ class CurveRuns(Runs):
         return self._predict(values, tangent.reach, tangent.forces * np.exp(distance @ tangent.slopes))
 
     def predict_coarse(self, x: Array, halvings: int) -> Prediction | None:
-        """Predict by a curve with the cells per side halved `halvings` times; None if that fails."""
         try:
             return self.run_curve(x, halvings)
         except (SceneError, DivergedError):
             return None
 
     def mesh_error(self, x: Array) -> float | None:
-        """Estimate the mesh error at x, in the run of the curve."""
+        # That of the run of a curve.
         values = self._predictor.values(x)
         return mesh_error(self._plan_curve(values, self._reach(values)), self._report_progress)
 
     def run_curve(self, x: Array, halvings: int = 0) -> Prediction:
-        """Predict by a curve at x, of halved cells; raises as `ForwardModel.predict` does."""
+        """Return the prediction by a curve; raises as `ForwardModel.predict` does.
+
+        Args:
+            x: coordinates of the parameters, shape (n,).
+            halvings: number of halvings of the cells per side.
+        """
         values = self._predictor.values(x)
         reach = self._reach(values)
         return self._predict(values, reach, self._forces(values, reach, halvings))
 
     def run_tests(self, x: Array) -> Prediction:
-        """Run the tests with the parameters at x; raises as `ForwardModel.predict` does."""
-        self.count += len(self.job.tests)
+        """Return the prediction by runs of the tests at x; raises as `ForwardModel.predict` does."""
+        self.count += len(self.problem.tests)
         return self._predictor.predict(x, pause=self._report_progress)
 
     def correct(self, x: Array, predicted: Prediction) -> None:
-        """Correct further predictions, so that the one at x is `predicted`."""
+        """Correct all further predictions by the error of the tangent at a place.
+
+        Args:
+            x: coordinates of the parameters, shape (n,).
+            predicted: prediction at x without this error.
+        """
         if (by_tangent := self.predict_one(x)) is not None:
             self._correction = self._correction + predicted.values[0] - by_tangent.values[0]
 
@@ -170,8 +168,9 @@ class CurveRuns(Runs):
         if total <= MAX_SHARES or not free:
             return x
         of_free = sum(values[key] for key in free)
-        reduction = np.log(max(RESTART_SHARES - (total - of_free), NO_SHARE) / of_free)
-        return x + reduction * np.array([parameter.key in free for parameter in self.job.parameters])
+        # They are reduced to a sum of 0.98, with a margin for differences.
+        reduction = np.log(max(0.98 - (total - of_free), NO_SHARE) / of_free)
+        return x + reduction * np.array([parameter.key in free for parameter in self.problem.parameters])
 
     def set_tangent(self, x: Array) -> None:
         """Set the tangent to the curve at x; raises as `ForwardModel.predict` does."""
@@ -179,8 +178,8 @@ class CurveRuns(Runs):
         reach = self._reach(values)
         forces, slopes = self._forces(values, reach), np.zeros((len(x), TRAVELS + 1))
         for n in np.flatnonzero(self.of_curve):
-            shifted, delta = x.copy(), difference_step(self.job.scene)
-            delta = delta if x[n] + delta <= self.job.parameters[n].limits[1] else -delta
+            shifted, delta = x.copy(), difference_step(self.problem.scene)
+            delta = delta if x[n] + delta <= self.problem.parameters[n].limits[1] else -delta
             shifted[n] += delta
             moved = self._forces(self._predictor.values(shifted), reach)
             is_pressed = (forces > 0) & (moved > 0)
@@ -194,7 +193,7 @@ class CurveRuns(Runs):
 
     def _reach(self, values: dict[str, float]) -> float:
         """Return the greatest travel of a curve [m]; raise a SceneError if no test has any."""
-        if not (reach := self.job.reach(values)):
+        if not (reach := self.problem.reach(values)):
             raise SceneError(["contact: no test goes deeper; take a smaller depth"])
         return reach * (1 + CONTACT_MARGIN * self.of_contact.any())
 
@@ -217,7 +216,7 @@ class CurveRuns(Runs):
         branches = [(scale * share, time) for share, time in branches]
         of_tests = [
             relax(curve(loading.travel(values.get(key))), branches, 1 / loading.rate)
-            for loading, key in zip(self.job.tests, self.job.contact_keys, strict=True)
+            for loading, key in zip(self.problem.tests, self.problem.contact_keys, strict=True)
         ]
         return Prediction((np.concatenate(of_tests)[:, None] + self._correction,), 1, np.zeros(1))
 
@@ -234,11 +233,11 @@ class CurveRuns(Runs):
 
     def _plan_curve(self, values: dict[str, float], reach: float) -> Plan:
         """Plan a run with equidistant travels up to `reach` [m], without relaxation."""
-        data = self.job.with_scene_values(self._predictor.data, values)
+        data = self.problem.with_scene_values(self._predictor.data, values)
         if branches := data.get("tissue", {}).get("relaxation"):
             no_branches = [{**branch, "share": NO_SHARE} for branch in branches]
             data = {**data, "tissue": {**data["tissue"], "relaxation": no_branches}}
-        placed = self.job.approach.place(data, np.linspace(0, reach, TRAVELS + 1), 1.0)
+        placed = self.problem.approach.place(data, np.linspace(0, reach, TRAVELS + 1), 1.0)
         return check_scene(Scene(**placed), self._predictor.maps)
 
 
@@ -246,17 +245,17 @@ def search_by_curve(runs: CurveRuns, misfit: Misfit, start: Array, first: Predic
     """Minimise from a start by tangents, curves, and runs of the tests.
 
     Args:
-        runs: the predictions.
-        misfit: the residuals.
-        start: coordinates of the parameters, shape (n,).
-        first: prediction there.
+        runs: predictions.
+        misfit: residuals.
+        start: initial coordinates of the parameters, shape (n,).
+        first: prediction at the start.
 
     Returns:
         The search by the last tangent, and the solution with the forces of the tests.
 
     Raises:
-        SceneError: when the curve next to an estimate is not valid.
-        DivergedError: when it diverges.
+        SceneError: when the scene of a curve next to an estimate is not valid.
+        DivergedError: when the run of a curve diverges.
     """
     search = Search(runs, misfit)
     solution = _descend(runs, misfit, _scaled(runs, misfit, start, first), by_tests=False)
@@ -267,11 +266,12 @@ def search_by_curve(runs: CurveRuns, misfit: Misfit, start: Array, first: Predic
             if (predicted := runs.predict_coarse(x, 0)) is not None:
                 costs.append((misfit.cost(misfit.residuals(predicted, solution.scales)), x.tolist()))
         starts = [np.array(x) for _, x in sorted(costs)[:2]]
-    # Beyond the forces measured, a lock or factor has no effect, but may have a better value where it has.
+    # A lock or factor beyond the measured forces has no effect, but may fit better at a smaller value, which has one.
+    # Then the forces change by less than 3 sigma per unit of x.
     information = np.linalg.norm(misfit.scaled(search.jacobian(solution), solution.scales), axis=0)
-    for n in np.flatnonzero(runs.of_curve & (information < MIN_INFORMATION)):
+    for n in np.flatnonzero(runs.of_curve & (information < 3.0)):
         starts.append(solution.x.copy())
-        starts[-1][n] = max(start[n] - 1, runs.job.parameters[n].limits[0])
+        starts[-1][n] = max(start[n] - 1, runs.problem.parameters[n].limits[0])
     for x in starts:
         with suppress(SceneError, DivergedError):
             solution = min(solution, _descend(runs, misfit, x, by_tests=False), key=lambda each: each.cost)
@@ -286,8 +286,9 @@ def _scaled(runs: CurveRuns, misfit: Misfit, x: Array, initial: Prediction) -> A
     predicted = misfit.row(initial)
     measured = predicted - misfit.of(initial)
     ratio = np.linalg.norm(measured) / max(float(np.linalg.norm(predicted)), 1e-300)
-    is_stiffness = [parameter.is_log and parameter.path[-1] in STIFFNESSES for parameter in runs.job.parameters]
-    return np.clip(np.where(is_stiffness, x + np.log(ratio), x), *runs.job.limits)
+    names = ("young", "foundation", "structural")
+    is_stiffness = [parameter.is_log and parameter.path[-1] in names for parameter in runs.problem.parameters]
+    return np.clip(np.where(is_stiffness, x + np.log(ratio), x), *runs.problem.limits)
 
 
 def _descend(runs: CurveRuns, misfit: Misfit, start: Array, *, by_tests: bool) -> Solution:
@@ -299,18 +300,20 @@ def _descend(runs: CurveRuns, misfit: Misfit, start: Array, *, by_tests: bool) -
         return Solution(x, predicted, scales, misfit.cost(misfit.residuals(predicted, scales)), converged=False)
 
     def is_at_end(cost: float, current: float) -> bool:
-        return abs(current - cost) <= max(MIN_RELATIVE_CHANGE * current, MIN_CHANGE)
+        # A change of the cost of 0.05 is that by a third of a standard deviation of a parameter.
+        return abs(current - cost) <= max(1e-3 * current, 0.05)
 
     current = evaluate(start)
-    trial, region = current, np.where(runs.of_curve, FIRST_REGION, np.inf)
-    for step in range(MAX_STEPS):
+    # The trust region of the parameters of a curve is at first 0.5, and at most 2, in units of x.
+    trial, region = current, np.where(runs.of_curve, 0.5, np.inf)
+    for step in range(20):
         if step and is_at_end(trial.cost, current.cost):
             return replace(min(trial, current, key=lambda each: each.cost), converged=True)
         if trial.cost <= current.cost:
             if not by_tests:
                 runs.set_tangent(trial.x)
             runs.correct(trial.x, trial.predicted)
-            current, region = trial, np.minimum(2 * region, np.where(runs.of_curve, MAX_REGION, np.inf))
+            current, region = trial, np.minimum(2 * region, np.where(runs.of_curve, 2.0, np.inf))
         else:
             shrunk = np.minimum(region, np.abs(trial.x - current.x)) / 4
             region = shrunk if by_tests else np.where(runs.of_curve, shrunk.max(where=runs.of_curve, initial=0), region)
@@ -328,22 +331,23 @@ def _descend(runs: CurveRuns, misfit: Misfit, start: Array, *, by_tests: bool) -
 
 def _limits(runs: CurveRuns, x: Array, region: Array) -> tuple[Array, Array]:
     """Return the bounds of x within the trust region, and of depths of contact within the reach of the curve."""
-    low, high = runs.job.limits
-    margin = np.array([CONTACT_MARGIN * runs.reach / (parameter.scale or 1) for parameter in runs.job.parameters])
+    low, high = runs.problem.limits
+    margin = np.array([CONTACT_MARGIN * runs.reach / (parameter.scale or 1) for parameter in runs.problem.parameters])
     below = np.where(runs.of_contact, np.minimum(region, margin), region)
     return np.maximum(low, x - below), np.minimum(high, x + region)
 
 
 def _relaxation_starts(runs: CurveRuns, misfit: Misfit, current: Solution, limits: tuple[Array, Array]) -> list[Array]:
-    """Return the two best of many starts of the parameters that need no curve."""
+    """Return the two best of 64 starts of the parameters that need no curve, within a factor of 10."""
     free = np.flatnonzero(~runs.of_curve)
     if not len(free):
         return []
     from scipy.stats import qmc
 
-    low, high = (np.clip(limit[free], current.x[free] - START_LOG, current.x[free] + START_LOG) for limit in limits)
+    max_log = np.log(10.0)
+    low, high = (np.clip(limit[free], current.x[free] - max_log, current.x[free] + max_log) for limit in limits)
     costs = []
-    for shares in qmc.Sobol(len(free), seed=1).random(RELAXATION_STARTS):
+    for shares in qmc.Sobol(len(free), seed=1).random(64):
         x = current.x.copy()
         x[free] = low + shares * (high - low)
         if (predicted := runs.predict_one(x)) is not None:

@@ -12,31 +12,33 @@ import numpy as np
 
 from taichi_msm.errors import Pause, SceneError
 from taichi_msm.fitting.forces import Forces
-from taichi_msm.fitting.machine_tables import cut_window, read_machine_test
-from taichi_msm.fitting.machine_test import Approach, Loading, build_loading, find_approach, late_contact_note
 from taichi_msm.fitting.observation import Array, ObservationModel
 from taichi_msm.fitting.parameters import Bounds, Method, Parameter, as_data, make_parameters, with_values
 from taichi_msm.fitting.predict import FitProblem, ForwardModel, Prediction, without_outputs
 from taichi_msm.load.check import check_scene
+from taichi_msm.machines.loading import Approach, Loading, build_loading, find_approach, late_contact_note
+from taichi_msm.machines.reader import cut_window, read_machine_test
 from taichi_msm.model.plan import Plan
 from taichi_msm.runs.simulation import Simulation
 from taichi_msm.scene.scene import Scene
 
 TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".xlsx")
-TABLE_OPTIONS = ("columns", "sheet", "block", "window", "rate", "contact")
 
-# Options of observed points.
+# Options of `fit` for tables, and those for observed points.
+TABLE_OPTIONS = ("columns", "sheet", "block", "window", "rate", "contact")
 POINT_OPTIONS = ("sigma", "correlation", "drift", "resolution")
 
 
 @dataclass(frozen=True, eq=False)
 class MachineForces(Forces, ObservationModel):
-    """Forces at the frames of all tests along the direction of the tool, of shape (frames, 1)."""
+    """Forces along the direction of the tool at the frames of all tests; values of shape (frames of all tests, 1).
+
+    It is also the map from the run of a test to its forces.
+    """
 
     approach: Approach
 
     def build_model(self, scene: Scene, frames: int) -> MachineForces:
-        """Return the map from the run of a test, which is the same for all."""
         return self
 
     def record(self, simulation: Simulation) -> Array:
@@ -50,9 +52,14 @@ class MachineForces(Forces, ObservationModel):
 
 @dataclass(frozen=True, eq=False)
 class MachineProblem(FitProblem):
-    """Scene, parameters and machine tests of a fit."""
+    """Scene, parameters and machine tests of a fit.
 
-    # Tests have many frames, and smooth forces.
+    Attributes:
+        tests: the tests at their frames.
+        approach: line of the tool.
+    """
+
+    # Forward differences suffice for many frames of smooth forces.
     signs: ClassVar[tuple[int, ...]] = (1,)
 
     tests: tuple[Loading, ...]
@@ -64,17 +71,27 @@ class MachineProblem(FitProblem):
         return contact_keys(len(self.tests))
 
     def build_model(self, threads: int | None) -> ForwardModel:
-        """Build the forward model of the tests."""
         return MachineModel(self, threads)
 
     def fitted_data(self, data: dict[str, Any], values: Mapping[str, float], n: int = 0) -> dict[str, Any]:
-        """Return a scene's data with parameter values, by key, and with the path and the times of test n."""
+        """Return a scene's data with parameter values, and with the path and the times of a test.
+
+        Args:
+            data: data of a scene, as of `as_data`.
+            values: values of all parameters by key.
+            n: index of the test.
+        """
         test, contact = self.tests[n], values.get(self.contact_keys[n])
         data = self.with_scene_values(data, values)
         return self.approach.place(data, test.travel(contact), test.rate)
 
     def with_scene_values(self, data: dict[str, Any], values: Mapping[str, float]) -> dict[str, Any]:
-        """Return a scene's data with parameter values by key, except depths of contact."""
+        """Return a scene's data with parameter values, but without a test.
+
+        Args:
+            data: data of a scene, as of `as_data`.
+            values: values of all parameters by key; depths of contact are ignored.
+        """
         of_scene = [parameter for parameter in self.parameters if parameter.key not in self.contact_keys]
         return with_values(data, of_scene, values)
 
@@ -87,7 +104,7 @@ class MachineProblem(FitProblem):
 class MachineModel(ForwardModel):
     """Forward model of machine tests; predicts `MachineForces`, of shape (frames of all tests, 1)."""
 
-    job: MachineProblem
+    problem: MachineProblem
 
     def predict(
         self,
@@ -98,18 +115,23 @@ class MachineModel(ForwardModel):
         to_end: bool = False,  # The runs end with their tests.
         pause: Pause = lambda: None,
     ) -> Prediction:
-        """Simulate all tests with the parameters at x; arguments and errors as of `ForwardModel.predict`."""
         forces, most_steps = [], 0
-        for n in range(len(self.job.tests)):
-            data = self.job.fitted_data(self.data, self.values(x), n)
+        for n in range(len(self.problem.tests)):
+            data = self.problem.fitted_data(self.data, self.values(x), n)
             simulation, plan = self.start(check_scene(Scene(**data), self.maps), steps, coarse)
             forces.append(self.forces(simulation, plan, pause))
             most_steps = max(most_steps, plan.grid.steps_per_frame)
         return Prediction((np.concatenate(forces),), most_steps, np.zeros(1))
 
     def forces(self, simulation: Simulation, plan: Plan, pause: Pause) -> Array:
-        """Run a simulation to its end; return the forces along the tool's direction [N], shape (frames, 1)."""
-        (observed,) = self.job.observations
+        """Return the forces of a run along the tool's direction [N], shape (frames, 1).
+
+        Args:
+            simulation: simulation at its first frame.
+            plan: its plan.
+            pause: called several times a second.
+        """
+        (observed,) = self.problem.observations
         frames = plan.grid.frames + 1
         model = observed.build_model(plan.scene, frames)
         (recorded,) = self.record([model], simulation, frames, pause)
@@ -146,15 +168,15 @@ def read_machine_problem(
     forces: object,
     method: Method,
 ) -> MachineProblem:
-    """Read tables of a testing machine, and build the fit.
+    """Return the fit of the tables of a testing machine.
 
     Args:
-        paths: the tables.
+        paths: paths of the tables.
         scene: the scene with its initial values.
         free: keys of the parameters.
         bounds: smallest and largest values by key.
-        forces: forces of another file, which are refused.
-        method: options of the fit.
+        forces: forces of another file, which raise an error, or None.
+        method: options of `fit`.
 
     Raises:
         SceneError: when a table, the scene or an option is invalid.
@@ -162,7 +184,7 @@ def read_machine_problem(
     if forces is not None:
         raise SceneError([f"--forces: {paths[0]} has the forces; leave the option out"])
     if unused := [name for name in POINT_OPTIONS if method.get(name) is not None]:
-        raise SceneError([f"--{unused[0]}: is of observed points, and {paths[0]} has none; leave the option out"])
+        raise SceneError([f"--{unused[0]}: only for observed points, and {paths[0]} has none; leave the option out"])
     rate, contacts = method.get("rate"), list(method.get("contact") or ())
     if rate is not None and not 0 < rate < np.inf:
         raise SceneError([f"--rate {rate:g}: take a number of frames per second, above 0"])
@@ -212,7 +234,7 @@ def _make_parameters(
         parameters = {parameter.key: parameter for parameter in make_parameters(scene, of_scene, limits)}
     for key, test in zip(contacts, tests, strict=True):
         if key in free:
-            # Depths of contact are in metres of the table, and units of the range of depths with a motion of the tool.
+            # A depth of contact is in metres of the table; x is in units of the range in which the tool moves.
             low, high = first, last = float(test.depth[0]), float(test.depth.max())
             if key in bounds:
                 low, high = max(first, bounds[key][0]), min(last, bounds[key][1])

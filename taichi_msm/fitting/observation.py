@@ -1,4 +1,4 @@
-"""Interface of an observation: measured values, and how a fit predicts, weighs, doubts and describes them."""
+"""Interface of an observation: measured values, their prediction, plausibility checks and messages."""
 
 from __future__ import annotations
 
@@ -37,29 +37,39 @@ class ObservationModel(ABC):
 
     @abstractmethod
     def record(self, simulation: Simulation) -> Array:
-        """Return what the model needs of the current frame."""
+        """Return the record of the current frame, of any shape."""
 
     @abstractmethod
     def predict(self, recorded: Array) -> Array:
         """Return the values of the observation, from the records of all frames."""
 
     def motion(self, recorded: Array) -> Array:
-        """Return the largest displacement of what is observed at each frame [m], shape (frames,)."""
+        """Return the largest displacement of the observed points at each frame [m], shape (frames,)."""
         return np.zeros(len(recorded))
 
 
 @dataclass(frozen=True, eq=False)
 class Observation(ABC):
-    """Measured values of any shape, NaN where not measured."""
+    """Measured values of any shape.
 
-    noun: ClassVar[str]  # name of the values, for messages
-    unit: ClassVar[str]  # of the values and of sigma
-    is_independent: ClassVar[bool] = False  # whether errors are independent: the values alone may reject a model
+    Attributes:
+        noun: name of the values, for messages.
+        unit: unit of the values and of sigma.
+        is_independent: whether the errors are independent, so that chi-square of these values alone may reject a model.
+        name: name of the file, for messages.
+        time: times of the values [s].
+        values: measured values [unit], NaN where not measured.
+        sigma: standard deviation of the errors [unit]: one number, an array of shape (known,), or None if estimated.
+    """
 
-    name: str  # of the file, in messages
-    time: Array  # of the values [s]
+    noun: ClassVar[str]
+    unit: ClassVar[str]
+    is_independent: ClassVar[bool] = False
+
+    name: str
+    time: Array
     values: Array
-    sigma: float | Array | None  # standard deviation of the errors, of all or of each known value; None: estimated
+    sigma: float | Array | None
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -67,7 +77,7 @@ class Observation(ABC):
         return np.isfinite(self.values)
 
     def with_sigma(self, sigma: Any) -> Self:
-        """Replace sigma unless it is None; raise a SceneError if it is no positive number."""
+        """Return the observation with another sigma, unless that is None; raise a SceneError unless it is positive."""
         if sigma is None:
             return self
         array = np.asarray(sigma)
@@ -80,19 +90,35 @@ class Observation(ABC):
 
     @abstractmethod
     def build_model(self, scene: Scene, frames: int) -> ObservationModel:
-        """Build the map from a run of a scene; `frames`: their number, from the first one."""
+        """Return the map from a run to the values.
+
+        Args:
+            scene: scene of the run, with its mesh and camera.
+            frames: number of frames, from the first one.
+        """
 
     @abstractmethod
     def signal(self, scene: Scene) -> float:
-        """Return the root mean square of the values that a fit explains; 0 where there is none."""
+        """Return the root mean square of the explained part of the values [unit]; 0 without any."""
 
     @abstractmethod
     def fits_well(self, residuals: Array, deviation: float, signal: float) -> bool:
-        """Return whether the residuals of the known values, with an estimated `deviation`, are small."""
+        """Return whether the residuals are small.
+
+        Args:
+            residuals: predicted minus observed known values [unit], shape (known,).
+            deviation: standard deviation estimated from them [unit].
+            signal: root mean square of the explained part of the values [unit].
+        """
 
     @abstractmethod
     def summary(self, residuals: Array, sigma: float | Array) -> dict[str, Any]:
-        """Return the fields of a `FitResult`: residual, and sigma as given or estimated."""
+        """Return the fields of a `FitResult` with residual and sigma.
+
+        Args:
+            residuals: predicted minus observed known values [unit], shape (known,).
+            sigma: standard deviation of the errors [unit], given or estimated.
+        """
 
     def faults(self, scene: Scene) -> Iterator[str]:
         """Yield the faults that need no run: units, lost values."""
@@ -103,11 +129,22 @@ class Observation(ABC):
         return False
 
     def faults_at_start(self, scene: Scene, predicted: Array, *, same_camera: bool) -> Iterator[str]:
-        """Yield the faults that a run of the scene shows, with the camera of the observation or a fitted one."""
+        """Yield the faults that a run of the scene shows: mirrored axes, another camera or origin.
+
+        Args:
+            scene: the scene with its initial values.
+            predicted: its predicted values, with the shape of `values`.
+            same_camera: whether the scene has the camera of the observation, which is False if the camera is fitted.
+        """
         yield from ()
 
     def opposed(self, scene: Scene, *predictions: Array) -> Iterator[str]:
-        """Yield components of the sign opposite to all predictions."""
+        """Yield a message per component that has the opposite sign in all predictions.
+
+        Args:
+            scene: the scene with its initial values.
+            predictions: predicted values, each with the shape of `values`.
+        """
         yield from ()
 
     def unit_faults(self, *predictions: Array) -> Iterator[str]:
@@ -115,7 +152,13 @@ class Observation(ABC):
         yield from ()
 
     def pattern(self, residuals: Array, signal: float, correlation: ErrorCorrelation) -> str | None:
-        """Return the reason to reject a model by a pattern of the residuals, with the shape of the values, or None."""
+        """Return the reason for rejecting a model by a pattern of its residuals, or None.
+
+        Args:
+            residuals: predicted minus observed values, with the shape of `values`.
+            signal: root mean square of the explained part of the values [unit].
+            correlation: given correlation of the errors.
+        """
         return None
 
     def factor_note(self, predicted: Array) -> str:
@@ -123,24 +166,43 @@ class Observation(ABC):
         return ""
 
     def correlated(self, rows: Array, correlation: ErrorCorrelation) -> tuple[Array, float]:
-        """Return R^T K R for rows R, shape (numbers, n), of known values, and tr(K^2), with K the errors' correlation.
+        """Return R^T K R, shape (n, n), and tr(K^2), with K the correlation of the errors; K = 1 by default.
 
-        Errors are independent by default.
+        Args:
+            rows: R, a row per known value, shape (known, n).
+            correlation: correlation lengths that define K.
         """
         return rows.T @ rows, float(len(rows))
 
     def residual_notes(self, predicted: Array, signal: float, correlation: ErrorCorrelation) -> Iterator[str]:
-        """Yield warnings about the residuals."""
+        """Yield warnings about the residuals.
+
+        Args:
+            predicted: values predicted by the solution, with the shape of `values`.
+            signal: root mean square of the explained part of the values [unit].
+            correlation: given correlation of the errors.
+        """
         yield from ()
 
 
 def time_in_frames(scene: Scene, time: Array) -> Array:
-    """Convert times [s] to frame numbers, rounded to six decimals, so that frames are integers."""
+    """Return times as frame numbers, rounded to six decimals, so that times of frames become integers.
+
+    Args:
+        scene: scene with the frame rate.
+        time: times [s], any shape.
+    """
     return np.round(time * scene.time.frames_per_second, 6)
 
 
 def time_weights(scene: Scene, time: Array, frames: int) -> Any:
-    """Return the weights of linear interpolation at times [s] between frames, sparse, shape (T, frames)."""
+    """Return the weights of linear interpolation between frames, sparse, shape (T, frames).
+
+    Args:
+        scene: scene with the frame rate.
+        time: times [s], shape (T,).
+        frames: number of frames.
+    """
     from scipy.sparse import csr_matrix
 
     position, row = time_in_frames(scene, time), np.arange(len(time))
@@ -150,7 +212,13 @@ def time_weights(scene: Scene, time: Array, frames: int) -> Any:
 
 
 def opposed_axes(observed: Array, predictions: Sequence[Array], sigma: Any) -> list[int]:
-    """Return the components (last axis) of a significant size that have the other sign in all predictions."""
+    """Return the components (last axis) of a significant size that have the opposite sign in all predictions.
+
+    Args:
+        observed: observed values, shape (..., components), NaN where not observed.
+        predictions: predicted values, each of the same shape.
+        sigma: standard deviation of the errors, or None if unknown.
+    """
     size = observed.shape[-1]
     is_opposed = np.ones(size, np.bool_)
     for predicted in predictions:

@@ -7,7 +7,7 @@ fixed sign. Other numbers, and those with an initial value of 0, are fitted line
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from numbers import Integral, Real
@@ -40,13 +40,21 @@ def rounded(number: float) -> str:
 
 @dataclass(frozen=True)
 class Parameter:
-    """Fitted number of a scene, as a function of a coordinate x, which is initially 0."""
+    """Fitted number of a scene, as a function of a coordinate x, which is initially 0.
 
-    key: str  # dotted path
-    start: float  # initial value
-    low: float  # bounds of the value, may be infinite
+    Attributes:
+        key: dotted path.
+        start: initial value.
+        low: smallest value, may be infinite.
+        high: largest value, may be infinite.
+        scale: x = (value - start) / scale; with a scale of 0 x = log(value / start).
+    """
+
+    key: str
+    start: float
+    low: float
     high: float
-    scale: float  # x = (value - start) / scale; 0: x = log(value / start)
+    scale: float
 
     @property
     def path(self) -> Key:
@@ -76,11 +84,21 @@ class Parameter:
         )
 
     def error(self, x: float, deviation: float) -> float:
-        """Convert a standard deviation of x to that of the value."""
+        """Return the standard deviation of the value.
+
+        Args:
+            x: coordinate.
+            deviation: standard deviation of x.
+        """
         return deviation * (abs(self.value(x)) if self.is_log else self.scale)
 
     def share(self, x: float, deviation: float) -> float:
-        """Convert a standard deviation of x to a share of the value, or of a coordinate's range."""
+        """Return the standard deviation as a share of the value, or of the range of a place or time.
+
+        Args:
+            x: coordinate.
+            deviation: standard deviation of x.
+        """
         if self.is_log:
             return deviation
         unit = self.scale if _is_coordinate(self.path) else abs(self.value(x))
@@ -88,7 +106,16 @@ class Parameter:
 
 
 def make_parameters(scene: Scene, free: Sequence[str], bounds: Mapping[str, Bounds]) -> tuple[Parameter, ...]:
-    """Build the parameters of the keys `free`, with bounds by key; raise a SceneError with all faults."""
+    """Return the parameters of a fit.
+
+    Args:
+        scene: the scene with its initial values.
+        free: keys of the parameters.
+        bounds: smallest and largest values by key.
+
+    Raises:
+        SceneError: when a key or its bounds are invalid; it has all faults.
+    """
     data, faults, parameters = as_data(scene), [], []
     if not free:
         faults.append("--free: names no key; take one or more, such as --free tissue.young")
@@ -111,11 +138,12 @@ def _parameter(scene: Scene, data: dict[str, Any], key: str, low: float, high: f
         example = f"{scene.kind}.{path[-1]}.range.1"
         raise SceneError([f"{option}: of maps only tissue.map is fitted; name numbers, such as {example}"])
     value = _look_up(option, data, path)
-    if isinstance(value, list):
-        raise SceneError([f"{option}: a list; name one of its numbers by its index, such as {key}.0"])
-    is_fittable = any(f"{key}.".startswith(f"{section}.") for section in SECTIONS)
-    if not is_fittable or not isinstance(value, float) or any(part in FIXED_KEYS for part in path):
-        description = "a section" if isinstance(value, dict) else f"{value!r}"
+    if not _is_fittable(path, value):
+        description = f"{value!r}"
+        if isinstance(value, (dict, list)):
+            description = "a list" if isinstance(value, list) else "a section"
+            if first := next(_numbers_below(path, value), None):
+                raise SceneError([f"{option}: {description}; name one of its numbers, such as {first}"])
         raise SceneError([f"{option}: {description}, which cannot be free; take a number of {', '.join(SECTIONS)}"])
     interval = f"--bounds {key}={low:g},{high:g}"
     if not low < high:
@@ -143,6 +171,22 @@ def _look_up(option: str, data: Any, path: Key) -> Any:
             raise SceneError([f"{option}: the scene has no {str(part) or 'such key'} there{suggestion}"])
         data = data[part if isinstance(data, list) else str(part)]
     return data
+
+
+def _is_fittable(path: Key, value: Any) -> bool:
+    """Return whether a value of a scene is a number that can be free."""
+    key = ".".join(map(str, path))
+    is_in_section = any(f"{key}.".startswith(f"{section}.") for section in SECTIONS)
+    return is_in_section and isinstance(value, float) and not any(part in FIXED_KEYS for part in path)
+
+
+def _numbers_below(path: Key, value: Any) -> Iterator[str]:
+    """Yield the keys of the numbers of a section or list that can be free."""
+    if _is_fittable(path, value):
+        yield ".".join(map(str, path))
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for part, item in items:
+        yield from _numbers_below((*path, part), item)
 
 
 def _is_coordinate(path: Key) -> bool:
@@ -175,7 +219,13 @@ def as_data(scene: Scene) -> dict[str, Any]:
 
 
 def with_values(data: dict[str, Any], parameters: Sequence[Parameter], values: Mapping[str, float]) -> dict[str, Any]:
-    """Return a copy of a scene's data with the values of parameters, by key."""
+    """Return a copy of a scene's data with other values of parameters.
+
+    Args:
+        data: data of a scene, as of `as_data`.
+        parameters: the parameters to be replaced.
+        values: their values by key.
+    """
     changed = deepcopy(data)
     for parameter in parameters:
         container: Any = changed
@@ -204,7 +254,17 @@ class Method(TypedDict, total=False):
 
 
 def require_types(observed: Any, free: Any, method: Mapping[str, Any], **others: Any) -> None:
-    """Check the types of the arguments of `fit`; raise an ArgumentError for the first fault."""
+    """Check the types of the arguments of `fit`.
+
+    Args:
+        observed: observations.
+        free: keys of the parameters.
+        method: options of the method.
+        others: further arguments by name; None where they are not given.
+
+    Raises:
+        ArgumentError: when an argument has a wrong type, or an option does not exist; for the first fault.
+    """
     known = Method.__annotations__
     if unknown := sorted(set(method) - set(known)):
         raise ArgumentError(f"{unknown[0]}: unknown; take {', '.join(known)}{did_you_mean(unknown[0], known)}")

@@ -39,7 +39,12 @@ Panel = Callable[[Axes], None]
 
 
 def plot(result: FitResult, file: BinaryIO) -> None:
-    """Write fit.png to a file."""
+    """Write fit.png.
+
+    Args:
+        result: result of the fit.
+        file: binary file for the PNG.
+    """
     with style.context(STYLE, after_reset=True), warnings.catch_warnings():
         # A name may contain characters that the font lacks, and a point may have no observations.
         warnings.filterwarnings("ignore", "Glyph .* missing")
@@ -71,8 +76,8 @@ def observation_panels(observed: Observation, fitted: Array, result: FitResult) 
 
     Args:
         observed: the observation.
-        fitted: its values in the fitted scene.
-        result: of the fit.
+        fitted: its values in the fitted scene, with their shape.
+        result: result of the fit.
     """
     if isinstance(observed, PointObservation):
         point_count, time_count = (int(observed.is_observed.any(axis=axis).sum()) for axis in (1, 0))
@@ -249,10 +254,10 @@ def _plot_cells(
 
 def _plot_weight(axes: Axes, choice: SmoothnessWeight) -> None:
     """Plot the excess of chi-square and its expectation against the weight of the smoothness."""
-    axes.plot(choice.weights, choice.left, color=BLUE, label="excess")
+    axes.plot(choice.weights, choice.excess, color=BLUE, label="excess")
     axes.plot(choice.weights, choice.expected, color=GREY, linestyle=DASHED, label="expected")
     chosen = np.abs(np.log(choice.weights / choice.weight)).argmin()
-    axes.plot(choice.weights[chosen], choice.left[chosen], "o", color=VERMILION, label="taken")
+    axes.plot(choice.weights[chosen], choice.excess[chosen], "o", color=VERMILION, label="taken")
     axes.set(title="Smoothness", xlabel="weight of the smoothness", ylabel="chi-square")
     axes.set(xscale="log", yscale="log")
     axes.legend(loc="upper left")

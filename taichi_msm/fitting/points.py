@@ -93,7 +93,7 @@ class PointModel(ObservationModel):
 
         Args:
             points: observed points [m], shape (N, T, 3).
-            gradient: by the observations, shape (N, T, 3 or 2).
+            gradient: gradient by the observations, shape (N, T, 3 or 2).
 
         Returns:
             Gradient by the positions, shape (frames, rows, cols, 3).
@@ -105,24 +105,37 @@ class PointModel(ObservationModel):
 
 
 class Conventions(NamedTuple):
-    """Where points are expected at rest, and the remedies where they are not."""
+    """Camera or origin of observed points, for messages about points that are displaced at rest.
 
-    tolerance: float  # largest offset with the correct camera and origin
+    Attributes:
+        tolerance: largest offset with the correct camera and origin [m] or [px].
+        place: clause about the expected place of points at rest.
+        remedy: remedy for another camera or origin.
+        mirror_remedies: remedies for a mirrored x and y.
+    """
+
+    tolerance: float
     place: str
     remedy: str
-    mirror_remedies: tuple[str, str]  # of a mirrored x and y
+    mirror_remedies: tuple[str, str]
 
 
 @dataclass(frozen=True, eq=False)
 class PointObservation(Observation):
-    """Points over time; values of shape (N, T, 3 or 2), times of shape (T,)."""
+    """Points over time; values of shape (N, T, 3 or 2), times of shape (T,).
+
+    Attributes:
+        kind: name of the array of values.
+        correlation_remedy: option for correlated errors of neighbouring points; empty if there is none.
+        coordinates: across and down as fractions of the sheet, shape (N, 2).
+    """
 
     noun: ClassVar[str] = "coordinates"
-    kind: ClassVar[str]  # name of the array of values
-    correlation_remedy: ClassVar[str]  # option for correlated errors of neighbouring points
+    kind: ClassVar[str]
+    correlation_remedy: ClassVar[str]
 
     sigma: float | None
-    coordinates: Array  # across and down as fractions of the sheet, shape (N, 2)
+    coordinates: Array
 
     @property
     def is_observed(self) -> NDArray[np.bool_]:
@@ -135,16 +148,26 @@ class PointObservation(Observation):
         return f"{self.name}: {self.kind}"
 
     def build_model(self, scene: Scene, frames: int) -> PointModel:
-        """Build the map from a run of a scene; `frames`: their number, from the first one."""
         return PointModel(scene, self, frames)
 
     @abstractmethod
     def observe(self, scene: Scene, points: Array) -> Array:
-        """Convert points [m], shape (N, T, 3), to values; NaN where they are not seen."""
+        """Return the values of points, shape (N, T, 3 or 2); NaN where they are not visible.
+
+        Args:
+            scene: scene with the camera.
+            points: positions [m], shape (N, T, 3).
+        """
 
     @abstractmethod
     def backward(self, scene: Scene, points: Array, gradient: Array) -> Array:
-        """Convert the gradient of a loss by the values to that by points [m], shape (N, T, 3)."""
+        """Return the gradient of a loss by points, shape (N, T, 3).
+
+        Args:
+            scene: scene with the camera.
+            points: positions [m], shape (N, T, 3).
+            gradient: gradient by the values, shape (N, T, 3 or 2).
+        """
 
     @abstractmethod
     def conventions(self, scene: Scene) -> Conventions:
@@ -166,13 +189,11 @@ class PointObservation(Observation):
         return float(np.sqrt(np.nanmean(motion**2, axis=(1, 2)).max())) if len(motion) else math.inf
 
     def fits_well(self, residuals: Array, deviation: float, signal: float) -> bool:
-        """Return whether the deviation is small, in sigma or as a share of the motion."""
         if self.sigma is None:
             return deviation <= observation.MAX_RESIDUAL_SHARE * signal
         return deviation <= observation.MAX_RESIDUAL_SIGMAS * self.sigma
 
     def summary(self, residuals: Array, sigma: float | Array) -> dict[str, Any]:
-        """Return residual, sigma and unit."""
         return {"residual": float(np.sqrt(np.mean(residuals**2))), "sigma": sigma, "unit": self.unit}
 
     def faults(self, scene: Scene) -> Iterator[str]:
@@ -197,7 +218,6 @@ class PointObservation(Observation):
         return not (is_significant or self.signal(scene) > MIN_MOTION_SIGMAS * self.sigma)
 
     def faults_at_start(self, scene: Scene, predicted: Array, *, same_camera: bool) -> Iterator[str]:
-        """Yield invisible points, mirrored axes, and a wrong camera or origin."""
         if invisible := int((self.known & ~np.isfinite(predicted)).any(axis=(1, 2)).sum()):
             fault = "are behind the eye of the scene's camera, or beyond its lens, where the search begins"
             remedy = "give the scene the camera that saw them, or NaN in their place"
@@ -210,7 +230,6 @@ class PointObservation(Observation):
             yield from self._misplaced(scene, predicted)
 
     def opposed(self, scene: Scene, *predictions: Array) -> Iterator[str]:
-        """Yield components of the motion that all predictions have with the other sign."""
         rest = self.at_rest(scene)
         moved = [prediction - rest for prediction in predictions]
         for axis in observation.opposed_axes(self.values - rest, moved, self.sigma):
@@ -218,13 +237,11 @@ class PointObservation(Observation):
             yield f"{self.subject}: {fault} change the sign of either"
 
     def pattern(self, residuals: Array, signal: float, correlation: ErrorCorrelation) -> str | None:
-        """Return the reason to reject a model by correlated residuals, or None; see `Observation.pattern`."""
         return rejection.by_pattern(
             residuals, self.time, self.coordinates, signal, correlation, self.correlation_remedy or "give --sigma"
         )
 
     def correlated(self, rows: Array, correlation: ErrorCorrelation) -> tuple[Array, float]:
-        """Return R^T K R, and tr(K^2); see `Observation.correlated`."""
         from scipy.spatial.distance import cdist
 
         # Distances are those of mean observed positions; tracks without observations are left out.
@@ -244,7 +261,6 @@ class PointObservation(Observation):
         return np.tensordot(by_track, correlated, ((0, 1, 2), (0, 1, 2))), square
 
     def residual_notes(self, predicted: Array, signal: float, correlation: ErrorCorrelation) -> Iterator[str]:
-        """Yield warnings about residuals next to 0, and correlated residuals."""
         residuals = predicted - self.values
         if np.sqrt(np.nanmean(residuals**2)) < max(1e-6 * signal, 0.1 * (self.sigma or 0.0)):
             if self.sigma is None:
@@ -268,7 +284,7 @@ class PointObservation(Observation):
         return motion[np.isfinite(motion).any(axis=(1, 2))]
 
     def _mirrored_axes(self, scene: Scene) -> list[int]:
-        """Return the axes on which the points have the other sign than those at rest."""
+        """Return the axes on which the points have the opposite sign of those at rest."""
         count = self.is_observed.sum(axis=1)
         expected, observed = (
             np.where(self.known, each, 0.0).sum(axis=1)[count > 0, :2] / count[count > 0, None]
@@ -292,18 +308,16 @@ class PointObservation(Observation):
 
 @dataclass(frozen=True, eq=False)
 class Positions(PointObservation):
-    """Positions of points [m], from the middle of the sheet at rest."""
+    """Positions of points [m], from the middle of the sheet at rest; values of shape (N, T, 3)."""
 
     kind: ClassVar[str] = "position"
     unit: ClassVar[str] = "m"
     correlation_remedy: ClassVar[str] = ""
 
     def observe(self, scene: Scene, points: Array) -> Array:
-        """Return the points."""
         return points
 
     def backward(self, scene: Scene, points: Array, gradient: Array) -> Array:
-        """Return the gradient."""
         return gradient
 
     def conventions(self, scene: Scene) -> Conventions:
@@ -333,19 +347,21 @@ class Positions(PointObservation):
 
 @dataclass(frozen=True, eq=False)
 class Pixels(PointObservation):
-    """Pixels of points [px], from the upper left corner of the picture."""
+    """Pixels of points [px], from the upper left corner of the picture; values of shape (N, T, 2).
+
+    Points behind the eye of the camera, or beyond its lens, have no pixel. The gradient is that of central differences
+    of the projection.
+    """
 
     kind: ClassVar[str] = "pixel"
     unit: ClassVar[str] = "px"
     correlation_remedy: ClassVar[str] = "give --correlation PX"
 
     def observe(self, scene: Scene, points: Array) -> Array:
-        """Project points by the scene's main camera; NaN behind the eye, or beyond the lens."""
         pixels = [view_at(scene, time).pixels(points[:, n]) for n, time in enumerate(self.time.tolist())]
         return np.stack(pixels, axis=1)
 
     def backward(self, scene: Scene, points: Array, gradient: Array) -> Array:
-        """Convert the gradient by central differences of the projection; see `PointObservation.backward`."""
         steps = 1e-6 * max(scene.sheet.size) * np.eye(3)
         changes = (
             (self.observe(scene, points + step) - self.observe(scene, points - step)) / (2 * step.sum())
@@ -365,10 +381,10 @@ class Pixels(PointObservation):
 
     def faults(self, scene: Scene) -> Iterator[str]:
         """Yield sentinel values of lost points, or fractions of the frame instead of pixels."""
-        found = list(super().faults(scene))
-        yield from found
+        sentinels = list(super().faults(scene))
+        yield from sentinels
         largest, rest = np.nanmax(np.abs(self.values)), self.at_rest(scene)
-        if not found and largest <= 1.5 < MAX_OFFSET_PX < np.nan_to_num(np.abs(rest)).max():
+        if not sentinels and largest <= 1.5 < MAX_OFFSET_PX < np.nan_to_num(np.abs(rest)).max():
             width, height = scene.render.size
             fault = "are they fractions of the frame? multiply them by its width and height"
             yield f"{self.subject}: up to {largest:.3g}; {fault}, {width} and {height} in the scene"

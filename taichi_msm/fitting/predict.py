@@ -31,22 +31,37 @@ from taichi_msm.system.process import available_memory, available_threads
 
 
 class Prediction(NamedTuple):
-    """Predicted observations."""
+    """Predicted observations.
 
-    values: tuple[Array, ...]  # of every observation, with its shape; NaN where a point is behind the camera
-    steps: int  # per frame
-    motion: Array  # largest displacement of the observed points at every simulated frame [m]
+    Attributes:
+        values: predicted values of every observation, with its shape; NaN where a point is behind the camera.
+        steps: number of steps per frame.
+        motion: largest displacement of the observed points at every simulated frame [m], shape (frames,).
+    """
+
+    values: tuple[Array, ...]
+    steps: int
+    motion: Array
 
 
 @dataclass(frozen=True, eq=False)
 class FitProblem:
-    """Scene, parameters and observations of a fit."""
+    """Scene, parameters and observations of a fit.
 
-    token: str  # identifies the fit in worker processes
-    scene: Scene  # with initial values
+    Attributes:
+        signs: signs of the finite differences at the solution.
+        token: identifier of the fit in worker processes.
+        scene: scene with its initial values.
+        parameters: parameters of the fit.
+        observations: observations of the fit.
+    """
+
+    signs: ClassVar[tuple[int, ...]] = (1, -1)
+
+    token: str
+    scene: Scene
     parameters: tuple[Parameter, ...]
     observations: tuple[Observation, ...]
-    signs: ClassVar[tuple[int, ...]] = (1, -1)  # of the finite differences at the solution
 
     @property
     def limits(self) -> tuple[Array, Array]:
@@ -59,7 +74,12 @@ class FitProblem:
         return ForwardModel(self, threads)
 
     def fitted_data(self, data: dict[str, Any], values: Mapping[str, float]) -> dict[str, Any]:
-        """Return a scene's data with parameter values by key."""
+        """Return a scene's data with parameter values.
+
+        Args:
+            data: data of a scene, as of `as_data`.
+            values: values of all parameters by key.
+        """
         return with_values(data, self.parameters, values)
 
 
@@ -70,15 +90,20 @@ def without_outputs(scene: Scene) -> Scene:
 
 
 class ForwardModel:
-    """Forward model of a fit: a simulation that is restarted for every prediction."""
+    """Forward model of a fit: a simulation that is restarted for every prediction.
 
-    def __init__(self, job: FitProblem, threads: int | None) -> None:
-        self.job, self.data = job, as_data(job.scene)
-        plan = check_scene(job.scene)
+    Args:
+        problem: the fit.
+        threads: number of threads; all cores if it is None.
+    """
+
+    def __init__(self, problem: FitProblem, threads: int | None) -> None:
+        self.problem, self.data = problem, as_data(problem.scene)
+        plan = check_scene(problem.scene)
         self.maps, self._threads = plan.maps, threads
         self._simulation: Simulation | None = None
-        times = np.concatenate([observed.time for observed in job.observations])
-        self._frames = max(2, math.ceil(time_in_frames(job.scene, times).max()) + 1)
+        times = np.concatenate([observed.time for observed in problem.observations])
+        self._frames = max(2, math.ceil(time_in_frames(problem.scene, times).max()) + 1)
 
     def predict(
         self,
@@ -89,11 +114,11 @@ class ForwardModel:
         to_end: bool = False,
         pause: Pause = lambda: None,
     ) -> Prediction:
-        """Simulate the scene with the parameters at x.
+        """Return the prediction of a run with the parameters at x.
 
         Args:
             x: coordinates of the parameters, shape (n,).
-            steps: smallest number of steps per frame; None: enough for finite differences around x.
+            steps: smallest number of steps per frame; by default enough for finite differences around x.
             coarse: number of halvings of the cells per side.
             to_end: whether to simulate to the last frame, beyond the last observation.
             pause: called several times a second; an exception from it ends the run.
@@ -104,7 +129,7 @@ class ForwardModel:
         """
         simulation, plan = self.start(self.plan(x), steps, coarse)
         # The mesh of a coarse run differs.
-        models = [observed.build_model(plan.scene, self._frames) for observed in self.job.observations]
+        models = [observed.build_model(plan.scene, self._frames) for observed in self.problem.observations]
         frames = max(self._frames, plan.grid.frames + 1) if to_end else self._frames
         pairs = list(zip(models, self.record(models, simulation, frames, pause), strict=True))
         values = tuple(model.predict(recorded[: self._frames]) for model, recorded in pairs)
@@ -112,7 +137,19 @@ class ForwardModel:
         return Prediction(values, plan.grid.steps_per_frame, motion)
 
     def start(self, plan: Plan, steps: int | None, coarse: int) -> tuple[Simulation, Plan]:
-        """Restart the simulation, and return it with the plan as it is run; arguments as of `predict`."""
+        """Restart the simulation.
+
+        Args:
+            plan: plan of the run.
+            steps: smallest number of steps per frame, or None, as of `predict`.
+            coarse: number of halvings of the cells per side.
+
+        Returns:
+            The simulation, and its plan with these cells and steps.
+
+        Raises:
+            SceneError: when the plan has too few mass points to be coarsened.
+        """
         for _ in range(coarse):
             if (coarser := coarser_plan(plan)) is None:
                 raise SceneError(["sheet.points: too few to take half of them"])
@@ -130,22 +167,33 @@ class ForwardModel:
         return self._simulation, plan
 
     def compile(self, x: Array, pause: Pause = lambda: None) -> None:
-        """Compile the kernels for the parameters at x; raises a SceneError as `predict` does."""
+        """Compile the kernels.
+
+        Args:
+            x: coordinates of the parameters, shape (n,); raises a SceneError as `predict` does.
+            pause: called several times a second.
+        """
         self._simulation = Simulation(self.plan(x), threads=self._threads)
         self._simulation.compile(pause)
 
     def try_predict(self, x: Array, steps: int | None = None, **options: Any) -> Prediction | None:
-        """Predict as `predict` does; None if the run fails, or an observed point is behind the camera."""
+        """Return the prediction at x, or None if the run fails or an observed point is behind the camera.
+
+        Args:
+            x: coordinates of the parameters, shape (n,).
+            steps: smallest number of steps per frame, or None, as of `predict`.
+            options: further arguments of `predict`.
+        """
         try:
             predicted = self.predict(x, steps, **options)
         except (SceneError, DivergedError):
             return None
-        pairs = zip(predicted.values, self.job.observations, strict=True)
+        pairs = zip(predicted.values, self.problem.observations, strict=True)
         return predicted if all(np.isfinite(values[observed.known]).all() for values, observed in pairs) else None
 
     def values(self, x: Array) -> dict[str, float]:
         """Return the parameter values by key at x; raise a SceneError if they are out of range."""
-        pairs = zip(self.job.parameters, x.tolist(), strict=True)
+        pairs = zip(self.problem.parameters, x.tolist(), strict=True)
         values = {parameter.key: parameter.value(coordinate) for parameter, coordinate in pairs}
         if not np.isfinite(list(values.values())).all():
             raise SceneError(["the values are out of range"])
@@ -153,12 +201,19 @@ class ForwardModel:
 
     def plan(self, x: Array) -> Plan:
         """Plan the scene with the parameters at x; raise a SceneError if it is not valid."""
-        return check_scene(Scene(**self.job.fitted_data(self.data, self.values(x))), self.maps)
+        return check_scene(Scene(**self.problem.fitted_data(self.data, self.values(x))), self.maps)
 
     def record(
         self, models: Sequence[ObservationModel], simulation: Simulation, frames: int, pause: Pause
     ) -> list[Array]:
-        """Return what models record of a number of frames, a stack of records for each."""
+        """Return the records of a run, a stack over all frames per model.
+
+        Args:
+            models: observation models.
+            simulation: simulation at its first frame.
+            frames: number of frames, including the first one.
+            pause: called several times a second.
+        """
         records: list[list[Array]] = [[] for _ in models]
         for frame in range(frames):
             simulation.advance(min(frame, 1), pause)
@@ -184,19 +239,30 @@ def difference_step(scene: Scene) -> float:
 _cached_models: dict[str, ForwardModel] = {}
 
 
-def predict(job: FitProblem, x: Array, steps: int | None) -> Prediction | None:
-    """Predict in a worker process on one thread, as `ForwardModel.try_predict` does."""
-    if job.token not in _cached_models:
+def predict(problem: FitProblem, x: Array, steps: int | None) -> Prediction | None:
+    """Return the prediction of a worker process on one thread, as `ForwardModel.try_predict` does.
+
+    Args:
+        problem: the fit; its forward model is kept for the next call.
+        x: coordinates of the parameters, shape (n,).
+        steps: smallest number of steps per frame, or None, as of `ForwardModel.predict`.
+    """
+    if problem.token not in _cached_models:
         for token in list(_cached_models):
             _cached_models.pop(token).close()
-        _cached_models[job.token] = job.build_model(threads=1)
-    return _cached_models[job.token].try_predict(x, steps)
+        _cached_models[problem.token] = problem.build_model(threads=1)
+    return _cached_models[problem.token].try_predict(x, steps)
 
 
 def mesh_error(plan: Plan, pause: Pause) -> float | None:
-    """Estimate the mesh error of a plan, as a fraction of the largest displacement.
+    """Return the estimated mesh error, as a fraction of the largest displacement.
 
-    It is None for springs, with too few mass points, or if a coarser run fails; `pause` is as for `ForwardModel`.
+    Args:
+        plan: plan of the run.
+        pause: called several times a second.
+
+    Returns:
+        The error, or None for springs, with too few mass points, or if a coarser run fails.
     """
     if coarser_plan(plan) is None:
         return None
@@ -211,22 +277,22 @@ class Runs:
     """Execution of the runs of a fit, in this process or in a pool; a context manager, which ends the pool.
 
     Args:
-        job: the fit.
-        workers: number of worker processes; 1: no pool; None: by the duration of the first run.
+        problem: the fit.
+        workers: number of worker processes, without a pool if it is 1; by default by the duration of the first run.
         progress: called often with the stage, the finished and the expected number of runs; an exception from it ends
             the fit.
     """
 
-    def __init__(self, job: FitProblem, workers: int | None, progress: StageProgressCallback) -> None:
-        self.job = job
+    def __init__(self, problem: FitProblem, workers: int | None, progress: StageProgressCallback) -> None:
+        self.problem = problem
         self.count = self.expected = 0  # number of finished runs, and the expected number
         self._workers, self._progress = workers, progress
-        self._predictor = job.build_model(threads=None)
+        self._predictor = problem.build_model(threads=None)
         self._pool: Pool | None = None
         self._seconds = 0.0
 
     def first(self, x: Array) -> Prediction:
-        """Predict to the last frame; raises as `ForwardModel.predict` does."""
+        """Return the prediction at x to the last frame; raises as `ForwardModel.predict` does."""
         self._predictor.compile(x, self._report_progress)
         start = time.perf_counter()
         predicted = self._predictor.predict(x, to_end=True, pause=self._report_progress)
@@ -234,28 +300,46 @@ class Runs:
         return predicted
 
     def predict_coarse(self, x: Array, halvings: int) -> Prediction | None:
-        """Predict with the cells per side halved `halvings` times; None if that fails."""
+        """Return the prediction of a coarser mesh, or None if it fails.
+
+        Args:
+            x: coordinates of the parameters, shape (n,).
+            halvings: number of halvings of the cells per side.
+        """
         self.count += 1
         return self._predictor.try_predict(x, coarse=halvings, pause=self._report_progress)
 
     def mesh_error(self, x: Array) -> float | None:
-        """Estimate the mesh error at x, as the function `mesh_error` does."""
+        """Return the estimated mesh error at x, as the function `mesh_error` does."""
         return mesh_error(self._predictor.plan(x), self._report_progress)
 
     def predict_one(self, x: Array, steps: int | None = None) -> Prediction | None:
-        """Predict at x; None if that fails."""
+        """Return the prediction at x, or None if it fails.
+
+        Args:
+            x: coordinates of the parameters, shape (n,).
+            steps: smallest number of steps per frame, or None, as of `ForwardModel.predict`.
+        """
         self._report_progress()
         predicted = self._predictor.try_predict(x, steps, pause=self._report_progress)
         self.count += 1
         return predicted
 
     def predict_many(self, coordinates: Sequence[Array], steps: int | None = None) -> list[Prediction | None]:
-        """Predict at several x, in parallel if that pays off."""
+        """Return predictions in parallel if that pays off, each None if it fails.
+
+        Args:
+            coordinates: coordinates of the parameters of every run, each of shape (n,).
+            steps: smallest number of steps per frame, or None, as of `ForwardModel.predict`.
+
+        Raises:
+            ExecutorError: when a worker process dies.
+        """
         if self._pool is None and (workers := self._choose_workers()) > 1:
             self._pool = Pool(workers)
         if self._pool is None or len(coordinates) < 2:
             return [self.predict_one(x, steps) for x in coordinates]
-        futures: list[Future[Any]] = [self._pool.submit(predict, self.job, x, steps) for x in coordinates]
+        futures: list[Future[Any]] = [self._pool.submit(predict, self.problem, x, steps) for x in coordinates]
         waiting = set(futures)
         while waiting:
             self._report_progress()
@@ -269,11 +353,11 @@ class Runs:
     def _choose_workers(self) -> int:
         if self._workers is not None:
             return self._workers
-        parameters = len(self.job.parameters)
+        parameters = len(self.problem.parameters)
         # A pool, whose start takes seconds, pays off if eight runs per parameter take longer than eight seconds.
         if 8 * parameters * self._seconds < 8.0:
             return 1
-        process_bytes = PROCESS_BYTES + cost.estimate_budget(check_scene(self.job.scene)).memory_bytes
+        process_bytes = PROCESS_BYTES + cost.estimate_budget(check_scene(self.problem.scene)).memory_bytes
         return max(1, min(available_threads(), available_memory() // process_bytes, 2 * parameters))
 
     def _report_progress(self) -> None:

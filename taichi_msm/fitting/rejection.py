@@ -19,20 +19,20 @@ from taichi_msm.fitting.observation import Array, ErrorCorrelation
 MIN_PROBABILITY = 1e-3
 
 
-def by_chi_square(chi_square: float, freedom: int, independent: float, what: str = "chi-square") -> str | None:
+def by_chi_square(chi_square: float, freedom: int, independent: float, name: str = "chi-square") -> str | None:
     """Return the reason for rejection by an improbable chi-square, or None.
 
     Args:
         chi_square: sum of squared residuals.
         freedom: degrees of freedom.
         independent: effective number of independent residuals, at most `freedom`.
-        what: name of the sum in the reason.
+        name: name of the sum, for the reason.
     """
     from scipy.stats import chi2
 
     if chi2.sf(chi_square * independent / freedom, independent) >= MIN_PROBABILITY:
         return None
-    return f"{what} {chi_square:.3g} for {freedom} degrees of freedom has a probability below {MIN_PROBABILITY:g}"
+    return f"{name} {chi_square:.3g} for {freedom} degrees of freedom has a probability below {MIN_PROBABILITY:g}"
 
 
 def by_pattern(
@@ -41,12 +41,12 @@ def by_pattern(
     """Return the reason for rejection by correlated residuals, or None.
 
     Args:
-        residuals: shape (N, T, numbers) [m] or [px].
+        residuals: predicted minus observed values [m] or [px], shape (N, T, 3 or 2), NaN where not observed.
         time: times of the observations [s], shape (T,).
         coordinates: of the points on the sheet, shape (N, 2).
         motion: root mean square of the motion [m] or [px].
         error_correlation: given correlation lengths of the errors.
-        remedy: where the errors of neighbouring points are correlated.
+        remedy: remedy for correlated errors of neighbouring points, for the reason.
     """
     # Smaller residuals are due to rounding and the tolerance of the search.
     if np.sqrt(np.nanmean(residuals**2)) < 1e-4 * motion:

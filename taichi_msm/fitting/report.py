@@ -34,14 +34,19 @@ def _is_fit_file(record: Mapping[str, Any]) -> IsListed:
 
 
 def publication(directory: Path) -> Publication:
-    """Begin the atomic replacement of a fit in a directory."""
+    """Return the atomic replacement of a fit in a directory."""
     return Publication(
         directory, PublicationSpec("fit", RECORD, PATTERNS, _is_fit_file), [RECORD, SCENE, PLOT, MAP, ERRORS]
     )
 
 
 def write_report(result: FitResult, published: Publication) -> None:
-    """Write and publish the files of a fit."""
+    """Write and publish the files of a fit; without matplotlib fit.png is left out, with a note in the result.
+
+    Args:
+        result: result of the fit.
+        published: replacement of the directory.
+    """
     folder = published.new_folder
     names: dict[str, str] = {}
     for n, scene in enumerate([result.scene, *result.other_scenes]):
@@ -71,7 +76,7 @@ def _write_png(grey: NDArray[np.uint16], path: Path) -> None:
 
 
 def _scene_text(result: FitResult, scene: Scene, folder: Path, names: dict[str, str]) -> str:
-    """Format a fitted scene, and copy its pictures to the folder; `names` are those of the copies, by path."""
+    """Format a fitted scene, and copy its pictures to the folder; `names`: names of the copies by path."""
 
     def copied(path: str) -> str:
         if path not in names:

@@ -10,24 +10,34 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.fitting.least_squares import ProfilePoint, UnidentifiedGroup
+from taichi_msm.fitting.identifiability import UnidentifiedGroup
 from taichi_msm.fitting.machine_fit import FittedTest
 from taichi_msm.fitting.observation import Array, Observation
 from taichi_msm.fitting.parameters import rounded
 from taichi_msm.fitting.points import PointObservation
+from taichi_msm.fitting.profiles import ProfilePoint
 from taichi_msm.fitting.tikhonov import SmoothnessWeight
 from taichi_msm.scene.scene import Scene
 
 
 class Estimate(NamedTuple):
-    """Estimate of a parameter."""
+    """Estimate of a parameter.
+
+    Attributes:
+        value: best value.
+        standard_error: standard error of the value.
+        interval: ends of the 95 % confidence interval, each None beyond the bounds.
+        start: initial value.
+        identifiable: whether the standard error is at most the value, or the range of a place or time.
+        mesh_error: conservative estimate of the discretisation error of the value, or None if unknown.
+    """
 
     value: float
-    standard_error: float  # of the value
-    interval: tuple[float | None, float | None]  # ends of the 95 % confidence interval; None: beyond the bounds
-    start: float  # initial value
-    identifiable: bool  # whether the standard error is at most the value, or the range of a coordinate or time
-    mesh_error: float | None  # conservative estimate of the discretisation error of the value; None: not known
+    standard_error: float
+    interval: tuple[float | None, float | None]
+    start: float
+    identifiable: bool
+    mesh_error: float | None
 
 
 def sixteen_bits(shares: Array) -> NDArray[np.uint16]:
@@ -41,7 +51,7 @@ class FittedMap:
 
     Attributes:
         factors: factors of young, shape (R, R), from the upper left corner of the sheet.
-        errors: relative standard errors, shape (R, R); NaN: not identifiable.
+        errors: relative standard errors, shape (R, R), NaN if not identifiable.
         choice: weight of the smoothness.
         sigma: combined standard deviation of the observations and the mesh error [m] or [px].
     """
@@ -90,7 +100,7 @@ class FittedMap:
         if known.size:
             middle, ends = 100 * np.median(known), 100 * np.array([known.min(), known.max()])
             errors = f"known to {rounded(middle)} % in the middle, {rounded(ends[0])} to {rounded(ends[1])} %"
-        return f"tissue.map: {size} x {size} fields, {low:.3g} to {high:.3g} times young, {errors}"
+        return f"tissue.map: {size} x {size} cells, {low:.3g} to {high:.3g} times young, {errors}"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -98,19 +108,19 @@ class FitResult:
     """Result of a fit.
 
     Attributes:
-        parameters: estimates, by key.
+        parameters: estimates by key.
         correlation: correlation matrix of the parameters, in their order.
-        residual: root mean square of predicted minus observed values [m] or [px]; None without points.
-        residual_force: root mean square of predicted minus observed forces [N]; None without forces.
-        sigma_force: given standard deviation of the forces [N]; None without forces.
-        sigma: standard deviation of the values [m] or [px], given or estimated; None without points.
+        residual: root mean square of predicted minus observed values [m] or [px], or None without points.
+        residual_force: root mean square of predicted minus observed forces [N], or None without forces.
+        sigma_force: given standard deviation of the forces [N], or None without forces.
+        rejection: reason for rejecting the model, or None if it is not rejected.
+        sigma: standard deviation of the values [m] or [px], given or estimated, or None without points.
         unit: unit of residual and sigma, m or px.
-        chi_square: sum of (predicted - observed)^2 / sigma^2; None without a given sigma.
-        rejection: reason for rejecting the model; None: not rejected.
+        chi_square: sum of (predicted - observed)^2 / sigma^2, or None without a given sigma.
         degrees_of_freedom: number of observations minus that of parameters; for a map, the number of observations.
         identifiable: whether all parameters are identifiable.
         unseen: groups of parameters that are identifiable in combinations only.
-        mesh_error: mesh error of the fitted scene, as a fraction of its largest displacement; None: not known.
+        mesh_error: mesh error of the fitted scene, as a fraction of its largest displacement, or None if unknown.
         runs: number of runs.
         seconds: duration [s].
         notes: warnings, a line each.
@@ -118,7 +128,7 @@ class FitResult:
         observations: the observations.
         fitted: values of every observation, predicted by the fitted scene.
         curves: profiles of the parameters by key, or their quadratic approximations.
-        map: estimated map; None for a fit of numbers.
+        map: estimated map, or None for a fit of numbers.
         tests: the machine tests with their fitted forces.
         other_scenes: fitted scenes of the machine tests after the first one.
     """
@@ -167,7 +177,7 @@ class FitResult:
 
     def summary(self) -> list[str]:
         """Format the result in lines."""
-        intervals = "intervals" if self.map is None else "errors of the fields"
+        intervals = "intervals" if self.map is None else "errors of the cells"
         lines = []
         if self.rejection is not None:
             lines.append(f"the model is rejected: {self.rejection}; the {intervals} do not cover this")
@@ -182,8 +192,8 @@ class FitResult:
             residual = (
                 f"{fitted.residual:.3g} N, {rounded(100 * fitted.residual / peak)} % of the peak, at {frames} frames"
             )
-            found = f"noise {fitted.loading.noise:.2g} N, contact at {fitted.contact:.4g} m"
-            lines.append(f"{fitted.loading.test.name}: residual {residual}; {found}{chi_text}")
+            details = f"noise {fitted.loading.noise:.2g} N, contact at {fitted.contact:.4g} m"
+            lines.append(f"{fitted.loading.test.name}: residual {residual}; {details}{chi_text}")
         force_text = "" if self.residual_force is None else f", {self.residual_force:.3g} N"
         for observed in self.observations:
             if isinstance(observed, PointObservation):

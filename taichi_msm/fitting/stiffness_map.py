@@ -12,11 +12,12 @@ import numpy as np
 from taichi_msm.accuracy.mesh import coarser_plan
 from taichi_msm.errors import SceneError, StageProgressCallback
 from taichi_msm.fitting.checks import faults, faults_at_start
-from taichi_msm.fitting.least_squares import MAX_RELATIVE_ERROR, ProfilePoint
+from taichi_msm.fitting.identifiability import MAX_RELATIVE_ERROR
 from taichi_msm.fitting.observation import Array
 from taichi_msm.fitting.parameters import Bounds, Parameter, make_parameters, rounded
 from taichi_msm.fitting.points import PointModel, PointObservation
 from taichi_msm.fitting.predict import Prediction, mesh_error, without_outputs
+from taichi_msm.fitting.profiles import ProfilePoint
 from taichi_msm.fitting.rejection import by_chi_square
 from taichi_msm.fitting.result import Estimate, FitResult, FittedMap
 from taichi_msm.fitting.tikhonov import MapGrid, MapSearch, MapSolution, centres, with_scaled_forces
@@ -35,9 +36,6 @@ KEY = "tissue.map"
 # Key of a component of a force.
 FORCE_KEY = re.compile(r"probes\.\d+\.total\.[012]")
 
-# Standard deviation of an unknown log of a force.
-UNKNOWN_DEVIATION = 3.0
-
 # Default bounds of the factors.
 DEFAULT_LOW, DEFAULT_HIGH = 0.1, 10.0
 
@@ -47,20 +45,36 @@ MAX_FACTOR = 1e6
 
 @dataclass(frozen=True)
 class MapSettings:
-    """Settings of a fitted map."""
+    """Settings of a fitted map.
+
+    Attributes:
+        resolution: number of cells per side, R.
+        limits: bounds of the factors.
+        force: component of a force, whose factor all forces share, or None if forces are known.
+    """
 
     resolution: int
-    limits: Bounds  # of the factors
-    force: Parameter | None  # component of a force, whose factor all forces share; None: forces are known
+    limits: Bounds
+    force: Parameter | None
 
 
 def map_settings(
     scene: Scene, free: Sequence[str], bounds: Mapping[str, Bounds], resolution: int | None
 ) -> MapSettings | None:
-    """Return the settings of a map, None for a fit of numbers; raise a SceneError for invalid arguments."""
+    """Return the settings of a map, or None for a fit of numbers.
+
+    Args:
+        scene: the scene with its initial values.
+        free: keys of the parameters.
+        bounds: smallest and largest values by key.
+        resolution: number of cells per side, or None.
+
+    Raises:
+        SceneError: when keys, bounds, resolution or scene do not allow the map.
+    """
     if KEY not in free:
         if resolution is not None:
-            raise SceneError([f"--resolution {resolution}: is that of a map; add --free {KEY}"])
+            raise SceneError([f"--resolution {resolution}: only for a map; add --free {KEY}"])
         return None
     option = f"--free {KEY}"
     force_keys = [key for key in free if key != KEY]
@@ -71,7 +85,7 @@ def map_settings(
         raise SceneError([f"{option}: the scene has springs; describe them as tissue"])
     cells = min(scene.sheet.points) - 1
     if resolution is None:
-        raise SceneError([f"{option}: add --resolution R, the fields along a side, such as {min(16, cells)}"])
+        raise SceneError([f"{option}: add --resolution R, the cells along a side, such as {min(16, cells)}"])
     if not 2 <= resolution <= cells:
         remedy = f"take 2 to {cells}, as the sheet has {cells} cells along a side, or more sheet.points"
         raise SceneError([f"--resolution {resolution}: {remedy}"])
@@ -93,12 +107,12 @@ def map_settings(
 def fit_map(
     scene: Scene, observations: PointObservation, settings: MapSettings, image: str, progress: StageProgressCallback
 ) -> FitResult:
-    """Estimate a map.
+    """Return the fit of a map.
 
     Args:
-        scene: the scene.
-        observations: with sigma.
-        settings: of the map.
+        scene: the scene with its initial values.
+        observations: observed points, with sigma.
+        settings: settings of the map.
         image: path of the map's picture in the fitted scene.
         progress: called often; an exception from it ends the fit.
 
@@ -182,7 +196,8 @@ def fit_map(
 
 def _force_estimate(parameter: Parameter, solution: MapSolution) -> tuple[Estimate, list[ProfilePoint]]:
     """Return the estimate of a force, and the quadratic approximation of its profile."""
-    x, deviation = float(solution.x[-1]), float(np.nan_to_num(solution.errors[-1], nan=UNKNOWN_DEVIATION))
+    # The log of an unknown force has a standard deviation of 3.
+    x, deviation = float(solution.x[-1]), float(np.nan_to_num(solution.errors[-1], nan=3.0))
     value, error, is_identifiable = parameter.value(x), parameter.error(x, deviation), deviation <= MAX_RELATIVE_ERROR
     low, high = sorted(parameter.value(x + side * 1.96 * deviation) for side in (-1, 1))
     curve = [ProfilePoint(value * math.exp(n * deviation), float(n)) for n in np.linspace(-3, 3, 25)]
@@ -196,14 +211,14 @@ def _faults(observations: PointObservation, scene: Scene, settings: MapSettings)
         yield f"{observations.name}: sigma: missing: {fault}"
         return
     if (count := int(observations.known.sum())) <= (cell_count := settings.resolution**2):
-        fault = f"{count} numbers were observed, too few for {cell_count} fields"
-        remedy = f"observe more points, or take fewer fields: --resolution {max(2, math.isqrt(max(count - 1, 0)))}"
+        fault = f"{count} numbers were observed, too few for {cell_count} cells of a map"
+        remedy = f"observe more points, or take fewer cells: --resolution {max(2, math.isqrt(max(count - 1, 0)))}"
         yield f"{observations.name}: {fault}; {remedy}"
         return
     # Two copies of the Jacobian, in f64.
     if (needed := 16 * count * cell_count) > (free := available_memory()):
-        fault = f"{cell_count} fields by {count} observed numbers take {needed / 2**30:.3g} GiB of memory"
-        remedy = "take fewer fields or points"
+        fault = f"{cell_count} cells of a map by {count} observed numbers take {needed / 2**30:.3g} GiB of memory"
+        remedy = "take fewer cells or points"
         yield f"--resolution {settings.resolution}: {fault}, and {free / 2**30:.3g} GiB is free; {remedy}"
         return
     yield from faults([observations], scene, settings.resolution**2)
@@ -220,7 +235,7 @@ def _initial_points(position: Array, model: PointModel, observations: PointObser
 
 
 def _with_stable_steps(plan: Plan, high: float) -> Plan:
-    """Return the plan with steps stable up to the factor `high`; raise a SceneError if the scene's own are not."""
+    """Return the plan with steps stable up to the factor `high`; raise a SceneError if a fixed step is not."""
     if plan.scene.time.at_rest:
         return plan
     stiffest = replace(plan.material, factors=np.full(_cells(plan), high))
@@ -258,7 +273,7 @@ def _notes(
     """Yield warnings; `residuals` are in [m] or [px]."""
     assert observations.sigma is not None
     if (unknown_count := int(fitted_map.unknown.sum())) > 0:
-        yield f"{unknown_count} of {fitted_map.factors.size} fields are unknown: nothing moves there; press there"
+        yield f"{unknown_count} of {fitted_map.factors.size} cells are unknown: nothing moves there; press there"
     if mesh_shift > observations.sigma / 2:
         size = f"about {rounded(mesh_shift)} {observations.unit}, and sigma is {rounded(observations.sigma)}"
         remedy = "the map is as smooth as both require; take more sheet.points"
@@ -270,4 +285,4 @@ def _notes(
         yield f"the residual is {factor} times the expected one with any map, and the errors are widened by this factor"
     logs = solution.x[: fitted_map.factors.size]
     if bounded := int((np.minimum(logs - limits[0], limits[1] - logs) < 1e-3).sum()):
-        yield f"{bounded} fields ended at a bound, {math.exp(limits[0]):.3g} or {math.exp(limits[1]):.3g}; see --bounds"
+        yield f"{bounded} cells ended at a bound, {math.exp(limits[0]):.3g} or {math.exp(limits[1]):.3g}; see --bounds"

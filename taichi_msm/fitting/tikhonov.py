@@ -31,9 +31,6 @@ from taichi_msm.scene.scene import Scene
 # Largest relative error of a known map cell, with all other cells given.
 MAX_KNOWN_ERROR = 0.5
 
-# Candidate weights, in units of the largest diagonal entry of J^T J.
-WEIGHTS = 10.0 ** np.arange(2, -9, -0.1)
-
 # Largest change of a stable weight, as a factor.
 MAX_WEIGHT_CHANGE = 2.0
 
@@ -45,17 +42,30 @@ DIFFERENCE_STEP = 1e-2
 
 
 class SmoothnessWeight(NamedTuple):
-    """Weight w of the smoothness, chosen by the discrepancy principle."""
+    """Weight w of the smoothness, chosen by the discrepancy principle.
+
+    Attributes:
+        weight: w.
+        step: change of x to the map with this weight, from the linearised predictions, shape (R^2,).
+        weights: candidates, up to this weight, shape (candidates,).
+        excess: excess of chi-square above its minimum, for each candidate, shape (candidates,).
+        expected: expected excess, shape (candidates,).
+    """
 
     weight: float
-    step: Array  # of x to the map with this weight, from the linearised predictions
-    weights: Array  # candidates, up to this weight
-    left: Array  # excess of chi-square above its minimum, for each candidate
-    expected: Array  # expected excess, for each candidate
+    step: Array
+    weights: Array
+    excess: Array
+    expected: Array
 
 
 def with_scaled_forces(scene: Scene, factor: float = 1.0) -> Scene:
-    """Scale the forces of all tools."""
+    """Return a scene with scaled forces of all tools.
+
+    Args:
+        scene: the scene.
+        factor: common factor of the forces.
+    """
     totals = [probe.total and tuple(factor * component for component in probe.total) for probe in scene.probes]
     probes = [probe.model_copy(update={"total": total}) for probe, total in zip(scene.probes, totals, strict=True)]
     return scene.model_copy(update={"probes": tuple(probes)})
@@ -63,18 +73,26 @@ def with_scaled_forces(scene: Scene, factor: float = 1.0) -> Scene:
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
-    """Predictions linearised at a map."""
+    """Predictions linearised at a map.
 
-    x: Array  # logs of the factors of the map cells, shape (R^2,)
-    information: Array  # J^T J / excess, shape (R^2, R^2)
-    slope: Array  # gradient of chi-square / (2 excess) by x, shape (R^2,)
-    excess: float  # chi-square of the best map per degree of freedom, at least 1
+    Attributes:
+        x: logs of the factors of the map cells, shape (R^2,).
+        information: J^T J / excess, shape (R^2, R^2).
+        slope: gradient of chi-square / (2 excess) by x, shape (R^2,).
+        excess: chi-square of the best map per degree of freedom, at least 1.
+    """
+
+    x: Array
+    information: Array
+    slope: Array
+    excess: float
 
     def choose_weight(self, roughness: Array) -> SmoothnessWeight:
-        """Choose the weight of L by the discrepancy principle."""
+        """Choose the weight of L, `roughness`, shape (R^2, R^2), by the discrepancy principle."""
         candidates: list[tuple[float, float, float]] = []
         excess_at_x = float(self.slope @ np.linalg.pinv(self.information, hermitian=True) @ self.slope)
-        for weight in WEIGHTS * np.diag(self.information).max():
+        # Candidates are in units of the largest diagonal entry of J^T J.
+        for weight in 10.0 ** np.arange(2, -9, -0.1) * np.diag(self.information).max():
             inverse = np.linalg.inv(self.information + weight * roughness)
             step = -inverse @ (self.slope + weight * (roughness @ self.x))
             excess = excess_at_x + float(2 * self.slope @ step + step @ self.information @ step)
@@ -84,18 +102,30 @@ class Linearisation:
         return SmoothnessWeight(candidates[-1][0], step, *np.array(candidates).T)
 
     def errors(self, weight: float, roughness: Array) -> Array:
-        """Return the standard errors of x, shape (R^2,); NaN if unknown."""
+        """Return the standard errors of x, shape (R^2,), NaN if unknown.
+
+        Args:
+            weight: w.
+            roughness: L, shape (R^2, R^2).
+        """
         deviations = np.sqrt(np.diag(np.linalg.inv(self.information + weight * roughness)))
         return np.where(np.diag(self.information) * MAX_KNOWN_ERROR**2 >= 1, deviations, np.nan)
 
 
 @dataclass(frozen=True, eq=False)
 class MapSolution:
-    """Estimated map."""
+    """Estimated map.
 
-    x: Array  # logs of the factors
-    errors: Array  # standard errors of x; NaN: unknown
-    excess: float  # as in `Linearisation`
+    Attributes:
+        x: logs of the factors, and of that of the forces where it is free, shape (R^2,) or (R^2 + 1,).
+        errors: standard errors of x, NaN if unknown.
+        excess: chi-square of the best map per degree of freedom, at least 1.
+        choice: weight of the smoothness.
+    """
+
+    x: Array
+    errors: Array
+    excess: float
     choice: SmoothnessWeight
 
 
@@ -105,12 +135,16 @@ class MapSearch:
     Args:
         adjoint: gradients of the scene.
         model: observation model of the scene.
-        observations: the observations.
+        observations: observed points.
         sigma: standard deviation of their errors, including the mesh error [m] or [px].
         grid: cells of the map.
         limits: bounds of the logs of the factors.
         pause: called several times a second; an exception from it ends the search.
-        force_limits: bounds of the log of a common factor of all forces, the last entry of x; None: forces are fixed.
+        force_limits: bounds of the log of a common factor of all forces, the last entry of x, or None if forces are
+            fixed.
+
+    Attributes:
+        runs: number of finished runs.
     """
 
     def __init__(
@@ -130,10 +164,10 @@ class MapSearch:
         extra_limits = [] if force_limits is None else [force_limits]
         self._roughness = np.pad(grid.roughness(), (0, len(extra_limits)))
         self._limits = np.array([limits] * self._cells + extra_limits).T
-        self.runs = 0  # finished ones
+        self.runs = 0
 
     def predict(self, x: Array) -> tuple[Array, Array]:
-        """Predict the points [m], shape (N, T, 3), and the observations with a map."""
+        """Return the points [m], shape (N, T, 3), and the observations with a map, shape (N, T, 3 or 2)."""
         self._pause()
         self.runs += 1
         cells, scene = x[: self._cells], with_scaled_forces(self._model.scene, *np.exp(x[self._cells :]))
@@ -220,7 +254,12 @@ class MapGrid:
         return np.asarray(self._down @ np.exp(x).reshape(self.resolution, -1) @ self._across.T)
 
     def backward(self, x: Array, gradient: Array) -> Array:
-        """Convert the gradient of a loss by the factors of the sheet's cells to that by the logs x."""
+        """Return the gradient of a loss by the logs x, shape (R^2,).
+
+        Args:
+            x: logs of the map cells, shape (R^2,).
+            gradient: gradient by the factors of the sheet's cells, with their shape.
+        """
         return np.asarray(np.exp(x) * (self._down.T @ gradient @ self._across).ravel())
 
     def roughness(self) -> Array:

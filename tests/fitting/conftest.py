@@ -11,15 +11,15 @@ from taichi_msm.system.runtime import Device
 
 
 @pytest.fixture(scope="module", autouse=True)
-def one_device(device: Device) -> Iterator[None]:
-    """A fit takes every core, and a process has one device."""
+def threads_of_the_device(device: Device) -> Iterator[None]:
+    """By default a fit takes all cores, but a process has a single device."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(process, "available_threads", lambda: device.threads)
         yield
 
 
 def with_keys(data: dict[str, Any], **keys: Any) -> dict[str, Any]:
-    """The data of a scene with other values, by their dotted paths with __ for the dots."""
+    """Data of a scene with changed values, by dotted paths with __ for the dots."""
     data = json.loads(json.dumps(data))
     for key, value in keys.items():
         *sections, name = key.split("__")

@@ -1,4 +1,4 @@
-"""Cells of a text table or of a workbook, by row and column, before they have a meaning, and their numbers.
+"""Cells of a text table or of a workbook by row and column, and numbers in them.
 
 A text may be UTF-8, UTF-16 or Windows-1252; its separator is the one that splits its header.
 """
@@ -42,20 +42,29 @@ NUMBER_PATTERN = re.compile(r"[+-]?(?:\d+(?:\.(\d*))?|\.(\d+))(?:[eE]([+-]?\d{1,
 
 # Thousands in groups, with the mark of the groups and the decimal mark.
 GROUPS = {
-    mark: re.compile(rf"[+-]?[1-9]\d{{0,2}}(?:\{other}\d{{3}})+\{mark}\d+", re.ASCII) for mark, other in (",.", ".,")
+    mark: re.compile(rf"[+-]?[1-9]\d{{0,2}}(?:\{group}\d{{3}})+\{mark}\d+", re.ASCII) for mark, group in (",.", ".,")
 }
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Cells of a table."""
+    """Cells of a table.
 
-    name: str  # of the file
-    sheet: str  # of a workbook; empty for a text
-    rows: list[Row]  # a row ends at its last filled cell
-    separator: str = ""  # name of that of a text
-    counts: Sequence[int] = ()  # of cells in each row of a text, with the empty ones at its end
-    merged: frozenset[tuple[int, int]] = frozenset()  # rows and columns of cells merged with the one to their right
+    Attributes:
+        name: name of the file.
+        sheet: sheet of a workbook, empty for a text.
+        rows: cells of every row, up to the last filled one.
+        separator: name of the separator of a text.
+        counts: number of cells in every row of a text, with the empty ones at its end.
+        merged: rows and columns of cells that are merged with the one to their right.
+    """
+
+    name: str
+    sheet: str
+    rows: list[Row]
+    separator: str = ""
+    counts: Sequence[int] = ()
+    merged: frozenset[tuple[int, int]] = frozenset()
 
     @property
     def title(self) -> str:
@@ -63,7 +72,12 @@ class Grid:
         return f"{self.name}: {self.sheet}" if self.sheet else self.name
 
     def place(self, row: int, column: int = 0) -> str:
-        """Return the place of a row or a cell, counted from 0, for a message."""
+        """Return the place of a row of a text, or of a cell of a sheet, for a message.
+
+        Args:
+            row: index of the row, from 0.
+            column: index of the column, from 0.
+        """
         if not self.sheet:
             return f"{self.name}:{row + 1}"
         from openpyxl.utils import get_column_letter
@@ -77,7 +91,15 @@ class Grid:
         return not is_comment and any(character.isalnum() for cell in cells for character in cell)
 
     def require_names(self, row: int, header: int) -> None:
-        """Raise a SceneError if a row of a text has more cells than its header has names."""
+        """Check that a row of a text has no more cells than its header has names.
+
+        Args:
+            row: index of the row.
+            header: index of the row of the names.
+
+        Raises:
+            SceneError: when it has more.
+        """
         cells, names = self.rows[row], self.rows[header]
         if not self.sheet and len(cells) > len(names):
             is_decimal = self.separator == "commas"
@@ -86,12 +108,12 @@ class Grid:
             raise SceneError([f"{self.place(row)}: {fault}; {remedy}"])
 
     def numbers(self, header: int, cells: Iterable[tuple[int, int]], remedy: str) -> list[tuple[float, int]]:
-        """Parse cells as `parse_number` does.
+        """Return the numbers of cells, as of `parse_number`.
 
         Args:
-            header: row of the names.
+            header: index of the row of the names.
             cells: row and column of each cell.
-            remedy: for a cell that is not a number.
+            remedy: remedy for a cell that is not a number.
 
         Raises:
             SceneError: when a cell is not a number, or has another decimal mark than an earlier one.
@@ -114,11 +136,11 @@ class Grid:
 
 
 def read_text(name: str, is_header: Callable[[Row], bool], expected: str) -> Grid:
-    """Read a text table.
+    """Return the cells of a text table.
 
     Args:
-        name: the file.
-        is_header: whether a row names the columns; it selects the separator.
+        name: path of the file.
+        is_header: function that returns whether a row names the columns; it selects the separator.
         expected: remedy for a file that cannot be read.
 
     Raises:
@@ -139,10 +161,10 @@ def read_text(name: str, is_header: Callable[[Row], bool], expected: str) -> Gri
 
 
 def read_workbook(name: str, expected: str) -> dict[str, Grid]:
-    """Read the sheets of a workbook by name, without chart sheets.
+    """Return the sheets of a workbook by name, without chart sheets.
 
     Args:
-        name: the file.
+        name: path of the file.
         expected: remedy for a file that cannot be read.
 
     Raises:

@@ -1,7 +1,7 @@
-"""Test of a testing machine as a scene, whose position-controlled tool follows the depths of the table.
+"""Test of a testing machine as the motion of a scene's position-controlled tool, with contact, noise and frames.
 
-The tool moves along a line, from the first contact with the sheet at rest, or a clamp from its rest. Until the table's
-depth exceeds the depth of contact, it waits there; that of a clamp is the depth of the first row.
+The tool moves along a line, from the first contact with the sheet at rest, or a clamp from its rest. It waits there
+until the table's depth exceeds the depth of contact, which of a clamp is that of the first row.
 
 Frames are equidistant in time. The equilibria of tissue without relaxation do not depend on time: their frames are
 equidistant in depth, from slightly above the contact to the greatest depth, and later rows are not used. The depth and
@@ -18,51 +18,46 @@ from typing import Any
 import numpy as np
 
 from taichi_msm.errors import SceneError
-from taichi_msm.fitting.machine_tables import MachineTest
-from taichi_msm.fitting.observation import Array
+from taichi_msm.machines.reader import Array, MachineTest
 from taichi_msm.model.tools import Clamp, Tool, build_tools, gap_to_sheet
 from taichi_msm.scene.scene import Scene
 
 # Default frames per second, and largest number of frames at this default.
 FRAMES_PER_SECOND, MAX_FRAMES = 10.0, 200
 
-# Frames of an equilibrium without relaxation, and the share of the depths that they cover above the contact.
-DEPTH_FRAMES, MARGIN_SHARE = 100, 0.05
+# Number of frames of an equilibrium without relaxation.
+DEPTH_FRAMES = 100
 
-# Rows from which the noise is estimated.
-NOISE_SHARE, MIN_NOISE_ROWS = 0.05, 10
-
-# Ratio of the standard deviation to the median of the magnitudes, of normal errors.
-DEVIATION_PER_MEDIAN = 1.48
-
-# Forces above this are due to contact [noise].
+# Smallest force of a contact [noise].
 CONTACT_NOISES = 5.0
-
-# Accuracy of predicted forces, as a share of the peak.
-FORCE_ACCURACY = 1e-5
-
-# A contact is late if 5 noises are more than this share of the peak, and force and depth of the rows of the noise have
-# a larger rank correlation: of 10 independent ones, it has a probability of 0.015.
-MIN_LATE_SHARE, MIN_LATE_CORRELATION = 0.01, 0.55
 
 
 @dataclass(frozen=True, eq=False)
 class Approach:
-    """Line of a position-controlled tool, from its first contact with the sheet at rest, or from a clamp's rest."""
+    """Line of a position-controlled tool, from its first contact with the sheet at rest, or from a clamp's rest.
 
-    probe: int  # index of the tool in the scene
-    start: Array  # centre of the tip at first contact, or 0, the displacement of a clamp at rest [m], shape (3,)
-    direction: Array  # unit vector, shape (3,)
-    tip_height: float  # of the centre above the lowest point of the tip [m]
-    size: tuple[float, float]  # height and width of the sheet [m]
+    Attributes:
+        probe: index of the tool in the scene.
+        start: centre of the tip at first contact, or 0, the displacement of a clamp at rest [m], shape (3,).
+        direction: unit vector, shape (3,).
+        tip_height: height of the centre above the lowest point of the tip [m].
+        size: height and width of the sheet [m].
+        is_clamp: whether the tool is a clamp.
+    """
+
+    probe: int
+    start: Array
+    direction: Array
+    tip_height: float
+    size: tuple[float, float]
     is_clamp: bool
 
     def place(self, data: dict[str, Any], travel: Array, rate: float) -> dict[str, Any]:
         """Return a scene's data with the path of the tool, and the times, of a test.
 
         Args:
-            data: a scene.
-            travel: distance from the first contact at the frames [m], shape (n,).
+            data: data of a scene.
+            travel: distance from the first contact at every frame [m], shape (frames,).
             rate: frames per second.
         """
         (height, width), time = self.size, np.arange(len(travel)) / rate
@@ -96,7 +91,7 @@ def find_approach(scene: Scene) -> Approach:
 
 
 def _first_contact(tool: Tool, direction: Array, scene: Scene) -> Array | None:
-    """Return the centre of the tip at first contact [m], shape (3,); None if the tool misses the sheet."""
+    """Return the centre of the tip at first contact [m], shape (3,), or None if the tool misses the sheet."""
     start, tolerance = tool.tip_centres[0], 1e-9 * tool.radius
     travel, reach = 0.0, float(np.linalg.norm(start)) + tool.length + math.hypot(*scene.sheet.size)
     # The distance from the sheet changes by at most the travel, so that the tool may advance by it (sphere tracing).
@@ -117,15 +112,25 @@ def _first_contact(tool: Tool, direction: Array, scene: Scene) -> Array | None:
 
 @dataclass(frozen=True, eq=False)
 class Loading:
-    """A machine test at the frames of its scene."""
+    """A machine test at the frames of its scene.
 
-    test: MachineTest  # with the mean force before contact subtracted
-    rate: float  # frames per second of the scene
-    time: Array  # of the table at every frame [s], shape (frames,)
-    depth: Array  # of the table at every frame [m], shape (frames,)
-    force: Array  # measured, along the tool's direction [N], shape (frames,)
-    noise: float  # standard deviation of the force in the first rows [N]
-    contact: float  # depth of contact [m of the table]
+    Attributes:
+        test: the test, with the median of the first forces subtracted.
+        rate: frames per second of the scene.
+        time: times of the table at every frame [s], shape (frames,).
+        depth: depths of the table at every frame [m], shape (frames,).
+        force: measured force along the tool's direction [N], shape (frames,).
+        noise: standard deviation of the force in the first rows [N].
+        contact: depth of contact [m of the table].
+    """
+
+    test: MachineTest
+    rate: float
+    time: Array
+    depth: Array
+    force: Array
+    noise: float
+    contact: float
 
     @property
     def scene_time(self) -> Array:
@@ -140,7 +145,8 @@ class Loading:
     @property
     def sigma(self) -> float:
         """Standard deviation of measured minus predicted forces [N]."""
-        return max(self.noise, FORCE_ACCURACY * self.peak)
+        # Predicted forces have an accuracy of 1e-5 of the peak.
+        return max(self.noise, 1e-5 * self.peak)
 
     def travel(self, contact: float | None = None) -> Array:
         """Return the distance of the tool from its first contact at every frame [m], shape (frames,)."""
@@ -152,13 +158,14 @@ class Loading:
 def build_loading(
     test: MachineTest, scene: Scene, rate: float | None = None, contact: float | None = None, *, is_clamp: bool = False
 ) -> Loading:
-    """Compute noise, contact and frames of a machine test.
+    """Return a machine test at frames, with its noise and contact.
 
     Args:
         test: the test.
         scene: the scene; its motion and relaxation determine the frames.
-        rate: frames per second; None: 10 or less, or equidistant in depth.
-        contact: depth of contact [m of the table]; None: found from the forces, or the first row of a clamp.
+        rate: frames per second. By default frames are equidistant in depth without relaxation, otherwise 10 or less per
+            second.
+        contact: depth of contact [m of the table]; by default from the forces, or that of the first row of a clamp.
         is_clamp: whether the tool is a clamp.
 
     Raises:
@@ -166,7 +173,8 @@ def build_loading(
     """
     first = test.force[: _noise_rows(test)]
     offset = float(np.median(first))
-    noise = max(DEVIATION_PER_MEDIAN * float(np.median(np.abs(first - offset))), test.digit)
+    # 1.48 is the ratio of the standard deviation to the median of the magnitudes, of normal errors.
+    noise = max(1.48 * float(np.median(np.abs(first - offset))), test.digit)
     test = replace(test, force=test.force - offset, time=test.time - test.time[0])
     peak = int(test.force.argmax())
     if contact is not None and not test.depth.min() <= contact < test.depth.max():
@@ -192,7 +200,7 @@ def build_loading(
 
 def _noise_rows(test: MachineTest) -> int:
     """Return the number of rows from which the noise is estimated."""
-    return max(MIN_NOISE_ROWS, math.ceil(NOISE_SHARE * len(test.force)))
+    return max(10, math.ceil(0.05 * len(test.force)))
 
 
 def _contact_row(test: MachineTest, noise: float, peak: int) -> int:
@@ -207,13 +215,19 @@ def _contact_row(test: MachineTest, noise: float, peak: int) -> int:
 
 
 def late_contact_note(loading: Loading, key: str) -> str | None:
-    """Return a note about a contact found late, as the force rises in the rows of the noise; `key`: its parameter."""
+    """Return a note about a contact found too late, as the force rises in the rows of the noise, or None.
+
+    Args:
+        loading: the test.
+        key: key of its depth of contact, for the remedy.
+    """
     from scipy.stats import kendalltau
 
     test, count = loading.test, _noise_rows(loading.test)
     significant = CONTACT_NOISES * loading.noise
     correlation = kendalltau(test.depth[:count], test.force[:count]).statistic
-    if not (significant > MIN_LATE_SHARE * loading.peak and correlation > MIN_LATE_CORRELATION):
+    # Of 10 independent rows, a rank correlation above 0.55 has a probability of 0.015.
+    if not (significant > 0.01 * loading.peak and correlation > 0.55):
         return None
     return (
         f"{test.name}: the force rises within the first {count} rows, from which its noise, {loading.noise:.3g} N, is "
@@ -226,7 +240,7 @@ def _in_depth(test: MachineTest, noise: float, contact: float) -> Loading:
     """Compute frames that are equidistant in depth, up to the greatest one."""
     rows = int(test.depth.argmax()) + 1
     deepest = float(test.depth[rows - 1])
-    first = max(contact - MARGIN_SHARE * (deepest - contact), float(test.depth[:rows].min()))
+    first = max(contact - 0.05 * (deepest - contact), float(test.depth[:rows].min()))
     depth = np.linspace(first, deepest, DEPTH_FRAMES + 1)
     order = np.argsort(test.depth[:rows], kind="stable")
     half = 0.5 * (depth[1] - depth[0])

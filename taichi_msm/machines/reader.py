@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import SceneError, did_you_mean
-from taichi_msm.fitting.tables import LETTER, WORKBOOK_SUFFIX, Grid, Row, parse_number, read_text, read_workbook
+from taichi_msm.machines.cells import LETTER, WORKBOOK_SUFFIX, Grid, Row, parse_number, read_text, read_workbook
 
 Array = NDArray[np.float64]
 
@@ -57,14 +57,23 @@ VALUE_START = re.compile(r"[+\-\N{MINUS SIGN}]?[.,]?\d|[+-]?(nan|inf)|[#=]", re.
 
 @dataclass(frozen=True)
 class MachineTest:
-    """A test of a testing machine."""
+    """A test of a testing machine.
 
-    name: str  # of the file, and the sheet and block where there is a choice
-    time: Array  # increasing [s], shape (n,)
-    depth: Array  # depths or elongations; their largest magnitude is positive [m], shape (n,)
-    force: Array  # their largest magnitude is positive [N], shape (n,)
-    digit: float  # last digit of the forces in the file [N]
-    notes: tuple[str, ...] = ()  # sentences about choices of the reader, and about the test
+    Attributes:
+        name: name of the file, and sheet and block where there is a choice.
+        time: increasing times [s], shape (n,).
+        depth: depths or elongations, the one of largest magnitude positive [m], shape (n,).
+        force: forces, the one of largest magnitude positive [N], shape (n,).
+        digit: last digit of the forces in the file [N].
+        notes: sentences about choices of the reader, and about the test.
+    """
+
+    name: str
+    time: Array
+    depth: Array
+    force: Array
+    digit: float
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -89,13 +98,13 @@ class _Column:
 def read_machine_test(
     path: str | Path, columns: Sequence[str] = (), sheet: str | None = None, block: int | None = None
 ) -> MachineTest:
-    """Read a test from a table.
+    """Return the test of a table.
 
     Args:
-        path: a workbook (.xlsx), or a text of any other suffix.
-        columns: chosen columns, such as "depth=Traverse, mm"; without a unit it is that of the file.
-        sheet: chosen sheet of a workbook.
-        block: chosen block, counted from 1.
+        path: path of a workbook (.xlsx), or of a text with any other suffix.
+        columns: chosen columns, such as "depth=Traverse, mm"; without a unit, that of the file.
+        sheet: chosen sheet of a workbook, or None for the only one with a table.
+        block: number of the chosen block, from 1, or None for the only one.
 
     Raises:
         SceneError: when the file is not such a table, or needs a choice.
@@ -127,8 +136,8 @@ def cut_window(test: MachineTest, start: float, end: float) -> MachineTest:
 
     Args:
         test: the test.
-        start: first time [s].
-        end: last time [s].
+        start: first time [s of the table].
+        end: last time [s of the table].
 
     Raises:
         SceneError: when too few rows remain.
@@ -222,17 +231,17 @@ def _is_header(row: Row, chosen: dict[str, str]) -> bool:
 
 def _find_candidates(row: Row, chosen: dict[str, str]) -> dict[str, list[int]]:
     """Return the columns of a header that may be each quantity."""
-    found = {}
+    candidates = {}
     for quantity, title in chosen.items():
         name = _plain(_split_choice(title, quantity)[0])
         same = [n for n, cell in enumerate(row) if _plain(cell) == _plain(title)]
-        found[quantity] = same or [
+        candidates[quantity] = same or [
             n for n, cell in enumerate(row) if name in (_plain(cell), _plain(_split_title(cell, quantity)[0]))
         ]
-    taken = {column for columns in found.values() for column in columns}
+    taken = {column for columns in candidates.values() for column in columns}
     for quantity in WORDS.keys() - chosen.keys():
-        found[quantity] = [n for n, cell in enumerate(row) if n not in taken and _is_named(cell, quantity)]
-    return {quantity: found[quantity] for quantity in WORDS}
+        candidates[quantity] = [n for n, cell in enumerate(row) if n not in taken and _is_named(cell, quantity)]
+    return {quantity: candidates[quantity] for quantity in WORDS}
 
 
 def _is_named(cell: str, quantity: str) -> bool:
@@ -339,18 +348,18 @@ def _missing_header(grid: Grid, chosen: dict[str, str]) -> str:
         return f"{grid.title}: is empty; a table has columns of time, depth and force"
     # The row that names most; the cells of a text are separated only below a header.
     cells = [row if grid.sheet else re.split(r"[\t;,|]", ";".join(row)) for row in grid.rows]
-    found = [{quantity for quantity, columns in _find_candidates(row, chosen).items() if columns} for row in cells]
-    best = max(range(len(found)), key=lambda row: len(found[row]))
-    if merged := [column for row, column in grid.merged if row == best and found[best]]:
+    named = [{quantity for quantity, columns in _find_candidates(row, chosen).items() if columns} for row in cells]
+    best = max(range(len(named)), key=lambda row: len(named[row]))
+    if merged := [column for row, column in grid.merged if row == best and named[best]]:
         return _merged(grid, best, min(merged))
     shown = f"{grid.place(best)}: {', '.join(grid.rows[best])[:100]!r}"
-    missing = [quantity for quantity in WORDS if quantity not in found[best]]
+    missing = [quantity for quantity in WORDS if quantity not in named[best]]
     if not missing:
         return f"{shown} names time, depth and force, but not in a cell each; separate them"
-    quantity = missing[0] if found[best] else "depth"
+    quantity = missing[0] if named[best] else "depth"
     known = ", ".join(UNITS[quantity])
     remedy = f'choose columns by --columns "{quantity}=NAME, {next(iter(UNITS[quantity]))}" (units: {known})'
-    if not found[best]:
+    if not named[best]:
         return f"{grid.title}: no row names time, depth and force; {remedy}"
     return f"{shown} names no {repr(chosen[quantity]) if quantity in chosen else quantity}; {remedy}"
 

@@ -1,10 +1,9 @@
-"""Tables of testing machines, as they write them, and damaged ones."""
+"""Tables of testing machines as exported: texts, workbooks, and their faults."""
 
 from __future__ import annotations
 
 import random
 import sys
-import zipfile
 from collections.abc import Callable
 from contextlib import suppress
 from datetime import datetime
@@ -15,7 +14,7 @@ import numpy as np
 import pytest
 
 from taichi_msm.errors import NotInstalledError, SceneError
-from taichi_msm.fitting.machine_tables import MachineTest, cut_window, read_machine_test
+from taichi_msm.machines.reader import MachineTest, cut_window, read_machine_test
 from tests.golden import Messages
 
 COUNT = 12
@@ -79,7 +78,7 @@ TEXTURE_ANALYSER = "PROBE TEST1\n\nForce\tDistance\tTime\ng\tmm\tsec\n" + rows("
 
 GF = 9.80665e-3
 
-# Tables as machines write them, the choices of columns, and the unit of force in newtons.
+# Exported tables, chosen columns, and the unit of force in newtons.
 EXPORTS: dict[str, tuple[str, list[str], float]] = {
     "semicolons": (TABLE, [], 1),
     "commas": (TABLE.replace(";", ","), [], 1),
@@ -87,22 +86,13 @@ EXPORTS: dict[str, tuple[str, list[str], float]] = {
     "bars": (TABLE.replace(";", "|"), [], 1),
     "spaces": (TABLE.replace(";", " "), [], 1),
     "aligned": ("# Temps d'essai (s)   Weg (mm)  Kraft (N)\n" + rows("    "), [], 1),
-    "commented names": ("# Time(s) Depth(mm) Force(N)\n" + rows(" "), [], 1),
     "aligned decimal commas": ("Time, s   Position (z), mm   Fz, N\n" + comma(rows("   ")), [], 1),
-    "commas and spaces": ("Time (s),  Depth (mm),  Force (N)\n" + rows(",  "), [], 1),
-    "decimal commas": (TABLE.splitlines()[0] + "\n" + comma(rows()), [], 1),
-    "quoted decimal commas": (
-        '"Time, s","Depth, mm","Force, N"\n' + comma(rows(";", '"{t:.1f}"{s}"{d:.2f}"{s}"{f:.3f}"')).replace(";", ","),
-        [],
-        1,
-    ),
     "minus": (TABLE.replace(";0", ";\N{MINUS SIGN}0").replace(";1", ";\N{MINUS SIGN}1"), [], 1),
     "exponents": ("Time_s;Depth_mm;Force_N\n" + rows(";", "{t:.3E}{s}{d:+.3e}{s}{f:.4E}"), [], 1),
     "comments": ("% of a rig\n" + TABLE.replace("\n0.5", "\n# paused\n\n0.5"), [], 1),
     "comma in names": (TABLE.replace(" [s]", ", s").replace(" [mm]", " / mm").replace(" [N]", " in N"), [], 1),
     "footer": (TABLE + "\nMaximum force;0.55\nOperator;A\n", [], 1),
     "carriage returns": (TABLE.replace("\n", "\r\n"), [], 1),
-    "empty cells at the end": (TABLE.replace("\n", ";;\n"), [], 1),
     "Zwick": (ZWICK, [], 1),
     "Instron": (BLUEHILL, [], 1),
     "Mach-1": (MACH_1, [], GF),
@@ -127,7 +117,7 @@ Read = Callable[..., MachineTest]
 
 
 def assert_is_test(test: MachineTest, newtons: float = 1) -> None:
-    # Scales round once.
+    # A conversion of units rounds once.
     np.testing.assert_allclose(test.time, TIME, rtol=1e-15, atol=1e-16)
     np.testing.assert_allclose(test.depth, DEPTH, rtol=1e-14)
     np.testing.assert_allclose(test.force, FORCE * newtons, rtol=1e-14)
@@ -135,7 +125,7 @@ def assert_is_test(test: MachineTest, newtons: float = 1) -> None:
 
 
 @pytest.mark.parametrize("name", EXPORTS)
-def test_exports_of_machines_are_read(name: str, read: Read) -> None:
+def test_exports_of_machines(name: str, read: Read) -> None:
     text, columns, newtons = EXPORTS[name]
     test = read(text, *columns)
     assert_is_test(test, newtons)
@@ -143,7 +133,7 @@ def test_exports_of_machines_are_read(name: str, read: Read) -> None:
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "cp1252"])
-def test_encodings_are_detected(encoding: str, tmp_path: Path) -> None:
+def test_encodings(encoding: str, tmp_path: Path) -> None:
     for suffix in (".csv", ".tsv", ".txt", ".TXT"):
         path = tmp_path / f"test{suffix}"
         path.write_bytes(ZWICK.encode(encoding))
@@ -158,7 +148,7 @@ UNITS = {
 
 
 @pytest.mark.parametrize(("quantity", "unit"), [(quantity, unit) for quantity in UNITS for unit in UNITS[quantity]])
-def test_units_are_converted(quantity: str, unit: str, read: Read) -> None:
+def test_units(quantity: str, unit: str, read: Read) -> None:
     units = {"time": "s", "depth": "mm", "force": "N"} | {quantity: unit}
     scales = {key: UNITS[key][name] for key, name in units.items()}
     in_header = "Time [{time}];depth, {depth};FORCE ({force})\n".format(**units)
@@ -182,36 +172,32 @@ def test_names_of_quantities(quantity: str, name: str, read: Read) -> None:
     assert_is_test(read(TABLE.replace(quantity, name)))
 
 
-def test_of_two_candidates_the_one_nearest_0_is_taken_and_named(read: Read, message: Messages) -> None:
+def test_the_candidate_nearest_0_is_taken_with_a_note(read: Read, message: Messages) -> None:
     # 90 um are nearer 0 than 0.4 mm.
     test = read("Time, s;Position, um;Extension, mm;Force, N\n" + rows(";", "{t:.1f}{s}9{d:.1f}{s}0.4{s}{f:.3f}"))
     np.testing.assert_allclose(test.depth, 1e-3 * DEPTH + 9e-5, rtol=1e-12)
     message(test.notes, "Extension", "Position")
-    line = "{t:.1f}{s}9{d:.2f}{s}{d:.2f}{s}{f:.3f}"
-    test = read("Time, s;Position, mm;Extension, mm;Force, N\n" + rows(";", line))
-    assert_is_test(test)
-    assert len(test.notes) == 1
     # Neither columns without a unit nor names in brackets are candidates.
-    for other in ("Position", "Strain (Extension), mm"):
-        assert read(f"Time, s;{other};Extension, mm;Force, N\n" + rows(";", line)).notes == ()
+    for name in ("Position", "Strain (Extension), mm"):
+        test = read(f"Time, s;{name};Extension, mm;Force, N\n" + rows(";", "{t:.1f}{s}9{d:.2f}{s}{d:.2f}{s}{f:.3f}"))
+        assert_is_test(test)
+        assert test.notes == ()
 
 
-def test_columns_are_chosen(read: Read, message: Messages) -> None:
-    line = "{t:.1f}{s}9{d:.2f}{s}{d:.2f}{s}{f:.3f}"
-    table = "Time [s];Position [mm];Traverse;Force [N]\n" + rows(";", line)
+def test_chosen_columns(read: Read, message: Messages) -> None:
+    table = "Time [s];Position [mm];Traverse;Force [N]\n" + rows(";", "{t:.1f}{s}9{d:.2f}{s}{d:.2f}{s}{f:.3f}")
     for choice in ("depth=Traverse, mm", "depth = traverse ,mm"):
         assert_is_test(read(table, choice))
-    assert_is_test(read(table.replace("Traverse", "Traverse (mm)"), "depth=Traverse"))
-    assert_is_test(read(table.replace("Traverse", "Traverse (mm)"), "depth=Traverse (mm)"))
-    assert_is_test(read(table.replace("Traverse", "x"), "depth=x, mm"))
-    # The unit given counts.
+    for choice in ("depth=Traverse", "depth=Traverse (mm)"):
+        assert_is_test(read(table.replace("Traverse", "Traverse (mm)"), choice))
+    # The given unit has priority.
     test = read(table.replace("Traverse", "Traverse (m)"), "depth=Traverse, mm")
     assert_is_test(test)
     message(test.notes, "depth", "mm")
 
 
 @pytest.mark.parametrize("sign", [(1, 1), (-1, 1), (1, -1), (-1, -1)])
-def test_largest_magnitudes_are_positive(sign: tuple[int, int], read: Read) -> None:
+def test_signs(sign: tuple[int, int], read: Read) -> None:
     numbers = "\n".join(f"{t};{sign[0] * (1e3 * d - 0.3)};{sign[1] * (f - 0.1)}" for t, d, f in NUMBERS)
     test = read(f"Time, s;Depth, mm;Force, N\n{numbers}")
     np.testing.assert_allclose(test.depth, DEPTH - 3e-4, atol=1e-15)
@@ -222,12 +208,12 @@ def test_largest_magnitudes_are_positive(sign: tuple[int, int], read: Read) -> N
     ("line", "unit", "digit"),
     [("{f:.3f}", "N", 1e-3), ("{f:.2f}", "mN", 1e-5), ("{f:.5E}", "N", 1e-7), ("{f:g}", "gf", 1e-2 * GF)],
 )
-def test_digit_is_the_last_of_the_forces(line: str, unit: str, digit: float, read: Read) -> None:
+def test_last_digit_of_the_forces(line: str, unit: str, digit: float, read: Read) -> None:
     test = read(f"Time, s;Depth, mm;Force, {unit}\n" + rows(";", f"{{t:.6f}}{{s}}{{d:.6f}}{{s}}{line}"))
     assert test.digit == pytest.approx(digit, rel=1e-12)
 
 
-def test_grouped_thousands_are_read(read: Read) -> None:
+def test_grouped_thousands(read: Read) -> None:
     table = '"Time","Depth","Force"\n"(s)","(mm)","(N)"\n' + "".join(
         f'"{n}.00","{n}.00","{f:,.2f}"\n' for n, f in enumerate(1000.5 * np.arange(COUNT))
     )
@@ -235,7 +221,7 @@ def test_grouped_thousands_are_read(read: Read) -> None:
         np.testing.assert_array_equal(read(text).force, 1000.5 * np.arange(COUNT))
 
 
-def test_blocks_are_chosen(read: Read, message: Messages) -> None:
+def test_chosen_blocks(read: Read, message: Messages) -> None:
     second = MACH_1[MACH_1.index("<Move") :].replace("\t-0.5", "\t-0.6")
     # The line of a wait has a number, and three rows are no block.
     wait = "<Wait>\nTime, s:\t10.0\n<END DATA>\nTime, s\tPosition (z), mm\tFz, gf\n0.0\t0.0\t0.0\n"
@@ -253,39 +239,42 @@ def test_blocks_are_chosen(read: Read, message: Messages) -> None:
     assert_is_test(read(MACH_1, block=1), GF)
 
 
-def strip(torn: Callable[[float], float], depth: Callable[[float], float] = lambda t: t, count: int = 200) -> str:
-    """Table of a test of two seconds: depth [mm] and force [N] as functions of time."""
-    times = np.linspace(0, 2, count)
-    return "Time, s;Extension, mm;Force, N\n" + "".join(f"{t};{depth(t)};{torn(t)}\n" for t in times)
+def strip(force: Callable[[float], float], depth: Callable[[float], float] = lambda t: t) -> str:
+    """Table of a test of two seconds: force [N] and depth [mm] as functions of time."""
+    times = np.linspace(0, 2, 200)
+    return "Time, s;Extension, mm;Force, N\n" + "".join(f"{t};{depth(t)};{force(t)}\n" for t in times)
 
 
-def test_a_test_that_tears_is_noted(read: Read, message: Messages) -> None:
+def test_a_tear_is_noted(read: Read, message: Messages) -> None:
     test = read(strip(lambda t: t if t < 1.5 else 0.3))
     message(test.notes, "tore", "--window")
-    # Until it tears it is a test without a note, and after that too.
-    cut = cut_window(test, 0.5, 1.45)
-    assert cut.notes == ()
-    assert (cut.time[0] >= 0.5, cut.time[-1] <= 1.45) == (True, True)
-    assert len(cut.time) == len(cut.depth) == len(cut.force) == 95
+    # Before the tear the test has no note.
+    part = cut_window(test, 0.5, 1.45)
+    assert part.notes == ()
+    assert 0.5 <= part.time.min() <= part.time.max() <= 1.45
+    assert len(part.time) == len(part.depth) == len(part.force) == 95
     assert cut_window(test, 0, 1.9).notes == test.notes
+
+
+def relax(t: float) -> float:
+    return t if t < 0.2 else 0.07 + 0.13 * np.exp(8 * (0.2 - t))
 
 
 @pytest.mark.parametrize(
     "text",
     [
-        # Held from 0.2 s on, relaxing to a third, with a drift of the depth; pulled back.
-        strip(lambda t: t if t < 0.2 else 0.07 + 0.13 * np.exp(8 * (0.2 - t)), lambda t: min(t, 0.2) + 1e-3 * t),
+        # Held from 0.2 s on, with a creep of the depth.
+        strip(relax, lambda t: min(t, 0.2) + 1e-3 * t),
         strip(lambda t: min(t, 2 - t), lambda t: min(t, 2 - t)),
         strip(lambda t: t if t < 1.5 else 0.8),
-        strip(lambda t: t if t < 0.2 else 0.07 + 0.13 * np.exp(8 * (0.2 - t)), lambda t: 9 - min(t, 0.2)),
     ],
-    ids=["relaxes", "unloaded", "falls less", "relaxes after the depth fell"],
+    ids=["relaxes", "unloaded", "falls less"],
 )
-def test_other_falls_of_the_force_are_not_noted(text: str, read: Read) -> None:
+def test_no_tear(text: str, read: Read) -> None:
     assert read(text).notes == ()
 
 
-def test_a_window_needs_rows(read: Read, message: Messages) -> None:
+def test_windows(read: Read, message: Messages) -> None:
     test = read(TABLE)
     assert_is_test(cut_window(test, 0, 2))
     for window in ((0.0, 0.85), (1.0, 0.0), (5.0, 9.0)):
@@ -304,44 +293,34 @@ FAULTS: dict[str, tuple[str | bytes, list[str], list[str]]] = {
     "megaunit": (TABLE.replace("[N]", "[MN]"), [], ["Force [MN]"]),
     "repeated name": (HEADER + ";Force [N]\n" + rows(";", "{t}{s}{d}{s}{f}{s}{f}"), [], ["csv:1", "Force [N]", "2"]),
     "gap": (TABLE.replace("0.5;0.50;0.250", "0.5;;0.250"), [], ["csv:7", "Depth [mm]", "empty"]),
-    "NaN": (TABLE.replace("0.250", "NaN"), [], ["csv:7", "Force [N]", "NaN"]),
     "too large": (TABLE.replace("0.250", "1e31"), [], ["csv:7", "Force [N]", "1e31"]),
     "word": (TABLE.replace("0.250", "over"), [], ["csv:7", "Force [N]", "over"]),
     "row of words": (TABLE.replace("0.5;0.50;0.250", "a;b;c"), [], ["csv:7", "a, b, c"]),
-    "time of day": (TABLE.replace("\n0.5", "\n12:00:05"), [], ["csv:7", "Time [s]", "12:00:05"]),
     "same time": (TABLE.replace("\n0.5", "\n0.4"), [], ["csv:7", "Time [s]", "0.4"]),
     "few rows": (HEADER + "\n" + rows(count=9), [], ["csv:1", "9", "10"]),
-    "no rows": (HEADER, [], ["csv:1", "0", "10"]),
     "decimal commas between commas": (HEADER.replace(";", ",") + "\n" + comma(rows(",")), [], ["csv:2", "6", "3"]),
     "other separator": (HEADER.replace(";", ",") + "\n" + rows(), [], ["csv:2", "commas"]),
     "two decimal marks": (TABLE.replace("0.250", "0,250"), [], ["csv:7", "Force [N]", "0,250"]),
     "more cells than names": (TABLE.replace("0.250", "0.250;1"), [], ["csv:7", "4", "3"]),
     "force at rest": (HEADER + "\n" + rows(line="{t}{s}{d}{s}0.0"), [], ["csv:1", "Force [N]", "--columns"]),
     "workbook by another name": (b"PK\x03\x04\0\0", [], [".xlsx"]),
-    "old workbook": (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", [], [".xlsx"]),
     "binary": (b"\xff\xfe\x00", [], ["text"]),
     "column of no quantity": (TABLE, ["strain=Strain, mm"], ["--columns", "strain"]),
-    "column without a name": (TABLE, ["depth="], ["--columns", "depth="]),
     "column chosen twice": (TABLE, ["depth=Depth", "depth=Time"], ["--columns", "depth"]),
-    "missing column": (TABLE, ["depth=Traverse, mm"], ["csv:1", "Traverse"]),
     "time of another unit": (TABLE.replace("[s]", "[ms]"), ["time=Time [s]"], ["csv:1", "Time [s]"]),
-    "depth of another unit": (TABLE.replace("[mm]", "[cm]"), ["depth=Depth [mm]"], ["csv:1", "Depth [mm]"]),
-    "force of another unit": (TABLE.replace("[N]", "(kN)"), ["force=Force (N)"], ["csv:1", "Force (N)"]),
-    "other unit after a space": (TABLE.replace("[N]", "(kN)"), ["force=Force N"], ["csv:1", "Force N"]),
-    "unknown unit": (TABLE, ["depth=Depth, in"], ["csv:1", "Depth, in", "mm"]),
     "column for two quantities": (TABLE, ["depth=Force [N], mm"], ["csv:1", "force"]),
 }
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_a_fault_is_one_line_with_its_place(name: str, read: Read, message: Messages) -> None:
+def test_faults_of_a_text(name: str, read: Read, message: Messages) -> None:
     text, columns, words = FAULTS[name]
     with message.raises(SceneError, *words) as caught:
         read(text, *columns)
     assert len(caught.value.lines) == 1
 
 
-def test_a_file_that_cannot_be_read_is_one_line(tmp_path: Path, message: Messages) -> None:
+def test_unreadable_files(tmp_path: Path, message: Messages) -> None:
     pytest.importorskip("openpyxl")
     with (tmp_path / "large.csv").open("wb") as file:
         file.truncate(1 << 30)
@@ -393,7 +372,7 @@ def save(tmp_path: Path) -> Callable[..., Path]:
 Save = Callable[..., Path]
 
 
-def test_a_workbook_is_read(save: Save, message: Messages) -> None:
+def test_workbook(save: Save, message: Messages) -> None:
     summary = [["", "Fmax", "dL(Fmax)"], ["", "N", "mm"], ["FF2", 0.55, 1.1]]
     test = read_machine_test(save({"Paramètres": [["Norme d'essai"]], "Résultats": summary, "FF2": SHEET, "Empty": []}))
     assert_is_test(test)
@@ -407,7 +386,7 @@ def test_a_workbook_is_read(save: Save, message: Messages) -> None:
     assert_is_test(read_machine_test(path.rename(path.with_suffix(".XLSX"))))
 
 
-def test_a_sheet_and_a_block_are_chosen(save: Save, message: Messages) -> None:
+def test_chosen_sheet_and_block(save: Save, message: Messages) -> None:
     path = save({"notes": [["x"]], "FF1": SHEET, "FF2": [*SHEET, [], *SHEET[1:]]}, add_chart_sheet)
     with message.raises(SceneError, "--sheet", "FF1, FF2"):
         read_machine_test(path)
@@ -431,8 +410,6 @@ SHEET_FAULTS: dict[str, tuple[list[list[Any]], Callable[[Any], object], list[str
     "empty sheet": ([], lambda book: None, ["FF2", "empty"]),
     "several sheets without a table": ([], lambda book: book.create_sheet("FF3"), ["FF2, FF3"]),
     "merged names": (SHEET, lambda book: book["FF2"].merge_cells("B2:C2"), ["FF2!B2", "merged"]),
-    "names merged with an unnamed column": (SHEET, lambda book: book["FF2"].merge_cells("C2:D2"), ["FF2!C2", "merged"]),
-    "formula without a value": (SHEET, put("C14", "=B14*2"), ["FF2!C14", "Allongement", "=B14*2"]),
     "column of formulas": (
         [[*row[:2], f"=A{n}" if n > 3 else row[2], row[3]] for n, row in enumerate(SHEET, 1)],
         lambda book: None,
@@ -442,73 +419,47 @@ SHEET_FAULTS: dict[str, tuple[list[list[Any]], Callable[[Any], object], list[str
     "error": (SHEET, put("B14", "#DIV/0!"), ["FF2!B14", "#DIV/0!"]),
     "row of formulas": ([*SHEET[:-1], ["=A14"] * 4], lambda book: None, ["FF2!A15", "=A14"]),
     "date": (SHEET, put("A14", datetime(2023, 4, 3)), ["FF2!A14", "date"]),
-    "time again": (SHEET, put("A14", 0.5), ["FF2!A14", "0.5"]),
     "no unit": (SHEET, put("C3", None), ["FF2!C2", "Allongement", "--columns"]),
     "cell far away": (SHEET, put("XFD1048576", 1), ["FF2", "cells"]),
 }
 
 
 @pytest.mark.parametrize("name", SHEET_FAULTS)
-def test_a_fault_of_a_sheet_is_one_line_with_its_cell(name: str, save: Save, message: Messages) -> None:
+def test_faults_of_a_sheet(name: str, save: Save, message: Messages) -> None:
     cells, change, words = SHEET_FAULTS[name]
     with message.raises(SceneError, *words) as caught:
         read_machine_test(save({"FF2": cells}, change))
     assert len(caught.value.lines) == 1
 
 
-def test_without_openpyxl_the_error_is_how_to_install_it(monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
+def test_openpyxl_is_not_installed(monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
     monkeypatch.setitem(sys.modules, "openpyxl", None)
     with message.raises(NotInstalledError, "openpyxl"):
         read_machine_test("tests.xlsx")
 
 
-def damaged(data: bytes, chance: random.Random) -> bytes:
+def damage(data: bytes, rng: random.Random) -> bytes:
     """Change, remove, repeat or insert some bytes."""
-    for _ in range(chance.randint(1, 4)):
-        start = chance.randrange(len(data))
-        end = min(len(data), start + chance.choice([1, 1, 1, 4, 40]))
-        put_in = chance.choice(
-            [b"", data[start:end] * 2, bytes(chance.choices(b'0123456789eE+-,.;\t "\n#%=', k=end - start))]
-        )
-        data = data[:start] + chance.choice([put_in, chance.randbytes(end - start)]) + data[end:]
-        data = data or b" "
+    for _ in range(rng.randint(1, 4)):
+        start = rng.randrange(len(data))
+        end = min(len(data), start + rng.choice([1, 1, 1, 4, 40]))
+        typed = bytes(rng.choices(b'0123456789eE+-,.;\t "\n#%=', k=end - start))
+        new = rng.choice([b"", data[start:end] * 2, typed, rng.randbytes(end - start)])
+        data = data[:start] + new + data[end:] or b" "
     return data
 
 
-TRIES = pytest.mark.parametrize("tries", [10, pytest.param(300, marks=pytest.mark.fuzz)], ids=["some", "all"])
-
-
-def try_read(path: Path, data: bytes) -> None:
-    """Read a table that may be damaged: it is a test, or a SceneError."""
-    path.write_bytes(data)
-    with suppress(SceneError):
-        test = read_machine_test(path)
-        assert len(test.time) == len(test.depth) == len(test.force) >= 10
-        assert np.isfinite([test.time, test.depth, test.force]).all()
-        assert (np.diff(test.time) > 0).all()
-        assert test.depth[np.abs(test.depth).argmax()] > 0
-
-
-@TRIES
-def test_damaged_texts_bring_no_other_error(tries: int, tmp_path: Path) -> None:
-    chance = random.Random(0)
+@pytest.mark.parametrize("tries", [10, pytest.param(300, marks=pytest.mark.fuzz)], ids=["some", "all"])
+def test_damaged_texts(tries: int, tmp_path: Path) -> None:
+    """A table with random damage is a valid test, or a SceneError."""
+    rng = random.Random(0)
     for text, _, _ in EXPORTS.values():
         for encoding in ("utf-8", "utf-16"):
             for _ in range(tries):
-                try_read(tmp_path / "test.csv", damaged(text.encode(encoding), chance))
-
-
-@TRIES
-def test_damaged_workbooks_bring_no_other_error(tries: int, save: Save, tmp_path: Path) -> None:
-    chance = random.Random(0)
-    with zipfile.ZipFile(save({"FF2": SHEET, "notes": [["x"]]})) as book:
-        parts = {name: book.read(name) for name in book.namelist()}
-    for _ in range(tries):
-        # Damage inside a part, as a damaged archive has a wrong checksum.
-        name = chance.choice(list(parts))
-        with zipfile.ZipFile(tmp_path / "parts.zip", "w") as book:
-            for part, data in parts.items():
-                book.writestr(part, damaged(data, chance) if part == name else data)
-        data = (tmp_path / "parts.zip").read_bytes()
-        try_read(tmp_path / "tests.xlsx", data)
-        try_read(tmp_path / "tests.xlsx", damaged(data, chance))
+                (tmp_path / "test.csv").write_bytes(damage(text.encode(encoding), rng))
+                with suppress(SceneError):
+                    test = read_machine_test(tmp_path / "test.csv")
+                    assert len(test.time) == len(test.depth) == len(test.force) >= 10
+                    assert np.isfinite([test.time, test.depth, test.force]).all()
+                    assert (np.diff(test.time) > 0).all()
+                    assert test.depth[np.abs(test.depth).argmax()] > 0

@@ -1,0 +1,145 @@
+"""Profile likelihood of the parameters of a least-squares solution.
+
+A parameter is fixed, and the others are optimised within their bounds by Gauss-Newton steps with the Jacobian of the
+solution, a run per step. The interval ends where the cost has risen by t^2 f / 2, with Student's t, times the widening
+by correlated errors.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator
+from typing import NamedTuple
+
+import numpy as np
+
+from taichi_msm.fitting.least_squares import Misfit, Solution
+from taichi_msm.fitting.observation import Array
+from taichi_msm.fitting.predict import Prediction, Runs
+from taichi_msm.fitting.uncertainty import Uncertainty
+
+# Relative tolerance of the end of an interval.
+PROFILE_TOLERANCE = 0.01
+
+Side = Generator[Array, "Prediction | None", "list[ProfilePoint]"]
+
+
+class ProfilePoint(NamedTuple):
+    """Point of a profile.
+
+    Attributes:
+        x: coordinate of the parameter.
+        deviations: signed root of twice the rise of the cost over f; infinite where runs fail.
+    """
+
+    x: float
+    deviations: float
+
+
+class Profile(NamedTuple):
+    """Profile of a parameter.
+
+    Attributes:
+        points: points of the profile, sorted by x.
+        low: lower end of the 95 % interval, or None beyond the bounds.
+        high: upper end, or None beyond the bounds.
+    """
+
+    points: list[ProfilePoint]
+    low: float | None
+    high: float | None
+
+
+class Profiler:
+    """Profile likelihood of a solution's parameters.
+
+    Args:
+        runs: predictions.
+        misfit: residuals.
+        solution: minimum of their cost.
+        uncertainties: uncertainty of the solution.
+    """
+
+    def __init__(self, runs: Runs, misfit: Misfit, solution: Solution, uncertainties: Uncertainty) -> None:
+        self._runs, self._misfit, self._solution, self._uncertainties = runs, misfit, solution, uncertainties
+        self._min_cost = misfit.cost(uncertainties.residuals)
+        self._low, self._high = runs.problem.limits
+
+    def profiles(self) -> list[Profile]:
+        """Return the profiles of all parameters, with both sides of each computed in parallel."""
+        count, runs = len(self._low), self._runs
+        sides = {(n, sign): self._side(n, sign) for n in range(count) for sign in (-1, 1)}
+        points: dict[tuple[int, int], list[ProfilePoint]] = {side_key: [] for side_key in sides}
+        requests = {side_key: x for side_key, side in sides.items() if (x := next(side, None)) is not None}
+        while requests:
+            runs.expected = max(runs.expected, runs.count + 2 * len(requests))
+            predictions = runs.predict_many(list(requests.values()))
+            for side_key, prediction in zip(list(requests), predictions, strict=True):
+                try:
+                    requests[side_key] = sides[side_key].send(prediction)
+                except StopIteration as stop:
+                    del requests[side_key]
+                    points[side_key] = stop.value
+        return [self._profile(n, points[n, -1], points[n, 1]) for n in range(count)]
+
+    def _profile(self, n: int, below: list[ProfilePoint], above: list[ProfilePoint]) -> Profile:
+        quantile = self._uncertainties.quantile
+        ends = [
+            side[-1].x if side and abs(abs(side[-1].deviations) / quantile - 1) < 5 * PROFILE_TOLERANCE else None
+            for side in (below, above)
+        ]
+        points = [*below, ProfilePoint(float(self._solution.x[n]), 0.0), *above]
+        return Profile(sorted(point for point in points if math.isfinite(point.deviations)), ends[0], ends[1])
+
+    def _side(self, n: int, sign: int) -> Side:
+        """Search for the end of the interval on one side; yields x to be predicted, and returns the points."""
+        x, root, quantile = self._solution.x, self._uncertainties.root, self._uncertainties.quantile
+        variance = float(root[n] @ root[n])
+        direction = root @ root[n] / variance
+        limit = float((self._high if sign > 0 else self._low)[n] - x[n]) * sign
+        points: list[ProfilePoint] = []
+        # Bracket of the end: distances, and the rises there, which are nearly proportional.
+        inner, outer = (0.0, 0.0), (math.inf, math.inf)
+        distance = min(quantile * math.sqrt(variance), limit)
+        while distance > 0 and len(points) < 8:
+            trial = np.clip(x + sign * distance * direction, self._low, self._high)
+            trial[n] = x[n] + sign * distance
+            cost = yield from self._conditional_minimum(n, trial)
+            rise = math.sqrt(max(0.0, 2 * (cost - self._min_cost) / self._uncertainties.factor))
+            rise /= self._uncertainties.widening[n]
+            points.append(ProfilePoint(float(trial[n]), sign * rise))
+            if abs(rise / quantile - 1) < PROFILE_TOLERANCE or (distance == limit and rise < quantile):
+                break
+            inner, outer = ((distance, rise), outer) if rise < quantile else (inner, (distance, rise))
+            if outer[1] < math.inf:
+                distance = inner[0] + (outer[0] - inner[0]) * (quantile - inner[1]) / (outer[1] - inner[1])
+            elif outer[0] < math.inf:  # The run there has failed.
+                distance = (inner[0] + outer[0]) / 2
+            else:
+                distance = min(distance * min(3.0, quantile / max(rise, 1e-3)), limit)
+        return points
+
+    def _conditional_minimum(self, n: int, x: Array) -> Generator[Array, Prediction | None, float]:
+        """Minimise over the other parameters; returns the cost, infinite if a run fails."""
+        from scipy.optimize import lsq_linear
+
+        others = np.delete(np.arange(len(x)), n)
+        jacobian, deviations = self._uncertainties.weighted[:, others], self._uncertainties.deviations[others]
+        min_cost = math.inf
+        for _ in range(6):
+            predicted = yield x
+            if predicted is None:
+                break
+            residuals = self._misfit.residuals(predicted, self._uncertainties.scales)
+            cost = self._misfit.cost(residuals)
+            if cost > min_cost:
+                break
+            min_cost = cost
+            # Gauss-Newton step: first derivatives of rho / 2 over the roots of the second ones.
+            bounds = (self._low - x)[others], (self._high - x)[others]
+            step = lsq_linear(jacobian, -residuals * self._misfit.robust_factor(residuals) ** 0.25, bounds).x
+            if np.all(np.abs(step) < 0.02 * deviations):
+                break
+            x = x.copy()
+            x[others] += step
+        return min_cost
