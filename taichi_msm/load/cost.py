@@ -160,7 +160,15 @@ def size_problems(plan: Plan) -> Iterator[Problem]:
 
 
 def require_disk(plan: Plan, directory: Path) -> None:
-    """Raise a SceneError if there is not enough disk space for a run in a directory, which need not exist."""
+    """Require that a disk has enough free space for a run.
+
+    Args:
+        plan: plan of the run.
+        directory: destination of the results, which need not exist.
+
+    Raises:
+        SceneError: when an upper bound of the files exceeds the free space; names the key with the largest share.
+    """
     scene, budget, free = plan.scene, estimate_budget(plan), _free_disk(directory)
     needed = budget.disk_bytes + budget.working_bytes
     if needed <= free:
