@@ -29,8 +29,8 @@ from tests import reference
 from tests.conftest import Program
 from tests.golden import Messages
 from tests.outputs import files
+from tests.reporting_process import ReportingProcess
 from tests.scenes import SMALL, speckle
-from tests.telling import Telling
 
 
 def own_process(*arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:
@@ -149,7 +149,7 @@ def test_ctrl_c_leaves_what_a_study_has_done(stage: str, runs: int, small: Path,
     (small / "here").mkdir()
     (small / "here" / "study.json").write_text("earlier")
     outlets = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with Telling("study", "small.yaml", "--out", "here", **outlets) as process:
+    with ReportingProcess("study", "small.yaml", "--out", "here", **outlets) as process:
         process.until(stage, runs)
         process.send_signal(signal.SIGINT)
         printed, error = process.communicate(timeout=60)
@@ -192,7 +192,7 @@ def test_a_signal_keeps_the_frames_so_far(
     """With one thread there is no encoder."""
     settings = ["--set", "time.duration=2000", "--set", "render.size=[200,150]", "--set", "output=[png, trajectory]"]
     command = ["run", "small.yaml", "--out", "long", "--threads", threads, *settings]
-    with Telling(*command, stderr=subprocess.PIPE) as process:
+    with ReportingProcess(*command, stderr=subprocess.PIPE) as process:
         process.until("frames", 9)
         assert len(children(process.pid)) == (threads != "1")
         if number == signal.SIGTERM:
@@ -237,7 +237,7 @@ def test_a_signal_before_the_first_frame_changes_nothing(
     earlier = '{"outputs": ["run.json"], "frames": 0}'
     (small / "kept" / "run.json").write_text(earlier)
     settings = ["--set", "render.size=[2048,2048]", "--set", "render.supersample=4", "--set", "output=[png]"]
-    with Telling("run", "small.yaml", "--out", "kept", *settings, stderr=subprocess.PIPE) as process:
+    with ReportingProcess("run", "small.yaml", "--out", "kept", *settings, stderr=subprocess.PIPE) as process:
         process.until(stage)
         time.sleep(delay)
         process.send_signal(number)
@@ -532,7 +532,7 @@ def test_results_that_nobody_can_read_are_4(command: str, here: Path) -> None:
 @needs_full
 def test_a_signal_is_heard_though_nobody_can_read_of_it(here: Path) -> None:
     command = ["run", "small.yaml", "--set", "render.size=[2048,2048]"]
-    with Path("/dev/full").open("w") as full, Telling(*command, stdout=full, stderr=full) as process:
+    with Path("/dev/full").open("w") as full, ReportingProcess(*command, stdout=full, stderr=full) as process:
         process.until("compile")
         process.terminate()
         assert process.wait(timeout=60) == 143

@@ -27,7 +27,7 @@ from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
 from tests.golden import Messages
-from tests.telling import Telling
+from tests.reporting_process import ReportingProcess
 
 Array = NDArray[np.float64]
 
@@ -302,7 +302,7 @@ def test_ctrl_c_stops_a_map_in_the_middle_of_a_run(tmp_path: Path, monkeypatch: 
     seen = np.random.default_rng(0).normal(rest, 1e-5, (2, len(PLACES), 3)).swapaxes(0, 1)
     np.savez("seen.npz", time=[1.0, 2.0], coordinates=PLACES, position=seen)
     command = ["fit", "scene.yaml", "seen.npz", "--free", "tissue.map", "--resolution", "4", "--sigma", "1e-6"]
-    with Telling(*command, stderr=subprocess.PIPE) as process:
+    with ReportingProcess(*command, stderr=subprocess.PIPE) as process:
         process.until("fit")
         sleep(2)
         process.send_signal(signal.SIGINT)

@@ -29,8 +29,8 @@ from taichi_msm.system.compiler import COMPILERS, active_compiler, versions
 from taichi_msm.system.runtime import Device
 from tests.golden import Messages
 from tests.outputs import files, results
+from tests.reporting_process import ReportingProcess
 from tests.scenes import speckle
-from tests.telling import Telling
 
 # Pressed while the tool moves, in many steps a frame.
 SETTINGS = (
@@ -278,7 +278,7 @@ def test_a_run_that_is_killed_goes_on_to_the_same_bits(small: Path, device: Devi
         (again, "redraw", 0),
         (again, "write", 0),
     ):
-        with Telling("run", *arguments, "--quiet", stderr=subprocess.PIPE) as process:
+        with ReportingProcess("run", *arguments, "--quiet", stderr=subprocess.PIPE) as process:
             process.until(stage, done)
             process.kill()
             assert process.communicate(timeout=60)[1] == ""  # until its encoder has ended too

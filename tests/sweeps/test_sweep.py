@@ -34,8 +34,8 @@ from taichi_msm.sweeps.sweep import finish_sweep
 from tests.conftest import Program
 from tests.golden import Messages
 from tests.outputs import files, results
+from tests.reporting_process import ReportingProcess
 from tests.scenes import SMALL, speckle
-from tests.telling import Telling
 
 # The step of 0.01 s is above the stability limit, so some runs are refused.
 SWEEP = """\
@@ -163,7 +163,9 @@ def test_a_shard_of_the_command_writes_no_table(many: Path, program: Program, me
 def test_a_kill_changes_nothing(many: Path, pool: Pool) -> None:
     (many / "many.yaml").write_text(LONG)
     go(pool, "whole")
-    with Telling("sweep", "many.yaml", "--workers", "1", "--out", "killed", stderr=subprocess.DEVNULL) as process:
+    with ReportingProcess(
+        "sweep", "many.yaml", "--workers", "1", "--out", "killed", stderr=subprocess.DEVNULL
+    ) as process:
         process.until("runs", 2)
         process.kill()
     # Its worker, which is in the middle of the last run, ends by itself.
@@ -175,7 +177,7 @@ def test_a_kill_changes_nothing(many: Path, pool: Pool) -> None:
 
 def test_a_signal_ends_it_and_says_how_to_go_on(many: Path, message: Messages) -> None:
     (many / "many.yaml").write_text(LONG)
-    with Telling("sweep", "many.yaml", "--workers", "1", "--out", "out", stderr=subprocess.PIPE) as process:
+    with ReportingProcess("sweep", "many.yaml", "--workers", "1", "--out", "out", stderr=subprocess.PIPE) as process:
         process.until("runs", 2)
         process.send_signal(signal.SIGINT)
         _, told = process.communicate()

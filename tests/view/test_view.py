@@ -20,7 +20,7 @@ from taichi_msm.view.server import MAX_DELAY_S, Pacing
 from tests.conftest import Program
 from tests.golden import Messages
 from tests.outputs import duration
-from tests.telling import Telling
+from tests.reporting_process import ReportingProcess
 
 SCRIPT = """\
 events:
@@ -141,7 +141,7 @@ events:
 def test_an_interrupted_film_leaves_the_one_that_was_there(small: Path, message: Messages) -> None:
     Path("live.gif").write_bytes(b"before")
     filming = ["view", "small.yaml", "--record", "live.gif", "--seconds", "3600"]
-    with Telling(*filming, stderr=subprocess.PIPE) as process:
+    with ReportingProcess(*filming, stderr=subprocess.PIPE) as process:
         process.until("film", 1)
         process.send_signal(signal.SIGINT)
         _, error = process.communicate(timeout=60)
