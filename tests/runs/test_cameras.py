@@ -28,7 +28,6 @@ from tests.golden import Messages
 from tests.outputs import files, results
 from tests.reference import drawing
 from tests.render.test_rasterizer import dented, difference, drawable, with_instruments
-from tests.runs.test_label_files import read_flow
 from tests.runs.test_resume import interrupted
 from tests.scenes import scene
 
@@ -333,23 +332,16 @@ def test_stereo_calibration(small: Path, message: Messages) -> None:
             with_cameras({"left": left, "right": wrong})
 
 
-MOVING = {**SWAYING, "distortion": {"k1": -0.1, "p1": 0.002}}
-
-
 def test_poses_of_a_moving_camera(small: Path, device: Device) -> None:
     """tests/test_consistency.py compares labels with these poses."""
-    made = load_scene("small.yaml", [f"render.camera={json.dumps(MOVING)}", "output=[png, flow, trajectory]"])
+    moving = {**SWAYING, "distortion": {"k1": -0.1, "p1": 0.002}}
+    made = load_scene("small.yaml", [f"render.camera={json.dumps(moving)}", "output=[depth]"])
     run(made, "out", threads=device.threads, estimate_error=False)
     written = json.loads(Path("out/camera.json").read_text())
     assert written["poses"][0] == written["pose"]
     np.testing.assert_allclose(written["projection"], view(made).matrix[:3])
-    for frame, pose in enumerate(written["poses"]):
-        np.testing.assert_allclose(pose, calibration(view(made, frame / 10))["pose"], atol=1e-12)
-    assert len(written["poses"]) == 5
-    with Playback("out", threads=device.threads) as again:
-        with Image.open("out/frames/0003.png") as image:
-            np.testing.assert_array_equal(again.draw(3), np.array(image))
-        np.testing.assert_array_equal(again.flow(1, 2).flow, read_flow(Path("out/flow/0001.flo")))
+    expected = [calibration(view(made, frame / 10))["pose"] for frame in range(5)]
+    np.testing.assert_allclose(written["poses"], expected, atol=1e-12)
 
 
 def posed(**camera: Any) -> Scene:
