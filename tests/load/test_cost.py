@@ -4,7 +4,6 @@ import json
 import math
 import os
 import shutil
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -181,16 +180,6 @@ def test_core_quotas_of_control_groups(
     group(groups / "outer", cpu__max=f"{outer} 100000\n")
     group(groups / "outer" / "inner", cpu__max=f"{inner} 100000\n")
     assert available_threads() == threads
-
-
-def test_memory_without_proc(monkeypatch: pytest.MonkeyPatch) -> None:
-    def missing(_: Path) -> int:
-        raise FileNotFoundError
-
-    monkeypatch.setattr(process, "_free_memory", missing)
-    assert 2**20 < available_memory() < sys.maxsize
-    monkeypatch.delattr(os, "sysconf")
-    assert available_memory() == sys.maxsize
 
 
 def test_file_system_of_size_0(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -191,23 +191,6 @@ def test_parts_of_another_run(name: str, out: Path, tmp_path: Path) -> None:
         read(out)
 
 
-def test_exchanged_frames_and_nan(out: Path) -> None:
-    path = out / ".partial" / "checkpoint" / FRAMES_FILE
-    data = path.read_bytes()
-    size = len(data) // FRAMES
-    path.write_bytes(data[size : 2 * size] + data[:size] + data[2 * size :])
-    with pytest.raises(DamagedError):
-        read(out)
-    path.write_bytes(data)
-    checkpoint = checkpoint_in(out)
-    checkpoint.reopen()
-    checkpoint.frames = 1
-    checkpoint.add(np.full((2, 3, 3), math.nan), forces(1))  # with a valid checksum
-    checkpoint.close()
-    with pytest.raises(DamagedError):
-        read(out)
-
-
 FORGED_MANIFESTS: dict[str, dict[str, Any]] = {
     "folder": {"folder": 3},
     "version": {"versions": {"taichi": 1}},

@@ -21,9 +21,9 @@ from PIL import Image
 
 from taichi_msm.errors import FilesError
 from taichi_msm.render.labels import Flow, FrameOutputs
-from taichi_msm.runs import encoder, media
+from taichi_msm.runs import media
 from taichi_msm.runs.checkpoint import is_unfinished
-from taichi_msm.runs.encoder import Encoder, PictureWriter
+from taichi_msm.runs.encoder import Encoder
 from taichi_msm.runs.writer import ResultWriter
 from taichi_msm.scene.scene import Scene
 from tests.golden import Messages
@@ -225,45 +225,15 @@ def test_interruption_during_encoding_in_threads(
     assert files(tmp_path / "interrupted") == files(tmp_path / "whole")
 
 
-def test_interruption_between_still_and_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A still that is written after the interruption is deleted."""
-
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    def write_late(*arguments: Any) -> float:
-        time.sleep(0.1)
-        return write_still(*arguments)
-
-    write_still = encoder._write_still
-    with ResultWriter(tmp_path / "interrupted", plan_of(small_scene()), encode_in_subprocess=False) as writer:
-        writer.add(position(0), observed(0))
-        assert isinstance(writer._encoder, PictureWriter)
-        with monkeypatch.context() as patch:
-            patch.setattr(writer._encoder._video_executor, "submit", interrupted)
-            patch.setattr(encoder, "_write_still", write_late)
-            with pytest.raises(KeyboardInterrupt):
-                writer.add(position(1), observed(1))
-        writer.finish()
-        time.sleep(0.2)
-        writer.publish({})
-    write(tmp_path / "whole", 1, small_scene())
-    assert files(tmp_path / "interrupted") == files(tmp_path / "whole")
-
-
 def test_published_run_is_finished(tmp_path: Path) -> None:
     """Even if it is killed before its checkpoint is deleted."""
     with ResultWriter(tmp_path, plan_of(small_scene()), {}) as writer:
         writer.add(position(0), observed(0))
         assert is_unfinished(tmp_path)
+        assert isinstance(writer._encoder, Encoder)
+        assert os.getsid(writer._encoder._process.pid) != os.getsid(0), "Ctrl-C does not reach the encoder"
         writer.publish({"status": "complete"})
         assert not is_unfinished(tmp_path)
-
-
-def test_encoder_has_its_own_session(tmp_path: Path) -> None:
-    with ResultWriter(tmp_path, plan_of(small_scene())) as writer:
-        assert isinstance(writer._encoder, Encoder)
-        assert os.getsid(writer._encoder._process.pid) != os.getsid(0)
 
 
 def test_killed_run_and_its_successor(tmp_path: Path, root: Path, message: Messages) -> None:

@@ -14,14 +14,13 @@ import pytest
 from PIL import Image
 
 from taichi_msm.errors import FilesError, SceneError
-from taichi_msm.load.scene_file import load_plan, load_scene
+from taichi_msm.load.scene_file import load_scene
 from taichi_msm.model.plan import Plan
 from taichi_msm.runs.checkpoint import input_digests
 from taichi_msm.runs.finished import read_run
 from taichi_msm.runs.playback import Playback
 from taichi_msm.runs.run import resume, run
 from taichi_msm.runs.writer import RunRecord
-from taichi_msm.solver.planning import stable_steps
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
 from tests.golden import Messages
@@ -291,15 +290,3 @@ def test_playback_requires_the_pictures_of_the_run(mapped: Path, device: Device,
     Image.new("L", (3, 3), 9).save("map.png")
     with message.raises(FilesError, "springs.map.image"):
         Playback("out", threads=device.threads)
-
-
-def test_step_limit_of_a_changed_map(mapped: Path, device: Device, message: Messages) -> None:
-    """A stiffer map, for which the step is unstable, does not affect the stored positions."""
-    Image.new("L", (3, 3), 0).save("map.png")
-    steps = stable_steps(load_plan("small.yaml", [MAP, SHORT]))
-    scene = load_scene("small.yaml", [MAP, SHORT, f"time.step={0.1 / steps}"])
-    run(scene, "out", threads=device.threads, estimate_error=False)
-    Image.new("L", (3, 3), 255).save("map.png")
-    with message.raises(SceneError, "time.step"):
-        load_scene("small.yaml", [MAP, SHORT, f"time.step={0.1 / steps}"])
-    assert len(read_run("out").positions()) == scene.time.frames + 1

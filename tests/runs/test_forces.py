@@ -27,7 +27,7 @@ from taichi_msm.system.runtime import Device
 from tests import reference
 from tests.golden import Messages
 from tests.scenes import plan_of, scene
-from tests.terms.test_contact import CASES, EDGES, PRESSED, touching
+from tests.terms.test_contact import CASES, PRESSED, touching
 
 Array = NDArray[np.float64]
 
@@ -66,17 +66,6 @@ def test_tool_force_against_the_reference(precision: str, difference: str, error
         for index, peak in enumerate(simulation.felt.greatest):
             greatest = int(norms[:, index].argmax())
             assert (peak.time, peak.force) == ((greatest + 1) / 25, forces[greatest][index])
-
-
-@pytest.mark.slow
-def test_tool_force_at_an_open_edge(device: Device) -> None:
-    made = touching(EDGES["comes from beside"])
-    made = made.model_copy(update={"sheet": made.sheet.model_copy(update={"fixed": "none"})})
-    expected = expected_forces(made)
-    with Simulation(made, threads=device.threads) as simulation:
-        for each in expected:
-            simulation.advance()
-            assert np.abs(simulation.forces()[0].force - each[0]).max() < 1e-12 * np.abs(expected).max()
 
 
 # Jumps up at a frame, down between two frames, and to another position at a third.

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 
 import taichi_msm
 from taichi_msm import (
@@ -185,19 +184,6 @@ def test_restart(simulation: Simulation, device: Device, message: Messages) -> N
     with message.raises(SceneError, "time.step"):
         simulation.restart(with_time(changed, step=0.04))
     assert simulation.scene == changed
-
-
-def test_restart_with_another_background(device: Device, tmp_path: Path) -> None:
-    """The background is visible through a transparent picture."""
-    Image.new("RGBA", (8, 8)).save(tmp_path / "clear.png")
-    first, second = (
-        scene(image=str(tmp_path / "clear.png"), render={"size": [40, 30], "background": colour})
-        for colour in ([0, 0, 0], [200, 0, 0])
-    )
-    with Simulation(first, threads=device.threads) as simulation:
-        assert (simulation.draw() == (0, 0, 0)).all()
-        simulation.restart(second)
-        assert (simulation.draw() == (200, 0, 0)).all()
 
 
 def test_velocities_of_the_last_step(simulation: Simulation) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import io
 import json
 from fractions import Fraction
 from pathlib import Path
@@ -17,7 +15,6 @@ from PIL import Image
 
 from taichi_msm import SceneError, run
 from taichi_msm.load.scene_file import load_scene
-from taichi_msm.runs.encoder import EncodingJob, PictureWriter
 from taichi_msm.runs.media import Mp4Writer
 from taichi_msm.scene import outputs
 from taichi_msm.system.runtime import Device
@@ -106,20 +103,6 @@ def test_size_increases_with_quality(small: Path, program: Program) -> None:
     assert sizes[0] < sizes[1] < sizes[2]
 
 
-def test_full_disk_raises_an_os_error() -> None:
-    class Full(io.BytesIO):
-        def write(self, data: Any) -> int:
-            raise OSError(errno.ENOSPC, "no space")
-
-    rng = np.random.default_rng(0)
-    writer = Mp4Writer(Full(), (256, 256), 25, 65)
-    with pytest.raises(OSError, match="no space") as caught:  # noqa: PT012
-        for _ in range(40):
-            writer.add(rng.integers(0, 256, (256, 256, 3), dtype=np.uint8))
-        writer.close()
-    assert caught.value.errno == errno.ENOSPC
-
-
 def test_film_of_a_run(small: Path, device: Device) -> None:
     scene = load_scene("small.yaml", ["output=[png, mp4]", "render.size=[41, 30]"])
     done = run(scene, "out", threads=device.threads, estimate_error=False)
@@ -137,15 +120,6 @@ def test_film_of_an_interrupted_run(small: Path, device: Device) -> None:
     made = load_scene("small.yaml", ["output=[mp4, trajectory]", "time.frames_per_second=40"])
     record = interrupted(made, "part", device)
     assert 0 < read(Path("part/animation.mp4"))[0].frames == record["frames"] < 17
-
-
-def test_aborted_film(tmp_path: Path) -> None:
-    job = EncodingJob((tmp_path,), (64, 48), 25.0, ("gif", "mp4"), (0, 0, 0), 65)
-    writer = PictureWriter(job)
-    for frame in range(30):
-        writer.add(smooth(64, 48, frame)[None])
-    writer.abort()
-    assert {path.name for path in tmp_path.iterdir()} == {"animation.gif", "animation.mp4"}
 
 
 def test_missing_pyav(small: Path, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:

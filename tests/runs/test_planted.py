@@ -15,7 +15,7 @@ import pytest
 from taichi_msm.cli.session import result_directory
 from taichi_msm.errors import FilesError
 from taichi_msm.render.labels import FrameOutputs
-from taichi_msm.runs.checkpoint import STATE_FILE, is_unfinished, read_manifest
+from taichi_msm.runs.checkpoint import is_unfinished, read_manifest
 from taichi_msm.runs.writer import ResultWriter
 from taichi_msm.scene.scene import Scene
 from tests.golden import Messages
@@ -164,8 +164,3 @@ def test_link_at_the_default_folder(treasure: Path, monkeypatch: pytest.MonkeyPa
     with message.raises(FilesError, "output"):
         result_directory(None, "press")
     assert result_directory("output/press", "press") == Path("output/press")
-
-
-def test_state_file_marks_an_unfinished_run(tmp_path: Path) -> None:
-    file(f".partial/checkpoint/{STATE_FILE}")(tmp_path, tmp_path)
-    assert is_unfinished(tmp_path)
