@@ -289,6 +289,7 @@ WRONG = {
     "folded distortion": right_of_top(f"{NEAR}, fov: 90, distortion: {{k1: -1}}"),
     "invalid name": "Left: top",
     "folder of labels": "flow: top",
+    "folder in place of a calibration": "left: top, right: {eye: [0, 0, 1], calibration: .}",
     "missing calibration": "left: top, right: {eye: [0, 0, 1], calibration: a.yml}",
 }
 
@@ -367,6 +368,7 @@ WRONG_MOTIONS: dict[str, dict[str, Any]] = {
     "eye at its target": {"eye": [0, 0, 1], "target": [[0, 0, 0, 0], [0.2, 0, 0, 1]]},
     "eye and poses": {"eye": [0, 0, 1], "poses": STOP},
     "equal times of poses": {"poses": [*STOP, *STOP]},
+    "poses and up": {"poses": STOP, "up": [0, 1, 0]},
     "intrinsics and fov": {"eye": [0, 0, 1], "intrinsics": {"fx": 1, "fy": 1, "cx": 0, "cy": 0}, "fov": 30},
 }
 

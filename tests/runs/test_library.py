@@ -26,7 +26,6 @@ from taichi_msm import (
     Sheet,
     Simulation,
     load_scene,
-    resume,
     run,
 )
 from taichi_msm.model.sheet import rest_positions
@@ -96,7 +95,6 @@ WRONG: dict[str, tuple[Callable[[Simulation, Any], object], list[Any]]] = {
     "coordinates": (Simulation.locate, [[[0.5, 1.5]], [0.5, 0.5], [[np.nan, 0.5]]]),
     "camera": (Simulation.draw, [3, "side", {"eye": [0, 0]}, {"eye": [0, 0, 0]}]),
     "frames": (Simulation.advance, [-1, 1.5, "2"]),
-    "frames of a player": (Simulation.play, [-1]),
     # Taichi would abort the process, or start all of them.
     "threads": (lambda simulation, value: Simulation(simulation.scene, threads=value), [0, -1, 10**6, True, 1.5, "2"]),
     "pixel": (Simulation.pick, [3, None, ("a", 1), (1, 2, 3), (np.inf, 1), [[1], [1, 2]]]),
@@ -107,7 +105,6 @@ WRONG: dict[str, tuple[Callable[[Simulation, Any], object], list[Any]]] = {
     "path of a scene": (lambda _, value: load_scene(value), [{"sheet": {}}]),
     "overrides": (lambda _, value: load_scene("small.yaml", value), [None, 3, {3: 3}, [3], "damping=1"]),
     "directory of a run": (lambda simulation, value: run(simulation.scene, value, threads=2), [None, 3, "a\0b"]),
-    "directory to resume": (lambda _, value: resume(value), [None, 3, "a\0b"]),
     "update": (lambda simulation, value: simulation.scene.model_copy(update=value), [3, {3: 3}]),
     "keys without names": (lambda _, value: Sheet(*value), [((3, 3), (1, 1), 1)]),
 }
