@@ -23,7 +23,7 @@ def report(stage, done):
 
 def exit_on_signals(original=process.exit_on_signals):
     original()
-    report("handled", 0)
+    report("heard", 0)
     from taichi_msm.cli import session  # as the program does next
 
     @contextmanager
@@ -52,7 +52,7 @@ class ReportingProcess(subprocess.Popen[str]):
         os.close(write)
 
     def until(self, stage: str, done: int = 0) -> None:
-        """Wait for a stage, and an amount of its work; the first stage, `handled`, means that signals are handled."""
+        """Wait for a stage, and an amount of its work; the first stage, `heard`, means that signals are handled."""
         for line in self._pipe:
             reached, count = line.split()
             if reached == stage and int(count) >= done:
