@@ -182,12 +182,6 @@ def test_core_quotas_of_control_groups(
     assert available_threads() == threads
 
 
-def test_file_system_of_size_0(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    disk_usage = shutil.disk_usage
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: disk_usage(path)._replace(total=0, used=0, free=0))
-    require_disk(plan_of(scene(output=["png"])), tmp_path)
-
-
 def test_insufficient_disk_space(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
     """The disk holds positions twice while the trajectory is written, and two states of 6 numbers per mass point."""
     made = scene(render={"size": [50, 60]}, output=["png", "trajectory"])

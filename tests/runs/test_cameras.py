@@ -200,13 +200,6 @@ def test_resumed_run_of_several_cameras(small: Path, device: Device) -> None:
         assert results(Path(f"part-{n}")) == results(Path("whole"))
 
 
-def test_another_main_camera_restarts(small: Path, device: Device) -> None:
-    cameras = {"a": LEFT, "b": {"eye": [0.3, 0, 0.3]}}
-    interrupted(with_cameras(cameras), "out", device, after=3)
-    record = run(with_cameras(dict(reversed(cameras.items()))), "out", threads=device.threads, estimate_error=False)
-    assert (record["status"], record["resumed"]) == ("complete", 0)
-
-
 def test_results_of_earlier_cameras_are_replaced(small: Path, device: Device, message: Messages) -> None:
     run(with_cameras(STEREO), "out", threads=device.threads, estimate_error=False)
     Path("out/left/mine.txt").write_text("mine")

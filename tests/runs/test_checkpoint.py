@@ -7,6 +7,7 @@ import json
 import math
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from operator import methodcaller
 from pathlib import Path
 from typing import Any
@@ -116,11 +117,23 @@ def test_bit_flips_are_detected(name: str, harmless: float, stride: int, out: Pa
             continue
         passed += 1
     assert passed <= harmless * len(whole) / stride
-    # Truncations.
-    for n in range(0, len(whole), 7 * stride):
-        path.write_bytes(whole[:n])
+    size = len(whole) // FRAMES
+    exchanged = whole[size : 2 * size] + whole[:size] + whole[2 * size :]
+    for damaged in (exchanged, *(whole[:n] for n in range(0, len(whole), 7 * stride))):
+        path.write_bytes(damaged)
         with pytest.raises(DamagedError):
             read(out)
+
+
+def test_order_of_cameras_affects_results() -> None:
+    """The light is at the first camera."""
+    made, cameras = small_scene(), {"a": "top", "b": "oblique"}
+    first, second = (
+        replace(manifest(), scene=made.model_copy(update={"render": {"cameras": order}}))
+        for order in (cameras, dict(reversed(cameras.items())))
+    )
+    assert first.has_same_bits_as(first)
+    assert not first.has_same_bits_as(second)
 
 
 def repacked(path: Path, change: Callable[[dict[str, Any]], object]) -> None:

@@ -269,7 +269,7 @@ def test_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, target: str,
 
 
 def file_error(
-    directory: Path, meanwhile: Callable[[ResultWriter], None] = lambda _: None, *, in_subprocess: bool = True
+    directory: Path, meanwhile: Callable[[ResultWriter], object] = lambda _: None, *, in_subprocess: bool = True
 ) -> str:
     """Error message of a run that an event interrupts."""
 
@@ -297,16 +297,14 @@ def test_read_only_directory(tmp_path: Path) -> None:
     assert "Permission denied" in file_error(tmp_path / "out")
 
 
-@pytest.mark.parametrize("in_subprocess", [True, False])
-def test_error_of_the_encoder(in_subprocess: bool, tmp_path: Path, message: Messages) -> None:
-    def block(_: ResultWriter) -> None:
-        (tmp_path / ".partial" / "new" / "frames").write_text("in the way")
+def test_errors_of_the_encoder(tmp_path: Path, message: Messages) -> None:
+    """A file in the way of the pictures, and a killed process."""
+    blocked = tmp_path / ".partial" / "new" / "frames"
+    for in_subprocess in (True, False):
+        message(file_error(tmp_path, lambda _: blocked.write_text("mine"), in_subprocess=in_subprocess), "--out")
+        assert blocked.read_text() == "mine"
+        blocked.unlink()
 
-    message(file_error(tmp_path, block, in_subprocess=in_subprocess), "--out")
-    assert (tmp_path / ".partial" / "new" / "frames").read_text() == "in the way"
-
-
-def test_killed_encoder(tmp_path: Path, message: Messages) -> None:
     def kill(writer: ResultWriter) -> None:
         assert isinstance(writer._encoder, Encoder)
         writer._encoder._process.kill()

@@ -20,7 +20,7 @@ from taichi_msm.cli.console import run_summary
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.surface import surface_point
-from taichi_msm.model.tool_force import control_point, probe_records
+from taichi_msm.model.tool_force import control_point
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.process import available_threads
 from taichi_msm.system.runtime import Device
@@ -93,16 +93,6 @@ def test_load_force_at_each_frame(device: Device) -> None:
             assert felt.tip == tuple(surface_point(simulation.positions(), made.render.refine, made.sheet, at)[0])
             assert felt.tip[2] < 0 or frame == 0
             simulation.advance()
-
-
-def test_total_force_of_a_free_sheet(device: Device) -> None:
-    probe = {"total": [1, 0, -2], "radius": 0.01, "falloff": 500, "load": [[0, 100]]}
-    made = touching([probe], sheet={"points": [17, 21], "size": [0.3, 0.4], "fixed": "none"})
-    (record,) = probe_records(made)
-    with Simulation(made, threads=device.threads) as simulation:
-        (felt,) = simulation.forces()
-    assert record is not None
-    assert np.linalg.norm(felt.force) == pytest.approx(record["total_force"], rel=1e-14)
 
 
 def test_forces_of_a_restored_simulation(device: Device, message: Messages) -> None:
