@@ -83,10 +83,11 @@ class ArgumentError(MsmError, ValueError):
 
 
 class DivergedError(MsmError):
-    """The simulation diverged; the message contains the time, the mass point and the remedy.
+    """The simulation diverged.
 
-    Attributes:
-        step: number of completed steps.
+    Args:
+        message: time, mass point, fault and remedy.
+        step: number of completed steps; like the following, also an attribute.
         time: simulated time [s].
         point: row and column of the mass point with the largest displacement.
     """

@@ -74,8 +74,8 @@ OUTPUT_NUMBERS = 15
 class Budget:
     """Memory and disk space of a run."""
 
-    points: int
-    steps: int
+    points: int  # number of mass points
+    steps: int  # number of time steps
     frames: int  # including the initial one
     simulation_bytes: int  # memory for the state of the sheet and its output
     drawing_bytes: int  # memory for a frame and the texture; 0 if nothing is drawn

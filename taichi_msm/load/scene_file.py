@@ -42,8 +42,8 @@ MAX_LINES = 100
 class FileKind(NamedTuple):
     """Kind of a YAML file: its name and its required keys, for messages."""
 
-    name: str
-    needs: str
+    name: str  # such as "scene"
+    needs: str  # list of the required keys
 
 
 class ParsedFile(NamedTuple):

@@ -55,7 +55,12 @@ class Document(NamedTuple):
 
 
 class UnreadableError(Exception):
-    """The text is not YAML, or has too many values or too deep nesting."""
+    """The text is not YAML, or has too many values or too deep nesting.
+
+    Args:
+        mark: position of the fault.
+        message: the fault and the remedy, without the position.
+    """
 
     def __init__(self, mark: Mark, message: str) -> None:
         super().__init__(message)

@@ -26,8 +26,8 @@ Shape = tuple[int, ...]
 class ChunkedArray(NamedTuple):
     """Array that is written chunk by chunk, as it may exceed memory."""
 
-    dtype: DTypeLike
-    shape: Shape
+    dtype: DTypeLike  # of all chunks
+    shape: Shape  # of the whole array
     chunks: Iterable[NDArray[Any]]  # contiguous; together the array's elements in C order
 
 

@@ -313,7 +313,7 @@ class Simulation:
         """
         self._require_open()
         if self._divergence is None:
-            raise MsmError("this simulation has not diverged; there is nothing to find out")
+            raise MsmError("this simulation has not diverged; there is nothing to diagnose")
         if self.scene.time.at_rest:
             last_state = None if self._frame_positions is None else self._snapshot()
             return Diagnosis(str(self._divergence), last_state)

@@ -327,11 +327,11 @@ class RunRecord(TypedDict, total=False):
     error_estimate_reason: str
     resumed: int  # number of frames simulated before the run was resumed
     timings: dict[str, float]  # time of every stage [s]
-    arch: str
-    device: str
-    threads: int
-    lanes: int
-    workers: int
+    arch: str  # cpu, cuda or vulkan
+    device: str  # name of the processor or the GPU; empty if unknown
+    threads: int  # number of CPU threads of the compiler
+    lanes: int  # number of SIMD lanes used for stepping; 1 on a GPU
+    workers: int  # number of threads used for stepping; 0 on a GPU
     versions: dict[str, str]  # of all software that affects the results
     commit: str | None  # of the program, by git; None if it does not run from a clone
     frames: int
