@@ -178,14 +178,6 @@ def test_excluded_features_of_yaml(load: Load, message: Messages) -> None:
         load(text + "damping: *m\n<<: *m\nimage: !!python/object/apply:os.getcwd []\n---\nmore: 1\n")
 
 
-@pytest.mark.usefixtures("load")
-def test_huge_file(message: Messages) -> None:
-    with Path("huge.yaml").open("wb") as file:
-        file.truncate(10**10)
-    with message.raises(SceneError, "huge.yaml"):
-        load_scene("huge.yaml")
-
-
 def test_expansion_of_aliases(load: Load) -> None:
     text = "a0: &a0 [x]\n" + "".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]\n" for n in range(1, 20))
     before = time.perf_counter()
@@ -198,12 +190,10 @@ def test_expansion_of_aliases(load: Load) -> None:
 @pytest.mark.parametrize(
     "text",
     [
-        "".join(f"k{n}: 1\n" for n in range(49_900)),
         "k: 1\n" * 49_900,
-        GOOD.replace("[]", "[" + "x," * 99_000 + "]"),
         GOOD + "probes:\n" + "- {}\n" * 49_000,
     ],
-    ids=["unknown", "duplicates", "outputs", "probes"],
+    ids=["duplicates", "probes"],
 )
 def test_file_with_many_faults(load: Load, text: str) -> None:
     before = time.process_time()
@@ -269,13 +259,15 @@ extra: 1
 
 @pytest.mark.parametrize(
     "name",
-    ["none.yaml", "folder", "pipe", "/dev/zero", "a\0b", "x" * 300],
-    ids=["missing", "folder", "pipe", "device", "null character", "long"],
+    ["none.yaml", "folder", "pipe", "/dev/zero", "a\0b", "x" * 300, "huge.yaml"],
+    ids=["missing", "folder", "pipe", "device", "null character", "long", "huge"],
 )
 @pytest.mark.usefixtures("load")
 def test_invalid_paths(name: str, message: Messages) -> None:
     Path("folder").mkdir()
     os.mkfifo("pipe")
+    Path("huge.yaml").touch()
+    os.truncate("huge.yaml", 10**10)
     with message.raises(SceneError, name.replace("\0", "\\x00")):
         load_scene(name)
 
@@ -292,10 +284,8 @@ def test_missing_files_of_a_scene(load: Load, message: Messages) -> None:
     text = GOOD.replace("shear: 20", map_) + f"image: none.png\nrender: {{{cameras}}}\n"
     with message.raises(SceneError) as caught:
         load(text)
-    for line, name in zip(
-        caught.value.lines, ("map.png", "none.png", "left.yml", "left.txt", "right.yml"), strict=True
-    ):
-        assert f": {name}: no such file" in line
+    names = ["map.png", "none.png", "left.yml", "left.txt", "right.yml"]
+    assert all(f": {name}: no such file" in line for line, name in zip(caught.value.lines, names, strict=True))
 
 
 def test_overrides(load: Load) -> None:
@@ -305,12 +295,9 @@ def test_overrides(load: Load) -> None:
     assert (scene.probes[0].load, scene.probes[0].force) == (((0, 100),), (0, 0, 9))
     scene = load(GOOD, {"sheet.points": (6, 7), "probes": [{"force": [0, 0, 1]}], "probes.0.falloff": 3})
     assert (scene.sheet.points, scene.probes[0].falloff) == ((6, 7), 3)
-
-
-def test_order_of_overrides(load: Load) -> None:
-    assert load(GOOD, ["damping=1", "damping=2"]).damping == 2
+    # The last override counts, and may correct a fault of the file.
     assert load(GOOD, ["render.camera.eye=[0, 0, 1]", "render={camera: top}"]).render.camera == "top"
-    assert load(GOOD.replace("1.0e-3", "0"), ["sheet.mass=1"]).sheet.mass == 1
+    assert load(GOOD.replace("1.0e-3", "0"), ["sheet.mass=2", "sheet.mass=1"]).sheet.mass == 1
 
 
 @pytest.mark.parametrize(
