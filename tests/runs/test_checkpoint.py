@@ -119,8 +119,8 @@ def test_bit_flips_are_detected(name: str, harmless: float, stride: int, out: Pa
     assert passed <= harmless * len(whole) / stride
     size = len(whole) // FRAMES
     exchanged = whole[size : 2 * size] + whole[:size] + whole[2 * size :]
-    for damaged in (exchanged, *(whole[:n] for n in range(0, len(whole), 7 * stride))):
-        path.write_bytes(damaged)
+    for forged in (exchanged, *(whole[:n] for n in range(0, len(whole), 7 * stride))):
+        path.write_bytes(forged)
         with pytest.raises(DamagedError):
             read(out)
 
