@@ -266,7 +266,7 @@ def right_of_top(keys: str) -> str:
     return f"left: top,\n right: {{beside: left, {keys}}}"
 
 
-WRONG = {
+INVALID_CAMERAS = {
     "unknown camera": "left: top,\n right: {beside: lift, baseline: 1}",
     "itself": "left: top,\n right: {beside: right, baseline: 1}",
     "cycle": "left: top,\n a: {beside: b, baseline: 1}, b: {beside: a, baseline: 1}",
@@ -287,7 +287,7 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("cameras", WRONG.values(), ids=WRONG)
+@pytest.mark.parametrize("cameras", INVALID_CAMERAS.values(), ids=INVALID_CAMERAS)
 def test_errors_of_cameras(cameras: str, small: Path, message: Messages) -> None:
     refuse(message, cameras)
 
@@ -301,7 +301,7 @@ def test_invalid_combinations_with_cameras(small: Path, message: Messages) -> No
     distorted = "a: {eye: [0, 0, 1], distortion: {k1: -0.01}}, b: {beside: a, baseline: 1}"
     refuse(message, distorted, "output=[disparity]")
     refuse(message, right_of_top(NEAR), "output=[stereo, disparity]")
-    refuse(message, WRONG["baseline 0"], "output=[png, disparity]")  # the output is not at fault
+    refuse(message, INVALID_CAMERAS["baseline 0"], "output=[png, disparity]")  # the output is not at fault
 
 
 def test_stereo_calibration(small: Path, message: Messages) -> None:
@@ -314,16 +314,16 @@ def test_stereo_calibration(small: Path, message: Messages) -> None:
     left = {**LEFT, "calibration": "pair.yml"}
     right = {"beside": "left", "calibration": "pair.yml", "calibration_eye": "right", "calibration_unit": "mm"}
     single = {"beside": "left", "calibration": "right.yml"}
-    place = {"rotation": rotation, "translation": [-0.01, 0.002, 0.0005]}
-    pairs = [with_cameras({"left": left, "right": camera}) for camera in (right, {**single, **place})]
+    pose = {"rotation": rotation, "translation": [-0.01, 0.002, 0.0005]}
+    pairs = [with_cameras({"left": left, "right": camera}) for camera in (right, {**single, **pose})]
     assert pairs[0].render == pairs[1].render
     np.testing.assert_allclose(
         pair_transform(pairs[0].render.all_cameras["right"])["translation"], [-0.01, 0.002, 5e-4]
     )
     assert [view_at(pairs[0], 0, name).scale[0] for name in ("left", "right")] == [40, 43]
-    for wrong in (single, {**right, **place}, {**right, "calibration_eye": "left"}):
+    for invalid in (single, {**right, **pose}, {**right, "calibration_eye": "left"}):
         with message.raises(SceneError):
-            with_cameras({"left": left, "right": wrong})
+            with_cameras({"left": left, "right": invalid})
 
 
 def test_poses_of_a_moving_camera(small: Path, device: Device) -> None:
@@ -348,25 +348,24 @@ def test_pose_against_eye_and_target(message: Messages) -> None:
     pose = {"rotation": (matrix[:, :3] * 1.0004).tolist(), "translation": matrix[:, 3].tolist()}
     # A rounded rotation is made orthonormal.
     np.testing.assert_allclose(view(posed(pose=pose, fov=50)).matrix, view(by_eye).matrix, atol=1e-9)
-    for wrong in (matrix[:, :3] * 1.002, matrix[[1, 0, 2], :3]):
+    for invalid in (matrix[:, :3] * 1.002, matrix[[1, 0, 2], :3]):
         with message.raises(SceneError, "render.camera.pose.rotation"):
-            view(posed(pose={**pose, "rotation": wrong.round(3).tolist()}))
+            view(posed(pose={**pose, "rotation": invalid.round(3).tolist()}))
 
 
-STOP = [[0, 0, 0, 1, 1, 0, 0, 0]]
+POSE = [[0, 0, 0, 1, 1, 0, 0, 0]]
 
-
-WRONG_MOTIONS: dict[str, dict[str, Any]] = {
+INVALID_MOTIONS: dict[str, dict[str, Any]] = {
     "equal times": {"eye": [[0, 0, 0, 1], [0, 0, 0, 2]]},
     "eye at its target": {"eye": [0, 0, 1], "target": [[0, 0, 0, 0], [0.2, 0, 0, 1]]},
-    "eye and poses": {"eye": [0, 0, 1], "poses": STOP},
-    "equal times of poses": {"poses": [*STOP, *STOP]},
-    "poses and up": {"poses": STOP, "up": [0, 1, 0]},
+    "eye and poses": {"eye": [0, 0, 1], "poses": POSE},
+    "equal times of poses": {"poses": [*POSE, *POSE]},
+    "poses and up": {"poses": POSE, "up": [0, 1, 0]},
     "intrinsics and fov": {"eye": [0, 0, 1], "intrinsics": {"fx": 1, "fy": 1, "cx": 0, "cy": 0}, "fov": 30},
 }
 
 
-@pytest.mark.parametrize("camera", WRONG_MOTIONS.values(), ids=WRONG_MOTIONS)
+@pytest.mark.parametrize("camera", INVALID_MOTIONS.values(), ids=INVALID_MOTIONS)
 def test_invalid_motions(camera: dict[str, Any], message: Messages) -> None:
     with message.raises(SceneError, "camera."):
         view(Scene(**posed(eye=[0, 0, 1]).model_dump(exclude={"render"}), render={"camera": camera}))

@@ -68,7 +68,7 @@ def test_camera_argument(simulation: Simulation) -> None:
 INVALID_TIMES: list[Any] = [10**400, np.inf, np.float16(np.nan), np.complex64(1), True, "1", [0.1]]
 
 
-WRONG: dict[str, tuple[Callable[[Simulation, Any], object], list[Any]]] = {
+INVALID_ARGUMENTS: dict[str, tuple[Callable[[Simulation, Any], object], list[Any]]] = {
     "positions": (
         lambda simulation, value: simulation.draw(positions=value),
         [
@@ -114,9 +114,9 @@ WRONG: dict[str, tuple[Callable[[Simulation, Any], object], list[Any]]] = {
 NUMPY_TEXT = r"(np\.float16\()?nan\)?|(np\.complex64)?\(1\+0j\)|setting an array.*(?=; take)|0{99,}"
 
 
-@pytest.mark.parametrize("name", WRONG)
+@pytest.mark.parametrize("name", INVALID_ARGUMENTS)
 def test_invalid_arguments(name: str, simulation: Simulation, small: Path, message: Messages) -> None:
-    call, values = WRONG[name]
+    call, values = INVALID_ARGUMENTS[name]
     for value in values:
         with message.raises(SceneError if name in ("camera", "probe") else ArgumentError, hide=NUMPY_TEXT):
             call(simulation, value)

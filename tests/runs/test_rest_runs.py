@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -107,17 +106,12 @@ def test_residual_of_a_run(device: Device, tmp_path: Path) -> None:
 def test_resumed_run_has_the_same_bits(device: Device, tmp_path: Path) -> None:
     made = loaded().model_copy(update={"output": ("trajectory",)})
 
-    def stops_in(frame: int) -> Callable[[str, int, int], None]:
-        def progress(stage: str, done: int, _total: int) -> None:
-            if stage == "frames" and done == frame:
-                raise KeyboardInterrupt
-
-        return progress
+    def stop(stage: str, done: int, _total: int) -> None:
+        if (stage, done) == ("frames", 2):
+            raise KeyboardInterrupt
 
     whole = run(made, tmp_path / "whole", threads=device.threads)
-    with pytest.raises(KeyboardInterrupt):
-        run(made, tmp_path / "first", threads=device.threads, progress=stops_in(0))
-    record = run(made, tmp_path / "parts", threads=device.threads, progress=stops_in(2))
+    record = run(made, tmp_path / "parts", threads=device.threads, progress=stop)
     assert (record["status"], record["frames"]) == ("interrupted", 2)
     record = resume(tmp_path / "parts", threads=device.threads)
     assert (record["status"], record["resumed"], record["evaluations"]) == ("complete", 2, whole["evaluations"])
@@ -216,10 +210,7 @@ def test_warning_of_path_dependence(device: Device, tmp_path: Path) -> None:
         return [note for note in record["notes"] if note.startswith("path-dependent")]
 
     (note,) = notes(pulled_sideways(bending=1e-5), "wrinkled")
-    assert "loaded at once" in note
-    share = re.search(r"(\d+) % of the largest displacement", note)
-    assert share is not None
-    assert int(share[1]) >= 10
+    assert re.search(r"loaded at once.* \d\d % of the largest displacement", note)
     assert "tissue.pretension, bending or a stiffer foundation" in note
     assert not notes(pulled_sideways(2.0, pretension=20), "taut")
     assert not notes(loaded(), "held")
