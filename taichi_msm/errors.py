@@ -6,6 +6,7 @@ Only the command line prints errors or turns them into exit codes.
 from __future__ import annotations
 
 import errno
+import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -82,10 +83,11 @@ class ArgumentError(MsmError, ValueError):
 
 
 class DivergedError(MsmError):
-    """The simulation diverged; the message contains the time, the mass point and the remedy.
+    """The simulation diverged.
 
-    Attributes:
-        step: number of completed steps.
+    Args:
+        message: time, mass point, fault and remedy.
+        step: number of completed steps; like the following, also an attribute.
         time: simulated time [s].
         point: row and column of the mass point with the largest displacement.
     """
@@ -107,7 +109,15 @@ class ForeignError(FilesError):
 
     @classmethod
     def at(cls, path: object, kind: str) -> ForeignError:
-        """Build the error for a path and the kind of its entry, such as "a file"."""
+        """Build the error for an entry in the way of a result.
+
+        Args:
+            path: path of the entry.
+            kind: noun for the message, such as "a file"; see `directory.entry_kind`.
+
+        Returns:
+            The error, to be raised.
+        """
         return cls(f"{path}: {kind} that no run has put there; move it away or choose another folder")
 
 
@@ -130,7 +140,12 @@ def truncate(text: str) -> str:
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return a hint for a message about an unknown name: the most similar of the known names, or an empty text."""
+    """Return a hint for a message about an unknown name, such as "; did you mean 'top'?".
+
+    Args:
+        name: the unknown name; case is ignored.
+        known: valid names, of which the most similar is proposed; without a similar one, the hint is empty.
+    """
     # Imported here, as it is needed only for a message.
     from difflib import get_close_matches
 
@@ -141,11 +156,14 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 @contextmanager
 def writing(path: object, option: str = "--out") -> Iterator[None]:
-    """Convert an OSError of the block to a FilesError.
+    """Return a context that converts an OSError to a FilesError.
 
     Args:
         path: file or folder that the block writes to, for the message.
         option: command-line option that selects another one, for the remedy.
+
+    Raises:
+        FilesError: in place of the OSError; contains its reason and the remedy.
     """
     try:
         yield
@@ -155,12 +173,32 @@ def writing(path: object, option: str = "--out") -> Iterator[None]:
         raise FilesError(f"{path}: cannot write: {error.strerror or error}; {remedy}") from error
 
 
+def out_of_memory(error: Exception) -> str:
+    """Return a message with the remedy for a failed allocation of memory; empty for other errors."""
+    # Taichi prefixes the line of its source.
+    reason = re.sub(r"^\[.*?\] ", "", " ".join(str(error).split())).rstrip(".")
+    # The compilers and the encoder of pictures raise a RuntimeError.
+    if isinstance(error, MemoryError) or re.search(
+        r"MemoryError|memory allocation|out of memory", reason, re.IGNORECASE
+    ):
+        fault = f"out of memory: {reason}" if reason else "out of memory"
+        return f"{fault}; reduce sheet.points or render.size, or raise the limit of memory (ulimit -v)"
+    return ""
+
+
 # Limit of the numbers of processes and threads.
 MAX_WORKERS = 1024
 
 
 def as_array(values: Any, name: str) -> NDArray[Any]:
-    """Convert the argument `name` to an array.
+    """Convert an argument of a library call to an array.
+
+    Args:
+        values: the argument, an array or nested sequences.
+        name: name of the argument, for the message.
+
+    Returns:
+        An array of any shape and dtype; not copied if `values` is one.
 
     Raises:
         ArgumentError: when conversion fails, such as for rows of different lengths.
@@ -175,7 +213,12 @@ def as_array(values: Any, name: str) -> NDArray[Any]:
 
 
 def is_real_array(array: NDArray[Any], shape: tuple[int, ...]) -> bool:
-    """Return whether an array has a real dtype and the given shape."""
+    """Return whether an array has a real dtype and a given shape.
+
+    Args:
+        array: array of any dtype.
+        shape: expected shape, compared exactly.
+    """
     return array.dtype.kind in "fiu" and array.shape == shape
 
 
@@ -186,7 +229,16 @@ def require_frame_count(frames: int) -> None:
 
 
 def require_path(path: str | Path, name: str = "directory", remedy: str = "take a path") -> None:
-    """Raise an ArgumentError unless an argument is a path: a text or a Path without null characters."""
+    """Require that an argument of a library call is a path.
+
+    Args:
+        path: the argument.
+        name: name of the argument, for the message.
+        remedy: advice at the end of the message.
+
+    Raises:
+        ArgumentError: when it is neither a text nor a Path, or contains null characters.
+    """
     if not isinstance(path, (str, Path)) or "\0" in str(path):
         raise ArgumentError(f"{name}: {path!r}; {remedy}")
 

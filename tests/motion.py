@@ -1,4 +1,4 @@
-"""How a scene moves, and how far that is from the truth; for tests."""
+"""Motion of a scene, its error, and the warnings of a run."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from tests.scenes import plan_of
 
 
 def structure_of(made: Scene, device: Device, cores: int | None = None) -> SheetLayout:
-    """What the kernel of a scene's own steps is compiled for."""
+    """Layout for which the stepping kernel of a scene is compiled."""
     return choose_layout(plan_of(made), device, cores)
 
 
 def dynamics_of(made: Scene, device: Device, layout: SheetLayout | None = None) -> Dynamics:
-    """The sheet of a scene, with the scene's own steps."""
+    """Dynamics of a scene with its planned steps."""
     return Dynamics(plan_of(made), device, layout)
 
 
 def frames(made: Scene, device: Device, cut: int | None = None) -> NDArray[np.float64]:
-    """Displacements at every frame [m], shape (frames, rows, cols, 3); cut: steps in a frame, None: the scene's own."""
+    """Displacements at every frame [m], shape (frames, rows, cols, 3); `cut` replaces the steps per frame."""
     plan = plan_of(made)
     return frames_on(plan if cut is None else plan.with_grid(steps_per_frame=cut), device)
 
@@ -42,18 +42,18 @@ def frames(made: Scene, device: Device, cut: int | None = None) -> NDArray[np.fl
 def frames_on(plan: Plan, device: Device) -> NDArray[np.float64]:
     """Displacements at every frame of a plan [m], shape (frames, rows, cols, 3)."""
     dynamics = Dynamics(plan, device)
-    found = []
+    displacements = []
     for _ in range(plan.grid.frames):
         dynamics.advance(plan.grid.steps_per_frame)
-        found.append(dynamics.displacement().astype(np.float64))
+        displacements.append(dynamics.displacement().astype(np.float64))
     dynamics.close()
-    return np.array(found)
+    return np.array(displacements)
 
 
 def true_error(plan: Plan, device: Device, fine: int) -> float:
-    """Error of the steps and the precision of a plan, by a run in f64 that takes `fine` times as many steps.
+    """Error due to steps and rounding of a plan, relative to the largest displacement.
 
-    The error of that run itself is about 1 / fine² of the one found.
+    The reference is a run in f64 with `fine` times the number of steps; its error is about 1 / fine² of the result.
     """
     finer = plan.with_grid(precision="f64", steps_per_frame=fine * plan.grid.steps_per_frame)
     reference = frames_on(finer, device)
@@ -61,12 +61,12 @@ def true_error(plan: Plan, device: Device, fine: int) -> float:
 
 
 def estimate_error(plan: Plan, device: Device) -> TimeStepEstimate:
-    """The estimate of the error of a plan's steps by a fine companion run."""
+    """Time-step error of a plan, estimated by a fine companion run."""
     return TimeStepTrials(plan, device).estimate(plan.grid.steps_per_frame)
 
 
 def assert_steered_like(made: Scene, short: Scene, device: Device) -> None:
-    """A scene steered keyframe by keyframe, from its first one, moves to the bit like the scene with the whole path."""
+    """A scene steered keyframe by keyframe moves with the same bits as the scene with the whole path."""
     path: Any = made.probes[0].path
     with (
         Simulation(made, threads=device.threads) as expected,
@@ -90,6 +90,6 @@ def notes_of(
     mesh: MeshEstimate | None = None,
     affords: Callable[[Plan], bool] = lambda plan: True,
 ) -> list[str]:
-    """What is noted of a run of a scene."""
+    """Warnings of a run of a scene."""
     errors = RunErrorEstimates(estimate, mesh=mesh)
     return list(run_warnings(plan_of(made), probe_records(made), progress, errors, affords))

@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 
 from taichi_msm.cli import common, example, export, fit, options, run, study, sweep  # noqa: F401  # each registers its commands
-from taichi_msm.errors import DivergedError, FilesError, MsmError, SceneError
+from taichi_msm.errors import DivergedError, FilesError, MsmError, SceneError, out_of_memory
 from taichi_msm.system.process import discard_buffer, write_stderr
 
 
@@ -66,5 +66,7 @@ def _run(words: list[str]) -> tuple[int, Sequence[str]]:
     except Exception as error:
         if os.environ.get("TAICHI_MSM_TRACEBACK"):
             raise
+        if message := out_of_memory(error):
+            return common.INVALID_INPUT, [f"taichi-msm: {message}"]
         message = f"a bug: {type(error).__name__}: {' '.join(str(error).split())}"
         return common.BUG, [f"taichi-msm: {message}; please report it with what TAICHI_MSM_TRACEBACK=1 prints"]

@@ -178,7 +178,7 @@ def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
     another = "choose another camera by --camera, or " if FORMATS[name].cameras == ANY_CAMERA else ""
     with reading(path):
         # The limit is sufficient for 100,000 poses.
-        camera = json.loads(read_regular(run.require_own_file(path, FORMATS[name].required_outputs[0]), 1 << 25))
+        camera = json.loads(read_regular(run.require_regular_file(path, FORMATS[name].required_outputs[0]), 1 << 25))
         # Lenses other than the rational one distort even without coefficients.
         is_distorted = camera.get("model", "pinhole") != "pinhole" or bool(np.any(camera.get("distortion", ())))
         is_pinhole = "intrinsics" in camera

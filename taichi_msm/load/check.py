@@ -57,7 +57,12 @@ def validate(data: dict[str, Any]) -> tuple[Plan | None, list[Problem]]:
 
 
 def value_at(data: Any, key: Key) -> Any:
-    """Return the value of a key of plain data, or None if it is missing."""
+    """Return the value of a key of a scene that is not validated yet.
+
+    Args:
+        data: plain data, as parsed from YAML.
+        key: path to the value through mappings only; for a missing key the value is None.
+    """
     for part in key:
         data = data.get(part) if isinstance(data, dict) else None
     return data
@@ -91,6 +96,9 @@ def check_scene(scene: Plan | Scene | Mapping[str, Any], maps: Maps | None = Non
         scene: a scene, whose image file is not checked; a mapping of its keys; or a plan, which is returned as it is.
         maps: images of the scene's maps, by key; they are read from their files if None.
 
+    Returns:
+        The plan, whose `scene` is the validated scene.
+
     Raises:
         ArgumentError: when `scene` has another type.
         SceneError: when the scene is invalid; contains all problems.
@@ -102,7 +110,7 @@ def check_scene(scene: Plan | Scene | Mapping[str, Any], maps: Maps | None = Non
     elif isinstance(scene, Mapping):
         plan, problems = validate(dict(scene))
     else:
-        raise ArgumentError(f"{type(scene).__name__} is no scene; take what load_scene returns, or a mapping")
+        raise ArgumentError(f"{type(scene).__name__} is not a scene; take the Scene of load_scene, or a mapping")
     if plan is None or problems:
         raise SceneError([str(problem) for problem in problems])
     return plan
@@ -130,7 +138,15 @@ def _replace_faulty(data: dict[str, Any], problems: list[Problem]) -> dict[str, 
 
 
 def parse_model(model: type[Model], data: dict[str, Any]) -> tuple[Model | None, list[Problem]]:
-    """Validate the keys of a section separately; return it, or None if there are problems, and the problems."""
+    """Validate the keys of a section separately.
+
+    Args:
+        model: class of the section.
+        data: values by key, as parsed from YAML.
+
+    Returns:
+        The section and no problems, or None and a problem for each faulty key.
+    """
     try:
         return model.model_validate(data), []
     except ValidationError as error:

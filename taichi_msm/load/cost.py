@@ -74,8 +74,8 @@ OUTPUT_NUMBERS = 15
 class Budget:
     """Memory and disk space of a run."""
 
-    points: int
-    steps: int
+    points: int  # number of mass points
+    steps: int  # number of time steps
     frames: int  # including the initial one
     simulation_bytes: int  # memory for the state of the sheet and its output
     drawing_bytes: int  # memory for a frame and the texture; 0 if nothing is drawn
@@ -160,7 +160,15 @@ def size_problems(plan: Plan) -> Iterator[Problem]:
 
 
 def require_disk(plan: Plan, directory: Path) -> None:
-    """Raise a SceneError if there is not enough disk space for a run in a directory, which need not exist."""
+    """Require that a disk has enough free space for a run.
+
+    Args:
+        plan: plan of the run.
+        directory: destination of the results, which need not exist.
+
+    Raises:
+        SceneError: when an upper bound of the files exceeds the free space; names the key with the largest share.
+    """
     scene, budget, free = plan.scene, estimate_budget(plan), _free_disk(directory)
     needed = budget.disk_bytes + budget.working_bytes
     if needed <= free:

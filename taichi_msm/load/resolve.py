@@ -1,4 +1,7 @@
-"""Choice of the settings that a scene leaves open: mass points, time step and precision."""
+"""Choice of the settings that a scene leaves open: mass points, time step and precision.
+
+Unlike validation (check.py), this starts the compiler.
+"""
 
 from __future__ import annotations
 
@@ -23,14 +26,22 @@ class ResolvedPlan(NamedTuple):
 
 
 def resolve(plan: Plan, device: Device, progress: ProgressCallback = lambda done, total: None) -> ResolvedPlan:
-    """Choose the settings that a valid scene leaves open, by trial runs on the device if it has tolerances.
+    """Choose the settings that a scene leaves open, by trial runs if it has tolerances.
+
+    Args:
+        plan: plan of a valid scene, checked for a CPU.
+        device: device of the run and of the trial runs.
+        progress: called with the completed and the total work of the trial runs.
+
+    Returns:
+        The plan with a frozen grid, and the error estimates of the trial runs.
 
     Raises:
         SceneError: when a tolerance cannot be met, or the precision of the device does not suffice.
     """
     estimate = mesh = None
     plan = planning.choose_precision(plan, device.arch)
-    # The scene was checked for a CPU, where `auto` may choose another precision.
+    # On a CPU, `auto` may have chosen another precision.
     if problems := [str(problem) for problem in planning.precision_problems(plan)]:
         raise SceneError(problems)
     if plan.scene.sheet.tolerance is not None:

@@ -42,8 +42,8 @@ MAX_LINES = 100
 class FileKind(NamedTuple):
     """Kind of a YAML file: its name and its required keys, for messages."""
 
-    name: str
-    needs: str
+    name: str  # such as "scene"
+    needs: str  # list of the required keys
 
 
 class ParsedFile(NamedTuple):
@@ -89,7 +89,20 @@ def load_scene(
 def load_plan(
     path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = (), image: str | Path | None = None
 ) -> Plan:
-    """Read and validate a scene file, as `load_scene`, and plan the scene for a CPU."""
+    """Read and validate a scene file, and plan the scene for a CPU.
+
+    Args:
+        path: as for `load_scene`.
+        overrides: as for `load_scene`.
+        image: as for `load_scene`.
+
+    Returns:
+        The plan, with the SHA-256 of the files of cameras.
+
+    Raises:
+        ArgumentError: as for `load_scene`, or when `path` is a mapping.
+        SceneError: as for `load_scene`.
+    """
     if isinstance(path, Mapping):
         raise ArgumentError("path: a mapping; Scene(**mapping) is its scene, and load_scene reads a file")
     return plan_file(read_file(str(path), SCENE_KIND), overrides, image)
@@ -98,7 +111,20 @@ def load_plan(
 def plan_file(
     file: ParsedFile, overrides: Sequence[str] | Mapping[str, Any] = (), image: str | Path | None = None
 ) -> Plan:
-    """Validate a parsed scene file, with overrides and image as in `load_scene`, and plan the scene for a CPU."""
+    """Validate a parsed scene file, and plan the scene for a CPU.
+
+    Args:
+        file: the parsed file.
+        overrides: as for `load_scene`.
+        image: as for `load_scene`.
+
+    Returns:
+        The plan, with the SHA-256 of the files of cameras.
+
+    Raises:
+        ArgumentError: as for `load_scene`.
+        SceneError: as for `load_scene`, or when the file is a sweep.
+    """
     if isinstance(overrides, str) or not (
         isinstance(overrides, (Sequence, Mapping)) and all(isinstance(item, str) for item in overrides)
     ):
@@ -218,7 +244,12 @@ class Draft:
     def resolve_path(self, key: Key, folder: Path) -> None:
         """Convert the path of a file from relative to a folder to relative to the current directory.
 
-        A path that is neither in the folder nor in an override is a problem, and so is a camera's file that is missing.
+        A path that is neither below the folder nor in an override is recorded as a problem, and so is a missing file of
+        a camera.
+
+        Args:
+            key: key whose value is the path; other values are left to validation.
+            folder: folder of the scene file.
         """
         section, path = value_at(self.data, key[:-1]), value_at(self.data, key)
         if not (isinstance(path, str) and 0 < len(path) <= MAX_PATH):
@@ -288,7 +319,7 @@ class Draft:
             key = (*key, part)
             if n == len(path) - 1:
                 container[part] = value
-                self._overridden = {other: at for other, at in self._overridden.items() if other[: len(key)] != key}
+                self._overridden = {path: at for path, at in self._overridden.items() if path[: len(key)] != key}
                 self._overridden[key] = origin
             elif isinstance(container, dict) and part not in container:
                 container[part] = [] if isinstance(path[n + 1], int) else {}
@@ -298,7 +329,12 @@ class Draft:
 
 
 def is_below(path: Path, folder: Path) -> bool:
-    """Return whether a path, which need not exist, is a folder or below it, with symbolic links resolved."""
+    """Return whether a path is a folder or below it, with symbolic links resolved.
+
+    Args:
+        path: any path, which need not exist.
+        folder: the folder; both paths are relative to the current directory.
+    """
     try:
         return path.resolve().is_relative_to(folder.resolve())
     except (OSError, RuntimeError, ValueError):
@@ -308,6 +344,13 @@ def is_below(path: Path, folder: Path) -> bool:
 
 def read_file(name: str, kind: FileKind) -> ParsedFile:
     """Read and parse a YAML file of an expected kind.
+
+    Args:
+        name: path of the file, as in messages.
+        kind: name and required keys of such a file, for messages.
+
+    Returns:
+        The parsed file, whose keys are not validated.
 
     Raises:
         SceneError: when the file cannot be read or does not contain a mapping.
@@ -334,8 +377,8 @@ def _read_text(name: str, kind: FileKind) -> str:
     except ValueError:
         raise SceneError([f"{name}: not a path; name a {kind.name} file"]) from None
     except OSError as error:
-        similar = (other for other in path.parent.glob("*.y*ml") if isinstance(error, FileNotFoundError))
-        hint = next((f"; did you mean '{other}'?" for other in similar if other.stem == path.stem), "")
+        scenes = path.parent.glob("*.y*ml") if isinstance(error, FileNotFoundError) else ()
+        hint = next((f"; did you mean '{scene}'?" for scene in scenes if scene.stem == path.stem), "")
         raise SceneError([f"{name}: {(error.strerror or str(error)).lower()}{hint}"]) from None
     if len(raw) > MAX_BYTES:
         raise SceneError([f"{name}: larger than {MAX_BYTES // 2**20} MiB; a {kind.name} is smaller"])

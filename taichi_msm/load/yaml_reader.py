@@ -22,9 +22,6 @@ _TOO_DEEP = f"nested more than {MAX_DEPTH} deep; write it flatter"
 # Limit of the recorded faults, as a broken file may have tens of thousands.
 MAX_FAULTS = 1000
 
-# Longer plain scalars are texts, because Python cannot convert integers of several thousand digits.
-MAX_NUMBER_LENGTH = 100
-
 # Characters that YAML excludes, and line breaks of YAML that editors do not count, which would shift line numbers.
 _NOT_ALLOWED = re.compile("[^\t\n\r\x20-\x7e\xa0-\u2027\u202a-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
@@ -58,7 +55,12 @@ class Document(NamedTuple):
 
 
 class UnreadableError(Exception):
-    """The text is not YAML, or has too many values or too deep nesting."""
+    """The text is not YAML, or has too many values or too deep nesting.
+
+    Args:
+        mark: position of the fault.
+        message: the fault and the remedy, without the position.
+    """
 
     def __init__(self, mark: Mark, message: str) -> None:
         super().__init__(message)
@@ -80,7 +82,12 @@ def read_yaml(text: str) -> Document:
 
 
 def mark_at(text: str, index: int) -> Mark:
-    """Return the position of the character at an index."""
+    """Return the position of a character of a text.
+
+    Args:
+        text: the whole document.
+        index: index of the character, from 0.
+    """
     before = text[:index]
     return Mark(before.count("\n") + 1, index - before.rfind("\n"))
 
@@ -110,7 +117,8 @@ def _plain_value(text: str) -> Any:
     """Convert a plain scalar."""
     if text in _WORDS:
         return _WORDS[text]
-    if text[0] in "+-.0123456789" and len(text) <= MAX_NUMBER_LENGTH:
+    # Longer ones are texts, because Python cannot convert integers of several thousand digits.
+    if text[0] in "+-.0123456789" and len(text) <= 100:
         for pattern, convert in _NUMBERS:
             if pattern.fullmatch(text):
                 return convert(text)

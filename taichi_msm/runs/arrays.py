@@ -26,13 +26,18 @@ Shape = tuple[int, ...]
 class ChunkedArray(NamedTuple):
     """Array that is written chunk by chunk, as it may exceed memory."""
 
-    dtype: DTypeLike
-    shape: Shape
+    dtype: DTypeLike  # of all chunks
+    shape: Shape  # of the whole array
     chunks: Iterable[NDArray[Any]]  # contiguous; together the array's elements in C order
 
 
 def write_arrays(file: BinaryIO, arrays: Mapping[str, NDArray[Any] | ChunkedArray]) -> None:
-    """Write arrays, by name, to an uncompressed .npz archive. Equal arrays produce identical files."""
+    """Write arrays to an uncompressed .npz archive. Equal arrays produce identical files.
+
+    Args:
+        file: binary file, open for writing at its start.
+        arrays: arrays by name, of any dtype without objects.
+    """
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         for name, array in arrays.items():
             chunked = array if isinstance(array, ChunkedArray) else ChunkedArray(array.dtype, array.shape, _rows(array))
@@ -50,7 +55,16 @@ def _rows(array: NDArray[Any]) -> Iterable[NDArray[Any]]:
 
 
 def read_array(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, shape: Shape) -> NDArray[Any]:
-    """Read an array of the expected dtype and shape, read-only, and verify its CRC-32.
+    """Read an array of the expected dtype and shape, and verify its CRC-32.
+
+    Args:
+        archive: open .npz archive.
+        name: name of the array, without ".npy".
+        dtype: expected dtype.
+        shape: expected shape.
+
+    Returns:
+        The array, read-only.
 
     Raises:
         ValueError: when dtype or shape differ; raised before memory is allocated.
@@ -64,14 +78,37 @@ def read_array(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, shape: Sha
 
 
 def read_rows(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, row_shape: Shape) -> NDArray[Any]:
-    """Read an array of any number of rows, shape (rows, *row_shape); otherwise as `read_array`."""
+    """Read an array with any number of rows.
+
+    Args:
+        archive: as for `read_array`.
+        name: as for `read_array`.
+        dtype: as for `read_array`.
+        row_shape: expected shape without the first axis.
+
+    Returns:
+        The array, shape (rows, *row_shape), read-only.
+    """
     header_bytes, row_bytes = len(_header(dtype, (0, *row_shape))), math.prod(row_shape) * np.dtype(dtype).itemsize
     rows = (archive.getinfo(f"{name}.npy").file_size - header_bytes) // row_bytes
     return read_array(archive, name, dtype, (max(0, rows), *row_shape))
 
 
 def map_array(path: Path, name: str, dtype: DTypeLike, shape: Shape) -> NDArray[Any]:
-    """Map an array, not empty, into memory; otherwise as `read_array`."""
+    """Map an array of the expected dtype and shape into memory, and verify its CRC-32.
+
+    Args:
+        path: .npz archive.
+        name: as for `read_array`.
+        dtype: as for `read_array`.
+        shape: as for `read_array`; not empty.
+
+    Returns:
+        The array, read-only.
+
+    Raises:
+        ValueError: as for `read_array`, or when the CRC-32 differs.
+    """
     header = _header(dtype, shape)
     with path.open("rb") as file, zipfile.ZipFile(file) as archive:
         info = _entry(archive, name, dtype, shape)
@@ -104,16 +141,29 @@ def _header(dtype: DTypeLike, shape: Shape) -> bytes:
 
 
 def write_flo(file: BinaryIO, flow: NDArray[np.float32]) -> None:
-    """Write optical flow to the right and down [px], shape (height, width, 2), as .flo."""
+    """Write optical flow as .flo.
+
+    Args:
+        file: binary file, open for writing.
+        flow: displacement to the right and down [px], shape (height, width, 2).
+    """
     height, width, _ = flow.shape
     file.write(_flo_header(width, height))
     file.write(np.ascontiguousarray(flow, "<f4").data)
 
 
 def read_flo(path: Path, size: tuple[int, int]) -> NDArray[np.float32]:
-    """Read optical flow to the right and down [px], shape (height, width, 2), read-only.
+    """Read optical flow from a .flo file.
 
-    Raises a ValueError when the file does not contain flow of the given width and height [px].
+    Args:
+        path: the file.
+        size: expected width and height [px].
+
+    Returns:
+        Displacement to the right and down [px], shape (height, width, 2), read-only.
+
+    Raises:
+        ValueError: when the file does not contain a flow of this size.
     """
     width, height = size
     header, length = _flo_header(width, height), 8 * width * height

@@ -46,19 +46,13 @@ CHECKPOINT_PATTERNS = (
     r"(?:manifest\.json|positions|forces)",  # of earlier versions
 )
 
-# A manifest contains the scene twice; a scene file may have 1 MiB.
-MAX_MANIFEST_BYTES = 1 << 26
-
-# Upper bound of the time spent on saving states, as a fraction of the run's time.
-MAX_SAVE_TIME_FRACTION = 0.02
-
 # Numbers of a `TipForce`, tip and force, and of a `PeakForce`, time and force.
 FORCE_COLUMNS, PEAK_FORCE_COLUMNS = 6, 4
 
 
 @dataclass(frozen=True)
 class Manifest:
-    """Inputs of a run."""
+    """Inputs of a run, from which another process continues it to the same bits."""
 
     given: Scene  # as loaded
     scene: Scene  # with resolved mesh, step and precision
@@ -76,11 +70,14 @@ class Manifest:
         return cast(dict[str, Any], _MANIFEST_ADAPTER.dump_python(self, mode="json"))
 
     def require_same_inputs(self, sha256: Mapping[str, str], versions: Mapping[str, str]) -> None:
-        """Raise a FilesError if a file or a version has changed, so that resuming might not yield the same bits.
+        """Require that resuming the run yields the same bits as a run without interruption.
 
         Args:
             sha256: current digests of picture, maps and cameras, from `input_digests`.
-            versions: current versions.
+            versions: current versions of software, by name.
+
+        Raises:
+            FilesError: when a file or a version has changed.
         """
         for key, path in self.scene.pictures.items():
             if sha256.get(key) != self.sha256.get(key):
@@ -90,12 +87,12 @@ class Manifest:
             # If the run began with a tested compiler, and the current one is untested, only the latter is compared.
             changed = any(version != current.get(name) for name, version in original.items())
             named = original if changed else self.versions
-            others = [f"{name} {version}" for name, version in named.items() if version != versions.get(name)]
-            raise FilesError(f"the run began with {', '.join(others)}; use these versions, or run the scene again")
+            differing = [f"{name} {version}" for name, version in named.items() if version != versions.get(name)]
+            raise FilesError(f"the run began with {', '.join(differing)}; use these versions, or run the scene again")
 
-    def has_same_bits_as(self, other: Manifest) -> bool:
-        """Return whether both runs produce results with the same bits, so that one can continue the other."""
-        return self._result_inputs() == other._result_inputs()
+    def has_same_bits_as(self, manifest: Manifest) -> bool:
+        """Return whether both runs produce results with the same bits, so that either can continue the other."""
+        return self._result_inputs() == manifest._result_inputs()
 
     def _result_inputs(self) -> tuple[Any, ...]:
         # Pictures are compared by digest, not by path.
@@ -172,7 +169,8 @@ def _open_state(directory: Path) -> BinaryIO:
 
 
 def _manifest_bytes(archive: zipfile.ZipFile) -> bytes:
-    if archive.getinfo("manifest.npy").file_size > MAX_MANIFEST_BYTES:
+    # A manifest contains the scene twice; a scene file may have 1 MiB.
+    if archive.getinfo("manifest.npy").file_size > 1 << 26:
         raise ValueError("too large")
     return read_rows(archive, "manifest", np.uint8, ()).tobytes()
 
@@ -249,7 +247,12 @@ class Checkpoint:
         return saved
 
     def add(self, position: NDArray[Any], forces: Sequence[TipForce]) -> None:
-        """Store the next frame: positions of the mass points [m], shape (rows, cols, 3), and forces of all probes."""
+        """Store the next frame.
+
+        Args:
+            position: positions of the mass points [m], shape (rows, cols, 3).
+            forces: force of every probe; stored only for scenes that output forces.
+        """
         if self._file:
             parts = np.ascontiguousarray(position, self.precision), _tip_force_array(forces)[: self._stored_probes]
             self._file.seek(self.frames * self._record.itemsize)
@@ -275,7 +278,8 @@ class Checkpoint:
         start = time.perf_counter()
         self._write_state(_state_arrays(saved))
         now = time.perf_counter()
-        self._next_save = now + (now - start) / MAX_SAVE_TIME_FRACTION
+        # Saving takes at most 2 % of the run's time.
+        self._next_save = now + (now - start) / 0.02
         return str(self._state_path)
 
     def load(self) -> Snapshot | None:

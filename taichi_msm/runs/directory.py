@@ -233,16 +233,35 @@ def entry_kind(path: Path) -> str | None:
 
 
 def require_kind(path: Path, wanted: str) -> Path:
-    """Return a path; raise a ForeignError if it exists and is not of the `wanted` kind, FILE or FOLDER."""
+    """Require that an entry is of the expected kind, or missing.
+
+    Args:
+        path: path of the entry.
+        wanted: expected kind, FILE or FOLDER.
+
+    Returns:
+        The path.
+
+    Raises:
+        ForeignError: when the entry is of another kind, such as a link.
+    """
     if (actual := entry_kind(path)) not in (None, wanted):
         raise ForeignError.at(path, str(actual))
     return path
 
 
 def require_no_link(folder: Path, option: str) -> Path:
-    """Return a default folder; raise a FilesError if it is a link, which may have come with the scene.
+    """Require that a default folder is not a link, which may have come with the scene.
 
-    `option` is the command-line option that selects another folder.
+    Args:
+        folder: the folder, which may be missing.
+        option: command-line option that selects another folder, for the remedy.
+
+    Returns:
+        The folder.
+
+    Raises:
+        FilesError: when it is a link or cannot be read.
     """
     try:
         is_link = folder.is_symlink()
@@ -254,13 +273,16 @@ def require_no_link(folder: Path, option: str) -> Path:
 
 
 def list_files(top: Path, patterns: Collection[str], *, strict: bool, ignored: Collection[str] = ()) -> Iterator[str]:
-    """List the files below a folder whose relative paths, with slashes, match a pattern. Links are not followed.
+    """List the files below a folder whose relative paths match a pattern. Links are not followed.
 
     Args:
         top: the folder.
         patterns: regular expressions of relative paths; their parts before slashes match the subfolders.
         strict: whether other entries are errors.
         ignored: names of entries to ignore.
+
+    Returns:
+        Paths relative to `top`, with slashes.
 
     Raises:
         ForeignError: with `strict`, at the first entry that matches no pattern.
@@ -293,10 +315,7 @@ if sys.platform == "win32":
 else:
     import fcntl
 
-HIDDEN_FOLDER_PATTERN, LOCK_FILE, DRAFT_FILE = r"\.partial-[0-9a-f]{16}", "lock", "draft"
-
-# Files that a hidden folder may contain.
-STAGED_PATTERN = r"lock|draft|picture|session|copy|animation\.(?:gif|mp4)|study\.(?:png|md|json)|sweep\.json"
+LOCK_FILE, DRAFT_FILE = "lock", "draft"
 
 
 @contextmanager
@@ -332,10 +351,11 @@ def hidden_folder(folder: Path) -> Iterator[Path]:
 
 def _clear_abandoned(folder: Path) -> None:
     for hidden in list(folder.iterdir()):
-        if re.fullmatch(HIDDEN_FOLDER_PATTERN, hidden.name) and entry_kind(hidden) == FOLDER:
+        if re.fullmatch(r"\.partial-[0-9a-f]{16}", hidden.name) and entry_kind(hidden) == FOLDER:
             # Folders that are locked, incomplete, of another user or with foreign files are kept.
             with suppress(OSError, FilesError):
-                list(list_files(hidden, [STAGED_PATTERN], strict=True))
+                staged = r"lock|draft|picture|session|copy|animation\.(?:gif|mp4)|study\.(?:png|md|json)|sweep\.json"
+                list(list_files(hidden, [staged], strict=True))
                 if entry_kind(hidden / LOCK_FILE) == FILE:
                     with (hidden / LOCK_FILE).open("ab", 0) as file:
                         is_abandoned = _try_lock(file)
@@ -353,7 +373,17 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 
 
 def move_to_free_name(draft: Path, folder: Path, stem: str, suffix: str) -> Path:
-    """Move a file to the first free name of stem-1, stem-2 and so on plus suffix; return the new path."""
+    """Move a file to the first free name in a folder: stem-1.suffix, stem-2.suffix and so on.
+
+    Args:
+        draft: the file, on the same file system.
+        folder: destination.
+        stem: name without number and suffix.
+        suffix: suffix with its dot.
+
+    Returns:
+        The new path.
+    """
     number = 1
     while os.path.lexists(path := folder / f"{stem}-{number}{suffix}") or not link_without_replacing(draft, path):
         number += 1
@@ -361,7 +391,15 @@ def move_to_free_name(draft: Path, folder: Path, stem: str, suffix: str) -> Path
 
 
 def link_without_replacing(draft: Path, path: Path) -> bool:
-    """Link a file to a new path; return False if the path exists already."""
+    """Link a file to a new path, or move it there on a file system without links.
+
+    Args:
+        draft: the file, on the same file system.
+        path: the new path; an existing file is not replaced, except without links in a race with another process.
+
+    Returns:
+        Whether the path was free.
+    """
     try:
         # A rename would replace an existing file.
         os.link(draft, path)
@@ -373,12 +411,31 @@ def link_without_replacing(draft: Path, path: Path) -> bool:
 
 
 def create_file(path: Path, buffering: int = -1) -> BinaryIO:
-    """Create a file and open it for writing and reading; raise a FileExistsError if the path exists."""
+    """Create a file and open it for writing and reading.
+
+    Args:
+        path: path of the file.
+        buffering: size of the buffer [bytes], as for `open`; -1 for its default, 0 for none.
+
+    Returns:
+        The open file.
+
+    Raises:
+        FileExistsError: when the path exists.
+    """
     return path.open("x+b", buffering)
 
 
 def write_new_file(path: Path, data: bytes) -> None:
-    """Create a file with some content; raise a FileExistsError if the path exists."""
+    """Create a file with its content.
+
+    Args:
+        path: path of the file.
+        data: the content.
+
+    Raises:
+        FileExistsError: when the path exists.
+    """
     with create_file(path) as file:
         file.write(data)
 
@@ -386,7 +443,8 @@ def write_new_file(path: Path, data: bytes) -> None:
 def lock_file(path: Path) -> BinaryIO:
     """Lock a file, created if missing, until it is closed here and in all processes that inherit it.
 
-    Raises a BlockingIOError when another process holds the lock.
+    Raises:
+        BlockingIOError: when another process holds the lock.
     """
     file = path.open("ab", 0)
     try:

@@ -149,11 +149,6 @@ def _write_still(picture: Picture, path: Path) -> float:
     return time.thread_time() - start
 
 
-# With the parent's sys.path, the child imports the same package. Unlike a child of multiprocessing, it does not import
-# the caller's main module, so that scripts need no guard.
-_CHILD_CODE = "import sys; sys.path[:] = {path!r}; from taichi_msm.runs.encoder import main; main()"
-
-
 class Encoder:
     """Child process that encodes pictures.
 
@@ -166,8 +161,11 @@ class Encoder:
     """
 
     def __init__(self, job: EncodingJob, inherit: tuple[int, ...] = ()) -> None:
+        # With the parent's sys.path, the child imports the same package. Unlike a child of multiprocessing, it does not
+        # import the caller's main module, so that scripts need no guard.
+        code = f"import sys; sys.path[:] = {sys.path!r}; from taichi_msm.runs.encoder import main; main()"
         self._process = subprocess.Popen(
-            [sys.executable, "-c", _CHILD_CODE.format(path=sys.path)],
+            [sys.executable, "-c", code],
             bufsize=0,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,

@@ -50,9 +50,13 @@ class FinishedRun:
         return np.arange(self.frames) / self.scene.time.frames_per_second
 
     def positions(self) -> NDArray[np.floating]:
-        """Map the positions of the mass points [m], shape (frames, rows, cols, 3), into memory, read-only.
+        """Map the trajectory into memory.
 
-        Raises a FilesError when the trajectory is missing, damaged or of another run.
+        Returns:
+            Positions of the mass points [m], shape (frames, rows, cols, 3), read-only.
+
+        Raises:
+            FilesError: when the trajectory is missing, damaged or of another run.
         """
         path = self.result_path("trajectory")
         dtype = np.dtype(np.float32 if self.scene.time.precision == "f32" else np.float64)
@@ -68,9 +72,17 @@ class FinishedRun:
         return positions
 
     def read_picture(self, key: str, frame: int) -> NDArray[np.uint8]:
-        """Read the picture of a frame, shape (height, width, 3), that an entry of `output`, such as "png", wrote.
+        """Read the picture of a frame.
 
-        Raises a FilesError when it is missing, cannot be decoded or has the wrong size.
+        Args:
+            key: entry of `output` that wrote the picture, such as "png".
+            frame: index of the frame.
+
+        Returns:
+            Colours, shape (height, width, 3).
+
+        Raises:
+            FilesError: when the picture is missing, cannot be decoded or has the wrong size.
         """
         path = self.result_path(key, frame)
         try:
@@ -83,7 +95,7 @@ class FinishedRun:
 
     @contextmanager
     def unchanged(self) -> Iterator[None]:
-        """Raise a FilesError, instead of other errors, if another run replaces the results within the block."""
+        """Return a context that raises a FilesError if another run replaces the results meanwhile."""
         try:
             yield
         except MsmError:
@@ -133,21 +145,33 @@ class FinishedRun:
         return f'run the scene again with --set "output=[{outputs}]"'
 
     def result_path(self, key: str, frame: int = 0) -> Path:
-        """Return the path of the file that an entry of `output` wrote, for a frame if it wrote one per frame.
+        """Return the path of the file that an entry of `output` wrote.
 
-        Raises a FilesError when the file is missing or is not a regular file of the run.
+        Args:
+            key: entry of `output`.
+            frame: index of the frame, if the entry writes a file per frame.
+
+        Raises:
+            FilesError: when the file is missing or is not a regular file of the run.
         """
         result, folder = OUTPUTS[key].result, self._output_folder(key)
         path = folder / OUTPUTS[key].path(frame)
         if not self.has_output(key):
             raise FilesError(f"{result}: not among the results of {folder}; {self.remedy(key)}")
-        return self.require_own_file(path, key)
+        return self.require_regular_file(path, key)
 
-    def require_own_file(self, path: Path, key: str) -> Path:
-        """Return a path below the run's folder; raise a FilesError unless it is a regular file, reached without links.
+    def require_regular_file(self, path: Path, key: str) -> Path:
+        """Require that a path leads to a regular file without passing a link, which could expose other files.
 
-        In untrusted results, a link could make an export expose other files. `key` is the entry of `output` that writes
-        the file, for messages.
+        Args:
+            path: path below the run's folder.
+            key: entry of `output` that writes the file, for the remedy.
+
+        Returns:
+            The path.
+
+        Raises:
+            FilesError: when the file is missing, or an entry on the path is of another kind.
         """
         below = path.relative_to(self.directory)
         for inner in [*list(below.parents)[-2::-1], below]:
@@ -164,7 +188,9 @@ class FinishedRun:
 def read_run(directory: str | Path) -> FinishedRun:
     """Read the record of a finished run, run.json; other results are read on demand.
 
-    Raises an ArgumentError when the directory is no path, a FilesError when the record is missing or invalid.
+    Raises:
+        ArgumentError: when the directory is not a path.
+        FilesError: when the record is missing or invalid.
     """
     require_path(directory)
     path = Path(directory) / RUN_RECORD
@@ -188,7 +214,7 @@ def read_run(directory: str | Path) -> FinishedRun:
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Convert any exception in the block to a FilesError; damaged archives and records raise many types."""
+    """Return a context that converts exceptions to FilesErrors; damaged archives and records raise many types."""
     try:
         yield
     except (FilesError, ImportError):

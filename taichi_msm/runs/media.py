@@ -43,11 +43,14 @@ def predict_colours(picture: Picture) -> Picture:
 
 
 class Palette:
-    """Colour palette of an animation; `table` has the colours, shape (256, 3).
+    """Colour palette of an animation.
 
     Args:
         samples: typical colours, shape (n, m, 3).
         background: a colour that the palette contains exactly.
+
+    Attributes:
+        table: the colours, shape (256, 3); unused entries are black.
     """
 
     def __init__(self, samples: Picture, background: tuple[int, int, int]) -> None:

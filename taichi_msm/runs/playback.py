@@ -77,6 +77,9 @@ class Playback:
         Args:
             frame: index of the frame.
             camera: as for `Simulation.draw`.
+
+        Returns:
+            As for `Simulation.labels`.
         """
         return self._simulation.labels(camera, *self._frame_state(frame))
 
@@ -88,6 +91,9 @@ class Playback:
             second: index of the second frame; may be the first one or earlier.
             camera: camera of the first frame, as for `Simulation.draw`.
             camera_then: camera of the second frame; None for the same camera.
+
+        Returns:
+            As for `Simulation.flow`.
         """
         then = camera if camera_then is None else camera_then
         return self._simulation.flow(self.labels(first, camera), then, *self._frame_state(second))
@@ -99,6 +105,9 @@ class Playback:
             frame: index of the frame.
             coordinates: as for `Simulation.locate`, shape (n, 2).
             camera: as for `Simulation.draw`.
+
+        Returns:
+            As for `Simulation.locate`.
         """
         return self._simulation.locate(coordinates, camera, *self._frame_state(frame))
 

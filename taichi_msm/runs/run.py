@@ -212,7 +212,7 @@ def _with_versions(manifest: Manifest) -> Manifest:
 class _RunContext(NamedTuple):
     """Inputs, device and destination of a run."""
 
-    manifest: Manifest
+    manifest: Manifest  # inputs on which the results depend
     plan: Plan  # of the manifest's resolved scene
     texture: NDArray[np.uint8] | None  # the picture on the sheet, if the scene is drawn
     device: Device

@@ -252,7 +252,7 @@ class Simulation:
         """
         self._require_open()
         if not isinstance(saved, Snapshot):
-            raise ArgumentError(f"{type(saved).__name__} is not what `save` returns")
+            raise ArgumentError(f"{type(saved).__name__} is not a Snapshot; take one of `save`")
         state, per_frame = saved.state, self._plan.grid.steps_per_frame
         steps_in_frame = state.steps - saved.progress.frame * per_frame
         current = self._dynamics.displacement()
@@ -305,12 +305,15 @@ class Simulation:
             start: an earlier state from `save`, from which the simulation is repeated; None for the initial state.
             pause: called several times a second; an exception from it stops the search.
 
+        Returns:
+            The cause with its remedy, and the last valid state.
+
         Raises:
             MsmError: when the simulation has not diverged.
         """
         self._require_open()
         if self._divergence is None:
-            raise MsmError("this simulation has not diverged; there is nothing to find out")
+            raise MsmError("this simulation has not diverged; there is nothing to diagnose")
         if self.scene.time.at_rest:
             last_state = None if self._frame_positions is None else self._snapshot()
             return Diagnosis(str(self._divergence), last_state)
@@ -344,6 +347,9 @@ class Simulation:
             positions: as for `draw`.
             time: as for `draw`.
 
+        Returns:
+            A value or vector per pixel: arrays of shape (height, width) or (height, width, components).
+
         Raises:
             SceneError: as for `draw`.
             DeviceError: as for `draw`.
@@ -361,6 +367,9 @@ class Simulation:
             camera: as for `draw`.
             positions: as for `draw`.
             time: as for `draw`.
+
+        Returns:
+            Displacement to the right and down [px], shape (height, width, 2), and occlusion, shape (height, width).
         """
         return self.renderer.flow(before, self._shot(camera, positions, time))
 
@@ -374,6 +383,9 @@ class Simulation:
             camera: as for `draw`.
             positions: as for `draw`.
             time: as for `draw`.
+
+        Returns:
+            Pixels to the right and down, shape (n, 2), and occlusion, shape (n,).
         """
         return self.renderer.locate(coordinates, self._shot(camera, positions, time))
 
@@ -387,6 +399,9 @@ class Simulation:
         Returns:
             Fractions of the sheet's width from its left and of its height from its top, as in a probe's `at`; None for
             the background.
+
+        Raises:
+            ArgumentError: when `pixel` is not a pair of finite numbers.
         """
         point = as_array(pixel, "pixel")
         if not (is_real_array(point, (2,)) and np.isfinite(point).all()):
@@ -408,6 +423,9 @@ class Simulation:
             camera: as for `draw`.
             positions: as for `draw`.
             time: as for `draw`.
+
+        Returns:
+            The requested outputs; None for others.
         """
         return self.renderer.observe(before, self._shot(camera, positions, time))
 
@@ -417,6 +435,9 @@ class Simulation:
         Args:
             frames: number of frames to simulate after the current one, which is also shown.
             camera: as for `draw`.
+
+        Returns:
+            A player with `frames` + 1 pictures, which a notebook displays.
         """
         require_frame_count(frames)
         pictures = [self.draw(camera)]
@@ -464,7 +485,7 @@ class Simulation:
         self.close()
 
     def __reduce__(self) -> Any:
-        remedy = "keep its `scene` and what `save` returns, and `restore` that in a new one"
+        remedy = "keep its `scene` and the Snapshot of `save`, and `restore` it in a new one"
         raise MsmError(f"a Simulation cannot be pickled or copied; {remedy}")
 
     def _solve_first_frame(self, pause: Pause = lambda: None) -> None:

@@ -139,7 +139,7 @@ class ResultWriter:
         return self.stored_frames > 0 and self._checkpoint.is_save_due
 
     def save(self, saved: Snapshot) -> str:
-        """Save a state of the run in the checkpoint; return the path of the file."""
+        """Save a state of the run in the checkpoint, and return the path of the file."""
         with writing(self._directory):
             return self._checkpoint.save(saved)
 
@@ -211,7 +211,13 @@ class ResultWriter:
 
 
 class LabelWriter:
-    """Writer of the labels of a camera, frame by frame; an unnamed camera has an empty name."""
+    """Writer of the labels of a camera, frame by frame.
+
+    Args:
+        folder: destination of the labels.
+        scene: the resolved scene.
+        camera: name of the camera; empty for an unnamed one.
+    """
 
     def __init__(self, folder: Path, scene: Scene, camera: str) -> None:
         self._folder, self._scene, self._camera = folder, scene, camera
@@ -226,7 +232,13 @@ class LabelWriter:
         self._added = 0
 
     def add(self, frame: int, observed: FrameOutputs, position: NDArray[Any]) -> None:
-        """Write the labels of a frame, and the tracks with positions of mass points [m], shape (rows, cols, 3)."""
+        """Write the labels of a frame; tracks are kept until `finish`.
+
+        Args:
+            frame: index of the frame.
+            observed: labels of the camera in this frame.
+            position: positions of the mass points [m], shape (rows, cols, 3).
+        """
         self._added = frame + 1
         for output in self._frame_outputs:
             number = frame - 1 if output.is_frame_pair else frame
@@ -315,11 +327,11 @@ class RunRecord(TypedDict, total=False):
     error_estimate_reason: str
     resumed: int  # number of frames simulated before the run was resumed
     timings: dict[str, float]  # time of every stage [s]
-    arch: str
-    device: str
-    threads: int
-    lanes: int
-    workers: int
+    arch: str  # cpu, cuda or vulkan
+    device: str  # name of the processor or the GPU; empty if unknown
+    threads: int  # number of CPU threads of the compiler
+    lanes: int  # number of SIMD lanes used for stepping; 1 on a GPU
+    workers: int  # number of threads used for stepping; 0 on a GPU
     versions: dict[str, str]  # of all software that affects the results
     commit: str | None  # of the program, by git; None if it does not run from a clone
     frames: int

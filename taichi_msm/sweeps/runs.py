@@ -282,7 +282,8 @@ def execute_run(task: RunTask, progress: StageProgressCallback = lambda stage, d
     except errors.MsmError as error:
         status, reason = "failed", str(error)
     except Exception as error:
-        status, reason = "failed", f"a bug, please report it: {type(error).__name__}: {error}"
+        bug = f"a bug, please report it: {type(error).__name__}: {error}"
+        status, reason = "failed", errors.out_of_memory(error) or bug
     # The reason is independent of absolute paths. The path of a picture follows a space.
     reason = " ".join(reason.split()).replace(str(task.directory), task.directory.name)
     return Outcome(task.run, status, reason.replace(f" {task.scene.folder / '_'}"[:-1], " "))

@@ -20,6 +20,9 @@ def read_regular(path: str | Path, limit: int) -> bytes:
         path: the file; symbolic links are followed.
         limit: largest size [bytes].
 
+    Returns:
+        The content.
+
     Raises:
         OSError: when the file cannot be read, is not a regular file or exceeds the limit; `strerror` has the reason.
         ValueError: when the path is invalid.

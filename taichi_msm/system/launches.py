@@ -46,7 +46,15 @@ class Launches:
         self._ended = self.upload(np.array([0, PROOF_ROUNDS if bounded else 0], np.int32))
 
     def array(self, dtype: DTypeLike, length: int) -> Any:
-        """Allocate an uninitialised array on the device, shape (length,)."""
+        """Allocate an uninitialised array on the device.
+
+        Args:
+            dtype: type of the entries, an integer or a real number.
+            length: number of entries.
+
+        Returns:
+            A Taichi array of shape (length,); a NumPy array unless `bounded`.
+        """
         if not self.bounded:
             return np.empty(length, dtype)
         kind = np.dtype(dtype)

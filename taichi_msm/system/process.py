@@ -198,7 +198,12 @@ def discard_buffer(stream: TextIO) -> None:
 
 @contextmanager
 def discarded_output(*descriptors: int, into: str = os.devnull) -> Iterator[None]:
-    """Redirect file descriptors to a file, to capture or discard the output of libraries; closed ones stay closed."""
+    """Return a context in which file descriptors lead to a file, to capture or discard the output of libraries.
+
+    Args:
+        *descriptors: file descriptors such as 2 for stderr; closed ones stay closed.
+        into: file that is replaced by the output.
+    """
     with _redirecting, Path(into).open("wb") as sink:
         copies = {}
         for descriptor in descriptors:

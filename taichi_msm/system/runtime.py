@@ -63,12 +63,15 @@ class Memory:
         weakref.finalize(self, _recycle, self._arrays, _free)
 
     def array(self, precision: str, lanes: int, length: int) -> Any:
-        """Allocate a one-dimensional array, or reuse a longer one; its content is arbitrary.
+        """Allocate an array, or reuse a longer one; its content is arbitrary.
 
         Args:
             precision: f32 or f64.
             lanes: number of components of each entry, a vector; 0 for scalar entries.
-            length: number of entries.
+            length: smallest number of entries.
+
+        Returns:
+            A Taichi array of at least `length` entries.
         """
         kind = precision, lanes
         fitting = [array for array in _free[kind] if array.shape[0] >= length]
@@ -83,7 +86,12 @@ class Memory:
 
 
 def write_vectors(array: Any, values: NDArray[Any]) -> None:
-    """Write vectors, shape (entries, lanes), to the first entries of an array, and zeros to the remaining ones."""
+    """Write vectors to the first entries of an array, and zeros to the remaining ones.
+
+    Args:
+        array: Taichi array of f32 or f64 vectors.
+        values: the vectors, shape (entries, lanes), converted to the array's precision.
+    """
     real = np.float32 if array.dtype == ti.f32 else np.float64
     array.from_numpy(np.pad(values.astype(real), ((0, array.shape[0] - len(values)), (0, 0))))
 
@@ -127,6 +135,9 @@ def start(arch: str = "cpu", threads: int | None = None) -> Device:
     Args:
         arch: cpu, cuda or vulkan.
         threads: number of CPU threads, or None for one per available core.
+
+    Returns:
+        The device, with its name.
 
     Raises:
         ArgumentError: when the number of threads is invalid.
@@ -266,7 +277,7 @@ def _isolated_environment() -> Iterator[None]:
     stdout itself is not redirected, because other threads may print meanwhile.
     """
     prefix, namespace = f"{active_compiler().prefix}_", vars(ti.lang.misc)
-    # Directories and the choice of a GPU are no arguments.
+    # Directories and the choice of a GPU are not arguments.
     kept = tuple(prefix + name for name in ("OFFLINE_CACHE_FILE_PATH", "VISIBLE_DEVICE", "LIB_DIR", "SKIP_"))
     names = [name for name in os.environ if name.startswith(prefix) and not name.startswith(kept)]
     hidden = {name: os.environ.pop(name) for name in names}
@@ -300,7 +311,7 @@ def _initialise(device: Device) -> str:
                 ti.set_logging_level(ti.ERROR)
             gpu_name = re.search(r'Vulkan Device "(.+)" supports|CUDA device \[id=\d+\]: (.+)', log.read())
     except Exception as error:
-        remedy = f"{active_compiler().title} says: {' '.join(str(error).split())}" if on_cpu else "take --arch cpu"
+        remedy = f"{active_compiler().title} reports: {' '.join(str(error).split())}" if on_cpu else "take --arch cpu"
         raise DeviceError(f"--arch {device.arch}: not available on this machine; {remedy}") from error
     # Taichi starts the threads of its pool last.
     _pin([thread for thread in _threads() if thread not in before][-device.threads :])

@@ -27,8 +27,8 @@ from tests import reference
 from tests.conftest import Program
 from tests.golden import Messages
 from tests.outputs import files
+from tests.reporting_process import ReportingProcess
 from tests.scenes import SMALL
-from tests.telling import Telling
 
 
 def separate_process(*arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:
@@ -99,7 +99,7 @@ def test_interrupted_study_keeps_its_measurements(small: Path) -> None:
     (small / "out").mkdir()
     (small / "out" / "study.json").write_text("earlier")
     outlets = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with Telling("study", "small.yaml", "--out", "out", **outlets) as process:
+    with ReportingProcess("study", "small.yaml", "--out", "out", **outlets) as process:
         process.until("stepping", 20)
         process.send_signal(signal.SIGINT)
         output, error = process.communicate(timeout=60)
@@ -137,7 +137,7 @@ def test_signal_keeps_the_finished_frames(
     """A run with one thread has no encoder process."""
     settings = ["--set", "time.duration=2000", "--set", "render.size=[200,150]", "--set", "output=[png, trajectory]"]
     command = ["run", "small.yaml", "--out", "long", "--threads", threads, *settings]
-    with Telling(*command, stderr=subprocess.PIPE) as process:
+    with ReportingProcess(*command, stderr=subprocess.PIPE) as process:
         process.until("frames", 9)
         assert len(children(process.pid)) == (threads != "1")
         if number == signal.SIGTERM:
@@ -174,7 +174,7 @@ def test_signal_before_the_first_frame_changes_nothing(
     earlier = '{"outputs": ["run.json"], "frames": 0}'
     (small / "out" / "run.json").write_text(earlier)
     settings = ["--set", "render.size=[2048,2048]", "--set", "render.supersample=4", "--set", "output=[png]"]
-    with Telling("run", "small.yaml", "--out", "out", *settings, stderr=subprocess.PIPE) as process:
+    with ReportingProcess("run", "small.yaml", "--out", "out", *settings, stderr=subprocess.PIPE) as process:
         process.until(stage)
         process.send_signal(number)
         _, error = process.communicate(timeout=60)

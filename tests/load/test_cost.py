@@ -4,7 +4,6 @@ import json
 import math
 import os
 import shutil
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -31,10 +30,10 @@ PROBE = {"force": [0, 0, 1]}
 
 
 def scene(**keys: Any) -> Scene:
-    """20 frames of 4 steps of a small sheet that draws nothing, unless the keys say otherwise."""
+    """A small sheet without outputs, 20 frames of 4 steps; `keys` replace these defaults."""
     sheet = {"points": [30, 40], "size": [1, 1], "mass": 1}
-    own = {"image": "none.png", "sheet": sheet, "springs": {}, "output": []}
-    return Scene.model_validate({**own, **keys, "time": {**TIME, **keys.get("time", {})}})
+    defaults = {"image": "none.png", "sheet": sheet, "springs": {}, "output": []}
+    return Scene.model_validate({**defaults, **keys, "time": {**TIME, **keys.get("time", {})}})
 
 
 def estimate(scene: Scene) -> Budget:
@@ -45,20 +44,20 @@ def faults(scene: Scene) -> list[str]:
     return [str(problem) for problem in size_problems(plan_of(scene))]
 
 
-def test_simulation() -> None:
+def test_memory_for_the_simulation() -> None:
+    """Companion runs are two sheets in f64."""
     need = estimate(scene())
     assert (need.points, need.steps, need.frames) == (1200, 80, 21)
-    # With a pilot, which is two sheets in f64.
     assert need.simulation_bytes == 1200 * (4 + 8 + 8) * 21
     assert estimate(scene(probes=[PROBE, PROBE])).simulation_bytes == 1200 * (4 + 8 + 8) * 23
     assert estimate(scene(time={"precision": "f64"})).simulation_bytes == 1200 * (8 + 8 + 8) * 21
-    large = {"sheet": {"points": [2000, 2000], "size": [1, 1], "mass": 1}, "time": {"step": 1e-4}}
-    assert estimate(scene(**large)).simulation_bytes == 2000**2 * 4 * 21
-    piloted = scene(sheet=large["sheet"], time={"step": "auto", "duration": 100, "tolerance": 1e-3})
-    assert estimate(piloted).simulation_bytes == 2000**2 * (4 + 8 + 8) * 21
+    large = {"points": [2000, 2000], "size": [1, 1], "mass": 1}
+    assert estimate(scene(sheet=large, time={"step": 1e-4})).simulation_bytes == 2000**2 * 4 * 21
+    tolerance = {"step": "auto", "duration": 100, "tolerance": 1e-3}
+    assert estimate(scene(sheet=large, time=tolerance)).simulation_bytes == 2000**2 * (4 + 8 + 8) * 21
 
 
-def test_drawing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_for_drawing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     render = {"size": [50, 60], "refine": 2, "supersample": 3}
     need = estimate(scene(render=render, output=["gif"]))
@@ -66,16 +65,16 @@ def test_drawing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert need.memory_bytes == need.simulation_bytes + need.drawing_bytes
     assert estimate(scene(output=["trajectory"])).drawing_bytes == 0
     Image.new("RGB", (70, 80)).save(tmp_path / "a.png")
-    pictured = scene(image=str(tmp_path / "a.png"), render=render, output=["gif"])
-    assert estimate(pictured).drawing_bytes == need.drawing_bytes + 70 * 80 * 20
-    cut = scene(image=str(tmp_path / "a.png"), region=[1, 2, 3, 4], render=render, output=["gif"])
-    assert estimate(cut).drawing_bytes == need.drawing_bytes + 70 * 80 * 20, "all of it is decoded"
+    # The whole image is decoded, even for a region of it.
+    for region in ({}, {"region": [1, 2, 3, 4]}):
+        pictured = scene(image=str(tmp_path / "a.png"), render=render, output=["gif"], **region)
+        assert estimate(pictured).drawing_bytes == need.drawing_bytes + 70 * 80 * 20
 
 
-@pytest.mark.parametrize("size", [(65, 47), (1, 90), (90, 1)])
-def test_a_run_takes_no_more_disk_than_was_said(size: tuple[int, int], device: Device, tmp_path: Path) -> None:
-    """Whatever the picture, and the hardest is one of noise at its own scale."""
-    (width, height), cameras = size, {"one": "top", "other": {"beside": "one", "baseline": 0.1}}
+@pytest.mark.parametrize("size", [(65, 47), (1, 90)])
+def test_bound_of_the_size_of_all_files(size: tuple[int, int], device: Device, tmp_path: Path) -> None:
+    """For a picture of noise, which compresses worst."""
+    (width, height), cameras = size, {"left": "top", "right": {"beside": "left", "baseline": 0.1}}
     Image.fromarray(speckle(height, width)).save(tmp_path / "noise.png")
     made = scene(
         image=str(tmp_path / "noise.png"),
@@ -87,17 +86,14 @@ def test_a_run_takes_no_more_disk_than_was_said(size: tuple[int, int], device: D
     )
     run(made, tmp_path / "out", threads=device.threads)
     sizes = {path: path.stat().st_size for path in (tmp_path / "out").rglob("*") if path.is_file()}
-    # Of each camera four kinds of labels and the pictures at 11 frames, two kinds between them, and four files; the
-    # disparity and two kinds of stereo of one; three files of the run.
+    # Per camera: pictures and four labels of 11 frames, two labels of pairs of frames, four files; three labels of the
+    # stereo pair; three files of the run.
     assert len(sizes) == 2 * (5 * 11 + 2 * 10 + 4) + 3 * 11 + 3
     need = estimate(made)
     assert sum(sizes.values()) <= need.disk_bytes
     pictures = sum(size for path, size in sizes.items() if path.parent.name == "frames")
-    assert pictures > 2 * 11 * width * height, "noise is hard to compress"
-
-
-def test_forces() -> None:
-    # A row has a number of a probe, and seven others of up to 24 characters.
+    assert pictures > 2 * 11 * width * height, "noise does not compress"
+    # A row of forces has the index of a probe, and seven numbers of up to 24 characters.
     assert len(",".join([repr(-math.pi * 1e-100)] * 7 + ["15"])) < FORCE_ROW_BYTES
 
 
@@ -113,7 +109,7 @@ def test_forces() -> None:
     ],
     ids=["points", "picture", "tracks"],
 )
-def test_what_takes_most_of_the_memory_is_named(
+def test_largest_share_of_memory_is_named(
     monkeypatch: pytest.MonkeyPatch, key: str, sections: dict[str, Any], message: Messages
 ) -> None:
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
@@ -121,7 +117,12 @@ def test_what_takes_most_of_the_memory_is_named(
     message(faults(scene(**sections)), key)
 
 
-def test_memory_that_just_fits(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_limits_of_memory_and_steps(monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
+    time = {"duration": 1e6, "frames_per_second": 10, "step": "auto"}
+    assert faults(scene(time=time | {"step": 1e-6})) == []
+    message(faults(scene(time=time | {"step": 1e-7})), "time.step", "1e+13 steps")
+    # The step limit is 2 / sqrt(8 * 1e14 / 1) s, and the step of `auto` is half of it: 1 / 28284271.2 s.
+    message(faults(scene(springs={"structural": 1e14}, time=time)), "time.duration", "2.83e+13 steps")
     need = estimate(scene()).memory_bytes
     monkeypatch.setattr(cost, "available_memory", lambda: need)
     assert faults(scene()) == []
@@ -129,26 +130,15 @@ def test_memory_that_just_fits(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(faults(scene())) == 1
 
 
-def test_too_many_steps(message: Messages) -> None:
-    time = {"duration": 1e6, "frames_per_second": 10, "step": "auto"}
-    assert faults(scene(time=time | {"step": 1e-6})) == []
-    message(faults(scene(time=time | {"step": 1e-7})), "time.step", "1e+13 steps")
-    # The step limit is 2 / sqrt(8 * 1e14 / 1) s, half of it the step of `auto`: 1 / 28284271.2 s.
-    message(faults(scene(springs={"structural": 1e14}, time=time)), "time.duration", "2.83e+13 steps")
-
-
-def test_free_memory(tmp_path: Path) -> None:
-    (tmp_path / "meminfo").write_text("MemTotal:  900 kB\nMemFree:  1 kB\nMemAvailable:  300 kB\n")
-    assert process._free_memory(tmp_path / "meminfo") == 300 * 1024
-
-
 @pytest.fixture
 def groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder of all control groups, of which this process is in outer/inner."""
+    """The folder of all control groups; this process is in outer/inner."""
     root, membership = tmp_path / "cgroup", tmp_path / "membership"
     membership.write_text("4:memory:/v1\n3:cpu,cpuacct:/v1\n2:cpuset:/\n0::/outer/inner\n")
     monkeypatch.setattr(process, "CONTROL_GROUPS", root)
     monkeypatch.setattr(process, "MEMBERSHIP", membership)
+    (tmp_path / "meminfo").write_text("MemTotal:  900 kB\nMemFree:  1 kB\nMemAvailable:  300 kB\n")
+    assert process._free_memory(tmp_path / "meminfo") == 300 * 1024
     monkeypatch.setattr(process, "_free_memory", lambda _: 2000)
     return root
 
@@ -159,7 +149,7 @@ def group(folder: Path, **files: str) -> None:
         (folder / name.replace("__", ".")).write_text(text)
 
 
-def test_the_narrowest_limit_of_memory_counts(groups: Path) -> None:
+def test_memory_limits_of_control_groups(groups: Path) -> None:
     assert available_memory() == 2000
     stat = "anon 7\ninactive_file 100\n"
     group(groups / "outer" / "inner", memory__max="max\n", memory__current="10", memory__stat=stat)
@@ -170,8 +160,8 @@ def test_the_narrowest_limit_of_memory_counts(groups: Path) -> None:
     assert available_memory() == 0
 
 
-def test_version_1_of_control_groups_counts(groups: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In a container the group's own folder is the root, whatever its name outside."""
+def test_control_groups_of_version_1(groups: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a container, the folder of the group is the root, whatever its name outside."""
     stat = "total_inactive_file 7\n"
     group(groups / "memory", memory__limit_in_bytes="512", memory__usage_in_bytes="100", memory__stat=stat)
     assert available_memory() == 419
@@ -183,7 +173,7 @@ def test_version_1_of_control_groups_counts(groups: Path, monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize(("outer", "inner", "threads"), [("max", "max", 8), ("350000", "max", 3), ("90000", "max", 1)])
-def test_the_narrowest_quota_of_cores_counts(
+def test_core_quotas_of_control_groups(
     outer: str, inner: str, threads: int, groups: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
@@ -192,32 +182,12 @@ def test_the_narrowest_quota_of_cores_counts(
     assert available_threads() == threads
 
 
-def test_systems_without_proc(monkeypatch: pytest.MonkeyPatch) -> None:
-    def missing(_: Path) -> int:
-        raise FileNotFoundError
-
-    monkeypatch.setattr(process, "_free_memory", missing)
-    assert 2**20 < available_memory() < sys.maxsize
-    monkeypatch.delattr(os, "sysconf")
-    assert available_memory() == sys.maxsize
-
-
-def test_a_file_system_without_a_size_may_have_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    disk_usage = shutil.disk_usage
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: disk_usage(path)._replace(total=0, used=0, free=0))
-    require_disk(plan_of(scene(output=["png"])), tmp_path)
-
-
-def test_results_that_do_not_fit_on_the_disk_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, message: Messages
-) -> None:
-    """Positions are there twice while the trajectory is written, and two states of 6 numbers a point."""
+def test_insufficient_disk_space(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
+    """The disk holds positions twice while the trajectory is written, and two states of 6 numbers per mass point."""
     made = scene(render={"size": [50, 60]}, output=["png", "trajectory"])
     need = estimate(made)
     needed = need.picture_bytes + 21 * (2 * 1200 * 3 * 4 + 8) + 1024 + need.record_bytes + 2 * 1200 * 6 * 4
-    below = tmp_path / "not" / "there"
-
-    disk_usage = shutil.disk_usage
+    below, disk_usage = tmp_path / "not" / "there", shutil.disk_usage
 
     def leave(free: int) -> None:
         monkeypatch.setattr(shutil, "disk_usage", lambda path: disk_usage(path)._replace(free=free))
@@ -231,13 +201,9 @@ def test_results_that_do_not_fit_on_the_disk_are_refused(
         require_disk(plan_of(scene(render={"size": [500, 600]}, output=["png"])), below)
 
 
-def test_the_calibration_is_soon_done() -> None:
-    cost._calibrate.cache_clear()
-    assert 0 < cost._calibrate() < 1
-
-
 @pytest.mark.parametrize("cores", [1, 64])
-def test_the_estimate_is_the_work_at_the_speed_of_the_machine(cores: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_estimated_duration(cores: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert 0 < cost._calibrate() < 1
     monkeypatch.setattr(cost, "_calibrate", lambda: 2 * CALIBRATION_S)
     monkeypatch.setattr(process, "available_threads", lambda: cores)
     plan = plan_of(scene(image="none.png", output=["gif"]))
@@ -246,14 +212,18 @@ def test_the_estimate_is_the_work_at_the_speed_of_the_machine(cores: int, monkey
     assert cost.estimate_duration(plan) == pytest.approx((2 * WORK_UNIT_S * sum(parts), 2 * WORK_UNIT_S * START_WORK))
 
 
-def test_check_estimates_the_duration_of_a_run(small: Path, program: Program, message: Messages) -> None:
+def test_estimated_duration_of_check(small: Path, program: Program, message: Messages) -> None:
     def line(*options: str) -> str:
-        (found,) = (line for line in program("check", "small.yaml", *options).stdout.splitlines() if " to run" in line)
-        return found
+        (estimate,) = (
+            line for line in program("check", "small.yaml", *options).stdout.splitlines() if " to run" in line
+        )
+        return estimate
 
     message(line(), hide=r"^\D*[\d.]+ \w+")
     message(line("--set", "time.step=auto", "--set", "time.tolerance=0.01"), "time.tolerance", hide=r"^\D*[\d.]+ \w+")
     before = program("check", "small.yaml", "--json").stdout
     assert program("run", "small.yaml", "--quiet").returncode == 0
     after = program("check", "small.yaml", "--json").stdout
-    assert json.loads(after)["estimated_seconds"] == json.loads(before)["estimated_seconds"], "nothing is learnt"
+    assert json.loads(after)["estimated_seconds"] == json.loads(before)["estimated_seconds"], (
+        "the estimate is independent of earlier runs"
+    )

@@ -1,4 +1,4 @@
-"""Files that a careless or hostile hand has changed: clean errors, soon, and nothing left behind."""
+"""Fuzzing of input files: clean errors within bounds of time and memory, and no leftovers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ resource: Any = pytest.importorskip("resource")
 
 WORDS = re.compile(rb"[A-Za-z_.\-0-9]+|[\[\]{}:,#\n]")
 
-# What breaks readers: values at and beyond the edge, YAML that a scene has no use for, bytes that are no text.
+# Extreme values, features of YAML that scenes exclude, and bytes that are not text.
 TOKENS = [
     *(b"null", b"~", b"true", b"0", b"-1", b"4096", b"4097", b"1000000000000", b"png", b"oblique", b"auto"),
     *(b"1e999", b"-1e999", b".nan", b".inf", b"-.inf", b"1e-320", b"1e308", b"1_000", b"0o17"),
@@ -44,10 +44,10 @@ TOKENS = [
 
 
 def damaged_text(rng: random.Random, data: bytes) -> bytes:
-    """Change, add, drop or repeat a few bytes or words."""
+    """Change, insert, delete or repeat a few bytes or words."""
     changed = bytearray(data)
     for _ in range(rng.choice((1, 1, 1, 2, 3, 8))):
-        at, other = sorted(rng.randrange(len(changed) + 1) for _ in range(2))
+        at, end = sorted(rng.randrange(len(changed) + 1) for _ in range(2))
         kind = rng.choice(("byte", "token", "word", "word", "drop", "repeat", "cut"))
         if kind == "byte":
             changed[at : at + rng.randrange(2)] = bytes([rng.randrange(256)])
@@ -60,14 +60,14 @@ def damaged_text(rng: random.Random, data: bytes) -> bytes:
         elif kind == "drop":
             del changed[at : at + rng.choice((1, 2, 5, 40))]
         elif kind == "repeat":
-            changed[at:at] = changed[at : min(other, at + 200)]
+            changed[at:at] = changed[at : min(end, at + 200)]
         elif kind == "cut":
             del changed[at:]
     return bytes(changed)
 
 
 def damaged_picture(rng: random.Random, data: bytes) -> bytes:
-    """Change, add or drop a few bytes or numbers, or cut the end off."""
+    """Change, insert or delete a few bytes or numbers, or truncate."""
     changed = bytearray(data)
     for _ in range(rng.choice((1, 1, 2, 4, 10))):
         at = rng.randrange(len(changed) + 1)
@@ -83,22 +83,14 @@ def damaged_picture(rng: random.Random, data: bytes) -> bytes:
     return bytes(changed)
 
 
-SCENES, OVERRIDES, PICTURES, VALID, BROKEN = 20_000, 2_000, 5_000, 500, 1_500
-
-
-def tries(all_of_them: int, part: int = 10) -> pytest.MarkDecorator:
-    """Give a test the argument `tries`: a part of them by default, and all by -m fuzz."""
-    return pytest.mark.parametrize(
-        "tries", [all_of_them // part, pytest.param(all_of_them, marks=pytest.mark.fuzz)], ids=["some", "all"]
-    )
-
-
-# The slowest that one input may be [s], and the most that memory may grow over all of them [KiB].
-SLOWEST, GROWTH = 1.0, 50_000
+def tries(total: int, part: int = 10) -> pytest.MarkDecorator:
+    """Parametrise the number of tries: a part of them by default, and all by -m fuzz."""
+    counts = [total // part, pytest.param(total, marks=pytest.mark.fuzz)]
+    return pytest.mark.parametrize("tries", counts, ids=["some", "all"])
 
 
 @pytest.fixture
-def here(tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The current directory, with the textures of the shipped scenes."""
     (tmp_path / "textures").mkdir()
     for picture in (root / "scenes" / "textures").glob("*.[pj][np]g"):
@@ -109,7 +101,7 @@ def here(tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @contextmanager
 def in_bounds(folder: Path) -> Iterator[Callable[[Callable[[], object]], bool]]:
-    """Give a function that tries one input, and says whether it was accepted; no input may break a promise."""
+    """Yield a function that tries an input and returns whether it was accepted, and check bounds at the end."""
     before, slowest, sizes = sorted(folder.rglob("*")), 0.0, []
 
     def attempt(work: Callable[[], object]) -> bool:
@@ -129,37 +121,37 @@ def in_bounds(folder: Path) -> Iterator[Callable[[Callable[[], object]], bool]]:
         return False
 
     yield attempt
-    assert slowest < SLOWEST
-    # After a tenth of them all that is kept has been made.
-    assert sizes[-1] - sizes[len(sizes) // 10] < GROWTH
+    assert slowest < 1  # [s]
+    # After a tenth of the inputs, all caches are filled.
+    assert sizes[-1] - sizes[len(sizes) // 10] < 50_000  # [KiB]
     assert sorted(folder.rglob("*")) == before
 
 
-@tries(SCENES, 30)
-def test_damaged_scenes(tries: int, here: Path, root: Path) -> None:
+@tries(20_000, 30)
+def test_damaged_scenes(tries: int, folder: Path, root: Path) -> None:
     rng = random.Random(1)
     scenes = [path.read_bytes() for path in sorted((root / "scenes").glob("*.yaml"))]
-    file = here / "damaged.yaml"
+    file = folder / "damaged.yaml"
     file.touch()
-    with in_bounds(here) as attempt:
+    with in_bounds(folder) as attempt:
         accepted = 0
         for _ in range(tries):
             file.write_bytes(damaged_text(rng, rng.choice(scenes)))
             accepted += attempt(lambda: load_scene("damaged.yaml"))
-    assert 0 < accepted < tries / 2, "some damage does no harm, and most does"
+    assert 0 < accepted < tries / 2, "some damage is harmless"
 
 
-@tries(OVERRIDES)
-def test_damaged_overrides(tries: int, here: Path, root: Path) -> None:
+@tries(2_000)
+def test_damaged_overrides(tries: int, folder: Path, root: Path) -> None:
     rng = random.Random(2)
-    shutil.copy(root / "scenes" / "press.yaml", here)
+    shutil.copy(root / "scenes" / "press.yaml", folder)
     keys = ["sheet.points", "probes.0.load", "probes.9.at", "render.camera.eye", "time.step", "image", "a.b", "0", ""]
     values = ["[61,61]", "[[0,100]]", "1e4", "-1", "null", "{a: 1}", "[", "top", "!!x 1", "&a 1", "[]", "é", "\ud800"]
-    with in_bounds(here) as attempt:
+    with in_bounds(folder) as attempt:
         for _ in range(tries):
             text = rng.choice(keys) + rng.choice(("=", "=", "", "==")) + rng.choice(values)
             if rng.random() < 0.5:
-                # As the command line gives bytes that are no UTF-8.
+                # As Python decodes arguments that are not UTF-8.
                 damaged = damaged_text(rng, text.encode("utf-8", "surrogatepass"))
                 text = damaged.decode("utf-8", "surrogateescape")
             attempt(partial(load_scene, "press.yaml", [text]))
@@ -185,14 +177,14 @@ def pictures() -> list[bytes]:
     return made
 
 
-@tries(PICTURES)
-def test_damaged_pictures(tries: int, here: Path, capfd: pytest.CaptureFixture[str]) -> None:
+@tries(5_000)
+def test_damaged_pictures(tries: int, folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
     rng = random.Random(3)
     whole = pictures()
     scene = Scene.model_validate(
         {"image": "damaged.png", "sheet": SHEET, "springs": SPRINGS, "time": {"duration": 0.04}}
     )
-    file = here / "damaged.png"
+    file = folder / "damaged.png"
     file.touch()
 
     def read() -> None:
@@ -202,20 +194,20 @@ def test_damaged_pictures(tries: int, here: Path, capfd: pytest.CaptureFixture[s
         assert texture.dtype == np.uint8
         assert texture.ndim == 3
 
-    with in_bounds(here) as attempt:
+    with in_bounds(folder) as attempt:
         accepted = 0
         for _ in range(tries):
             file.write_bytes(damaged_picture(rng, rng.choice(whole)))
             accepted += attempt(read)
     assert 0 < accepted < tries / 2
-    assert capfd.readouterr() == ("", ""), "no library talks past us"
+    assert capfd.readouterr() == ("", ""), "libraries print nothing"
 
 
 def valid_scene(rng: random.Random) -> dict[str, Any]:
-    """A random scene that keeps every rule; of few structures, so that few kernels are compiled."""
+    """A random valid scene; with few structures, so that few kernels are compiled."""
 
     def size(low: float, high: float) -> float:
-        """A number of any order of magnitude between two."""
+        """A number with a uniformly distributed logarithm."""
         return math.exp(rng.uniform(math.log(low), math.log(high)))
 
     rate = rng.choice((10, 24, 25, 30, 60))
@@ -246,59 +238,14 @@ def valid_scene(rng: random.Random) -> dict[str, Any]:
     }
 
 
-def write(scene: dict[str, Any]) -> str:
-    """Write a scene; JSON is YAML, but for what is no number."""
-    return json.dumps(scene).replace("Infinity", ".inf").replace("NaN", ".nan")
-
-
-@tries(VALID)
-def test_a_scene_that_keeps_every_rule_runs(tries: int, here: Path, device: Device) -> None:
+@tries(500)
+def test_valid_scenes_run(tries: int, folder: Path, device: Device) -> None:
     rng = random.Random(4)
     for _ in range(tries):
-        text = write(valid_scene(rng))
+        text = json.dumps(valid_scene(rng))
         Path("valid.yaml").write_text(text)
         dynamics = dynamics_of(load_scene("valid.yaml"), device)
         dynamics.advance(3)
         displacement = dynamics.displacement()
         dynamics.close()
         assert np.isfinite(displacement).all(), text
-
-
-# Values that break one rule, each of the key above them.
-RULES: dict[str, list[Any]] = {
-    "sheet.points": [[1, 7], [5, 4097], [5], 5, "five", [5.5, 7], [5, True], None],
-    "sheet.size": [[0, 1], [-1, 1], [1], [float("inf"), 1]],
-    "sheet.mass": [0, -1, float("nan"), True, [1], {"a": 1}],
-    "sheet.fixed": ["all", ["left", "middle"], 1],
-    "springs.structural": [-1, "stiff", float("inf")],
-    "springs.virtual_active": ["never", 1],
-    "damping": [-1, [1], "some"],
-    "probes.0.at": [[0.5], "middle", [[0, 0.5, 0.5], [0, 0.5]]],
-    "probes.0.force": [[1, 2], [1, 2, "x"], 3],
-    "probes.0.load": [[[1, 0], [0, 1]], [[0]], [[0, 0], [0, 1], [0, 2]], "full"],
-    "time.duration": [0, -1, 1.23456],
-    "time.frames_per_second": [0, "film"],
-    "time.damping_difference": ["forward"],
-    "time.precision": ["f16", 32],
-    "time.step": [1e6, "fast", 0],
-    "output": [["avi"], "png", {"png": True}],
-}
-
-
-@tries(BROKEN)
-def test_a_scene_that_breaks_one_rule_is_refused_where_it_does(tries: int, here: Path) -> None:
-    rng = random.Random(5)
-    rules = [(key, value) for key in RULES for value in RULES[key]]
-    for n in range(tries):
-        key, value = rules[n % len(rules)]
-        broken: Any = valid_scene(rng)
-        *sections, name = key.split(".")
-        holder = broken
-        for section in sections:
-            holder = holder[int(section) if section.isdigit() else section]
-        holder[name] = value
-        text = write(broken)
-        Path("broken.yaml").write_text(text)
-        with pytest.raises(SceneError) as caught:
-            load_scene("broken.yaml")
-        assert all(said.split(": ")[1].startswith(key) for said in caught.value.lines), (text, caught.value)

@@ -1,4 +1,4 @@
-"""Several cameras: one simulation, seen from each of them, by its name."""
+"""Several cameras: one simulation with the results of each named camera."""
 
 from __future__ import annotations
 
@@ -28,7 +28,6 @@ from tests.golden import Messages
 from tests.outputs import files, results
 from tests.reference import drawing
 from tests.render.test_rasterizer import dented, difference, drawable, with_instruments
-from tests.runs.test_label_files import read_flow
 from tests.runs.test_resume import interrupted
 from tests.scenes import scene
 
@@ -46,21 +45,23 @@ Cameras = dict[str, Any]
 UNLIT = "render.shading=none"
 
 
-def seen_by(cameras: Cameras, output: str = "[png, trajectory]", *overrides: str) -> Scene:
-    """The small scene, with 9 x 9 points, seen by cameras."""
+def with_cameras(cameras: Cameras, output: str = "[png, trajectory]", *overrides: str) -> Scene:
+    """The small scene with 9 x 9 points and several cameras."""
     render = [f"render.cameras={json.dumps(cameras)}", "render.tracks=3", "sheet.points=[9, 9]"]
     return load_scene("small.yaml", [*render, f"output={output}", *overrides])
 
 
 def alone(camera: Any, output: str) -> Scene:
-    """The same scene seen by one camera, which has no name."""
-    of_one = [f"render.camera={json.dumps(camera)}", "render.tracks=3", "sheet.points=[9, 9]", UNLIT]
-    return load_scene("small.yaml", [*of_one, f"output={output}"])
+    """The same scene with one unnamed camera."""
+    render = [f"render.camera={json.dumps(camera)}", "render.tracks=3", "sheet.points=[9, 9]", UNLIT]
+    return load_scene("small.yaml", [*render, f"output={output}"])
 
 
 @pytest.mark.slow
-def test_each_camera_writes_what_it_would_write_alone(small: Path, device: Device) -> None:
-    record = run(seen_by({**STEREO, "sway": SWAYING}, ALL, UNLIT), "out", threads=device.threads, estimate_error=False)
+def test_results_of_each_camera(small: Path, device: Device) -> None:
+    record = run(
+        with_cameras({**STEREO, "sway": SWAYING}, ALL, UNLIT), "out", threads=device.threads, estimate_error=False
+    )
     moved = {"eye": [0.05 + 0.02, 0, 0.5], "target": [0.05 + 0.02, 0, 0]}
     written = files(Path("out"))
     for name, camera in {"left": LEFT, "right": moved, "sway": SWAYING}.items():
@@ -68,28 +69,35 @@ def test_each_camera_writes_what_it_would_write_alone(small: Path, device: Devic
         expected = results(Path(name))
         for file in ("trajectory.npz", "forces.csv"):
             assert written.pop(file, expected[file]) == expected.pop(file)
-        found, alike = (json.loads(each) for each in (written.pop(f"{name}/camera.json"), expected.pop("camera.json")))
+        several, single = (
+            json.loads(each) for each in (written.pop(f"{name}/camera.json"), expected.pop("camera.json"))
+        )
         if name == "right":
             pair = {"beside": "left", "rotation": np.eye(3).tolist(), "translation": [-0.02, 0, 0]}
-            assert {key: found.pop(key) for key in pair} == pair
-        assert found.keys() == alike.keys()
-        assert found.pop("model") == alike.pop("model")
-        for key, value in alike.items():
-            np.testing.assert_allclose(found[key], value, atol=1e-12)
+            assert {key: several.pop(key) for key in pair} == pair
+        assert several.keys() == single.keys()
+        assert several.pop("model") == single.pop("model")
+        for key, value in single.items():
+            np.testing.assert_allclose(several[key], value, atol=1e-12)
         assert {file: written.pop(f"{name}/{file}") for file in expected} == expected
-    assert list(written) == ["run.json"], "and nothing else"
+    assert list(written) == ["run.json"]
     assert record["outputs"][:3] == ["left/frames", "right/frames", "sway/frames"]
     assert record["outputs"][-4:] == ["left/camera.json", "right/camera.json", "sway/camera.json", "run.json"]
 
 
-def test_disparity_is_that_of_depth_and_of_flow_from_left_to_right(small: Path, device: Device) -> None:
+def test_disparity_against_depth_and_flow(small: Path, device: Device) -> None:
     cameras = {**SWAYING_STEREO, "third": {"beside": "right", "baseline": -0.05}}
-    run(seen_by(cameras, "[png, trajectory, depth, disparity]"), "out", threads=device.threads, estimate_error=False)
+    run(
+        with_cameras(cameras, "[png, trajectory, depth, disparity]"),
+        "out",
+        threads=device.threads,
+        estimate_error=False,
+    )
     focal = json.loads(Path("out/left/camera.json").read_text())["intrinsics"][0][0]
     assert not Path("out/third/disparity").exists()
     with Playback("out") as playback:
         for frame in (0, 2):
-            for name, other, baseline in (("left", "right", 0.02), ("right", "third", -0.05)):
+            for name, right, baseline in (("left", "right", 0.02), ("right", "third", -0.05)):
                 with Image.open(f"out/{name}/depth/{frame:04}.tiff") as image:
                     depth = np.array(image)
                 with Image.open(f"out/{name}/disparity/{frame:04}.tiff") as image:
@@ -99,13 +107,13 @@ def test_disparity_is_that_of_depth_and_of_flow_from_left_to_right(small: Path, 
                 assert 0 < sheet.sum() < sheet.size
                 np.testing.assert_allclose(disparity[sheet], focal * baseline / depth[sheet], rtol=1e-6)
                 assert (disparity[~sheet] == 0).all()
-                flow = playback.flow(frame, frame, camera=name, camera_then=other).flow
-                # Of coordinates in f32, on a picture of 40 px.
+                flow = playback.flow(frame, frame, camera=name, camera_then=right).flow
+                # Coordinates have f32, on a picture of 40 px.
                 assert np.abs(flow[sheet] + np.stack([disparity, 0 * disparity], axis=-1)[sheet]).max() < 1e-4
 
 
-def test_an_orthographic_pair_has_the_same_disparity_everywhere(small: Path, device: Device) -> None:
-    made = seen_by({"left": "top", "right": RIGHT}, "[png, disparity]")
+def test_disparity_of_an_orthographic_pair(small: Path, device: Device) -> None:
+    made = with_cameras({"left": "top", "right": RIGHT}, "[png, disparity]")
     with Simulation(made, threads=device.threads) as simulation:
         disparity = simulation.observe(None, "left").stereo
         sight = simulation.locate(np.array([[0.5, 0.5]]), "right").pixels
@@ -117,20 +125,20 @@ def test_an_orthographic_pair_has_the_same_disparity_everywhere(small: Path, dev
     np.testing.assert_allclose(sight, [[18, 15]], atol=1e-5)
 
 
-def test_a_right_camera_with_a_rotation_moves_along(small: Path) -> None:
-    """X_right = R X_left + T in every frame, with a lens of its own; labels of the pair belong to the left one."""
+def test_right_camera_with_a_rotation(small: Path) -> None:
+    """X_right = R X_left + T in every frame; the right camera has its own lens, labels belong to the left one."""
     pair = {"rotation": TURN.tolist(), "translation": [-0.03, 0.004, 0.002]}
     lens = {"intrinsics": {"fx": 30, "fy": 31, "cx": 18, "cy": 13}, "distortion": {"k1": -0.05, "p1": 0.002}}
     left = {**SWAYING, "distortion": {"k1": -0.1}}
-    made = seen_by({"left": left, "right": {"beside": "left", **pair, **lens}}, "[stereo]")
+    made = with_cameras({"left": left, "right": {"beside": "left", **pair, **lens}}, "[stereo]")
     assert made.folders == {"": (), "left": ("stereo", "stereo_occlusion"), "right": ()}
     assert is_moving(made, "right")
     for time in (0, 0.3):
-        pose, found = (calibration(view_at(made, time, name)) for name in ("left", "right"))
-        expected = TURN @ pose["pose"] + np.array([0, 0, 0, 1]) * np.array(pair["translation"])[:, None]
-        np.testing.assert_allclose(found["pose"], expected, atol=1e-12)
-    assert found["calibration"] == [[30, 0, 18], [0, 31, 13], [0, 0, 1]]
-    assert found["distortion"] == [-0.05, 0, 0.002, 0, 0, 0, 0, 0]
+        left_matrices, right_matrices = (calibration(view_at(made, time, name)) for name in ("left", "right"))
+        expected = TURN @ left_matrices["pose"] + np.array([0, 0, 0, 1]) * np.array(pair["translation"])[:, None]
+        np.testing.assert_allclose(right_matrices["pose"], expected, atol=1e-12)
+    assert right_matrices["calibration"] == [[30, 0, 18], [0, 31, 13], [0, 0, 1]]
+    assert right_matrices["distortion"] == [-0.05, 0, 0.002, 0, 0, 0, 0, 0]
     written = pair_transform(made.render.all_cameras["right"])
     assert written.pop("beside") == "left"
     for key, value in pair.items():
@@ -139,22 +147,22 @@ def test_a_right_camera_with_a_rotation_moves_along(small: Path) -> None:
 
 
 @pytest.mark.parametrize("left", ["top", {**SWAYING, "distortion": {"k1": -0.1}}], ids=["top", "pinhole"])
-def test_without_a_lens_of_its_own_it_has_that_of_the_other(left: Any, small: Path) -> None:
+def test_right_camera_inherits_the_lens(left: Any, small: Path) -> None:
     pair = {"beside": "left", "rotation": TURN.tolist(), "translation": [-0.03, 0.004, 0.002]}
-    made = seen_by({"left": left, "right": pair, "third": {"beside": "right", "baseline": 0.1}})
-    one, other, third = (view_at(made, 0.2, name) for name in ("left", "right", "third"))
+    made = with_cameras({"left": left, "right": pair, "third": {"beside": "right", "baseline": 0.1}})
+    first, second, third = (view_at(made, 0.2, name) for name in ("left", "right", "third"))
     points = np.random.default_rng(0).uniform(-0.1, 0.1, (20, 3))
-    seen = (points - one.eye) @ one.axes.T * [1, -1, -1] @ TURN.T + pair["translation"]
-    np.testing.assert_allclose((points - other.eye) @ other.axes.T * [1, -1, -1], seen, atol=1e-12)
-    # Where the left camera sees points that are for it where these are for the right one.
-    there = one.eye + seen * [1, -1, -1] @ one.axes
-    np.testing.assert_allclose(other.pixels(points), one.pixels(there), atol=1e-9)
-    np.testing.assert_allclose(third.eye, other.eye + 0.1 * other.axes[0], atol=1e-12)
+    in_second = (points - first.eye) @ first.axes.T * [1, -1, -1] @ TURN.T + pair["translation"]
+    np.testing.assert_allclose((points - second.eye) @ second.axes.T * [1, -1, -1], in_second, atol=1e-12)
+    # The left camera projects points with these coordinates in its own axes to the same pixels.
+    moved = first.eye + in_second * [1, -1, -1] @ first.axes
+    np.testing.assert_allclose(second.pixels(points), first.pixels(moved), atol=1e-9)
+    np.testing.assert_allclose(third.eye, second.eye + 0.1 * second.axes[0], atol=1e-12)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("shading", [pytest.param("headlight", marks=pytest.mark.slow), "tissue"])
-def test_the_light_is_that_of_the_main_camera(shading: str, device: Device) -> None:
+def test_light_at_the_main_camera(shading: str, device: Device) -> None:
     side = {"eye": [0.35, 0.1, 0.3], "up": [0.1, 1, 0]}
     cameras = {"main": {"eye": [-0.3, 0.05, 0.35]}, "side": side, "beside": {"beside": "main", "baseline": 0.06}}
     made = with_instruments(drawable(shading=shading, size=[30, 24]))
@@ -166,17 +174,17 @@ def test_the_light_is_that_of_the_main_camera(shading: str, device: Device) -> N
     on_cpu = Rasterizer(made, texture, config)
     of_gpu = Rasterizer(made, texture, config._replace(lanes=1)) if shading == "tissue" else on_cpu
     for name in made.render.all_cameras:
-        seen = view_at(made, 0.0, name)
-        drawn = on_cpu.draw(position, seen, placed)
-        apart = difference(drawn, drawing.draw(made, position, texture, placed, seen))
-        assert (apart > 1).mean() < 0.01, f"{name}, but for outlines"
-        own = on_cpu.draw(position, seen._replace(light_view=None), placed)
-        assert (difference(drawn, own).max() > 20) == (name != "main")
-        np.testing.assert_array_equal(of_gpu.draw(position, seen, placed), drawn)
+        camera = view_at(made, 0.0, name)
+        drawn = on_cpu.draw(position, camera, placed)
+        differences = difference(drawn, drawing.draw(made, position, texture, placed, camera))
+        assert (differences > 1).mean() < 0.01, f"{name}, except outlines"
+        headlight = on_cpu.draw(position, camera._replace(light_view=None), placed)
+        assert (difference(drawn, headlight).max() > 20) == (name != "main")
+        np.testing.assert_array_equal(of_gpu.draw(position, camera, placed), drawn)
 
 
-def test_an_interrupted_run_goes_on_to_the_same_bits(small: Path, device: Device) -> None:
-    made = seen_by(SWAYING_STEREO, ALL.replace("tracks", "tracks, disparity, stereo"))
+def test_resumed_run_of_several_cameras(small: Path, device: Device) -> None:
+    made = with_cameras(SWAYING_STEREO, ALL.replace("tracks", "tracks, disparity, stereo"))
     run(made, "whole", threads=device.threads, estimate_error=False)
     assert {path.parent.parent.name for path in Path("whole").rglob("stereo*/0004.*")} == {"left"}
     for n in (1, 3):
@@ -192,30 +200,21 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(small: Path, device: Device
         assert results(Path(f"part-{n}")) == results(Path("whole"))
 
 
-def test_a_run_with_another_main_camera_is_another_run(small: Path, device: Device) -> None:
-    cameras = {"a": LEFT, "b": {"eye": [0.3, 0, 0.3]}}
-    interrupted(seen_by(cameras), "out", device, after=3)
-    record = run(seen_by(dict(reversed(cameras.items()))), "out", threads=device.threads, estimate_error=False)
-    assert (record["status"], record["resumed"]) == ("complete", 0)
-
-
-def test_results_replace_those_of_other_cameras_and_nothing_else(
-    small: Path, device: Device, message: Messages
-) -> None:
-    run(seen_by(STEREO), "out", threads=device.threads, estimate_error=False)
+def test_results_of_earlier_cameras_are_replaced(small: Path, device: Device, message: Messages) -> None:
+    run(with_cameras(STEREO), "out", threads=device.threads, estimate_error=False)
     Path("out/left/mine.txt").write_text("mine")
-    run(seen_by({"one": LEFT, "two": LEFT}), "out", threads=device.threads, estimate_error=False)
+    run(with_cameras({"one": LEFT, "two": LEFT}), "out", threads=device.threads, estimate_error=False)
     assert sorted(path.name for path in Path("out").iterdir()) == ["left", "one", "run.json", "trajectory.npz", "two"]
     assert [path.name for path in Path("out/left").iterdir()] == ["mine.txt"]
     Path("out/left/frames").mkdir()
     shutil.copy("speckle.png", "out/left/frames/0002.png")
     with message.raises(ForeignError, "out/left/frames/0002.png"):
-        run(seen_by(STEREO), "out", threads=device.threads, estimate_error=False)
+        run(with_cameras(STEREO), "out", threads=device.threads, estimate_error=False)
 
 
-def test_cameras_have_names_in_python(stereo: Path, device: Device, message: Messages) -> None:
-    found = read_run(stereo)
-    assert (found.camera_names(), found.camera) == (["left", "right"], "left")
+def test_cameras_of_a_playback(stereo: Path, device: Device, message: Messages) -> None:
+    finished = read_run(stereo)
+    assert (finished.camera_names(), finished.camera) == (["left", "right"], "left")
     with Playback(stereo, threads=device.threads) as playback:
         for name in ("left", "right"):
             with Image.open(stereo / name / "frames/0002.png") as image:
@@ -225,16 +224,16 @@ def test_cameras_have_names_in_python(stereo: Path, device: Device, message: Mes
                 np.testing.assert_array_equal(pixels, tracks["points"][:, 2])
                 np.testing.assert_array_equal(hidden, tracks["occluded"][:, 2])
         np.testing.assert_array_equal(playback.draw(2), playback.draw(2, "left"))
-        found_then = playback.flow(1, 2, "left", "right").flow
-        assert not np.array_equal(found_then, playback.flow(1, 2, "left").flow)
+        to_right = playback.flow(1, 2, "left", "right").flow
+        assert not np.array_equal(to_right, playback.flow(1, 2, "left").flow)
         assert playback.draw(0, "oblique").shape == (256, 320, 3)
         with message.raises(ArgumentError, "camera"):
             playback.draw(0, "lift")
 
 
 @pytest.mark.parametrize("play", [True, False])
-def test_a_session_follows_the_main_camera_and_keeps_the_others(play: bool, small: Path, device: Device) -> None:
-    made = seen_by(SWAYING_STEREO, "[png]", "time.frames_per_second=25")
+def test_session_with_several_cameras(play: bool, small: Path, device: Device) -> None:
+    made = with_cameras(SWAYING_STEREO, "[png]", "time.frames_per_second=25")
     with Session(made, Captures(Path("captures"), "small.yaml"), threads=device.threads, play=play) as session:
         for _ in range(5):
             session.advance()
@@ -244,7 +243,7 @@ def test_a_session_follows_the_main_camera_and_keeps_the_others(play: bool, smal
         session.viewport.turn(20, 5)
         turned = session.viewport.view
         session.advance()
-        assert session.viewport.view is turned, "a camera that was turned stays"
+        assert session.viewport.view is turned, "a turned camera stays"
         left, right = session.recorded_scene().render.all_cameras.items()
         assert left[1] != made.render.main_camera
         assert right == ("right", made.render.all_cameras["right"])
@@ -253,7 +252,7 @@ def test_a_session_follows_the_main_camera_and_keeps_the_others(play: bool, smal
 
 
 def refuse(message: Messages, cameras: str, *overrides: str) -> None:
-    """Compare the errors of cameras that begin in line 11 of a scene file."""
+    """Compare the errors of cameras; they begin in line 11 of a scene file."""
     text = Path("small.yaml").read_text()
     Path("s.yaml").write_text(text.replace("refine: 1}", f"refine: 1, cameras: {{\n{cameras}}}}}"))
     with message.raises(SceneError):
@@ -263,57 +262,50 @@ def refuse(message: Messages, cameras: str, *overrides: str) -> None:
 NEAR = PAIR.format("[1, 0, 0]")
 
 
-def beside(keys: str) -> str:
+def right_of_top(keys: str) -> str:
     return f"left: top,\n right: {{beside: left, {keys}}}"
 
 
-WRONG = {
-    "not there": "left: top,\n right: {beside: lift, baseline: 1}",
-    "not at all like one": "left: top,\n right: {beside: x, baseline: 1}",
+INVALID_CAMERAS = {
+    "unknown camera": "left: top,\n right: {beside: lift, baseline: 1}",
     "itself": "left: top,\n right: {beside: right, baseline: 1}",
-    "a cycle": "left: top,\n a: {beside: b, baseline: 1}, b: {beside: a, baseline: 1}",
-    "the main one": "right: {beside: left, baseline: 1},\n left: top",
-    "no baseline": "left: top,\n right: {beside: left}",
+    "cycle": "left: top,\n a: {beside: b, baseline: 1}, b: {beside: a, baseline: 1}",
+    "main camera": "right: {beside: left, baseline: 1},\n left: top",
     "baseline 0": "left: top,\n right: {beside: left, baseline: 0}",
-    "far away": "left: top,\n right: {beside: left, baseline: 1.0e+20}",
-    "a baseline alone": "left: {eye: [0, 0, 1], baseline: 1}",
-    "an eye of its own": "left: top,\n right: {beside: left, baseline: 1, eye: [0, 0, 1]}",
-    "a lens at a baseline": beside("baseline: 1, fov: 30"),
-    "a rotation alone": beside("rotation: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]"),
-    "no rotation": beside("rotation: [[1, 0, 0], [0, 1, 0], [0, 0, 2]], translation: [1, 0, 0]"),
-    "far away by its translation": beside(PAIR.format("[0, 1.0e+20, 0]")),
-    "a distortion without a lens": beside(f"{NEAR}, distortion: {{k1: 1}}"),
-    "folds of its own": beside(f"{NEAR}, fov: 90, distortion: {{k1: -1}}"),
-    "no name": "Left: top",
-    "a folder of labels": "flow: top",
-    "a folder of exports": "export-obj: top",
-    "a calibration that is not there": "left: top, right: {eye: [0, 0, 1], calibration: a.yml}",
-    "a calibration that is a folder": "left: top, right: {eye: [0, 0, 1], calibration: .}",
+    "large baseline": "left: top,\n right: {beside: left, baseline: 1.0e+20}",
+    "baseline alone": "left: {eye: [0, 0, 1], baseline: 1}",
+    "baseline and eye": "left: top,\n right: {beside: left, baseline: 1, eye: [0, 0, 1]}",
+    "baseline and lens": right_of_top("baseline: 1, fov: 30"),
+    "rotation alone": right_of_top("rotation: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]"),
+    "scaled rotation": right_of_top("rotation: [[1, 0, 0], [0, 1, 0], [0, 0, 2]], translation: [1, 0, 0]"),
+    "distortion without a lens": right_of_top(f"{NEAR}, distortion: {{k1: 1}}"),
+    "folded distortion": right_of_top(f"{NEAR}, fov: 90, distortion: {{k1: -1}}"),
+    "invalid name": "Left: top",
+    "folder of labels": "flow: top",
+    "folder in place of a calibration": "left: top, right: {eye: [0, 0, 1], calibration: .}",
+    "missing calibration": "left: top, right: {eye: [0, 0, 1], calibration: a.yml}",
 }
 
 
-@pytest.mark.parametrize("cameras", WRONG.values(), ids=WRONG)
-def test_errors_name_the_camera_and_the_key(cameras: str, small: Path, message: Messages) -> None:
+@pytest.mark.parametrize("cameras", INVALID_CAMERAS.values(), ids=INVALID_CAMERAS)
+def test_errors_of_cameras(cameras: str, small: Path, message: Messages) -> None:
     refuse(message, cameras)
 
 
-def test_an_output_is_not_blamed_for_a_faulty_camera(small: Path, message: Messages) -> None:
-    refuse(message, WRONG["baseline 0"], "output=[png, disparity]")
-
-
-def test_what_does_not_go_together_is_refused(small: Path, message: Messages) -> None:
+def test_invalid_combinations_with_cameras(small: Path, message: Messages) -> None:
     refuse(message, "left: top", "render.camera=top")
     for override, cameras in (("render.cameras=null", [""]), ("render.camera=null", ["left"])):
         assert list(load_scene("s.yaml", ["render.camera=top", override]).render.all_cameras) == cameras
     refuse(message, "left: top", "output=[disparity]")
     refuse(message, "left: top", "output=[stereo]")
-    bent = "a: {eye: [0, 0, 1], distortion: {k1: -0.01}}, b: {beside: a, baseline: 1}"
-    refuse(message, bent, "output=[disparity]")
-    refuse(message, beside(NEAR), "output=[stereo, disparity]")
+    distorted = "a: {eye: [0, 0, 1], distortion: {k1: -0.01}}, b: {beside: a, baseline: 1}"
+    refuse(message, distorted, "output=[disparity]")
+    refuse(message, right_of_top(NEAR), "output=[stereo, disparity]")
+    refuse(message, INVALID_CAMERAS["baseline 0"], "output=[png, disparity]")  # the output is not at fault
 
 
-def test_a_pair_of_a_stereo_file(small: Path, message: Messages) -> None:
-    """R and T come from the file or, for a file of one camera, from the scene."""
+def test_stereo_calibration(small: Path, message: Messages) -> None:
+    """R and T are those of the file or, if it has one camera, of the scene."""
     matrices = [f"[[{fx}, 0, 20], [0, 41, 15], [0, 0, 1]]" for fx in (40, 43)]
     eyes = [f"K{n}: {matrix}\nD{n}: [-0.0{n}, 0, 0, 0]\n" for n, matrix in enumerate(matrices, 1)]
     rotation = TURN.tolist()
@@ -322,67 +314,58 @@ def test_a_pair_of_a_stereo_file(small: Path, message: Messages) -> None:
     left = {**LEFT, "calibration": "pair.yml"}
     right = {"beside": "left", "calibration": "pair.yml", "calibration_eye": "right", "calibration_unit": "mm"}
     single = {"beside": "left", "calibration": "right.yml"}
-    place = {"rotation": rotation, "translation": [-0.01, 0.002, 0.0005]}
-    found = [seen_by({"left": left, "right": other}) for other in (right, {**single, **place})]
-    assert found[0].render == found[1].render
+    pose = {"rotation": rotation, "translation": [-0.01, 0.002, 0.0005]}
+    pairs = [with_cameras({"left": left, "right": camera}) for camera in (right, {**single, **pose})]
+    assert pairs[0].render == pairs[1].render
     np.testing.assert_allclose(
-        pair_transform(found[0].render.all_cameras["right"])["translation"], [-0.01, 0.002, 5e-4]
+        pair_transform(pairs[0].render.all_cameras["right"])["translation"], [-0.01, 0.002, 5e-4]
     )
-    assert [view_at(found[0], 0, name).scale[0] for name in ("left", "right")] == [40, 43]
-    for wrong in (single, {**right, **place}, {**right, "calibration_eye": "left"}):
+    assert [view_at(pairs[0], 0, name).scale[0] for name in ("left", "right")] == [40, 43]
+    for invalid in (single, {**right, **pose}, {**right, "calibration_eye": "left"}):
         with message.raises(SceneError):
-            seen_by({"left": left, "right": wrong})
+            with_cameras({"left": left, "right": invalid})
 
 
-MOVING = {**SWAYING, "distortion": {"k1": -0.1, "p1": 0.002}}
-
-
-def test_a_camera_that_moves_has_a_pose_for_every_frame(small: Path, device: Device) -> None:
-    """Where labels are with these poses, tests/test_consistency.py tells."""
-    made = load_scene("small.yaml", [f"render.camera={json.dumps(MOVING)}", "output=[png, flow, trajectory]"])
+def test_poses_of_a_moving_camera(small: Path, device: Device) -> None:
+    """tests/test_consistency.py compares labels with these poses."""
+    moving = {**SWAYING, "distortion": {"k1": -0.1, "p1": 0.002}}
+    made = load_scene("small.yaml", [f"render.camera={json.dumps(moving)}", "output=[depth]"])
     run(made, "out", threads=device.threads, estimate_error=False)
     written = json.loads(Path("out/camera.json").read_text())
     assert written["poses"][0] == written["pose"]
     np.testing.assert_allclose(written["projection"], view(made).matrix[:3])
-    for frame, pose in enumerate(written["poses"]):
-        np.testing.assert_allclose(pose, calibration(view(made, frame / 10))["pose"], atol=1e-12)
-    assert len(written["poses"]) == 5
-    with Playback("out", threads=device.threads) as again:
-        with Image.open("out/frames/0003.png") as image:
-            np.testing.assert_array_equal(again.draw(3), np.array(image))
-        np.testing.assert_array_equal(again.flow(1, 2).flow, read_flow(Path("out/flow/0001.flo")))
+    expected = [calibration(view(made, frame / 10))["pose"] for frame in range(5)]
+    np.testing.assert_allclose(written["poses"], expected, atol=1e-12)
 
 
 def posed(**camera: Any) -> Scene:
     return scene(render={"camera": camera, "size": [40, 30]})
 
 
-def test_a_pose_is_that_of_an_eye_and_a_target(message: Messages) -> None:
+def test_pose_against_eye_and_target(message: Messages) -> None:
     by_eye = posed(eye=[0.1, -0.3, 0.4], target=[0, 0.05, 0], fov=50)
     matrix = np.array(calibration(view(by_eye))["pose"])
     pose = {"rotation": (matrix[:, :3] * 1.0004).tolist(), "translation": matrix[:, 3].tolist()}
-    # Rounded ones are made orthonormal.
+    # A rounded rotation is made orthonormal.
     np.testing.assert_allclose(view(posed(pose=pose, fov=50)).matrix, view(by_eye).matrix, atol=1e-9)
-    for wrong in (matrix[:, :3] * 1.002, matrix[[1, 0, 2], :3]):
+    for invalid in (matrix[:, :3] * 1.002, matrix[[1, 0, 2], :3]):
         with message.raises(SceneError, "render.camera.pose.rotation"):
-            view(posed(pose={**pose, "rotation": wrong.round(3).tolist()}))
+            view(posed(pose={**pose, "rotation": invalid.round(3).tolist()}))
 
 
-STOP = [[0, 0, 0, 1, 1, 0, 0, 0]]
+POSE = [[0, 0, 0, 1, 1, 0, 0, 0]]
 
-
-WRONG_MOTIONS: dict[str, dict[str, Any]] = {
+INVALID_MOTIONS: dict[str, dict[str, Any]] = {
     "equal times": {"eye": [[0, 0, 0, 1], [0, 0, 0, 2]]},
     "eye at its target": {"eye": [0, 0, 1], "target": [[0, 0, 0, 0], [0.2, 0, 0, 1]]},
-    "eye and poses": {"eye": [0, 0, 1], "poses": STOP},
-    "equal times of poses": {"poses": [*STOP, *STOP]},
-    "scale alone": {"eye": [0, 0, 1], "scale": True},
-    "poses and up": {"poses": STOP, "up": [0, 1, 0]},
+    "eye and poses": {"eye": [0, 0, 1], "poses": POSE},
+    "equal times of poses": {"poses": [*POSE, *POSE]},
+    "poses and up": {"poses": POSE, "up": [0, 1, 0]},
     "intrinsics and fov": {"eye": [0, 0, 1], "intrinsics": {"fx": 1, "fy": 1, "cx": 0, "cy": 0}, "fov": 30},
 }
 
 
-@pytest.mark.parametrize("camera", WRONG_MOTIONS.values(), ids=WRONG_MOTIONS)
-def test_what_cannot_be_is_refused(camera: dict[str, Any], message: Messages) -> None:
+@pytest.mark.parametrize("camera", INVALID_MOTIONS.values(), ids=INVALID_MOTIONS)
+def test_invalid_motions(camera: dict[str, Any], message: Messages) -> None:
     with message.raises(SceneError, "camera."):
         view(Scene(**posed(eye=[0, 0, 1]).model_dump(exclude={"render"}), render={"camera": camera}))

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import errno
 import json
 import os
 import re
@@ -16,6 +15,7 @@ from taichi_msm.runs.directory import LOCK_FILE, Publication, hidden_folder, loc
 from taichi_msm.runs.writer import RUN_PUBLICATION
 from taichi_msm.scene.outputs import RESULT_PATTERNS
 from tests.golden import Messages
+from tests.outputs import files
 
 OLD = ["frames/0000.png", "frames/0001.png", "frames/0002.png", "flow/0000.flo", "animation.gif", "run.json"]
 NEW = ["frames/0000.png", "frames/0001.png", "trajectory.npz", "run.json"]
@@ -29,12 +29,8 @@ FOREIGN = [
 ]
 
 
-class Killed(BaseException):
-    """Ends a process that can do nothing more on paths, as if by SIGKILL."""
-
-
 def write(directory: Path, names: Collection[str], text: str) -> None:
-    """Write files, and in the record what there is."""
+    """Write files, and a record that lists them."""
     outputs = sorted({name.partition("/")[0] for name in names})
     record = {"outputs": outputs, "frames": sum(name.startswith("frames/") for name in names), "text": text}
     for name in names:
@@ -49,7 +45,7 @@ def publish(directory: Path, names: Collection[str]) -> None:
 
 
 def contents(directory: Path) -> dict[str, str]:
-    """The results, the record by its text."""
+    """Texts of the results by name."""
     paths = {str(path.relative_to(directory)): path for path in sorted(directory.rglob("*"))}
     texts = {name: path.read_text() for name, path in paths.items() if re.fullmatch("|".join(RESULT_PATTERNS), name)}
     return {name: json.loads(text)["text"] if name == "run.json" else text for name, text in texts.items()}
@@ -73,7 +69,7 @@ def assert_tidy(directory: Path) -> None:
     assert {name: (directory / name).read_text() for name in FOREIGN} == dict.fromkeys(FOREIGN, "mine")
 
 
-def test_new_results_take_the_place_of_all_old_ones(directory: Path) -> None:
+def test_new_results_replace_earlier_ones(directory: Path) -> None:
     with Publication(directory, RUN_PUBLICATION) as publication:
         write(publication.new_folder, NEW, "new")
         assert contents(directory) == expected(OLD, "old")
@@ -83,58 +79,58 @@ def test_new_results_take_the_place_of_all_old_ones(directory: Path) -> None:
     assert_tidy(directory)
 
 
-def test_an_empty_directory_of_the_user_stays(tmp_path: Path) -> None:
-    with Publication(tmp_path, RUN_PUBLICATION):
-        pass
-    assert list(tmp_path.iterdir()) == []
+class Killed(BaseException):
+    """End of a process, as by SIGKILL: no operation on a path succeeds afterwards."""
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # of a lock that nobody closed
-def test_killed_at_any_moment_the_results_are_all_old_or_all_new(
-    directory: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # of a lock that is not closed
+@pytest.mark.parametrize(
+    ("operation", "calls", "outcome"),
+    [
+        pytest.param("mkdir", 1, "old", id="new folder"),
+        pytest.param("replace", 0, "old", id="commit"),
+        pytest.param("replace", 1, "new", id="earlier record"),
+        pytest.param("replace", 3, "new", id="second file"),
+        pytest.param("unlink", 1, "new", id="second obsolete file"),
+        pytest.param("rmdir", 0, "new", id="obsolete folder"),
+        pytest.param("replace", 5, "new", id="new record"),
+    ],
+)
+def test_publication_killed_at_each_stage(
+    operation: str, calls: int, outcome: str, directory: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Before every operation on a path, with none after it."""
-    outcomes: list[str] = []
-    left = 0
+    """Results with a record are all old or all new; the next publication completes or discards the new ones."""
+    remaining, killed = calls, False
 
-    def mortal(operation: Callable[..., Any]) -> Callable[..., Any]:
+    def mortal(name: str) -> Callable[..., Any]:
+        original = getattr(os, name)
+
         def call(*args: Any, **kwargs: Any) -> Any:
-            nonlocal left
-            left -= 1
-            if left < 0:
+            nonlocal remaining, killed
+            remaining -= name == operation
+            if killed or remaining < 0:
+                killed = True
                 raise Killed
-            return operation(*args, **kwargs)
+            return original(*args, **kwargs)
 
         return call
 
-    for moment in range(100):
-        write(directory, OLD, "old")
-        (directory / "trajectory.npz").unlink(missing_ok=True)
-        left = moment
-        with monkeypatch.context() as patch, suppress(Killed):
-            for name in ("open", "mkdir", "rename", "replace", "unlink", "rmdir"):
-                patch.setattr(os, name, mortal(getattr(os, name)))
-            publish(directory, NEW)
-            break
-        if (directory / "run.json").exists():
-            # Where there is a record, results are whole without the help of a next run.
-            assert contents(directory) in (expected(OLD, "old"), expected(NEW, "new"))
-        else:
-            assert (directory / ".partial" / "whole" / "run.json").exists()
-        with Publication(directory, RUN_PUBLICATION):
-            pass
-        found = contents(directory)
-        assert found in (expected(OLD, "old"), expected(NEW, "new")), f"killed before operation {moment}"
-        outcomes.append(found["run.json"])
-        assert_tidy(directory)
-    assert len(outcomes) < 100
-    # Once new, always new: all operations but those before the new files are renamed roll forward.
-    assert outcomes == sorted(outcomes, reverse=True)
-    assert outcomes.count("old") > 5
-    assert outcomes.count("new") > 10
+    with monkeypatch.context() as patch, suppress(Killed):
+        for name in ("open", "mkdir", "rename", "replace", "unlink", "rmdir"):
+            patch.setattr(os, name, mortal(name))
+        publish(directory, NEW)
+    assert killed
+    if (directory / "run.json").exists():
+        assert contents(directory) in (expected(OLD, "old"), expected(NEW, "new"))
+    else:
+        assert (directory / ".partial" / "whole" / "run.json").exists()
+    with Publication(directory, RUN_PUBLICATION):
+        pass
+    assert contents(directory) == expected(OLD if outcome == "old" else NEW, outcome)
+    assert_tidy(directory)
 
 
-def test_a_second_run_is_refused_until_the_first_ends(directory: Path, message: Messages) -> None:
+def test_concurrent_publication_is_refused(directory: Path, message: Messages) -> None:
     with Publication(directory, RUN_PUBLICATION) as first:
         write(first.new_folder, NEW, "new")
         with message.raises(FilesError, "--out"), Publication(directory, RUN_PUBLICATION):
@@ -146,28 +142,7 @@ def test_a_second_run_is_refused_until_the_first_ends(directory: Path, message: 
     assert_tidy(directory)
 
 
-def test_the_lock_of_a_directory_that_was_removed_is_no_lock(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Between opening the lock and locking it, the run that held it may end and remove it."""
-    import fcntl
-
-    flock = fcntl.flock
-    opened: list[int] = []
-
-    def late(file: int, operation: int) -> None:
-        if not opened:
-            (directory / ".partial" / "lock").unlink()
-        opened.append(file)
-        flock(file, operation)
-
-    monkeypatch.setattr(fcntl, "flock", late)
-    with Publication(directory, RUN_PUBLICATION):
-        assert len(opened) == 2
-        monkeypatch.undo()
-        with pytest.raises(FilesError), Publication(directory, RUN_PUBLICATION):
-            pass
-
-
-def test_what_a_killed_run_left_is_cleared(directory: Path) -> None:
+def test_leftovers_of_a_killed_run_are_deleted(directory: Path) -> None:
     write(directory / ".partial", ["lock", "earlier.json", "new/frames/0000.png", "whole/frames/0000.png"], "stale")
     with Publication(directory, RUN_PUBLICATION) as publication:
         assert list(publication.new_folder.iterdir()) == []
@@ -175,7 +150,7 @@ def test_what_a_killed_run_left_is_cleared(directory: Path) -> None:
     assert_tidy(directory)
 
 
-def test_a_staged_file_that_is_taken_away_is_missed(directory: Path, message: Messages) -> None:
+def test_missing_staged_file(directory: Path, message: Messages) -> None:
     with Publication(directory, RUN_PUBLICATION, NEW) as publication:
         write(publication.new_folder, NEW, "new")
         (publication.new_folder / "frames" / "0001.png").unlink()
@@ -185,25 +160,8 @@ def test_a_staged_file_that_is_taken_away_is_missed(directory: Path, message: Me
     assert_tidy(directory)
 
 
-def test_new_files_with_a_damaged_record_are_not_published(directory: Path, message: Messages) -> None:
-    write(directory / ".partial" / "whole", NEW, "new")
-    for damaged in ("", "[]", '{"outputs": 3, "frames": 2}', '{"outputs": ["frames"], "frames": 1e999}'):
-        (directory / ".partial" / "whole" / "run.json").write_text(damaged)
-        with message.raises(FilesError, "/whole/run.json"), Publication(directory, RUN_PUBLICATION):
-            pass
-        assert contents(directory) == expected(OLD, "old")
-
-
-def test_new_files_that_were_made_up_take_no_file_of_the_user(tmp_path: Path, message: Messages) -> None:
-    write(tmp_path, ["animation.gif", "trajectory.npz", "frames/0000.png"], "mine")
-    write(tmp_path / ".partial" / "whole", ["animation.gif", "run.json"], "new")
-    with message.raises(ForeignError, "animation.gif"), Publication(tmp_path, RUN_PUBLICATION):
-        pass
-    assert contents(tmp_path) == expected(["animation.gif", "trajectory.npz", "frames/0000.png"], "mine")
-
-
-def test_what_no_run_has_written_is_neither_replaced_nor_removed(directory: Path, message: Messages) -> None:
-    """Files with names like ours, which the record does not list."""
+def test_foreign_files_are_kept(directory: Path, message: Messages) -> None:
+    """Files with names of results that the record does not list."""
     write(directory, ["frames/0100.png"], "mine")
     publish(directory, NEW)
     assert contents(directory) == {**expected(NEW, "new"), "frames/0100.png": "mine"}
@@ -213,8 +171,8 @@ def test_what_no_run_has_written_is_neither_replaced_nor_removed(directory: Path
     assert contents(directory) == {**expected(NEW, "new"), "frames/0100.png": "mine", "animation.gif": "mine"}
 
 
-def test_what_a_killed_process_left_is_cleared_by_the_next(tmp_path: Path) -> None:
-    """But nothing that is still being written, and nothing of anybody else."""
+def test_abandoned_hidden_folders_are_deleted(tmp_path: Path) -> None:
+    """Locked or incomplete folders, and those with foreign files, are kept."""
     names = (*(16 * letter for letter in "abcd"), "mine")
     stale, living, begun, used, _ = kept = [tmp_path / f".partial-{name}" for name in names]
     for folder in kept:
@@ -230,7 +188,7 @@ def test_what_a_killed_process_left_is_cleared_by_the_next(tmp_path: Path) -> No
     assert (used / "thesis.txt").exists()
 
 
-def test_a_link_among_what_was_left_leads_nowhere(tmp_path: Path) -> None:
+def test_links_in_hidden_folders_are_not_followed(tmp_path: Path) -> None:
     treasure, out = tmp_path / "treasure", tmp_path / "out"
     (treasure / "lock").mkdir(parents=True)
     for name in ("a", "b"):
@@ -245,28 +203,9 @@ def test_a_link_among_what_was_left_leads_nowhere(tmp_path: Path) -> None:
     assert not (treasure / "notes.txt").exists()
 
 
-def test_without_locks_nothing_is_taken_for_abandoned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Such as a film that is still being recorded."""
-
-    def refuse(*_: object) -> None:
-        raise OSError(errno.ENOLCK, "no locks")
-
-    monkeypatch.setattr("fcntl.flock", refuse)
-    with hidden_folder(tmp_path) as film:
-        (film / "animation.gif").touch()
-        with hidden_folder(tmp_path):
-            pass
-        assert (film / "animation.gif").exists()
-
-
-def test_a_folder_made_for_nothing_goes(tmp_path: Path) -> None:
-    with hidden_folder(tmp_path / "out"):
-        pass
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_file_is_replaced_as_a_whole_or_not_at_all(tmp_path: Path) -> None:
+def test_atomic_replacement_of_a_file(tmp_path: Path) -> None:
     path = tmp_path / "a"
+    (tmp_path / "draft").write_text("mine")
     for data in (b"first", b"second"):
         with replacing(path) as file:
             file.write(data)
@@ -279,17 +218,10 @@ def test_a_file_is_replaced_as_a_whole_or_not_at_all(tmp_path: Path) -> None:
 
     with pytest.raises(KeyboardInterrupt):
         fail()
-    assert [(entry.name, entry.read_bytes()) for entry in tmp_path.iterdir()] == [("a", b"second")]
+    assert files(tmp_path) == {"a": b"second", "draft": b"mine"}
 
 
-def test_a_draft_of_the_user_stays(tmp_path: Path) -> None:
-    (tmp_path / "draft").write_text("mine")
-    with replacing(tmp_path / "a") as file:
-        file.write(b"new")
-    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"a": "new", "draft": "mine"}
-
-
-def test_a_file_takes_the_first_free_name(tmp_path: Path) -> None:
+def test_first_free_name(tmp_path: Path) -> None:
     for name in ("a-1.png", "a-3.png"):
         (tmp_path / name).write_text("mine")
     with hidden_folder(tmp_path) as hidden:

@@ -3,7 +3,6 @@ from __future__ import annotations
 import errno
 import json
 import os
-import resource
 import shutil
 import signal
 import subprocess
@@ -22,9 +21,9 @@ from PIL import Image
 
 from taichi_msm.errors import FilesError
 from taichi_msm.render.labels import Flow, FrameOutputs
-from taichi_msm.runs import encoder, media
+from taichi_msm.runs import media
 from taichi_msm.runs.checkpoint import is_unfinished
-from taichi_msm.runs.encoder import Encoder, PictureWriter
+from taichi_msm.runs.encoder import Encoder
 from taichi_msm.runs.writer import ResultWriter
 from taichi_msm.scene.scene import Scene
 from tests.golden import Messages
@@ -34,7 +33,7 @@ from tests.scenes import plan_of, scene, speckle
 ROWS, COLS = 3, 4
 WIDTH, HEIGHT = 40, 24
 
-# A run of one frame after another that never ends; names its encoder on stdout when the tenth is handed over.
+# An endless run; prints the process id of its encoder at the tenth frame.
 ENDLESS = """
 import itertools
 import sys
@@ -76,8 +75,8 @@ def observed(frame: int) -> dict[str, FrameOutputs]:
     return {"": FrameOutputs(picture(frame), flow=flow)}
 
 
-def write(directory: Path, frames: int, scene: Scene, *, beside: bool = True) -> list[str]:
-    with ResultWriter(directory, plan_of(scene), encode_in_subprocess=beside) as writer:
+def write(directory: Path, frames: int, scene: Scene, *, in_subprocess: bool = True) -> list[str]:
+    with ResultWriter(directory, plan_of(scene), encode_in_subprocess=in_subprocess) as writer:
         for frame in range(frames):
             writer.add(position(frame), observed(frame) if scene.draws else {"": FrameOutputs()})
         names: list[str] = writer.publish({})["outputs"]
@@ -86,68 +85,57 @@ def write(directory: Path, frames: int, scene: Scene, *, beside: bool = True) ->
     return names
 
 
-def test_all_results_of_a_run(tmp_path: Path) -> None:
-    names = write(tmp_path / "a" / "b", 11, small_scene())
+def test_results_of_a_run(tmp_path: Path) -> None:
+    out = tmp_path / "a" / "b"
+    names = write(out, 11, small_scene())
     assert names == ["frames", "animation.gif", "trajectory.npz", "run.json"]
-    found = files(tmp_path / "a" / "b")
     frames = [f"frames/{frame:04}.png" for frame in range(11)]
-    assert sorted(found) == sorted([*frames, "animation.gif", "trajectory.npz", "run.json"])
-    for frame in range(11):
-        with Image.open(tmp_path / "a" / "b" / frames[frame]) as image:
-            np.testing.assert_array_equal(np.asarray(image), picture(frame))
-    with Image.open(tmp_path / "a" / "b" / "animation.gif") as image:
-        assert image.size == (WIDTH, HEIGHT)
-        assert getattr(image, "n_frames", 1) == 11
-    assert json.loads(found["run.json"]) == {"frames": 11, "outputs": names}
+    assert sorted(files(out)) == sorted([*frames, *names[1:]])
+    for number, frame in enumerate(frames):
+        with Image.open(out / frame) as image:
+            np.testing.assert_array_equal(np.asarray(image), picture(number))
+    with Image.open(out / "animation.gif") as image:
+        assert (image.size, getattr(image, "n_frames", 1)) == ((WIDTH, HEIGHT), 11)
+    assert json.loads((out / "run.json").read_bytes()) == {"frames": 11, "outputs": names}
 
 
-@pytest.mark.parametrize("beside", [True, False])
-def test_equal_runs_write_equal_bytes(beside: bool, tmp_path: Path) -> None:
-    for name, other in (("first", True), ("second", beside)):
-        write(tmp_path / name, 7, small_scene(), beside=other)
+@pytest.mark.parametrize("in_subprocess", [True, False])
+def test_equal_runs_write_equal_bytes(in_subprocess: bool, tmp_path: Path) -> None:
+    write(tmp_path / "first", 7, small_scene())
+    write(tmp_path / "second", 7, small_scene(), in_subprocess=in_subprocess)
     assert files(tmp_path / "first") == files(tmp_path / "second")
 
 
-@pytest.mark.parametrize(
-    ("outputs", "names"),
-    [
-        (["png"], ["frames", "run.json"]),
-        (["gif"], ["animation.gif", "run.json"]),
-        (["trajectory"], ["trajectory.npz", "run.json"]),
-        ([], ["run.json"]),
-    ],
-)
-def test_only_the_outputs_asked_for_are_there(tmp_path: Path, outputs: list[str], names: list[str]) -> None:
-    """Also those that an earlier run left go, but no file of the user's."""
+def test_only_requested_outputs_remain(tmp_path: Path) -> None:
+    """Other outputs of an earlier run are deleted, foreign files are kept."""
     write(tmp_path, 4, small_scene())
     (tmp_path / "notes.txt").write_text("mine")
-    assert write(tmp_path, 3, small_scene(*outputs) if outputs else scene(output=[])) == names
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*names, "notes.txt"])
-    if "png" in outputs:
-        assert len(list((tmp_path / "frames").iterdir())) == 3
+    for made, names in (
+        (small_scene("png"), ["frames", "run.json"]),
+        (small_scene("gif"), ["animation.gif", "run.json"]),
+        (scene(output=[]), ["run.json"]),
+    ):
+        assert write(tmp_path, 3, made) == names
+        assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*names, "notes.txt"])
+        assert len(list((tmp_path / "frames").glob("*"))) == (3 if "frames" in names else 0)
 
 
 @pytest.mark.parametrize(("precision", "dtype"), [("f32", np.float32), ("f64", np.float64)])
-def test_the_trajectory_comes_back(tmp_path: Path, precision: str, dtype: type[np.floating[Any]]) -> None:
+def test_trajectory_file(
+    precision: str, dtype: type[np.floating[Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It may exceed 4 GiB: zipfile writes beyond its limit only if ZIP64 is chosen before the first byte."""
+    monkeypatch.setattr(zipfile, "ZIP64_LIMIT", 100)
     write(tmp_path, 6, small_scene("trajectory", precision=precision))
     with np.load(tmp_path / "trajectory.npz") as trajectory:
-        assert trajectory["position"].dtype == dtype
-        assert trajectory["time"].dtype == np.float64
+        assert (trajectory["position"].dtype, trajectory["time"].dtype) == (dtype, np.float64)
         np.testing.assert_array_equal(trajectory["time"], np.arange(6) / 25)
         np.testing.assert_array_equal(trajectory["position"], [position(f).astype(dtype) for f in range(6)])
 
 
-def test_a_trajectory_may_be_longer_than_4_gib(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """zipfile refuses to write past its limit unless it was told before the first byte."""
-    monkeypatch.setattr(zipfile, "ZIP64_LIMIT", 1000)
-    write(tmp_path, 20, small_scene("trajectory"))
-    with np.load(tmp_path / "trajectory.npz") as trajectory:
-        assert trajectory["position"].shape == (20, ROWS, COLS, 3)
-
-
 @pytest.mark.parametrize("light", [1.25, 0.25])
-def test_the_animation_is_like_its_frames(tmp_path: Path, light: float) -> None:
-    """The palette, made from the first frame, foresees later ones in other light, and the background."""
+def test_animation_colours_under_changing_light(tmp_path: Path, light: float) -> None:
+    """The palette of the first frame covers later frames in other light, and the background."""
     first = np.empty((16, 16, 3), np.uint8)
     first[:, ::2], first[:, 1::2] = (200, 100, 90), (180, 130, 100)
     later = first.copy()
@@ -162,26 +150,26 @@ def test_the_animation_is_like_its_frames(tmp_path: Path, light: float) -> None:
         image.seek(1)
         shown = np.asarray(image.convert("RGB")).astype(float)
     assert (shown[:, 0] == background).all()
-    # Levels of light lie up to a quarter apart: half of that, of 200, and the lookup's 2 and the rounding's 1.
+    # Brightnesses are at most a quarter apart: half of that, of 200, plus 2 of the lookup and 1 of rounding.
     assert np.abs(shown - later).max() <= 28
 
 
-@pytest.mark.parametrize("beside", [True, False])
-def test_leaving_without_publishing_leaves_what_was_there(beside: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize("in_subprocess", [True, False])
+def test_unpublished_results_are_discarded(in_subprocess: bool, tmp_path: Path) -> None:
     write(tmp_path / "out", 3, small_scene())
     before = files(tmp_path / "out")
     for directory in (tmp_path / "out", tmp_path / "fresh"):
-        with ResultWriter(directory, plan_of(small_scene()), encode_in_subprocess=beside) as writer:
+        with ResultWriter(directory, plan_of(small_scene()), encode_in_subprocess=in_subprocess) as writer:
             writer.add(position(9), {"": FrameOutputs(picture(9))})
     assert files(tmp_path / "out") == before
     assert not (tmp_path / "fresh").exists()
 
 
 @pytest.mark.parametrize(("rows", "frames"), [(HEIGHT // 2, 1), (HEIGHT, 2)])
-def test_an_interrupted_hand_over_leaves_whole_frames(
+def test_interruption_between_positions_and_picture(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rows: int, frames: int
 ) -> None:
-    """Ctrl-C may come when the positions of a frame, but not all rows of its picture, are handed over."""
+    """Ctrl-C after the encoder has received the positions of a frame and some rows of its picture."""
 
     def interrupted(encoder: Encoder, pictures: NDArray[np.uint8]) -> None:
         add(encoder, pictures[:, :rows])
@@ -201,31 +189,25 @@ def test_an_interrupted_hand_over_leaves_whole_frames(
     assert files(tmp_path / "interrupted") == files(tmp_path / "whole")
 
 
-def finish_after_another(writer: ResultWriter) -> None:
-    writer.add(position(1), {"": FrameOutputs(picture(1))})
-    writer.finish()
-
-
-@pytest.mark.parametrize(
-    ("owner", "part"), [(Image.Image, "save"), (media.Palette, "indices"), (media.GifWriter, "_write_last")]
-)
-def test_an_interruption_while_a_picture_is_encoded_here_leaves_whole_frames(
+@pytest.mark.parametrize(("owner", "part"), [(Image.Image, "save"), (media.GifWriter, "_write_last")])
+def test_interruption_during_encoding_in_threads(
     owner: type, part: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ctrl-C may come in the middle of a still, of a frame of the film, and of its end."""
+    """Ctrl-C during a still, and at the end of the film."""
     original = getattr(owner, part)
 
     def interrupted(*arguments: Any, **keywords: Any) -> Any:
         interrupt_main()
-        time.sleep(0.3)  # until the main thread has heard of it
+        time.sleep(0.3)  # until the main thread is interrupted
         return original(*arguments, **keywords)
 
     with ResultWriter(tmp_path / "interrupted", plan_of(small_scene()), encode_in_subprocess=False) as writer:
         writer.add(position(0), {"": FrameOutputs(picture(0))})
         with monkeypatch.context() as patch:
             patch.setattr(owner, part, interrupted)
-            with pytest.raises(KeyboardInterrupt):
-                finish_after_another(writer)
+            with pytest.raises(KeyboardInterrupt):  # noqa: PT012
+                writer.add(position(1), {"": FrameOutputs(picture(1))})
+                writer.finish()
         writer.finish()
         writer.publish({})
         frames = writer.frames
@@ -233,52 +215,18 @@ def test_an_interruption_while_a_picture_is_encoded_here_leaves_whole_frames(
     assert files(tmp_path / "interrupted") == files(tmp_path / "whole")
 
 
-def test_an_interruption_between_still_and_film_leaves_whole_frames(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Even if the still is written late."""
-
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    def write_late(*arguments: Any) -> float:
-        time.sleep(0.1)
-        return write_still(*arguments)
-
-    write_still = encoder._write_still
-    with ResultWriter(tmp_path / "interrupted", plan_of(small_scene()), encode_in_subprocess=False) as writer:
-        writer.add(position(0), observed(0))
-        assert isinstance(writer._encoder, PictureWriter)
-        with monkeypatch.context() as patch:
-            patch.setattr(writer._encoder._video_executor, "submit", interrupted)
-            patch.setattr(encoder, "_write_still", write_late)
-            with pytest.raises(KeyboardInterrupt):
-                writer.add(position(1), observed(1))
-        writer.finish()
-        time.sleep(0.2)
-        writer.publish({})
-    write(tmp_path / "whole", 1, small_scene())
-    assert files(tmp_path / "interrupted") == files(tmp_path / "whole")
-
-
-def test_a_run_whose_results_are_published_is_not_gone_on_with(tmp_path: Path) -> None:
-    """Not even when it is killed before its checkpoint is deleted."""
+def test_published_run_is_finished(tmp_path: Path) -> None:
+    """Even if it is killed before its checkpoint is deleted."""
     with ResultWriter(tmp_path, plan_of(small_scene()), {}) as writer:
         writer.add(position(0), observed(0))
         assert is_unfinished(tmp_path)
+        assert isinstance(writer._encoder, Encoder)
+        assert os.getsid(writer._encoder._process.pid) != os.getsid(0), "Ctrl-C does not reach the encoder"
         writer.publish({"status": "complete"})
         assert not is_unfinished(tmp_path)
 
 
-def test_ctrl_c_does_not_reach_the_encoder(tmp_path: Path) -> None:
-    with ResultWriter(tmp_path, plan_of(small_scene())) as writer:
-        assert isinstance(writer._encoder, Encoder)
-        assert os.getsid(writer._encoder._process.pid) != os.getsid(0)
-
-
-def test_a_killed_run_leaves_the_results_and_the_next_one_goes_on(
-    tmp_path: Path, root: Path, message: Messages
-) -> None:
+def test_killed_run_and_its_successor(tmp_path: Path, root: Path, message: Messages) -> None:
     write(tmp_path, 3, small_scene())
     before = files(tmp_path)
     command = [sys.executable, "-c", ENDLESS, str(tmp_path)]
@@ -293,7 +241,7 @@ def test_a_killed_run_leaves_the_results_and_the_next_one_goes_on(
         with message.raises(FilesError):
             write(tmp_path, 2, small_scene())
         os.kill(encoder, signal.SIGCONT)
-        run.communicate()  # until the encoder has ended too
+        run.communicate()  # until the encoder has ended
     assert {name: data for name, data in files(tmp_path).items() if ".partial" not in name} == before
     write(tmp_path, 2, small_scene())
     assert len(list((tmp_path / "frames").iterdir())) == 2
@@ -305,10 +253,8 @@ def full_disk(*_: object, **__: object) -> None:
 
 
 @pytest.mark.parametrize("target", ["checkpoint.create_file", "checkpoint.write_arrays", "writer.write_new_file"])
-def test_a_full_disk_is_one_line_and_changes_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, target: str, message: Messages
-) -> None:
-    """When the positions are written, the manifest or the record."""
+def test_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, target: str, message: Messages) -> None:
+    """While positions, manifest or record are written; results are unchanged."""
     write(tmp_path, 3, small_scene())
     before = files(tmp_path)
     monkeypatch.setattr(f"taichi_msm.runs.{target}", full_disk)
@@ -317,76 +263,57 @@ def test_a_full_disk_is_one_line_and_changes_nothing(
     assert files(tmp_path) == before
 
 
-@pytest.mark.parametrize("limit", [4096, 100 * 100 * 3 * 8 + 200], ids=["positions", "trajectory"])
-def test_positions_that_cannot_be_written(tmp_path: Path, limit: int, message: Messages) -> None:
-    sheet = {"points": [100, 100], "size": [0.3, 0.4], "mass": 1e-3}
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+def file_error(
+    directory: Path, meanwhile: Callable[[ResultWriter], object] = lambda _: None, *, in_subprocess: bool = True
+) -> str:
+    """Error message of a run that an event interrupts."""
 
     def run() -> None:
-        with ResultWriter(tmp_path, plan_of(scene(sheet=sheet, output=["trajectory"]))) as writer:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
-            writer.add(np.zeros((100, 100, 3)), {"": FrameOutputs()})
-            writer.publish({})
-
-    try:
-        with message.raises(FilesError, "--out"):
-            run()
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert list(tmp_path.iterdir()) == []
-
-
-def refused(directory: Path, meanwhile: Callable[[ResultWriter], None] = lambda _: None, *, beside: bool = True) -> str:
-    """The error of a run of many frames in whose course something happens."""
-
-    def run() -> None:
-        with ResultWriter(directory, plan_of(small_scene()), encode_in_subprocess=beside) as writer:
+        with ResultWriter(directory, plan_of(small_scene()), encode_in_subprocess=in_subprocess) as writer:
             meanwhile(writer)
             for frame in range(1000):
                 writer.add(position(frame), {"": FrameOutputs(picture(frame))})
             writer.publish({})
 
-    with pytest.raises(FilesError) as told:
+    with pytest.raises(FilesError) as caught:
         run()
-    return str(told.value)
+    return str(caught.value)
 
 
-def test_a_file_in_the_place_of_the_directory(tmp_path: Path, message: Messages) -> None:
+def test_file_at_the_path_of_the_directory(tmp_path: Path, message: Messages) -> None:
     (tmp_path / "out").write_text("mine")
-    message(refused(tmp_path / "out"), "--out")
+    message(file_error(tmp_path / "out"), "--out")
     assert (tmp_path / "out").read_text() == "mine"
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_a_directory_that_cannot_be_written(tmp_path: Path) -> None:
+def test_read_only_directory(tmp_path: Path) -> None:
     tmp_path.chmod(0o500)
-    assert "Permission denied" in refused(tmp_path / "out")
+    assert "Permission denied" in file_error(tmp_path / "out")
 
 
-@pytest.mark.parametrize("beside", [True, False])
-def test_what_stops_the_encoder_is_told(beside: bool, tmp_path: Path, message: Messages) -> None:
-    def block(_: ResultWriter) -> None:
-        (tmp_path / ".partial" / "new" / "frames").write_text("in the way")
+def test_errors_of_the_encoder(tmp_path: Path, message: Messages) -> None:
+    """A file in the way of the pictures, and a killed process."""
+    blocked = tmp_path / ".partial" / "new" / "frames"
+    for in_subprocess in (True, False):
+        message(file_error(tmp_path, lambda _: blocked.write_text("mine"), in_subprocess=in_subprocess), "--out")
+        assert blocked.read_text() == "mine"
+        blocked.unlink()
 
-    message(refused(tmp_path, block, beside=beside), "--out")
-    assert (tmp_path / ".partial" / "new" / "frames").read_text() == "in the way"
-
-
-def test_an_encoder_that_is_killed_is_told(tmp_path: Path, message: Messages) -> None:
     def kill(writer: ResultWriter) -> None:
         assert isinstance(writer._encoder, Encoder)
         writer._encoder._process.kill()
 
-    message(refused(tmp_path, kill), "encoder")
+    message(file_error(tmp_path, kill), "encoder")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_directory_that_vanishes(tmp_path: Path, message: Messages) -> None:
-    message(refused(tmp_path / "out", lambda _: shutil.rmtree(tmp_path / "out")), "--out")
+def test_deleted_directory(tmp_path: Path, message: Messages) -> None:
+    message(file_error(tmp_path / "out", lambda _: shutil.rmtree(tmp_path / "out")), "--out")
     assert not (tmp_path / "out").exists()
 
 
-def test_the_record_is_strict_json(tmp_path: Path) -> None:
+def test_record_is_strict_json(tmp_path: Path) -> None:
     with ResultWriter(tmp_path, plan_of(scene())) as writer:
         with pytest.raises(ValueError, match="JSON"):
             writer.publish({"step": float("nan")})

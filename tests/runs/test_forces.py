@@ -1,4 +1,4 @@
-"""The forces of probes on the sheet: against the twin, and against what must hold of any force."""
+"""Forces of probes on the sheet, against the NumPy reference and closed forms."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ from taichi_msm.cli.console import run_summary
 from taichi_msm.load.scene_file import load_scene
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.model.surface import surface_point
-from taichi_msm.model.tool_force import control_point, probe_records
+from taichi_msm.model.tool_force import control_point
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.process import available_threads
 from taichi_msm.system.runtime import Device
 from tests import reference
 from tests.golden import Messages
 from tests.scenes import plan_of, scene
-from tests.terms.test_contact import CASES, EDGES, PRESSED, touching
+from tests.terms.test_contact import CASES, PRESSED, touching
 
 Array = NDArray[np.float64]
 
 
 def expected_forces(made: Scene) -> Array:
-    """The twin's mean force of every probe at every frame but the first [N], shape (frames, probes, 3)."""
+    """Mean force of every probe over each frame in the reference [N], shape (frames, probes, 3)."""
     plan = plan_of(made)
-    per_frame, found = plan.grid.steps_per_frame, []
+    per_frame, forces = plan.grid.steps_per_frame, []
     for n, (_, contact) in enumerate(reference.steps(plan)):
         if n > 0:
-            found.append(contact.force.sum(axis=(1, 2)))
-    return np.array(found).reshape(-1, per_frame, len(made.probes), 3).mean(axis=1)
+            forces.append(contact.force.sum(axis=(1, 2)))
+    return np.array(forces).reshape(-1, per_frame, len(made.probes), 3).mean(axis=1)
 
 
 @pytest.mark.parametrize(
@@ -50,17 +50,17 @@ def expected_forces(made: Scene) -> Array:
         ("f64", "backward", 1e-13),
     ],
 )
-def test_the_force_of_a_tool_is_that_of_the_twin(precision: str, difference: str, error: float, device: Device) -> None:
-    """In f32, positions of 0.1 m are rounded by 4e-9 m, and pushes are 1e-5 m."""
+def test_tool_force_against_the_reference(precision: str, difference: str, error: float, device: Device) -> None:
+    """In f32, positions of 0.1 m are rounded by 4e-9 m, and contact corrections are 1e-5 m."""
     made = touching(CASES["together"], time={"precision": precision, "damping_difference": difference})
     forces, expected = [], expected_forces(made)
     with Simulation(made, threads=device.threads) as simulation:
-        assert all(one.force == (0, 0, 0) for one in simulation.forces())
+        assert all(tip.force == (0, 0, 0) for tip in simulation.forces())
         for frame, each in enumerate(expected):
             simulation.advance()
-            forces.append([one.force for one in simulation.forces()])
+            forces.append([tip.force for tip in simulation.forces()])
             lowest = [tool.lowest_point((frame + 1) / 25) for tool in plan_of(made).tools]
-            assert [one.tip for one in simulation.forces()] == lowest
+            assert [tip.tip for tip in simulation.forces()] == lowest
             assert np.abs(np.array(forces[-1]) - each).max() < error * np.abs(expected).max()
         norms = np.linalg.norm(forces, axis=2)
         for index, peak in enumerate(simulation.felt.greatest):
@@ -68,18 +68,7 @@ def test_the_force_of_a_tool_is_that_of_the_twin(precision: str, difference: str
             assert (peak.time, peak.force) == ((greatest + 1) / 25, forces[greatest][index])
 
 
-@pytest.mark.slow
-def test_points_at_an_open_edge_count_with_their_mass(device: Device) -> None:
-    made = touching(EDGES["from outside the border"])
-    made = made.model_copy(update={"sheet": made.sheet.model_copy(update={"fixed": "none"})})
-    expected = expected_forces(made)
-    with Simulation(made, threads=device.threads) as simulation:
-        for each in expected:
-            simulation.advance()
-            assert np.abs(simulation.forces()[0].force - each[0]).max() < 1e-12 * np.abs(expected).max()
-
-
-# Jumps up at a frame, down between two, and to another place at a third.
+# Jumps up at a frame, down between two frames, and to another position at a third.
 JUMPING: dict[str, Any] = {
     "at": [[0, 0.4, 0.5], [0.2, 0.6, 0.5], [0.2, 0.3, 0.5]],
     "load": [[0, 0], [0.08, 50], [0.08, 100], [0.17, 100], [0.17, 0], [0.2, 0], [0.3, 80]],
@@ -89,7 +78,7 @@ JUMPING: dict[str, Any] = {
 }
 
 
-def test_the_force_of_a_load_is_that_at_the_frame(device: Device) -> None:
+def test_load_force_at_each_frame(device: Device) -> None:
     made = scene(probes=[JUMPING])
     rate = made.time.frames_per_second
     percents = {0: 0, 1: 25, 2: 100, 3: 100, 4: 100, 5: 0, 6: 80 * 0.4, 7: 80 * 0.8, 8: 80}
@@ -106,17 +95,7 @@ def test_the_force_of_a_load_is_that_at_the_frame(device: Device) -> None:
             simulation.advance()
 
 
-def test_a_tool_far_from_what_is_fixed_has_the_force_that_is_told(device: Device) -> None:
-    probe = {"total": [1, 0, -2], "radius": 0.01, "falloff": 500, "load": [[0, 100]]}
-    made = touching([probe], sheet={"points": [17, 21], "size": [0.3, 0.4], "fixed": "none"})
-    (record,) = probe_records(made)
-    with Simulation(made, threads=device.threads) as simulation:
-        (felt,) = simulation.forces()
-    assert record is not None
-    assert np.linalg.norm(felt.force) == pytest.approx(record["total_force"], rel=1e-14)
-
-
-def test_forces_go_on_where_they_were_saved(device: Device, message: Messages) -> None:
+def test_forces_of_a_restored_simulation(device: Device, message: Messages) -> None:
     made = touching([PRESSED, {"total": [0, 0, -1], "at": [0.2, 0.2], "load": [[0, 0], [0.2, 100], [0.4, 0]]}])
     with Simulation(made, threads=device.threads) as simulation:
         first = simulation.forces()
@@ -142,37 +121,34 @@ def table_of(directory: Path) -> list[list[str]]:
         return list(csv.reader(file))
 
 
-def test_a_run_writes_the_forces_of_all_frames(device: Device, tmp_path: Path) -> None:
-    """To the bit, and the greatest of every probe is in the record."""
+def test_table_of_forces(device: Device, tmp_path: Path) -> None:
+    """The table has the bits of the simulation, and run.json the greatest force of every probe."""
     load = {"total": [0.1, 0, -1], "load": [[0, 0], [0.2, 100], [0.4, 0]], "at": [0.2, 0.3]}
     made = touching([load, *CASES["rubbed"]], output=["forces"])
     expected = []
     with Simulation(made, threads=device.threads) as simulation:
         for frame in range(11):
-            expected += [[frame / 25, one.probe, *one.tip, *one.force] for one in simulation.forces()]
+            expected += [[frame / 25, tip.probe, *tip.tip, *tip.force] for tip in simulation.forces()]
             simulation.advance(int(frame < 10))
     record = run(made, tmp_path / "out", threads=device.threads)
     assert record["outputs"] == ["forces.csv", "run.json"]
     header, *rows = table_of(tmp_path / "out")
     assert header == ["time", "probe", "tip_x", "tip_y", "tip_z", "force_x", "force_y", "force_z"]
     assert [list(map(float, row)) for row in rows] == expected
-    for probe, found in enumerate(record["probes"]):
-        (greatest, row) = max((math.hypot(*row[5:]), row) for row in expected if row[1] == probe)
-        assert found["greatest_force"] == greatest
-        assert [found["greatest_force_time"], *found["greatest_force_vector"]] == [row[0], *row[5:]]
-    said = run_summary(record, tmp_path)
-    assert re.search(r"^probes\.0: [\d.]+ N in all, at most [\d.]+ kPa$", said, re.MULTILINE)
-    assert re.search(r"^probes\.1: at most [\d.]+ N, at 0\.\d+ s$", said, re.MULTILINE)
-
-
-def test_without_probes_there_is_a_table_without_rows(device: Device, tmp_path: Path) -> None:
-    run(scene(probes=[], output=["forces"]), tmp_path, threads=device.threads, estimate_error=False)
-    assert len(table_of(tmp_path)) == 1
+    for index, probe in enumerate(record["probes"]):
+        greatest, row = max((math.hypot(*row[5:]), row) for row in expected if row[1] == index)
+        assert probe["greatest_force"] == greatest
+        assert [probe["greatest_force_time"], *probe["greatest_force_vector"]] == [row[0], *row[5:]]
+    summary = run_summary(record, tmp_path)
+    assert re.search(r"^probes\.0: [\d.]+ N in all, at most [\d.]+ kPa$", summary, re.MULTILINE)
+    assert re.search(r"^probes\.1: at most [\d.]+ N, at 0\.\d+ s$", summary, re.MULTILINE)
+    run(scene(probes=[], output=["forces"]), tmp_path / "none", threads=device.threads, estimate_error=False)
+    assert len(table_of(tmp_path / "none")) == 1
 
 
 @pytest.mark.slow
-def test_forces_have_the_same_bits_with_any_number_of_threads(tmp_path: Path, device: Device) -> None:
-    """Also a thread, in a process of its own."""
+def test_forces_are_independent_of_threads(tmp_path: Path, device: Device) -> None:
+    """The run with one thread is in another process."""
     probes = json.dumps([{**PRESSED, "friction": 0.3}])
     (tmp_path / "scene.yaml").write_text(
         "sheet: {points: [41, 61], size: [0.3, 0.4]}\n"
@@ -191,8 +167,8 @@ def test_forces_have_the_same_bits_with_any_number_of_threads(tmp_path: Path, de
     assert record["probes"][0]["greatest_force"] > 0.1
 
 
-def test_what_was_felt_before_a_divergence_is_kept(device: Device) -> None:
-    """At the frame before the last good step, also when it is found out again from an earlier one."""
+def test_forces_before_a_divergence(device: Device) -> None:
+    """Forces of the last valid frame, also after a diagnosis from an earlier state."""
     blow = {"total": [0, 0, 1e30], "load": [[0.21, 0], [0.21, 100]]}
     with Simulation(touching([PRESSED, blow]), threads=device.threads) as simulation:
         simulation.advance(3)

@@ -1,4 +1,4 @@
-"""The labels of a run: their files as other programs read them, and what they say against the twin."""
+"""Label files of a run, read without this package, against the NumPy reference."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from taichi_msm.load.scene_file import load_scene
 from taichi_msm.model.surface import place_instruments
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
+from tests.conftest import write_small
 from tests.golden import Messages
 from tests.outputs import results
 from tests.reference import labels as twin
-from tests.scenes import SMALL, speckle
 
 ALL = "output=[png, coordinates, depth, normals, flow, occlusion, instrument, tracks, trajectory]"
 OBLIQUE = "render.camera=oblique"
@@ -32,7 +32,7 @@ def small_scene(*overrides: str) -> Scene:
 
 
 def read_flow(path: Path) -> NDArray[np.float32]:
-    """Read the Middlebury format, as its authors describe it."""
+    """Read a .flo file by the description of its authors."""
     data = path.read_bytes()
     assert data[:4] == b"PIEH"
     width, height = np.frombuffer(data, "<i4", 2, 4)
@@ -40,7 +40,7 @@ def read_flow(path: Path) -> NDArray[np.float32]:
 
 
 def made(directory: str, device: Device, *overrides: str) -> Results:
-    """The results of a run, and its trajectory."""
+    """Directory and trajectory of a run."""
     record = run(small_scene(*overrides), directory, threads=device.threads, estimate_error=False)
     assert record["status"] == "complete"
     with np.load(f"{directory}/trajectory.npz") as archive:
@@ -49,24 +49,24 @@ def made(directory: str, device: Device, *overrides: str) -> Results:
 
 @pytest.fixture(scope="module")
 def labelled(device: Device, tmp_path_factory: pytest.TempPathFactory) -> Results:
-    """The results of a run with all labels of a rod, seen obliquely, and its trajectory; to be read only."""
-    here = tmp_path_factory.mktemp("labelled")
-    Image.fromarray(speckle(30, 40)).save(here / "speckle.png")
-    (here / "small.yaml").write_text(SMALL)
+    """Directory and trajectory of a run with all labels of an instrument, from an oblique camera; read-only."""
+    folder = tmp_path_factory.mktemp("labelled")
+    write_small(folder)
     with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(here)
-        return here / made("out", device, ALL, OBLIQUE, ROD)[0], dict(np.load("out/trajectory.npz"))
+        patch.chdir(folder)
+        directory, trajectory = made("out", device, ALL, OBLIQUE, ROD)
+    return folder / directory, trajectory
 
 
-def test_labels_are_those_of_the_twin(labelled: Results, small: Path) -> None:
+def test_labels_against_the_reference(labelled: Results, small: Path) -> None:
     done, trajectory = labelled
     scene, position = small_scene(OBLIQUE, ROD), trajectory["position"].astype(float)
     for frame in range(5):
         placed = place_instruments(scene, position[frame], trajectory["time"][frame])
         coordinates, depth, instrument = twin.labels(scene, position[frame], placed)
-        found = np.load(done / f"coordinates/{frame:04}.npy")
-        assert (found.dtype, found.shape) == (np.float32, (30, 40, 2))
-        np.testing.assert_allclose(found, coordinates, atol=1e-5)
+        written = np.load(done / f"coordinates/{frame:04}.npy")
+        assert (written.dtype, written.shape) == (np.float32, (30, 40, 2))
+        np.testing.assert_allclose(written, coordinates, atol=1e-5)
         with Image.open(done / f"depth/{frame:04}.tiff") as image:
             assert image.mode == "F"
             np.testing.assert_allclose(np.array(image), depth, rtol=1e-5)
@@ -87,7 +87,7 @@ def test_labels_are_those_of_the_twin(labelled: Results, small: Path) -> None:
     assert not (done / "occlusion/0004.png").exists()
 
 
-def test_tracks_are_listed_by_rows_of_material_points(labelled: Results) -> None:
+def test_layout_of_tracks(labelled: Results) -> None:
     with np.load(labelled[0] / "tracks.npz") as archive:
         tracks = dict(archive)
     middle = (np.arange(5) + 0.5) / 5
@@ -101,13 +101,13 @@ def test_tracks_are_listed_by_rows_of_material_points(labelled: Results) -> None
     }
 
 
-def test_labels_do_not_depend_on_the_samples_of_the_picture(labelled: Results, small: Path, device: Device) -> None:
+def test_labels_are_independent_of_supersampling(labelled: Results, small: Path, device: Device) -> None:
     twice, _ = made("twice", device, ALL, ROD, OBLIQUE, "render.supersample=2")
-    one, two = results(labelled[0]), results(twice)
-    assert {name for name in one if one[name] != two[name]} == {f"frames/{n:04}.png" for n in range(5)}
+    first, second = results(labelled[0]), results(twice)
+    assert {name for name in first if first[name] != second[name]} == {f"frames/{n:04}.png" for n in range(5)}
 
 
-def test_labels_need_no_picture_and_masks_alone_no_camera(small: Path, device: Device) -> None:
+def test_labels_without_picture_or_camera(small: Path, device: Device) -> None:
     scene = small_scene("output=[flow, tracks]").model_copy(update={"image": None})
     record = run(scene, "out", threads=device.threads, estimate_error=False)
     assert record["outputs"] == ["flow", "tracks.npz", "camera.json", "run.json"]
@@ -117,7 +117,7 @@ def test_labels_need_no_picture_and_masks_alone_no_camera(small: Path, device: D
     assert not Path("masks/camera.json").exists()
 
 
-def test_a_run_is_played_back(labelled: Results, device: Device, message: Messages) -> None:
+def test_playback(labelled: Results, device: Device, message: Messages) -> None:
     done, trajectory = labelled
     with Playback(done, threads=device.threads) as playback:
         np.testing.assert_array_equal(playback.positions, trajectory["position"])
@@ -126,7 +126,7 @@ def test_a_run_is_played_back(labelled: Results, device: Device, message: Messag
             np.testing.assert_array_equal(playback.draw(2), np.array(image))
         np.testing.assert_array_equal(playback.labels(3).coordinates, np.load(done / "coordinates/0003.npy"))
         np.testing.assert_array_equal(playback.flow(1, 2).flow, read_flow(done / "flow/0001.flo"))
-        # Any two frames: what stays where it is flows nowhere.
+        # The flow from a frame to itself is 0.
         still = playback.flow(4, 4).flow
         assert np.abs(still[still[..., 0] < 1e9]).max() < 1e-3
         for frame in (-1, 5, 1.0, True):

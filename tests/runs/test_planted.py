@@ -1,4 +1,4 @@
-"""Folders that somebody else has prepared: nothing of theirs, or beyond, is read, changed or removed."""
+"""Prepared folders: no foreign file, in them or behind their links, is read, changed or deleted."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ import pytest
 from taichi_msm.cli.common import result_directory
 from taichi_msm.errors import FilesError
 from taichi_msm.render.labels import FrameOutputs
-from taichi_msm.runs.checkpoint import STATE_FILE, is_unfinished, read_manifest
+from taichi_msm.runs.checkpoint import is_unfinished, read_manifest
 from taichi_msm.runs.writer import ResultWriter
 from taichi_msm.scene.scene import Scene
 from tests.golden import Messages
 from tests.scenes import plan_of, scene, speckle
 
-# Everything that a run might reach beyond its folder.
+# Names that a run might reach through a link.
 TREASURE = "notes.txt 0000.png frames state.npz run.json lock new/a.txt draft"
 
 Plant = Callable[[Path, Path], None]
@@ -42,17 +42,17 @@ def write(directory: Path, *, resumes: bool = False) -> None:
 
 
 def snapshot(folder: Path) -> dict[str, tuple[int, bytes]]:
-    """Everything in a folder and below: kind, and what is in it or where it leads."""
-    found = {}
+    """Kind, and content or target, of every entry below a folder."""
+    entries = {}
     for path in sorted(folder.rglob("*")):
         kind = stat.S_IFMT(path.lstat().st_mode)
         data = path.read_bytes() if stat.S_ISREG(kind) else b""
-        found[str(path.relative_to(folder))] = kind, os.fsencode(path.readlink()) if path.is_symlink() else data
-    return found
+        entries[str(path.relative_to(folder))] = kind, os.fsencode(path.readlink()) if path.is_symlink() else data
+    return entries
 
 
 def plant(name: str, make: Callable[[Path, Path], object]) -> Plant:
-    """Plant what `make`, given its path and the folder of the treasure, makes."""
+    """Plant an entry that `make` creates from its path and the folder of the treasure."""
 
     def planted(out: Path, treasure: Path) -> None:
         (out / name).parent.mkdir(parents=True, exist_ok=True)
@@ -78,43 +78,36 @@ def folder(name: str) -> Plant:
     return plant(name, lambda path, treasure: path.mkdir())
 
 
-LIES = json.dumps({"outputs": ["frames", "run.json", "../treasure/notes.txt"], "frames": 1e9})
-
 PLANTED = {
-    "the staging folder leads elsewhere": link(".partial"),
-    "the staging folder is the user's": file(".partial/notes.txt"),
-    "the staging folder is a file": file(".partial"),
-    "the lock leads elsewhere": link(".partial/lock", "lock"),
-    "the lock never ends": link(".partial/lock", "/dev/zero"),
-    "the lock is a pipe": pipe(".partial/lock"),
-    "the whole results lead elsewhere": link(".partial/whole"),
-    "the record of whole results is a pipe": pipe(".partial/whole/run.json"),
-    "the record of whole results names what is elsewhere": file(
+    "link at the staging folder": link(".partial"),
+    "foreign file in the staging folder": file(".partial/notes.txt"),
+    "link at the lock": link(".partial/lock", "lock"),
+    "endless lock": link(".partial/lock", "/dev/zero"),
+    "pipe at the lock": pipe(".partial/lock"),
+    "link at the committed results": link(".partial/whole"),
+    "pipe at the committed record": pipe(".partial/whole/run.json"),
+    "committed record that lists files elsewhere": file(
         ".partial/whole/run.json", '{"outputs": "../../treasure/notes.txt"}'
     ),
-    "the earlier record leads elsewhere": link(".partial/earlier.json", "notes.txt"),
-    "the new results lead elsewhere": link(".partial/new"),
-    "the new frames lead elsewhere": link(".partial/new/frames"),
-    "unknown link beside them": link(".partial/x"),
-    "the checkpoint leads elsewhere": link(".partial/checkpoint"),
-    "the state leads elsewhere": link(".partial/checkpoint/state.npz", "state.npz"),
-    "the state is a pipe": pipe(".partial/checkpoint/state.npz"),
-    "the stored frames lead elsewhere": link(".partial/checkpoint/frames", "frames"),
-    "the draft leads elsewhere": link(".partial/checkpoint/state.new", "draft"),
-    "unknown file beside them": file(".partial/checkpoint/draft"),
-    "the state is a folder": folder(".partial/checkpoint/state.npz"),
-    "the frames lead elsewhere": link("frames"),
-    "the frames are a file": file("frames"),
-    "a frame leads elsewhere": link("frames/0000.png", "0000.png"),
-    "a frame is a folder": folder("frames/0003.png"),
-    "a frame is the user's": file("frames/0003.png"),
-    "the trajectory is the user's": file("trajectory.npz"),
-    "the trajectory is a pipe": pipe("trajectory.npz"),
-    "the record leads elsewhere": link("run.json", "run.json"),
-    "the record is a folder": folder("run.json"),
-    "the record is another program's": file("run.json", '{"a": 1}'),
-    "the record is no list": file("run.json", "[1e999]"),
-    "the record lies": file("run.json", LIES),
+    "link at the earlier record": link(".partial/earlier.json", "notes.txt"),
+    "link at the new frames": link(".partial/new/frames"),
+    "link at the checkpoint": link(".partial/checkpoint"),
+    "link at the state": link(".partial/checkpoint/state.npz", "state.npz"),
+    "pipe at the state": pipe(".partial/checkpoint/state.npz"),
+    "link at the stored frames": link(".partial/checkpoint/frames", "frames"),
+    "link at the draft of the state": link(".partial/checkpoint/state.new", "draft"),
+    "foreign file in the checkpoint": file(".partial/checkpoint/draft"),
+    "link at the frames": link("frames"),
+    "link at a frame": link("frames/0000.png", "0000.png"),
+    "folder at a frame": folder("frames/0003.png"),
+    "foreign frame": file("frames/0003.png"),
+    "foreign trajectory": file("trajectory.npz"),
+    "link at the record": link("run.json", "run.json"),
+    "record of another program": file("run.json", '{"a": 1}'),
+    "record that is a list": file("run.json", "[1e999]"),
+    "forged record": file(
+        "run.json", json.dumps({"outputs": ["frames", "run.json", "../treasure/notes.txt"], "frames": 1e9})
+    ),
 }
 
 
@@ -127,11 +120,11 @@ def treasure(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("case", PLANTED)
-def test_what_no_run_has_put_there_is_left_alone(case: str, treasure: Path, message: Messages) -> None:
+def test_planted_entries_are_refused(case: str, treasure: Path, message: Messages) -> None:
     out = treasure.parent / "out"
     PLANTED[case](out, treasure)
     precious, before = snapshot(treasure), snapshot(out)
-    if case == "the record lies":
+    if case == "forged record":
         write(out)
         assert snapshot(treasure) == precious
         return
@@ -146,8 +139,7 @@ def test_what_no_run_has_put_there_is_left_alone(case: str, treasure: Path, mess
 
 
 @pytest.mark.parametrize("name", ["frames", "state.npz"])
-def test_a_checkpoint_whose_file_has_another_name(name: str, treasure: Path) -> None:
-    """A hard link to what is elsewhere is not written to."""
+def test_hard_link_in_a_checkpoint(name: str, treasure: Path) -> None:
     checkpoint = treasure.parent / "out" / ".partial" / "checkpoint"
     checkpoint.mkdir(parents=True)
     os.link(treasure / name, checkpoint / name)
@@ -159,10 +151,8 @@ def test_a_checkpoint_whose_file_has_another_name(name: str, treasure: Path) -> 
     assert snapshot(treasure) == precious
 
 
-def test_the_default_folder_is_not_reached_by_a_link(
-    treasure: Path, monkeypatch: pytest.MonkeyPatch, message: Messages
-) -> None:
-    """Who names a folder may name a link; what came with a scene may not choose for them."""
+def test_link_at_the_default_folder(treasure: Path, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
+    """A folder named by an option may be a link; a default folder may have come with the scene."""
     monkeypatch.chdir(treasure.parent)
     Path("output").mkdir()
     assert result_directory(None, "press") == Path("output/press")
@@ -174,8 +164,3 @@ def test_the_default_folder_is_not_reached_by_a_link(
     with message.raises(FilesError, "output"):
         result_directory(None, "press")
     assert result_directory("output/press", "press") == Path("output/press")
-
-
-def test_a_plan_alone_is_enough_to_be_unfinished(tmp_path: Path) -> None:
-    file(f".partial/checkpoint/{STATE_FILE}")(tmp_path, tmp_path)
-    assert is_unfinished(tmp_path)

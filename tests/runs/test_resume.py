@@ -1,4 +1,4 @@
-"""Runs that end early, and go on: the result has the bits of a run that was left alone."""
+"""Resumed runs: results have the bits of an uninterrupted run."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ from taichi_msm.system.compiler import COMPILERS, active_compiler, versions
 from taichi_msm.system.runtime import Device
 from tests.golden import Messages
 from tests.outputs import files, results
+from tests.reporting_process import ReportingProcess
 from tests.scenes import speckle
-from tests.telling import Telling
 
-# Pressed while the tool moves, in many steps a frame.
+# A tool presses while it moves; many steps per frame.
 SETTINGS = (
     "probes.0.at=[[0, 0.2, 0.5], [2, 0.8, 0.5]]",
     "probes.0.load=[[0, 0], [0.1, 100], [1.5, 100], [1.5, 0]]",
@@ -57,7 +57,7 @@ def published(directory: Path) -> dict[str, bytes]:
 
 
 class Stop:
-    """Progress that interrupts a run when it tells of its frames for the n-th time."""
+    """Progress callback that interrupts a run at the n-th report of its frames."""
 
     def __init__(self, after: int) -> None:
         self._left = after
@@ -69,14 +69,14 @@ class Stop:
 
 
 def interrupted(made: Scene, directory: str, device: Device, after: int = 12) -> RunRecord:
-    """The record of a run that is interrupted after some of its frames."""
+    """Record of a run that is interrupted after some frames."""
     record = run(made, directory, threads=device.threads, progress=Stop(after))
     assert record["status"] == "interrupted"
     assert 0 < record["frames"] <= made.time.frames
     return record
 
 
-# A tool that is moved, and pulls what it has gripped, besides one with a force.
+# A force-controlled tool, and a position-controlled one that grips.
 GRIPPING = (
     "probes=[{force: [0, 300, -1000], falloff: 20, load: [[0, 0], [0.03, 100], [0.06, 0]]}, "
     "{path: [[0, 0.5, 0.5, 0.001], [0.05, 0.5, 0.5, -0.02], [0.12, 0.6, 0.5, 0.03]], grip: [[0.05, 0.11]], "
@@ -90,10 +90,10 @@ GRIPPING = (
     [("png, gif, trajectory", ()), ("png, forces", GRIPPING), ("forces", GRIPPING), ("", GRIPPING)],
     ids=["all", "forces and more", "forces", "none"],
 )
-def test_a_run_that_is_interrupted_goes_on_to_the_same_bits(
+def test_repeatedly_interrupted_run(
     output: str, probes: tuple[str, ...], small: Path, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Again and again, at a frame's end and within one, and while earlier frames are drawn anew."""
+    """Interruptions between frames, within a frame, and while earlier frames are redrawn."""
     monkeypatch.setattr(dynamics, "MAX_STEPS_PER_LAUNCH", 300)
     made = dragged("time.duration=0.12", f"output=[{output}]", *probes)
     whole = run(made, "whole", threads=device.threads, estimate_error=False)
@@ -105,11 +105,11 @@ def test_a_run_that_is_interrupted_goes_on_to_the_same_bits(
             steps.append(int(state["steps"]))
         before = published(small / "parts")
         try:
-            # From another directory: what the manifest names is found all the same.
+            # Paths of the manifest are independent of the current directory.
             monkeypatch.chdir(small / "whole")
             record = resume("../parts", threads=device.threads, progress=Stop(after))
         except KeyboardInterrupt:
-            assert published(small / "parts") == before, "no frame more, and nothing lost"
+            assert published(small / "parts") == before, "no new frame, no lost one"
         if record["status"] == "complete":
             break
     assert record["status"] == "complete"
@@ -122,19 +122,19 @@ def test_a_run_that_is_interrupted_goes_on_to_the_same_bits(
     assert not (small / "parts" / ".partial").exists()
 
 
-def test_frames_that_are_drawn_anew_are_not_told_as_simulated(small: Path, device: Device) -> None:
-    """So that the time which is left is reckoned from those that are simulated."""
-    told: list[tuple[str, int, int]] = []
+def test_progress_of_redrawn_frames(small: Path, device: Device) -> None:
+    """They are a stage of their own, because the remaining time is estimated from simulated frames."""
+    reports: list[tuple[str, int, int]] = []
     interrupted(dragged("time.duration=0.3", "output=[gif, trajectory]"), "parts", device)
-    stored = resume("parts", threads=device.threads, progress=lambda *said: told.append(said))["resumed"]
+    stored = resume("parts", threads=device.threads, progress=lambda *report: reports.append(report))["resumed"]
     assert stored > 1
-    stages = {stage: [(done, total) for of, done, total in told if of == stage] for stage in ("redraw", "frames")}
-    assert sorted(set(stages["redraw"])) == [(frame, stored) for frame in range(stored)]
-    # That all are done is told only while pictures are still being encoded.
-    assert sorted({*stages["frames"], (16, 16)}) == [(frame, 16) for frame in range(stored, 17)]
+    assert sorted({report[1:] for report in reports if report[0] == "redraw"}) == [(n, stored) for n in range(stored)]
+    # The total is reported only while pictures are still encoded.
+    simulated = {report[1:] for report in reports if report[0] == "frames"} | {(16, 16)}
+    assert sorted(simulated) == [(n, 16) for n in range(stored, 17)]
 
 
-def test_a_run_that_finds_the_disk_full_goes_on_when_it_is_not(
+def test_resume_after_a_full_disk(
     small: Path, device: Device, monkeypatch: pytest.MonkeyPatch, message: Messages
 ) -> None:
     made = dragged("time.duration=0.2", "output=[trajectory]")
@@ -162,8 +162,7 @@ def test_a_run_that_finds_the_disk_full_goes_on_when_it_is_not(
     assert results(small / "parts") == results(small / "whole")
 
 
-def test_the_same_run_typed_again_goes_on(small: Path, device: Device, message: Messages) -> None:
-    """Who did not see that a run was unfinished loses nothing of it."""
+def test_repeated_command_resumes(small: Path, device: Device, message: Messages) -> None:
     made = dragged("time.duration=0.2", "output=[trajectory]")
     run(made, "whole", threads=device.threads)
     left = interrupted(made, "parts", device)
@@ -174,42 +173,40 @@ def test_the_same_run_typed_again_goes_on(small: Path, device: Device, message: 
         resume("parts", threads=device.threads)
 
 
-@pytest.mark.parametrize("change", ["damping=0.02", "sheet.points=[9,12]"])
-def test_another_run_begins_anew_and_keeps_what_was_there_until_it_has_a_frame(
-    change: str, small: Path, device: Device
-) -> None:
+def test_changed_scene_restarts(small: Path, device: Device) -> None:
+    """The checkpoint of the unfinished run is kept until the new run has a frame."""
     settings = ["time.duration=0.2", "output=[trajectory]"]
     interrupted(dragged(*settings), "parts", device)
     before = files(small / "parts")
-    other = dragged(*settings, change)
+    changed = dragged(*settings, "sheet.points=[9,12]")
     with pytest.raises(KeyboardInterrupt):
-        run(other, "parts", threads=device.threads, progress=Stop(0))
+        run(changed, "parts", threads=device.threads, progress=Stop(0))
     assert files(small / "parts") == before
-    assert run(other, "parts", threads=device.threads)["resumed"] == 0
+    assert run(changed, "parts", threads=device.threads)["resumed"] == 0
     assert not (small / "parts" / ".partial").exists()
 
 
-@pytest.mark.parametrize("asked", [True, None, False])
-def test_a_run_that_kept_no_positions_goes_on_where_no_pilot_needs_them(
-    asked: bool | None, small: Path, device: Device, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("requested", [True, None])
+def test_run_without_stored_positions(
+    requested: bool | None, small: Path, device: Device, monkeypatch: pytest.MonkeyPatch, message: Messages
 ) -> None:
-    """Else it begins anew, so that what is known of its error does not depend on the interruption."""
+    """It restarts if its error is estimated, which needs all frames; `resume` continues without an estimate."""
     monkeypatch.setattr(planning, "MAX_COMPANION_SHARE", 0.0)
     made = dragged("time.duration=0.2", "output=[]")
-    whole = run(made, "whole", threads=device.threads, estimate_error=asked)
-    assert (whole["error_estimate"] is None) == (not asked)
+    whole = run(made, "whole", threads=device.threads, estimate_error=requested)
+    assert (whole["error_estimate"] is None) == (not requested)
     interrupted(made, "parts", device)
-    again = run(made, "parts", threads=device.threads, estimate_error=asked)
-    assert (again["resumed"] > 0) == (not asked)
+    again = run(made, "parts", threads=device.threads, estimate_error=requested)
+    assert (again["resumed"] > 0) == (not requested)
     differ = dict.fromkeys(("timings", "resumed"))
     assert {**again, **differ} == {**whole, **differ}
-
-
-def test_a_run_that_kept_no_positions_is_resumed_without_pilots(small: Path, device: Device, message: Messages) -> None:
-    interrupted(dragged("time.duration=0.2", "output=[]"), "parts", device)
-    record = resume("parts", threads=device.threads)
-    assert record["resumed"] > 0
-    message(str(record["error_estimate_reason"]))
+    if requested is None:
+        monkeypatch.undo()
+        monkeypatch.chdir(small)
+        interrupted(made, "parts", device)
+        record = resume("parts", threads=device.threads)
+        assert record["resumed"] > 0
+        message(str(record["error_estimate_reason"]))
 
 
 DAMAGE: list[tuple[str, Callable[[bytes], bytes]]] = [
@@ -219,7 +216,7 @@ DAMAGE: list[tuple[str, Callable[[bytes], bytes]]] = [
 ]
 
 
-def test_what_is_damaged_is_not_gone_on_with(small: Path, device: Device, message: Messages) -> None:
+def test_damaged_checkpoint(small: Path, device: Device, message: Messages) -> None:
     made = dragged("time.duration=0.2", "output=[trajectory]")
     interrupted(made, "whole", device)
     for name, damage in DAMAGE:
@@ -231,44 +228,43 @@ def test_what_is_damaged_is_not_gone_on_with(small: Path, device: Device, messag
         with message.raises(FilesError, f"parts/.partial/checkpoint/{name}"):
             resume("parts", threads=device.threads)
         assert files(small / "parts") == before
-        # The scene itself is run as if nothing were there, or what there is were another's.
+        # A run of the scene restarts.
         assert run(made, "parts", threads=device.threads, estimate_error=False)["resumed"] == 0
 
 
-def test_a_run_begins_anew_unless_its_compiler_has_the_same_bits(
-    small: Path, device: Device, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made, mine = dragged("time.duration=0.2", "output=[trajectory]"), versions()
-    other = next(one for one in COMPILERS.values() if one is not active_compiler())
-    rest = {name: version for name, version in mine.items() if name != active_compiler().name}
-    for there, goes_on in (({other.name: other.tested_version}, True), ({active_compiler().name: "0.0.1"}, False)):
+def test_run_with_another_compiler(small: Path, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It resumes with a tested compiler, and restarts with an untested version."""
+    made, current = dragged("time.duration=0.2", "output=[trajectory]"), versions()
+    second = next(compiler for compiler in COMPILERS.values() if compiler is not active_compiler())
+    rest = {name: version for name, version in current.items() if name != active_compiler().name}
+    for compiler, resumes in (({second.name: second.tested_version}, True), ({active_compiler().name: "0.0.1"}, False)):
         interrupted(made, "parts", device)
         with monkeypatch.context() as patch:
-            patch.setattr(run_module, "versions", lambda there=there: {**rest, **there})
+            patch.setattr(run_module, "versions", lambda compiler=compiler: {**rest, **compiler})
             record = run(made, "parts", threads=device.threads)
-        assert (record["resumed"] > 0) == goes_on
-        assert record["versions"] == {**(mine if goes_on else rest), **there}
+        assert (record["resumed"] > 0) == resumes
+        assert record["versions"] == {**(current if resumes else rest), **compiler}
 
 
-def test_another_picture_or_version_is_not_gone_on_with(
+def test_changed_picture_or_version(
     small: Path, device: Device, monkeypatch: pytest.MonkeyPatch, message: Messages
 ) -> None:
     interrupted(dragged("time.duration=0.2"), "parts", device)
     before, compiler = files(small / "parts"), active_compiler()
-    mine = f"{compiler.name} {compiler.version}"
+    original = f"{compiler.name} {compiler.version}"
     with monkeypatch.context() as patch:
         patch.setattr(run_module, "versions", lambda: {**versions(), compiler.name: "1.7.99"})
-        with message.raises(FilesError, hide=re.escape(mine)) as caught:
+        with message.raises(FilesError, hide=re.escape(original)) as caught:
             resume("parts", threads=device.threads)
-        assert mine in str(caught.value)
+        assert original in str(caught.value)
     Image.fromarray(speckle(30, 40, 1)).save(small / "speckle.png")
     with message.raises(FilesError, "speckle.png"):
         resume("parts", threads=device.threads)
     assert files(small / "parts") == before
 
 
-def test_a_run_that_is_killed_goes_on_to_the_same_bits(small: Path, device: Device) -> None:
-    """At every stage of a run and of one that goes on."""
+def test_killed_run(small: Path, device: Device) -> None:
+    """Killed at every stage of a run and of its resumption."""
     duration = "time.duration=0.8"
     run(dragged(duration), "whole", threads=device.threads, estimate_error=False)
     settings = [word for setting in (*SETTINGS, duration) for word in ("--set", setting)]
@@ -278,12 +274,12 @@ def test_a_run_that_is_killed_goes_on_to_the_same_bits(small: Path, device: Devi
         (again, "redraw", 0),
         (again, "write", 0),
     ):
-        with Telling("run", *arguments, "--quiet", stderr=subprocess.PIPE) as process:
+        with ReportingProcess("run", *arguments, "--quiet", stderr=subprocess.PIPE) as process:
             process.until(stage, done)
             process.kill()
-            assert process.communicate(timeout=60)[1] == ""  # until its encoder has ended too
+            assert process.communicate(timeout=60)[1] == ""  # until its encoder has ended
         assert_readable(small / "parts")
-    # It may have been done before it was killed.
+    # The run may have been finished before it was killed.
     if checkpoint_in(small / "parts").exists():
         assert resume("parts", threads=device.threads)["resumed"] > 0
     assert results(small / "parts") == results(small / "whole")
@@ -291,7 +287,7 @@ def test_a_run_that_is_killed_goes_on_to_the_same_bits(small: Path, device: Devi
 
 
 def assert_readable(directory: Path) -> None:
-    """Every file under a final name is whole."""
+    """Assert that every result can be decoded."""
     for path in directory.glob("frames/*.png"):
         with Image.open(path) as image:
             image.load()

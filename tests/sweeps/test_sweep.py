@@ -32,9 +32,9 @@ from taichi_msm.sweeps.sweep import finish_sweep
 from tests.conftest import Program
 from tests.golden import Messages
 from tests.outputs import files, results
+from tests.reporting_process import ReportingProcess
 from tests.scenes import SMALL, speckle
 from tests.sweeps.conftest import CALIBRATION
-from tests.telling import Telling
 
 # The step of 0.01 s is above the stability limit, so some runs are refused.
 SWEEP = """\
@@ -153,7 +153,9 @@ def test_shards_change_nothing(many: Path, pool: Pool, whole: Path) -> None:
 def test_kill_changes_nothing(many: Path, pool: Pool) -> None:
     (many / "many.yaml").write_text(LONG)
     execute_sweep(pool, "whole")
-    with Telling("sweep", "many.yaml", "--workers", "1", "--out", "killed", stderr=subprocess.DEVNULL) as process:
+    with ReportingProcess(
+        "sweep", "many.yaml", "--workers", "1", "--out", "killed", stderr=subprocess.DEVNULL
+    ) as process:
         process.until("runs", 2)
         process.kill()
     # Its worker, which executes the last run, ends by itself.
@@ -165,7 +167,7 @@ def test_kill_changes_nothing(many: Path, pool: Pool) -> None:
 
 def test_interruption_of_a_sweep(many: Path, message: Messages) -> None:
     (many / "many.yaml").write_text(LONG)
-    with Telling("sweep", "many.yaml", "--workers", "1", "--out", "out", stderr=subprocess.PIPE) as process:
+    with ReportingProcess("sweep", "many.yaml", "--workers", "1", "--out", "out", stderr=subprocess.PIPE) as process:
         process.until("runs", 2)
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate()

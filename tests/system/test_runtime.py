@@ -1,16 +1,15 @@
-"""What Taichi is told at its start and around a launch."""
+"""Start of Taichi, its threads and memory, and messages of failed allocations."""
 
 from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from taichi_msm.cli.main import main
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.render.rasterizer import Rasterizer
 from taichi_msm.system import process as process_module
@@ -21,7 +20,7 @@ from tests.motion import dynamics_of
 from tests.scenes import SHEET, scene, speckle
 from tests.system import python
 
-# Start, make every thread of the pool work, and tell of each thread its processor time [ticks] and its cores.
+# Start, occupy every thread of the pool, and print the processor time [ticks] and the cores of each thread.
 WORK = """
 import json, os
 from pathlib import Path
@@ -45,8 +44,8 @@ print(json.dumps([[t == os.getpid(), ticks[t], sorted(os.sched_getaffinity(t))] 
 """
 
 
-@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="the system does not tell the cores of threads")
-def test_the_threads_that_are_pinned_are_those_that_work(tmp_path: Path) -> None:
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="needs /proc")
+def test_worker_threads_are_pinned(tmp_path: Path) -> None:
     cores = sorted(os.sched_getaffinity(0))
     if process_module.available_threads() != len(cores):
         pytest.skip("a quota keeps this process from using all of its cores")
@@ -57,8 +56,8 @@ def test_the_threads_that_are_pinned_are_those_that_work(tmp_path: Path) -> None
 
 
 @pytest.mark.slow
-def test_a_process_may_have_many_sheets_and_gets_their_memory_back(device: runtime.Device) -> None:
-    """More than Taichi's 512 trees of fields."""
+def test_memory_is_reused(device: runtime.Device) -> None:
+    """Also with more sheets than Taichi's limit of 512 trees of fields."""
 
     def resident() -> int:
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
@@ -76,42 +75,20 @@ def test_a_process_may_have_many_sheets_and_gets_their_memory_back(device: runti
         sheets.clear()
         if Path("/proc/self/statm").exists():
             sizes.append(resident())
-    # Nothing stays of the last 200; Python's own pools may grow by a little.
+    # The memory of the last 200 is reused; Python's pools may grow slightly.
     assert not sizes or sizes[2] - sizes[1] < 4 * 2**20
 
 
-# Two of these at once on one core, from a line on stdin on: each waits while the other works.
-BESIDE = """
-import os, time
-from taichi_msm.system.process import core_wait_s
-
-os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-print("ready", flush=True)
-input()
-before, end = core_wait_s(), time.perf_counter() + 1
-while time.perf_counter() < end:
-    pass
-print(core_wait_s() - before)
-"""
+def test_time_of_waiting_for_a_core(tmp_path: Path) -> None:
+    for task, wait_ns in (("7", 250_000_000), ("8", 50_000_000)):
+        (tmp_path / task).mkdir()
+        (tmp_path / task / "schedstat").write_text(f"1000 {wait_ns} 3\n")
+    assert process_module.core_wait_s(tmp_path) == pytest.approx(0.3)
+    assert process_module.core_wait_s(tmp_path / "missing") is None
 
 
-@pytest.mark.skipif(process_module.core_wait_s() is None, reason="the system does not tell")
-def test_waiting_for_a_core_is_noticed(root: Path) -> None:
-    piped: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    environment = {**os.environ, "PYTHONPATH": str(root)}
-    both = [subprocess.Popen([sys.executable, "-c", BESIDE], env=environment, **piped) for _ in range(2)]
-    for process in both:
-        assert process.stdout
-        assert process.stdout.readline() == "ready\n"
-    for process in both:
-        assert process.stdin
-        process.stdin.write("\n")
-        process.stdin.flush()
-    assert max(float(process.communicate(timeout=60)[0]) for process in both) > 0.1
-
-
-# One simulation in another thread and another process.
-ELSEWHERE = """
+# Use of a simulation in another thread and in a forked process.
+THREAD_AND_FORK = """
 import os, threading, warnings
 from taichi_msm import MsmError, Simulation
 from tests.motion import dynamics_of
@@ -142,78 +119,64 @@ print(simulation.frame)
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
-def test_other_threads_and_forked_processes_are_refused(tmp_path: Path, message: Messages) -> None:
-    """Taichi would fail with text of its own, or hang."""
-    done = python(tmp_path, ELSEWHERE)
+def test_threads_and_forked_processes_are_refused(tmp_path: Path, message: Messages) -> None:
+    """Taichi would fail with another error, or hang."""
+    done = python(tmp_path, THREAD_AND_FORK)
     *lines, frame = done.stdout.splitlines()
     assert ([lines.count(line) for line in lines], frame, done.stderr) == ([4] * 4 + [2] * 2, "2", "")
     message(lines[3:5], hide=active_compiler().title)
 
 
-# Two threads start at once, while a third one prints.
-AT_ONCE = """
+# Two threads start the compiler at once.
+TWO_STARTS = """
 import os, threading
 from concurrent.futures import ThreadPoolExecutor
 from taichi_msm import MsmError
 from taichi_msm.system import runtime
 
-done = threading.Event()
-def count():
-    n = 0
-    while not done.wait(0.001):
-        print(n, flush=True)
-        n += 1
-    print("end", n)
 def start(barrier):
     barrier.wait()
     try:
         return runtime.start("cpu", 2).threads
     except MsmError as error:
         return str(error)
-counter = threading.Thread(target=count)
-counter.start()
 with ThreadPoolExecutor(2) as pool:
     results = sorted(map(str, pool.map(start, [threading.Barrier(2)] * 2)))
-done.set()
-counter.join()
 print(*results, runtime.ti.lang.impl.current_cfg().debug, sorted(os.environ.items() & given.items()), sep="|")
 """
 
 
-def test_environment_and_other_threads_change_nothing_at_the_start(tmp_path: Path, message: Messages) -> None:
-    """The compiler's variables for its arch, its threads and its types would come before our arguments."""
+def test_start_ignores_environment_and_threads(tmp_path: Path, message: Messages) -> None:
+    """Environment variables of the compiler would override arguments of its start."""
     settings = {"ARCH": "opengl", "DEBUG": "1", "CPU_MAX_NUM_THREADS": "1", "LOG_LEVEL": "loud", "OFFLINE_CACHE": "no"}
     given = {f"{active_compiler().prefix}_{name}": value for name, value in settings.items()}
-    done = python(tmp_path, f"given = {given}\n{AT_ONCE}", **given)
-    *lines, last = done.stdout.splitlines()
-    threads, refused, debug, variables = last.split("|")
+    done = python(tmp_path, f"given = {given}\n{TWO_STARTS}", **given)
+    assert (done.returncode, done.stderr) == (0, "")
+    threads, refused, debug, variables = done.stdout.removesuffix("\n").split("|")
     assert (threads, debug, variables) == ("2", "False", str(sorted(given.items())))
     message(refused, hide=active_compiler().title)
-    assert lines == [*map(str, range(len(lines) - 1)), f"end {len(lines) - 1}"]
-    assert (done.returncode, done.stderr) == (0, "")
 
 
-# Starts after a stop; an object that was made before a stop is dropped after it.
-AGAIN = """
-from taichi_msm.model.sheet import rest_positions
-from taichi_msm.render.rasterizer import Rasterizer
-from taichi_msm.system import runtime
-from tests.scenes import scene, speckle
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError("Unable to allocate 256. MiB for an array"),
+        MemoryError(),
+        RuntimeError("[host_memory_pool.cpp:allocate_raw_memory@62] Virtual memory allocation (24 B) failed."),
+        RuntimeError("in the encoder: MemoryError: Unable to allocate 3. MiB"),
+        RuntimeError("list index out of range"),
+    ],
+    ids=["NumPy", "Python", "Taichi", "encoder", "bug"],
+)
+def test_failed_allocation(error: Exception, small: Path, monkeypatch: pytest.MonkeyPatch, message: Messages) -> None:
+    """Other errors are reported as bugs, with exit code 1."""
 
-made, sums, kept = scene(), set(), []
-for turn in range(3):
-    runtime.start()
-    drawings = [Rasterizer(made, speckle(8, 8)) for _ in range(2)]
-    sums.update(int(drawing.draw(rest_positions(made.sheet)).sum()) for drawing in drawings)
-    kept.append(drawings.pop())
-    runtime.stop()
-    if turn == 1:
-        kept.clear()
-print(len(sums))
-"""
+    def fail(*_: object, **__: object) -> None:
+        raise error
 
-
-@pytest.mark.slow
-def test_taichi_starts_again_after_a_stop(tmp_path: Path) -> None:
-    done = python(tmp_path, AGAIN)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "1\n", "")
+    monkeypatch.setattr("taichi_msm.runs.run.run", fail)
+    capture = []
+    monkeypatch.setattr("taichi_msm.cli.common.report_failure", lambda kind, lines, as_json: capture.extend(lines))
+    code = main(["run", "small.yaml"])
+    message(capture)
+    assert code == (1 if "a bug" in capture[0] else 2)

@@ -1,4 +1,4 @@
-"""The program in a process of its own that tells how far it is, so that a signal is sent when handlers stand for it."""
+"""The program in a process that reports its progress, so that a test sends a signal at a known stage."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import sys
 from types import TracebackType
 from typing import Any
 
-# Writes a line when signals are heard, and whenever some work reports its progress; lines that nobody reads are lost.
+# Writes a line when signals are handled, and at each report of progress; lines that nobody reads are lost.
 PROGRAM = """
 import os, runpy, sys
 from contextlib import contextmanager, suppress
@@ -17,22 +17,22 @@ from taichi_msm.system import process
 pipe = int(sys.argv.pop(1))
 os.set_blocking(pipe, False)
 
-def tell(stage, done):
+def report(stage, done):
     with suppress(OSError):
         os.write(pipe, f"{stage} {done}\\n".encode())
 
 def exit_on_signals(original=process.exit_on_signals):
     original()
-    tell("heard", 0)
+    report("heard", 0)
     from taichi_msm.cli import common  # as the program does next
 
     @contextmanager
     def show_progress(*arguments, original=common.show_progress, **named):
         with original(*arguments, **named) as progress:
-            def telling(stage, done, total):
-                tell(stage, done)
+            def reporting(stage, done, total):
+                report(stage, done)
                 progress(stage, done, total)
-            yield telling
+            yield reporting
 
     common.show_progress = show_progress
 
@@ -41,8 +41,8 @@ runpy.run_module("taichi_msm", run_name="__main__")
 """
 
 
-class Telling(subprocess.Popen[str]):
-    """`taichi-msm` with these arguments; its output is text. A `with` ends it when a test fails."""
+class ReportingProcess(subprocess.Popen[str]):
+    """`taichi-msm` with some arguments and text output; as a context manager, it is killed when a test fails."""
 
     def __init__(self, *arguments: str, **options: Any) -> None:
         read, write = os.pipe()
@@ -52,12 +52,12 @@ class Telling(subprocess.Popen[str]):
         os.close(write)
 
     def until(self, stage: str, done: int = 0) -> None:
-        """Wait until the work has come to a stage, and in it so far; the first stage is `heard`: signals are."""
+        """Wait for a stage, and an amount of its work; the first stage, `heard`, means that signals are handled."""
         for line in self._pipe:
             reached, count = line.split()
             if reached == stage and int(count) >= done:
                 return
-        raise AssertionError(f"it ended with {self.wait()} before it came to {stage} {done}")
+        raise AssertionError(f"exit code {self.wait()} before {stage} {done}")
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
