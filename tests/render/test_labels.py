@@ -65,7 +65,7 @@ def seen_as_by_the_twin(made: Scene, position: Array) -> Labels:
     assert ((found.instrument == 255) == instrument)[alike].all()
     sheet = alike & ~np.isnan(coordinates[..., 0])
     assert sheet.mean() > 0.2
-    pixels, _ = twin.find(made, found.coordinates[sheet].astype(float), position)
+    pixels, _ = twin.project(made, found.coordinates[sheet].astype(float), position)
     assert np.abs(pixels - np.argwhere(sheet)[:, ::-1] - 0.5).max() < 0.01
     return found
 
@@ -82,7 +82,7 @@ def hidden_as_by_the_twin(made: Scene, position: Array) -> NDArray[np.bool_]:
     """Which of many points are hidden; all are where the twin finds them."""
     coordinates = np.random.default_rng(9).uniform(0, 1, (2000, 2)).astype(np.float32)
     found = locate_points(made, coordinates, position, view(made))
-    pixels, hidden = twin.find(made, coordinates.astype(float), position)
+    pixels, hidden = twin.project(made, coordinates.astype(float), position)
     np.testing.assert_array_equal(np.isnan(found.pixels), np.isnan(pixels))
     near = np.abs(pixels).max(axis=1) < 1e4
     np.testing.assert_allclose(found.pixels[near], pixels[near], atol=1e-4)

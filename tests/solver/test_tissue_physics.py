@@ -172,8 +172,8 @@ def test_the_tension_at_rest_is_the_same_in_all_directions(tmp_path: Path) -> No
     inner = np.zeros((8, 6, 3))
     for springs in assembled(made).springs:
         pull = springs.stiffness * (springs.length - springs.unstretched) / springs.length
-        inner[springs.here] += pull[..., None] * springs.offset
-        inner[springs.there] -= pull[..., None] * springs.offset
+        inner[springs.start] += pull[..., None] * springs.offset
+        inner[springs.end] -= pull[..., None] * springs.offset
     assert np.abs(inner[1:-1, 1:-1]).max() < 1e-13 * np.abs(inner).max()
 
 
