@@ -1,4 +1,4 @@
-"""SciPy's general integrator DOP853 on the equations of scenes/figure-3.yaml, in NumPy; prints time and error."""
+"""SciPy's general integrator DOP853 on the equations of scenes/figure-3.yaml, in NumPy."""
 
 from __future__ import annotations
 
@@ -21,16 +21,13 @@ Array = NDArray[Any]
 RTOLS = (1e-3, 1e-5, 1e-7)
 REFERENCE_RTOL = 1e-10
 
-# Loads jump at keyframes: they are evaluated at this distance from them, as a fraction of the interval.
-KEY_MARGIN = 1e-9
-
 
 def integrate(rtol: float, largest: float = 0.03) -> Array:
-    """Return the displacements at every frame but the first [m], shape (F, rows, cols, 3).
+    """Return the displacements at every frame but the first [m], shape (frames, rows, cols, 3).
 
     Args:
         rtol: relative tolerance; the absolute one is rtol x largest / 10.
-        largest: about the largest displacement [m].
+        largest: rough largest displacement [m].
     """
     plan = make_plan(load_scene(ROOT / "scenes" / "figure-3.yaml", ["output=[]"]))
     scene, shape = plan.scene, (*plan.scene.sheet.points, 3)
@@ -40,7 +37,7 @@ def integrate(rtol: float, largest: float = 0.03) -> Array:
     state, displacements = np.zeros((2, *shape)).ravel(), []
     # Intervals between keyframes, where loads are smooth.
     for start, end in pairwise(sorted({0.0, *(t for t, _ in scene.probes[0].load), float(frames[-1])})):
-        margin = KEY_MARGIN * (end - start)
+        margin = 1e-9 * (end - start)  # loads jump at keyframes
 
         def motion(t: float, y: Array, first: float = start + margin, last: float = end - margin) -> Array:
             u, v = y.reshape(2, *shape)
@@ -62,15 +59,10 @@ def measure() -> dict[float, tuple[float, float]]:
     """Return time [s] and error, as a fraction of the largest displacement, by relative tolerance."""
     exact = integrate(REFERENCE_RTOL)
     largest = np.linalg.norm(exact, axis=-1).max()
-    found = {}
+    results = {}
     for rtol in RTOLS:
         start = time.perf_counter()
         frames = integrate(rtol)
         seconds = time.perf_counter() - start
-        found[rtol] = seconds, float(np.linalg.norm(frames - exact, axis=-1).max() / largest)
-    return found
-
-
-if __name__ == "__main__":
-    for rtol, (seconds, error) in measure().items():
-        print(f"rtol {rtol:g}: {seconds:.3g} s, error {error:.2g}")
+        results[rtol] = seconds, float(np.linalg.norm(frames - exact, axis=-1).max() / largest)
+    return results

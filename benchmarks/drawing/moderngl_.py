@@ -1,4 +1,4 @@
-"""OpenGL by moderngl, on a processor by llvmpipe: mass points go in as textures; shaders refine, light and filter."""
+"""OpenGL by moderngl, on a CPU by llvmpipe: mass points are textures; shaders refine, light and filter."""
 
 from __future__ import annotations
 
@@ -53,13 +53,13 @@ void main() {
 
 
 class OpenGl:
-    """A context without a window, and what it draws."""
+    """An offscreen context with the sheet."""
 
     def __init__(self, problem: Problem) -> None:
         try:
             self._context = context = moderngl.create_context(standalone=True, backend="egl")
         except Exception as error:
-            raise UnavailableError(f"no OpenGL without a window: {error}") from None
+            raise UnavailableError(f"no offscreen OpenGL: {error}") from None
         n, pixels = problem.vertices, problem.pixels
         context.enable(moderngl.DEPTH_TEST)
         program = context.program(VERTEX, FRAGMENT)
@@ -72,7 +72,7 @@ class OpenGl:
         self._picture.filter = moderngl.LINEAR, moderngl.LINEAR
         self._picture.repeat_x = self._picture.repeat_y = False
         quad = np.arange(n - 1)[:, None, None] * n + np.arange(n - 1)[:, None]
-        # Each small quad is cut from its top left to its bottom right corner.
+        # The diagonal of each quad leads from its top left to its bottom right corner.
         index = context.buffer(np.add(quad, [0, n, n + 1, 0, n + 1, 1]).astype(np.int32).tobytes())
         self._sheet = context.vertex_array(program, [], index_buffer=index)
         self._frame = context.framebuffer(
@@ -97,6 +97,6 @@ class OpenGl:
 
 
 def prepare(problem: Problem, threads: int | None) -> OpenGl:
-    """Set up OpenGL; llvmpipe takes its number of threads from the environment."""
+    """Set up OpenGL; llvmpipe reads the number of threads from the environment."""
     del threads
     return OpenGl(problem)
