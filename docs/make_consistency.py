@@ -1,4 +1,4 @@
-"""Write the table of measured between labels into labels.md, as measured by tests/test_consistency.py.
+"""Write the table of largest deviations between labels into labels.md, as measured by tests/test_consistency.py.
 
 PYTHONPATH=. python docs/make_consistency.py
 """
@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 
 from benchmarks.marked import replace_marked
 from taichi_msm import run
-from tests.test_consistency import AGREEMENTS, CAMERAS, measured, scene
+from tests.test_consistency import AGREEMENTS, CAMERAS, largest_deviations, scene
 
 PAGE = Path(__file__).parent / "labels.md"
 THREADS = 2
@@ -27,7 +27,7 @@ def table() -> str:
     for name, camera in CAMERAS.items():
         with TemporaryDirectory() as folder:
             run(scene(camera), folder, threads=THREADS, estimate_error=False)
-            worst[name] = measured(Path(folder), name, THREADS)
+            worst[name] = largest_deviations(Path(folder), name, THREADS)
     lines = [f"| at most apart | in | {' | '.join(CAMERAS)} | bound |", f"|---|---|{'---|' * len(CAMERAS)}---|"]
     for key, (description, unit, bound) in AGREEMENTS.items():
         cells = [cell(worst[name].get(key)) for name in CAMERAS]
