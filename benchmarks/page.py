@@ -304,7 +304,7 @@ def machine_table(rates: Results) -> str:
         rows.append([f"triad over the state of {points} × {points} points", f"{bandwidth / 1e9:.0f} GB/s"])
     rows.append(["launch of an empty kernel", format_duration(rates["launch"])])
     rows.append([f"`advance(1)` of {bounds.SMALLEST} × {bounds.SMALLEST} points", format_duration(rates["one_step"])])
-    return table(["what", "measured"], rows)
+    return table(["quantity", "measured"], rows)
 
 
 def step_bound_table(results: Results) -> str:

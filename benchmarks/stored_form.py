@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.neighbours import springs
 from taichi_msm import load_scene
 from taichi_msm.model.loads import Schedule, average_loads, decay
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import rest_positions
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.planning import make_plan
-from tests.reference.neighbours import springs
 
 SCENE = Path(__file__).parent.parent / "scenes" / "figure-3.yaml"
 STEPS_PER_SECOND = 18000

@@ -57,10 +57,10 @@ def beef() -> tuple[FitResult, Floats]:
     return names["found"], table
 
 
-def draw_beef(found: FitResult, table: Floats) -> None:
+def draw_beef(result: FitResult, table: Floats) -> None:
     """Draw the forces against depth and time; the model has a single force at a depth."""
     times, depth, force = table.T
-    scene = found.scene.model_dump(mode="json", exclude_none=True)
+    scene = result.scene.model_dump(mode="json", exclude_none=True)
     scene["probes"][0]["path"] = [[t, 0.5, 0.5, -d] for t, d in zip(times.tolist(), depth.tolist(), strict=True)]
     scene["time"]["duration"] = float(times[-1])
     model = []
@@ -104,18 +104,18 @@ def fit_press(newtons: float, tracks: int, points: int = 41) -> FitResult:
 
 def main() -> None:
     """Write the picture, and print the numbers."""
-    found, table = beef()
-    draw_beef(found, table)
+    result, table = beef()
+    draw_beef(result, table)
     print(f"force at the end of the hold: {table[-1, 2] / table[:, 2].max():.0%} of the largest")
     for newtons, tracks in ((2, 16), (2, 32), (6, 16)):
         start = time.perf_counter()
-        found = fit_press(newtons, tracks)
+        result = fit_press(newtons, tracks)
         errors = [
             f"{100 * estimate.standard_error / abs(estimate.value):.2g} % ({100 * (estimate.value / truth - 1):+.2g} %)"
-            for estimate, truth in zip(found.parameters.values(), (TRUTH, 3e5, 6000, 0.5, 0.5), strict=True)
+            for estimate, truth in zip(result.parameters.values(), (TRUTH, 3e5, 6000, 0.5, 0.5), strict=True)
         ]
         seconds = time.perf_counter() - start
-        print(f"| {newtons} N, {tracks} × {tracks} tracks | {' | '.join(errors)} | {found.runs} | {seconds:.0f} s |")
+        print(f"| {newtons} N, {tracks} × {tracks} tracks | {' | '.join(errors)} | {result.runs} | {seconds:.0f} s |")
 
 
 if __name__ == "__main__":

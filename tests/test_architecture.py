@@ -52,20 +52,20 @@ def tree(path: Path) -> ast.Module:
 
 def imports(path: Path) -> set[str]:
     """Modules of this package that a module imports anywhere."""
-    found = set()
+    names = set()
     for node in ast.walk(tree(path)):
         if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "taichi_msm":
             inner = node.module.partition(".")[2]
             # An imported name may be that of a module, or of something in a module.
-            found |= {name for alias in node.names if (name := f"{inner}.{alias.name}".strip(".")) in NAMES} or {inner}
-    return found & NAMES
+            names |= {name for alias in node.names if (name := f"{inner}.{alias.name}".strip(".")) in NAMES} or {inner}
+    return names & NAMES
 
 
 def third_party(path: Path) -> set[str]:
     nodes = list(ast.walk(tree(path)))
-    found = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
-    found |= {node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.module}
-    return {name.split(".")[0] for name in found}
+    names = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    names |= {node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.module}
+    return {name.split(".")[0] for name in names}
 
 
 def test_every_module_has_a_layer() -> None:

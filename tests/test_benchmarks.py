@@ -13,7 +13,7 @@ import pytest
 
 from benchmarks import child, dop853, page, process, race
 from benchmarks.stepping import PEERS, measure, numpy_
-from benchmarks.stepping.problem import Array, Problem
+from benchmarks.stepping.problem import Array
 from taichi_msm import load_scene
 from taichi_msm.accuracy.time_step import max_norm
 from taichi_msm.system.runtime import Device
@@ -83,11 +83,6 @@ def test_failures_of_a_measuring_process(monkeypatch: pytest.MonkeyPatch, messag
     monkeypatch.setenv("PATH", "")
     with message.raises(process.UnavailableError):
         process.call("benchmarks.stepping.measure:check", peer=PEERS["C++, OpenMP"], points=5)
-
-
-def test_load_on_every_point() -> None:
-    for share in np.abs(Problem(101).load):
-        assert share.min() > 0.01 * share.max()
 
 
 def test_tables_of_the_page(message: Messages) -> None:

@@ -115,15 +115,15 @@ def longest_part(node: ast.AST) -> str:
 
 def messages_of(file: Path) -> set[str]:
     """The longest fixed part of every message that a file raises or reports, if it has two words."""
-    found: set[str] = set()
+    parts: set[str] = set()
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         arguments: list[ast.expr] = []
         if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
             arguments = node.exc.args
         elif isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] in ("Problem", "scene_fault"):
             arguments = node.args
-        found |= {part for part in map(longest_part, arguments) if len(part) > 13 and " " in part}
-    return found
+        parts |= {part for part in map(longest_part, arguments) if len(part) > 13 and " " in part}
+    return parts
 
 
 def test_every_message_is_provoked(root: Path) -> None:

@@ -18,7 +18,7 @@ uniform int parts;
 uniform int vertices;
 uniform int points;
 uniform float side;
-out vec2 place;
+out vec2 coordinates;
 out float light;
 
 vec3 between(sampler2D values, ivec2 low, vec2 share) {
@@ -33,7 +33,7 @@ void main() {
     vec2 share = vec2(vertex - low * parts) / parts;
     vec3 position = between(point, low, share);
     light = abs(normalize(between(normal, low, share)).z);
-    place = vec2(vertex) / (vertices - 1);
+    coordinates = vec2(vertex) / (vertices - 1);
     gl_Position = vec4(position.x * 2 / side, -position.y * 2 / side, -position.z / side, 1);
 }
 """
@@ -42,12 +42,12 @@ FRAGMENT = """
 #version 330
 uniform sampler2D picture;
 uniform bool lit;
-in vec2 place;
+in vec2 coordinates;
 in float light;
 out vec4 colour;
 
 void main() {
-    colour = vec4(texture(picture, place).rgb * (lit ? light : 1.0), 1);
+    colour = vec4(texture(picture, coordinates).rgb * (lit ? light : 1.0), 1);
 }
 """
 

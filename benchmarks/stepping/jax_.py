@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks.neighbours import springs
 from benchmarks.stepping.problem import Array, Problem
-from tests.reference.neighbours import springs
 
 
 class Stepper:

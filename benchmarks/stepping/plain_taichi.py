@@ -4,8 +4,8 @@
 
 import taichi as ti
 
+from benchmarks.neighbours import springs
 from benchmarks.stepping.problem import Array, Problem, Stepper
-from tests.reference.neighbours import springs
 
 
 class PlainTaichi:

@@ -20,6 +20,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.neighbours import Spring, springs
 from taichi_msm.model.loads import decay
 from taichi_msm.model.plan import Plan
 from taichi_msm.model.sheet import Material
@@ -27,7 +28,6 @@ from taichi_msm.model.time_grid import TimeGrid
 from taichi_msm.scene.scene import Scene
 from taichi_msm.solver.planning import make_plan
 from tests import reference
-from tests.reference.neighbours import Spring, springs
 
 CELL = 0.01
 FORCE = (0.02, 0.01, -0.08)

@@ -95,11 +95,11 @@ def rasterise(
     """Rasterise the sheet, without instruments: refine, project, and keep the nearest triangle of every sample.
 
     Args:
-        scene: the scene.
+        scene: scene with the sheet and the render settings.
         position: positions of the mass points [m], shape (rows, cols, 3).
         factor: samples per pixel and axis.
         texels: width and height of the texture, for the footprint.
-        camera: the camera; that of the scene at time 0 by default.
+        camera: view to draw from; that of the scene at time 0 by default.
 
     Returns:
         The G-buffer, of `factor` times the picture's size.
@@ -180,11 +180,11 @@ def draw(
     """Return the picture of one frame, shape (height, width, 3).
 
     Args:
-        scene: the scene.
+        scene: scene with the sheet and the render settings.
         position: positions of the mass points [m], shape (rows, cols, 3).
         texture: picture on the sheet, shape (height, width, 3).
         rods: instruments.
-        camera: the camera; that of the scene at time 0 by default.
+        camera: view to draw from; that of the scene at time 0 by default.
     """
     factor, camera = scene.render.supersample, camera or view(scene)
     buffer = rasterise(scene, position, factor, (texture.shape[1], texture.shape[0]), camera)

@@ -31,7 +31,7 @@ def elastic_force(scene: Scene, displacement: Array, assembled: Sheet | None = N
     forces of a sheet under tension cancel. Stiffening tissue has `lock` of the strain in place of the strain.
 
     Args:
-        scene: the scene; only its sheet and springs or tissue count.
+        scene: scene with springs or tissue.
         displacement: u = x - X [m], shape (rows, cols, 3), real or complex.
         assembled: another sheet than the scene's.
     """
@@ -82,7 +82,7 @@ def foundation_force(scene: Scene, displacement: Array, assembled: Sheet | None 
     -K u (eq. 4), with `lock` of the depth -u_z where the foundation locks.
 
     Args:
-        scene: the scene.
+        scene: scene with virtual springs or a foundation.
         displacement: u [m], shape (rows, cols, 3).
         assembled: another sheet than the scene's.
     """
@@ -113,7 +113,7 @@ def bending_force(scene: Scene, displacement: Array, assembled: Sheet | None = N
     The negative gradient of D / 2 sum of dx dy |Laplacian of u|^2 over the points with four neighbours.
 
     Args:
-        scene: the scene.
+        scene: scene with springs or tissue.
         displacement: u [m], shape (rows, cols, 3), real or complex.
         assembled: another sheet than the scene's.
     """
@@ -131,7 +131,7 @@ def shortest_spring(scene: Scene, displacement: Array) -> float:
     """Return the smallest ratio of a spring's length to that at rest, at most 1.
 
     Args:
-        scene: the scene; springs without stiffness do not count.
+        scene: scene whose springs are measured, except those without stiffness.
         displacement: u [m], shape (rows, cols, 3).
     """
     return min(1.0, *(float(strain.min(initial=1.0)) for strain in _strains(scene, displacement)))
@@ -141,7 +141,7 @@ def longest_spring(scene: Scene, displacement: Array) -> float:
     """Return the largest ratio of a spring's length to that at rest, at least 1.
 
     Args:
-        scene: the scene; springs without stiffness do not count.
+        scene: scene whose springs are measured, except those without stiffness.
         displacement: u [m], shape (rows, cols, 3).
     """
     return max(1.0, *(float(strain.max(initial=1.0)) for strain in _strains(scene, displacement)))
@@ -158,7 +158,7 @@ def energy(scene: Scene, displacement: Array) -> float:
     The sum of k ((L - L0)^2 - (L_rest - L0)^2) / 2, less the part linear in u, and of D / 2 |Laplacian|^2 dx dy.
 
     Args:
-        scene: the scene.
+        scene: scene with springs or tissue.
         displacement: u [m], shape (rows, cols, 3).
     """
     assembled = sheet(scene)
@@ -182,7 +182,7 @@ def surgical_force(scene: Scene, loads: Schedule, n: int) -> Array:
     Of each, (percent / 100) force exp(-falloff d - offset) (eq. 5), or its total shared by exp(-falloff d).
 
     Args:
-        scene: the scene.
+        scene: scene with force-controlled tools.
         loads: schedule of loads and control points, a row for every step or time.
         n: row of the schedule.
     """
@@ -205,7 +205,7 @@ def force(scene: Scene, displacement: Array, loads: Schedule, n: int, assembled:
     """Return the sum of all forces except damping (eq. 1) [N], shape (rows, cols, 3).
 
     Args:
-        scene: the scene.
+        scene: scene with springs or tissue.
         displacement: u [m], shape (rows, cols, 3), real or complex.
         loads: schedule of loads and of the activity of virtual springs.
         n: row of the schedule.
@@ -223,11 +223,11 @@ def internal_force(scene: Scene, displacement: Array, loads: Schedule, n: int, a
     """Return the sum of the forces of springs, bending and foundation [N], shape (rows, cols, 3).
 
     Args:
-        scene: the scene.
+        scene: scene with springs or tissue.
         displacement: u [m], shape (rows, cols, 3).
         loads: schedule of the activity of virtual springs.
         n: row of the schedule.
-        assembled: the sheet.
+        assembled: assembled sheet of the scene, or another one.
     """
     springs = elastic_force(scene, displacement, assembled) + bending_force(scene, displacement, assembled)
     return springs + loads.active[n] * foundation_force(scene, displacement, assembled)
@@ -270,7 +270,7 @@ def tangent(
     lock, the linear part alone.
 
     Args:
-        scene: the scene.
+        scene: scene with springs or tissue.
         displacement: u [m], shape (rows, cols, 3).
         change: direction du [m], same shape.
         active: share of the virtual springs that are active, 0 to 1.

@@ -24,7 +24,7 @@ def labels(scene: Scene, position: Array, rods: Sequence[Solid] = ()) -> tuple[A
     """Compute material coordinates, depth and the instrument mask at pixel centres.
 
     Args:
-        scene: the scene.
+        scene: scene with the sheet and the render settings.
         position: positions of the mass points [m], shape (rows, cols, 3).
         rods: instruments.
 
@@ -46,7 +46,7 @@ def normals(scene: Scene, position: Array, rods: Sequence[Solid] = ()) -> Array:
     In OpenCV's camera axes: x right, y down, z forward.
 
     Args:
-        scene: the scene.
+        scene: scene with the sheet and the render settings.
         position: positions of the mass points [m], shape (rows, cols, 3).
         rods: instruments.
     """
@@ -60,7 +60,7 @@ def project(scene: Scene, coordinates: Array, position: Array) -> tuple[Array, N
     """Project material points, and test them for occlusion by the sheet.
 
     Args:
-        scene: the scene.
+        scene: scene with the sheet and the render settings.
         coordinates: fractions of the sheet's width from its left and of its height from its top, shape (n, 2).
         position: positions of the mass points [m], shape (rows, cols, 3).
 

@@ -47,7 +47,7 @@ def undistorted(camera: View, x: Array, y: Array) -> tuple[Array, Array]:
     """Return undistorted image points [px]; NaN beyond the lens's limit.
 
     Args:
-        camera: the camera; without a lens the points are returned as they are.
+        camera: view; without a lens the points are returned unchanged.
         x: distorted x [px], from the left.
         y: distorted y [px], from the top, same shape.
     """

@@ -25,7 +25,7 @@ def potential(scene: Scene, displacement: Array, loads: Schedule) -> float:
     """Return the energy of springs, bending and virtual springs, less the work of the loads [J].
 
     Args:
-        scene: the scene.
+        scene: scene with springs or tissue.
         displacement: u [m], shape (rows, cols, 3).
         loads: schedule; its first row counts.
     """
@@ -147,7 +147,7 @@ def stiffness(scene: Scene, displacement: Array | float = 0.0, active: float = 1
     column is displaced at once.
 
     Args:
-        scene: the scene.
+        scene: scene with springs or tissue.
         displacement: u at which it is taken [m], shape (rows, cols, 3), or 0 for the flat sheet.
         active: share of the virtual springs that are active, 0 to 1.
     """

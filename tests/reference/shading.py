@@ -99,7 +99,7 @@ def minified(texture: NDArray[np.uint8], u: Array, v: Array, footprint: Array) -
     lower = np.floor(np.log2(np.maximum(footprint, 1))).astype(int)
     share = np.clip(footprint / 2.0**lower - 1, 0, 1)[..., None]
     height, width, _ = texture.shape
-    # Every level is filtered at the places of all samples; a texel of a halved level begins where its first half does.
+    # Every level is filtered for all samples; a texel of a halved level begins where its first half does.
     colours, rises = [], []
     for n, level in enumerate(levels):
         across, down = u * width / 2**n / level.shape[1], v * height / 2**n / level.shape[0]
@@ -136,7 +136,7 @@ def points(camera: View, factor: int, depth: Array) -> Array:
     """Return the points in space that samples show [m], shape (height, width, 3).
 
     Args:
-        camera: the camera.
+        camera: view to draw from.
         factor: samples per pixel and axis.
         depth: depth along the direction of view [m], shape (height, width) in samples; infinite where there is nothing,
             and the returned values are meaningless.
@@ -155,7 +155,7 @@ def illuminate(camera: View, factor: int, depth: Array, normal: Array) -> tuple[
     """Compute the vectors of the lighting model.
 
     Args:
-        camera: the camera.
+        camera: view to draw from.
         factor: samples per pixel and axis.
         depth: as for `points` [m], shape (height, width).
         normal: normals of any length, shape (height, width, 3).
@@ -198,8 +198,8 @@ def tissue(
     """Return the colours of wet tissue, 0 to 255, shape (height, width, 3), by the formulas of `render/shading.py`.
 
     Args:
-        scene: the scene, with its light.
-        camera: the camera.
+        scene: scene with the light and the sheet.
+        camera: view to draw from.
         texture: colours, shape (height, width, 3).
         normal: normals of any length, shape (height, width, 3).
         depth: as for `points` [m], shape (height, width).
@@ -236,7 +236,7 @@ def metal(camera: View, factor: int, depth: Array, normal: Array) -> Array:
     """Return the colours of metal in a room that is bright above and dark below, 0 to 255, shape (height, width, 3).
 
     Args:
-        camera: the camera.
+        camera: view to draw from.
         factor: samples per pixel and axis.
         depth: as for `points` [m], shape (height, width).
         normal: outward normals of any length, shape (height, width, 3).
@@ -256,8 +256,8 @@ def intersect(rods: Sequence[Solid], camera: View, size: tuple[int, int], factor
     """Intersect the lines of sight with instruments, by search: the distance to a capsule is convex along a line.
 
     Args:
-        rods: the capsules.
-        camera: the camera.
+        rods: instruments, capsules.
+        camera: view to draw from.
         size: width and height of the picture [px].
         factor: samples per pixel and axis.
 

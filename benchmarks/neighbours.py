@@ -1,4 +1,4 @@
-"""Springs between a mass point and its neighbours, for scenes with `springs` and without a map; used by benchmarks."""
+"""Springs between a mass point and its neighbours, for scenes with `springs` and without a map."""
 
 from __future__ import annotations
 
