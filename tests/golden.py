@@ -95,13 +95,7 @@ class Messages:
     def raises(
         self, error: type[AnyError] | tuple[type[AnyError], ...], *words: str, hide: str = r"(?!)"
     ) -> Iterator[pytest.ExceptionInfo[AnyError]]:
-        """Expect an error, and compare its message.
-
-        Args:
-            error: the expected type.
-            words: as for `__call__`.
-            hide: as for `__call__`.
-        """
+        """Expect an error, and compare its message; see `__call__`."""
         with pytest.raises(error) as caught:
             yield caught
         self(str(caught.value), *words, hide=hide)

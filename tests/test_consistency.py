@@ -1,7 +1,7 @@
 """Consistency of the labels of a run: deviations between its files, in float64, with OpenCV's cameras.
 
-Of the program only `run` and, for a second camera, `Simulation` are used. Pixels are OpenCV's: the centre of the first
-one is at (0, 0). Occlusion is tested against all triangles.
+Of the program only `run` and, for a second camera, `Simulation` are used; of the NumPy reference, the refined surface.
+Pixels are OpenCV's: the centre of the first one is at (0, 0). Occlusion is tested against all triangles.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ from PIL import Image
 from taichi_msm import Simulation, run
 from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
+from tests.reference.drawing import refine, triangles
+from tests.reference.labels import interpolate
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -164,28 +166,6 @@ def read_camera(written: dict[str, Any], frame: int) -> Camera:
     return Camera(pose[:, :3], pose[:, 3], project, unproject, True)
 
 
-def surface(position: Array) -> Array:
-    """The refined vertices, shape (n, n, 3)."""
-    count = (POINTS - 1) * (REFINE + 1) + 1
-    hats = np.maximum(0, 1 - np.abs(np.arange(count)[:, None] / (REFINE + 1) - np.arange(POINTS)))
-    return np.asarray(np.einsum("ai,ijk,bj->abk", hats, position, hats))
-
-
-def triangles(vertices: Array) -> Array:
-    """All triangles, shape (n, 3, 3)."""
-    a, b, c, d = vertices[:-1, :-1], vertices[:-1, 1:], vertices[1:, :-1], vertices[1:, 1:]
-    return np.concatenate([np.stack(three, axis=2).reshape(-1, 3, 3) for three in ((a, c, d), (a, d, b))])
-
-
-def material(vertices: Array, coordinates: Array) -> Array:
-    """Points of the surface at coordinates, shape (n, 3)."""
-    index = coordinates * (len(vertices) - 1)
-    j, i = np.minimum(index.astype(int), len(vertices) - 2).T
-    s, t = (index - np.stack([j, i], axis=1)).T[:, :, None]
-    a, b, c, d = vertices[i, j], vertices[i, j + 1], vertices[i + 1, j], vertices[i + 1, j + 1]
-    return np.where(t > s, a * (1 - t) + c * (t - s) + d * s, a * (1 - s) + b * (s - t) + d * t)
-
-
 def triangle_of(coordinates: Array) -> Array:
     """A number of the triangle at coordinates; NaN in the background."""
     index = coordinates * ((POINTS - 1) * (REFINE + 1))
@@ -201,7 +181,7 @@ def behind_sheet(image: Array, depth: Array, camera: Camera, vertices: Array) ->
     of an orthographic camera where sum b_i c_i = (p, depth), with sum b_i = 1.
     """
     hidden, rays = np.zeros(len(image), bool), np.concatenate([image, np.ones((len(image), 1))], axis=1)
-    corners = camera.to_camera(triangles(vertices).reshape(-1, 3))
+    corners = camera.to_camera(np.concatenate(list(triangles(vertices))))
     outlines, corners = camera.image_points(corners).reshape(-1, 3, 2), corners.reshape(-1, 3, 3)
     low, high = outlines.min(axis=1), outlines.max(axis=1)
     columns = np.moveaxis(corners if camera.pinhole else np.insert(outlines, 2, 1, axis=2), 1, 2)
@@ -242,7 +222,7 @@ class Files:
         self.written = json.loads((folder / "camera.json").read_text())
         with np.load(folder / "trajectory.npz") as archive:
             self.time, self.positions = archive["time"], archive["position"]
-        self.vertices = [surface(position) for position in self.positions]
+        self.vertices = [refine(position, REFINE) for position in self.positions]
         with np.load(folder / "tracks.npz") as archive:
             self.tracks = dict(archive)
         with (folder / "forces.csv").open() as file:
@@ -291,7 +271,7 @@ def of_pixels(files: Files) -> Deviations:
         coordinates, flow = files.read("coordinates", frame), files.read("flow", frame)
         sheet = np.isfinite(coordinates[..., 0])
         pixels, coordinates = centres()[sheet], coordinates[sheet]
-        visible, moved = (material(files.vertices[n], coordinates) for n in (frame, frame + 1))
+        visible, moved = (interpolate(files.vertices[n], coordinates) for n in (frame, frame + 1))
         yield "coordinates", distance(first.pixels(visible), pixels)
         yield "depth", distance(first.points(pixels, files.read("depth", frame)[sheet]), visible)
         yield "flow", distance(pixels + flow[sheet], second.pixels(moved))
@@ -325,7 +305,7 @@ def of_tracks(files: Files) -> Deviations:
         occluded = files.tracks["occluded"][:, frame]
         pixels = points - 0.5
         yield "tracks", distance(pixels, camera.pixels(position))
-        hidden = files.hidden(material(files.vertices[frame], coordinates), frame, camera)
+        hidden = files.hidden(interpolate(files.vertices[frame], coordinates), frame, camera)
         yield "occluded", float(np.mean(occluded != hidden))
         # The line of sight meets the plane of the triangle, which the depth and normal of the pixel determine.
         x, y = np.round(pixels).astype(int).clip(0, [WIDTH - 1, HEIGHT - 1]).T
@@ -357,7 +337,7 @@ def of_stereo(files: Files, name: str, threads: int) -> Deviations:
             left, depth = files.camera(frame), labels.depth.astype(float)
             right = read_camera(right_camera(files.written, right_keys), frame)
             sheet, tool = np.isfinite(labels.coordinates[..., 0]), labels.instrument > 0
-            visible = material(files.vertices[frame], labels.coordinates[sheet].astype(float))
+            visible = interpolate(files.vertices[frame], labels.coordinates[sheet].astype(float))
             metal, outside = on_rod(left, centres()[tool], depth[tool], files.tip_centres[frame])
             for part, points, tested in ((sheet, visible, visible), (tool, metal, outside)):
                 known = stereo[part][:, 0] < 1e9  # within the limit of the lens

@@ -70,7 +70,7 @@ def project(scene: Scene, coordinates: Array, position: Array) -> tuple[Array, N
     camera, (width, height) = view(scene), scene.render.size
     points = np.concatenate([position, np.ones((*position.shape[:2], 1))], axis=-1) @ camera.matrix.T
     surface = refine(points, scene.render.refine)
-    projected = _interpolate(surface, coordinates)
+    projected = interpolate(surface, coordinates)
     with np.errstate(divide="ignore", invalid="ignore"):
         undistorted = np.where(projected[:, 2:3] > camera.near, projected[:, :2] / projected[:, 2:3], np.nan)
     x, y = undistorted.T
@@ -88,8 +88,13 @@ def project(scene: Scene, coordinates: Array, position: Array) -> tuple[Array, N
     return pixels, hidden
 
 
-def _interpolate(surface: Array, coordinates: Array) -> Array:
-    """Interpolate values of vertices, shape (rows, cols, k), linearly on each triangle, at coordinates (n, 2)."""
+def interpolate(surface: Array, coordinates: Array) -> Array:
+    """Return values on the surface, linear on each triangle, shape (n, k).
+
+    Args:
+        surface: values of the refined vertices, shape (rows, cols, k).
+        coordinates: fractions of the sheet's width and height, shape (n, 2).
+    """
     rows, cols = surface.shape[:2]
     # The vertex to the upper left of each point, and the point's fractions within that vertex's quad.
     across, down = coordinates[:, 0] * (cols - 1), coordinates[:, 1] * (rows - 1)
