@@ -6,12 +6,11 @@ All in f64.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
+from benchmarks.clock import in_turn
 from benchmarks.process import FailedError, call
 from benchmarks.race import Progress
 from benchmarks.stepping.problem import Problem
@@ -58,7 +57,8 @@ def ours(points: int, steps: int, rounds: int) -> dict[str, Any]:
         cotangent[-1] = position[-1] - position[0]
         gradient = adjoint.backward(cotangent).maps["springs.map"]
 
-    return _timed(run, differentiate, rounds) | {"gradient_values": gradient.tolist()}
+    times = in_turn({"forward": run, "gradient": differentiate}, rounds)
+    return {**times, "gradient_values": gradient.tolist()}
 
 
 def autodiff(points: int, steps: int, rounds: int) -> dict[str, Any]:
@@ -66,20 +66,8 @@ def autodiff(points: int, steps: int, rounds: int) -> dict[str, Any]:
     from benchmarks.taichi_autodiff import Differentiated
 
     peer = Differentiated(Problem(points), steps, available_threads())
-    times = _timed(peer.run, peer.differentiate, rounds)
-    return times | {"gradient_values": peer.gradient().tolist()}
-
-
-def _timed(run: Callable[[], object], differentiate: Callable[[], object], rounds: int) -> dict[str, Any]:
-    """Time both in turn; the first round compiles."""
-    samples: dict[str, Any] = {"forward": [], "gradient": []}
-    for number in range(rounds + 1):
-        for name, work in (("forward", run), ("gradient", differentiate)):
-            start = time.perf_counter()
-            work()
-            if number:
-                samples[name].append(time.perf_counter() - start)
-    return samples
+    times = in_turn({"forward": peer.run, "gradient": peer.differentiate}, rounds)
+    return {**times, "gradient_values": peer.gradient().tolist()}
 
 
 def measure(rounds: int, progress: Progress) -> dict[str, dict[str, dict[str, list[float]]]]:

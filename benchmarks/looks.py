@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 import tempfile
-import time
 from collections.abc import Callable
 from typing import Any
 
-from benchmarks.clock import seconds
+from benchmarks.clock import in_turn, seconds
 from benchmarks.drawing.problem import Problem
 from benchmarks.process import call
 from benchmarks.race import Progress
@@ -97,16 +96,7 @@ def variants(problem: Problem) -> dict[str, Callable[[], Any]]:
 def cost(pixels: int, rounds: int) -> Samples:
     """Return times of every variant [s], measured in turn."""
     runtime.start("cpu", available_threads())
-    timed = variants(Problem(pixels, REFINE, lit=True))
-    samples: Samples = {name: [] for name in timed}
-    for _ in range(1 + rounds):
-        for name, draw in timed.items():
-            start = time.perf_counter()
-            for _ in range(PICTURES):
-                draw()
-            samples[name].append((time.perf_counter() - start) / PICTURES)
-    # The first round compiles.
-    return {name: times[1:] for name, times in samples.items()}
+    return in_turn(variants(Problem(pixels, REFINE, lit=True)), rounds, PICTURES)
 
 
 def labels(pixels: int) -> float:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import tempfile
-import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
+from benchmarks.clock import in_turn
 from benchmarks.process import call
 from benchmarks.race import Progress
 from taichi_msm.scene.scene import Scene
@@ -81,13 +82,8 @@ def cost(points: int, precision: str, rounds: int) -> dict[str, list[float]]:
         }
     for sheet in sheets.values():
         sheet.advance(math.ceil(DOWN * sheet.plan.grid.steps_per_second))
-    samples: dict[str, list[float]] = {name: [] for name in sheets}
-    for _ in range(rounds):
-        for name, sheet in sheets.items():
-            start = time.perf_counter()
-            sheet.advance(count)
-            samples[name].append((time.perf_counter() - start) / count)
-    return samples
+    samples = in_turn({name: partial(sheet.advance, count) for name, sheet in sheets.items()}, rounds)
+    return {name: [seconds / count for seconds in times] for name, times in samples.items()}
 
 
 def measure(rounds: int, progress: Progress) -> dict[str, dict[str, list[float]]]:

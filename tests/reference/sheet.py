@@ -44,7 +44,7 @@ class Sheet(NamedTuple):
 ALONG_ROW, ALONG_COLUMN, TO_RIGHT, TO_LEFT = (0, 1), (1, 0), (1, 1), (1, -1)
 
 
-def factors(scene: Scene) -> Array:
+def _factors(scene: Scene) -> Array:
     """Return the stiffness factor at the centre of every cell, shape (rows - 1, cols - 1); ones without a map."""
     rows, cols = scene.sheet.points
     if scene.stiffness_map is None:
@@ -52,7 +52,7 @@ def factors(scene: Scene) -> Array:
     return cell_factors(scene.stiffness_map, _image(scene.stiffness_map), scene.sheet)
 
 
-def foundation_factors(scene: Scene) -> Array:
+def _foundation_factors(scene: Scene) -> Array:
     """Return the factor of the foundation at every point, shape (rows, cols); ones without a map."""
     stiffness_map = scene.maps.get("foundation_map")
     if stiffness_map is None:
@@ -81,7 +81,7 @@ def sheet(scene: Scene) -> Sheet:
     if scene.tissue is not None:
         return _of_tissue(scene, scene.tissue)
     assert scene.springs is not None
-    factor = factors(scene)
+    factor = _factors(scene)
     cells = np.ones_like(factor)
     structural, shear = scene.springs.structural, scene.springs.shear
     stiffness = {
@@ -97,7 +97,7 @@ def sheet(scene: Scene) -> Sheet:
 
 def _of_tissue(scene: Scene, tissue: Tissue) -> Sheet:
     dx, dy = spacing(scene.sheet)
-    factor, membrane = factors(scene), tissue.young * tissue.thickness
+    factor, membrane = _factors(scene), tissue.young * tissue.thickness
     cells = np.ones_like(factor)
     along_row = membrane * (9 / 8 * dy / dx - 3 / 8 * dx / dy) / 2
     along_column = membrane * (9 / 8 * dx / dy - 3 / 8 * dy / dx) / 2
@@ -113,7 +113,7 @@ def _of_tissue(scene: Scene, tissue: Tissue) -> Sheet:
     mass = (tissue.density or 0.0) * tissue.thickness * dx * dy / 4 * quarters
     plate = tissue.young * tissue.thickness**3 / 12 / (1 - 1 / 9)
     bending = plate if tissue.bending == "plate" else tissue.bending
-    virtual = tissue.foundation_stiffness * dx * dy / 4 * quarters * foundation_factors(scene)
+    virtual = tissue.foundation_stiffness * dx * dy / 4 * quarters * _foundation_factors(scene)
     return Sheet(springs, mass, tissue.damping * mass, virtual, bending * dx * dy)
 
 
