@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -46,12 +47,15 @@ def scene(**sections: Any) -> Scene:
     )
 
 
+def _random(*seed: int) -> tuple[np.random.Generator, Callable[[float, float], float]]:
+    """Return a generator, and its uniform floats between two limits."""
+    rng = np.random.default_rng(seed[0] if len(seed) == 1 else seed)
+    return rng, lambda low, high: float(rng.uniform(low, high))
+
+
 def random_scene(seed: int, precision: str = "f64") -> Scene:
     """A random scene of few mass points; every term of the model occurs in some seed."""
-    rng = np.random.default_rng(seed)
-
-    def uniform(low: float, high: float) -> float:
-        return float(rng.uniform(low, high))
+    rng, uniform = _random(seed)
 
     def keys(count: int, *ranges: tuple[float, float]) -> list[list[float]]:
         times = np.sort(rng.choice(40, count, replace=False)) / 100
@@ -83,21 +87,13 @@ def random_scene(seed: int, precision: str = "f64") -> Scene:
         },
         damping=uniform(0.01, 0.1) if rng.random() < 0.8 else 0,
         probes=[probe() for _ in range(rng.integers(0, 4))],
-        time={
-            "duration": 0.4,
-            "precision": precision,
-            "damping_difference": ["central", "backward"][rng.integers(2)],
-        },
+        time={"duration": 0.4, "precision": precision, "damping_difference": ["central", "backward"][rng.integers(2)]},
     )
 
 
 def random_tissue(seed: int, image: str, precision: str = "f64") -> Scene:
     """A random scene of tissue with few mass points, as stiff for its size as `random_scene`; `image` is for maps."""
-    rng = np.random.default_rng(seed)
-
-    def uniform(low: float, high: float) -> float:
-        return float(rng.uniform(low, high))
-
+    rng, uniform = _random(seed)
     sides = ["top", "bottom", "left", "right"]
     rows, cols = int(rng.integers(3, 14)), int(rng.integers(3, 23))
     fixed = ["border", "border", "corners", "none", [side for side in sides if rng.random() < 0.4]][rng.integers(5)]
@@ -134,11 +130,7 @@ def random_tissue(seed: int, image: str, precision: str = "f64") -> Scene:
         sheet={"points": [rows, cols], "size": size, "fixed": fixed},
         tissue=tissue,
         probes=probes,
-        time={
-            "duration": 0.4,
-            "precision": precision,
-            "damping_difference": ["central", "backward"][rng.integers(2)],
-        },
+        time={"duration": 0.4, "precision": precision, "damping_difference": ["central", "backward"][rng.integers(2)]},
         output=[],
     )
 
@@ -152,15 +144,14 @@ def random_contact(seed: int, image: str, *, cells: float = 2.0) -> Scene:
         cells: radius of the tools, about [cells].
     """
     for attempt in range(100):
-        made = Scene.model_validate(_random_contact(np.random.default_rng([seed, attempt]), image, cells))
+        made = Scene.model_validate(_random_contact(seed, attempt, image, cells))
         if not try_plan(made)[1]:
             return made
     raise AssertionError("no valid scene")
 
 
-def _random_contact(rng: np.random.Generator, image: str, cells: float) -> dict[str, Any]:
-    def uniform(low: float, high: float) -> float:
-        return float(rng.uniform(low, high))
+def _random_contact(seed: int, attempt: int, image: str, cells: float) -> dict[str, Any]:
+    rng, uniform = _random(seed, attempt)
 
     def likely(chance: float) -> bool:
         return bool(rng.random() < chance)

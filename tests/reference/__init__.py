@@ -5,7 +5,6 @@ Not an independent check of the model; it is itself tested against closed forms 
 
 from tests.reference.drawing import draw as draw
 from tests.reference.drawing import refine as refine
-from tests.reference.dynamics import bending_force as bending_force
 from tests.reference.dynamics import displacements as displacements
 from tests.reference.dynamics import elastic_force as elastic_force
 from tests.reference.dynamics import energy as energy
